@@ -365,37 +365,59 @@ def linear_errors(
     m = session.measurements
     rows = max(streams(m), key=len)
     rows = rows[np.linspace(0, len(rows) - 1, min(len(rows), _MOST_LINEAR)).astype(np.int64)]
-    q, points = m.q[rows], m.position[rows]
-    n = len(rows)
-    centred = points - points.mean(axis=0)
-    extent = np.median(np.linalg.norm(centred, axis=1))
-    # What G and t can do is projected out; it is the same for all arrangements.
-    base = np.linalg.svd(np.column_stack((centred, np.ones(n))), full_matrices=False)[0]
+    n, q = len(rows), m.q[rows]
     errors, scales = np.empty(len(arrangements)), np.empty(len(arrangements))
     step = max(1, _BATCH_FRAMES // n)
     for first in range(0, len(arrangements), step):
         part = arrangements[first : first + step]
-        tools = chain.forward(np.array([a.joints(q) for a in part]))
-        flat = tools[..., :3, :].reshape(len(part), n, 12)
-        left = (flat - base @ (base.T @ flat)).reshape(len(part), n, 3, 4)
-        design = left[..., :3].reshape(len(part), 3 * n, 3)
-        target = -left[..., 3].reshape(len(part), 3 * n, 1)
-        by_marker = np.swapaxes(design, 1, 2)
-        normal = by_marker @ design
-        # Where the tool hardly turns, the marker is not determined, and stays near the tool.
-        ridge = 1e-9 * np.trace(normal, axis1=1, axis2=2)[:, None, None] + 1e-15
-        marker = np.linalg.solve(normal + ridge * np.eye(3), by_marker @ target)
-        residual = (design @ marker - target).reshape(len(part), n, 3)
-        modelled = (tools[..., :3, :3] @ marker[:, None])[..., 0] + tools[..., :3, 3]
-        modelled -= modelled.mean(axis=1, keepdims=True)
-        G = np.linalg.lstsq(centred, np.concatenate(list(modelled), axis=1), rcond=None)[0]
-        det = np.linalg.det(G.T.reshape(len(part), 3, 3))
-        scale = np.sign(det) * np.cbrt(np.abs(det))
-        scales[first : first + step] = scale
-        # Not in metres: wrong joints that hardly move would win by a G near zero.
-        size = np.median(np.linalg.norm(residual, axis=2), axis=1)
-        errors[first : first + step] = size / np.maximum(np.abs(scale) * extent, 1e-12)
+        at = slice(first, first + step)
+        errors[at], scales[at] = linear_fit(
+            chain, np.array([a.joints(q) for a in part]), m.position[rows]
+        )
     return errors, scales
+
+
+def linear_fit(
+    chain: SerialChain, q: FloatArray, points: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return how near joints come to points in the linear problem, whatever the points' unit.
+
+    Parameters
+    ----------
+    q
+        rad, (m, n, k): of m ways to have n rows.
+    points
+        (n, 3).
+
+    Returns
+    -------
+    errors, scales
+        As of `linear_errors`, (m,).
+    """
+    n = len(points)
+    centred = points - points.mean(axis=0)
+    extent = np.median(np.linalg.norm(centred, axis=1))
+    # What G and t can do is projected out; it is the same for all of them.
+    base = np.linalg.svd(np.column_stack((centred, np.ones(n))), full_matrices=False)[0]
+    tools = chain.forward(q)
+    flat = tools[..., :3, :].reshape(len(q), n, 12)
+    left = (flat - base @ (base.T @ flat)).reshape(len(q), n, 3, 4)
+    design = left[..., :3].reshape(len(q), 3 * n, 3)
+    target = -left[..., 3].reshape(len(q), 3 * n, 1)
+    by_marker = np.swapaxes(design, 1, 2)
+    normal = by_marker @ design
+    # Where the tool hardly turns, the marker is not determined, and stays near the tool.
+    ridge = 1e-9 * np.trace(normal, axis1=1, axis2=2)[:, None, None] + 1e-15
+    marker = np.linalg.solve(normal + ridge * np.eye(3), by_marker @ target)
+    residual = (design @ marker - target).reshape(len(q), n, 3)
+    modelled = (tools[..., :3, :3] @ marker[:, None])[..., 0] + tools[..., :3, 3]
+    modelled -= modelled.mean(axis=1, keepdims=True)
+    G = np.linalg.lstsq(centred, np.concatenate(list(modelled), axis=1), rcond=None)[0]
+    det = np.linalg.det(G.T.reshape(len(q), 3, 3))
+    scale = np.sign(det) * np.cbrt(np.abs(det))
+    # Not in metres: wrong joints that hardly move would win by a G near zero.
+    size = np.median(np.linalg.norm(residual, axis=2), axis=1)
+    return size / np.maximum(np.abs(scale) * extent, 1e-12), scale
 
 
 def search(session: Session, given: Fitted, lengths: Sequence[float] = ()) -> list[Fitted]:

@@ -87,6 +87,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=1.0,
         help='largest difference of times that are joined (default 1)',
     )
+    table.add_argument(
+        '--clock-offset',
+        metavar='S',
+        type=number(-1e10, 1e10, 's'),
+        help="of two streams: the joints' clock less the points' (default: found by standstills)",
+    )
     arm = parser.add_argument_group('corrections of the joints, by column or joint')
     arm.add_argument(
         '--couple',
@@ -315,7 +321,7 @@ def _read(args: argparse.Namespace, chain: SerialChain) -> RawRows:
     if bags:
         if len(args.files) > 1:
             raise InputError(f'{bags[0]}: a bag is imported alone; give one file')
-        return read_bag(bags[0], chain, args.joints, args.points, args.length)
+        return read_bag(bags[0], chain, args.joints, args.points, args.length, args.clock_offset)
     if len(args.files) > 2:
         raise InputError(f'{len(args.files)} files; give one table, or two that are to be joined')
     return read_rows(
@@ -330,6 +336,7 @@ def _read(args: argparse.Namespace, chain: SerialChain) -> RawRows:
             told=Told(args.joints, args.points, args.time, args.names),
             join=args.join,
             within_s=args.within,
+            clock_offset_s=args.clock_offset,
         ),
     )
 

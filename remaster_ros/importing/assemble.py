@@ -162,7 +162,10 @@ def assemble(
         std=rows.std,
         samples=rows.samples.astype(np.int64),
         temperature_c=rows.temperature_c,
-        frame=_frames(rows.stamp_s, sensor, marker, configuration),
+        frame=_frames(
+            rows.stamp_s if rows.reading is None else rows.reading, sensor, marker, configuration
+        ),
+        orientation=rows.orientation,
     )
     place = np.zeros(3) if options.marker_m is None else np.array(options.marker_m)
     std = UNKNOWN_MARKER_STD_M if options.marker_m is None else 0.5e-3
@@ -239,15 +242,18 @@ def _poses(rows: RawRows, chain: SerialChain, q: FloatArray) -> tuple[IntArray, 
 
 
 def _frames(
-    stamp_s: FloatArray | None, sensor: IntArray, marker: IntArray, configuration: IntArray
+    moment: FloatArray | IntArray | None,
+    sensor: IntArray,
+    marker: IntArray,
+    configuration: IntArray,
 ) -> IntArray | None:
     """Return the frame of each row, (n,): different markers that a sensor had at one moment.
 
     -1 for a row by itself; None where all are, or the times are not known.
     """
-    if stamp_s is None:
+    if moment is None:
         return None
-    moments = np.column_stack((sensor, configuration, stamp_s))
+    moments = np.column_stack((sensor, configuration, moment))
     frame = np.unique(moments, axis=0, return_inverse=True)[1].reshape(-1)
     size = np.bincount(frame)[frame]
     once = len(np.unique(np.column_stack((frame, marker)), axis=0)) == len(frame)

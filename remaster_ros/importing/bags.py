@@ -10,23 +10,28 @@ from typing import Any
 
 import numpy as np
 
-from remaster_ros.collection.frame_mean import are_too_many, of_the_marker
-from remaster_ros.collection.pairing import SensorRules
+from remaster_ros.calibration.arrangement import linear_fit
 from remaster_ros.errors import InputError
 from remaster_ros.importing.rows import RawRows
+from remaster_ros.importing.standstills import (
+    SWING_S,
+    Standstills,
+    Stream,
+    between,
+    is_stream,
+    joint_standstills,
+    match,
+    point_standstills,
+    reading_of,
+)
 from remaster_ros.importing.units import LENGTHS
 from remaster_ros.kinematics.serial_chain import SerialChain
-from remaster_ros.motion.settling import SettleRules
 from remaster_ros.session.bag import BagReader
-from remaster_ros.types import FARTHEST_M, FloatArray
+from remaster_ros.types import FARTHEST_M, FloatArray, IntArray
 
 JOINT_STATE = 'sensor_msgs/msg/JointState'
 POINT = 'geometry_msgs/msg/PointStamped'
 SUFFIXES = ('.mcap', '.db3', '.bag')
-# The arm may still swing so long after its encoders stand still, s.
-SWING_S = 0.5
-# Fewer samples have no standard deviation worth the name.
-FEWEST_SAMPLES = 5
 
 
 def is_bag(path: Path) -> bool:
@@ -39,16 +44,15 @@ def is_bag(path: Path) -> bool:
 
 
 @dataclass(eq=False)
-class _Stream:
+class _Topic:
     """Stamps and values of one topic."""
 
     stamps: list[float] = field(default_factory=list)
     values: list[Any] = field(default_factory=list)
 
-    def arrays(self) -> tuple[FloatArray, FloatArray]:
-        """Return stamps (n,) and values (n, m) in the order of the stamps."""
-        order = np.argsort(self.stamps, kind='stable')
-        return np.array(self.stamps)[order], np.array(self.values, dtype=float)[order]
+    def stream(self, scale: float = 1.0) -> Stream:
+        """Return them in the order of their stamps."""
+        return Stream.of(np.array(self.stamps), scale * np.array(self.values, dtype=float))
 
 
 def read_bag(
@@ -57,6 +61,7 @@ def read_bag(
     joint_topics: Sequence[str] = (),
     point_topics: Sequence[str] = (),
     length: str = '',
+    clock_offset_s: float | None = None,
 ) -> RawRows:
     """Read a bag; each topic of points is a sensor.
 
@@ -66,14 +71,16 @@ def read_bag(
         As told; () for all that fit.
     length
         Unit of the points where it is not the metre of ROS.
+    clock_offset_s
+        What is added to the stamps of the points to have the joints'; None to find it.
 
     Raises
     ------
     InputError
         No such topics, no standstill with a point in it, or a damaged bag.
     """
-    joints: dict[str, _Stream] = defaultdict(_Stream)
-    points: dict[str, _Stream] = defaultdict(_Stream)
+    joints: dict[str, _Topic] = defaultdict(_Topic)
+    points: dict[str, _Topic] = defaultdict(_Topic)
     seen: dict[str, str] = {}
     for topic, kind, message, log_s in _messages(path, seen):
         stamp = message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec or log_s
@@ -89,11 +96,10 @@ def read_bag(
     joint_topic = _joint_topic(path, joints, seen, chain)
     if not points:
         raise InputError(f'{path}: no geometry_msgs/PointStamped; it has {_topics(seen)}')
-    rows = _Rows(LENGTHS[length or 'm'])
-    for start, end, q in _standstills(*joints[joint_topic].arrays()):
-        for topic, stream in sorted(points.items()):
-            rows.add(topic, stream, start, end, q)
-    return rows.raw(path, chain, joint_topic, sorted(points), length or 'm', seen)
+    rows = _Rows(path, chain, joints[joint_topic].stream(), joint_topic, clock_offset_s)
+    for topic, found in sorted(points.items()):
+        rows.add(topic, found.stream(LENGTHS[length or 'm']))
+    return rows.raw(sorted(points), length or 'm', seen)
 
 
 def _messages(path: Path, seen: dict[str, str]) -> Iterator[tuple[str, str, Any, float]]:
@@ -141,7 +147,7 @@ def _topics(seen: dict[str, str]) -> str:
 
 
 def _joint_topic(
-    path: Path, joints: dict[str, _Stream], seen: dict[str, str], chain: SerialChain
+    path: Path, joints: dict[str, _Topic], seen: dict[str, str], chain: SerialChain
 ) -> str:
     named = [topic for topic in joints if topic.endswith('joint_states')] or list(joints)
     if len(named) == 1:
@@ -156,83 +162,80 @@ def _joint_topic(
     )
 
 
-def _standstills(stamps: FloatArray, q: FloatArray) -> Iterator[tuple[float, float, FloatArray]]:
-    """Give begin, end (s) and mean joints (rad, (k,)) of each time that the arm stood still."""
-    rules = SettleRules()
-    first = 0
-    low = high = q[0]
-    for i in range(1, len(q) + 1):
-        if i < len(q) and stamps[i] - stamps[i - 1] <= rules.max_gap_s:
-            lower, higher = np.minimum(low, q[i]), np.maximum(high, q[i])
-            if np.all(higher - lower <= rules.still_tolerance):
-                low, high = lower, higher
-                continue
-        if stamps[i - 1] - stamps[first] > SWING_S:
-            yield stamps[first], stamps[i - 1], q[first:i].mean(axis=0)
-        if i < len(q):
-            first, low, high = i, q[i], q[i]
-
-
 class _Rows:
     """Rows as they are found.
 
     Parameters
     ----------
-    unit
-        Of the points, m.
+    joints
+        Stream of `joint_topic`, rad.
+    clock_offset_s
+        As of `read_bag`.
     """
 
-    def __init__(self, unit: float) -> None:
-        self._unit = unit
-        self._rows: list[tuple[str, float, FloatArray, FloatArray, FloatArray, int]] = []
-        self._unsteady = self._dropped = 0
-        self._arrays: dict[str, tuple[FloatArray, FloatArray]] = {}
-
-    def add(self, topic: str, stream: _Stream, start: float, end: float, q: FloatArray) -> None:
-        """Take the mean of the points of a standstill."""
-        if topic not in self._arrays:
-            self._arrays[topic] = stream.arrays()
-        stamps, values = self._arrays[topic]
-        part = slice(*np.searchsorted(stamps, (start + SWING_S, end)))
-        points = values[part] * self._unit
-        points = points[np.all(np.isfinite(points), axis=1)]
-        if not len(points):
-            return
-        std = np.full(3, np.nan)
-        if len(points) >= FEWEST_SAMPLES:
-            kept = of_the_marker(points)
-            dropped = len(points) - int(kept.sum())
-            if are_too_many(dropped, len(points)):
-                self._unsteady += 1
-                return
-            points = points[kept]
-            self._dropped += dropped
-            std = points.std(axis=0, ddof=1)
-            if std.max() > SensorRules('', '').max_std_m:
-                self._unsteady += 1
-                return
-        else:
-            # Shots of an instrument: the last one is the one that was kept.
-            points = points[-1:]
-        self._rows.append((topic, end, q, points.mean(axis=0), std, len(points)))
-
-    def raw(
+    def __init__(
         self,
         path: Path,
         chain: SerialChain,
+        joints: Stream,
         joint_topic: str,
-        topics: Sequence[str],
-        length: str,
-        seen: dict[str, str],
-    ) -> RawRows:
+        clock_offset_s: float | None,
+    ) -> None:
+        self._path, self._chain, self._joint_topic = path, chain, joint_topic
+        self._still = joint_standstills(joints)
+        self._clock_offset_s = clock_offset_s
+        self._rows: list[tuple[int, str, FloatArray, FloatArray, int]] = []
+        self._unsteady = self._dropped = 0
+        self._matched: list[str] = []
+
+    def add(self, topic: str, stream: Stream) -> None:
+        """Take the mean of the points of each standstill."""
+        still = self._still
+        if not len(still) or not len(stream.stamps):
+            return
+        dense = is_stream(stream.stamps)
+        seen = (
+            point_standstills(stream)
+            if dense
+            else Standstills.of_shots(stream.stamps, stream.values)
+        )
+        offset = self._clock_offset_s or 0.0
+        if self._clock_offset_s is None and len(seen):
+
+            def error_of(i: IntArray, j: IntArray) -> float:
+                q = still.mean[j][None]
+                return float(linear_fit(self._chain, q, seen.mean[i])[0][0])
+
+            names = f'{self._path}, {topic}', self._joint_topic
+            matching = match(seen, still, names, error_of)
+            self._matched.append(matching.in_words(seen, still, (topic, self._joint_topic)))
+            offset = matching.offset_s or 0.0
+        for j in range(len(still)):
+            # A shot is taken when somebody has seen the arm at rest.
+            part = between(stream, still.begin[j] - offset, still.end[j] - offset)
+            if part.start == part.stop:
+                continue
+            reading = reading_of(stream.values[part])
+            if reading is None:
+                self._unsteady += 1
+                continue
+            place, std, kept = reading
+            if np.isfinite(std).all():
+                self._dropped += part.stop - part.start - len(kept)
+            self._rows.append((j, topic, place, std, len(kept)))
+
+    def raw(self, topics: Sequence[str], length: str, seen: dict[str, str]) -> RawRows:
         """Return the rows."""
+        path, chain, joint_topic = self._path, self._chain, self._joint_topic
         if not self._rows:
             raise InputError(
                 f'{path}: no point of {", ".join(topics)} was measured while the joints of '
                 f'{joint_topic} stood still for {SWING_S:g} s ({self._unsteady} were unsteady); '
                 'are the clocks of both the same?'
             )
-        sensors, ends, q, places, std, samples = zip(*self._rows, strict=True)
+        self._rows.sort(key=lambda row: row[:2])
+        at, sensors, places, std, samples = zip(*self._rows, strict=True)
+        ends, q = self._still.end[[*at]], self._still.mean[[*at]]
         position = np.array(places)
         if np.abs(position).max() > FARTHEST_M:
             raise InputError(
@@ -251,18 +254,19 @@ class _Rows:
         return RawRows(
             where=tuple(f'{path}, {end:.3f} s' for end in ends),
             joint_columns=chain.joint_names,
-            q=np.array(q),
+            q=q,
             from_q=np.full((len(q), len(chain)), np.nan),
             position=position,
             std=np.array(std),
-            stamp_s=np.array(ends),
+            stamp_s=ends,
             labels={'sensor': [names[topic] for topic in sensors]},
             temperature_c=np.full(len(q), np.nan),
             samples=np.array(samples, dtype=float),
             columns=columns,
             description=(
-                f'{path}: {len(set(ends))} standstills with points; means of the points from '
+                f'{path}: {len(set(at))} standstills with points; means of the points from '
                 f'{SWING_S:g} s after the joints stood still',
+                *self._matched,
             ),
             warnings=(
                 *((unsteady,) if self._unsteady else ()),

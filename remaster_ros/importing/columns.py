@@ -13,6 +13,14 @@ from remaster_ros.importing.text_table import TextTable
 from remaster_ros.importing.units import ANGLES, LENGTHS, split_unit
 
 AXES = ('x', 'y', 'z')
+_TOKEN = re.compile(r'[^\W\d_]+|\d+|#')
+_CAMEL = re.compile(r'(?<=[a-z])(?=[A-Z])')
+# Words for the coordinates of surveyors: east, north and up are right-handed, as X, Y and Z.
+_AXIS_WORDS = {
+    **dict.fromkeys(('rechtswert', 'easting', 'ost', 'ostwert'), 'x'),
+    **dict.fromkeys(('hochwert', 'northing', 'nord', 'nordwert'), 'y'),
+    **dict.fromkeys(('höhe', 'hoehe', 'height', 'elevation'), 'z'),
+}
 # Words of headers, in the languages of the programs and pendants seen so far.
 _JOINT_WORDS = {
     'a',
@@ -37,6 +45,19 @@ _OTHER_JOINTS = {
     *('velocity', 'vel', 'qd', 'speed', 'current', 'torque', 'effort', 'moment', 'tau', 'temp'),
     *('temperature', 'acceleration', 'error', 'err', 'offset', 'std', 'sigma', 'min', 'max'),
 }
+# What pendants call the joints, base to tip, as words of a header: UR in five languages, Yaskawa.
+_PENDANTS = tuple(
+    tuple(tuple(_TOKEN.findall(name)) for name in names.split())
+    for names in (
+        'base shoulder elbow wrist1 wrist2 wrist3',
+        'basis schulter ellbogen handgelenk1 handgelenk2 handgelenk3',
+        'base hombro codo muñeca1 muñeca2 muñeca3',
+        'base épaule coude poignet1 poignet2 poignet3',
+        'base spalla gomito polso1 polso2 polso3',
+        's l u r b t',
+        's l e u r b t',
+    )
+)
 _SPREAD = {'std', 'stdev', 'stddev', 'sigma', 'sd', 'uncertainty', 'rms'}
 _TOOL = {
     *('target', 'nominal', 'command', 'goal', 'desired', 'soll', 'tcp', 'tool', 'flange', 'robot'),
@@ -70,8 +91,6 @@ _WORDS = {
     'samples': {'samples', 'shots', 'messungen'},
 }
 _KINDS = {word: kind for kind, words in _WORDS.items() for word in words}
-_TOKEN = re.compile(r'[^\W\d_]+|\d+|#')
-_CAMEL = re.compile(r'(?<=[a-z])(?=[A-Z])')
 
 
 @dataclass
@@ -82,8 +101,9 @@ class Columns:
     ----------
     joints, from_joints
         Base to tip.
-    point, std
-        X, Y and Z of the marker, and the standard deviations.
+    points, stds, orientations
+        Marker ('' where there is one without a name) -> X, Y and Z, their standard deviations, and
+        the quaternion x, y, z, w where it was measured.
     others
         Kind (``name``, ``time``, ``pose``, …) -> columns.
     units
@@ -94,11 +114,17 @@ class Columns:
 
     joints: tuple[int, ...] = ()
     from_joints: tuple[int, ...] = ()
-    point: tuple[int, ...] = ()
-    std: tuple[int, ...] = ()
+    points: dict[str, tuple[int, ...]] = field(default_factory=dict)
+    stds: dict[str, tuple[int, ...]] = field(default_factory=dict)
+    orientations: dict[str, tuple[int, ...]] = field(default_factory=dict)
     others: dict[str, list[int]] = field(default_factory=lambda: defaultdict(list))
     units: dict[int, str] = field(default_factory=dict)
     why: dict[int, str] = field(default_factory=dict)
+
+    @property
+    def point(self) -> tuple[int, ...]:
+        """X, Y and Z of all markers, one marker after the other."""
+        return tuple(flat.from_iterable(self.points.values()))
 
     def one(self, kind: str) -> int | None:
         """Return the first column of a kind."""
@@ -132,17 +158,18 @@ def find_columns(table: TextTable, joint_names: Sequence[str], told: Told = Told
     headers = [_Header.of(name) for name in table.names]
     found.units = {i: header.unit for i, header in enumerate(headers) if header.unit}
     found.joints = _told_columns(table, told.joints, '--joints', found)
-    found.point = _told_columns(table, told.points, '--points', found)
+    found.points = _told_points(table, headers, told.points, found)
     for kind, name in (('time', told.time), ('name', told.names)):
         if name and name != 'none':
-            found.others[kind] += _told_columns(table, (name,), f'--{kind}', found, missing=True)
+            found.others[kind] += _told_columns(table, (name,), f'--{kind}', found)
     if not table.has_header:
         return _by_place(table, found, len(joint_names))
     taken = set(found.why)
     if not found.joints:
         found.joints = _joints(table, headers, joint_names, taken, found)
-    if not found.point:
-        found.point = _point(table, headers, taken, found)
+    if not found.points:
+        found.points = _points(table, headers, taken, found)
+    _orientations(headers, taken, found)
     for i, header in enumerate(headers):
         if i in taken:
             continue
@@ -187,11 +214,10 @@ def _first_kind(words: Sequence[str]) -> str:
 
 
 def _told_columns(
-    table: TextTable, names: Sequence[str], option: str, found: Columns, missing: bool = False
+    table: TextTable, names: Sequence[str], option: str, found: Columns
 ) -> tuple[int, ...]:
-    """Return told columns; with `missing`, none where this table has not the column."""
+    """Return told columns; none where this table has not all of them."""
     columns = []
-    # Of two tables the columns are in one: all of them, or none.
     index = {name.casefold(): i for i, name in enumerate(table.names)}
     for i, name in enumerate(table.names):
         index.setdefault(split_unit(name)[0].casefold(), i)
@@ -201,14 +227,9 @@ def _told_columns(
             at = int(name) - 1
         if at is not None:
             columns.append(at)
-    if not columns or (missing and len(columns) < len(names)):
-        return ()
+    # Of two tables the columns are in one: all of them, or none.
     if len(columns) < len(names):
-        absent = [name for name in names if name.casefold() not in index]
-        raise InputError(
-            f'{table.path}: {option}: there is no column {absent[0]!r}; it has '
-            f'{", ".join(table.names)}'
-        )
+        return ()
     if len(set(columns)) < len(columns):
         raise InputError(f'{table.path}: {option} names a column twice')
     found.why.update(dict.fromkeys(columns, 'told'))
@@ -223,22 +244,28 @@ def _joints(
     found: Columns,
 ) -> tuple[int, ...]:
     """Return the columns of the joints, base to tip; those they came from go into `found`."""
-    groups: dict[tuple[str, ...], dict[int, int]] = defaultdict(dict)
-    named = [tuple(_Header.of(name).words) for name in joint_names]
-    for i, header in enumerate(headers):
-        if i in taken or (header.unit and header.unit not in ANGLES):
-            continue
-        number, stem = _joint_of(header.words, named)
-        if number is not None:
-            groups[stem].setdefault(number, i)
-    complete = {}
-    for stem, columns in groups.items():
-        numbers = sorted(columns)
-        if len(numbers) > 1 and numbers in (
-            list(range(1, len(numbers) + 1)),
-            list(range(len(numbers))),
-        ):
-            complete[stem] = tuple(columns[number] for number in numbers)
+    complete: dict[tuple[str, ...], tuple[int, ...]] = {}
+    schemes = [tuple(tuple(_Header.of(name).words) for name in joint_names)]
+    schemes += [names for names in _PENDANTS if len(names) == len(joint_names)]
+    for named in schemes:
+        groups: dict[tuple[str, ...], dict[int, int]] = defaultdict(dict)
+        for i, header in enumerate(headers):
+            if i in taken or (header.unit and header.unit not in ANGLES):
+                continue
+            number, stem = _joint_of(header.words, named)
+            # `x1 y1 z1 x2 …` are points.
+            if number is not None and not set(stem) & {*AXES}:
+                groups[stem].setdefault(number, i)
+        for stem, columns in groups.items():
+            numbers = sorted(columns)
+            if len(numbers) > 1 and numbers in (
+                list(range(1, len(numbers) + 1)),
+                list(range(len(numbers))),
+            ):
+                complete.setdefault(stem, tuple(columns[number] for number in numbers))
+        # A pendant's words are looked for where the robot's names and numbers give nothing.
+        if complete:
+            break
     came_from = [stem for stem in complete if 'from' in stem]
     if came_from:
         found.from_joints = complete[came_from[0]]
@@ -285,10 +312,47 @@ def _joint_of(
     return int(words[at]), (*words[:at], '*', *words[at + 1 :])
 
 
-def _point(
-    table: TextTable, headers: Sequence[_Header], taken: set[int], found: Columns
-) -> tuple[int, ...]:
-    """Return the columns X, Y, Z of the marker; their standard deviations go into `found`."""
+def _told_points(
+    table: TextTable, headers: Sequence[_Header], names: Sequence[str], found: Columns
+) -> dict[str, tuple[int, ...]]:
+    """Return the told points, by the markers' names or by three columns each."""
+    groups = {name: table.groups[name] for name in table.groups} or {
+        _label(table, columns): columns for columns in _groups(headers, set()).values()
+    }
+    folded = {name.casefold(): name for name in groups}
+    if names and all(name.casefold() in folded for name in names):
+        told = {folded[name.casefold()]: groups[folded[name.casefold()]] for name in names}
+        found.why.update(dict.fromkeys(flat.from_iterable(told.values()), 'told'))
+        found.orientations = {name: table.turns[name] for name in told if name in table.turns}
+        return told
+    columns = _told_columns(table, names, '--points', found)
+    if len(columns) % 3:
+        raise InputError(
+            f'{table.path}: --points names {len(columns)} columns; name X, Y and Z of each marker'
+        )
+    return _markers(table, [columns[i : i + 3] for i in range(0, len(columns), 3)])
+
+
+def _markers(table: TextTable, sets: Sequence[tuple[int, ...]]) -> dict[str, tuple[int, ...]]:
+    """Return marker -> columns; one alone has no name of its own."""
+    if len(sets) < 2:
+        return dict.fromkeys([''] * len(sets), sets[0]) if sets else {}
+    labels = [_label(table, columns) for columns in sets]
+    if len(set(labels)) < len(labels):
+        labels = [f'marker_{i}' for i in range(1, len(sets) + 1)]
+    return dict(zip(labels, sets, strict=True))
+
+
+def _label(table: TextTable, columns: Sequence[int]) -> str:
+    """Return the name of a marker: what the header of its X has beside the axis."""
+    name = split_unit(table.names[columns[0]])[0]
+    rest = re.sub(r'(?<![^\W\d_])(?:[Pp]os(?:ition)?|[Pp])?[_ .-]?[xX](?![^\W\d_])', '', name)
+    rest = rest.strip(' _-./:')
+    return f'marker_{rest}' if rest.isdigit() or not rest else rest
+
+
+def _groups(headers: Sequence[_Header], taken: set[int]) -> dict[tuple[str, ...], tuple[int, ...]]:
+    """Return words around the axis -> columns X, Y and Z, where all three are there."""
     groups: dict[tuple[str, ...], dict[str, int]] = defaultdict(dict)
     for i, header in enumerate(headers):
         if i in taken or (header.unit and header.unit not in LENGTHS):
@@ -298,26 +362,72 @@ def _point(
         if len(axes) == 1:
             stem = tuple('*' if word in AXES else word for word in words)
             groups[stem].setdefault(axes[0], i)
-    complete = {
+    return {
         stem: tuple(columns[axis] for axis in AXES)
         for stem, columns in groups.items()
         if len(columns) == 3
     }
+
+
+def _points(
+    table: TextTable, headers: Sequence[_Header], taken: set[int], found: Columns
+) -> dict[str, tuple[int, ...]]:
+    """Return the columns X, Y, Z of each marker; standard deviations go into `found`."""
+    if table.groups:
+        chosen = {name: table.groups[name] for name in table.points or table.groups}
+        found.orientations = {name: table.turns[name] for name in chosen if name in table.turns}
+        for columns in (*chosen.values(), *found.orientations.values()):
+            _take(found, columns, taken)
+        return chosen
+    complete = _groups(headers, taken)
     spreads = [stem for stem in complete if _SPREAD & set(stem) or 's' in stem]
-    if spreads:
-        found.std = complete[spreads[0]]
-        _take(found, found.std, taken)
     usable = [stem for stem in complete if stem not in spreads]
     best = [stem for stem in usable if not _TOOL & set(stem)] or usable
     best = [stem for stem in best if _REPORTED & set(stem)] or best
     sets = [complete[stem] for stem in best]
-    chosen = _only_one(table, sets, 'the measured points', 'name the three columns with --points')
-    _take(found, chosen, taken)
-    return chosen
+    # Names that differ in their numbers alone are several markers: `x1 y1 z1 x2 …`, `m1_x`.
+    if len({tuple(word for word in stem if not word.isdigit()) for stem in best}) > 1:
+        _only_one(table, sets, 'the measured points', _NAME_POINTS)
+    markers = _markers(table, sets)
+    _take(found, tuple(flat.from_iterable(sets)), taken)
+    for stem in spreads:
+        around = tuple(word for word in stem if word not in {*_SPREAD, 's'})
+        for marker, own in zip(markers, best, strict=True):
+            if len(best) == 1 or around == own:
+                found.stds.setdefault(marker, complete[stem])
+                _take(found, complete[stem], taken)
+    return markers
+
+
+_NAME_POINTS = 'name the three columns of the point, or three for each marker, with --points'
+
+
+def _orientations(headers: Sequence[_Header], taken: set[int], found: Columns) -> None:
+    """Find the quaternions that were measured beside the points."""
+    groups: dict[tuple[str, ...], dict[str, int]] = defaultdict(dict)
+    for i, header in enumerate(headers):
+        words = header.words
+        for at, word in enumerate(words):
+            axis = re.fullmatch(r'(?:q|quat|orientation)?_?([xyzw])', word)
+            turned = axis and (
+                len(word) > 1 or {'quaternion', 'orientation', 'rotation'} & set(words)
+            )
+            if turned and axis and i not in taken:
+                rest = (*words[:at], *words[at + 1 :])
+                groups[tuple(word for word in rest if word not in _TURNED)][axis[1]] = i
+    complete = [columns for columns in groups.values() if len(columns) == 4]
+    if len(found.points) == 1 and len(complete) == 1:
+        (marker,) = found.points
+        found.orientations[marker] = tuple(complete[0][axis] for axis in 'xyzw')
+        _take(found, found.orientations[marker], taken)
+
+
+_TURNED = {'quaternion', 'quat', 'orientation', 'rotation', 'q'}
 
 
 def _with_axis(words: Sequence[str]) -> tuple[str, ...]:
     """Return words with `px`, `posx`, `sy` or `dz` taken apart."""
+    words = [_AXIS_WORDS.get(word, word) for word in words]
     apart = (
         (word[:-1], word[-1]) if re.fullmatch(r'(?:p|pos|s|d|r|t|v)[xyz]', word) else (word,)
         for word in words
@@ -335,7 +445,7 @@ def _by_place(table: TextTable, found: Columns, joints: int) -> Columns:
     free = [i for i in range(len(table.names)) if i not in found.why]
     numeric = [i for i in free if all(_numeric(table, row, i) for row in range(len(table.rows)))]
     texts = [i for i in free if i not in numeric]
-    wanted = (0 if found.joints else joints, 0 if found.point else 3)
+    wanted = (0 if found.joints else joints, 0 if found.points else 3)
     first = numeric[:1] if _counts_up(table, numeric) else []
     for need_joints, need_point in ((*wanted,), (0, wanted[1]), (wanted[0], 0)):
         for lead in ([], first):
@@ -344,12 +454,12 @@ def _by_place(table: TextTable, found: Columns, joints: int) -> Columns:
                 if need_joints:
                     found.joints = tuple(places[:need_joints])
                 if need_point:
-                    found.point = tuple(places[need_joints:])
+                    found.points = {'': tuple(places[need_joints:])}
                 if texts or lead:
                     found.others['name'] += [*texts[:1], *lead]
                 found.why.update(dict.fromkeys([*texts[:1], *lead, *places], 'place'))
                 return found
-    if found.joints or found.point:
+    if found.joints or found.points:
         return found
     raise InputError(
         f'{table.path}: no header, and {len(numeric)} columns of numbers, which is neither a '

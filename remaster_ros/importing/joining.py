@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -12,6 +11,7 @@ import numpy as np
 
 from remaster_ros.errors import InputError
 from remaster_ros.importing.columns import Columns
+from remaster_ros.importing.standstills import some
 from remaster_ros.importing.text_table import TextTable
 from remaster_ros.importing.values import labels, numbers, times
 from remaster_ros.types import IntArray
@@ -20,7 +20,9 @@ How = Literal['', 'name', 'time', 'order']
 # A joint that turns by more between the reports before and after a point was moving, in the
 # units of the table: degrees; in radians a thousandth.
 _STILL_DEG = 0.05
-_SHOWN = 5
+# Between the parts of a name: SpatialAnalyzer's collection::group::point, and paths.
+_PATH = re.compile(r'::|[/\\|]')
+_BRACKETS = re.compile(r'[\[\](){}_\s-]')
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,18 +86,32 @@ def join(
     raise InputError(f'{a.path} and {b.path} have {what} in common; {remedy}')
 
 
+def common_names(
+    points: tuple[TextTable, Columns], joints: tuple[TextTable, Columns]
+) -> tuple[int, int, list[str], list[str]] | None:
+    """Return the columns by whose names most rows belong together, and the names as compared.
+
+    `P01`, `p1` and `P1 ` are the same; where no names are, then the last parts (`A::KR6::P1` and
+    `P1`), then those without brackets and underscores (`P[1]`).
+    """
+    best: tuple[int, int, int, int, list[str], list[str]] | None = None
+    for level in range(3):
+        for i in points[1].others['name']:
+            for j in joints[1].others['name']:
+                a, b = _keys(points[0], i, level), _keys(joints[0], j, level)
+                common = len(set(a) & set(b))
+                if common and (best is None or common > best[0]):
+                    best = common, level, i, j, a, b
+        if best is not None:
+            return best[2:]
+    return None
+
+
 def _by_name(points: tuple[TextTable, Columns], joints: tuple[TextTable, Columns]) -> Pairs | None:
-    best: tuple[int, int, int] | None = None
-    for i in points[1].others['name']:
-        for j in joints[1].others['name']:
-            a, b = _keys(points[0], i), _keys(joints[0], j)
-            common = len(set(a) & set(b))
-            if common and (best is None or common > best[0]):
-                best = common, i, j
+    best = common_names(points, joints)
     if best is None:
         return None
-    _, i, j = best
-    a, b = _keys(points[0], i), _keys(joints[0], j)
+    i, j, a, b = best
     several = points[1].one('sensor') is not None or points[1].one('marker') is not None
     for keys, (table, _), column in ((a, points, i), (b, joints, j)):
         count = Counter(keys)
@@ -112,7 +128,7 @@ def _by_name(points: tuple[TextTable, Columns], joints: tuple[TextTable, Columns
     for (table, _), column, keys, other in ((points, i, a, set(b)), (joints, j, b, set(a))):
         alone = [table.rows[row][column] for row, key in enumerate(keys) if key not in other]
         if alone:
-            left_out.append(f'{table.path}: {_some(alone)}: not in the other table, left out')
+            left_out.append(f'{table.path}: {some(alone)}: not in the other table, left out')
     return Pairs(
         rows,
         np.array([at[a[row]] for row in rows], dtype=np.int64),
@@ -121,9 +137,13 @@ def _by_name(points: tuple[TextTable, Columns], joints: tuple[TextTable, Columns
     )
 
 
-def _keys(table: TextTable, column: int) -> list[str]:
-    """Return names in a form in which `P01`, `p1` and `P1 ` are the same."""
+def _keys(table: TextTable, column: int, level: int) -> list[str]:
+    """Return names as they are compared: 0 whole, 1 their last parts, 2 those without brackets."""
     names = labels(table, column) or []
+    if level > 0:
+        names = [_PATH.split(name.strip())[-1] for name in names]
+    if level > 1:
+        names = [_BRACKETS.sub('', name) for name in names]
     return [
         re.sub(r'\d+', lambda digits: str(int(digits[0])), name.strip().casefold())
         for name in names
@@ -166,14 +186,8 @@ def _by_time(
         ('measured while the arm moved', np.flatnonzero(moved)),
     ):
         if len(rows):
-            lines = _some([str(table.lines[row]) for row in rows])
+            lines = some([str(table.lines[row]) for row in rows])
             left_out.append(f'{table.path}, line {lines}: {why}, left out')
     if not kept.any():
         raise InputError(f'{table.path}: every point was measured while the arm moved')
     return Pairs(np.flatnonzero(kept), order[nearer[kept]], 'by time', tuple(left_out))
-
-
-def _some(names: Sequence[str]) -> str:
-    """Return the first few names, and how many more there are."""
-    more = f' and {len(names) - _SHOWN} more' if len(names) > _SHOWN else ''
-    return f'{", ".join(names[:_SHOWN])}{more}'

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, Literal, cast
 
 import numpy as np
 
 from remaster_ros.errors import InputError
 from remaster_ros.importing.columns import AXES, Columns, Told, find_columns
-from remaster_ros.importing.joining import How, join
+from remaster_ros.importing.joining import How, common_names, join
+from remaster_ros.importing.streams import stopped
 from remaster_ros.importing.text_table import TextTable, read_table
 from remaster_ros.importing.units import ANGLES, LENGTHS
 from remaster_ros.importing.values import (
@@ -23,8 +24,13 @@ from remaster_ros.importing.values import (
     times,
 )
 from remaster_ros.kinematics.serial_chain import SerialChain
-from remaster_ros.types import AngleUnit, FloatArray
+from remaster_ros.types import AngleUnit, BoolArray, FloatArray, IntArray
 
+# A marker that moves by less than this share of what others move is not on the arm: one on the
+# first link would, by less than a fiftieth of the arm's reach about its axis.
+_STATIC = 0.02
+# Of fewer configurations any two may well have one time.
+_FEWEST_ALIKE = 4
 _OTHERS = ('pose', 'configuration', 'split', 'sensor', 'marker')
 
 
@@ -40,6 +46,7 @@ class TableOptions:
     told: Told = field(default_factory=Told)
     join: How = ''
     within_s: float = 1.0
+    clock_offset_s: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,6 +71,15 @@ class RawRows:
         Column -> what it was taken for, for people.
     angle_unit
         In which the table has the joints; None where they are those of the URDF, as in a bag.
+    reading
+        Which rows were measured at once, (n,); None where each was measured by itself.
+    orientation
+        Quaternion x, y, z, w of the marker in the sensor's frame, (n, 4), NaN where unknown; None
+        where none was measured.
+    coupling
+        Joint column -> (another one, 1 or -1), as the controller of this file counts.
+    maker
+        Of the controller; '' where it is not known.
     description
         How the files were read and joined, a line each.
     warnings
@@ -84,6 +100,10 @@ class RawRows:
     description: tuple[str, ...]
     warnings: tuple[str, ...]
     angle_unit: AngleUnit | None = None
+    reading: IntArray | None = None
+    orientation: FloatArray | None = None
+    coupling: Mapping[str, tuple[str, Literal[1, -1]]] = field(default_factory=dict)
+    maker: str = ''
 
     def in_order(self) -> RawRows:
         """Return the rows in the order of their times."""
@@ -106,6 +126,9 @@ class RawRows:
         )
 
 
+Table = tuple[TextTable, Columns]
+
+
 def read_rows(paths: Sequence[Path], chain: SerialChain, options: TableOptions) -> RawRows:
     """Read one table with joints and points, or one with each.
 
@@ -119,8 +142,8 @@ def read_rows(paths: Sequence[Path], chain: SerialChain, options: TableOptions) 
     ]
     found = [(table, find_columns(table, chain.joint_names, options.told)) for table in tables]
     _refuse_untold(found, options.told)
-    with_points = [pair for pair in found if pair[1].point]
-    with_joints = [pair for pair in found if pair[1].joints]
+    with_points = _told_first([pair for pair in found if pair[1].points], 'points')
+    with_joints = _told_first([pair for pair in found if pair[1].joints], 'joints')
     points = _only(with_points, tables, 'a measured point (X, Y, Z)', '--points')
     # Where the points' table repeats the joints, those of the other table were meant.
     joints = _only(
@@ -139,16 +162,28 @@ def read_rows(paths: Sequence[Path], chain: SerialChain, options: TableOptions) 
             'with --base-link and --tip-link'
         )
     description = [table.describe() for table in tables]
-    warnings: list[str] = []
-    rows_p = rows_j = np.arange(len(points[0].rows))
-    if joints is not points:
+    warnings = [note for table in tables for note in table.notes]
+    stamp = None
+    told = options.join or options.told.time == 'none'
+    still = None
+    # A clock that was told is that of two streams.
+    if options.clock_offset_s is not None or (
+        not told and not (joints is not points and common_names(points, joints))
+    ):
+        still = stopped(
+            points, joints, chain, options.angles, options.length, options.clock_offset_s
+        )
+    if still is not None:
+        points, joints, stamp = still.points, still.joints, still.stamp_s
+        description += still.description
+        warnings += still.warnings
+    elif joints is not points:
         pairs = join(points, joints, options.join, options.within_s)
-        rows_p, rows_j = pairs.points, pairs.joints
-        description.append(f'{len(rows_p)} rows joined {pairs.how}')
+        description.append(f'{len(pairs.points)} rows joined {pairs.how}')
         warnings += pairs.left_out
-    points = points[0].select(rows_p), points[1]
-    joints = joints[0].select(rows_j), joints[1]
-    return _values(points, joints, chain, options, tuple(description), tuple(warnings))
+        points = points[0].select(pairs.points), points[1]
+        joints = joints[0].select(pairs.joints), joints[1]
+    return _values(points, joints, chain, options, stamp, tuple(description), tuple(warnings))
 
 
 def _values(
@@ -156,33 +191,54 @@ def _values(
     joints: tuple[TextTable, Columns],
     chain: SerialChain,
     options: TableOptions,
+    stamp: FloatArray | None,
     description: tuple[str, ...],
     warnings: tuple[str, ...],
 ) -> RawRows:
     table, columns = points
     angle, how_angle = angle_unit(*joints, options.angles)
     q = numbers(joints[0], joints[1].joints) * ANGLES[angle]
-    raw = numbers(table, columns.point)
+    several = len(columns.points) > 1
+    raw = np.array([numbers(table, own, several) for own in columns.points.values()])
+    _refuse_part_of_a_point(table, columns, raw)
+    # A row of the table for each marker that was seen in it.
+    row, marker = np.nonzero(np.isfinite(raw[:, :, 0]).T)
+    modelled = chain.forward(q)[:, :3, 3]
     length, how_length = length_unit(
-        table, columns, options.length, raw, chain.forward(q)[:, :3, 3]
+        table, columns, options.length, raw[marker, row], modelled[row]
     )
     refuse_far(table, columns, length)
+    names = list(columns.points)
+    if several:
+        moved, left = _moved(raw, names, table)
+        warnings += left
+        row, marker = row[moved[marker]], marker[moved[marker]]
     n, k = q.shape
     from_q = np.full((n, k), np.nan)
     if len(joints[1].from_joints) == k:
         from_q = numbers(joints[0], joints[1].from_joints, optional=True) * ANGLES[angle]
-    std = np.full((n, 3), np.nan)
-    if columns.std:
-        std = numbers(table, columns.std, optional=True) * LENGTHS[length]
-    stamp = None if options.told.time == 'none' else times(*points)
-    if stamp is None and options.told.time != 'none' and joints[0] is not table:
-        stamp = times(*joints)
+    std = np.full((len(names), n, 3), np.nan)
+    turns = np.full((len(names), n, 4), np.nan)
+    for i, name in enumerate(names):
+        if name in columns.stds:
+            std[i] = numbers(table, columns.stds[name], optional=True) * LENGTHS[length]
+        if name in columns.orientations:
+            turns[i] = numbers(table, columns.orientations[name], optional=True)
+    if stamp is None and options.told.time != 'none':
+        stamp = times(*points)
+        if stamp is None and joints[0] is not table:
+            stamp = times(*joints)
+    if stamp is not None and (equal := _all_the_same(stamp, q)):
+        stamp = None
+        warnings += (equal,)
     given = {}
     for kind in _OTHERS:
         for one, found in (points, joints):
-            names = labels(one, found.one(kind))
-            if names is not None and kind not in given:
-                given[kind] = names
+            words = labels(one, found.one(kind))
+            if words is not None and kind not in given:
+                given[kind] = [words[i] for i in row]
+    if several:
+        given['marker'] = [names[i] for i in marker]
     meanings: dict[str, str] = {}
     both = [points] if joints[0].path == table.path else [points, joints]
     for one, found in both:
@@ -198,20 +254,75 @@ def _values(
             )
             meanings[f'{prefix}{name}'] = meaning
     return RawRows(
-        where=tuple(f'{table.path}, line {line}' for line in table.lines),
+        where=tuple(f'{table.path}, line {table.lines[i]}' for i in row),
         joint_columns=tuple(joints[0].names[i] for i in joints[1].joints),
-        q=q,
-        from_q=from_q,
-        position=raw * LENGTHS[length],
-        std=std,
-        stamp_s=stamp,
+        q=q[row],
+        from_q=from_q[row],
+        position=raw[marker, row] * LENGTHS[length],
+        std=std[marker, row],
+        stamp_s=None if stamp is None else stamp[row],
         labels=given,
-        temperature_c=_optional(points, 'temperature'),
-        samples=np.nan_to_num(_optional(points, 'samples'), nan=-1.0),
+        temperature_c=_optional(points, 'temperature')[row],
+        samples=np.nan_to_num(_optional(points, 'samples')[row], nan=-1.0),
         columns=meanings,
         description=description,
         warnings=warnings,
         angle_unit=cast(AngleUnit, angle),
+        reading=row if several else None,
+        orientation=turns[marker, row] if columns.orientations else None,
+        coupling=joints[0].coupling,
+        maker=joints[0].maker,
+    )
+
+
+def _refuse_part_of_a_point(table: TextTable, columns: Columns, raw: FloatArray) -> None:
+    """Refuse points of which X, Y or Z alone is missing."""
+    for own, points in zip(columns.points.values(), raw):
+        empty = np.isnan(points)
+        for row in np.flatnonzero(empty.any(axis=1) & ~empty.all(axis=1))[:1]:
+            raise table.fault(
+                int(row),
+                own[int(np.argmax(empty[row]))],
+                'is empty, and the others of its point are not; complete it or empty all three',
+            )
+    if len(raw) > 1 and np.isnan(raw).all():
+        raise InputError(f'{table.path}: it has no point that was measured')
+
+
+def _moved(
+    raw: FloatArray, names: Sequence[str], table: TextTable
+) -> tuple[BoolArray, tuple[str, ...]]:
+    """Return which markers move with the arm, (markers,), and the sentences on the others."""
+    seen = np.array([bool(np.isfinite(own[:, 0]).any()) for own in raw])
+    extent = np.array(
+        [
+            np.nanmax(np.ptp(own[np.isfinite(own[:, 0])], axis=0), initial=0.0)
+            if any_seen
+            else 0.0
+            for own, any_seen in zip(raw, seen)
+        ]
+    )
+    moved = extent > _STATIC * extent.max()
+    return moved, tuple(
+        f'{table.path}: {name} stays in its place, so it is not on the arm; left out'
+        if any_seen
+        else f'{table.path}: {name} was never seen; left out'
+        for name, is_moved, any_seen in zip(names, moved, seen)
+        if not is_moved
+    )
+
+
+def _all_the_same(stamp: FloatArray, q: FloatArray) -> str:
+    """Return that most configurations have one and the same time, which is none; '' else."""
+    configurations = np.unique(np.column_stack((q, stamp)), axis=0)
+    if len(configurations) < _FEWEST_ALIKE:
+        return ''
+    _, count = np.unique(configurations[:, -1], return_counts=True)
+    if 2 * count.max() <= len(configurations):
+        return ''
+    return (
+        f'{count.max()} of {len(configurations)} configurations have one and the same time, so '
+        'the times are left out'
     )
 
 
@@ -230,14 +341,30 @@ def _meaning(i: int, columns: Columns, chain: SerialChain, angle: str, length: s
         if i in joints:
             joint = joints.index(i)
             return f'{kind}joint {joint + 1} ({chain.joint_names[joint]}), {angle}{by_place}'
-    if length and i in columns.point:
-        return f'{AXES[columns.point.index(i)]} of the marker, {length}{by_place}'
-    if length and i in columns.std:
-        return f'standard deviation of {AXES[columns.std.index(i)]}, {length}'
+    for marker, own in columns.points.items():
+        of = f'marker {marker}' if marker else 'the marker'
+        spread, turned = columns.stds.get(marker, ()), columns.orientations.get(marker, ())
+        if length and i in own:
+            return f'{AXES[own.index(i)]} of {of}, {length}{by_place}'
+        if length and i in spread:
+            return f'standard deviation of {AXES[spread.index(i)]} of {of}, {length}'
+        if length and i in turned:
+            return f'{"xyzw"[turned.index(i)]} of the quaternion of {of}{by_place}'
     for kind, places in columns.others.items():
         if i in places:
             return f'{kind}{by_place}'
     return 'not used'
+
+
+def _told_first(found: list[Table], kind: str) -> list[Table]:
+    """Return the tables in which columns of a kind were told, or all where none were."""
+    told = [
+        pair
+        for pair in found
+        if 'told'
+        in (pair[1].why.get(i) for i in (pair[1].joints if kind == 'joints' else pair[1].point))
+    ]
+    return told or found
 
 
 def _only(

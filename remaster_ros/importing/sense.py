@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -112,6 +113,8 @@ def check_sense(session: Session, rows: RawRows, progress: Callable[[str, float]
             error_m=as_given.error_m,
         )
     progress('trying', 0.3)
+    if as_given.gross and len(part.markers) > 1 and (apart := _by_marker(part, rows, without)):
+        return replace(apart, error_m=as_given.error_m)
     mistakes = find_mistakes(session)
     if mistakes.fitting:
         sentence, options = in_a_sentence(mistakes, session, columns_of(rows, chain))
@@ -148,8 +151,41 @@ def _too_few(session: Session, joints: int) -> str:
         f'{count} different configurations to fit are too few: a fit of this arm has {unknowns} '
         f'unknowns ({max(joints - 2, 0)} zero-offsets, 6 of each sensor, 3 of each marker), and '
         f'each configuration gives {each} numbers, so it takes at least {needed}, and some forty '
-        'for a good result; measure more (of a bag only standstills of half a second and more '
-        'count)'
+        'for a good result; measure more (of a stream only standstills of half a second and '
+        'more count)'
+    )
+
+
+def _by_marker(session: Session, rows: RawRows, without: str) -> Sense | None:
+    """Return which markers fit where they are looked at one at a time; None where none does."""
+    m = session.measurements
+    fitting: dict[str, float] = {}
+    for i, name in enumerate(session.markers):
+        with contextlib.suppress(InsufficientDataError):
+            fitted = fit_arrangement(
+                session.select(m.marker == i), Arrangement.given(m.q.shape[1])
+            )
+            if not fitted.gross:
+                fitting[name] = fitted.error_m
+    if not fitting:
+        return None
+    others = [name for name in session.markers if name not in fitting]
+    alone = ', '.join(fitting)
+    if others:
+        why = f'without {", ".join(others)}; is that on the tool?'
+    else:
+        why = 'each alone; were they computed from one another? Points of one body turn with it'
+    name = next(iter(fitting))
+    points = [
+        column.rpartition(': ')[2]
+        for column, meaning in rows.columns.items()
+        if any(meaning.startswith(f'{axis} of marker {name},') for axis in 'xyz')
+    ]
+    return Sense(
+        False,
+        f'all markers together fit to {without} only, {alone} to '
+        f'{shown_mm(max(fitting.values()))} {why}',
+        f'--points {",".join(points)}' if points else '',
     )
 
 
@@ -218,7 +254,7 @@ def columns_of(rows: RawRows, chain: SerialChain) -> Columns:
     lengths = ['m']
     for name, meaning in rows.columns.items():
         for axis in 'xyz':
-            if meaning.startswith(f'{axis} of the marker'):
+            if meaning.startswith((f'{axis} of the marker', f'{axis} of marker ')):
                 points.setdefault(axis, name)
                 if ', ' in meaning:
                     lengths.append(meaning.split(', ')[1].split()[0])

@@ -5,17 +5,23 @@ from __future__ import annotations
 import csv
 import re
 from collections import Counter
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Literal
+
+import numpy as np
 
 from remaster_ros.errors import InputError
+from remaster_ros.importing.makers import READERS
 from remaster_ros.importing.units import bare, is_unit
 from remaster_ros.session.files import read_limited
 
 TABLE_LIMIT = 256 * 1024**2
 # In this order where several explain a table equally well; blanks come last.
 SEPARATORS = {';': 'semicolons', '\t': 'tabs', ',': 'commas', '|': 'bars', ' ': 'blanks'}
+# From so many lines the separator is found.
+SEEN_LINES = 2000
 _COMMENT = re.compile(r'\s*(?:#|//|%|!|\*)\s*')
 _PLAIN = re.compile(r'[+-]?(?:\d+[.,]?\d*|[.,]\d+)(?:[eE][+-]?\d+)?', re.ASCII)
 # Groups of three digits, as spreadsheets like to write thousands, and then a decimal sign.
@@ -44,6 +50,20 @@ class TextTable:
         Title and comment lines.
     has_header
         Whether the names stand in the file.
+    kind
+        What the file is, where it is no plain table; '' else.
+    groups
+        Marker -> columns X, Y and Z, where the file itself names its markers.
+    turns
+        Marker -> columns of its quaternion x, y, z, w.
+    points
+        Those that are taken where nothing is told; () for all of them.
+    coupling
+        Joint column -> (another one, 1 or -1) that the controller does not count with it.
+    maker
+        Of the controller; '' where it is not known.
+    notes
+        What was left out of the file, a sentence each.
     """
 
     path: Path
@@ -55,9 +75,18 @@ class TextTable:
     lines: tuple[int, ...]
     preamble: str
     has_header: bool
+    kind: str = ''
+    groups: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
+    turns: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
+    points: tuple[str, ...] = ()
+    coupling: Mapping[str, tuple[str, Literal[1, -1]]] = field(default_factory=dict)
+    maker: str = ''
+    notes: tuple[str, ...] = ()
 
     def describe(self) -> str:
         """Return how it is written, in a few words."""
+        if self.kind:
+            return f'{self.path}: {len(self.rows)} rows of {self.kind}'
         sign = 'comma' if self.decimal == ',' else 'point'
         header = '' if self.has_header else ', no header'
         return (
@@ -122,18 +151,31 @@ def read_table(
     """
     data = read_limited(path, TABLE_LIMIT, 'name the table')
     text, encoding = decode(data, path, encoding)
+    for read in READERS:
+        try:
+            found = read(text)
+        except InputError as error:
+            raise InputError(f'{path}, {error}') from None
+        if found is not None:
+            own = vars(found)
+            return TextTable(
+                path=path, encoding=encoding, separator='', preamble='', has_header=True, **own
+            )
     lines = [
         (number, line)
         for number, line in enumerate(text.replace('\r\n', '\n').split('\n'), start=1)
         if line.strip().strip(''.join(SEPARATORS))
     ]
     plain = [line for _, line in lines if not _COMMENT.match(line)]
-    separator = separator or _find_separator(plain)
+    separator = separator or _find_separator(plain[:SEEN_LINES])
     split = [(number, line, _split(line, separator, path, number)) for number, line in lines]
     width, first = _first_row(split, path)
-    header, preamble = _header(split[:first], width, separator)
+    header, preamble, named = _header(split[:first], width, separator)
     rows, at = [], []
-    for number, line, cells in split[first:]:
+    # Titles may hold numbers; below the names a line with numbers is a row.
+    above = split[named:first]
+    damaged = [entry for entry in above if _is_row(entry[2]) and not _COMMENT.match(entry[1])]
+    for number, line, cells in (*damaged, *split[first:]):
         if _COMMENT.match(line):
             preamble += f'\n{line}'
             continue
@@ -251,17 +293,26 @@ def _first_row(split: list[tuple[int, str, list[str]]], path: Path) -> tuple[int
             f'{path}: no row with two numbers; is it a table? name its separator with '
             '--separator if it has an unusual one'
         )
-    widths = Counter(len(cells) for _, cells in rows)
-    return widths.most_common(1)[0][0], rows[0][0]
+    width = Counter(len(cells) for _, cells in rows).most_common(1)[0][0]
+    full = [(i, [*map(_is_number, cells)]) for i, cells in rows if len(cells) == width]
+    # A title of as many words has its numbers elsewhere.
+    usual = 2 * np.sum([numbers for _, numbers in full], axis=0) > len(full)
+    return width, next(
+        (i for i, numbers in full if 2 * np.sum(usual & numbers) > usual.sum()), full[0][0]
+    )
 
 
 def _header(
     above: list[tuple[int, str, list[str]]], width: int, separator: str
-) -> tuple[list[str], str]:
-    """Return the names of the columns, empty where there are none, and the lines above them."""
+) -> tuple[list[str], str, int]:
+    """Return the names of the columns, empty where there are none, and the lines above them.
+
+    The third is how many lines there are down to the names, 0 where there are none.
+    """
     names: list[str] = []
     preamble = []
-    for number, line, cells in above:
+    named = 0
+    for at, (number, line, cells) in enumerate(above, start=1):
         mark = _COMMENT.match(line)
         if mark:
             # NumPy and many trackers write the names into a comment.
@@ -271,15 +322,15 @@ def _header(
         while len(cells) > width and not cells[-1]:
             cells = cells[:-1]
         given = [cell for cell in cells if cell]
-        if len(cells) != width or len(given) < _FEWEST_NUMBERS:
+        if len(cells) != width or len(given) < _FEWEST_NUMBERS or (_is_row(cells) and not mark):
             preamble.append(line)
         elif names and all(map(is_unit, given)):
             names = [
                 f'{name} [{bare(unit)}]' if unit else name for name, unit in zip(names, cells)
             ]
         else:
-            names = cells
-    return names, '\n'.join(preamble)
+            names, named = cells, at
+    return names, '\n'.join(preamble), named
 
 
 def _find_decimal(rows: Sequence[Sequence[str]]) -> str:

@@ -13,7 +13,10 @@ from remaster_ros.importing.text_table import TextTable, parse_number
 from remaster_ros.importing.units import LENGTHS, TIMES, unit_of
 from remaster_ros.types import FARTHEST_M, FloatArray
 
-_UNIT_LINE = re.compile(r'units?\s*(?:are|is)?\s*[:=]?\s*([A-Za-zµ"°]+)', re.IGNORECASE)
+_UNIT_LINE = re.compile(
+    r'(?:units?|einheit(?:en)?|unidad(?:es)?|unités?|unità)\s*(?:are|is)?\s*[:=]?\s*([A-Za-zµ"°]+)',
+    re.IGNORECASE,
+)
 # A time since 1970 that is larger is in ms, us or ns.
 _EPOCHS = ((1e17, 'ns'), (1e14, 'us'), (1e11, 'ms'))
 # More than one turn each way: no arm reports that in radians.
@@ -95,7 +98,7 @@ def length_unit(
 
 def refuse_far(table: TextTable, columns: Columns, unit: str) -> None:
     """Refuse points beyond any sensor."""
-    far = np.abs(numbers(table, columns.point)) * LENGTHS[unit] > FARTHEST_M
+    far = np.abs(numbers(table, columns.point, optional=True)) * LENGTHS[unit] > FARTHEST_M
     for row, i in np.argwhere(far)[:1]:
         raise table.fault(
             int(row),

@@ -81,7 +81,11 @@ def test_a_stream_of_joints_is_joined_by_time_where_the_arm_stood_still(chain, t
     assert any('line 3: measured while the arm moved' in text for text in rows.warnings)
     late = points(tmp_path, ['a', 'b', 'c'], XYZ, time=when + 1000.0)
     with pytest.raises(InputError, match=r'its times \(1004.0 to 1025.0 s\) are not those of'):
+        read_rows([late, q_file], chain, TableOptions(join='time'))
+    with pytest.raises(InputError, match=r'several offsets of the clocks .* with --clock-offset'):
         read_rows([late, q_file], chain, TableOptions())
+    told = TableOptions(angles='rad', length='m', clock_offset_s=-1000.0)
+    np.testing.assert_allclose(read_rows([late, q_file], chain, told).stamp_s, when[[0, 2]])
 
 
 def test_rows_stand_in_the_order_of_their_times(chain, tmp_path):

@@ -125,3 +125,29 @@ def test_the_command_makes_a_session_of_it(bag, session, tmp_path, capsys):
     # Two sensors saw each configuration.
     assert made.measurements.configuration.tolist() == [0, 0, 1, 1, 2, 2]
     assert made.timed
+
+
+def test_a_camera_with_a_clock_of_its_own_is_matched_by_standstills(chain, tmp_path):
+    rng = np.random.default_rng(3)
+    print('bag seed 3')
+    stops = rng.uniform(-1.0, 1.0, (8, 2))
+    place = chain.positions(stops, np.array([0.3, 0.2, 0.1]), np.zeros(2))
+    with BagWriter(tmp_path / 'bag') as writer:
+        start = START_S
+        for i, length_s in enumerate(rng.uniform(2.0, 4.0, len(stops))):
+            for step in range(int(50 * length_s)):
+                time_s = start + 0.02 * step
+                # Moving for a second, to where it stops.
+                left = max(0.0, 1.0 - 0.02 * step)
+                before = max(i - 1, 0)
+                q = stops[i] + left * (stops[before] - stops[i])
+                xyz = place[i] + left * (place[before] - place[i]) + rng.normal(0.0, 1e-5, 3)
+                camera = point(time_s - 1.6e9, '/camera/marker', xyz)
+                for topic, kind, message, _ in (joints(time_s, q), camera):
+                    data = bytes(STORE.serialize_cdr(message, kind))
+                    writer.write(topic, kind, data, int(1e9 * time_s))
+            start += length_s
+    rows = read_bag(tmp_path / 'bag', chain)
+    np.testing.assert_allclose(rows.q, stops, atol=1e-5)
+    np.testing.assert_allclose(rows.position, place, atol=1e-4)
+    assert '/camera/marker +1600000000.' in ' '.join(rows.description)

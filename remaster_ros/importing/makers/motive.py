@@ -1,0 +1,110 @@
+"""OptiTrack Motive's export of a take: rigid bodies and markers, a line a frame.
+
+Above the frames stand a line about the take and one line each for type, name, ID, in newer
+versions the parent, the quantity and the axis; they are recognised by words, not by their number.
+"""
+
+from __future__ import annotations
+
+import csv
+import re
+from collections import defaultdict
+
+from remaster_ros.importing.makers.named import Named, unexpected
+
+_UNITS = {
+    **dict.fromkeys(('millimeters', 'millimetres', 'mm'), 'mm'),
+    **dict.fromkeys(('centimeters', 'centimetres', 'cm'), 'cm'),
+    **dict.fromkeys(('meters', 'metres', 'm'), 'm'),
+    **dict.fromkeys(('inches', 'in'), 'in'),
+}
+_START = re.compile(r'\s*"?Format Version"?([,;\t])')
+_NUMBER = re.compile(r'[+-]?\d+(?:[.,]\d+)?(?:[eE][+-]?\d+)?', re.ASCII)
+_MOST_HEAD_LINES = 12
+# What a tool carries, the likeliest kind first: the points of a body are of one solution.
+_KINDS = ('Rigid Body', 'Marker', 'Rigid Body Marker')
+
+
+def read(text: str) -> Named | None:
+    """Return the columns of a take; None for anything else.
+
+    Raises
+    ------
+    InputError
+        Naming the line and what was expected there.
+    """
+    start = _START.match(text)
+    if start is None:
+        return None
+    lines = [(i, line) for i, line in enumerate(text.splitlines(), 1) if line.strip(' \t,;')]
+    rows = [next(csv.reader([line], delimiter=start[1])) for _, line in lines]
+    at = next(
+        (i for i, row in enumerate(rows[:_MOST_HEAD_LINES]) if row[0].strip() == 'Frame'), None
+    )
+    if at is None:
+        raise unexpected(*lines[min(len(lines), _MOST_HEAD_LINES) - 1], 'the line Frame, Time, …')
+    take = dict(zip(rows[0][::2], rows[0][1::2]))
+    unit = _UNITS.get(take.get('Length Units', '').strip().lower())
+    if unit is None:
+        raise unexpected(*lines[0], 'a Length Units such as Millimeters')
+    head = {row[1].strip(): row for row in rows[1 : at - 1] if len(row) > 1}
+    axes, quantities = [cell.strip() for cell in rows[at]], rows[at - 1]
+    width = len(axes)
+    for what, row in (
+        ('Type', head.get('Type')),
+        ('Name', head.get('Name')),
+        ('Position', quantities if 'Position' in quantities else None),
+    ):
+        if row is None or len(row) != width:
+            raise unexpected(*lines[at], f'a line with {width} cells and {what} above this one')
+    places: dict[tuple[str, str], dict[str, int]] = defaultdict(dict)
+    turns: dict[tuple[str, str], dict[str, int]] = defaultdict(dict)
+    for i in range(2, width):
+        asset = head['Type'][i].strip(), head['Name'][i].strip()
+        of = {'Position': places, 'Rotation': turns}.get(quantities[i].strip())
+        if of is not None:
+            if axes[i] in of[asset] or axes[i] not in (*'XYZW',):
+                raise unexpected(*lines[at], f'X, Y and Z once for {" ".join(asset)}')
+            of[asset][axes[i]] = i
+    places = {asset: columns for asset, columns in places.items() if {*columns} == {*'XYZ'}}
+    names, used = ['Frame', 'Time [s]'], [0, 1]
+    groups, quaternions = {}, {}
+    alone = [name for _, name in places]
+    kinds: dict[str, str] = {}
+    for (kind, name), columns in places.items():
+        label = name if alone.count(name) == 1 else f'{kind} {name}'
+        kinds[label] = kind
+        groups[label] = tuple(range(len(used), len(used) + 3))
+        names += [f'{label} {axis} [{unit}]' for axis in 'XYZ']
+        used += [columns[axis] for axis in 'XYZ']
+        turned = turns[kind, name]
+        if len(turned) == 4:
+            quaternions[label] = tuple(range(len(used), len(used) + 4))
+            names += [f'{label} q{axis}' for axis in 'xyzw']
+            used += [turned[axis] for axis in 'XYZW']
+    if not groups:
+        raise unexpected(*lines[at], 'X, Y and Z of a body or a marker')
+    before = float('-inf')
+    for (number, line), row in zip(lines[at + 1 :], rows[at + 1 :]):
+        if len(row) != width or not (row[0].isdigit() and _NUMBER.fullmatch(row[1])):
+            raise unexpected(number, line, f'a frame, its time and {width - 2} more cells')
+        time_s = float(row[1].replace(',', '.'))
+        if time_s <= before:
+            raise unexpected(number, line, f'a time after {before:g} s')
+        before = time_s
+    labelled = [label for label in groups if not label.startswith('Unlabeled')]
+    chosen = next(
+        (found for kind in _KINDS if (found := [n for n in labelled if kinds[n] == kind])), ()
+    )
+    frames = rows[at + 1 :]
+    commas = start[1] != ',' and any(',' in cell for row in frames[:100] for cell in row)
+    return Named(
+        kind=f'a take of Motive (format {take.get("Format Version", "?").strip()}), {unit}',
+        names=tuple(names),
+        rows=tuple(tuple(row[i].strip() for i in used) for row in frames),
+        lines=tuple(number for number, _ in lines[at + 1 :]),
+        decimal=',' if commas else '.',
+        groups=groups,
+        turns=quaternions,
+        points=tuple(chosen),
+    )

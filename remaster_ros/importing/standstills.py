@@ -1,0 +1,434 @@
+"""Where a stream stood still, and which clock of one stream is that of another: by standstills.
+
+A log of joints and a camera's take have each their own clock. Both stand still where the arm does:
+the offset of the clocks is that by which most begins and ends of standstills fall together. Where
+the visits are alike in length several offsets do that as well; then the robot decides: paired
+rightly, its modelled points differ from the measured ones by little.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from remaster_ros.collection.frame_mean import are_too_many, of_the_marker
+from remaster_ros.collection.pairing import SensorRules
+from remaster_ros.errors import InputError
+from remaster_ros.motion.settling import SettleRules
+from remaster_ros.types import BoolArray, FloatArray, IntArray
+
+# The arm may still swing so long after its encoders stand still, s.
+SWING_S = 0.5
+# Rows closer than this are a stream: no arm moves, stops and is measured within a second, s.
+STREAM_S = 1.0
+# Fewer samples have no standard deviation worth the name.
+FEWEST_SAMPLES = 5
+# Fewer rows of a table between two motions are no standstill that was recorded.
+_FEWEST_ROWS = 3
+# Of the blocks of a stream at least so many are of standstills, which gives the noise.
+_STILL_SHARE = 0.1
+# Largest range of so many normal samples, in standard deviations: 1e4 of them keep within 8.
+_RANGE_STDS = 10.0
+# A stream whose quietest part ranges over more than this share of its extent never stands still.
+_QUIETEST = 0.01
+# Largest difference of begins and ends, s: those of a log of 10 Hz, and a clock that is 50 parts
+# in a million fast over an hour.
+_TOLERANCE_S = 0.3
+# Offsets that are looked at, the likeliest first.
+_MOST_OFFSETS = 60
+# With so many pairs the 15 unknowns of the linear problem leave more equations than that over.
+_FEWEST_FOR_ROBOT = 11
+# A robot that is paired rightly leaves no larger share of the points' extent: zero-offsets of some
+# degrees do, at most.
+_LARGEST_ERROR = 0.15
+# An offset that explains a tenth fewer standstills is as good: some are lost in either stream.
+_ALIKE = 0.9
+
+
+@dataclass(frozen=True, eq=False)
+class Stream:
+    """What was reported at which time.
+
+    Attributes
+    ----------
+    stamps
+        s, rising, (n,).
+    values
+        (n, m).
+    """
+
+    stamps: FloatArray
+    values: FloatArray
+
+    @classmethod
+    def of(cls, stamps: FloatArray, values: FloatArray) -> Stream:
+        """Return the finite values in the order of their stamps."""
+        finite = np.flatnonzero(np.isfinite(values).all(axis=1) & np.isfinite(stamps))
+        order = finite[np.argsort(stamps[finite], kind='stable')]
+        return cls(stamps[order], values[order])
+
+
+@dataclass(frozen=True, eq=False)
+class Standstills:
+    """When a stream stood still, and where.
+
+    Attributes
+    ----------
+    begin, end
+        s, (n,); equal for single shots.
+    mean
+        (n, m).
+    opened, closed
+        Whether motion was seen before the begin and after the end, (n,): else the record begins or
+        ends there.
+    """
+
+    begin: FloatArray
+    end: FloatArray
+    mean: FloatArray
+    opened: BoolArray
+    closed: BoolArray
+
+    def __len__(self) -> int:
+        """Return how many there are."""
+        return len(self.begin)
+
+    @property
+    def shots(self) -> bool:
+        """Whether these are moments, not times."""
+        return bool(np.all(self.begin == self.end))
+
+    @classmethod
+    def of_shots(cls, stamps: FloatArray, values: FloatArray) -> Standstills:
+        """Return single shots of an instrument, each taken while the arm stood still."""
+        none = np.zeros(len(stamps), bool)
+        return cls(stamps, stamps, values, none, none)
+
+
+def is_stream(stamps: FloatArray) -> bool:
+    """Return whether rows follow each other faster than an arm can stop and be measured."""
+    return len(stamps) > _FEWEST_ROWS and float(np.median(np.diff(np.sort(stamps)))) < STREAM_S
+
+
+def joint_standstills(stream: Stream, fewest: int = 1) -> Standstills:
+    """Return when no joint moved for longer than an arm may swing.
+
+    Parameters
+    ----------
+    stream
+        Joints in rad.
+    fewest
+        Reports that a standstill has at least.
+    """
+    rules = SettleRules()
+    noise = min(_RANGE_STDS * _quietest(stream), 5.0 * rules.still_tolerance)
+    return _standstills(stream, max(rules.still_tolerance, noise), fewest)
+
+
+def point_standstills(stream: Stream) -> Standstills:
+    """Return when a marker stood still, in whatever unit it is; none where it never did."""
+    # A frame that jumps is no motion.
+    values = _median_of_five(stream.values)
+    smooth = Stream(stream.stamps, values)
+    extent = float(np.ptp(values, axis=0).max(initial=0.0))
+    tolerance = max(_RANGE_STDS * _quietest(smooth), 1e-4 * extent)
+    if tolerance > _QUIETEST * extent:
+        return Standstills.of_shots(np.empty(0), np.empty((0, values.shape[1])))
+    return _standstills(smooth, tolerance, _FEWEST_ROWS)
+
+
+def _median_of_five(values: FloatArray) -> FloatArray:
+    if len(values) < FEWEST_SAMPLES:
+        return values
+    padded = np.pad(values, ((2, 2), (0, 0)), mode='edge')
+    windows = np.lib.stride_tricks.sliding_window_view(padded, 5, axis=0)
+    return np.asarray(np.median(windows, axis=-1))
+
+
+def _quietest(stream: Stream) -> float:
+    """Return the standard deviation of a stream where it is quietest, of its noisiest column."""
+    step = float(np.median(np.diff(stream.stamps))) if len(stream.stamps) > 1 else SWING_S
+    size = max(FEWEST_SAMPLES, round(SWING_S / max(step, 1e-4)))
+    blocks = len(stream.values) // size
+    if not blocks:
+        return 0.0
+    cut = stream.values[: blocks * size].reshape(blocks, size, -1)
+    return float(np.quantile(cut.std(axis=1).max(axis=1), _STILL_SHARE))
+
+
+def _standstills(stream: Stream, tolerance: float, fewest: int) -> Standstills:
+    stamps, values = stream.stamps, stream.values
+    step = float(np.median(np.diff(stamps))) if len(stamps) > 1 else 0.0
+    gap = max(SettleRules().max_gap_s, _FEWEST_ROWS * step)
+    found: list[tuple[float, float, FloatArray, bool, bool]] = []
+    first = 0
+    low = high = values[0] if len(values) else np.empty(0)
+    for i in range(1, len(values) + 1):
+        joined = i < len(values) and stamps[i] - stamps[i - 1] <= gap
+        if joined:
+            lower, higher = np.minimum(low, values[i]), np.maximum(high, values[i])
+            if np.all(higher - lower <= tolerance):
+                low, high = lower, higher
+                continue
+        if stamps[i - 1] - stamps[first] > SWING_S and i - first >= fewest:
+            opened = first > 0 and stamps[first] - stamps[first - 1] <= gap
+            found.append(
+                (stamps[first], stamps[i - 1], values[first:i].mean(axis=0), opened, joined)
+            )
+        if i < len(values):
+            first, low, high = i, values[i], values[i]
+    begin, end, mean, opened, closed = zip(*found, strict=True) if found else ((),) * 5
+    return Standstills(
+        np.array(begin, dtype=float),
+        np.array(end, dtype=float),
+        np.array(mean, dtype=float).reshape(len(found), values.shape[1]),
+        np.array(opened, dtype=bool),
+        np.array(closed, dtype=bool),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Matching:
+    """Which standstills of points are which of the joints.
+
+    Attributes
+    ----------
+    points, joints
+        Indices, (n,) each.
+    offset_s
+        What is added to the points' times to have the joints'; None where the pairs are by order.
+    apart_s
+        Median difference of begins and ends then; None where single shots have none.
+    error
+        What the robot leaves, as a share of the points' extent; None where there are too few.
+    """
+
+    points: IntArray
+    joints: IntArray
+    offset_s: float | None
+    apart_s: float | None = None
+    error: float | None = None
+
+    def in_words(self, points: Standstills, joints: Standstills, names: tuple[str, str]) -> str:
+        """Return how well they match, for people; `names` of points and joints."""
+        what = 'points' if points.shots else 'standstills'
+        text = (
+            f'{len(self.points)} of {len(points)} {what} of {names[0]} match '
+            f'{len(np.unique(self.joints))} of {len(joints)} standstills of {names[1]}'
+        )
+        if self.offset_s is None:
+            return f'{text}, by their order: no offset of the clocks joins them'
+        if self.apart_s is not None:
+            text += f'; begins and ends agree within {self.apart_s:.2f} s (median)'
+        if self.offset_s == 0.0:
+            return f'{text}; the clocks are the same'
+        return f'{text}; {names[1]} has the time of {names[0]} {self.offset_s:+.3f} s'
+
+
+def match(
+    points: Standstills,
+    joints: Standstills,
+    names: tuple[str, str],
+    error_of: Callable[[IntArray, IntArray], float],
+    offset_s: float | None = None,
+) -> Matching:
+    """Pair the standstills of points with those of the joints.
+
+    Parameters
+    ----------
+    names
+        Of points and joints, for messages.
+    error_of
+        What the robot leaves of pairs of indices, as a share of the points' extent.
+    offset_s
+        As told; None to find it.
+
+    Raises
+    ------
+    InputError
+        Nothing stood still, no offset joins them, or several do as well.
+    """
+    for name, standstills in zip(names, (points, joints)):
+        if not len(standstills):
+            raise InputError(
+                f'{name}: nothing in it stands still for {SWING_S:g} s, and only what is measured '
+                'at a standstill belongs to one configuration; let the arm stop at each pose'
+            )
+    offsets = [offset_s] if offset_s is not None else [0.0, *_offsets(points, joints)]
+    found = [_matching(points, joints, offset, error_of) for offset in offsets]
+    found = [one for one in found if len(one.points)]
+    if offset_s is not None:
+        if not found:
+            raise InputError(
+                f'--clock-offset {offset_s:g}: no standstills of {names[0]} and {names[1]} fall '
+                'together; leave it out to have it found'
+            )
+        return found[0]
+    if len(points) == len(joints):
+        order = np.arange(len(points))
+        found.append(_judged(order, order, None, None, error_of))
+    right = [one for one in found if one.error is not None and one.error < _LARGEST_ERROR]
+    if right:
+        least = min(one.error for one in right if one.error is not None)
+        # Twice the least: what a few wrong pairs add.
+        found = [one for one in right if one.error is not None and one.error <= 2.0 * least]
+    else:
+        found = [one for one in found if one.offset_s is not None]
+    if not found:
+        raise InputError(
+            f'{names[0]} and {names[1]}: no offset of their clocks brings their standstills '
+            f'together ({len(points)} and {len(joints)}); are they of the same run? state the '
+            'offset with --clock-offset, or join by name or by order (--join)'
+        )
+    most = max(len(one.points) for one in found)
+    likely = [one for one in found if len(one.points) >= _ALIKE * most]
+    # Clocks that are the same need no robot: a part of the points is measured in motion then.
+    same = [one for one in found if one.offset_s == 0.0 and 2 * len(one.points) >= most]
+    likely = likely if right else same or likely
+    best = max(likely, key=lambda one: (one.offset_s == 0.0, len(one.points)))
+    rivals = [
+        one.offset_s
+        for one in likely
+        if one.offset_s is not None
+        and best.offset_s is not None
+        and abs(one.offset_s - best.offset_s) > STREAM_S
+        and not np.array_equal(one.joints, best.joints)
+    ]
+    if rivals and not right and best.offset_s != 0.0:
+        listed = ', '.join(
+            f'{offset:.2f}' for offset in sorted([best.offset_s or 0.0, *rivals])[:5]
+        )
+        raise InputError(
+            f'{names[0]} and {names[1]}: their standstills match as well with several offsets of '
+            f'the clocks ({listed} s), and the robot fits none; state it with --clock-offset'
+        )
+    return best
+
+
+def _matching(
+    points: Standstills,
+    joints: Standstills,
+    offset: float,
+    error_of: Callable[[IntArray, IntArray], float],
+) -> Matching:
+    """Return the pairs that overlap with an offset of the clocks, s."""
+    begin, end = points.begin + offset, points.end + offset
+    before = np.searchsorted(joints.end, begin)
+    after = np.searchsorted(joints.begin, end, side='right')
+    pairs: dict[int, tuple[float, int]] = {}
+    rows, of = [], []
+    for i in range(len(points)):
+        for j in range(before[i], after[i]):
+            common = min(end[i], joints.end[j]) - max(begin[i], joints.begin[j])
+            shorter = min(end[i] - begin[i], joints.end[j] - joints.begin[j])
+            if points.shots:
+                if common >= 0.0:
+                    rows.append(i)
+                    of.append(j)
+            elif common > 0.5 * shorter and common > pairs.get(j, (0.0, 0))[0]:
+                pairs[j] = common, i
+    if not points.shots:
+        of = sorted(pairs)
+        rows = [pairs[j][1] for j in of]
+    a, b = np.array(rows, dtype=np.int64), np.array(of, dtype=np.int64)
+    if points.shots or not len(a):
+        return _judged(a, b, offset, None, error_of)
+    apart = np.concatenate(
+        (
+            (joints.begin[b] - points.begin[a])[joints.opened[b] & points.opened[a]],
+            (joints.end[b] - points.end[a])[joints.closed[b] & points.closed[a]],
+        )
+    )
+    if not len(apart):
+        return _judged(a, b, offset, None, error_of)
+    # Clocks that are the same but for how the standstills are found stay so.
+    refined = offset if offset == 0.0 else float(np.median(apart))
+    return _judged(a, b, refined, float(np.median(np.abs(apart - refined))), error_of)
+
+
+def _judged(
+    i: IntArray,
+    j: IntArray,
+    offset: float | None,
+    apart: float | None,
+    error_of: Callable[[IntArray, IntArray], float],
+) -> Matching:
+    error = error_of(i, j) if len(i) >= _FEWEST_FOR_ROBOT else None
+    return Matching(i, j, offset, apart, error)
+
+
+def _offsets(points: Standstills, joints: Standstills) -> list[float]:
+    """Return offsets of the clocks that bring many standstills together, the likeliest first."""
+    if points.shots:
+        return _offsets_of_shots(points.begin, joints)
+    differences = [
+        (joints.begin[joints.opened][None] - points.begin[points.opened][:, None]).ravel(),
+        (joints.end[joints.closed][None] - points.end[points.closed][:, None]).ravel(),
+    ]
+    apart = np.sort(np.concatenate(differences))
+    if not len(apart):
+        apart = np.sort((joints.begin[None] - points.begin[:, None]).ravel())
+    count = np.searchsorted(apart, apart + _TOLERANCE_S, side='right') - np.arange(len(apart))
+    offsets: list[float] = []
+    for at in np.argsort(-count, kind='stable'):
+        offset = float(np.median(apart[at : at + count[at]]))
+        if all(abs(offset - other) > _TOLERANCE_S for other in offsets):
+            offsets.append(offset)
+        if len(offsets) == _MOST_OFFSETS or count[at] < 0.5 * count.max():
+            break
+    return offsets
+
+
+def _offsets_of_shots(shots: FloatArray, joints: Standstills) -> list[float]:
+    """Return offsets with which most shots fall into standstills, the middle of each range."""
+    starts = (joints.begin[None] - shots[:, None]).ravel()
+    stops = (joints.end[None] - shots[:, None]).ravel()
+    at = np.concatenate((starts, stops))
+    order = np.argsort(at, kind='stable')
+    at = at[order]
+    count = np.cumsum(np.where(order < len(starts), 1, -1))
+    offsets: list[float] = []
+    # A range of offsets ends where a shot leaves its standstill.
+    ranges = np.flatnonzero((np.diff(count) < 0) & (np.diff(at) > 0.0))
+    for i in ranges[np.argsort(-count[ranges], kind='stable')][:_MOST_OFFSETS]:
+        offsets.append(float(0.5 * (at[i] + at[i + 1])))
+    return offsets
+
+
+def reading_of(points: FloatArray) -> tuple[FloatArray, FloatArray, IntArray] | None:
+    """Return mean and standard deviation of a marker at a standstill, and which points are of it.
+
+    Parameters
+    ----------
+    points
+        m, (n, 3), at least one.
+
+    Returns
+    -------
+    mean, std, kept
+        (3,), (3,) and (m,); NaN for the std of a shot. None where the marker was not still.
+    """
+    if len(points) < FEWEST_SAMPLES:
+        # Shots of an instrument: the last one is the one that was kept.
+        return points[-1], np.full(3, np.nan), np.array([len(points) - 1])
+    kept = of_the_marker(points)
+    if are_too_many(len(points) - int(kept.sum()), len(points)):
+        return None
+    std = points[kept].std(axis=0, ddof=1)
+    if std.max() > SensorRules('', '').max_std_m:
+        return None
+    return points[kept].mean(axis=0), std, np.flatnonzero(kept)
+
+
+def between(stream: Stream, begin: float, end: float) -> slice:
+    """Return the values of a stream from where the arm no longer swings."""
+    first, last = np.searchsorted(stream.stamps, (begin + SWING_S, end))
+    return slice(int(first), int(last))
+
+
+def some(names: Sequence[str], shown: int = 5) -> str:
+    """Return the first few names, and how many more there are."""
+    more = f' and {len(names) - shown} more' if len(names) > shown else ''
+    return f'{", ".join(names[:shown])}{more}'
