@@ -6,24 +6,15 @@ import argparse
 import logging
 import time
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import numpy as np
-
-from remaster_ros.calibration.fit import (
-    COARSEST_PRECISION,
-    FINEST_PRECISION,
-    PRECISION,
-    FitResult,
-    fit_session,
-)
 from remaster_ros.cli.console import progress_bar, show, show_file
 from remaster_ros.cli.options import integer, number
-from remaster_ros.cli.sessions import read_to_fit
-from remaster_ros.compensation.export import MODEL_FILE
-from remaster_ros.reports.fit_json import FIT_FILE, geometry_of, prepare_folder, save_fit
-from remaster_ros.reports.judgement import verdict
-from remaster_ros.session.files import undone_on_failure
-from remaster_ros.session.priors import read_priors
+
+# What fits and draws is imported where it does so: SciPy and the rest take a second to load, and
+# neither `remaster fit --help` nor a mistyped option needs them.
+if TYPE_CHECKING:
+    from remaster_ros.calibration.result import FitResult
 
 log = logging.getLogger('remaster_ros')
 
@@ -51,11 +42,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         '--precision',
-        type=number(FINEST_PRECISION, COARSEST_PRECISION),
-        default=PRECISION,
+        type=number(),
+        default=0.02,
         metavar='P',
         help='sample until every mean is known to P standard deviations of its parameter '
-        f'(default {PRECISION}); of no effect with --draws',
+        '(0.002 to 0.1, default 0.02); of no effect with --draws',
     )
     parser.add_argument(
         '--prior',
@@ -67,6 +58,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Fit, write, and print a summary of a few lines."""
+    import numpy as np
+
+    from remaster_ros.calibration.fit import fit_session
+    from remaster_ros.cli.sessions import read_to_fit
+    from remaster_ros.reports.fit_json import FIT_FILE, prepare_folder, save_fit
+    from remaster_ros.session.files import undone_on_failure
+    from remaster_ros.session.priors import read_priors
+
     session = read_to_fit(args.session)
     priors = read_priors(args.prior) if args.prior is not None else None
     with undone_on_failure(), progress_bar(args.quiet or args.json) as progress:
@@ -97,6 +96,11 @@ def run(args: argparse.Namespace) -> int:
 
 def geometry_lines(result: FitResult) -> list[str]:
     """Return what lengths and tilts off their drawing do to the offsets, and the model of them."""
+    import numpy as np
+
+    from remaster_ros.compensation.export import MODEL_FILE
+    from remaster_ros.reports.fit_json import geometry_of
+
     geometry = geometry_of(result)
     if geometry is None or not result.identifiable.any():
         return []
@@ -121,6 +125,10 @@ def geometry_lines(result: FitResult) -> list[str]:
 
 def summary(result: FitResult) -> str:
     """Return offsets, errors and verdict in a few lines."""
+    import numpy as np
+
+    from remaster_ros.reports.judgement import verdict
+
     lines = []
     for joint, mean, std, seen in zip(
         result.joint_names,
