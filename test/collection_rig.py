@@ -16,6 +16,9 @@ from remaster_ros.session.workcell import read_cell
 from remaster_ros.simulation.setup import make_world
 
 SEED = 11
+SHORT = {'settle_s': 1.0}
+FAST = {'speed_share': 0.6}
+"""Of a collection, a node's time goes into what the arm and the sensors publish meanwhile."""
 
 
 class Cell:
@@ -66,19 +69,21 @@ class Cell:
                 'discovery': discovery or folder / 'discovery',
                 # A process starts as late as a busy machine lets it.
                 'resume_within_s': 600.0,
+                **FAST,
             },
-            'robot_bridge': {'simulated_clock_rate': rate},
+            'robot_bridge': {'simulated_clock_rate': rate, **SHORT, **FAST},
             'recorder': {
                 'session': self.session,
                 'require': require,
                 'simulated_clock_rate': rate,
+                **SHORT,
             },
         }
         if by_action:
             own['robot_bridge']['command_interface'] = 'action'
         if 'mocap' in sensors:
             ports = {'command_port': command, 'data_port': data}
-            own['fake_optitrack'] = {'world': folder / 'world', **ports}
+            own['fake_optitrack'] = {'world': folder / 'world', 'rate': 20.0, **ports}
             own['optitrack_markers'] = ports
         if 'tracker' in sensors:
             own['fake_laser_tracker'] = {'world': folder / 'world', 'port': tracker}

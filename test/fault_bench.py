@@ -21,6 +21,7 @@ from pathlib import Path
 import numpy as np
 from fault_observer import Observer
 from fault_relay import Relay
+from forked_nodes import NodeProcess
 from ros_rig import PATIENCE
 
 from remaster_ros.collection.events import ConfigurationEnded, PoseAnnounced, SolutionSettled
@@ -199,7 +200,7 @@ class Bench:
             for written in (topic, f'/{topic}'):
                 command += ['-r', f'{written}:=/bench/{topic}']
         with (self.folder / 'log' / f'{name}.log').open('ab') as log:
-            self.processes[name] = subprocess.Popen(
+            self.processes[name] = NodeProcess(
                 command, stdout=log, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL,
                 env=self._environment,
             )  # fmt: skip

@@ -9,6 +9,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from forked_nodes import NodeProcess
+
 ROOT = Path(__file__).resolve().parents[1]
 
 
@@ -35,7 +37,7 @@ class BridgeProcess:
         for name, value in self.parameters.items():
             command += ['-p', f'{name}:={value}']
         with self.log.open('ab') as log:
-            self.process = subprocess.Popen(
+            self.process = NodeProcess(
                 command, env=self.environment, stdout=log, stderr=log, cwd=ROOT
             )
 

@@ -12,6 +12,7 @@ from itertools import cycle
 from pathlib import Path
 
 import pytest
+from forked_nodes import NodeProcess
 
 ROOT = Path(__file__).parents[1]
 LAST_DOMAIN = 101
@@ -70,7 +71,8 @@ def start(ros_environment):
     running = []
 
     def begin(module, *args, **options):
-        process = subprocess.Popen(
+        kind = NodeProcess if module.startswith('remaster_ros.nodes.') else subprocess.Popen
+        process = kind(
             [sys.executable, '-m', module, *map(str, args)],
             env=ros_environment,
             stdout=subprocess.PIPE,
