@@ -186,9 +186,7 @@ def test_a_read_only_folder(good: Path, session: Path, tmp_path: Path) -> None:
     folder.mkdir(mode=0o555)
     offsets = ('--offsets', good / 'fit/fit.json')
     for out, args in (
-        (folder, ('fit', session, '--out', folder)),
         (folder / 'new', ('fit', session, '--out', folder / 'new')),
-        (folder / 'new', ('simulate', folder / 'new', '--poses', 8)),
         (folder / 'a.json', ('accuracy', session, *offsets, '--out', folder / 'a.json')),
     ):
         line = refusal(*args, through=OBEYING)

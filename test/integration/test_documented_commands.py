@@ -35,7 +35,6 @@ CHEAP = {
     'import',
     'quick-start-real-hardware',
     'tutorial-demo',
-    'tutorial-table',
 }
 
 

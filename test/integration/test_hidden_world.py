@@ -349,6 +349,7 @@ def test_the_same_seed_plans_the_same_tour() -> None:
     np.testing.assert_array_equal(visits('six', 2, 10).q, first.q)
 
 
+@pytest.mark.qualify
 def test_the_oracle_has_the_power_that_it_computes() -> None:
     """At its size for 90 % the best test finds 90 %, and 2 % where nothing is.
 

@@ -72,7 +72,13 @@ def errors(session, offsets):
     return (found.model.offsets(x) - offsets)[1:6] / std, parts
 
 
-@pytest.mark.parametrize('hidden', [0.0, 0.3], ids=['all seen', '30 % hidden'])
+@pytest.mark.parametrize(
+    'hidden',
+    [
+        pytest.param(0.0, id='all seen', marks=pytest.mark.qualify),
+        pytest.param(0.3, id='30 % hidden'),
+    ],
+)
 def test_noise_that_a_frame_shares_is_found_and_the_intervals_hold(configurations, hidden):
     """Of 1,000 intervals of 200 sessions 939, with markers hidden 961, held; 676 without it."""
     print('seed', SEED)

@@ -70,8 +70,8 @@ CHANGES = [
     (dict(points=lambda p: 1e3 * p), 'length_scale'),
     (dict(q=lambda q: np.roll(q, 1, axis=0)), 'shift'),
 ]
-# Of other arms one change each: a search on seven joints takes four seconds.
-OTHERS = [('ur5e', 'quarters'), ('panda', 'order')]
+# Which of them `make test` tries: two seconds each, and test_mistakes has others of sessions.
+TRIED = {'irb120': ('signs', 'order', 'coupled', 'mirrored'), 'ur5e': ('quarters',), 'panda': ()}
 
 
 @pytest.mark.parametrize(
@@ -81,7 +81,7 @@ OTHERS = [('ur5e', 'quarters'), ('panda', 'order')]
             robot,
             change,
             found,
-            marks=() if robot == 'irb120' or (robot, found) in OTHERS else pytest.mark.qualify,
+            marks=() if found in TRIED[robot] else pytest.mark.qualify,
             id=f'{robot}-{found}-{number}',
         )
         for robot in ('irb120', 'ur5e', 'panda')
@@ -103,7 +103,7 @@ def test_one_change_is_found_and_nothing_else_is(robot, change, found):
 
 
 @pytest.mark.parametrize(
-    'seed', [0, 1, *(pytest.param(seed, marks=pytest.mark.qualify) for seed in (2, 3, 4))]
+    'seed', [0, *(pytest.param(seed, marks=pytest.mark.qualify) for seed in (1, 2, 3, 4))]
 )
 def test_a_right_table_is_not_gross_and_nonsense_has_no_remedy(seed):
     session = scene('irb120', 30, seed)

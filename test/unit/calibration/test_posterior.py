@@ -231,6 +231,7 @@ def test_a_random_walk_is_the_last_resort(found, monkeypatch) -> None:
     assert stages == {'sampling', 'adapting the sampler', 'sampling by random walk'}
 
 
+@pytest.mark.qualify
 def test_a_random_walk_to_a_precision_is_as_long_as_it_takes(found, monkeypatch) -> None:
     """Against the independent sampler of the same posterior; more chains than were asked for."""
     monkeypatch.setattr(sampling, 'POOR_ACCEPTANCE', 1.1)

@@ -78,7 +78,7 @@ def test_structure_is_found_and_named(errors, driver, words) -> None:
     assert [test.p_value for test in found] == sorted(test.p_value for test in found)
 
 
-@pytest.mark.parametrize('freedom', [3.0, 1000.0])
+@pytest.mark.parametrize('freedom', [3.0, pytest.param(1000.0, marks=pytest.mark.qualify)])
 def test_noise_of_any_tails_has_none(freedom: float) -> None:
     """Ten sessions: 1 in 100 fires; two of them by chance in 1 of 250 sets of seeds."""
     fired = 0
@@ -88,6 +88,7 @@ def test_noise_of_any_tails_has_none(freedom: float) -> None:
     assert fired < 2
 
 
+@pytest.mark.qualify
 def test_p_values_of_noise_are_uniform() -> None:
     """Of 12 sessions with noise common to a pose: mean within five standard errors."""
     values = []
@@ -185,6 +186,7 @@ def misled() -> list[tuple[Estimate, FloatArray]]:
     return made
 
 
+@pytest.mark.qualify
 def test_robust_intervals_cover_where_those_of_the_model_do_not(misled) -> None:
     covered = np.zeros((2, 0))
     for found, truth in misled:

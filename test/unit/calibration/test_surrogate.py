@@ -100,7 +100,7 @@ def test_sampling_goes_on_until_the_precision_is_reached() -> None:
     session, _ = scene(43, poses=12)
     mode = estimate(Problem.of(session)).mode
     size = mode.linearisation.posterior.size
-    long = sample_posterior(mode, chains=4, draws=40_000, rng=np.random.default_rng(50)).run.draws
+    long = sample_posterior(mode, chains=4, draws=10_000, rng=np.random.default_rng(50)).run.draws
     long = long.reshape(-1, size)
     lengths = []
     for precision in (0.02, 0.012):

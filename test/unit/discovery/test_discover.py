@@ -98,14 +98,18 @@ def test_an_unnamed_cause_is_located():
     assert first.driver == 'gravity_torque_of_joint_2'
 
 
-@pytest.mark.parametrize('seed', [31, 32, 33])
+@pytest.mark.parametrize(
+    'seed', [31, *(pytest.param(seed, marks=pytest.mark.qualify) for seed in (32, 33))]
+)
 def test_nothing_is_found_where_nothing_is(seed):
     # A false claim at 1 % each: all three pass in 97 % of seeds; these are fixed.
     found = discovered(session_with(seed, sensor=None, outlier_share=0.03))
     assert found.effects == ()
 
 
-@pytest.mark.parametrize('seed', [34, 35, 36, 37])
+@pytest.mark.parametrize(
+    'seed', [34, *(pytest.param(seed, marks=pytest.mark.qualify) for seed in (35, 36, 37))]
+)
 def test_few_poses_are_enough_for_a_large_cause_and_show_none_where_none_is(seed):
     # The signs of 6 poses have 32 patterns, too few for a p-value of 1 %.
     few = {'poses': 6, 'validation': 4}

@@ -37,6 +37,7 @@ def off_its_drawing(session: Session, joint: str, axis: int, off_m: float) -> Se
     return replace(session, urdf=ElementTree.tostring(root, encoding='unicode'))
 
 
+@pytest.mark.qualify
 def test_an_elbow_off_its_drawing_by_the_tolerance_is_held_by_the_wider_std() -> None:
     """The z of each offset by ``std_deg`` reaches tens; with geometry 95 % are within 1.96.
 

@@ -100,6 +100,7 @@ def test_a_slip_is_dated_between_the_two_configurations():
     assert f'{group[0].moment / 60.0:.1f} min after the first reading' in effect.cause
 
 
+@pytest.mark.qualify
 def test_a_step_is_dated_also_where_held_out_readings_lie_between():
     """Moments between held-out readings are tried; the rows fitted may have none of these."""
     session = session_with(32, pose_sigma_m=0.05e-3)
