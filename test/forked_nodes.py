@@ -21,6 +21,7 @@ import signal
 import socket
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -115,6 +116,7 @@ def _serve(tests: socket.socket) -> list[str]:
         os.chdir(request['folder'])
         os.environ.clear()
         os.environ.update(request['environment'])
+        tempfile.tempdir = None  # Of this environment, when next asked for.
         return request['words']
 
 
@@ -137,7 +139,8 @@ def main() -> None:
         setattr(sys, name, open(number, 'w', buffering=1, closefd=False))  # noqa: SIM115
     sys.stdout.reconfigure(line_buffering=False, write_through=at_once)
     # With the folder it runs in, as of `python -m`.
-    sys.path[0] = os.getcwd()
+    further = os.environ.get('PYTHONPATH', '').split(os.pathsep)
+    sys.path[:1] = [os.getcwd(), *(path for path in further if path and path not in sys.path)]
     sys.argv = [module, *arguments]
     runpy.run_module(module, run_name='__main__', alter_sys=True)
 

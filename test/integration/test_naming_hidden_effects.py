@@ -110,6 +110,7 @@ def test_two_effects_at_once() -> None:
     assert judgement.size_right, judgement
 
 
+@pytest.mark.qualify
 def test_causes_carry_over_to_a_session_of_the_same_arm_until_they_are_removed() -> None:
     recipe = Recipe(SEED, ('encoder_eccentricity',), CLEAR)
     found, first = discovered(recipe)
@@ -125,6 +126,7 @@ def test_causes_carry_over_to_a_session_of_the_same_arm_until_they_are_removed()
     assert repaired.rms_after_m > repaired.rms_before_m
 
 
+@pytest.mark.qualify
 def test_what_was_found_predicts_a_third_set_better_than_the_offsets() -> None:
     """Causes at a joint, in the sensor, over time: all that a prediction is made of."""
     recipe = Recipe(SEED, ('registration_drift', 'backlash', 'sensor_scale'), CLEAR)

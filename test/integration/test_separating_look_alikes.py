@@ -15,6 +15,7 @@ from remaster_ros.planning.separating_design import MOST_FURTHER
 pytestmark = pytest.mark.timeout(600)
 
 
+@pytest.mark.qualify
 def test_a_sag_that_looks_like_a_base_that_yields_is_decided():
     number = 1
     print('session', number)

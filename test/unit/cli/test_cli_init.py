@@ -48,7 +48,7 @@ def written(folder, description: Description, name='robot.urdf'):
 @pytest.mark.parametrize(
     ('robot', 'held'),
     [
-        ('ur5e', ''),
+        pytest.param('ur5e', '', marks=pytest.mark.qualify),
         ('irb120', ''),
         pytest.param('panda', 'panda_joint5', marks=pytest.mark.qualify),
         ('iiwa14', 'lbr_A3'),

@@ -82,6 +82,7 @@ def test_another_arm_of_the_same_model_is_not_taken_for_this_one():
     assert 'another arm of this kind' in in_words(found, alike)[1]
 
 
+@pytest.mark.qualify
 def test_a_cause_counts_where_it_was_seen():
     """The arm errs differently where joint 2 was not in the first session: that is no matter."""
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
+import pytest
 from calibration_scenes import CHAIN
 from discovery_scenes import at_joint, discovered, session_with
 
@@ -110,6 +111,7 @@ def test_a_part_tells_the_cause_and_the_other_rows_confirm_it(monkeypatch):
     assert parameter.std > other.std, 'fewer rows know less, and say so'
 
 
+@pytest.mark.qualify
 def test_nothing_in_a_part_is_nothing_in_the_rest(monkeypatch):
     monkeypatch.setattr(discover, 'draw_rows', partial(draw_rows, most=250))
     part = discovered(session_with(22, poses=120))
@@ -117,6 +119,7 @@ def test_nothing_in_a_part_is_nothing_in_the_rest(monkeypatch):
     assert part.thinning.others_rms_after_m == part.thinning.others_rms_before_m
 
 
+@pytest.mark.qualify
 def test_forgotten_displacements_are_computed_again(monkeypatch):
     """What is kept is bounded in bytes; the results are the same."""
     session = session_with(21, sagging)
@@ -144,6 +147,7 @@ def test_columns_and_errors_of_a_part_are_those_of_the_whole():
     )
 
 
+@pytest.mark.qualify
 def test_what_a_fit_leaves_does_not_depend_on_blocks(monkeypatch):
     found = discovered(session_with(21, sagging))
     data, solution = found.residuals, found.solution
