@@ -16,9 +16,40 @@ from typing import Annotated, ClassVar, Literal, get_args
 import msgspec
 import numpy as np
 
-from remaster_ros.collection.event_body import Body
-from remaster_ros.collection.optimizer_state import OptimizerState
 from remaster_ros.errors import InputError
+
+
+class Body(msgspec.Struct, frozen=True, tag_field='kind'):
+    """What a record carries; ``kind`` names its type.
+
+    Attributes
+    ----------
+    sender
+        The name of the only node that may publish it; '' for any.
+    """
+
+    sender: ClassVar[str] = ''
+
+
+class OptimizerState(Body, frozen=True, kw_only=True, tag='optimizer'):
+    """State of the optimizer.
+
+    Attributes
+    ----------
+    plan
+        The plan whose session it has looked at, '' for none.
+    enough
+        Whether the precision that the cell file states is reached: no more poses to fit are
+        visited then.
+    precision
+        What is known, and what more would cost, as text.
+    """
+
+    sender: ClassVar[str] = 'optimizer'
+    plan: str
+    enough: bool
+    precision: str = ''
+
 
 VERSION = 1
 

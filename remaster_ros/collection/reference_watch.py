@@ -9,21 +9,151 @@ Only for a round that differs a cause is looked for.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 import scipy
 
-from remaster_ros.collection.reference_readings import (
-    ReferenceReading,
-    ReferenceRound,
-    SetupChange,
-)
+from remaster_ros.collection.pairing import PairedReading
 from remaster_ros.kinematics import transforms
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.planning.reference_choice import Cause, Place, causes
 from remaster_ros.planning.tour_order import nearest_solution
-from remaster_ros.types import FloatArray, IntArray
+from remaster_ros.types import FloatArray, IntArray, Session
+
+
+def changes(
+    session: Session, chain: SerialChain, T_R_N: Mapping[str, FloatArray]
+) -> tuple[int, list[SetupChange]]:
+    """Return how many rounds of the references there are, and what has changed by them.
+
+    Each change is returned once, as the last round that shows it has it.
+    """
+    m = session.references
+    if m is None:
+        return 0, []
+    readings = [
+        ReferenceReading(
+            session.sensor_names[m.sensor[i]],
+            session.marker_names[m.marker[i]],
+            float(m.stamp_s[i]),
+            m.q[i],
+            m.position[i],
+            m.std[i] if np.all(np.isfinite(m.std[i])) else None,
+            max(int(m.samples[i]), 1),
+            configuration=int(m.configuration[i]),
+        )
+        for i in range(len(m))
+    ]
+    watch = ReferenceWatch(chain, session.markers)
+    found = replay(watch, readings, session.measurements.configuration.tolist(), T_R_N)
+    last = {(change.subject, change.after): change for change in found}
+    return watch.rounds, list(last.values())
+
+
+def replay(
+    watch: ReferenceWatch,
+    readings: Sequence[ReferenceReading],
+    others: Sequence[int],
+    T_R_N: Mapping[str, FloatArray],
+) -> list[SetupChange]:
+    """Judge the references of a recorded session; return what was found, round by round.
+
+    Parameters
+    ----------
+    readings
+        In the order measured.
+    others
+        Numbers of the configurations that are no references, in any order.
+    """
+    other = np.sort(np.asarray(others, dtype=int))
+    found: list[SetupChange] = []
+    for i, reading in enumerate(readings):
+        if i:
+            between = (readings[i - 1].configuration, reading.configuration)
+            if np.ptp(np.searchsorted(other, between)) > 0:
+                watch.end_round()
+        if watch.rounds and watch.begins_round(reading):
+            change = watch.judge(T_R_N)
+            found += [change] if change is not None else []
+        watch.add(reading)
+    change = watch.judge(T_R_N)
+    return found + ([change] if change is not None else [])
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReferenceReading(PairedReading):
+    """A reading at a reference; `configuration` is the configuration's number in the session."""
+
+    configuration: int
+
+
+@dataclass(frozen=True)
+class SetupChange:
+    """What has changed.
+
+    Attributes
+    ----------
+    kind
+        ``sensor``, ``base``, ``marker``, ``tool``, ``joint``, or ``unexplained`` (no one cause) or
+        ``unsteady`` (the references do not repeat from the first).
+    subject
+        For people.
+    drifts
+        Whether it grows with time; else it came at once.
+    size_m
+        Largest displacement of a marker at a reference.
+    turn_rad
+        Of the sensor, base, tool or joint; None where nothing turns.
+    after, before
+        Configurations that it happened between: the last one that was as at first (None where it
+        was so from the first) and the first one that was not.
+    p_value
+        Of the round that showed it.
+    look_alikes
+        Other subjects that explain the same readings.
+    """
+
+    kind: str
+    subject: str
+    drifts: bool
+    size_m: float
+    turn_rad: float | None
+    after: int | None
+    before: int
+    p_value: float
+    look_alikes: tuple[str, ...] = ()
+
+    def describe(self) -> str:
+        """Return it in a sentence."""
+        turn = ''
+        if self.turn_rad is not None:
+            turn = f' and turned by {np.rad2deg(self.turn_rad) * 60:.1f} arc minutes'
+            if self.kind == 'joint':
+                turn = f' ({np.rad2deg(self.turn_rad):.4f} degrees)'
+        how = ', growing with time,' if self.drifts else ''
+        since = f'between configurations {self.after} and {self.before}'
+        if self.after is None:
+            since = f'up to configuration {self.before}'
+        alike = f'; it looks the same as: {", ".join(self.look_alikes)}' * bool(self.look_alikes)
+        size = f'the references are off by up to {1e3 * self.size_m:.2f} mm{turn}'
+        return f'{self.subject}{how} {since}: {size}{alike}'
+
+
+@dataclass
+class ReferenceRound:
+    """Readings of one visit to the references, by reference and sensor."""
+
+    rows: dict[tuple[int, str], ReferenceReading] = field(default_factory=dict)
+    judged: bool = False
+    alarmed: bool = False
+
+    @property
+    def configurations(self) -> list[int]:
+        """Numbers in the session of what was measured."""
+        return [row.configuration for row in self.rows.values()]
+
 
 FALSE_ALARM = 0.01
 """Probability that a session in which nothing changes has any alarm."""

@@ -6,8 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 
 from remaster_ros.collection.events import SetupChanged
 from remaster_ros.collection.pairing import PairedReading
-from remaster_ros.collection.reference_readings import ReferenceReading, SetupChange
-from remaster_ros.collection.reference_watch import ReferenceWatch
+from remaster_ros.collection.reference_watch import ReferenceReading, ReferenceWatch, SetupChange
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.types import FloatArray
 

@@ -13,8 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from remaster_ros.collection.frame_mean import are_too_many, of_the_marker
-from remaster_ros.collection.pairing import SensorRules
+from remaster_ros.collection.pairing import SensorRules, are_too_many, of_the_marker
 from remaster_ros.errors import InputError
 from remaster_ros.motion.settling import SettleRules
 from remaster_ros.types import BoolArray, FloatArray, IntArray

@@ -31,8 +31,8 @@ from std_srvs.srv import Trigger
 from remaster_ros.collection import events
 from remaster_ros.collection.announcements import Announcements
 from remaster_ros.collection.collection_run import CollectionRun
+from remaster_ros.collection.events import OptimizerState
 from remaster_ros.collection.message_fields import JointOrder
-from remaster_ros.collection.optimizer_state import OptimizerState
 from remaster_ros.collection.peer_models import PeerModels
 from remaster_ros.collection.plan_confirmation import service_name
 from remaster_ros.collection.preflight_facts import PreflightFacts

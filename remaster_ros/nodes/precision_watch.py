@@ -14,8 +14,7 @@ from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.clock import Clock, ClockType
 from std_msgs.msg import String
 
-from remaster_ros.collection.events import EventRecord, PlannerState, RecorderState
-from remaster_ros.collection.optimizer_state import OptimizerState
+from remaster_ros.collection.events import EventRecord, OptimizerState, PlannerState, RecorderState
 from remaster_ros.collection.stopping_rule import (
     Look,
     StoppingGoal,

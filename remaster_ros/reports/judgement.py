@@ -10,7 +10,7 @@ import numpy as np
 from remaster_ros.calibration.measured_again import MeasuredAgain
 from remaster_ros.calibration.noise_check import NoiseCheck
 from remaster_ros.calibration.residual_structure import FEWEST_POSES
-from remaster_ros.collection.reference_session import changes
+from remaster_ros.collection.reference_watch import changes
 from remaster_ros.reports.schemas import Judgement
 
 if TYPE_CHECKING:

@@ -15,12 +15,12 @@ from remaster_ros.collection.events import (
     ArmStopped,
     ConfigurationEnded,
     EventRecord,
+    OptimizerState,
     PlannerState,
     PoseAnnounced,
     RecorderState,
     encode,
 )
-from remaster_ros.collection.optimizer_state import OptimizerState
 from remaster_ros.session.reader import write_session
 from remaster_ros.session.workcell import config_path
 

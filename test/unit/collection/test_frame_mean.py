@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from pairing_feed import STREAM, Q
 
-from remaster_ros.collection.frame_mean import of_the_marker
-from remaster_ros.collection.pairing import PairedReading, Pairing, Rejection
+from remaster_ros.collection.pairing import PairedReading, Pairing, Rejection, of_the_marker
 from remaster_ros.types import MarkerReading
 
 TRUE = np.array([0.3, -0.2, 2.5])

@@ -6,9 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from remaster_ros.collection.reference_readings import ReferenceReading
-from remaster_ros.collection.reference_session import replay
-from remaster_ros.collection.reference_watch import ReferenceWatch
+from remaster_ros.collection.reference_watch import ReferenceReading, ReferenceWatch, replay
 from remaster_ros.kinematics import transforms
 from remaster_ros.planning.reference_choice import choose_references
 from remaster_ros.session.workcell import read_cell

@@ -18,8 +18,8 @@ from remaster_ros.planning.candidates import (
     plan_poses,
 )
 from remaster_ros.planning.free_order import free_order
-from remaster_ros.planning.registration_tour import registration_tour
 from remaster_ros.planning.tour_order import Tour, nearest_solution
+from remaster_ros.planning.tour_planner import registration_tour
 from remaster_ros.session.workcell import read_cell
 
 CHAIN = read_cell('demo').chain()

@@ -10,8 +10,8 @@ import pytest
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.planning.candidates import Plan, PlannedPose
-from remaster_ros.planning.registration_tour import registration_tour
 from remaster_ros.planning.tour_order import REGISTRATION, Tour
+from remaster_ros.planning.tour_planner import registration_tour
 from remaster_ros.session.journal import Journal
 from remaster_ros.session.plan_journal import PlanJournal
 from remaster_ros.session.workcell import read_cell
