@@ -10,10 +10,10 @@ import random
 import struct
 from collections.abc import Iterable, Sequence
 
-from remaster_ros.sensors.laser_tracker.protocol import codes
+from remaster_ros.sensors.laser_tracker.protocol import packets
 from remaster_ros.sensors.laser_tracker.protocol import packets as emscon
 from remaster_ros.sensors.optitrack.protocol import natnet
-from remaster_ros.sensors.optitrack.protocol.frames import (
+from remaster_ros.sensors.optitrack.protocol.natnet import (
     TRACKING_VALID,
     AnalogDevice,
     Asset,
@@ -21,13 +21,11 @@ from remaster_ros.sensors.optitrack.protocol.frames import (
     Frame,
     LabeledMarker,
     MarkerSet,
-    RigidBody,
-    Skeleton,
-)
-from remaster_ros.sensors.optitrack.protocol.models import (
     MarkerSetDescription,
     ModelDefinition,
+    RigidBody,
     RigidBodyDescription,
+    Skeleton,
     SkeletonDescription,
 )
 
@@ -130,7 +128,18 @@ def measurement() -> emscon.Measurement:
     """Return a result as an instrument sends it."""
     three = (1e-5, 2e-5, 3e-5)
     return emscon.Measurement(
-        0, codes.STATIONARY, 0, (2.0, 0.5, -0.3), three, 4e-5, three, three, 4e-5, 20.0, 1013.0, 50
+        0,
+        packets.STATIONARY,
+        0,
+        (2.0, 0.5, -0.3),
+        three,
+        4e-5,
+        three,
+        three,
+        4e-5,
+        20.0,
+        1013.0,
+        50,
     )
 
 
@@ -147,7 +156,7 @@ def emscon_seeds() -> list[bytes]:
             emscon.UnknownPacket(77, b'12345678'),
         )
     ]
-    for command in codes.Command:
+    for command in packets.Command:
         for kind, layout in (('request', command.request), ('reply', command.reply)):
             zeros = layout.unpack(bytes(layout.size))
             filled = tuple(

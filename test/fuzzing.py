@@ -18,9 +18,8 @@ from pathlib import Path
 import numpy as np
 from fuzz_messages import VERSIONS, full_frame, model_definition, server_info
 
-from remaster_ros.sensors.laser_tracker.client import LaserTrackerClient
-from remaster_ros.sensors.laser_tracker.link import LaserTrackerError
-from remaster_ros.sensors.laser_tracker.protocol import codes
+from remaster_ros.sensors.laser_tracker.client import LaserTrackerClient, LaserTrackerError
+from remaster_ros.sensors.laser_tracker.protocol import packets
 from remaster_ros.sensors.laser_tracker.protocol import packets as emscon
 from remaster_ros.sensors.laser_tracker.settings import LaserTrackerSettings
 from remaster_ros.sensors.optitrack import marker_follower
@@ -205,9 +204,9 @@ class TrackerClientTarget:
         reader = emscon.PacketReader('client')
         command = rng.choice((self._measure, self._measure, self.client.request_status))
         expected = (
-            emscon.Reply(codes.Command.START_MEASUREMENT)
+            emscon.Reply(packets.Command.START_MEASUREMENT)
             if command == self._measure
-            else emscon.Reply(codes.Command.GET_TRACKER_STATUS, 0, (rng.randrange(4),))
+            else emscon.Reply(packets.Command.GET_TRACKER_STATUS, 0, (rng.randrange(4),))
         )
         first = emscon.encode(expected) if rng.random() < 0.7 else b''
         cut = rng.randrange(len(data) + 1)

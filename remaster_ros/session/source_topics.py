@@ -6,7 +6,7 @@ from remaster_ros.errors import did_you_mean
 
 POSE = 'geometry_msgs/msg/PoseStamped'
 MESSAGE_TYPES = ('geometry_msgs/msg/PointStamped', POSE, 'mocap4r2_msgs/msg/Markers')
-"""`sensors.topic.messages.READERS` reads them."""
+"""`sensors.topic.driver.READERS` reads them."""
 
 
 def source_problem(key: str, source: str, message_type: str, *, single_shot: bool) -> str:

@@ -12,15 +12,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from remaster_ros.errors import DeviceError
-from remaster_ros.sensors.laser_tracker.protocol.codes import Command, Status
 from remaster_ros.sensors.laser_tracker.protocol.packets import (
     NEED_DATA,
+    Command,
     ConnectionClosed,
     ErrorReport,
     Event,
     PacketReader,
     ProtocolError,
     Request,
+    Status,
     encode,
 )
 from remaster_ros.simulation.faults import Numbers

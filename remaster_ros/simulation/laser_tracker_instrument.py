@@ -11,13 +11,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from remaster_ros.sensors.laser_tracker.protocol.codes import Change, Command, Readiness, Status
 from remaster_ros.sensors.laser_tracker.protocol.packets import (
+    Change,
+    Command,
     ErrorReport,
     Event,
     Measurement,
+    Readiness,
     Reply,
     Request,
+    Status,
     StatusChange,
     Value,
 )

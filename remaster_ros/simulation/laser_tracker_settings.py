@@ -7,8 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from remaster_ros.sensors.laser_tracker.protocol.codes import Change, Command, Status
-from remaster_ros.sensors.laser_tracker.protocol.packets import Value
+from remaster_ros.sensors.laser_tracker.protocol.packets import Change, Command, Status, Value
 
 LENGTH_UNITS_M = (1.0, 1e-3, 1e-6, 0.3048, 0.9144, 0.0254)
 """Metre, millimetre, micron, foot, yard, inch."""

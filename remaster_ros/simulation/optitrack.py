@@ -17,17 +17,16 @@ import numpy as np
 
 from remaster_ros.errors import InputError
 from remaster_ros.sensors.optitrack.protocol import natnet
-from remaster_ros.sensors.optitrack.protocol.frames import Frame
 from remaster_ros.sensors.optitrack.protocol.natnet import (
     ClientRequest,
+    Frame,
     Message,
     MessageId,
     ProtocolError,
     Version,
+    require_supported,
 )
-from remaster_ros.sensors.optitrack.protocol.wire import require_supported
-from remaster_ros.sensors.optitrack.settings import require_group
-from remaster_ros.sensors.optitrack.sockets import open_socket
+from remaster_ros.sensors.optitrack.settings import open_socket, require_group
 from remaster_ros.simulation.optitrack_faults import FrameFaults
 from remaster_ros.simulation.optitrack_scene import CLOCK_HZ, OptiTrackBehaviour, OptiTrackScene
 

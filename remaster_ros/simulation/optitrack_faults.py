@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from remaster_ros.sensors.optitrack.protocol.frames import Frame, LabeledMarker
+from remaster_ros.sensors.optitrack.protocol.natnet import Frame, LabeledMarker
 from remaster_ros.simulation.faults import Numbers
 
 JUMP_M = 0.5

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from remaster_ros.sensors.optitrack.protocol.frames import (
+from remaster_ros.sensors.optitrack.protocol.natnet import (
     HAS_MODEL,
     MEASURED,
     MODEL_FILLED,
@@ -20,14 +20,13 @@ from remaster_ros.sensors.optitrack.protocol.frames import (
     Frame,
     LabeledMarker,
     MarkerSet,
-    RigidBody,
-)
-from remaster_ros.sensors.optitrack.protocol.models import (
     MarkerSetDescription,
     ModelDefinition,
+    RigidBody,
     RigidBodyDescription,
+    Vec3,
+    Version,
 )
-from remaster_ros.sensors.optitrack.protocol.wire import Vec3, Version
 from remaster_ros.types import FloatArray
 
 if TYPE_CHECKING:

@@ -22,8 +22,8 @@ from remaster_ros.errors import DeviceError, InsufficientDataError
 from remaster_ros.sensors.laser_tracker.client import LaserTrackerClient
 from remaster_ros.sensors.laser_tracker.settings import LaserTrackerSettings
 from remaster_ros.sensors.optitrack.client import NatNetClient
-from remaster_ros.sensors.optitrack.diagnosis import warning
 from remaster_ros.sensors.optitrack.frame_gate import MarkerChoice
+from remaster_ros.sensors.optitrack.marker_follower import warning
 from remaster_ros.sensors.optitrack.settings import NatNetSettings
 from remaster_ros.session.workcell import read_cell
 from remaster_ros.simulation.laser_tracker import FakeLaserTracker

@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 from tracker_world import MARKER, ReflectorWorld, across_and_along
 
-from remaster_ros.sensors.laser_tracker.protocol.codes import Command, Status
 from remaster_ros.sensors.laser_tracker.protocol.packets import (
+    Command,
     ErrorReport,
     Measurement,
     PacketReader,
     Reply,
     Request,
+    Status,
     StatusChange,
     encode,
 )

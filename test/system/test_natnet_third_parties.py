@@ -27,7 +27,7 @@ from remaster_ros.sensors.optitrack.driver import OptiTrackDriver, Parameters
 from remaster_ros.sensors.optitrack.frame_gate import Dropped, MarkerChoice
 from remaster_ros.sensors.optitrack.natnetclient_backend import NatNetClientBackend
 from remaster_ros.sensors.optitrack.protocol import natnet as our_natnet
-from remaster_ros.sensors.optitrack.protocol.frames import LabeledMarker
+from remaster_ros.sensors.optitrack.protocol.natnet import LabeledMarker
 from remaster_ros.sensors.optitrack.settings import NatNetSettings
 from remaster_ros.simulation.optitrack import FakeOptiTrackServer
 from remaster_ros.simulation.optitrack_scene import OptiTrackBehaviour

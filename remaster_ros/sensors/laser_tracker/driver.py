@@ -15,8 +15,7 @@ import numpy as np
 from remaster_ros.errors import DeviceError
 from remaster_ros.parameters import parameter
 from remaster_ros.sensors.driver import SensorClock, SensorParameters, SensorState, TriggeredDriver
-from remaster_ros.sensors.laser_tracker.client import LaserTrackerClient
-from remaster_ros.sensors.laser_tracker.link import LaserTrackerError
+from remaster_ros.sensors.laser_tracker.client import LaserTrackerClient, LaserTrackerError
 from remaster_ros.sensors.laser_tracker.settings import (
     LaserTrackerSettings,
     TrackerReading,

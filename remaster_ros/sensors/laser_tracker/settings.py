@@ -9,24 +9,29 @@ import numpy as np
 
 from remaster_ros.errors import InputError
 from remaster_ros.parameters import check_all, parameter
-from remaster_ros.sensors.laser_tracker.protocol import codes
-from remaster_ros.sensors.laser_tracker.protocol.codes import Change, Command
-from remaster_ros.sensors.laser_tracker.protocol.packets import Value
+from remaster_ros.sensors.laser_tracker.protocol import packets
+from remaster_ros.sensors.laser_tracker.protocol.packets import Change, Command, Value
 from remaster_ros.types import FloatArray, MarkerReading
 
-_UNITS = codes.METRE, codes.RADIAN, codes.CELSIUS, codes.MILLIBAR, codes.RELATIVE_HUMIDITY
+_UNITS = (
+    packets.METRE,
+    packets.RADIAN,
+    packets.CELSIUS,
+    packets.MILLIBAR,
+    packets.RELATIVE_HUMIDITY,
+)
 SET_FOR_READINGS: tuple[tuple[Command, Command, tuple[Value, ...], str], ...] = (
     (Command.SET_UNITS, Command.GET_UNITS, _UNITS, 'units (metre, radian, °C, mbar)'),
     (
         Command.SET_COORDINATE_SYSTEM_TYPE,
         Command.GET_COORDINATE_SYSTEM_TYPE,
-        (codes.RIGHT_HANDED_CARTESIAN,),
+        (packets.RIGHT_HANDED_CARTESIAN,),
         'coordinate system (right-handed Cartesian)',
     ),
     (
         Command.SET_MEASUREMENT_MODE,
         Command.GET_MEASUREMENT_MODE,
-        (codes.STATIONARY,),
+        (packets.STATIONARY,),
         'measurement mode (stationary)',
     ),
 )

@@ -15,24 +15,24 @@ from collections import deque
 from collections.abc import Callable
 
 from remaster_ros.errors import DeviceError
-from remaster_ros.sensors.optitrack.frame_gate import Dropped, MarkerSample
-from remaster_ros.sensors.optitrack.frame_source import Source
+from remaster_ros.sensors.optitrack.frame_gate import Dropped, MarkerSample, Source
 from remaster_ros.sensors.optitrack.marker_follower import MarkerFollower
 from remaster_ros.sensors.optitrack.protocol import natnet
-from remaster_ros.sensors.optitrack.protocol.frames import (
+from remaster_ros.sensors.optitrack.protocol.natnet import (
     BITSTREAM_CHANGED,
     MODEL_LIST_CHANGED,
     Frame,
-)
-from remaster_ros.sensors.optitrack.protocol.models import ModelDefinition
-from remaster_ros.sensors.optitrack.protocol.natnet import (
     Message,
     MessageId,
+    ModelDefinition,
     ProtocolError,
     ServerInfo,
 )
-from remaster_ros.sensors.optitrack.settings import NatNetSettings
-from remaster_ros.sensors.optitrack.sockets import open_multicast_socket, open_socket
+from remaster_ros.sensors.optitrack.settings import (
+    NatNetSettings,
+    open_multicast_socket,
+    open_socket,
+)
 
 RETRY_S = 0.5
 KEEPALIVE_S = 1.0

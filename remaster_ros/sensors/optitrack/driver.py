@@ -13,8 +13,8 @@ from remaster_ros.parameters import parameter
 from remaster_ros.sensors.clock_offset import ClockMapping
 from remaster_ros.sensors.driver import SensorClock, SensorParameters, SensorState, StreamDriver
 from remaster_ros.sensors.optitrack.client import NatNetClient
-from remaster_ros.sensors.optitrack.diagnosis import warning
 from remaster_ros.sensors.optitrack.frame_gate import MarkerChoice, MarkerSample
+from remaster_ros.sensors.optitrack.marker_follower import warning
 from remaster_ros.sensors.optitrack.natnetclient_backend import READS, NatNetClientBackend
 from remaster_ros.sensors.optitrack.settings import NatNetSettings
 from remaster_ros.types import MarkerReading

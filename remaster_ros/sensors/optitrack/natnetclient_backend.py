@@ -18,20 +18,18 @@ from collections.abc import Callable
 from typing import Any
 
 from remaster_ros.errors import DeviceError, InputError
-from remaster_ros.sensors.optitrack.diagnosis import Diagnosis
 from remaster_ros.sensors.optitrack.frame_gate import Dropped, MarkerSample
-from remaster_ros.sensors.optitrack.marker_follower import MarkerFollower
+from remaster_ros.sensors.optitrack.marker_follower import Diagnosis, MarkerFollower
 from remaster_ros.sensors.optitrack.protocol import natnet
-from remaster_ros.sensors.optitrack.protocol.frames import (
+from remaster_ros.sensors.optitrack.protocol.natnet import (
     MODEL_FILLED,
     OCCLUDED,
+    OLDEST_VERSION,
     Frame,
     LabeledMarker,
+    ProtocolError,
 )
-from remaster_ros.sensors.optitrack.protocol.natnet import ProtocolError
-from remaster_ros.sensors.optitrack.protocol.wire import OLDEST_VERSION
-from remaster_ros.sensors.optitrack.settings import NatNetSettings
-from remaster_ros.sensors.optitrack.sockets import open_socket
+from remaster_ros.sensors.optitrack.settings import NatNetSettings, open_socket
 
 NEWEST_READ = (2, 10)
 READS = 'NatNet 2.6 to 2.10 in unicast only, one marker, from a server on this computer'

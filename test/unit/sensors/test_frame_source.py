@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from remaster_ros.sensors.optitrack.frame_source import (
+from remaster_ros.sensors.optitrack.frame_gate import (
     PROBATION_S,
     REFUSED_FOR_S,
     REMEMBERED,

@@ -13,9 +13,8 @@ import pytest
 from tracker_world import MARKER, ReflectorWorld, across_and_along, wait_for
 
 from remaster_ros.errors import DeviceError, InputError
-from remaster_ros.sensors.laser_tracker.client import LaserTrackerClient
-from remaster_ros.sensors.laser_tracker.link import LaserTrackerError
-from remaster_ros.sensors.laser_tracker.protocol.codes import Status
+from remaster_ros.sensors.laser_tracker.client import LaserTrackerClient, LaserTrackerError
+from remaster_ros.sensors.laser_tracker.protocol.packets import Status
 from remaster_ros.sensors.laser_tracker.settings import (
     Environment,
     LaserTrackerSettings,

@@ -14,11 +14,11 @@ import pytest
 from tracker_world import wait_for
 
 from remaster_ros.errors import DeviceError
-from remaster_ros.sensors.laser_tracker.client import LaserTrackerClient
-from remaster_ros.sensors.laser_tracker.link import LaserTrackerError
-from remaster_ros.sensors.laser_tracker.protocol.codes import Change, Command
+from remaster_ros.sensors.laser_tracker.client import LaserTrackerClient, LaserTrackerError
 from remaster_ros.sensors.laser_tracker.protocol.packets import (
     NEED_DATA,
+    Change,
+    Command,
     ErrorReport,
     Event,
     Measurement,

@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from remaster_ros.sensors.laser_tracker.protocol.codes import Command, Status, describe_status
 from remaster_ros.sensors.laser_tracker.protocol.packets import (
     MAX_PACKET_SIZE,
     NEED_DATA,
+    Command,
     ConnectionClosed,
     ErrorReport,
     Event,
@@ -21,8 +21,10 @@ from remaster_ros.sensors.laser_tracker.protocol.packets import (
     ProtocolError,
     Reply,
     Request,
+    Status,
     StatusChange,
     UnknownPacket,
+    describe_status,
     encode,
 )
 

@@ -7,12 +7,12 @@ import dataclasses
 import pytest
 
 from remaster_ros.errors import InputError
-from remaster_ros.sensors.optitrack.diagnosis import (
+from remaster_ros.sensors.optitrack.frame_gate import Dropped
+from remaster_ros.sensors.optitrack.marker_follower import (
     StreamStatus,
     diagnose,
     warning,
 )
-from remaster_ros.sensors.optitrack.frame_gate import Dropped
 from remaster_ros.sensors.optitrack.protocol.natnet import Connection, ServerInfo
 from remaster_ros.sensors.optitrack.settings import NatNetSettings
 

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from remaster_ros.sensors.optitrack.protocol.frames import (
+from remaster_ros.sensors.optitrack.protocol.natnet import (
     MEASURED,
     OCCLUDED,
     TRACKING_VALID,
@@ -21,12 +21,12 @@ from remaster_ros.sensors.optitrack.protocol.frames import (
     Frame,
     LabeledMarker,
     MarkerSet,
+    ProtocolError,
     RigidBody,
     Skeleton,
     decode_frame,
     encode_frame,
 )
-from remaster_ros.sensors.optitrack.protocol.wire import ProtocolError
 
 VERSIONS = [
     (2, 6), (2, 7), (2, 9), (2, 10), (2, 11), (3, 0), (3, 1), (4, 0), (4, 1), (4, 2), (4, 3),

@@ -10,15 +10,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from remaster_ros.sensors.optitrack.protocol import natnet
-from remaster_ros.sensors.optitrack.protocol.frames import Frame
-from remaster_ros.sensors.optitrack.protocol.models import (
+from remaster_ros.sensors.optitrack.protocol.natnet import (
+    Frame,
     MarkerSetDescription,
+    MessageId,
     ModelDefinition,
     OtherDescription,
+    ProtocolError,
     RigidBodyDescription,
     SkeletonDescription,
 )
-from remaster_ros.sensors.optitrack.protocol.natnet import MessageId, ProtocolError
 
 VERSIONS = [(2, 6), (2, 10), (2, 11), (3, 0), (3, 1), (4, 0), (4, 1), (4, 2), (4, 3)]
 CONNECTION = natnet.Connection(10_000_000, 1511, True, '239.255.42.99')

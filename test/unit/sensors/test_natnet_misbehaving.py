@@ -16,13 +16,14 @@ from remaster_ros.sensors.optitrack import client as natnet_client
 from remaster_ros.sensors.optitrack.client import NatNetClient, _is_of_no_use
 from remaster_ros.sensors.optitrack.frame_gate import Dropped, MarkerChoice
 from remaster_ros.sensors.optitrack.protocol import natnet
-from remaster_ros.sensors.optitrack.protocol.frames import (
+from remaster_ros.sensors.optitrack.protocol.natnet import (
     BITSTREAM_CHANGED,
     MODEL_LIST_CHANGED,
     Frame,
     LabeledMarker,
+    ModelDefinition,
+    RigidBodyDescription,
 )
-from remaster_ros.sensors.optitrack.protocol.models import ModelDefinition, RigidBodyDescription
 from remaster_ros.sensors.optitrack.settings import NatNetSettings
 
 

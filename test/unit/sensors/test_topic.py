@@ -9,8 +9,14 @@ import pytest
 from remaster_ros.errors import DeviceError
 from remaster_ros.sensors.driver import SensorClock
 from remaster_ros.sensors.topic import driver as module
-from remaster_ros.sensors.topic.driver import Parameters, TopicDriver
-from remaster_ros.sensors.topic.messages import MARKERS, POINT, POSE, READERS
+from remaster_ros.sensors.topic.driver import (
+    MARKERS,
+    POINT,
+    POSE,
+    READERS,
+    Parameters,
+    TopicDriver,
+)
 from remaster_ros.session.source_topics import MESSAGE_TYPES
 
 PLACE = (0.5, -0.25, 2.0)

@@ -6,13 +6,16 @@ import numpy as np
 import pytest
 from tracker_world import MARKER, ReflectorWorld, across_and_along
 
-from remaster_ros.sensors.laser_tracker.protocol.codes import Change, Command, Readiness, Status
 from remaster_ros.sensors.laser_tracker.protocol.packets import (
+    Change,
+    Command,
     ErrorReport,
     Event,
     Measurement,
+    Readiness,
     Reply,
     Request,
+    Status,
     StatusChange,
 )
 from remaster_ros.simulation.laser_tracker_instrument import TrackerInstrument

@@ -12,8 +12,7 @@ from optitrack_world import SENSOR, MarkerWorld, SteppedWorld, free_port
 
 from remaster_ros.errors import InputError
 from remaster_ros.sensors.optitrack.protocol import natnet
-from remaster_ros.sensors.optitrack.protocol.frames import TRACKING_VALID, Frame
-from remaster_ros.sensors.optitrack.protocol.natnet import MessageId
+from remaster_ros.sensors.optitrack.protocol.natnet import TRACKING_VALID, Frame, MessageId
 from remaster_ros.simulation.optitrack import MAX_CLIENTS, FakeOptiTrackServer
 from remaster_ros.simulation.optitrack_scene import OptiTrackBehaviour, OptiTrackScene
 

@@ -8,23 +8,885 @@ frames is in `frames`, that of model definitions in `models`. One exception come
 
 from __future__ import annotations
 
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from enum import IntEnum
+from functools import cache, partial
+from itertools import chain
 from struct import Struct
+from typing import Any, NamedTuple
 
-from remaster_ros.sensors.optitrack.protocol.codec import F32, I32, TEXT, Row, number
-from remaster_ros.sensors.optitrack.protocol.frames import Frame, decode_frame, encode_frame
-from remaster_ros.sensors.optitrack.protocol.models import (
-    ModelDefinition,
-    decode_model_definition,
-    encode_model_definition,
-)
-from remaster_ros.sensors.optitrack.protocol.wire import (
-    NEWEST_VERSION,
-    ProtocolError,
-    Reader,
-    Version,
-)
+# The versions of NatNet, and bounds-checked reading of a datagram; no sockets.
+#
+# Everything is little-endian and packed. Bytes from the network may be anything: whatever is
+# wrong with them is raised as `ProtocolError`, and nothing is allocated for a count that the
+# bytes left could not hold.
+
+
+Version = tuple[int, int]
+"""NatNet bitstream version, (major, minor)."""
+
+Vec3 = tuple[float, float, float]
+Quaternion = tuple[float, float, float, float]
+"""x, y, z, w."""
+
+OLDEST_VERSION: Version = (2, 6)
+"""The first bitstream with the flags that distinguish a measured marker from a guessed one."""
+NEWEST_VERSION: Version = (4, 3)
+"""The last described layout; 4.4 and later 4.x are read as this one and fail where they differ."""
+
+MAX_TEXT_BYTES = 256
+"""Longest text on the wire, its final NUL included."""
+
+_I32 = Struct('<i')
+
+
+class ProtocolError(Exception):
+    """Bytes that are not as NatNet defines them; the message states where."""
+
+
+def require_supported(version: Version) -> None:
+    """Raise `ProtocolError` for a bitstream version that this decoder cannot read."""
+    if not (OLDEST_VERSION <= version < (5, 0)):
+        raise ProtocolError(
+            f'NatNet {version[0]}.{version[1]} is unknown here: 2.6 to 4.3 can be read'
+        )
+
+
+class Reader:
+    """A cursor over the bytes of one datagram that refuses to run past the end.
+
+    Parameters
+    ----------
+    data
+        The datagram's payload.
+    """
+
+    __slots__ = ('_data', 'end', 'offset')
+
+    def __init__(self, data: bytes) -> None:
+        self._data = data
+        self.offset = 0
+        self.end = len(data)
+
+    @property
+    def left(self) -> int:
+        """Bytes between the cursor and the end."""
+        return self.end - self.offset
+
+    def unpack(self, layout: Struct) -> tuple[Any, ...]:
+        """Read one struct."""
+        start = self.offset
+        self.skip(layout.size)
+        return layout.unpack_from(self._data, start)
+
+    def rows(self, layout: Struct, count: int) -> list[tuple[Any, ...]]:
+        """Read `count` structs in a row."""
+        start = self.offset
+        self.skip(layout.size * count)
+        return list(layout.iter_unpack(memoryview(self._data)[start : self.offset]))
+
+    def count(self, item_bytes: int) -> int:
+        """Read an i32 count of items that take at least `item_bytes` each."""
+        start = self.offset
+        (count,) = self.unpack(_I32)
+        if count < 0 or count * item_bytes > self.left:
+            raise ProtocolError(f'a count of {count} at byte {start} with {self.left} bytes left')
+        return count
+
+    def text(self) -> bytes:
+        """Read the bytes of a text, without its NUL."""
+        start = self.offset
+        stop = self._data.find(0, start, min(self.end, start + MAX_TEXT_BYTES))
+        if stop < 0:
+            raise ProtocolError(f'text at byte {start} has no end')
+        self.offset = stop + 1
+        return self._data[start:stop]
+
+    def skip(self, size: int) -> None:
+        """Step over `size` bytes."""
+        stop = self.offset + size
+        if not self.offset <= stop <= self.end:
+            raise ProtocolError(f'{size} bytes wanted at byte {self.offset}, {self.left} left')
+        self.offset = stop
+
+    @contextmanager
+    def bounded(self, size: int) -> Iterator[None]:
+        """Let the next `size` bytes be the end; stand behind them afterwards."""
+        if not 0 <= size <= self.left:
+            raise ProtocolError(f'{size} bytes wanted at byte {self.offset}, {self.left} left')
+        end, self.end = self.end, self.offset + size
+        yield
+        self.offset, self.end = self.end, end
+
+
+# How NatNet's items lie in their bytes: one description to read, to write and to step over.
+#
+# A codec is put together from smaller ones for one version of the protocol. What comes from the
+# network may be damaged: a count is checked before anything is allocated for it.
+
+
+_COUNT = Struct('<i')
+_COUNT_AND_SIZE = Struct('<2i')
+
+
+class Codec(ABC):
+    """Reads, writes and steps over one item.
+
+    Attributes
+    ----------
+    least
+        The fewest bytes that an item takes.
+    """
+
+    least: int
+
+    @abstractmethod
+    def read(self, reader: Reader) -> Any:
+        """Read an item; `ProtocolError` where the bytes are not one."""
+
+    @abstractmethod
+    def skip(self, reader: Reader) -> None:
+        """Step over an item, whose counts are checked and whose numbers are not looked at."""
+
+    @abstractmethod
+    def write(self, item: Any) -> bytes:
+        """Write an item; `ValueError` or `struct.error` where it does not fit."""
+
+    def read_many(self, reader: Reader, count: int) -> tuple[Any, ...]:
+        """Read items that follow one another."""
+        return tuple([self.read(reader) for _ in range(count)])
+
+    def skip_many(self, reader: Reader, count: int) -> None:
+        """Step over items that follow one another."""
+        for _ in range(count):
+            self.skip(reader)
+
+
+def _same(item: Any) -> Any:
+    return item
+
+
+class Row(Codec):
+    """Numbers of a fixed layout.
+
+    Parameters
+    ----------
+    layout
+        `struct` format, without the byte order.
+    build
+        Makes the items of rows of numbers.
+    flatten
+        Undoes it, for one item.
+    """
+
+    def __init__(
+        self,
+        layout: str,
+        build: Callable[[list[tuple]], Sequence[Any]] = _same,
+        flatten: Callable[[Any], Sequence[Any]] = _same,
+    ) -> None:
+        self.layout = Struct('<' + layout)
+        self.least = self.layout.size
+        self._build, self._flatten = build, flatten
+
+    def read(self, reader: Reader) -> Any:
+        """Read one row."""
+        return self._build([reader.unpack(self.layout)])[0]
+
+    def skip(self, reader: Reader) -> None:
+        """Step over one row."""
+        reader.skip(self.least)
+
+    def write(self, item: Any) -> bytes:
+        """Write one row."""
+        return self.layout.pack(*self._flatten(item))
+
+    def read_many(self, reader: Reader, count: int) -> tuple[Any, ...]:
+        """Read rows at once."""
+        return tuple(self._build(reader.rows(self.layout, count)))
+
+    def skip_many(self, reader: Reader, count: int) -> None:
+        """Step over rows at once."""
+        reader.skip(self.least * count)
+
+
+def number(layout: str) -> Row:
+    """Return the codec of a single number."""
+    return Row(layout, lambda rows: list(chain.from_iterable(rows)), lambda value: (value,))
+
+
+class _Text(Codec):
+    """UTF-8 text up to its NUL; bytes that are no UTF-8 become U+FFFD."""
+
+    least = 1
+
+    def read(self, reader: Reader) -> str:
+        return reader.text().decode('utf-8', 'replace')
+
+    def skip(self, reader: Reader) -> None:
+        reader.text()
+
+    def write(self, item: str) -> bytes:
+        data = item.encode('utf-8')
+        if b'\0' in data or len(data) >= MAX_TEXT_BYTES:
+            raise ValueError(
+                f'NatNet cannot carry the text {item[:40]!r}: a NUL, or over 255 bytes'
+            )
+        return data + b'\0'
+
+
+TEXT = _Text()
+I32 = number('i')
+F32 = number('f')
+VEC3 = Row('3f')
+QUATERNION = Row('4f')
+
+
+class Record(Codec):
+    """Items of different kinds that follow one another.
+
+    Parameters
+    ----------
+    build
+        Makes the record of the items.
+    parts
+        Their codecs.
+    flatten
+        Undoes `build`; a named tuple is its own items.
+    """
+
+    def __init__(
+        self,
+        build: Callable[..., Any],
+        *parts: Codec,
+        flatten: Callable[[Any], Sequence[Any]] = _same,
+    ) -> None:
+        self._build, self._parts, self._flatten = build, parts, flatten
+        self.least = sum(part.least for part in parts)
+
+    def read(self, reader: Reader) -> Any:
+        """Read the items in their order."""
+        return self._build(*[part.read(reader) for part in self._parts])
+
+    def skip(self, reader: Reader) -> None:
+        """Step over the items."""
+        for part in self._parts:
+            part.skip(reader)
+
+    def write(self, item: Any) -> bytes:
+        """Write the items in their order."""
+        values = self._flatten(item)
+        return b''.join(part.write(value) for part, value in zip(self._parts, values))
+
+
+class Columns(Codec):
+    """A count, then so many items of the first kind, so many of the second, and so on.
+
+    Read as a tuple of columns.
+    """
+
+    least = _COUNT.size
+
+    def __init__(self, *kinds: Codec) -> None:
+        self._kinds = kinds
+        self._least_row = sum(kind.least for kind in kinds)
+
+    def read(self, reader: Reader) -> tuple[Any, ...]:
+        """Read the columns."""
+        count = reader.count(self._least_row)
+        return tuple([kind.read_many(reader, count) for kind in self._kinds])
+
+    def skip(self, reader: Reader) -> None:
+        """Step over the columns."""
+        count = reader.count(self._least_row)
+        for kind in self._kinds:
+            kind.skip_many(reader, count)
+
+    def write(self, item: Sequence[Sequence[Any]]) -> bytes:
+        """Write the columns, which are equally long."""
+        columns = [map(kind.write, column) for kind, column in zip(self._kinds, item)]
+        return _COUNT.pack(len(item[0])) + b''.join(chain(*columns))
+
+
+class List(Codec):
+    """A count and so many items of one kind."""
+
+    least = _COUNT.size
+
+    def __init__(self, kind: Codec) -> None:
+        self.kind = kind
+
+    def read(self, reader: Reader) -> tuple[Any, ...]:
+        """Read the items."""
+        return self.kind.read_many(reader, reader.count(self.kind.least))
+
+    def skip(self, reader: Reader) -> None:
+        """Step over the items."""
+        self.kind.skip_many(reader, reader.count(self.kind.least))
+
+    def write(self, item: Sequence[Any]) -> bytes:
+        """Write the items."""
+        return _COUNT.pack(len(item)) + b''.join(map(self.kind.write, item))
+
+
+class SizedList(List):
+    """A count, the size in bytes of all items, and the items.
+
+    The size bounds the items, and what a newer server adds behind them is skipped. Items of a
+    fixed layout must fill the size: another size shows that the layout is not the known one.
+    """
+
+    least = _COUNT_AND_SIZE.size
+
+    def _head(self, reader: Reader) -> tuple[int, int]:
+        count, size = reader.unpack(_COUNT_AND_SIZE)
+        if count < 0 or not count * self.kind.least <= size <= reader.left:
+            raise ProtocolError(f'a section of {count} items in {size} bytes, {reader.left} left')
+        return count, size
+
+    def read(self, reader: Reader) -> tuple[Any, ...]:
+        """Read the items."""
+        count, size = self._head(reader)
+        if isinstance(self.kind, Row):
+            if size == count * self.kind.least:
+                return self.kind.read_many(reader, count)
+            raise ProtocolError(
+                f'a section of {count} items of {self.kind.least} bytes that claims {size} bytes'
+            )
+        with reader.bounded(size):
+            return self.kind.read_many(reader, count)
+
+    def skip(self, reader: Reader) -> None:
+        """Step over the items at once."""
+        reader.skip(self._head(reader)[1])
+
+    def write(self, item: Sequence[Any]) -> bytes:
+        """Write the items."""
+        body = b''.join(map(self.kind.write, item))
+        return _COUNT_AND_SIZE.pack(len(item), len(body)) + body
+
+
+# FRAMEOFDATA, the message that carries marker positions, NatNet 2.6 to 4.3.
+#
+# Lengths are metres in the axes chosen in Motive. A position counts only where its item claims to
+# be measured: see the flags of `LabeledMarker` and `RigidBody`.
+
+
+OCCLUDED = 1 << 0
+MEASURED = 1 << 1
+"""Solved from the cameras' rays (the point cloud)."""
+MODEL_FILLED = 1 << 2
+"""Position inferred from the asset's other markers."""
+HAS_MODEL = 1 << 3
+UNLABELED = 1 << 4
+TRACKING_VALID = 1 << 0
+RECORDING = 1 << 0
+MODEL_LIST_CHANGED = 1 << 1
+NOT_LIVE = 1 << 2
+"""Motive plays a recording (Edit mode)."""
+BITSTREAM_CHANGED = 1 << 3
+
+
+class LabeledMarker(NamedTuple):
+    """One entry of the labelled list, which holds every marker, the strays too.
+
+    Attributes
+    ----------
+    id
+        ``asset id << 16 | member`` (member from 1) for a marker of an asset; arbitrary otherwise.
+    position
+        m, (3,). Not measured where `params` has `OCCLUDED` or `MODEL_FILLED`.
+    size
+        Diameter, m.
+    params
+        The flags above; NatNet 2 has the first three only.
+    residual
+        Metres per ray; None before NatNet 3.
+    """
+
+    id: int
+    position: Vec3
+    size: float
+    params: int
+    residual: float | None = None
+
+
+class BodyMarker(NamedTuple):
+    """A marker inside a rigid body; only NatNet 2 sends these."""
+
+    position: Vec3
+    id: int
+    size: float
+
+
+class RigidBody(NamedTuple):
+    """Pose of a body or bone; stale or zero unless `params` has `TRACKING_VALID`."""
+
+    id: int
+    position: Vec3
+    orientation_xyzw: Quaternion
+    mean_error: float
+    params: int
+    markers: tuple[BodyMarker, ...] = ()
+
+
+class MarkerSet(NamedTuple):
+    """A named list of positions, m; the one called ``all`` repeats the others. No flags."""
+
+    name: str
+    positions: tuple[Vec3, ...]
+
+
+class Skeleton(NamedTuple):
+    """Bones of one skeleton."""
+
+    id: int
+    bodies: tuple[RigidBody, ...]
+
+
+class Asset(NamedTuple):
+    """A trained marker set (4.1+): bones and markers."""
+
+    id: int
+    bodies: tuple[RigidBody, ...]
+    markers: tuple[LabeledMarker, ...]
+
+
+class AnalogDevice(NamedTuple):
+    """Samples of a force plate or another analog device, one tuple a channel."""
+
+    id: int
+    channels: tuple[tuple[float, ...], ...]
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One frame of data.
+
+    Attributes
+    ----------
+    number
+        Frame number; starts again with the stream, loops in Edit mode.
+    timestamp
+        Seconds since Motive, or the recording, started.
+    other_markers
+        Unlabelled positions, m (deprecated by OptiTrack; also in `labeled_markers`).
+    mid_exposure, data_received, transmitted
+        Server clock ticks (3.0+); `mid_exposure` is 0 where the cameras have no such clock.
+    precision_seconds, precision_fraction
+        PTP time (4.1+), else 0.
+    software_latency
+        Seconds, before 3.0 only.
+    params
+        `RECORDING`, `MODEL_LIST_CHANGED`, `NOT_LIVE`, `BITSTREAM_CHANGED`.
+    """
+
+    number: int
+    timestamp: float
+    labeled_markers: tuple[LabeledMarker, ...] = ()
+    rigid_bodies: tuple[RigidBody, ...] = ()
+    marker_sets: tuple[MarkerSet, ...] = ()
+    other_markers: tuple[Vec3, ...] = ()
+    skeletons: tuple[Skeleton, ...] = ()
+    assets: tuple[Asset, ...] = ()
+    force_plates: tuple[AnalogDevice, ...] = ()
+    devices: tuple[AnalogDevice, ...] = ()
+    software_latency: float = 0.0
+    timecode: int = 0
+    timecode_sub: int = 0
+    mid_exposure: int = 0
+    data_received: int = 0
+    transmitted: int = 0
+    precision_seconds: int = 0
+    precision_fraction: int = 0
+    params: int = 0
+
+
+def decode_frame(payload: bytes, version: Version, *, markers_only: bool = False) -> Frame:
+    """Decode the payload of a FRAMEOFDATA datagram, to its end tag.
+
+    Parameters
+    ----------
+    payload
+        The bytes behind the 4-byte header.
+    version
+        The server's bitstream version.
+    markers_only
+        Step over everything but the labelled markers and the times: every count is checked, but
+        what is stepped over is left out and its numbers are not looked at. Half the work.
+
+    Raises
+    ------
+    ProtocolError
+        If the version is unknown, the bytes end early or late, a count does not fit, or a number
+        that must be finite is not. Positions of occluded markers and untracked bodies claim
+        nothing and may be anything.
+    """
+    require_supported(version)
+    layout = _layout(min(version, NEWEST_VERSION))
+    reader = Reader(payload)
+    frame = {'number': I32.read(reader)}
+    for name, codec in layout.sections.items():
+        if markers_only and name != 'labeled_markers':
+            codec.skip(reader)
+        else:
+            frame[name] = codec.read(reader)
+    *rest, tag = reader.unpack(layout.rest)
+    frame.update(zip(layout.rest_names, rest))
+    if tag != 0 or reader.left:
+        raise ProtocolError(
+            f'frame {frame["number"]} does not end where it should '
+            f'(tag {tag}, {reader.left} bytes left)'
+        )
+    _require_finite((frame['timestamp'], frame.get('software_latency', 0.0)), 'time')
+    return Frame(**frame)
+
+
+def encode_frame(frame: Frame, version: Version) -> bytes:
+    """Encode the payload of a FRAMEOFDATA message; what the version does not have is left out.
+
+    Raises
+    ------
+    ProtocolError
+        If the version is unknown.
+    ValueError, struct.error
+        If a value does not fit its field.
+    """
+    require_supported(version)
+    layout = _layout(min(version, NEWEST_VERSION))
+    sections = [codec.write(getattr(frame, name)) for name, codec in layout.sections.items()]
+    rest = [getattr(frame, name) for name in layout.rest_names]
+    return b''.join((I32.write(frame.number), *sections, layout.rest.pack(*rest, 0)))
+
+
+class _Layout(NamedTuple):
+    """A frame of one version: its sections in order, then numbers; all named as in `Frame`."""
+
+    sections: dict[str, Codec]
+    rest_names: tuple[str, ...]
+    rest: Struct
+
+
+@cache
+def _layout(version: Version) -> _Layout:
+    """Describe the frame of a version."""
+    since_3, since_4_1 = version >= (3, 0), version >= (4, 1)
+    section = SizedList if since_4_1 else List
+    body = _BODY_3 if since_3 else _BODY_2
+    labeled = _LABELED_3 if since_3 else _LABELED_2
+    analog = Record(AnalogDevice, I32, List(List(F32)))
+    sections: dict[str, Codec] = {
+        'marker_sets': section(Record(MarkerSet, TEXT, List(_POSITION))),
+        'other_markers': section(_POSITION),
+        'rigid_bodies': section(body),
+        'skeletons': section(Record(Skeleton, I32, List(body))),
+    }
+    if since_4_1:
+        sections['assets'] = section(Record(Asset, I32, List(body), List(labeled)))
+    sections['labeled_markers'] = section(labeled)
+    if version >= (2, 9):
+        sections['force_plates'] = section(analog)
+    if version >= (2, 11):
+        sections['devices'] = section(analog)
+    rest = {} if since_3 else {'software_latency': 'f'}
+    rest |= {'timecode': 'I', 'timecode_sub': 'I', 'timestamp': 'd' if version >= (2, 7) else 'f'}
+    if since_3:
+        rest |= {'mid_exposure': 'Q', 'data_received': 'Q', 'transmitted': 'Q'}
+    if since_4_1:
+        rest |= {'precision_seconds': 'I', 'precision_fraction': 'I'}
+    rest['params'] = 'H'
+    end_tag = 'i'
+    return _Layout(sections, tuple(rest), Struct('<' + ''.join(rest.values()) + end_tag))
+
+
+def _require_finite(values: Iterable[float], what: str) -> None:
+    if not all(map(math.isfinite, values)):
+        raise ProtocolError(f'the {what} is not finite')
+
+
+def _positions(rows: list[tuple]) -> list[tuple]:
+    _require_finite(chain.from_iterable(rows), 'position of a marker')
+    return rows
+
+
+def _labeled(rows: list[tuple], *, has_residual: bool) -> list[LabeledMarker]:
+    """Build the labelled markers; the sum of all numbers shows whether one is not finite."""
+    # The named tuple's own constructor would take as long as all the rest of a frame.
+    make = tuple.__new__
+    if has_residual:
+        markers = [
+            make(LabeledMarker, (label, (x, y, z), size, params, residual))
+            for label, x, y, z, size, params, residual in rows
+        ]
+    else:
+        markers = [
+            make(LabeledMarker, (label, (x, y, z), size, params, None))
+            for label, x, y, z, size, params in rows
+        ]
+    if not math.isfinite(sum(chain.from_iterable(rows))):
+        for marker in markers:
+            if not marker.params & OCCLUDED:
+                _require_finite(marker.position, f'position of marker {marker.id}')
+    return markers
+
+
+def _flat_labeled_2(marker: LabeledMarker) -> tuple:
+    return marker.id, *marker.position, marker.size, marker.params
+
+
+def _flat_labeled_3(marker: LabeledMarker) -> tuple:
+    return *_flat_labeled_2(marker), math.nan if marker.residual is None else marker.residual
+
+
+def _bodies_3(rows: list[tuple]) -> list[RigidBody]:
+    bodies = [RigidBody(row[0], row[1:4], row[4:8], row[8], row[9]) for row in rows]
+    for body in bodies:
+        _require_finite_if_tracked(body)
+    return bodies
+
+
+def _flat_body_3(body: RigidBody) -> tuple:
+    return body.id, *body.position, *body.orientation_xyzw, body.mean_error, body.params
+
+
+def _body_2(head: tuple, columns: tuple[tuple, ...], end: tuple) -> RigidBody:
+    markers = tuple(map(BodyMarker, *columns))
+    mean_error, params = end
+    body = RigidBody(head[0], head[1:4], head[4:8], mean_error, params, markers)
+    _require_finite_if_tracked(body)
+    return body
+
+
+def _parts_of_body_2(body: RigidBody) -> tuple:
+    columns = tuple(zip(*body.markers)) or ((), (), ())
+    head = body.id, *body.position, *body.orientation_xyzw
+    return head, columns, (body.mean_error, body.params)
+
+
+def _require_finite_if_tracked(body: RigidBody) -> None:
+    if not body.params & TRACKING_VALID:
+        return
+    _require_finite(body.position + body.orientation_xyzw, f'pose of rigid body {body.id}')
+    inside = chain.from_iterable([marker.position for marker in body.markers])
+    _require_finite(inside, f'position of a marker of body {body.id}')
+
+
+_POSITION = Row('3f', _positions)
+_LABELED_2 = Row('i4fH', partial(_labeled, has_residual=False), _flat_labeled_2)
+_LABELED_3 = Row('i4fHf', partial(_labeled, has_residual=True), _flat_labeled_3)
+_BODY_2 = Record(_body_2, Row('i7f'), Columns(VEC3, I32, F32), Row('fH'), flatten=_parts_of_body_2)
+_BODY_3 = Row('i8fH', _bodies_3, _flat_body_3)
+
+
+MARKER_SET, RIGID_BODY, SKELETON, FORCE_PLATE, DEVICE, CAMERA, ASSET = range(7)
+
+_IDENTITY: Quaternion = (0.0, 0.0, 0.0, 1.0)
+
+
+class MarkerSetDescription(NamedTuple):
+    """A marker set and the names of its markers."""
+
+    name: str
+    marker_names: tuple[str, ...]
+
+
+class RigidBodyDescription(NamedTuple):
+    """A rigid body.
+
+    Attributes
+    ----------
+    id
+        The id in the frames; its marker number m is the labelled marker ``id << 16 | m``.
+    parent_id
+        -1 for none.
+    offset, offset_rotation
+        Pose relative to the parent, m and x, y, z, w (the rotation is sent since 4.2).
+    marker_positions
+        In the body's own axes, m (since 3.0).
+    marker_labels
+        Required active label of each marker, 0 for passive ones (since 3.0).
+    marker_names
+        Since 4.0.
+    """
+
+    name: str
+    id: int
+    parent_id: int = -1
+    offset: Vec3 = (0.0, 0.0, 0.0)
+    offset_rotation: Quaternion = _IDENTITY
+    marker_positions: tuple[Vec3, ...] = ()
+    marker_labels: tuple[int, ...] = ()
+    marker_names: tuple[str, ...] = ()
+
+
+class SkeletonDescription(NamedTuple):
+    """A skeleton and its bones."""
+
+    name: str
+    id: int
+    bodies: tuple[RigidBodyDescription, ...]
+
+
+class OtherDescription(NamedTuple):
+    """A force plate, device, camera or asset: only what names it is kept.
+
+    Attributes
+    ----------
+    kind
+        The wire's type number, `FORCE_PLATE` to `ASSET`, or one unknown here.
+    id
+        None for cameras, which have none, and for unknown kinds.
+    """
+
+    kind: int
+    name: str
+    id: int | None = None
+
+
+Description = MarkerSetDescription | RigidBodyDescription | SkeletonDescription | OtherDescription
+
+
+@dataclass(frozen=True)
+class ModelDefinition:
+    """Everything the server streams, in its order."""
+
+    descriptions: tuple[Description, ...] = ()
+
+    @property
+    def rigid_bodies(self) -> tuple[RigidBodyDescription, ...]:
+        """The rigid bodies that are no part of a skeleton."""
+        return tuple(d for d in self.descriptions if isinstance(d, RigidBodyDescription))
+
+    @property
+    def labelled_assets(self) -> dict[str, int]:
+        """Ids by name of what labels markers: rigid bodies and (4.1+) trained marker sets."""
+        named = {
+            d.name: d.id
+            for d in self.descriptions
+            if isinstance(d, OtherDescription) and d.kind == ASSET and d.id is not None
+        }
+        return named | {body.name: body.id for body in self.rigid_bodies}
+
+
+def decode_model_definition(payload: bytes, version: Version) -> ModelDefinition:
+    """Decode the payload of a MODELDEF datagram.
+
+    Bytes behind the last description, and from 4.1 on behind each, are skipped: servers newer
+    than this decoder put new fields there.
+
+    Raises
+    ------
+    ProtocolError
+        If the version is unknown, the bytes end early or a count does not fit.
+    """
+    require_supported(version)
+    reader = Reader(payload)
+    count = reader.count(8 if version >= (4, 1) else 4)
+    return ModelDefinition(tuple([_read(reader, version) for _ in range(count)]))
+
+
+def encode_model_definition(definition: ModelDefinition, version: Version) -> bytes:
+    """Encode the payload of a MODELDEF message.
+
+    Raises
+    ------
+    ProtocolError
+        If the version is unknown.
+    ValueError
+        If a name is too long, or a description is of a kind whose details are not kept.
+    """
+    require_supported(version)
+    descriptions = [_write(description, version) for description in definition.descriptions]
+    return I32.write(len(descriptions)) + b''.join(descriptions)
+
+
+def _read(reader: Reader, version: Version) -> Description:
+    kind = I32.read(reader)
+    codec = _codecs(min(version, NEWEST_VERSION)).get(kind)
+    if version < (4, 1):
+        if codec is None:
+            # Without a byte size there is no way to find the next description.
+            raise ProtocolError(f'a description of the unknown kind {kind}')
+        return codec.read(reader)
+    with reader.bounded(I32.read(reader)):
+        return OtherDescription(kind, '') if codec is None else codec.read(reader)
+
+
+def _write(description: Description, version: Version) -> bytes:
+    kind = _KINDS.get(type(description))
+    if kind is None:
+        raise ValueError(f'only the name of {description.name!r} is kept: it cannot be encoded')
+    body = _codecs(min(version, NEWEST_VERSION))[kind].write(description)
+    size = I32.write(len(body)) if version >= (4, 1) else b''
+    return I32.write(kind) + size + body
+
+
+_KINDS: dict[type, int] = {
+    MarkerSetDescription: MARKER_SET,
+    RigidBodyDescription: RIGID_BODY,
+    SkeletonDescription: SKELETON,
+}
+
+
+@cache
+def _codecs(version: Version) -> dict[int, Codec]:
+    """Return how each kind of description lies in its bytes in a version."""
+    body = _rigid_body(version)
+    codecs: dict[int, Codec] = {
+        MARKER_SET: Record(MarkerSetDescription, TEXT, List(TEXT)),
+        RIGID_BODY: body,
+        SKELETON: Record(SkeletonDescription, TEXT, I32, List(body)),
+    }
+    if version >= (3, 0):
+        plate = Row(f'{2 + 3 + 144 + 12}f2i')
+        marker = Record(lambda *_: None, TEXT, Row('i4fH'))
+        codecs |= {
+            FORCE_PLATE: Record(
+                lambda plate_id, serial, *_: OtherDescription(FORCE_PLATE, serial, plate_id),
+                *(I32, TEXT, plate, List(TEXT)),
+            ),
+            DEVICE: Record(
+                lambda device_id, name, *_: OtherDescription(DEVICE, name, device_id),
+                *(I32, TEXT, TEXT, Row('2i'), List(TEXT)),
+            ),
+            CAMERA: Record(lambda name, _pose: OtherDescription(CAMERA, name), TEXT, Row('7f')),
+            ASSET: Record(
+                lambda name, type_and_id, *_: OtherDescription(ASSET, name, type_and_id[1]),
+                *(TEXT, Row('2i'), List(body), List(marker)),
+            ),
+        }
+    return codecs
+
+
+def _rigid_body(version: Version) -> Record:
+    """Return how a rigid body lies in its bytes: the fields were added one after the other."""
+    has_rotation, has_markers = version >= (4, 2), version >= (3, 0)
+    columns: list[Codec] = [VEC3, I32]
+    if version >= (4, 0):
+        columns.append(TEXT)
+
+    def build(name: str, ids_and_offset: tuple, *rest: tuple) -> RigidBodyDescription:
+        rotation = rest[0] if has_rotation else _IDENTITY
+        markers = rest[-1] if has_markers else ()
+        body_id, parent_id, *offset = ids_and_offset
+        return RigidBodyDescription(name, body_id, parent_id, tuple(offset), rotation, *markers)
+
+    def flatten(body: RigidBodyDescription) -> list:
+        rotation = [body.offset_rotation] if has_rotation else []
+        markers = [(body.marker_positions, body.marker_labels, body.marker_names)]
+        return [body.name, (body.id, body.parent_id, *body.offset), *rotation, *markers]
+
+    parts: list[Codec] = [TEXT, Row('2i3f')]
+    if has_rotation:
+        parts.append(QUATERNION)
+    if has_markers:
+        parts.append(Columns(*columns))
+    return Record(build, *parts, flatten=flatten)
+
 
 DEFAULT_COMMAND_PORT = 1510
 DEFAULT_DATA_PORT = 1511
