@@ -10,8 +10,8 @@ from remaster_ros.collection.events import ConfigurationEnded
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.nodes.demo import free_ports
 from remaster_ros.session.journal import read_journal
+from remaster_ros.session.plan_journal import read_plan
 from remaster_ros.session.reader import read_session
-from remaster_ros.session.recorded_plan import read_plan
 from remaster_ros.session.workcell import read_cell
 from remaster_ros.simulation.setup import make_world
 

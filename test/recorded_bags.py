@@ -11,7 +11,7 @@ from rosbags.typesys import Stores, get_typestore
 from remaster_ros.collection import events
 from remaster_ros.kinematics.transforms import apply, inverse, transform
 from remaster_ros.session.bag_writer import BagWriter
-from remaster_ros.session.recorder_parameters import Parameters
+from remaster_ros.session.session_recorder import Parameters
 from remaster_ros.session.workcell import read_cell
 
 STORE = get_typestore(Stores.ROS2_JAZZY)

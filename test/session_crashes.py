@@ -17,9 +17,9 @@ from remaster_ros.session import session_yaml
 from remaster_ros.session.journal import Journal
 from remaster_ros.session.reader import read_session
 from remaster_ros.session.recovery import recover_session
-from remaster_ros.session.safe_yaml import load_yaml
 from remaster_ros.session.session_opening import PLAN
 from remaster_ros.session.session_writer import SessionWriter
+from remaster_ros.session.yaml_records import load_yaml
 from remaster_ros.types import Measurements, Observation, Session
 
 JOINT = """<joint name="joint_{n}" type="revolute">

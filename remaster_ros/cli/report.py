@@ -19,7 +19,7 @@ from remaster_ros.reports.answer_inputs import parts, read_inputs
 from remaster_ros.reports.answer_plan import PlanFacts, plan_facts, plan_to_dict
 from remaster_ros.reports.fit_json import FIT_FILE, REPORT_FILE, prepare_folder, save_fit
 from remaster_ros.session.files import undone_on_failure
-from remaster_ros.session.recorded_plan import read_plan
+from remaster_ros.session.plan_journal import read_plan
 
 FIT_FOLDER = 'fit'
 

@@ -21,8 +21,7 @@ from remaster_ros.nodes.bagging import BagRecorder
 from remaster_ros.nodes.running import RemasterNode
 from remaster_ros.nodes.simulated_clock import SteadyTime
 from remaster_ros.nodes.triggered_sensors import TriggeredSensors
-from remaster_ros.session.recorder_parameters import Parameters
-from remaster_ros.session.session_recorder import SessionRecorder
+from remaster_ros.session.session_recorder import Parameters, SessionRecorder
 from remaster_ros.session.workcell import Workcell
 
 

@@ -53,8 +53,7 @@ from remaster_ros.nodes.running import RemasterNode, run
 from remaster_ros.nodes.status import JOINT_STATES, LATCHED, RELIABLE, NodeStatus, Summary, listen
 from remaster_ros.planning.collection_plan import session_time_s
 from remaster_ros.planning.tour_order import REGISTRATION, PoseVisit
-from remaster_ros.session.plan_journal import PlanJournal
-from remaster_ros.session.plan_records import NO_FREE_PATH
+from remaster_ros.session.plan_journal import NO_FREE_PATH, PlanJournal
 from remaster_ros.session.workcell import read_cell
 from remaster_ros.types import FloatArray
 

@@ -44,8 +44,12 @@ from remaster_ros.nodes.status import (
     receiver,
     taken_key,
 )
-from remaster_ros.session.recorder_parameters import Parameters, session_header
-from remaster_ros.session.session_recorder import Outlet, SessionRecorder
+from remaster_ros.session.session_recorder import (
+    Outlet,
+    Parameters,
+    SessionRecorder,
+    session_header,
+)
 from remaster_ros.session.workcell import read_cell
 from remaster_ros.types import FloatArray
 

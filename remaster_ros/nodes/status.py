@@ -34,7 +34,7 @@ from remaster_ros.collection.events import (
 from remaster_ros.errors import InputError
 from remaster_ros.motion.rivalry import DuplicateNodeCheck
 from remaster_ros.nodes.qos_mismatch import mismatches
-from remaster_ros.session.bag_metadata import LATCHED_DEPTH
+from remaster_ros.session.bag import LATCHED_DEPTH
 
 TOPIC = 'remaster/status'
 EVENTS = 'remaster/events'

@@ -14,12 +14,11 @@ from remaster_ros.motion.trajectory import Trajectory
 from remaster_ros.planning.candidates import PlannedPose
 from remaster_ros.planning.planned_design import NO_FREE_PATH, Designed
 from remaster_ros.planning.separating_design import SeparatingDesign
-from remaster_ros.planning.tour_order import PoseVisit, Tour
+from remaster_ros.planning.tour_order import FITTED, PoseVisit, Tour
 from remaster_ros.planning.tour_planner import TourPlanner
 from remaster_ros.planning.travel_time import TravelTime
 from remaster_ros.types import FloatArray
 
-FITTED = 'optimization'
 REGISTERING = 3
 """Poses that register the sensors; the others of their plan are visited where one is not seen."""
 

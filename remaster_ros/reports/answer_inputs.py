@@ -27,7 +27,7 @@ from remaster_ros.reports.predictions_csv import PREDICTED, PREDICTIONS_FILE
 from remaster_ros.reports.rows_csv import AFTER, BEFORE, RESIDUALS_FILE, read_columns
 from remaster_ros.reports.schemas import Fit, FittedGeometry, Judgement
 from remaster_ros.session.files import decode_text, read_limited
-from remaster_ros.session.recorded_plan import RecordedPlan
+from remaster_ros.session.plan_journal import RecordedPlan
 from remaster_ros.types import FloatArray, Session
 
 

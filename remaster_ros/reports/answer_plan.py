@@ -15,7 +15,7 @@ from remaster_ros.errors import InputError
 from remaster_ros.reports.answer_inputs import Inputs
 from remaster_ros.reports.plan_page import WORDS, read_plan_page
 from remaster_ros.session.files import write_atomically
-from remaster_ros.session.recorded_plan import RecordedPlan
+from remaster_ros.session.plan_journal import RecordedPlan
 
 PLAN_FILE = 'plan.html'
 RECORDED = ('recorded', 'partial')

@@ -4,23 +4,222 @@ from __future__ import annotations
 
 import logging
 import os
+import struct
 import zlib
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
-from typing import NamedTuple
+from typing import IO, Any, NamedTuple
 
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
-from mcap.records import Channel, Message, Schema
+from mcap.records import Channel, Chunk, Message, Schema
 from mcap.writer import MCAP0_MAGIC
 
 from remaster_ros.errors import InputError
-from remaster_ros.session.bag_metadata import FileMetadata, all_of
 from remaster_ros.session.files import reason
 from remaster_ros.session.manifest import check_file, read_manifest
-from remaster_ros.session.mcap_frames import CutOffError, frames, unchunked, without_zeros
+from remaster_ros.session.yaml_records import dump_yaml
+
+METADATA_FILE = 'metadata.yaml'
+
+# rosbag2 writes an empty bag's start, and QoS "for ever", as these.
+_NEVER_NS = 2**63 - 1
+LATCHED_DEPTH = 10
+"""How many messages of a latched topic a late joiner gets: as the nodes' publishers have it."""
+_FOREVER = {'sec': 9223372036, 'nsec': 854775807}
+
+
+@dataclass
+class TopicMetadata:
+    """A topic as metadata.yaml lists it; ``count`` is the number of its messages so far."""
+
+    topic: str
+    msgtype: str
+    type_hash: str
+    latched: bool
+    count: int = 0
+
+
+@dataclass
+class FileMetadata:
+    """A file of a bag as metadata.yaml lists it; `first_ns` is None where it holds nothing."""
+
+    name: str
+    first_ns: int | None = None
+    last_ns: int = 0
+    count: int = 0
+
+    def add(self, stamp_ns: int) -> None:
+        """Count a message."""
+        if self.first_ns is None:
+            self.first_ns = stamp_ns
+        self.last_ns = stamp_ns
+        self.count += 1
+
+    def span(self) -> dict[str, Any]:
+        """Return start, duration and number of messages as metadata.yaml has them."""
+        first = self.first_ns
+        return {
+            'starting_time': {'nanoseconds_since_epoch': _NEVER_NS if first is None else first},
+            'duration': {'nanoseconds': 0 if first is None else self.last_ns - first},
+            'message_count': self.count,
+        }
+
+
+def all_of(files: list[FileMetadata]) -> FileMetadata:
+    """Return several files, in the order recorded, as one without a name."""
+    filled = [file for file in files if file.count]
+    if not filled:
+        return FileMetadata('')
+    count = sum(file.count for file in filled)
+    return FileMetadata('', filled[0].first_ns, filled[-1].last_ns, count)
+
+
+def metadata_text(files: list[FileMetadata], topics: Iterable[TopicMetadata]) -> str:
+    """Return metadata.yaml for a bag of these MCAP files, in the order recorded."""
+    information: dict[str, Any] = {
+        'version': 9,
+        'storage_identifier': 'mcap',
+        **all_of(files).span(),
+        'topics_with_message_count': [
+            {
+                'topic_metadata': {
+                    'name': topic.topic,
+                    'type': topic.msgtype,
+                    'serialization_format': 'cdr',
+                    'offered_qos_profiles': _qos(topic.latched),
+                    'type_description_hash': topic.type_hash,
+                },
+                'message_count': topic.count,
+            }
+            for topic in topics
+        ],
+        'compression_format': '',
+        'compression_mode': '',
+        'relative_file_paths': [file.name for file in files],
+        'files': [{'path': file.name, **file.span()} for file in files],
+        'custom_data': None,
+        'ros_distro': 'jazzy',
+    }
+    return dump_yaml({'rosbag2_bagfile_information': information})
+
+
+def qos_text(latched: bool) -> str:
+    """Return a topic's offered QoS as the MCAP channel keeps it."""
+    return dump_yaml(_qos(latched))
+
+
+def _qos(latched: bool) -> list[dict[str, Any]]:
+    return [
+        {
+            'history': 'keep_last',
+            # As the publishers offer it: who joins late gets the registration of every sensor.
+            'depth': LATCHED_DEPTH if latched else 10,
+            'reliability': 'reliable',
+            'durability': 'transient_local' if latched else 'volatile',
+            # Copies: YAML would write a shared object as an alias.
+            'deadline': dict(_FOREVER),
+            'lifespan': dict(_FOREVER),
+            'liveliness': 'automatic',
+            'liveliness_lease_duration': dict(_FOREVER),
+            'avoid_ros_namespace_conventions': False,
+        }
+    ]
+
+
+CHUNK_LIMIT = 256 * 1024**2
+"""Bytes of an unpacked chunk: recorders begin a new one after one or a few megabytes, and only a
+single larger message makes a larger one."""
+
+
+class CutOffError(Exception):
+    """A record reaches past the end of the file."""
+
+
+def without_zeros(file: IO[bytes], size: int) -> int:
+    """Return the size of a file without the zeros at its end, which a power cut may leave."""
+    block = 1024 * 1024
+    for start in range((size - 1) // block * block, -1, -block):
+        file.seek(start)
+        if kept := len(file.read(block if start + block < size else size - start).rstrip(b'\0')):
+            return start + kept
+    return 0
+
+
+def frames(file: IO[bytes], size: int, crc: int | None, solid: int) -> Iterator[tuple[int, bytes]]:
+    """Yield opcode and content of every record up to the end of the data section.
+
+    A record that ends among zeros, with more zeros behind it, was not all written.
+    """
+    while True:
+        head = file.read(9)
+        if not head and crc is None:
+            return
+        if len(head) < 9:
+            raise CutOffError
+        opcode, length = struct.unpack('<BQ', head)
+        end = file.tell() + length
+        # MCAP has no opcodes 0 and 0x10 to 0x7f.
+        known = 0x01 <= opcode <= 0x0F or opcode >= 0x80
+        if not known or end > size or solid < end < size:
+            raise CutOffError
+        body = file.read(length)
+        if opcode == Opcode.DATA_END:
+            (stated,) = struct.unpack('<I', body)
+            if stated and stated != crc:
+                raise ValueError('its checksum does not match')
+            return
+        if crc is not None:
+            crc = zlib.crc32(body, zlib.crc32(head, crc))
+        yield opcode, body
+
+
+def unchunked(records: Iterator[tuple[int, bytes]]) -> Iterator[tuple[int, bytes]]:
+    """Unpack the chunks that other recorders write."""
+    for opcode, body in records:
+        if opcode != Opcode.CHUNK:
+            yield opcode, body
+            continue
+        chunk = Chunk.read(ReadDataStream(BytesIO(body)))
+        data = _unpacked(chunk)
+        try:
+            yield from frames(BytesIO(data), len(data), crc=None, solid=len(data))
+        except CutOffError:
+            raise ValueError('a record does not fit its chunk') from None
+
+
+def _unpacked(chunk: Chunk) -> bytes:
+    """Unpack a chunk, and never more of it than the size that it states.
+
+    A few megabytes of zeros, packed, are gigabytes; they are refused before they are in memory.
+    """
+    stated = chunk.uncompressed_size
+    if stated > CHUNK_LIMIT:
+        raise ValueError(f'a chunk states more than {CHUNK_LIMIT} bytes')
+    # One byte more than stated, so that a longer content is noticed.
+    if chunk.compression == 'zstd':
+        import zstandard
+
+        with zstandard.ZstdDecompressor().stream_reader(chunk.data) as reader:
+            data = reader.read(stated + 1)
+    elif chunk.compression == 'lz4':
+        import lz4.frame
+
+        data = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=stated + 1)
+    elif chunk.compression == '':
+        data = chunk.data
+    else:
+        raise ValueError(f'a chunk is packed as {chunk.compression!r}, which is not known')
+    if len(data) != stated:
+        more = 'more' if len(data) > stated else 'less'
+        raise ValueError(f'a chunk holds {more} than the {stated} bytes that it states')
+    if chunk.uncompressed_crc and zlib.crc32(data) != chunk.uncompressed_crc:
+        raise ValueError('the checksum of a chunk does not match')
+    return data
+
 
 log = logging.getLogger('remaster_ros')
 

@@ -24,9 +24,13 @@ from remaster_ros.parameters import check_all
 from remaster_ros.session.bag import BagReader, live_name
 from remaster_ros.session.files import decode_text, read_limited
 from remaster_ros.session.reader import HEADER, OBSERVATIONS_LIMIT, ROWS
-from remaster_ros.session.recorder_parameters import Parameters, session_header
 from remaster_ros.session.session_journal import SessionJournal
-from remaster_ros.session.session_recorder import Outlet, SessionRecorder
+from remaster_ros.session.session_recorder import (
+    Outlet,
+    Parameters,
+    SessionRecorder,
+    session_header,
+)
 from remaster_ros.session.session_yaml import ExitStatus
 from remaster_ros.session.workcell import Workcell
 

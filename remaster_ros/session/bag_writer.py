@@ -9,15 +9,18 @@ only copy of an observation.
 from __future__ import annotations
 
 import os
+from functools import cache
 from pathlib import Path
 from types import TracebackType
+from typing import TYPE_CHECKING
 
 from mcap.writer import CompressionType, Writer
 
 from remaster_ros.errors import DiskError, InputError
-from remaster_ros.session.bag import LATCHED_TOPICS, BagReader
-from remaster_ros.session.bag_metadata import (
+from remaster_ros.session.bag import (
+    LATCHED_TOPICS,
     METADATA_FILE,
+    BagReader,
     FileMetadata,
     TopicMetadata,
     metadata_text,
@@ -32,8 +35,34 @@ from remaster_ros.session.files import (
     writing,
 )
 from remaster_ros.session.manifest import add_to_manifest, read_manifest
-from remaster_ros.session.message_definitions import definition_of
 from remaster_ros.version import __version__
+
+if TYPE_CHECKING:
+    from rosbags.typesys.store import Typestore
+
+
+@cache
+def _jazzy() -> Typestore:
+    from rosbags.typesys import Stores, get_typestore
+
+    return get_typestore(Stores.ROS2_JAZZY)
+
+
+@cache
+def definition_of(msgtype: str) -> tuple[str, str]:
+    """Return the message definition of one of Jazzy's types and its RIHS01 hash."""
+    from rosbags.typesys.store import TypesysError
+
+    types = _jazzy()
+    try:
+        definition, _ = types.generate_msgdef(msgtype, ros_version=2)
+        return definition, types.hash_rihs01(msgtype)
+    except (KeyError, TypesysError):
+        raise InputError(
+            f'{msgtype!r}: not a message type of ROS 2 Jazzy; '
+            'write it as in sensor_msgs/msg/JointState'
+        ) from None
+
 
 WAITING_LIMIT = 64 * 1024**2
 """So many bytes that a full disk does not take are kept in memory; later messages are refused."""

@@ -13,7 +13,7 @@ import numpy as np
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.planning.candidates import PoseRanges
 from remaster_ros.planning.cell_proposal import HeldJoint, Reach
-from remaster_ros.session.safe_yaml import load_yaml
+from remaster_ros.session.yaml_records import load_yaml
 
 # As of `session.workcell`: arms of some 7 to 20 kg.
 LINK_RADIUS_M = 0.075

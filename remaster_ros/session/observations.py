@@ -2,25 +2,266 @@
 
 from __future__ import annotations
 
+import csv
 import logging
+import math
 import re
-from collections.abc import Sequence
+from collections import ChainMap
+from collections.abc import Iterator, Mapping, MutableMapping, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.serial_chain import LIMIT_TOLERANCE_RAD, SerialChain
-from remaster_ros.session.csv_table import Table, split_line
 from remaster_ros.session.files import decode_text, refuse_utf16
-from remaster_ros.session.sequence_rules import (
-    SPLITS,
-    RowKeys,
-    SequenceRules,
-    row_keys,
-    split_indices,
+from remaster_ros.types import (
+    FARTHEST_M,
+    BoolArray,
+    FloatArray,
+    IntArray,
+    Measurements,
+    Observation,
 )
-from remaster_ros.types import FARTHEST_M, FloatArray, Measurements, Observation
+
+_NUMBER = re.compile(r'[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?')
+_NUMBER_CHARACTERS = re.compile(r'[0-9+\-.eE,]*')
+_INTEGER_CHARACTERS = re.compile(r'[0-9+\-,]*')
+_INTEGER = re.compile(r'[+-]?[0-9]{1,18}')
+
+
+class Table:
+    """Cells as text by column name, with what an error message needs to name a place."""
+
+    def __init__(self, path: Path, names: list[str], lines: list[str], first_line: int) -> None:
+        self.path = path
+        self.first_line = first_line
+        self.rows = len(lines)
+        width = len(names)
+        for number, line in enumerate(lines, start=first_line):
+            # Without quotes, counting commas is counting columns.
+            found = len(split_line(line, path, number)) if '"' in line else line.count(',') + 1
+            if found != width:
+                raise InputError(
+                    f'{path}, line {number}: {found} columns instead of the {width} of the '
+                    'header; give every column, empty where unknown'
+                )
+        text = ','.join(lines)
+        # One flat list: millions of cells in a list per row would keep the garbage collector busy.
+        cells = split_line(text, path, first_line) if '"' in text else text.split(',')
+        self.cells = {name: cells[i::width] for i, name in enumerate(names)}
+
+    def fault(self, row: int, column: str, problem: str) -> InputError:
+        """Return the error for one cell."""
+        cell = self.cells[column][row]
+        shown = repr(cell if len(cell) <= 40 else cell[:40] + '…')
+        line = self.first_line + row
+        return InputError(f'{self.path}, line {line}, column {column}: {shown} {problem}')
+
+    def refuse(self, wrong: BoolArray, problems: Mapping[str, str]) -> None:
+        """Raise the fault of the first True of `wrong`, (n, columns); `problems` by column."""
+        for row, column in np.argwhere(wrong)[:1]:
+            name = list(problems)[column]
+            raise self.fault(int(row), name, problems[name])
+
+    def integers(self, column: str, least: int | None = None) -> IntArray:
+        """Return a column of integers.
+
+        With `least` it is an optional column, of integers from `least` (above -1) on; -1 stands
+        for an empty cell.
+        """
+        given = self.cells[column]
+        cells = given if least is None else [cell or '-1' for cell in given]
+        try:
+            values = np.array(list(map(int, cells)), dtype=np.int64)
+        except (ValueError, OverflowError):
+            values = None
+        # int() also reads 1_000, blanks and other scripts' digits.
+        if values is None or not _INTEGER_CHARACTERS.fullmatch(','.join(cells)):
+            row = next(i for i, cell in enumerate(cells) if not _INTEGER.fullmatch(cell))
+            raise self.fault(row, column, 'is not an integer; correct it')
+        if least is not None:
+            few = (values < least) & (np.array(given) != '')
+            self.refuse(
+                few[:, None], {column: f'is less than {least}; leave it empty where unknown'}
+            )
+        return values
+
+    def numbers(self, columns: Sequence[str], optional: bool = False) -> FloatArray:
+        """Return columns of finite numbers, (n, len(columns)); NaN where optional and empty."""
+        result = np.empty((self.rows, len(columns)))
+        for i, column in enumerate(columns):
+            cells = self.cells[column]
+            empty, blank = (cells.count(''), 'nan') if optional else (0, '')
+            try:
+                result[:, i] = [float(cell or blank) for cell in cells]
+            except ValueError:
+                raise self._not_a_number(column, optional) from None
+            # float() also reads nan, inf, 1_000, blanks and other scripts' digits.
+            plain = _NUMBER_CHARACTERS.fullmatch(','.join(cells))
+            if not plain or np.count_nonzero(np.isfinite(result[:, i])) + empty < self.rows:
+                raise self._not_a_number(column, optional)
+        return result
+
+    def whole_or_empty(self, columns: Sequence[str]) -> FloatArray:
+        """Return optional columns of which a row fills all or none."""
+        values = self.numbers(columns, optional=True)
+        unknown = np.isnan(values)
+        problem = (
+            f'is empty though others of {columns[0]} … {columns[-1]} are not; fill all of them or '
+            'none'
+        )
+        self.refuse(unknown & ~unknown.all(axis=1, keepdims=True), dict.fromkeys(columns, problem))
+        return values
+
+    def choices(self, column: str, names: Sequence[str], remedy: str) -> IntArray:
+        """Return the index of every cell among `names`."""
+        index = {name: i for i, name in enumerate(names)}
+        values = np.array([index.get(cell, -1) for cell in self.cells[column]], dtype=np.int64)
+        self.refuse(values[:, None] < 0, {column: remedy})
+        return values
+
+    def _not_a_number(self, column: str, optional: bool) -> InputError:
+        row = next(
+            row
+            for row, cell in enumerate(self.cells[column])
+            if not (optional and not cell)
+            and not (_NUMBER.fullmatch(cell) and math.isfinite(float(cell)))
+        )
+        remedy = 'leave the field empty where unknown' if optional else 'leave the row out'
+        return self.fault(row, column, f'is not a finite number; correct it or {remedy}')
+
+
+def split_line(line: str, path: Path, number: int) -> list[str]:
+    """Return the cells of one line; an `InputError` where its quotes do not close."""
+    if '"' not in line:
+        return line.split(',')
+    try:
+        return next(csv.reader([line], strict=True))
+    except csv.Error as error:
+        raise InputError(f'{path}, line {number}: {error}; correct the quotes') from None
+
+
+SPLITS = ('optimization', 'validation', 'reference')
+
+
+class RowKeys(NamedTuple):
+    """What the rules between rows are about, of one row."""
+
+    line: int
+    observation: int
+    pose: int
+    configuration: int
+    split: int
+    stamp_s: float
+    sensor: int
+    marker: int
+    frame: int
+
+
+class SequenceRules:
+    """What must hold between rows, given in their order.
+
+    Observation numbers are unique and grow with time, time never runs backwards, a pose belongs
+    to one split and a configuration to one pose. The rows of a frame are of one configuration and
+    of different markers.
+    """
+
+    def __init__(self) -> None:
+        self._last: RowKeys | None = None
+        self._of_observation: MutableMapping[int, RowKeys] = {}
+        self._of_pose: MutableMapping[int, RowKeys] = {}
+        self._of_configuration: MutableMapping[int, RowKeys] = {}
+        self._of_frame: MutableMapping[tuple[int, int], RowKeys] = {}
+        self._in_frame: MutableMapping[tuple[int, int, int], RowKeys] = {}
+
+    def branch(self) -> SequenceRules:
+        """Return rules after the same rows; rows that they accept change nothing here."""
+        rules = SequenceRules()
+        rules._last = self._last
+        rules._of_observation = ChainMap({}, self._of_observation)
+        rules._of_pose = ChainMap({}, self._of_pose)
+        rules._of_configuration = ChainMap({}, self._of_configuration)
+        rules._of_frame = ChainMap({}, self._of_frame)
+        rules._in_frame = ChainMap({}, self._in_frame)
+        return rules
+
+    def problem(self, row: RowKeys) -> str:
+        """Return '' or what is wrong with the next row: "column …: …; remedy"."""
+        same = self._of_observation.get(row.observation)
+        if same is not None:
+            return (
+                f'column observation: {row.observation} is already on line {same.line}; '
+                'number every row once'
+            )
+        last = self._last
+        if last is not None and row.observation < last.observation:
+            return (
+                f'column observation: {row.observation} comes after {last.observation}; '
+                'number the rows in the order measured'
+            )
+        if last is not None and row.stamp_s < last.stamp_s:
+            return (
+                f'column stamp_s: {row.stamp_s} is before the row above it ({last.stamp_s}): '
+                'time runs backwards; give the rows in the order measured'
+            )
+        same = self._of_pose.get(row.pose)
+        if same is not None and same.split != row.split:
+            return (
+                f'column split: pose {row.pose} is {SPLITS[same.split]} on line '
+                f'{same.line} and {SPLITS[row.split]} here; give a pose one split'
+            )
+        same = self._of_configuration.get(row.configuration)
+        if same is not None and same.pose != row.pose:
+            return (
+                f'column configuration: {row.configuration} belongs to pose {same.pose} on line '
+                f'{same.line} and to pose {row.pose} here; give a configuration one pose'
+            )
+        same = self._of_frame.get((row.sensor, row.frame))
+        if row.frame >= 0 and same is not None and same.configuration != row.configuration:
+            return (
+                f'column frame: {row.frame} belongs to configuration {same.configuration} on line '
+                f'{same.line} and to {row.configuration} here; give every frame its own number'
+            )
+        same = self._in_frame.get((row.sensor, row.frame, row.marker))
+        if row.frame >= 0 and same is not None:
+            return (
+                f'column marker: frame {row.frame} of this sensor has this marker on line '
+                f'{same.line} already; a frame has each marker once'
+            )
+        return ''
+
+    def accept(self, row: RowKeys) -> None:
+        """Take a row without a problem as the last one."""
+        self._last = row
+        self._of_observation[row.observation] = row
+        self._of_pose.setdefault(row.pose, row)
+        self._of_configuration.setdefault(row.configuration, row)
+        if row.frame >= 0:
+            self._of_frame.setdefault((row.sensor, row.frame), row)
+            self._in_frame[row.sensor, row.frame, row.marker] = row
+
+
+def split_indices(m: Measurements) -> IntArray:
+    """Return the index into `SPLITS` of every row, (n,)."""
+    index = m.is_validation.astype(np.int64)
+    if m.is_reference is not None:
+        index[m.is_reference] = SPLITS.index('reference')
+    return index
+
+
+def row_keys(m: Measurements, first_line: int) -> Iterator[RowKeys]:
+    """Yield the keys of every row, the first being on `first_line` of its file."""
+    lines = range(first_line, first_line + len(m))
+    frame = np.full(len(m), -1) if m.frame is None else m.frame
+    columns = (
+        *(m.observation, m.pose, m.configuration, split_indices(m), m.stamp_s),
+        *(m.sensor, m.marker, frame),
+    )
+    # Plain Python numbers: dictionaries of NumPy scalars are slow.
+    return map(RowKeys, lines, *(column.tolist() for column in columns))
+
 
 log = logging.getLogger('remaster_ros')
 

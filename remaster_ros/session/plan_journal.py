@@ -10,38 +10,229 @@ from __future__ import annotations
 import uuid
 from collections import Counter, deque
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
+
+import msgspec
+import numpy as np
 
 from remaster_ros.errors import DiskError, InputError
 from remaster_ros.kinematics.collision import CollisionModel
 from remaster_ros.kinematics.serial_chain import SerialChain
+from remaster_ros.planning.candidates import Plan
 from remaster_ros.planning.collection_plan import Expected
 from remaster_ros.planning.tour_order import (
     FITTED,
     REFERENCE,
     REGISTRATION,
     PoseVisit,
+    Route,
     Tour,
 )
 from remaster_ros.session.files import make_folder
-from remaster_ros.session.journal import Journal, Record
-from remaster_ros.session.plain_data import from_plain, to_plain
-from remaster_ros.session.plan_records import (
-    NO_FREE_PATH,
-    EnoughNoted,
-    ExpectationNoted,
-    OutcomeNoted,
-    PlanBegun,
-    PlanRecord,
-    RoundNoted,
-    RouteNoted,
-    StateNoted,
-    StopNoted,
-    TourNoted,
-)
+from remaster_ros.session.journal import Journal, Record, read_journal
 from remaster_ros.session.session_opening import PLAN
+from remaster_ros.session.yaml_records import from_plain, to_plain
+from remaster_ros.types import FloatArray
+
+NO_FREE_PATH = 'no_free_path'
+"""Outcome of a configuration that the arm cannot get to without hitting something."""
+
+
+class PlanBegun(msgspec.Struct, tag_field='kind', tag='plan'):
+    """The first record: the plan's name, and what it depends on."""
+
+    id: str
+    settings: dict[str, Any]
+
+
+class TourNoted(msgspec.Struct, tag_field='kind', tag='tour'):
+    """A tour, as planned."""
+
+    plans: dict[str, Plan]
+    in_order: bool
+    one_solution: bool
+    # Plans of older versions have no references, and go on without them.
+    reference_every: int = 0
+    # Empty where the nearest pose is next.
+    order: tuple[tuple[str, int, int], ...] = ()
+    # Above 0 behind another tour of the collection.
+    begin_at: int = 0
+
+    def tour(self, chain: SerialChain, model: CollisionModel | None = None) -> Tour:
+        """Return the tour of this arm, at its beginning; the model is what it must not hit."""
+        return Tour(
+            chain,
+            self.plans,
+            in_order=self.in_order,
+            one_solution=self.one_solution,
+            model=model,
+            reference_every=self.reference_every,
+            order=self.order,
+            begin_at=self.begin_at,
+        )
+
+
+class RouteNoted(msgspec.Struct, tag_field='kind', tag='route'):
+    """Solutions in the order of their visits, by number; `paths` has those that go around."""
+
+    ids: tuple[int, ...]
+    paths: dict[str, FloatArray] = {}
+    unreached: tuple[int, ...] = ()
+
+    def route(self, joints: int) -> Route:
+        """Return it as a tour has it, for an arm with so many joints."""
+        straight = np.empty((0, joints))
+        paths = tuple(self.paths.get(str(number), straight) for number in self.ids)
+        return Route(self.ids, paths, self.unreached)
+
+
+class StopNoted(RouteNoted, kw_only=True, tag='stop'):
+    """The next pose: which of the poses of its split, and the way to its solutions."""
+
+    split: str
+    index: int
+
+
+class RoundNoted(msgspec.Struct, tag_field='kind', tag='round'):
+    """A round of the references is next, by request."""
+
+
+class EnoughNoted(msgspec.Struct, tag_field='kind', tag='enough'):
+    """Enough is known: no more poses to fit are visited."""
+
+
+class ExpectationNoted(msgspec.Struct, tag_field='kind', tag='expected'):
+    """What a fit of the tour before it is expected to state, at the noise of the cell file."""
+
+    joint_std_rad: dict[str, float | None]
+    tool_rms_m: float
+
+
+class OutcomeNoted(msgspec.Struct, tag_field='kind', tag='outcome'):
+    """What became of a solution of the last pose."""
+
+    id: int
+    result: str
+
+
+class StateNoted(msgspec.Struct, tag_field='kind', tag='state'):
+    """The planner's state, and the token of the run that it is in."""
+
+    state: str
+    run: str = ''
+
+
+PlanRecord = (
+    PlanBegun
+    | TourNoted
+    | RouteNoted
+    | StopNoted
+    | RoundNoted
+    | EnoughNoted
+    | ExpectationNoted
+    | OutcomeNoted
+    | StateNoted
+)
+
+
+def plan_page_path(session: Path) -> Path:
+    """Return where the plan of a session is drawn for a person: beside its folder."""
+    return session.absolute().with_name(f'{session.absolute().name}.plan.html')
+
+
+Configuration = tuple[str, int, int]
+"""Split, pose and solution, as in the plan."""
+
+
+@dataclass
+class RecordedPlan:
+    """A planned collection and its end.
+
+    Attributes
+    ----------
+    tour
+        As planned.
+    page
+        Where the planner draws it where a person has to confirm it (`confirm: true`).
+    expected
+        What its fit was expected to state; None in sessions of older versions.
+    outcomes
+        What became of each configuration that was begun, references not among them: ``recorded``,
+        ``partial``, ``rejected``, ``failed`` or ``no_free_path``.
+    references
+        How many visits to references came to which end.
+    enough
+        Whether poses to fit were left out because enough was known.
+    """
+
+    tour: Tour
+    page: Path
+    expected: ExpectationNoted | None = None
+    outcomes: dict[Configuration, str] = field(default_factory=dict)
+    references: Counter[str] = field(default_factory=Counter)
+    enough: bool = False
+
+
+def read_plan(folder: Path, chain: SerialChain) -> RecordedPlan | None:
+    """Return the plan of a session's collection; None where it has none.
+
+    Parameters
+    ----------
+    folder
+        The session's.
+    chain
+        Its arm.
+
+    Raises
+    ------
+    InputError
+        plan.jsonl is damaged, or no plan of this version.
+    """
+    path = folder / PLAN
+    if not path.exists():
+        return None
+    plan: RecordedPlan | None = None
+    split, index = '', 0
+    try:
+        for record in from_plain(read_journal(path).records, list[PlanRecord]):
+            match record:
+                case TourNoted():
+                    collection = REGISTRATION not in record.plans
+                    tour = record.tour(chain)
+                    plan = RecordedPlan(tour, plan_page_path(folder)) if collection else None
+                case StopNoted():
+                    split, index = record.split, record.index
+            if plan is None:
+                continue
+            match record:
+                case ExpectationNoted():
+                    plan.expected = record
+                case RouteNoted():
+                    _close(plan, split, index, record.unreached, NO_FREE_PATH)
+                case OutcomeNoted():
+                    _close(plan, split, index, (record.id,), record.result)
+                case EnoughNoted():
+                    plan.enough = True
+        return plan if plan is not None and plan.tour.plans[FITTED].poses else None
+    except (KeyError, IndexError, TypeError, ValueError) as error:
+        raise InputError(
+            f'{path}: no plan of this version ({type(error).__name__}: {error}); '
+            'move it out of the session folder to go without'
+        ) from None
+
+
+def _close(
+    plan: RecordedPlan, split: str, index: int, solutions: tuple[int, ...], result: str
+) -> None:
+    """Note what became of configurations; a first outcome stays."""
+    for solution in solutions:
+        if split == REFERENCE:
+            plan.references[result] += 1
+        else:
+            plan.outcomes.setdefault((split, index, solution), result)
+
 
 ENOUGH = 'enough is known'
 """Why planned poses are not visited once the wanted precision is reached."""

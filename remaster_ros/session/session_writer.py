@@ -19,9 +19,14 @@ from remaster_ros.errors import InputError, MovedError
 from remaster_ros.session.files import AppendFile, make_folder, read_limited, write_atomically
 from remaster_ros.session.journal import Journal, Record
 from remaster_ros.session.manifest import write_sums
-from remaster_ros.session.observations import RowFormat, format_header, format_observation
+from remaster_ros.session.observations import (
+    RowFormat,
+    RowKeys,
+    SequenceRules,
+    format_header,
+    format_observation,
+)
 from remaster_ros.session.reader import HEADER, OBSERVATIONS_LIMIT, ROWS, URDF, read_chain
-from remaster_ros.session.sequence_rules import RowKeys, SequenceRules
 from remaster_ros.session.session_guard import SessionGuard, set_aside
 from remaster_ros.session.session_opening import (
     JOURNAL,

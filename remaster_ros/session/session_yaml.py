@@ -14,9 +14,16 @@ import numpy as np
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.pad_angles import coupled_in_circle
 from remaster_ros.session.files import decode_text
-from remaster_ros.session.plain_data import to_plain
-from remaster_ros.session.safe_yaml import YamlError, dump_yaml, load_yaml
-from remaster_ros.session.yaml_records import BaseFrame, Bounds, Triple, out_of_bounds
+from remaster_ros.session.yaml_records import (
+    BaseFrame,
+    Bounds,
+    Triple,
+    YamlError,
+    dump_yaml,
+    load_yaml,
+    out_of_bounds,
+    to_plain,
+)
 from remaster_ros.types import AngleUnit, Controller, Measurements, PadJoint, Session
 
 FORMAT = 'remaster-session/1'

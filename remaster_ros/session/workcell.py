@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import hashlib
 import importlib.util
+import itertools
+import re
 import xml.etree.ElementTree as ElementTree
-from math import radians
+from collections.abc import Mapping
+from math import degrees, pi, radians
 from pathlib import Path
 from typing import Annotated
 
@@ -13,6 +16,8 @@ import msgspec
 import numpy as np
 
 from remaster_ros.collection.events import ArmModel
+from remaster_ros.collection.plausibility import SMALLEST_M
+from remaster_ros.collection.stopping_rule import StoppingGoal
 from remaster_ros.errors import InputError, did_you_mean
 from remaster_ros.kinematics.bodies import Body, Shape, box, cylinder, obstacle, sphere
 from remaster_ros.kinematics.collision import HALF_STEP_M, CollisionModel, arm_bodies
@@ -24,16 +29,298 @@ from remaster_ros.planning.candidates import (
     LIMIT_MARGIN_RAD,
     LineOfSight,
     PlanningScene,
+    PoseRanges,
 )
-from remaster_ros.planning.expected_sensors import POSE_SIGMA_M, SIGMA_M, ExpectedSensor
+from remaster_ros.planning.expected_sensors import POSE_SIGMA_M, SIGMA_M, ExpectedSensor, ToolBox
 from remaster_ros.planning.planned_design import DesignSettings
-from remaster_ros.session.cell_poses import RANGES, CellPoses
-from remaster_ros.session.cell_sensor import CellSensor
 from remaster_ros.session.files import URDF_LIMIT, decode_text, read_limited
 from remaster_ros.session.meshes import mesh_reader
-from remaster_ros.session.yaml_places import with_line
-from remaster_ros.session.yaml_records import YAML_LIMIT, Bounds, Triple, read_yaml
-from remaster_ros.types import FloatArray
+from remaster_ros.session.yaml_records import YAML_LIMIT, Bounds, Triple, read_yaml, with_line
+from remaster_ros.types import FARTHEST_M, FloatArray
+
+POSE = 'geometry_msgs/msg/PoseStamped'
+MESSAGE_TYPES = ('geometry_msgs/msg/PointStamped', POSE, 'mocap4r2_msgs/msg/Markers')
+"""`sensors.topic.driver.READERS` reads them."""
+
+
+def source_problem(key: str, source: str, message_type: str, *, single_shot: bool) -> str:
+    """Return what is wrong with the keys of such a sensor; '' where nothing is.
+
+    Parameters
+    ----------
+    key
+        Of the sensor, such as ``sensors.mocap``.
+    source, message_type, single_shot
+        As in `cell_sensor.CellSensor`.
+    """
+    if source and not message_type:
+        return f'{key}.source is no key; write it as topic, and give its message_type'
+    if message_type and message_type not in MESSAGE_TYPES:
+        meant = did_you_mean(message_type, MESSAGE_TYPES)
+        known = ', '.join(MESSAGE_TYPES)
+        return f'{key}.message_type is {message_type!r}; it can be {known}{meant}'
+    if message_type and single_shot:
+        return f'{key}.single_shot is for instruments that measure on request; a topic streams'
+    return ''
+
+
+# From the resolution of an interferometer to a depth camera's noise.
+NOISE = Bounds(1e-7, 0.05, 'm')
+# A retroreflector or sphere is seen from further round than this.
+VIEW = Bounds(3.5, 180.0, 'degrees')
+# Twice what a reading may at least be off before it counts as that of another marker.
+LEAST_APART_M = 2.0 * SMALLEST_M
+LAST_MEMBER = 65535
+"""The wire has 16 bits for the number of a marker in its rigid body."""
+
+
+class CellSensor(msgspec.Struct, forbid_unknown_fields=True):
+    """A sensor of a cell.
+
+    Attributes
+    ----------
+    marker
+        The marker it follows.
+    further_markers
+        Further markers that it measures, by name: in the same frame, each with its number in the
+        rigid body; or, where it is `single_shot`, one after another while the arm stands.
+    topic
+        Where its readings are published (geometry_msgs/PointStamped, sensor frame); relative to
+        the nodes' namespace, unless it begins with ``/``. Further markers have topics of their
+        own below it, ``TOPIC/NAME``; each has a message for every frame in which one of them was
+        seen, NaN where this one was not.
+    rough_position_m
+        Where it stands in the robot base, roughly.
+    single_shot
+        True for an instrument that measures on request.
+    measure_service
+        The service (std_srvs/Trigger) that makes it measure.
+    max_angle_deg
+        Largest angle between the tool's z axis and the line to the sensor at which the marker
+        is seen.
+    message_type
+        Where `topic` is of a node that is not of this package, the type of its messages, one of
+        `source_topics.MESSAGE_TYPES`.
+    noise_m, pose_noise_m, frame_noise_m
+        Standard deviations per axis that are expected: of a reading, of the error that all
+        readings at one pose share, and of the one that the markers of one frame share. Only plans
+        depend on them; a fit estimates its own.
+    """
+
+    marker: str
+    topic: str
+    rough_position_m: Annotated[Triple, Bounds(-FARTHEST_M, FARTHEST_M, 'm')]
+    single_shot: bool = False
+    measure_service: str = ''
+    max_angle_deg: Annotated[float, VIEW] = 60.0
+    noise_m: Annotated[float, NOISE] = SIGMA_M
+    pose_noise_m: Annotated[float, Bounds(0.0, 0.05, 'm')] = POSE_SIGMA_M
+    frame_noise_m: Annotated[float, Bounds(0.0, 0.05, 'm')] = 0.0
+    further_markers: dict[str, int] = {}
+    message_type: str = ''
+    # No key of the file: the topic of such a node, whose readings are published on `topic` anew.
+    source: str = ''
+
+    def publish_anew(self, name: str) -> None:
+        """Read the topic of a node that is not of this package; publish it as others are."""
+        if self.message_type:
+            self.source, self.topic = self.topic, f'{name}/marker'
+
+    @property
+    def markers(self) -> tuple[str, ...]:
+        """Every marker that it measures, the one it follows first."""
+        return (self.marker, *self.further_markers)
+
+    @property
+    def topics(self) -> dict[str, str]:
+        """Marker -> where its readings are published."""
+        further = {name: f'{self.topic}/{name}' for name in self.further_markers}
+        return {self.marker: self.topic, **further}
+
+    @property
+    def pose_topic(self) -> str:
+        """Where its full poses are published beside the positions; '' where it has none.
+
+        The recorder takes these: position and orientation then come in one message.
+        """
+        return f'{self.topic}/pose' if self.message_type == POSE else ''
+
+    def problem(self, where: str, markers: Mapping[str, Triple]) -> str:
+        """Return what is wrong with it, being at `where` in the file; '' where nothing is."""
+        return self._marker_problem(where, markers) or source_problem(
+            where, self.source, self.message_type, single_shot=self.single_shot
+        )
+
+    def _marker_problem(self, where: str, markers: Mapping[str, Triple]) -> str:
+        known = ', '.join(markers)
+        if self.marker not in markers:
+            meant = did_you_mean(self.marker, markers)
+            return f'{where}.marker is {self.marker!r}; markers has {known}{meant}'
+        where += '.further_markers'
+        for name, number in self.further_markers.items():
+            if name not in markers:
+                return f'{where} has {name!r}; markers has {known}{did_you_mean(name, markers)}'
+            if name == self.marker:
+                return f'{where} has {name!r}, which is its marker already; leave it out there'
+            if not re.fullmatch('[A-Za-z][A-Za-z0-9_]*', name):
+                return (
+                    f'{where}: {name!r} is the end of a topic; name the marker with letters, '
+                    'digits and underscores'
+                )
+            if not 1 <= number <= LAST_MEMBER:
+                return f'{where}.{name} is {number}; markers of a body have the numbers 1 to 65535'
+            if list(self.further_markers.values()).count(number) > 1:
+                return f'{where}: two markers have the number {number}; give each its own'
+        for one, other in itertools.combinations(self.markers, 2):
+            apart = float(np.linalg.norm(np.subtract(markers[one], markers[other])))
+            if apart < LEAST_APART_M:
+                return (
+                    f'{where}: {one} and {other} are {1e3 * apart:.0f} mm apart; below '
+                    f'{1e3 * LEAST_APART_M:.0f} mm one could be taken for the other'
+                )
+        return ''
+
+
+Range = tuple[float, float]
+# No arm or tool of those that this is for reaches so far.
+REACH = Bounds(-10.0, 10.0, 'm')
+LATIN_HYPERCUBE, OPTIMAL = 'latin_hypercube', 'optimal'
+NEAREST, FASTEST = 'nearest', 'fastest'
+ALL, CHOSEN = 'all', 'chosen'
+RANGES = ('azimuth_deg', 'radius_m', 'height_m', 'roll_deg')
+
+
+class CellToolBox(msgspec.Struct, forbid_unknown_fields=True):
+    """Where the tool is to be accurate: a box in base_link."""
+
+    center_m: Triple
+    size_m: Annotated[Triple, Bounds(0.0, 20.0, 'm', above=True)]
+
+
+class CellPoses(msgspec.Struct, forbid_unknown_fields=True):
+    """Ranges of the Latin hypercube of poses, which of them are visited, and in which order.
+
+    Attributes
+    ----------
+    design
+        ``optimal`` for the poses that tell the most, ``latin_hypercube`` for all of its poses.
+    solutions
+        ``all`` for each pose in all its free joint solutions, nearest first; ``chosen`` for the
+        configurations that take the fewest minutes, a pose again where that is shorter.
+    order
+        ``nearest`` for the nearest pose next, ``fastest`` for the least travel.
+    tool_share
+        0 for the joint offsets alone, 1 for the tool's error alone, between them for a mixture.
+    joint_std_deg, tool_std_m
+        What is to be reached: an optimal design is made for it (without, for what the Latin
+        hypercube reaches), and a collection ends where it is known to be.
+    tool_box
+        Where the tool's error counts; without, at all candidate poses.
+    """
+
+    azimuth_deg: Range = (0.0, 360.0)
+    radius_m: Annotated[Range, Bounds(0.0, 10.0, 'm')] = (0.2, 0.5)
+    height_m: Annotated[Range, REACH] = (0.4, 0.8)
+    roll_deg: Range = (0.0, 360.0)
+    design: str = OPTIMAL
+    solutions: str = ALL
+    order: str = NEAREST
+    tool_share: Annotated[float, Bounds(0.0, 1.0)] = 0.0
+    joint_std_deg: Annotated[float | None, Bounds(0.0, 5.0, 'degrees', above=True)] = None
+    tool_std_m: Annotated[float | None, Bounds(0.0, 0.1, 'm', above=True)] = None
+    tool_box: CellToolBox | None = None
+
+    def ranges(self) -> PoseRanges:
+        """Return the ranges in SI units."""
+        return PoseRanges(
+            azimuth_rad=(radians(self.azimuth_deg[0]), radians(self.azimuth_deg[1])),
+            radius_m=self.radius_m,
+            height_m=self.height_m,
+            roll_rad=(radians(self.roll_deg[0]), radians(self.roll_deg[1])),
+        )
+
+    def settings(self, sensors: tuple[ExpectedSensor, ...], marker_std_m: float) -> DesignSettings:
+        """Return what the design is chosen by, in SI units."""
+        box = self.tool_box
+        return DesignSettings(
+            optimal=self.design == OPTIMAL,
+            whole_poses=self.solutions == ALL,
+            fastest=self.order == FASTEST,
+            sensors=sensors,
+            marker_std_m=marker_std_m,
+            tool_share=self.tool_share,
+            joint_std_rad=None if self.joint_std_deg is None else radians(self.joint_std_deg),
+            tool_std_m=self.tool_std_m,
+            box=None if box is None else ToolBox(np.array(box.center_m), np.array(box.size_m)),
+        )
+
+    def stopping_goal(self) -> StoppingGoal:
+        """Return what ends a collection, in SI units: all that counts, where it is stated."""
+        optimal, stated = self.design == OPTIMAL, (self.joint_std_deg, self.tool_std_m)
+        counts = (self.tool_share < 1.0, self.tool_share > 0.0)
+        if optimal and any(one and value is None for one, value in zip(counts, stated)):
+            # The design is made for what the Latin hypercube reaches, which no one has stated.
+            return StoppingGoal()
+        settings = self.settings((), 0.0)
+        return StoppingGoal(settings.joint_std_rad, settings.tool_std_m, settings.box)
+
+    def given(self) -> Mapping[str, object]:
+        """Return the keys beside the ranges that are not as by default."""
+        plain = CellPoses()
+        return {
+            key: getattr(self, key)
+            for key in self.__struct_fields__
+            if key not in RANGES and getattr(self, key) != getattr(plain, key)
+        }
+
+    def problem(self) -> str:
+        """Return what is wrong between the keys; '' where nothing is."""
+        for key in RANGES:
+            low, high = getattr(self, key)
+            if low > high:
+                return (
+                    f'poses.{key} goes from {low:g} down to {high:g}; give the smaller one first'
+                )
+            if key.endswith('_deg') and low < high and max(abs(low), abs(high)) < 2.0 * pi + 0.01:
+                return (
+                    f'poses.{key} is {low:g} to {high:g}, a range of {high - low:.3g} degrees; if '
+                    f'radians were meant, write {degrees(low):.4g}, {degrees(high):.4g}'
+                )
+        choices = {
+            'design': (OPTIMAL, LATIN_HYPERCUBE),
+            'solutions': (ALL, CHOSEN),
+            'order': (NEAREST, FASTEST),
+        }
+        for key, words in choices.items():
+            if getattr(self, key) not in words:
+                return f'poses.{key} is {getattr(self, key)!r}; write {" or ".join(words)}'
+        return self._without_effect()
+
+    def _without_effect(self) -> str:
+        """Return which key changes nothing beside the others; '' where each does."""
+        given = self.given()
+        if self.solutions == CHOSEN and (self.design, self.order) == (LATIN_HYPERCUBE, NEAREST):
+            return (
+                f'poses.solutions: {CHOSEN} has no effect with design: {LATIN_HYPERCUBE} and '
+                f'order: {NEAREST}; leave it out'
+            )
+        if 'tool_share' in given and self.design != OPTIMAL:
+            return (
+                f'poses.tool_share has no effect with design: {self.design}; write design: '
+                f'{OPTIMAL}, or leave it out'
+            )
+        if self.design != OPTIMAL:
+            if 'tool_box' in given and 'tool_std_m' not in given:
+                return (
+                    'poses.tool_box has no effect without tool_std_m; write it, or leave both out'
+                )
+            return ''
+        if 'joint_std_deg' in given and self.tool_share == 1.0:
+            return 'poses.joint_std_deg has no effect with tool_share: 1; write less, such as 0.5'
+        if 'tool_std_m' in given and self.tool_share == 0.0:
+            return 'poses.tool_std_m has no effect with tool_share: 0; write more, such as 0.5'
+        return ''
+
 
 ON_TOOL = Bounds(-3.0, 3.0, 'm')
 # A marker is placed better than this; a session file may give more, where nothing is known.

@@ -14,8 +14,7 @@ from remaster_ros.planning.planned_design import NOT_NEEDED, DesignSettings
 from remaster_ros.planning.pose_design import HELD_OUT_POSES, HELD_OUT_SOLUTIONS, Floors
 from remaster_ros.planning.tour_planner import TourPlanner
 from remaster_ros.reports.plan_json import plan_text, plan_to_dict
-from remaster_ros.session.cell_poses import CellPoses
-from remaster_ros.session.workcell import read_cell
+from remaster_ros.session.workcell import CellPoses, read_cell
 
 
 @pytest.fixture(autouse=True)

@@ -20,8 +20,7 @@ from remaster_ros.reports.answer_plan import copy_plan, drawn_plan, plan_facts, 
 from remaster_ros.reports.answer_report import answer_html, require_ready
 from remaster_ros.reports.fit_json import fit_content
 from remaster_ros.reports.schemas import Fit, Judgement
-from remaster_ros.session.plan_records import ExpectationNoted
-from remaster_ros.session.recorded_plan import RecordedPlan
+from remaster_ros.session.plan_journal import ExpectationNoted, RecordedPlan
 
 
 @pytest.fixture

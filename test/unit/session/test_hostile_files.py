@@ -16,8 +16,8 @@ from remaster_ros.reports.fit_json import joint_offsets_rad, read_fit, write_fit
 from remaster_ros.session.bag import BagReader
 from remaster_ros.session.bag_writer import BagWriter
 from remaster_ros.session.reader import read_session, write_session
-from remaster_ros.session.safe_yaml import YamlError, load_yaml
 from remaster_ros.session.workcell import read_cell
+from remaster_ros.session.yaml_records import YamlError, load_yaml
 
 CONFIG = Path(__file__).parents[3] / 'config'
 SEED = random.SystemRandom().randrange(10**6)

@@ -9,8 +9,7 @@ from remaster_ros.errors import InputError
 from remaster_ros.planning.candidates import Plan, PlannedPose
 from remaster_ros.planning.collection_plan import Expected
 from remaster_ros.planning.tour_order import FITTED, REFERENCE, REGISTRATION, Tour
-from remaster_ros.session.plan_journal import PlanJournal
-from remaster_ros.session.recorded_plan import plan_page_path, read_plan
+from remaster_ros.session.plan_journal import PlanJournal, plan_page_path, read_plan
 from remaster_ros.session.workcell import read_cell
 
 CHAIN = read_cell('demo').chain()
