@@ -492,10 +492,18 @@ def within_limits(
             if low[joint] + turns * _QUARTER >= chain.lower[joint]
             and high[joint] + turns * _QUARTER <= chain.upper[joint]
         ]
-        if not whole:
+        if whole:
+            quarters[joint] += whole[0]
+        # Angles from 0 to 360 degrees take a turn off some rows alone.
+        elif not keeps_limits(chain, chain.within_turns(q)[:, joint], joint):
             return None
-        quarters[joint] += whole[0]
     return replace(arrangement, quarters=tuple(quarters))
+
+
+def keeps_limits(chain: SerialChain, q: FloatArray, joint: int) -> bool:
+    """Return whether all angles of a joint, rad, (n,), are within its limits."""
+    low, high = chain.lower[joint] - LIMIT_TOLERANCE_RAD, chain.upper[joint] + LIMIT_TOLERANCE_RAD
+    return bool(np.all((q >= low) & (q <= high)))
 
 
 def _nearest(

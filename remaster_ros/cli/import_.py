@@ -16,8 +16,10 @@ from remaster_ros.cli.options import add_description, names, number, xacro_argum
 from remaster_ros.errors import InputError, InsufficientDataError, MistakeFoundError
 from remaster_ros.importing.assemble import (
     SessionOptions,
+    as_counted,
     assemble,
     refuse_outside_limits,
+    without_whole_turns,
 )
 from remaster_ros.importing.bags import is_bag, read_bag
 from remaster_ros.importing.columns import Told
@@ -68,8 +70,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument('--json', action='store_true', help='print one JSON object')
     table = parser.add_argument_group('what the columns are, where it was not found')
-    table.add_argument('--joints', metavar='COLUMN,…', type=names, default=(), help='base to tip')
-    table.add_argument('--points', metavar='X,Y,Z', type=names, default=(), help='measured points')
+    table.add_argument(
+        '--joints',
+        metavar='COLUMN,…',
+        type=names,
+        default=(),
+        help='base to tip: names, or numbers (1-6) where there is no header; joints.txt:1-6 of '
+        'that file',
+    )
+    table.add_argument(
+        '--points',
+        metavar='X,Y,Z',
+        type=names,
+        default=(),
+        help='measured points; three columns for each marker, or the names of markers',
+    )
     table.add_argument('--time', metavar='COLUMN', default='', help="or 'none' to leave it out")
     table.add_argument('--names', metavar='COLUMN', default='', help='by which to join two tables')
     table.add_argument('--angles', choices=tuple(ANGLES), default='', help='unit of the joints')
@@ -244,7 +259,7 @@ def run(args: argparse.Namespace) -> int:
     with progress_bar(args.quiet or args.json) as progress:
         progress('reading', 0.0)
         rows = _read(args, chain).in_order()
-        options = _session_options(args, cell)
+        options, counted = as_counted(rows, chain, _session_options(args, cell))
         notes = f'imported from {", ".join(path.name for path in args.files)}'
         rng = np.random.default_rng(args.seed)
         session, how = assemble(rows, urdf, chain, options, rng, notes)
@@ -254,6 +269,8 @@ def run(args: argparse.Namespace) -> int:
         )
         session = mended(session, arrangement_of(told, session, chain.joint_names))
         sense = check_sense(session, rows, progress)
+    session, turned = without_whole_turns(session, chain)
+    how += [*counted, *filter(None, [turned])]
     if not args.json:
         show(args.quiet, _as_text(rows, session, how))
     if sense.fits or args.unchecked:
@@ -308,7 +325,7 @@ def _mend(args: argparse.Namespace) -> int:
                     f'{error}: {error.options}; nothing was written; to write it as it is, add '
                     '--unchecked'
                 ) from None
-    write_session(args.out, session)
+    write_session(args.out, without_whole_turns(session, chain)[0])
     if args.json:
         print(json.dumps({'session': str(args.out), 'columns': {}, 'warnings': [], 'hint': ''}))
         return 0

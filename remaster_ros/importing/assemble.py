@@ -10,6 +10,7 @@ from typing import Literal
 import numpy as np
 from scipy.spatial import cKDTree
 
+from remaster_ros.calibration.arrangement import FEWEST_ROWS, linear_fit
 from remaster_ros.calibration.mistakes import UNKNOWN_MARKER_STD_M
 from remaster_ros.errors import InputError
 from remaster_ros.importing.rows import RawRows
@@ -105,7 +106,7 @@ def controller_of(rows: RawRows, chain: SerialChain, options: SessionOptions) ->
         raise InputError(
             f'--couple: {joints[joint].name} is coupled to itself, directly or by way of others'
         )
-    return Controller(joints)
+    return Controller(joints, rows.maker)
 
 
 def _joint(name: str, rows: RawRows, chain: SerialChain, option: str) -> int:
@@ -188,6 +189,45 @@ def assemble(
         controller=controller,
     )
     return session, [how_pose, how_split]
+
+
+def as_counted(
+    rows: RawRows, chain: SerialChain, options: SessionOptions
+) -> tuple[SessionOptions, list[str]]:
+    """Return the options with what the file's controller couples, and the sentence on it.
+
+    A description may have the coupling already: then the points fit without it.
+    """
+    coupling = tuple(rows.coupling.items())
+    if options.couple or not coupling:
+        return options, []
+    coupled = replace(options, couple=coupling)
+    q = [
+        PadAngles.of(controller_of(rows, chain, one), chain.joint_names).to_urdf(rows.q)
+        for one in (options, coupled)
+    ]
+    errors = linear_fit(chain, np.array(q), rows.position)[0]
+    if len(rows.q) >= FEWEST_ROWS and errors[0] < errors[1]:
+        return options, []
+    listed = ', '.join(f'--couple {joint}={other}' for joint, (other, _) in coupling)
+    return coupled, [f'joints coupled as a {rows.maker} controller counts them: {listed}']
+
+
+def without_whole_turns(session: Session, chain: SerialChain) -> tuple[Session, str]:
+    """Return the session with its angles within the limits, and which were turned, '' for none."""
+    m = session.measurements
+    q = chain.within_turns(m.q)
+    if np.array_equal(q, m.q):
+        return session, ''
+    turned = (q != m.q).sum(axis=0)
+    listed = ', '.join(
+        f'{name} ({count} rows)' for name, count in zip(chain.joint_names, turned) if count
+    )
+    m = replace(m, q=q, from_q=chain.within_turns(m.from_q))
+    return (
+        replace(session, measurements=m, observations_sha256=''),
+        f'whole turns were taken off, as the limits ask for it: {listed}',
+    )
 
 
 def _date(rows: RawRows) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -29,6 +30,8 @@ from remaster_ros.types import AngleUnit, BoolArray, FloatArray, IntArray
 # A marker that moves by less than this share of what others move is not on the arm: one on the
 # first link would, by less than a fiftieth of the arm's reach about its axis.
 _STATIC = 0.02
+# Of a range of numbers of columns.
+_MOST_COLUMNS = 10_000
 # Of fewer configurations any two may well have one time.
 _FEWEST_ALIKE = 4
 _OTHERS = ('pose', 'configuration', 'split', 'sensor', 'marker')
@@ -140,7 +143,10 @@ def read_rows(paths: Sequence[Path], chain: SerialChain, options: TableOptions) 
     tables = [
         read_table(path, options.separator, options.decimal, options.encoding) for path in paths
     ]
-    found = [(table, find_columns(table, chain.joint_names, options.told)) for table in tables]
+    found = [
+        (table, find_columns(table, chain.joint_names, _of_file(options.told, table.path, paths)))
+        for table in tables
+    ]
     _refuse_untold(found, options.told)
     with_points = _told_first([pair for pair in found if pair[1].points], 'points')
     with_joints = _told_first([pair for pair in found if pair[1].joints], 'joints')
@@ -356,6 +362,26 @@ def _meaning(i: int, columns: Columns, chain: SerialChain, angle: str, length: s
     return 'not used'
 
 
+def _of_file(told: Told, path: Path, paths: Sequence[Path]) -> Told:
+    """Return what was told of one file: `joints.txt:1-6` is of that file alone."""
+    own: dict[str, tuple[str, ...]] = {}
+    for kind, names in (('joints', told.joints), ('points', told.points)):
+        for other in paths:
+            for name in (str(other), other.name):
+                if names and names[0].startswith(f'{name}:'):
+                    rest = (names[0][len(name) + 1 :], *names[1:])
+                    names = rest if other == path else ()
+        own[kind] = tuple(one for name in names for one in _range(name))
+    return replace(told, joints=own['joints'], points=own['points'])
+
+
+def _range(name: str) -> list[str]:
+    ends = re.fullmatch(r'(\d+)-(\d+)', name)
+    if ends is None or not int(ends[1]) <= int(ends[2]) < _MOST_COLUMNS:
+        return [name]
+    return [str(i) for i in range(int(ends[1]), int(ends[2]) + 1)]
+
+
 def _told_first(found: list[Table], kind: str) -> list[Table]:
     """Return the tables in which columns of a kind were told, or all where none were."""
     told = [
@@ -394,7 +420,9 @@ def _refuse_untold(found: list[tuple[TextTable, Columns]], told: Told) -> None:
             for _, columns in found
         ):
             has = '; '.join(f'{table.path} has {", ".join(table.names)}' for table, _ in found)
-            raise InputError(f'{option}: there is no column {names[0]!r}; {has}')
+            known = {name.casefold() for table, _ in found for name in table.names}
+            absent = next((name for name in names if name.casefold() not in known), names[0])
+            raise InputError(f'{option}: there is no column {absent!r}; {has}')
     for option, name in (('--time', told.time), ('--names', told.names)):
         if name not in ('', 'none') and not any('told' in c.why.values() for _, c in found):
             has = '; '.join(f'{table.path} has {", ".join(table.names)}' for table, _ in found)

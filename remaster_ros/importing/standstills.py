@@ -108,7 +108,10 @@ class Standstills:
 
 def is_stream(stamps: FloatArray) -> bool:
     """Return whether rows follow each other faster than an arm can stop and be measured."""
-    return len(stamps) > _FEWEST_ROWS and float(np.median(np.diff(np.sort(stamps)))) < STREAM_S
+    if len(stamps) <= _FEWEST_ROWS:
+        return False
+    # Times that are all the same are none.
+    return 0.0 < float(np.median(np.diff(np.sort(stamps)))) < STREAM_S
 
 
 def joint_standstills(stream: Stream, fewest: int = 1) -> Standstills:

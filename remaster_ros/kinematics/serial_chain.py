@@ -190,6 +190,20 @@ class SerialChain:
         """Return the tool pose T_R_T, (..., 4, 4), for joint angles (..., k); see `frames`."""
         return self.frames(q, joint_offsets)[..., -1, :, :] @ self.T_fixed[-1]
 
+    def within_turns(self, q: FloatArray) -> FloatArray:
+        """Return joint angles (n, k) with whole turns taken off where the limits ask for it.
+
+        Angles that no turn brings within the limits stay as they are. A controller that counts on
+        is not more than two turns off.
+        """
+        low, high = self.lower - LIMIT_TOLERANCE_RAD, self.upper + LIMIT_TOLERANCE_RAD
+        turned = q.copy()
+        for turns in (-1, 1, -2, 2):
+            other = q + turns * 2.0 * np.pi
+            outside = ~((turned >= low) & (turned <= high))
+            turned = np.where(outside & (other >= low) & (other <= high), other, turned)
+        return turned
+
     def positions(
         self,
         q: ArrayLike,

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import re
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
 from remaster_ros.errors import InputError
 
 SHOWN = 60
+NUMBER = re.compile(r'[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?', re.ASCII)
+# An arm that this program calibrates has more than one joint.
+_FEWEST_AXES = 2
 
 
 @dataclass(frozen=True)
@@ -45,3 +49,55 @@ def unexpected(number: int, line: str, expected: str) -> InputError:
     text = line.strip()
     shown = text if len(text) <= SHOWN else f'{text[:SHOWN]}…'
     return InputError(f'line {number}: {shown!r}, where {expected} is expected')
+
+
+def axes_in_order(
+    kind: str,
+    found: Sequence[tuple[int, str, Mapping[str, str]]],
+    letters: Sequence[str],
+    maker: str = '',
+    coupling: Mapping[str, tuple[str, Literal[1, -1]]] | None = None,
+    notes: tuple[str, ...] = (),
+    unit: str = 'deg',
+) -> Named:
+    """Return positions as columns: their names where any has one, then the axes in order.
+
+    Parameters
+    ----------
+    found
+        Line, name ('' for none) and axes of each position; axes as ``A1``.
+    letters
+        Of the arm's axes first; then of external axes, which are left out where they stay at 0.
+
+    Raises
+    ------
+    InputError
+        A position without one of the axes that others have.
+    """
+    every = {axis for _, _, values in found for axis in values}
+    axes = sorted(every, key=lambda axis: (letters.index(axis[0]), int(axis[1:])))
+    arm = [axis for axis in axes if axis[0] == letters[0]]
+    if arm != [f'{letters[0]}{i}' for i in range(1, len(arm) + 1)] or len(arm) < _FEWEST_AXES:
+        raise unexpected(found[0][0], ', '.join(axes), f'{letters[0]}1, {letters[0]}2 and so on')
+    for number, name, values in found:
+        for axis in arm:
+            if axis not in values:
+                raise unexpected(number, f'{name} {", ".join(values)}', f'{axis} as well')
+    axes = arm + [
+        axis
+        for axis in axes
+        if axis not in arm and any(float(values.get(axis, '0')) for _, _, values in found)
+    ]
+    named = any(name for _, name, _ in found)
+    return Named(
+        kind=kind,
+        names=(*['name'] * named, *(f'{axis} [{unit}]' for axis in arm), *axes[len(arm) :]),
+        rows=tuple(
+            (*[name] * named, *(values.get(axis, '') for axis in axes))
+            for _, name, values in found
+        ),
+        lines=tuple(number for number, _, _ in found),
+        maker=maker,
+        coupling=coupling or {},
+        notes=notes,
+    )

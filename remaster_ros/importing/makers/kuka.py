@@ -1,0 +1,64 @@
+"""KUKA's own texts: axis positions of a .dat or .src file, and of $AXIS_ACT as it is shown."""
+
+from __future__ import annotations
+
+import re
+
+from remaster_ros.errors import InputError
+from remaster_ros.importing.makers.named import NUMBER, Named, axes_in_order, unexpected
+
+_AGGREGATE = re.compile(r'\{([^{}]*)\}')
+_AXES = re.compile(r'\b(?:E6)?AXIS\b|\$AXIS_ACT', re.IGNORECASE)
+_PLACE = re.compile(r'\bE6POS\b|\bPOS\b|\bFRAME\b|[{:,]\s*X\s+[-+.\d]', re.IGNORECASE)
+_ENTRY = re.compile(rf'\s*(?:(?:E6)?AXIS\s*:)?\s*([AE]\d)\s+({NUMBER.pattern})\s*', re.IGNORECASE)
+_MOVE_TO = re.compile(r'\bS?PTP\s*\{', re.IGNORECASE)
+_NAME = re.compile(r'([A-Za-z]\w*)\s*=\s*$')
+_PROGRAM = re.compile(r'\s*(?:&[A-Z]|;\s*FOLD|DEF(?:DAT)?\s+\w[^:\n]*(?:\n|$))', re.IGNORECASE)
+_EXPECTED = '{E6AXIS: A1 …, A2 …} with a number for each axis'
+
+
+def read(text: str) -> Named | None:
+    """Return the axis positions in a text of KUKA's; None for anything else."""
+    if not (re.search(r'\{[^{}]*\bA1\s+[-+.\d]', text) or _PROGRAM.match(text)):
+        return None
+    found: list[tuple[int, str, dict[str, str]]] = []
+    places = []
+    for number, line in enumerate(text.splitlines(), 1):
+        code = line.partition(';')[0]
+        aggregates = [*_AGGREGATE.finditer(code)]
+        axes = [a for a in aggregates if re.search(r'\bA\d\b', a[1])]
+        if axes:
+            for aggregate in axes:
+                found.append((number, *_position(number, line, code, aggregate)))
+        elif _PLACE.search(code):
+            places.append(number)
+        elif _MOVE_TO.search(code) or (_AXES.search(code) and re.search(r'[={}]', code)):
+            raise unexpected(number, line, _EXPECTED)
+    if not found:
+        raise InputError(
+            'line 1: there are no axis positions in it ({E6AXIS: A1 …}); where its moves name '
+            'points, give the .dat file of the program, and of Cartesian points what $AXIS_ACT '
+            'was there'
+        )
+    notes: tuple[str, ...] = ()
+    if places:
+        notes = (f'{len(places)} Cartesian points (first on line {places[0]}) were left out',)
+    return axes_in_order(
+        'positions of a KUKA controller', found, ('A', 'E'), maker='KUKA', notes=notes
+    )
+
+
+def _position(
+    number: int, line: str, code: str, aggregate: re.Match[str]
+) -> tuple[str, dict[str, str]]:
+    """Return the name of a position, '' where it has none, and its axes."""
+    values: dict[str, str] = {}
+    for part in aggregate[1].split(','):
+        entry = _ENTRY.fullmatch(part)
+        if entry is None or entry[1].upper() in values:
+            raise unexpected(number, line, _EXPECTED)
+        values[entry[1].upper()] = entry[2]
+    named = _NAME.search(code[: aggregate.start()])
+    name = '' if named is None or named[1].upper() == 'AXIS_ACT' else named[1]
+    # The data of point P1 is called XP1.
+    return name[1:] if name.upper().startswith('X') and len(name) > 1 else name, values

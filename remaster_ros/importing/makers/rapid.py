@@ -1,0 +1,91 @@
+"""Joint targets of RAPID (ABB), as Rokae writes them, and of a log of CJointT()."""
+
+from __future__ import annotations
+
+import re
+
+from remaster_ros.errors import InputError
+from remaster_ros.importing.makers.named import NUMBER, Named, axes_in_order, unexpected
+
+_TARGET = re.compile(r'\bjointtarget\b', re.IGNORECASE)
+_LISTED = re.compile(r'^\s*\[\s*\[', re.MULTILINE)
+_MOVE = re.compile(r'\bMoveAbsJ\s*\[', re.IGNORECASE)
+_ASSIGNED = re.compile(r'\s*([A-Za-z]\w*)\s*:?=\s*')
+_VALUE = re.compile(
+    r'\s*(?:[A-Za-z]\w*\s*:)?\s*[\[{]?\s*[\[{]([^\[\]{}]*)[\]}]\s*,?\s*(?:(?:[A-Za-z]\w*\s*:)?\s*[\[{]([^\[\]{}]*)[\]}])?\s*[\]}]?'
+)
+# Nothing else in RAPID begins with six numbers.
+_SIX = re.compile(r'(?:=|^)\s*(?:[A-Za-z]\w*\s*:)?[\s\[{}]*(?:[-+.\deE]+\s*,\s*){5}')
+_UNUSED = 9e9
+_EXPECTED = '[[…,…],[…]] with a number for each axis'
+
+
+def read(text: str) -> Named | None:
+    """Return the joint targets of a module; None for anything else."""
+    if not (_TARGET.search(text) or _MOVE.search(text) or _LISTED.search(text)):
+        return None
+    found: list[tuple[int, str, dict[str, str]]] = []
+    places = 0
+    for number, statement in _statements(text):
+        target, move = _TARGET.search(statement), _MOVE.search(statement)
+        name = ''
+        if target:
+            assigned = _ASSIGNED.match(statement, target.end())
+            if assigned is None:
+                # A declaration without a value.
+                if re.fullmatch(r'\s*[A-Za-z]\w*\s*', statement[target.end() :]):
+                    continue
+                raise unexpected(number, statement, f'jointtarget NAME:={_EXPECTED}')
+            name, start = assigned[1], assigned.end()
+        elif move:
+            start = move.end() - 1
+        elif _LISTED.match(statement):
+            start = 0
+        else:
+            if _SIX.search(statement) or (not _TARGET.search(text) and not _MOVE.search(text)):
+                raise unexpected(number, statement, f'jointtarget NAME:={_EXPECTED}')
+            places += bool(re.search(r'\brobtarget\b[^;]*:?=', statement, re.IGNORECASE))
+            continue
+        value = _VALUE.match(statement, start)
+        if value is None or (not move and statement[value.end() :].strip(' \t\r\n;')):
+            raise unexpected(number, statement, _EXPECTED)
+        found.append((number, name, _axes(number, statement, value)))
+    if not found:
+        raise InputError(f'line 1: there is no joint target in it (jointtarget p1:={_EXPECTED})')
+    notes = (f'{places} Cartesian targets were left out',) * bool(places)
+    return axes_in_order('joint targets of RAPID', found, ('J', 'E'), notes=notes)
+
+
+def _statements(text: str) -> list[tuple[int, str]]:
+    """Return the statements without comments, and the line on which each begins."""
+    statements: list[tuple[int, str]] = []
+    parts: list[str] = []
+    start = 0
+    for number, line in enumerate(text.splitlines(), 1):
+        code = line.partition('!')[0]
+        listed = bool(_LISTED.match(code)) and not parts
+        for i, piece in enumerate(code.split(';')):
+            if i and parts:
+                statements.append((start, ' '.join(parts)))
+                parts = []
+            if piece.strip():
+                start = start if parts else number
+                parts.append(piece)
+        # A log has a target in each line, with or without a semicolon.
+        if listed and parts:
+            statements.append((start, ' '.join(parts)))
+            parts = []
+    return [*statements, (start, ' '.join(parts))] if parts else statements
+
+
+def _axes(number: int, statement: str, value: re.Match[str]) -> dict[str, str]:
+    axes = {}
+    for letter, group in (('J', value[1]), ('E', value[2])):
+        for i, cell in enumerate((group or '').split(',') if group else (), 1):
+            if not NUMBER.fullmatch(cell.strip()):
+                raise unexpected(number, statement, _EXPECTED)
+            if float(cell) < _UNUSED:
+                axes[f'{letter}{i}'] = cell.strip()
+            elif letter == 'J':
+                raise unexpected(number, statement, 'an angle for each axis of the arm')
+    return axes

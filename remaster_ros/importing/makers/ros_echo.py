@@ -1,0 +1,92 @@
+"""What ``rostopic echo -p`` and ``ros2 topic echo --csv`` print of joint states.
+
+ROS 1 has the names of the joints in cells of their own (``field.name0``); ROS 2 has no header: a
+second, a nanosecond, the frame, the names, then positions, velocities and efforts.
+"""
+
+from __future__ import annotations
+
+import re
+
+from remaster_ros.importing.makers.named import NUMBER, Named, unexpected
+
+_FIELD = re.compile(r'field\.(name|position)\[?(\d+)\]?')
+
+
+def read(text: str) -> Named | None:
+    """Return the joints of a printed topic; None for anything else."""
+    lines = [(i, line) for i, line in enumerate(text.splitlines(), 1) if line.strip()]
+    if not lines:
+        return None
+    head = [cell.strip() for cell in lines[0][1].split(',')]
+    if any(_FIELD.fullmatch(cell) for cell in head):
+        return _with_header(head, lines[1:])
+    return _without(lines) if _names(head) else None
+
+
+def _with_header(head: list[str], lines: list[tuple[int, str]]) -> Named | None:
+    columns = {cell: i for i, cell in enumerate(head)}
+    names = {
+        match[2]: i
+        for cell, i in columns.items()
+        if (match := _FIELD.fullmatch(cell)) and match[1] == 'name'
+    }
+    positions = {
+        match[2]: i
+        for cell, i in columns.items()
+        if (match := _FIELD.fullmatch(cell)) and match[1] == 'position'
+    }
+    if not names or {*names} != {*positions}:
+        return None
+    # The time of the message, not that of printing it.
+    time = next(
+        (columns[name] for name in ('field.header.stamp', '%time') if name in columns), None
+    )
+    if time is None:
+        return None
+    first: list[str] = []
+    rows = []
+    for number, line in lines:
+        cells = [cell.strip() for cell in line.split(',')]
+        own = [cells[i] for i in names.values()] if len(cells) == len(head) else []
+        first = first or own
+        if not own or own != first:
+            raise unexpected(number, line, f'{len(head)} cells with the same names of joints')
+        rows.append((cells[time], *(cells[positions[i]] for i in names)))
+    return _named(first, rows, lines, 'ns')
+
+
+def _names(cells: list[str]) -> list[str]:
+    """Return the joints' names of a line of ``ros2 topic echo --csv``; [] of other lines."""
+    if len(cells) < 5 or not (cells[0].isdigit() and cells[1].isdigit() and int(cells[1]) < 1e9):
+        return []
+    names = []
+    for cell in cells[3:]:
+        if NUMBER.fullmatch(cell):
+            break
+        names.append(cell)
+    return names if len(names) > 1 and len(cells) >= 3 + 2 * len(names) and all(names) else []
+
+
+def _without(lines: list[tuple[int, str]]) -> Named:
+    first = _names([cell.strip() for cell in lines[0][1].split(',')])
+    rows = []
+    for number, line in lines:
+        cells = [cell.strip() for cell in line.split(',')]
+        if _names(cells) != first:
+            raise unexpected(number, line, f'second, nanosecond, frame, {", ".join(first)}')
+        start = 3 + len(first)
+        stamp = f'{cells[0]}.{int(cells[1]):09d}'
+        rows.append((stamp, *cells[start : start + len(first)]))
+    return _named(first, rows, lines, 's')
+
+
+def _named(
+    joints: list[str], rows: list[tuple[str, ...]], lines: list[tuple[int, str]], unit: str
+) -> Named:
+    return Named(
+        kind='joint states as ROS prints them',
+        names=(f'time [{unit}]', *(f'{joint} position' for joint in joints)),
+        rows=tuple(rows),
+        lines=tuple(number for number, _ in lines),
+    )

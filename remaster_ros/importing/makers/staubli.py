@@ -1,0 +1,38 @@
+"""Joint variables of Staubli's VAL 3 (.dtx and older data files in XML)."""
+
+from __future__ import annotations
+
+import re
+
+from remaster_ros.importing.makers.named import NUMBER, Named, axes_in_order, unexpected
+
+_TAG = re.compile(r'<[^<>]*>')
+_ATTRIBUTE = re.compile(r'([\w:]+)\s*=\s*"([^"]*)"')
+_JOINT = re.compile(r'j\d+')
+
+
+def read(text: str) -> Named | None:
+    """Return the joints of a data file of VAL 3; None for anything else."""
+    if not re.search(r'<[^<>]*\bj1\s*=\s*"', text):
+        return None
+    found: list[tuple[int, str, dict[str, str]]] = []
+    name, several = '', False
+    for tag in _TAG.finditer(text):
+        number = text.count('\n', 0, tag.start()) + 1
+        attributes = dict(_ATTRIBUTE.findall(tag[0]))
+        if 'name' in attributes:
+            name = attributes['name']
+            several = attributes.get('size', '1') != '1'
+        joints = {key.upper(): cell for key, cell in attributes.items() if _JOINT.fullmatch(key)}
+        if not joints:
+            continue
+        if not all(NUMBER.fullmatch(cell.strip()) for cell in joints.values()):
+            raise unexpected(number, tag[0], 'j1="…" j2="…" with a number each')
+        key = attributes.get('key', '') if several else ''
+        found.append((number, f'{name}[{key}]' if key else name, joints))
+    for line, piece in enumerate(
+        _TAG.sub(lambda tag: '\n' * tag[0].count('\n'), text).split('\n'), 1
+    ):
+        if re.search(r'\bj\d+\s*=|[<>]', piece):
+            raise unexpected(line, piece, 'a whole element, <Value … j1="…" … />,')
+    return axes_in_order('joints of VAL 3', found, ('J',), maker='Staubli')

@@ -1,0 +1,78 @@
+"""Joint positions of a program in URScript: those of movej, and waypoints called …_q."""
+
+from __future__ import annotations
+
+import math
+import re
+
+from remaster_ros.errors import InputError
+from remaster_ros.importing.makers.named import NUMBER, Named, axes_in_order, unexpected
+
+_MOVE = re.compile(r'\b(?:movej|servoj)\s*\(\s*')
+_LIST = re.compile(r'\[([^\[\]]*)\]')
+_ASSIGNED = re.compile(r'\s*(?:global\s+|local\s+)?([A-Za-z]\w*)\s*=\s*')
+_DEGREES = re.compile(rf'd2r\(\s*({NUMBER.pattern})\s*\)')
+# Six numbers in a list, and what takes such beside movej.
+_SIX = re.compile(r'\(\s*\[\s*(?:[-+.\deE]+\s*,\s*){5}')
+_OTHERS = re.compile(r'\b(?:speed[jl]|set_\w+|force_mode|inverse_\w+|textmsg|get_\w+)\s*\(')
+_EXPECTED = 'a list of the joints in rad, [0.1, -1.5, …],'
+
+
+def read(text: str) -> Named | None:
+    """Return the joint positions of a program in URScript; None for anything else."""
+    if not re.search(r'\bmove[jlp]\s*\(|^\s*(?:global\s+)?\w+_q\s*=\s*\[', text, re.MULTILINE):
+        return None
+    named = {*re.findall(r'\bmovej\s*\(\s*([A-Za-z]\w*)\s*[,)]', text)}
+    found: list[tuple[int, str, dict[str, str]]] = []
+    defined: set[str] = set()
+    places = 0
+    for number, line in enumerate(text.splitlines(), 1):
+        code = line.partition('#')[0]
+        assigned, move = _ASSIGNED.match(code), _MOVE.search(code)
+        name = ''
+        if assigned and (assigned[1].endswith('_q') or assigned[1] in named):
+            name, start = re.sub(r'_q$', '', assigned[1]), assigned.end()
+            defined.add(assigned[1])
+        elif move:
+            start = move.end()
+        else:
+            if _SIX.search(code) and not _OTHERS.search(code):
+                raise unexpected(number, line, 'movej([…])')
+            continue
+        if re.match(r'p\[|pose_|get_inverse_kin', code[start:]):
+            places += 1
+            continue
+        if move and not assigned and re.match(r'[A-Za-z]\w*\s*[,)]', code[start:]):
+            # A waypoint, which stands above.
+            continue
+        listed = _LIST.match(code, start)
+        if listed is None:
+            raise unexpected(number, line, _EXPECTED)
+        found.append((number, name, _joints(number, line, listed[1])))
+    absent = named - defined
+    if absent:
+        raise InputError(
+            f'line 1: {min(absent)} of movej is nowhere; {min(absent)}=[…] is expected'
+        )
+    if not found:
+        raise InputError(
+            'line 1: there is no joint position in it (movej([…]), Waypoint_1_q=[…]); of '
+            'Cartesian waypoints record what the joints were there'
+        )
+    notes = (f'{places} moves to Cartesian poses were left out',) * bool(places)
+    return axes_in_order(
+        'joint positions of URScript', found, ('J',), maker='UR', notes=notes, unit='rad'
+    )
+
+
+def _joints(number: int, line: str, listed: str) -> dict[str, str]:
+    values = {}
+    for i, cell in enumerate(listed.split(','), 1):
+        degrees = _DEGREES.fullmatch(cell.strip())
+        if degrees:
+            values[f'J{i}'] = repr(math.radians(float(degrees[1])))
+        elif NUMBER.fullmatch(cell.strip()):
+            values[f'J{i}'] = cell.strip()
+        else:
+            raise unexpected(number, line, _EXPECTED)
+    return values

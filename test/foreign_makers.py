@@ -1,0 +1,125 @@
+"""Programs and logs in the text of makers of controllers, for the tests: joints by name."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Kind:
+    """One kind of text: how it is written, and what its language takes for comments.
+
+    Attributes
+    ----------
+    write
+        Names and joints, deg, (n, k) -> text.
+    named
+        Whether the names stand in it.
+    comment
+        What begins a comment; '' where nothing does.
+    one_line
+        Whether each position is a line.
+    """
+
+    write: Callable[[Sequence[str], np.ndarray], str]
+    named: bool = True
+    comment: str = ''
+    one_line: bool = True
+
+
+def _kuka(q: np.ndarray, between: str) -> str:
+    axes = [f'A{i} {value:.4f}' for i, value in enumerate(q, 1)]
+    return between.join([*axes, *[f'E{i} 0.0' for i in range(1, 7)]])
+
+
+def kuka_dat(names, q):
+    lines = ['&ACCESS RVP', '&REL 4', 'DEFDAT calib', 'EXTERNAL DECLARATIONS']
+    for name, row in zip(names, q):
+        lines += [f'DECL E6AXIS X{name}={{{_kuka(row, ",")}}}']
+        lines += [f'DECL FDAT F{name}={{TOOL_NO 1,BASE_NO 0,IPO_FRAME #BASE,POINT2[] " "}}']
+    return '\r\n'.join(
+        [*lines, 'DECL E6POS XAWAY={X 1.0,Y 2.0,Z 3.0,A 0.0,B 0.0,C 0.0}', 'ENDDAT']
+    )
+
+
+def kuka_src(names, q):
+    moves = [f'PTP {{E6AXIS: {_kuka(row, ", ")}}}\r\nWAIT SEC 5' for row in q]
+    return '\r\n'.join(['DEF calib( )', ';FOLD INI', 'BAS (#INITMOV,0)', *moves, 'END'])
+
+
+def kuka_log(names, q):
+    return '\n'.join(f'$AXIS_ACT={{E6AXIS: {_kuka(row, ", ")}}}' for row in q)
+
+
+def fanuc(names, q):
+    lines = ['/PROG  CALIB', '/ATTR', f'LINE_COUNT\t= {len(q)};', '/MN']
+    lines += [f'{i:4d}:J {name} 10% FINE    ;' for i, name in enumerate(names, 1)]
+    lines += ['/POS']
+    for i, row in enumerate(q, 1):
+        axes = [f'J{i}= {value:9.4f} deg' for i, value in enumerate(row, 1)]
+        lines += [f'P[{i}]{{', '   GP1:', '\tUF : 0, UT : 1,']
+        lines += ['\t' + ',\t'.join(axes[:3]) + ',', '\t' + ',\t'.join(axes[3:]), '};']
+    return '\r\n'.join([*lines, '/END'])
+
+
+def rapid(names, q):
+    lines = ['MODULE calib', '  ! measured', '  VAR jointtarget here;']
+    for name, row in zip(names, q):
+        axes = ','.join(f'{value:.4f}' for value in row)
+        lines += [f'  CONST jointtarget {name}:=[[{axes}],[9E9,9E9,9E9,9E9,9E9,9E9]];']
+    lines += ['  CONST robtarget away:=[[1,2,3],[1,0,0,0],[0,0,0,0],[9E9,9E9,9E9,9E9,9E9,9E9]];']
+    return '\n'.join([*lines, '  PROC main()', '    MoveAbsJ here, v100, fine, tool0;', 'ENDPROC'])
+
+
+def rapid_log(names, q):
+    unused = ','.join(['9E+09'] * 6)
+    return '\n'.join(f'[[{",".join(f"{v:.4f}" for v in row)}],[{unused}]]' for row in q)
+
+
+def rokae(names, q):
+    rows = zip(names, (','.join(f'{value:.4f}' for value in row) for row in q), strict=True)
+    return '\n'.join(f'GLOBAL CONST jointtarget {name} = J:{{{row}}};' for name, row in rows)
+
+
+def staubli(names, q):
+    lines = ['<?xml version="1.0" encoding="utf-8"?>', '<Database>', '  <Datas>']
+    for name, row in zip(names, q):
+        axes = ' '.join(f'j{i}="{value:.4f}"' for i, value in enumerate(row, 1))
+        lines += [f'    <Data name="{name}" xsi:type="array" type="jointRx" size="1">']
+        lines += [f'      <Value key="0" {axes} />', '    </Data>']
+    return '\n'.join([*lines, '  </Datas>', '</Database>'])
+
+
+def ur_script(names, q):
+    lines = ['def calib():', '  set_tcp(p[0.0,0.0,0.1,0.0,0.0,0.0])', '  global grav=[0, 0, 9.82]']
+    for name, row in zip(names, np.deg2rad(q)):
+        lines += [f'  global {name}_q=[{", ".join(f"{value:.8f}" for value in row)}]']
+    lines += [f'  movej({name}_q, a=1.4, v=1.05)' for name in names]
+    return '\n'.join([*lines, '  movel(p[0.1,0.2,0.3,0,0,0], a=1.2)', 'end'])
+
+
+def ur_moves(names, q):
+    rows = ([f'{value:.8f}' for value in row] for row in np.deg2rad(q))
+    return '\n'.join(['def calib():', *[f'  movej([{", ".join(r)}], a=1.4)' for r in rows], 'end'])
+
+
+KINDS = {
+    'kuka_dat': Kind(kuka_dat, comment=';'),
+    'kuka_src': Kind(kuka_src, named=False, comment=';'),
+    'kuka_log': Kind(kuka_log, named=False, comment=';'),
+    'fanuc': Kind(fanuc, one_line=False),
+    'rapid': Kind(rapid, comment='!'),
+    'rapid_log': Kind(rapid_log, named=False, comment='!'),
+    'rokae': Kind(rokae, comment='!'),
+    'staubli': Kind(staubli, one_line=False),
+    'ur_script': Kind(ur_script, comment='#'),
+    'ur_moves': Kind(ur_moves, named=False, comment='#'),
+}
+
+
+def names_of(kind: str, count: int) -> list[str]:
+    """Return what a kind calls its positions."""
+    return [f'P[{i}]' if kind == 'fanuc' else f'P{i}' for i in range(1, count + 1)]

@@ -1,0 +1,260 @@
+"""Joints from the text of each maker's controller; what is damaged is read right or refused."""
+
+from __future__ import annotations
+
+import random
+import re
+from collections import Counter
+
+import numpy as np
+import pytest
+from foreign_makers import KINDS, names_of
+from foreign_tables import measured, text, write
+
+from remaster_ros.cli.main import main
+from remaster_ros.errors import InputError
+from remaster_ros.importing.columns import Told, find_columns
+from remaster_ros.importing.makers import READERS
+from remaster_ros.importing.rows import TableOptions, read_rows
+from remaster_ros.importing.text_table import read_table
+from remaster_ros.importing.units import ANGLES
+from remaster_ros.importing.values import angle_unit, numbers
+from remaster_ros.session.reader import read_session
+
+JOINTS = tuple(f'joint_{i}' for i in range(1, 7))
+
+
+def joints_of(count=12, seed=0):
+    return np.random.default_rng(seed).uniform(-170.0, 170.0, (count, 6)).round(4)
+
+
+def read_text(content):
+    found = [named for read in READERS if (named := read(content)) is not None]
+    assert len(found) == 1
+    return found[0]
+
+
+@pytest.mark.parametrize('kind', KINDS)
+def test_joints_and_names_are_those_that_were_written(kind, tmp_path):
+    q = joints_of()
+    names = names_of(kind, len(q))
+    table = read_table(write(tmp_path, 'program.txt', KINDS[kind].write(names, q)))
+    found = find_columns(table, JOINTS)
+    unit, how = angle_unit(table, found, '')
+    assert how == 'header'
+    got = np.rad2deg(numbers(table, found.joints) * ANGLES[unit])
+    np.testing.assert_allclose(got, q, atol=1e-6)
+    if KINDS[kind].named:
+        assert [row[found.one('name')] for row in table.rows] == names
+
+
+def test_the_coupling_of_fanuc_and_the_names_are_kept(tmp_path, capsys):
+    arm = measured(rows=30)
+    pad = np.rad2deg(arm.q)
+    pad[:, 2] -= pad[:, 1]
+    names = names_of('fanuc', len(pad))
+    program = write(tmp_path, 'calib.ls', KINDS['fanuc'].write(names, pad))
+    points = write(tmp_path, 'points.csv', text(['Name', 'X', 'Y', 'Z'], [names, *arm.points.T]))
+    (tmp_path / 'robot.urdf').write_text(arm.urdf)
+    out = tmp_path / 'session'
+    args = [str(program), str(points), '--urdf', str(tmp_path / 'robot.urdf'), '--out', str(out)]
+    assert main(['import', *args]) == 0
+    assert 'as a FANUC controller counts them: --couple J3=J2' in capsys.readouterr().out
+    session = read_session(out)
+    np.testing.assert_allclose(session.measurements.q, arm.q, atol=2e-6)
+    assert session.controller.maker == 'FANUC'
+    assert session.controller.joints['joint_3'].coupling == {'joint_2': 1}
+
+
+def test_a_description_that_couples_itself_is_left_as_it_is(tmp_path, capsys):
+    arm = measured(rows=30)
+    names = names_of('fanuc', len(arm.q))
+    program = write(tmp_path, 'calib.ls', KINDS['fanuc'].write(names, np.rad2deg(arm.q)))
+    points = write(tmp_path, 'points.csv', text(['Name', 'X', 'Y', 'Z'], [names, *arm.points.T]))
+    (tmp_path / 'robot.urdf').write_text(arm.urdf)
+    out = tmp_path / 'session'
+    args = [str(program), str(points), '--urdf', str(tmp_path / 'robot.urdf'), '--out', str(out)]
+    assert main(['import', *args]) == 0
+    assert 'coupled' not in capsys.readouterr().out
+    np.testing.assert_allclose(read_session(out).measurements.q, arm.q, atol=2e-6)
+
+
+def test_spatial_analyzers_names_are_joined_by_their_last_part(tmp_path):
+    arm = measured(rows=12)
+    program = write(
+        tmp_path, 'p.dat', KINDS['kuka_dat'].write(names_of('kuka_dat', 12), np.rad2deg(arm.q))
+    )
+    lines = [
+        f'A::KR6::P{i}, {x:.6f}, {y:.6f}, {z:.6f}' for i, (x, y, z) in enumerate(arm.points, 1)
+    ]
+    points = write(tmp_path, 'sa.txt', '\r\n'.join(['// Units: Meters', *reversed(lines)]))
+    rows = read_rows([points, program], arm.chain, TableOptions())
+    np.testing.assert_allclose(rows.q, arm.q[::-1], atol=2e-6)
+    # Two groups with the same last parts are not joined by them.
+    twice = write(tmp_path, 'sa.txt', '\r\n'.join([*lines, lines[0].replace('KR6', 'KR7')]))
+    with pytest.raises(InputError, match='is also on line 1; keep one'):
+        read_rows([twice, program], arm.chain, TableOptions())
+
+
+def test_joints_that_ros_prints(tmp_path):
+    q = np.deg2rad(joints_of(4))
+    order = [2, 0, 1, 3, 5, 4]
+    head = ['%time', 'field.header.seq', 'field.header.stamp', 'field.header.frame_id']
+    head += [f'field.{what}{i}' for what in ('name', 'position') for i in range(6)]
+    ros1 = [','.join(head)]
+    ros2 = []
+    for i, row in enumerate(q):
+        names = [JOINTS[joint] for joint in order]
+        cells = [f'{row[joint]:.9f}' for joint in order]
+        ros1.append(
+            ','.join(
+                [
+                    f'{1_700_000_000 + i}000000000',
+                    str(i),
+                    f'{1_700_000_000 + i}500000000',
+                    '',
+                    *names,
+                    *cells,
+                ]
+            )
+        )
+        ros2.append(','.join([f'{1_700_000_000 + i}', '500000000', '', *names, *cells, *cells]))
+    for lines in (ros1, ros2):
+        table = read_table(write(tmp_path, 'echo.csv', '\n'.join(lines)))
+        found = find_columns(table, JOINTS)
+        np.testing.assert_allclose(numbers(table, found.joints), q, atol=1e-8)
+        wrong = lines[2].replace('joint_2', 'joint_9')
+        with pytest.raises(InputError, match=r"line 3: '.* is expected"):
+            read_table(write(tmp_path, 'echo.csv', '\n'.join([*lines[:2], wrong, *lines[3:]])))
+
+
+def test_columns_are_told_of_one_of_two_files_without_header(tmp_path):
+    arm = measured(rows=8)
+    joints = write(tmp_path, 'joints.txt', text([], [*np.rad2deg(arm.q).T, *np.zeros((3, 8))]))
+    points = write(tmp_path, 'points.txt', text([], [*arm.points.T, *np.zeros((4, 8))]))
+    told = Told(joints=('joints.txt:1-6',), points=('points.txt:1-3',))
+    options = TableOptions(told=told, join='order', length='m')
+    rows = read_rows([points, joints], arm.chain, options)
+    np.testing.assert_allclose(rows.q, arm.q, atol=1e-7)
+    np.testing.assert_allclose(rows.position, arm.points, atol=1e-6)
+
+
+@pytest.mark.parametrize('turns', [1, -1, 2])
+def test_whole_turns_are_taken_off_where_the_limits_ask_for_it(turns, tmp_path, capsys):
+    arm = measured(rows=30)
+    q = np.rad2deg(arm.q)
+    q[::2, 1] += 360.0 * turns
+    q[:, 4] = q[:, 4] % 360.0
+    header = [*[f'A{i}' for i in range(1, 7)], 'X', 'Y', 'Z']
+    table = write(tmp_path, 't.csv', text(header, [*q.T, *arm.points.T]))
+    (tmp_path / 'robot.urdf').write_text(arm.urdf)
+    out = tmp_path / 'session'
+    args = [str(table), '--urdf', str(tmp_path / 'robot.urdf'), '--out', str(out)]
+    assert main(['import', *args]) == 0
+    assert 'whole turns were taken off, as the limits ask for it: joint_2 (15 rows)' in (
+        capsys.readouterr().out
+    )
+    np.testing.assert_allclose(read_session(out).measurements.q, arm.q, atol=2e-6)
+
+
+def test_times_that_are_all_the_same_are_no_times(tmp_path):
+    arm = measured(rows=20)
+    stamp = np.full(20, 1.7e9)
+    stamp[-1] += 5.0
+    header = [*[f'A{i}' for i in range(1, 7)], 'X', 'Y', 'Z', 'time']
+    table = write(tmp_path, 't.csv', text(header, [*np.rad2deg(arm.q).T, *arm.points.T, stamp]))
+    rows = read_rows([table], arm.chain, TableOptions())
+    assert rows.stamp_s is None
+    assert '19 of 20 configurations have one and the same time' in rows.warnings[0]
+
+
+def mutated(rng, content, one_line, comment):
+    """Return a text with one thing wrong in it, and whether a row may be lost by it."""
+    at = rng.randrange(len(content))
+    letter = rng.choice('0123456789.,;:-+=[]{}()"\'<>!#/ \tABEJPXjpqx')
+    what = rng.choice(['change', 'change', 'remove', 'insert', 'cut', 'line'])
+    if what == 'change':
+        return content[:at] + letter + content[at + 1 :], letter == comment
+    if what == 'remove':
+        return content[:at] + content[at + 1 :], False
+    if what == 'insert':
+        return content[:at] + letter + content[at:], letter == comment
+    if what == 'cut':
+        return content[:at], True
+    lines = content.splitlines(keepends=True)
+    i, j = rng.randrange(len(lines)), rng.randrange(len(lines))
+    if one_line and rng.random() < 0.5:
+        lines[i], lines[j] = lines[j], lines[i]
+    else:
+        lines[i : i + 1] = rng.choice([[], [lines[i]] * 2])
+    return ''.join(lines), True
+
+
+def rows_of(table, named):
+    """Return the cells of names and joints, counted."""
+    found = find_columns(table, JOINTS)
+    columns = (*[found.one('name')] * named, *found.joints)
+    return Counter(tuple(row[i] for i in columns) for row in table.rows)
+
+
+def check_mutations(kind, count, seed, path):
+    """Each mutated text is refused, or its rows are those written, but for what was mutated."""
+    print(f'mutations of {kind}: {count}, seed {seed}')
+    rng = random.Random(seed)
+    made = KINDS[kind]
+    q = joints_of(8, seed)
+    content = made.write(names_of(kind, len(q)), q)
+    path.write_text(content)
+    true = rows_of(read_table(path), made.named)
+    read, refusals = 0, []
+    for _ in range(count):
+        broken, may_lose = mutated(rng, content, made.one_line, made.comment)
+        path.write_bytes(broken.encode())
+        try:
+            table = read_table(path)
+            columns = find_columns(table, JOINTS)
+        except InputError as error:
+            refusals.append(str(error))
+            continue
+        if not table.kind:
+            # As a plain table it has no joints.
+            assert not columns.joints, broken
+            continue
+        read += 1
+        rows = rows_of(table, made.named)
+        # A line may stand twice: names given twice are refused where tables are joined.
+        other = [row for row in (rows - true).elements() if row not in true]
+        if len(found_joints := columns.joints) != len(JOINTS):
+            # `read_rows` refuses another number of joints than the robot has.
+            assert found_joints != JOINTS
+            continue
+        # One thing was wrong, so one row can be other than written, in one of its cells; and that
+        # cell stands in the text as it was read.
+        assert len(other) <= 1, (broken, other)
+        for row in other:
+            best = min(true, key=lambda one: sum(a != b for a, b in zip(one, row, strict=True)))
+            changed = [b for a, b in zip(best, row, strict=True) if a != b]
+            assert len(changed) == 1, (broken, row)
+            number = re.escape(changed[0])
+            if kind.startswith('ur') and changed[0] not in broken:
+                continue
+            assert re.search(rf'(?<![\w.]){number}(?![\w.])|X{number}\b|{number}_q', broken), (
+                changed,
+                broken,
+            )
+        lost = [*(true - rows).elements()]
+        if not may_lose and len(lost) > len(other):
+            raise AssertionError((broken, lost))
+    assert all(re.match(r'.*: |.*, line \d+: ', text) for text in refusals)
+    return read
+
+
+@pytest.mark.parametrize('kind', KINDS)
+def test_a_mutated_text_is_read_right_or_refused(kind, tmp_path):
+    assert check_mutations(kind, 60, 11, tmp_path / 'program.txt') > 0
+
+
+@pytest.mark.qualify
+@pytest.mark.parametrize('kind', KINDS)
+def test_two_thousand_mutations_are_read_right_or_refused(kind, tmp_path):
+    assert check_mutations(kind, 2000, 12, tmp_path / 'program.txt') > 0
