@@ -159,7 +159,10 @@ DISCOVER = {
 }
 
 
-@pytest.mark.parametrize('case', DISCOVER)
+# That nothing is there a node answers, too: test_discovering.
+@pytest.mark.parametrize(
+    'case', [pytest.param('none', marks=pytest.mark.qualify), 'effects', 'undetermined']
+)
 def test_discover(case: str, tmp_path: Path) -> None:
     options, verdict, mood, words = DISCOVER[case]
     session = simulated(tmp_path / 'session', '--seed', 3, *options)
@@ -219,7 +222,8 @@ def test_causes_that_do_harm_on_held_out_poses_are_not_returned(tmp_path: Path) 
     assert left['next'] in page
 
 
-@pytest.mark.parametrize('case', [pytest.param('none', marks=pytest.mark.qualify), 'effects'])
+@pytest.mark.qualify
+@pytest.mark.parametrize('case', ['none', 'effects'])
 def test_discover_with_a_session_that_confirms(case: str, tmp_path: Path) -> None:
     options = DISCOVER[case][0]
     session = simulated(tmp_path / 'session', '--seed', 3, *options)

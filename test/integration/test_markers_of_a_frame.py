@@ -113,6 +113,7 @@ def test_without_the_frames_the_same_sessions_are_too_certain(configurations):
     assert np.sqrt(np.mean(np.square(z))) > 1.4
 
 
+@pytest.mark.qualify
 def test_frames_of_four_markers_go_through_file_fit_and_search(configurations, tmp_path):
     print('seed', SEED)
     rng = np.random.default_rng(SEED)

@@ -292,8 +292,15 @@ def test_progress_and_seconds_come_from_outside() -> None:
     [
         ('validation only', 'no optimization rows'),
         ('two poses', 'saw 2 poses'),
-        ('joints reversed', 'with the joints in the order joint_7, joint_6, .* the data fit to 0'),
-        ('millimetres', 'with the points in mm the data fit to 0'),
+        # Mistakes of all kinds: test_mistakes.
+        pytest.param(
+            'joints reversed',
+            'with the joints in the order joint_7, joint_6, .* the data fit to 0',
+            marks=pytest.mark.qualify,
+        ),
+        pytest.param(
+            'millimetres', 'with the points in mm the data fit to 0', marks=pytest.mark.qualify
+        ),
     ],
 )
 def test_data_that_allow_no_answer_say_why(change: str, message: str) -> None:

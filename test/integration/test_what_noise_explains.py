@@ -48,7 +48,13 @@ def test_a_healthy_arm_is_green(made: Session, tmp_path: Path) -> None:
         assert check['stated_std_m'] is None
 
 
-@pytest.mark.parametrize('share', [0.25, 0.5], ids=['while fitting', 'before the held-out poses'])
+@pytest.mark.parametrize(
+    'share',
+    [
+        pytest.param(0.25, id='while fitting', marks=pytest.mark.qualify),
+        pytest.param(0.5, id='before the held-out poses'),
+    ],
+)
 def test_a_tracker_that_was_moved_4_mm_is_not(made: Session, tmp_path: Path, share: float) -> None:
     m = made.measurements
     tracker = list(made.sensors).index('tracker')

@@ -44,6 +44,7 @@ def test_a_nearly_singular_session_ends_with_its_direction_named(session, monkey
     assert np.all(np.isnan(sampler.r_hat))
 
 
+@pytest.mark.qualify
 def test_the_allowance_does_not_depend_on_the_machine(session, monkeypatch) -> None:
     monkeypatch.setattr(sampling, 'EVALUATED_ROWS', 2_000_000)
     first, second = (fit_session(session, rng=np.random.default_rng(1)) for _ in range(2))

@@ -62,6 +62,7 @@ def test_poses_that_were_fitted_as_well_prove_nothing() -> None:
     assert any('were fitted as well' in point for point in page.doubts)
 
 
+@pytest.mark.qualify
 def test_a_few_of_many_are_said_and_no_more() -> None:
     session = healthy(15)
     assert verdict(fit_session(session, rng=np.random.default_rng(1))).mood == 'good'

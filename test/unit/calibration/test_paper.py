@@ -61,6 +61,7 @@ def test_every_chain_starts_from_three_points_of_its_own() -> None:
     assert len(np.unique(shifts.round(9), axis=0)) == 4
 
 
+@pytest.mark.qualify
 def test_about_one_step_in_twenty_is_taken_at_the_mode() -> None:
     """The paper's noise and size; its proposals are as wide as measured there: about 5 %."""
     session, _ = scene(44, poses=36, sigma_m=0.85e-3, pose_sigma_m=0.0, marker_std_m=0.0)

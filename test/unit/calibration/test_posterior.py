@@ -171,6 +171,7 @@ def test_what_the_length_is_judged_by_is_what_is_stated() -> None:
         np.testing.assert_allclose(stated, of(fit.draws), rtol=1e-9)
 
 
+@pytest.mark.qualify
 def test_the_draws_do_not_depend_on_the_proposal() -> None:
     """Independent proposals and a random walk of the same target; KS at 1 in 1,000."""
     # Few rows, noise at zero: as far from Gaussian as a session gets.

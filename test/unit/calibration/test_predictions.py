@@ -40,6 +40,7 @@ def test_held_out_rows_lie_in_their_regions_as_often_as_stated(sensors):
     assert np.linalg.eigvalsh(found.covariance).min() > 0.9 * noise**2
 
 
+@pytest.mark.qualify
 def test_errors_with_long_tails_widen_the_regions():
     session, _ = scene(52, poses=60, validation=60, sigma_m=1e-6, pose_sigma_m=0.0)
     seed = 3

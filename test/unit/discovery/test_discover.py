@@ -48,6 +48,7 @@ def test_two_joints_that_sag_together_are_named_with_their_compliances():
         assert parameter.unit == 'rad/(N m)'
 
 
+@pytest.mark.qualify
 def test_backlash_and_a_sensor_scale_are_found_beside_each_other():
     def backlash(session: Session) -> np.ndarray:
         m = session.measurements

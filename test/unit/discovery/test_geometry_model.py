@@ -64,6 +64,7 @@ def test_an_elbow_off_its_drawing_by_the_tolerance_is_held_by_the_wider_std() ->
     assert np.sum(np.array(with_geometry) > 1.96) <= 4
 
 
+@pytest.mark.qualify
 def test_the_tolerance_of_the_drawing_is_a_prior() -> None:
     """Where lengths and tilts show nothing, it alone decides what they could do to offsets."""
     made = remaster_ros.simulate(poses=25, validation_poses=8, seed=0)

@@ -4,6 +4,7 @@ from dataclasses import replace
 from functools import cache
 
 import numpy as np
+import pytest
 from discovery_scenes import at_joint, discovered, residuals_of, session_with
 
 from remaster_ros.discovery import discover
@@ -88,6 +89,7 @@ def test_what_two_cells_explain_may_be_one_other_or_one_of_them():
     assert effect.tied
 
 
+@pytest.mark.qualify
 def test_the_largest_cause_is_in_doubt_also_where_held_out_poses_gain_nothing(monkeypatch):
     session = session_with(41, lambda s: at_joint(2, ARC_MINUTE * np.sin(s.measurements.q[:, 1])))
     found = discover.describe

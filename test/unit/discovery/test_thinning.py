@@ -93,6 +93,7 @@ def sagging(session):
     return at_joint(2, 5e-5 * CHAIN.gravity_torque(session.measurements.q)[:, 1])
 
 
+@pytest.mark.qualify
 def test_a_part_tells_the_cause_and_the_other_rows_confirm_it(monkeypatch):
     session = session_with(21, sagging, poses=120)
     whole = discovered(session)
