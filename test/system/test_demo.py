@@ -41,9 +41,6 @@ def demo(ros_environment, tmp_path_factory):
             str(SEED),
             '--candidates',
             '5',
-            # Whoever cannot keep up is waited for; of what comes by wall time there is less.
-            '--rate',
-            '20',
         ],
         env={**ros_environment, 'COLUMNS': '200'},
         capture_output=True,
