@@ -17,7 +17,7 @@ from remaster_ros.simulation.setup import make_world
 
 SEED = 11
 SHORT = {'settle_s': 1.0}
-FAST = {'speed_share': 0.6}
+FAST, SLOW = {'speed_share': 0.6}, {'speed_share': 0.3}
 """Of a collection, a node's time goes into what the arm and the sensors publish meanwhile."""
 
 
@@ -58,6 +58,8 @@ class Cell:
         command, data, tracker = free_ports(
             socket.SOCK_DGRAM, socket.SOCK_DGRAM, socket.SOCK_STREAM
         )
+        # Who stops it on its way has to meet it there.
+        speed = SLOW if by_action else FAST
         own = {
             'fake_robot': {'world': folder / 'world'},
             'pose_planner': {
@@ -69,9 +71,9 @@ class Cell:
                 'discovery': discovery or folder / 'discovery',
                 # A process starts as late as a busy machine lets it.
                 'resume_within_s': 600.0,
-                **FAST,
+                **speed,
             },
-            'robot_bridge': {'simulated_clock_rate': rate, **SHORT, **FAST},
+            'robot_bridge': {'simulated_clock_rate': rate, **SHORT, **speed},
             'recorder': {
                 'session': self.session,
                 'require': require,
