@@ -9,8 +9,7 @@ from optitrack_world import SENSOR, MarkerWorld
 
 from remaster_ros.sensors.optitrack.client import NatNetClient
 from remaster_ros.sensors.optitrack.settings import NatNetSettings
-from remaster_ros.simulation.optitrack import FakeOptiTrackServer
-from remaster_ros.simulation.optitrack_scene import OptiTrackBehaviour
+from remaster_ros.simulation.optitrack import FakeOptiTrackServer, OptiTrackBehaviour
 
 LOCAL = '127.0.0.1'
 NOISELESS = OptiTrackBehaviour(noise_across_m=0.0, noise_along_m=0.0)

@@ -27,7 +27,6 @@ from remaster_ros.nodes.running import RemasterNode, run
 from remaster_ros.nodes.simulated_clock import TAKEN
 from remaster_ros.session.workcell import read_cell
 from remaster_ros.simulation.arm_motion import ServoPoint
-from remaster_ros.simulation.pace import Pace
 from remaster_ros.simulation.robot import FakeArm
 from remaster_ros.simulation.setup import (
     default_folder,
@@ -35,7 +34,7 @@ from remaster_ros.simulation.setup import (
     make_world,
     open_world,
 )
-from remaster_ros.simulation.world_clock import POLL_WALL_S
+from remaster_ros.simulation.world_clock import POLL_WALL_S, Pace
 
 STANDING_CLOCK_WALL_S = 0.1
 """A clock that stands is published so often, s of wall time."""

@@ -44,10 +44,8 @@ from remaster_ros.nodes.rviz_markers import RvizMarkers
 from remaster_ros.nodes.status import LATCHED, LEVELS, RELIABLE, TOPIC, NodeStatus, Summary, listen
 from remaster_ros.nodes.waypoints import waypoints_by_solution
 from remaster_ros.reports.fit_json import FIT_FILE, REPORT_FILE, read_fit
-from remaster_ros.reports.live_facts import FitFacts, PlanPage
-from remaster_ros.reports.live_place import Place
-from remaster_ros.reports.live_server import COMMANDS, CONFIRM, Done, LiveServer
-from remaster_ros.reports.live_view import LiveView
+from remaster_ros.reports.live_server import COMMANDS, CONFIRM, Done, LiveServer, Place
+from remaster_ros.reports.live_view import FitFacts, LiveView, PlanPage
 from remaster_ros.reports.plan_page import read_plan_page
 from remaster_ros.reports.robot_scene import robot_scene
 from remaster_ros.reports.scene_view import scene_to_dict

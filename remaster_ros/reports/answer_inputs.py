@@ -23,8 +23,14 @@ from remaster_ros.reports.fit_json import (
     FIT_LIMIT,
     read_fit,
 )
-from remaster_ros.reports.predictions_csv import PREDICTED, PREDICTIONS_FILE
-from remaster_ros.reports.rows_csv import AFTER, BEFORE, RESIDUALS_FILE, read_columns
+from remaster_ros.reports.rows_csv import (
+    AFTER,
+    BEFORE,
+    PREDICTED,
+    PREDICTIONS_FILE,
+    RESIDUALS_FILE,
+    read_columns,
+)
 from remaster_ros.reports.schemas import Fit, FittedGeometry, Judgement
 from remaster_ros.session.files import decode_text, read_limited
 from remaster_ros.session.plan_journal import RecordedPlan

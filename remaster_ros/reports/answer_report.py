@@ -24,10 +24,10 @@ from remaster_ros.reports.answer_figures import Subject, draw_answer
 from remaster_ros.reports.answer_inputs import Inputs
 from remaster_ros.reports.answer_plan import PLAN_FILE, copy_plan, plan_facts
 from remaster_ros.reports.fit_json import APPLY_FOLDER, REPORT_FILE
-from remaster_ros.reports.fit_tables import accuracy_rows, marker_rows
 from remaster_ros.reports.pages import inlined, page
 from remaster_ros.reports.plan_page import check_plan_page
 from remaster_ros.reports.remaining import NO_FILE
+from remaster_ros.reports.report import accuracy_rows, marker_rows
 from remaster_ros.session.files import decode_text, make_folder, read_limited, write_atomically
 from remaster_ros.types import FloatArray
 

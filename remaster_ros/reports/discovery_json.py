@@ -26,7 +26,7 @@ from remaster_ros.reports.fit_json import (
     remove_report,
     table_rows,
 )
-from remaster_ros.reports.predictions_csv import PREDICTIONS_FILE, predictions_text
+from remaster_ros.reports.rows_csv import PREDICTIONS_FILE, predictions_text
 from remaster_ros.session.files import make_folder, write_atomically
 from remaster_ros.version import __version__
 

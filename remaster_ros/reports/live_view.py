@@ -10,7 +10,7 @@ import hashlib
 import re
 from collections import deque
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any
 
@@ -21,9 +21,120 @@ from remaster_ros.collection import events
 from remaster_ros.collection.live_residuals import LiveResiduals
 from remaster_ros.collection.pace import Pace, minutes_text
 from remaster_ros.kinematics.serial_chain import SerialChain
-from remaster_ros.reports.live_commands import commands
-from remaster_ros.reports.live_facts import FitFacts, PlanPage, Precision
 from remaster_ros.types import FloatArray
+
+STOP_LABEL = 'Stop the collection'
+STOP_NOTE = (
+    'No emergency stop: it asks the planner over the network. In danger use the red button.'
+)
+
+
+def commands(
+    *,
+    state: str,
+    silent: bool,
+    halted: bool,
+    begun: bool,
+    measured: bool,
+    unconfirmed: bool,
+    confirmation: dict[str, Any] | None,
+) -> dict[str, dict[str, Any]]:
+    """Return what each command is called, whether it is of use now, and a note.
+
+    Parameters
+    ----------
+    state
+        Of the planner.
+    silent
+        Whether the planner was not heard for long.
+    halted
+        Whether the arm is halted.
+    begun, measured
+        Whether something was visited, and recorded.
+    unconfirmed
+        Whether the arm waits until a plan is confirmed.
+    confirmation
+        Which plan that is (`LiveView`); None as long as it is not shown.
+    """
+    plan = confirmation['plan'] if confirmation else ''
+    why = 'the planner is silent' if silent else ''
+    if not why and halted:
+        why = 'the arm is halted'
+    if not why and state not in ('idle', 'paused', 'stopped'):
+        why = f'the collection is {state[:100]}'
+    if not why and unconfirmed:
+        why = f'plan {plan} is not confirmed' if plan else 'the plan is not shown yet'
+    idle = state not in ('running', 'held')
+    ready = bool(confirmation and confirmation['address'] and confirmation['offered'])
+    return {
+        'collect': {
+            'label': 'Go on' if begun else 'Begin the collection',
+            'on': not why,
+            'note': why or 'the arm moves',
+        },
+        'pause': {'label': 'Pause', 'on': not silent and not idle, 'note': ''},
+        'stop': {'label': STOP_LABEL, 'on': True, 'note': STOP_NOTE},
+        'fit': {'label': 'Fit', 'on': idle and measured, 'note': ''},
+        'confirm': {
+            'label': f'Confirm plan {plan}',
+            'on': ready and unconfirmed and idle and not silent,
+            'note': 'Nothing moves before you begin the collection or go on.',
+        },
+    }
+
+
+class Look(msgspec.Struct, frozen=True):
+    """Of `precision_json`: what was known after so many configurations."""
+
+    configurations: int
+    minutes: float | None
+    joint_std_deg: dict[str, float | None]
+
+
+class Precision(msgspec.Struct, frozen=True):
+    """What the page shows of `precision_json`."""
+
+    message: str = ''
+    looks: list[Look] = []
+
+
+@dataclass(frozen=True)
+class PlanPage:
+    """Where the page of a plan is served.
+
+    Attributes
+    ----------
+    plan
+        Fingerprint of the plan.
+    address
+        Below that of the live page; '' where it is not served.
+    trouble
+        Why it is not; ''.
+    """
+
+    plan: str = ''
+    address: str = ''
+    trouble: str = ''
+
+
+@dataclass(frozen=True)
+class FitFacts:
+    """What is known of a fit beside its offsets.
+
+    Attributes
+    ----------
+    shown
+        Label -> text.
+    unidentifiable
+        Joints whose offset is not to be believed.
+    markers
+        Where the markers were found, in the tool frame, m, (3,).
+    """
+
+    shown: Mapping[str, str] = field(default_factory=dict)
+    unidentifiable: frozenset[str] = frozenset()
+    markers: Mapping[str, FloatArray] = field(default_factory=dict)
+
 
 SILENT_S = 3.0
 """A node that was not heard for longer counts as gone."""

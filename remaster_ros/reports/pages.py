@@ -11,6 +11,8 @@ import msgspec
 from jinja2 import Environment, FunctionLoader, StrictUndefined
 from markupsafe import Markup
 
+from remaster_ros.discovery.effects.registry import EFFECTS
+from remaster_ros.discovery.effects.unnamed import EFFECT as NO_NAME
 from remaster_ros.discovery.words import (
     called,
     p_value_text,
@@ -20,10 +22,16 @@ from remaster_ros.discovery.words import (
     shown,
 )
 from remaster_ros.reports.discovery_schema import Effect
-from remaster_ros.reports.effect_words import law
 from remaster_ros.reports.figures import GRID, INK, PAPER
 from remaster_ros.reports.fit_json import REPORT_FILE
 from remaster_ros.session.files import make_folder, write_atomically
+
+
+def law(effect: Effect) -> str:
+    """Return equation and source of an effect; one without a name has those of its form."""
+    happened = effect.name == NO_NAME.name and effect.moment_s is not None
+    kind = EFFECTS.get('step' if happened else effect.name)
+    return '' if kind is None else f'{kind.equation} ({kind.source})'
 
 
 def page(template: str, **content: Any) -> str:

@@ -1,4 +1,4 @@
-"""Files with one line for every row of a session: residuals.csv of a fit, and what they share."""
+"""Files with a line for every row: residuals.csv of `fit`, predictions.csv of `discover`."""
 
 from __future__ import annotations
 
@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from remaster_ros.calibration.predictions import Predictions
 from remaster_ros.errors import InputError
 from remaster_ros.session.files import decode_text, read_limited
-from remaster_ros.types import FloatArray, Session
+from remaster_ros.types import FloatArray, Measurements, Session
 
 if TYPE_CHECKING:
     from remaster_ros.calibration.result import FitResult
@@ -22,6 +23,19 @@ AXES = 'xyz'
 ROWS_LIMIT = 1024**3
 IDENTITY = ('observation', 'pose', 'configuration', 'split', 'sensor', 'marker')
 BEFORE, AFTER = (tuple(f'{side}_{axis}_m' for axis in AXES) for side in ('before', 'after'))
+PREDICTIONS_FILE = 'predictions.csv'
+# The upper triangle of the covariance, row by row.
+PAIRS = tuple((a, b) for a in range(3) for b in range(a, 3))
+MEASURED, PREDICTED = (tuple(f'{what}{axis}_m' for axis in AXES) for what in ('', 'predicted_'))
+PREDICTION_COLUMNS = (
+    *MEASURED,
+    *PREDICTED,
+    *(f'cov_{AXES[a]}{AXES[b]}_m2' for a, b in PAIRS),
+    'held_out',
+    'left_out',
+    'inside95',
+)
+"""``held_out``: never fitted; ``left_out``: a gross error; ``inside95``: in its 95 % region."""
 
 
 def rows_text(session: Session, columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
@@ -60,6 +74,34 @@ def residuals_text(result: FitResult) -> str:
         )
     )
     return rows_text(result.session, (*BEFORE, *AFTER, 'left_out'), rows)
+
+
+def predictions_text(session: Session, predictions: Predictions, left_out: set[int]) -> str:
+    """Return the file: positions in the frame of the row's sensor, m; 1 is yes and 0 no.
+
+    Parameters
+    ----------
+    session
+        All n rows.
+    predictions
+        Of the same rows.
+    left_out
+        ``observation`` of the gross errors.
+    """
+    m: Measurements = session.measurements
+    upper = predictions.covariance[:, [a for a, _ in PAIRS], [b for _, b in PAIRS]]
+    numbers = np.concatenate((m.position, predictions.position), axis=1)
+    rows = (
+        (
+            *(f'{value:.7f}' for value in numbers[i]),
+            *(f'{value:.6e}' for value in upper[i]),
+            int(m.is_validation[i]),
+            int(m.observation[i] in left_out),
+            int(predictions.inside[i]),
+        )
+        for i in range(len(m))
+    )
+    return rows_text(session, PREDICTION_COLUMNS, rows)
 
 
 def read_columns(path: Path, session: Session, columns: Sequence[str], verb: str) -> FloatArray:

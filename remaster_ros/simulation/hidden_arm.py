@@ -6,9 +6,96 @@ import numpy as np
 
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.transforms import apply
+from remaster_ros.simulation.hidden_effect import Deviation
 from remaster_ros.simulation.truth import SessionTruth
-from remaster_ros.simulation.world_model import ArmState, Round, WorldModel
+from remaster_ros.simulation.world_model import (
+    ArmState,
+    Round,
+    WorldModel,
+    circumstances,
+    deviation,
+    measured,
+)
 from remaster_ros.types import FloatArray
+
+# What is wrong with the true arm and sensors of the fakes, over time.
+#
+# Effects depend on where the arm stands and how it came there. They are worked out where a motion
+# ends. While the arm moves, when nothing is measured, they pass smoothly from one end to the
+# next.
+
+
+MOVES_KEPT = 16
+"""Effects are looked up for the present and the near past only."""
+
+
+class WrongArm:
+    """The true arm in front of the true sensors.
+
+    Parameters
+    ----------
+    chain
+        The arm as drawn.
+    truth
+        What is wrong with it.
+    start_s, q
+        When and where the arm stands at first, rad, (k,).
+    """
+
+    def __init__(
+        self, chain: SerialChain, truth: SessionTruth, start_s: float, q: FloatArray
+    ) -> None:
+        self._arm, self._truth, self._start_s = ChainArm(chain), truth, start_s
+        self._stops: list[FloatArray] = [q]
+        self._times: list[float] = [start_s]
+        still = self._deviation()
+        # Start and end of each motion, and the deviations there.
+        self._moves: list[tuple[float, float, Deviation, Deviation]] = [
+            (start_s, start_s, still, still)
+        ]
+
+    def move(self, start_s: float, start: FloatArray, end_s: float, end: FloatArray) -> None:
+        """Add a motion (rad, (k,)); it replaces what was still to come of the last one."""
+        before = self.deviation(start_s)
+        self._stops[-1] = start
+        self._stops.append(end)
+        self._times.append(end_s)
+        self._moves.append((start_s, end_s, before, self._deviation()))
+        del self._moves[:-MOVES_KEPT]
+        if not self._truth.effects:
+            # Without effects the way to a stop does not matter; memory stays bounded.
+            del self._stops[:-2], self._times[:-2]
+
+    def deviation(self, t: float) -> Deviation:
+        """What is wrong at a time, one row."""
+        move = next((m for m in reversed(self._moves) if m[0] <= t), self._moves[0])
+        start_s, end_s, before, after = move
+        share = 1.0 if t >= end_s else (t - start_s) / (end_s - start_s)
+        smooth = share * share * (3.0 - 2.0 * share)
+        return before.map(lambda a, b: a + smooth * (b - a), after)
+
+    def marker_in_sensor(self, name: str, t: float, q: FloatArray, marker: str = '') -> FloatArray:
+        """What a sensor would measure without noise, in its frame N, m, (3,), for reported q."""
+        sensor, wrong = self._truth.sensors[name], self.deviation(t)
+        marker = marker or sensor.marker
+        state = self._arm.state(q + self._truth.joint_offsets + wrong.angle)
+        return measured(state, name, sensor, marker, self._truth.markers[marker], wrong)[0]
+
+    def _deviation(self) -> Deviation:
+        """Work out what is wrong at the last stop, with all that went before."""
+        times = np.array(self._times)
+        visited = Round(
+            q=np.array(self._stops),
+            home=self._stops[0],
+            time_s=times - self._start_s,
+            warming_k=self._truth.warming.at(times),
+        )
+        c = circumstances(self._arm, visited, self._truth.joint_offsets)
+        together = deviation(
+            self._truth.effects, c, tuple(self._truth.sensors), tuple(self._truth.markers)
+        )
+        return together.map(lambda array: array[-1:])
+
 
 GRAVITY = (0.0, 0.0, -9.81)
 SECONDS_PER_CONFIGURATION = 10.0

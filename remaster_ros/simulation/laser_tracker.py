@@ -6,28 +6,636 @@ import contextlib
 import selectors
 import socket
 import threading
-from collections.abc import Iterable, Mapping
-from typing import TYPE_CHECKING
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from remaster_ros.errors import DeviceError
 from remaster_ros.sensors.laser_tracker.protocol.packets import (
     NEED_DATA,
+    Change,
     Command,
     ConnectionClosed,
     ErrorReport,
     Event,
+    Measurement,
     PacketReader,
     ProtocolError,
+    Readiness,
+    Reply,
     Request,
     Status,
+    StatusChange,
+    Value,
     encode,
 )
 from remaster_ros.simulation.faults import Numbers
-from remaster_ros.simulation.laser_tracker_instrument import TrackerInstrument
-from remaster_ros.simulation.laser_tracker_settings import TrackerBehaviour
 from remaster_ros.types import FloatArray
+
+LENGTH_UNITS_M = (1.0, 1e-3, 1e-6, 0.3048, 0.9144, 0.0254)
+"""Metre, millimetre, micron, foot, yard, inch."""
+
+REFLECTORS = {1: (1, 0.01905, 'CCR 1.5in'), 2: (1, 0.00635, 'CCR 0.5in')}
+"""Number -> target type (corner cube), surface offset (m), name."""
+
+
+class Setting(NamedTuple):
+    """The command that reads a setting, what is sent when it changes, the first values."""
+
+    get: Command
+    change: Change
+    initial: tuple[Value, ...]
+
+
+SETTINGS = {
+    Command.SET_UNITS: Setting(Command.GET_UNITS, Change.UNITS, (1, 0, 0, 0, 0)),
+    Command.SET_ENVIRONMENT: Setting(
+        Command.GET_ENVIRONMENT, Change.ENVIRONMENT, (20.0, 1013.25, 50.0)
+    ),
+    Command.SET_MEASUREMENT_MODE: Setting(
+        Command.GET_MEASUREMENT_MODE, Change.MEASUREMENT_MODE, (0,)
+    ),
+    Command.SET_COORDINATE_SYSTEM_TYPE: Setting(
+        Command.GET_COORDINATE_SYSTEM_TYPE, Change.COORDINATE_SYSTEM_TYPE, (0,)
+    ),
+    Command.SET_STATIONARY_MODE: Setting(
+        Command.GET_STATIONARY_MODE, Change.STATIONARY_MODE, (1000, 1)
+    ),
+    Command.SET_REFLECTOR: Setting(Command.GET_REFLECTOR, Change.REFLECTOR, (1,)),
+    Command.SET_SEARCH: Setting(Command.GET_SEARCH, Change.SEARCH, (50.0, 10_000)),
+    Command.SET_STATISTIC_MODE: Setting(Command.GET_STATISTIC_MODE, Change.STATISTIC_MODE, (0, 0)),
+}
+"""The environment is temperature (°C), pressure (mbar) and relative humidity (%) of the air."""
+
+
+@dataclass(frozen=True)
+class TrackerBehaviour:
+    """What can be set on the fake. World time in s, lengths in m.
+
+    Attributes
+    ----------
+    warm_up_s
+        From switching on until it can be initialised (two hours on a real one).
+    initialise_s
+        How long the initialisation takes.
+    slew_rad_s, slew_settle_s
+        Speed of turning to a position, and what each turn takes on top.
+    spiral_pitch_m, spiral_speed_m_s
+        Of the search, at the reflector.
+    acquire_s
+        From the first return of light to a lock with a valid absolute distance.
+    search_failure_share
+        Share of searches that find nothing for no visible reason.
+    tracking_speed_m_s
+        The beam loses a reflector that moves faster across it.
+    large_move_rad, large_move_break_share
+        Share of the moves in which a joint turns further than that which break the beam (gimbal
+        and reflector shake); the line of sight breaks others.
+    stability_limit_m
+        The ADM refuses a reflector that leaves a sphere of this radius while it integrates.
+    range_limit_m, range_limit_ppm, across_limit_m, across_limit_ppm
+        Accuracy limits (two standard deviations): a constant, and parts per million of distance.
+    """
+
+    warm_up_s: float = 5.0
+    initialise_s: float = 2.0
+    slew_rad_s: float = 1.0
+    slew_settle_s: float = 0.3
+    spiral_pitch_m: float = 0.02
+    spiral_speed_m_s: float = 3.0
+    acquire_s: float = 1.0
+    search_failure_share: float = 0.02
+    tracking_speed_m_s: float = 4.0
+    large_move_rad: float = 1.5
+    large_move_break_share: float = 0.25
+    stability_limit_m: float = 50e-6
+    range_limit_m: float = 10e-6
+    range_limit_ppm: float = 0.3
+    across_limit_m: float = 15e-6
+    across_limit_ppm: float = 6.0
+
+
+def refusal(command: Command, values: tuple[Value, ...]) -> Status:
+    """Why a setting is refused, or `Status.ALL_OK`."""
+    numbers = np.array(values, float)
+    if not np.all(np.isfinite(numbers)):
+        return Status.INVALID_INPUT_DATA
+    if command is Command.SET_UNITS:
+        length, angle, temperature, pressure, humidity = numbers
+        known = length < len(LENGTH_UNITS_M) and angle == temperature == humidity == 0
+        # The second pressure unit, hPa, is the first one, mbar.
+        return Status.ALL_OK if known and pressure < 2 else Status.NOT_IMPLEMENTED
+    if command in (
+        Command.SET_MEASUREMENT_MODE,
+        Command.SET_COORDINATE_SYSTEM_TYPE,
+        Command.SET_STATISTIC_MODE,
+    ):
+        return Status.NOT_IMPLEMENTED if np.any(numbers) else Status.ALL_OK
+    if command is Command.SET_REFLECTOR:
+        return Status.ALL_OK if values[0] in REFLECTORS else Status.WRONG_PARAMETER_1
+    if command is Command.SET_ENVIRONMENT:
+        temperature, pressure, humidity = numbers
+        inside = -20 <= temperature <= 60 and 500 <= pressure <= 1200 and 0 <= humidity <= 100
+        return Status.ALL_OK if inside else Status.METEO_DATA_OUT_OF_RANGE
+    # What is left are the search and the stationary mode: radius and time, time and a flag.
+    return Status.ALL_OK if numbers[0] > 0 and numbers[1] >= 0 else Status.WRONG_PARAMETER
+
+
+# The beam of the fake laser tracker: it follows a reflector, or loses it; its errors.
+#
+# The beam follows while nothing is in its way, the reflector faces it and does not outrun it.
+# Large moves of the arm lose it now and then even so. Errors are those of a data sheet, in range
+# and angles: limits of 10 µm + 0.3 µm/m along the beam and 15 µm + 6 µm/m across it, at two
+# standard deviations.
+
+
+if TYPE_CHECKING:
+    from remaster_ros.simulation.world import World
+
+STEP_S = 0.1
+"""World time between two looks at the world."""
+_SIGHT_EVERY_S = 0.5
+
+
+class Beam:
+    """Where the instrument points, and whether it is locked on the reflector.
+
+    Parameters
+    ----------
+    world, sensor
+        Where the reflector truly is, and the tracker's name in the world.
+    rng
+        Source of all randomness.
+    behaviour
+        See `TrackerBehaviour`.
+    t
+        World time, s.
+    aim
+        Where it points at first, in its own frame, m, (3,); None: at the reflector.
+    further
+        Further reflectors of the tool by name, with the numbers of the fault ``hidden``; the
+        first has the name '' and the number 1.
+    """
+
+    def __init__(
+        self,
+        world: World,
+        sensor: str,
+        rng: np.random.Generator,
+        behaviour: TrackerBehaviour,
+        t: float,
+        aim: FloatArray | None,
+        further: Mapping[str, int] | None = None,
+    ) -> None:
+        self._world, self._sensor, self._rng = world, sensor, rng
+        self._behaviour = behaviour
+        self._numbers = {'': 1, **(further or {})}
+        # The reflector that it is locked on.
+        self._on = ''
+        self.locked = False
+        self.home = self.reflector(t) if aim is None else np.asarray(aim, float)
+        self.aim = self.home
+        self._sight_at = -np.inf
+        self._swept_rad = 0.0
+        self._move_judged = False
+
+    def reflector(self, t: float) -> FloatArray:
+        """True position of the reflector that it is on at time t, m, (3,)."""
+        return self._world.marker_in_sensor(self._sensor, t, self._on)
+
+    def sees(self, t: float) -> bool:
+        """Whether the line of sight to this reflector is free at time t."""
+        if self._world.faults(self._sensor).get('hidden') == self._numbers[self._on]:
+            return False
+        return self._world.line_of_sight(self._sensor, t, self._on)
+
+    def find(self, target: FloatArray, largest_rad: float, t: float) -> bool:
+        """Find the reflector in sight nearest to a direction; False where none is so near."""
+        before, near = self._on, {}
+        for name in self._numbers:
+            self._on = name
+            angle = angle_between(target, self.reflector(t))
+            if angle <= largest_rad and self.sees(t):
+                near[name] = angle
+        self._on = min(near, key=near.__getitem__, default=before)
+        return bool(near)
+
+    def lock(self, t: float) -> None:
+        """Lock on the reflector that was found, at time t."""
+        self.locked, self.aim, self._sight_at = True, self.reflector(t), t
+        self._swept_rad, self._move_judged = 0.0, False
+
+    def follow(self, t: float) -> bool:
+        """Follow the reflector for a step that ends at time t; return whether it is kept."""
+        reflector, moving = self.reflector(t), self._world.is_moving(t)
+        across_speed = angle_between(self.aim, reflector) * np.linalg.norm(reflector) / STEP_S
+        # The line of sight takes long to work out, and changes little while nothing moves.
+        hidden = False
+        if moving or t - self._sight_at > _SIGHT_EVERY_S:
+            hidden, self._sight_at = not self.sees(t), t
+        outrun = across_speed > self._behaviour.tracking_speed_m_s
+        if self._shaken(t, moving) or hidden or outrun:
+            self.locked = False
+        else:
+            self.aim = reflector
+        return self.locked
+
+    def _shaken(self, t: float, moving: bool) -> bool:
+        """Whether a large move breaks the beam now; chance decides once for each move."""
+        if not moving:
+            self._swept_rad, self._move_judged = 0.0, False
+            return False
+        self._swept_rad += self._world.joint_speed(t) * STEP_S
+        if self._move_judged or self._swept_rad <= self._behaviour.large_move_rad:
+            return False
+        self._move_judged = True
+        return self._rng.random() < self._behaviour.large_move_break_share
+
+
+def angle_between(a: FloatArray, b: FloatArray) -> float:
+    """Angle between two directions, rad; exact for small ones too."""
+    return float(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b))
+
+
+def covariance(position: FloatArray, behaviour: TrackerBehaviour) -> FloatArray:
+    """Covariance of a measured position, m², (3, 3): range and angles err on their own.
+
+    The limits of a data sheet are two standard deviations.
+    """
+    b = behaviour
+    distance = np.linalg.norm(position)
+    range_std = 0.5 * (b.range_limit_m + b.range_limit_ppm * 1e-6 * distance)
+    across_std = 0.5 * (b.across_limit_m + b.across_limit_ppm * 1e-6 * distance)
+    along = np.outer(position, position) / distance**2
+    return range_std**2 * along + across_std**2 * (np.eye(3) - along)
+
+
+def adm_result(
+    position: FloatArray,
+    std: FloatArray,
+    unit_m: float,
+    environment: tuple[float, float, float],
+) -> Measurement:
+    """Return the packet of a measured position and its standard deviation (m, (3,) each).
+
+    Parameters
+    ----------
+    unit_m
+        The client's unit of length, m.
+    environment
+        Temperature (°C), pressure (mbar), relative humidity (%).
+    """
+    x, y, z = (position / unit_m).tolist()
+    std_x, std_y, std_z = (std / unit_m).tolist()
+    total = float(np.linalg.norm(std)) / unit_m
+    temperature, pressure, humidity = environment
+    return Measurement(
+        status=0,
+        mode=0,
+        is_try=0,
+        values=(x, y, z),
+        std=(std_x, std_y, std_z),
+        std_total=total,
+        pointing_error=(0.0, 0.0, 0.0),
+        a_priori_std=(std_x, std_y, std_z),
+        a_priori_std_total=total,
+        temperature=temperature,
+        pressure=pressure,
+        humidity=humidity,
+    )
+
+
+# How the fake laser tracker behaves: packets in, packets out, world time as an argument.
+#
+# The beam is described in `laser_tracker_beam`. A search winds a spiral about the place the
+# tracker points to. The ADM averages over the integration time and refuses a target that moves
+# meanwhile.
+
+
+if TYPE_CHECKING:
+    from remaster_ros.simulation.world import World
+
+_LONGEST_CATCH_UP_S = 5.0
+
+Operation = Iterator[None]
+"""A command that takes time: advanced once a step until it ends."""
+
+
+class TrackerInstrument:
+    """The instrument without sockets, threads and clocks.
+
+    Parameters
+    ----------
+    world
+        Where the reflector truly is.
+    sensor
+        The tracker's name in the world.
+    rng
+        Source of all randomness.
+    switched_on_s
+        World time at which it was switched on, s.
+    behaviour
+        See `TrackerBehaviour`.
+    aim
+        Where it points at first, in its own frame, m, (3,); None: where the reflector is, as
+        a person who sets up the instrument leaves it.
+    further
+        Further reflectors of the tool, as of `Beam`.
+    """
+
+    def __init__(
+        self,
+        world: World,
+        sensor: str,
+        rng: np.random.Generator,
+        switched_on_s: float,
+        behaviour: TrackerBehaviour | None = None,
+        aim: FloatArray | None = None,
+        further: Mapping[str, int] | None = None,
+    ) -> None:
+        self.behaviour = behaviour or TrackerBehaviour()
+        self._world, self._rng = world, rng
+        self._beam = Beam(world, sensor, rng, self.behaviour, switched_on_s, aim, further)
+        self._warm_at = switched_on_s + self.behaviour.warm_up_s
+        self._time = switched_on_s
+        self._initialized = False
+        self._operation: Operation | None = None
+        self._command = Command.UNKNOWN
+        self._last_measured: FloatArray | None = None
+        self._out: list[Event] = []
+        self._settings = {setting.get: setting.initial for setting in SETTINGS.values()}
+
+    # What a client sees
+
+    @property
+    def locked(self) -> bool:
+        """Whether the beam is on the reflector."""
+        return self._beam.locked
+
+    @property
+    def readiness(self) -> Readiness:
+        """Not ready, busy or ready, as the instrument reports it."""
+        if self._operation is not None:
+            return Readiness.BUSY
+        return Readiness.READY if self.locked else Readiness.NOT_READY
+
+    def greeting(self) -> list[Event]:
+        """Return the first packets for a client that connects."""
+        return [self._readiness_change()]
+
+    def handle(self, request: Request) -> list[Event]:
+        """Take a command at the time of the last step; return what is sent at once."""
+        command = request.command
+        if command in SETTINGS:
+            self._set(command, request.values)
+        elif command in _TAKES_TIME:
+            self._begin(command, request.values)
+        elif command is Command.STOP_MEASUREMENT:
+            self._reply(command)
+            if self._operation and self._command is Command.START_MEASUREMENT:
+                self.abort()
+        elif answers := self._answers(command):
+            for values in answers:
+                self._reply(command, 0, values)
+        else:
+            self._reply(command, Status.NOT_IMPLEMENTED)
+        return self._sent()
+
+    def step(self, t: float) -> list[Event]:
+        """Go on to world time t; return what is sent meanwhile."""
+        self._time = max(self._time, t - _LONGEST_CATCH_UP_S)
+        while t - self._time >= STEP_S:
+            self._time += STEP_S
+            if self.locked and not self._beam.follow(self._time):
+                self._lose()
+            self._advance()
+        return self._sent()
+
+    def abort(self) -> None:
+        """End what is under way, as when the client goes away."""
+        if self._operation is not None:
+            self._operation = None
+            self._out.append(self._readiness_change())
+
+    def break_beam(self) -> list[Event]:
+        """Lose the reflector, as when a person walks through the beam."""
+        self._lose()
+        return self._sent()
+
+    def _sent(self) -> list[Event]:
+        out, self._out = self._out, []
+        return out
+
+    def _reply(self, command: Command, status: int = 0, values: tuple[Value, ...] = ()) -> None:
+        self._out.append(Reply(command, status, values))
+
+    def _readiness_change(self) -> StatusChange:
+        # The three changes have the order of the three states.
+        return StatusChange(Change.NOT_READY + self.readiness)
+
+    # Settings and queries
+
+    @property
+    def _unit_m(self) -> float:
+        return LENGTH_UNITS_M[int(self._settings[Command.GET_UNITS][0])]
+
+    def _set(self, command: Command, values: tuple[Value, ...]) -> None:
+        setting = SETTINGS[command]
+        status = Status.SERVER_BUSY if self._operation else refusal(command, values)
+        if status == Status.ALL_OK:
+            if command is Command.SET_UNITS:
+                self._convert_lengths(int(values[0]))
+            self._settings[setting.get] = values
+        self._reply(command, status)
+        if status == Status.ALL_OK:
+            self._out.append(StatusChange(setting.change))
+
+    def _convert_lengths(self, unit: int) -> None:
+        """Keep the search radius what it is when its unit changes."""
+        radius, timeout = self._settings[Command.GET_SEARCH]
+        scale = self._unit_m / LENGTH_UNITS_M[unit]
+        self._settings[Command.GET_SEARCH] = (float(radius) * scale, timeout)
+
+    def _answers(self, command: Command) -> list[tuple[Value, ...]]:
+        """Return the values of each reply to a query; none where it is no query."""
+        if command in self._settings:
+            return [self._settings[command]]
+        if command is Command.GET_TRACKER_STATUS:
+            return [(self.readiness,)]
+        if command is Command.GET_SYSTEM_STATUS:
+            processor = 5 if self._initialized else 3
+            laser, adm = (3, 2) if self._time >= self._warm_at else (0, 1)
+            return [(Status.ALL_OK, processor, laser, adm, 3, 8, 500, 0, 0, 390001)]
+        if command is Command.GET_MEASUREMENT_STATUS_INFO:
+            # Tracker, its compensation, ADM, its compensation, reflector, face 1, initialised.
+            flags = 1 | 2 | 4 | 8 | self.locked * 2048 | 4096 | self._initialized * 65536
+            return [(Status.ALL_OK, flags)]
+        if command is Command.GET_REFLECTORS:
+            return [
+                (len(REFLECTORS), number, kind, offset / self._unit_m, name.encode('utf-16le'))
+                for number, (kind, offset, name) in REFLECTORS.items()
+            ]
+        return []
+
+    # Commands that take time
+
+    def _begin(self, command: Command, values: tuple[Value, ...]) -> None:
+        status = self._why_not(command, values)
+        if status != Status.ALL_OK:
+            self._reply(command, status)
+            return
+        if command is Command.START_MEASUREMENT:
+            # Its result follows later.
+            self._reply(command)
+        self._command, self._operation = command, self._start(command, values)
+        self._out.append(self._readiness_change())
+        self._advance()
+
+    def _start(self, command: Command, values: tuple[Value, ...]) -> Operation:
+        if command is Command.START_MEASUREMENT:
+            return self._measure()
+        if command is Command.INITIALIZE:
+            return self._initialize()
+        if command is Command.FIND_REFLECTOR:
+            return self._search(command, self._beam.aim, float(values[0]) * self._unit_m)
+        if command in (Command.GO_POSITION, Command.POINT_LASER):
+            target = np.array(values[:3], float) * self._unit_m
+        elif command is Command.GO_LAST_MEASURED_POINT and self._last_measured is not None:
+            target = self._last_measured
+        elif command is Command.CHANGE_FACE:
+            target = self._beam.aim
+        else:
+            target = self._beam.home
+        if command in _ONLY_TURNS:
+            return self._point(command, target)
+        return self._search(command, target, float(np.linalg.norm(target)))
+
+    def _why_not(self, command: Command, values: tuple[Value, ...]) -> Status:
+        """Why a command cannot begin now."""
+        if self._operation is not None:
+            return Status.SERVER_BUSY
+        if self._time < self._warm_at:
+            return Status.ADM_START_UP_BUSY
+        if command is not Command.INITIALIZE and not self._initialized:
+            return Status.TRACKER_NOT_INITIALIZED
+        if command is Command.START_MEASUREMENT and not self.locked:
+            return Status.MEASUREMENT_STATUS_NOT_READY
+        if command is Command.GO_LAST_MEASURED_POINT and self._last_measured is None:
+            return Status.NO_LAST_MEASURED_POINT
+        if not np.all(np.isfinite(np.array(values, float))):
+            return Status.INVALID_INPUT_DATA
+        if command is Command.FIND_REFLECTOR and not float(values[0]) > 0:
+            return Status.WRONG_PARAMETER_1
+        if command in (Command.GO_POSITION, Command.POINT_LASER) and not any(values[:3]):
+            return Status.WRONG_PARAMETER
+        return Status.ALL_OK
+
+    def _advance(self) -> None:
+        if self._operation is None:
+            return
+        try:
+            next(self._operation)
+        except StopIteration:
+            self._operation = None
+            self._out.append(self._readiness_change())
+
+    def _initialize(self) -> Operation:
+        self._beam.locked = False
+        yield from self._wait(self.behaviour.initialise_s)
+        self._initialized = True
+        self._reply(Command.INITIALIZE)
+        self._out.append(StatusChange(Change.INITIALIZATION))
+
+    def _wait(self, seconds: float) -> Operation:
+        end = self._time + seconds
+        while self._time < end:
+            yield
+
+    def _turn(self, target: FloatArray) -> Operation:
+        self._beam.locked = False
+        b = self.behaviour
+        yield from self._wait(
+            b.slew_settle_s + angle_between(self._beam.aim, target) / b.slew_rad_s
+        )
+        self._beam.aim = target
+
+    def _point(self, command: Command, target: FloatArray) -> Operation:
+        yield from self._turn(target)
+        self._reply(command)
+
+    def _search(self, command: Command, target: FloatArray, distance: float) -> Operation:
+        """Turn to the target and wind a spiral about it.
+
+        A spiral of pitch p, run through at speed v, reaches the radius r after π r² / (p v).
+        """
+        b = self.behaviour
+        search_radius, timeout_ms = self._settings[Command.GET_SEARCH]
+        radius = float(search_radius) * self._unit_m
+        blind = self._rng.random() < b.search_failure_share
+        yield from self._turn(target)
+        start, reached, found = self._time, 0.0, False
+        while not found and reached < radius and self._time - start < int(timeout_ms) * 1e-3:
+            yield
+            area = b.spiral_pitch_m * b.spiral_speed_m_s * (self._time - start)
+            reached = np.sqrt(area / np.pi)
+            within = min(reached, radius) / distance
+            found = not blind and self._beam.find(target, within, self._time)
+        if found:
+            yield from self._wait(b.acquire_s)
+            found = self._beam.sees(self._time)
+        if found:
+            self._beam.lock(self._time)
+        self._reply(command, Status.ALL_OK if found else Status.MEASUREMENT_STATUS_NOT_READY)
+
+    def _measure(self) -> Operation:
+        integration_ms, _ = self._settings[Command.GET_STATIONARY_MODE]
+        end = self._time + int(integration_ms) * 1e-3
+        samples = [self._beam.reflector(self._time)]
+        problem = Status.ALL_OK
+        while self._time < end and problem == Status.ALL_OK:
+            yield
+            samples.append(self._beam.aim)
+            if not self.locked:
+                problem = Status.MEASUREMENT_STATUS_NOT_READY
+            elif np.linalg.norm(samples[-1] - samples[0]) > self.behaviour.stability_limit_m:
+                problem = Status.SENSOR_NOT_STABLE
+        if problem == Status.ALL_OK:
+            self._out.append(self._result(np.mean(samples, axis=0)))
+        else:
+            self._out.append(ErrorReport(Command.START_MEASUREMENT, problem))
+
+    def _result(self, truth: FloatArray) -> Measurement:
+        cov = covariance(truth, self.behaviour)
+        self._last_measured = self._rng.multivariate_normal(truth, cov)
+        temperature, pressure, humidity = map(float, self._settings[Command.GET_ENVIRONMENT])
+        # The weather station measures the warming on top of the temperature that was set.
+        temperature += self._world.warming_k(self._time)
+        return adm_result(
+            self._last_measured,
+            np.sqrt(np.diag(cov)),
+            self._unit_m,
+            (temperature, pressure, humidity),
+        )
+
+    def _lose(self) -> None:
+        self._beam.locked = False
+        if self._operation is None:
+            self._out.append(self._readiness_change())
+
+
+_ONLY_TURNS = (Command.POINT_LASER, Command.GO_BIRD_BATH, Command.GO_BIRD_BATH_2)
+_TAKES_TIME = (
+    *_ONLY_TURNS,
+    Command.INITIALIZE,
+    Command.START_MEASUREMENT,
+    Command.FIND_REFLECTOR,
+    Command.GO_POSITION,
+    Command.GO_LAST_MEASURED_POINT,
+    Command.CHANGE_FACE,
+)
+
 
 if TYPE_CHECKING:
     from remaster_ros.simulation.world import World

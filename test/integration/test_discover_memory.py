@@ -15,7 +15,7 @@ from command_line import ROOT
 
 from remaster_ros.reports.discovery_json import read_discovery
 from remaster_ros.session.reader import write_session
-from remaster_ros.simulation.session_simulator import simulate_session
+from remaster_ros.simulation.simulated_workcell import simulate_session
 
 # The command with a search of few rows, so that what all rows take is what counts; then the
 # largest resident memory of this process alone, which os.wait4 mixes up with its parent's.

@@ -14,7 +14,7 @@ from command_line import ROOT, refusal, remaster
 
 from remaster_ros.kinematics.transforms import transform
 from remaster_ros.session.reader import read_chain, read_session, write_session
-from remaster_ros.simulation.session_simulator import simulate_session
+from remaster_ros.simulation.simulated_workcell import simulate_session
 from remaster_ros.simulation.truth import SimulatedSensor
 
 

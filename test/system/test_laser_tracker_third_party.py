@@ -19,8 +19,7 @@ from remaster_ros.sensors.laser_tracker.protocol.packets import (
     StatusChange,
     encode,
 )
-from remaster_ros.simulation.laser_tracker import FakeLaserTracker
-from remaster_ros.simulation.laser_tracker_settings import TrackerBehaviour
+from remaster_ros.simulation.laser_tracker import FakeLaserTracker, TrackerBehaviour
 
 packet = pytest.importorskip('CESAPI.packet', reason='the judge, PyPI CESAPI, is not installed')
 from CESAPI.command import CommandSync  # noqa: E402

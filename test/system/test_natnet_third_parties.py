@@ -29,8 +29,7 @@ from remaster_ros.sensors.optitrack.natnetclient_backend import NatNetClientBack
 from remaster_ros.sensors.optitrack.protocol import natnet as our_natnet
 from remaster_ros.sensors.optitrack.protocol.natnet import LabeledMarker
 from remaster_ros.sensors.optitrack.settings import NatNetSettings
-from remaster_ros.simulation.optitrack import FakeOptiTrackServer
-from remaster_ros.simulation.optitrack_scene import OptiTrackBehaviour
+from remaster_ros.simulation.optitrack import FakeOptiTrackServer, OptiTrackBehaviour
 
 MARKER = np.array([0.3, -0.1, 2.0])
 TOOL = OptiTrackBehaviour()

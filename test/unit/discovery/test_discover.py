@@ -19,7 +19,7 @@ from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.discovery.evidence import _System, solve
 from remaster_ros.discovery.screening import screen
 from remaster_ros.errors import InsufficientDataError
-from remaster_ros.simulation.session_simulator import simulate_session
+from remaster_ros.simulation.simulated_workcell import simulate_session
 from remaster_ros.types import Session
 
 ARC_MINUTE = np.radians(1.0 / 60.0)

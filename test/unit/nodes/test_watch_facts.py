@@ -15,7 +15,7 @@ from remaster_ros.errors import InputError
 from remaster_ros.nodes import watch
 from remaster_ros.nodes.pose_publisher import PosePublisher
 from remaster_ros.nodes.watch import fit_facts
-from remaster_ros.reports.live_facts import FitFacts
+from remaster_ros.reports.live_view import FitFacts
 
 
 def errors(before, after):

@@ -14,8 +14,7 @@ import pytest
 
 from remaster_ros.errors import InputError
 from remaster_ros.reports import live_server
-from remaster_ros.reports.live_place import Place
-from remaster_ros.reports.live_server import COMMANDS, SEEN_FIRST, LiveServer
+from remaster_ros.reports.live_server import COMMANDS, SEEN_FIRST, LiveServer, Place
 
 TOKEN = 'T' * 43
 

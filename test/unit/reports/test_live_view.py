@@ -12,12 +12,13 @@ from played_collection import CHAIN, MARKERS, T_R_N, PlayedCollection
 from remaster_ros import simulate
 from remaster_ros.collection import events
 from remaster_ros.collection.stopping_rule import StoppingGoal, StoppingRule
-from remaster_ros.reports.live_facts import FitFacts, PlanPage
 from remaster_ros.reports.live_view import (
     LONGEST_TEXT,
     MOST_NODES,
     SILENT_S,
+    FitFacts,
     LiveView,
+    PlanPage,
     tool_path,
 )
 from remaster_ros.reports.precision_json import precision_json

@@ -18,8 +18,7 @@ from remaster_ros.kinematics import transforms
 from remaster_ros.kinematics.transforms import apply
 from remaster_ros.reports.fit_json import save_fit
 from remaster_ros.reports.judgement import verdict
-from remaster_ros.reports.report import report_html
-from remaster_ros.reports.view_3d import _round_factor, draw_view
+from remaster_ros.reports.report import _round_factor, draw_view, report_html
 
 VOID = {'meta', 'br', 'img', 'link', 'hr', 'input'}
 

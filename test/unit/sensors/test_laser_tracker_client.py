@@ -20,8 +20,7 @@ from remaster_ros.sensors.laser_tracker.settings import (
     LaserTrackerSettings,
     TrackerStatus,
 )
-from remaster_ros.simulation.laser_tracker import FakeLaserTracker
-from remaster_ros.simulation.laser_tracker_settings import TrackerBehaviour
+from remaster_ros.simulation.laser_tracker import FakeLaserTracker, TrackerBehaviour
 
 QUICK = TrackerBehaviour(warm_up_s=0.5, initialise_s=0.5, search_failure_share=0.0)
 

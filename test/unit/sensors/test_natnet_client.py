@@ -17,7 +17,7 @@ from remaster_ros.sensors.optitrack.client import NatNetClient
 from remaster_ros.sensors.optitrack.frame_gate import Dropped, MarkerChoice
 from remaster_ros.sensors.optitrack.protocol import natnet
 from remaster_ros.sensors.optitrack.settings import NatNetSettings
-from remaster_ros.simulation.optitrack_scene import OptiTrackBehaviour
+from remaster_ros.simulation.optitrack import OptiTrackBehaviour
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ from remaster_ros.kinematics.transforms import transform
 from remaster_ros.session.workcell import read_cell
 from remaster_ros.simulation.arm_motion import ServoPoint
 from remaster_ros.simulation.effect_sampling import RANDOM, EffectSpec, hide
-from remaster_ros.simulation.hidden_arm import ChainArm
+from remaster_ros.simulation.hidden_arm import ChainArm, WrongArm
 from remaster_ros.simulation.hidden_effect import HiddenEffect
 from remaster_ros.simulation.hidden_effects import NAMED, UNNAMED
 from remaster_ros.simulation.setup import make_world
@@ -24,7 +24,6 @@ from remaster_ros.simulation.truth import (
 )
 from remaster_ros.simulation.world import World
 from remaster_ros.simulation.world_model import Round, WorldModel
-from remaster_ros.simulation.wrong_arm import WrongArm
 
 SEED = 5
 WARMING = Warming(5.0, 100.0, 0.0)

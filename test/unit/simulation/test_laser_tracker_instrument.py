@@ -18,8 +18,7 @@ from remaster_ros.sensors.laser_tracker.protocol.packets import (
     Status,
     StatusChange,
 )
-from remaster_ros.simulation.laser_tracker_instrument import TrackerInstrument
-from remaster_ros.simulation.laser_tracker_settings import TrackerBehaviour
+from remaster_ros.simulation.laser_tracker import TrackerBehaviour, TrackerInstrument
 
 SURE = TrackerBehaviour(search_failure_share=0.0)
 METRES = Request(Command.SET_UNITS, (0, 0, 0, 0, 0))

@@ -13,8 +13,12 @@ from optitrack_world import SENSOR, MarkerWorld, SteppedWorld, free_port
 from remaster_ros.errors import InputError
 from remaster_ros.sensors.optitrack.protocol import natnet
 from remaster_ros.sensors.optitrack.protocol.natnet import TRACKING_VALID, Frame, MessageId
-from remaster_ros.simulation.optitrack import MAX_CLIENTS, FakeOptiTrackServer
-from remaster_ros.simulation.optitrack_scene import OptiTrackBehaviour, OptiTrackScene
+from remaster_ros.simulation.optitrack import (
+    MAX_CLIENTS,
+    FakeOptiTrackServer,
+    OptiTrackBehaviour,
+    OptiTrackScene,
+)
 
 SEED = 20
 CALIBRATION_ID = 1 << 16 | 1

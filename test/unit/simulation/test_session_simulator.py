@@ -11,7 +11,7 @@ from calibration_scenes import CHAIN, MARKERS, URDF, random_poses, scene, sensor
 
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.transforms import apply
-from remaster_ros.simulation.session_simulator import simulate_session
+from remaster_ros.simulation.simulated_workcell import simulate_session
 
 
 def test_without_noise_it_measures_the_true_robot() -> None:
