@@ -28,6 +28,7 @@ def with_control_messages(ros_environment):
         ros_environment['PYTHONPATH'] += f'{os.pathsep}{folder}'
 
 
+@pytest.mark.qualify
 def test_a_collection_by_the_action_with_a_pause_and_a_bridge_that_is_killed(
     with_control_messages, start, client, tmp_path
 ):

@@ -12,6 +12,7 @@ from ros_rig import call, node_arguments, wait_until
 pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(900)]
 
 
+@pytest.mark.qualify
 def test_the_optimizer_discovers_on_request(start, client, tmp_path):
     session, out = tmp_path / 'session', tmp_path / 'discovery'
     made = remaster(

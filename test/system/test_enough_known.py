@@ -110,6 +110,7 @@ def test_the_optimizer_reports_what_is_known_and_ends_only_its_own_plan(start, c
     assert not of_plan('other') or not any(s.enough for s in of_plan('other'))
 
 
+@pytest.mark.qualify
 @pytest.mark.slow
 @pytest.mark.timeout(900)
 def test_a_collection_that_knows_enough_ends_as_any_other(start, client, tmp_path):

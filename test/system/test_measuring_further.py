@@ -30,6 +30,7 @@ def sag(size):
     }  # fmt: skip
 
 
+@pytest.mark.qualify
 def test_what_separates_is_measured_behind_the_session_and_decides(start, client, tmp_path):
     found = tmp_path / 'discovery'
     cell = Cell(

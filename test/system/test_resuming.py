@@ -51,6 +51,7 @@ def stands(cell, seconds=2.0):
     assert planner(cell, 'state') != 'running'
 
 
+@pytest.mark.qualify
 def test_a_killed_planner_goes_on_in_its_run(cell):
     token = planner(cell, 'run')
     cell.until(lambda: cell.recorder('run') == token, 'the recorder')

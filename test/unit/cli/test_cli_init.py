@@ -51,7 +51,7 @@ def written(folder, description: Description, name='robot.urdf'):
         pytest.param('ur5e', '', marks=pytest.mark.qualify),
         ('irb120', ''),
         pytest.param('panda', 'panda_joint5', marks=pytest.mark.qualify),
-        ('iiwa14', 'lbr_A3'),
+        pytest.param('iiwa14', 'lbr_A3', marks=pytest.mark.qualify),
         pytest.param('xarm7', 'joint5', marks=pytest.mark.qualify),
     ],
 )

@@ -116,6 +116,7 @@ def test_the_robot_time_is_that_of_the_whole_session():
     assert 'robot time of the whole session' in plan_text(plan, DesignSettings(optimal=True))
 
 
+@pytest.mark.qualify
 def test_the_time_without_looking_for_ways_is_that_of_the_plan():
     planner, start = planner_of(CellPoses(), every=25, registration=12)
     plan = plan_collection(planner, planner.rough_places, start)
@@ -133,6 +134,7 @@ def test_every_candidate_is_accounted_for():
     assert plan.tour.dropped[NOT_NEEDED] > 0
 
 
+@pytest.mark.qualify
 def test_the_fastest_order_of_the_same_configurations_takes_less_time():
     _, nearest = planned(CellPoses(design=LATIN))
     _, fastest = planned(CellPoses(design=LATIN, solutions='chosen', order='fastest'))

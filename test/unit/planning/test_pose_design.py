@@ -70,6 +70,7 @@ def test_the_same_precision_takes_fewer_configurations_with_the_floors_kept():
     assert Floors().hold(INFORMATION.pose[list(design.chosen)])
 
 
+@pytest.mark.qualify
 def test_the_same_seed_chooses_the_same():
     goal = Goal(JOINTS, TOOL)
     assert chosen(goal, 3) == chosen(goal, 3)
