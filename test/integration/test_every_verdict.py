@@ -120,6 +120,7 @@ def test_fit(case: str, healthy: Path, tmp_path: Path) -> None:
     assert accuracy['optimization'] is not None
 
 
+@pytest.mark.qualify
 def test_offsets_that_are_corrected_hardly_matter(healthy: Path, tmp_path: Path) -> None:
     """The fit of an arm that was corrected: nothing is left to gain, and the report states it."""
     out = tmp_path / 'fit'
@@ -159,9 +160,10 @@ DISCOVER = {
 }
 
 
-# That nothing is there a node answers, too: test_discovering.
+# Of every verdict the page: test_discovery_verdicts.
 @pytest.mark.parametrize(
-    'case', [pytest.param('none', marks=pytest.mark.qualify), 'effects', 'undetermined']
+    'case',
+    [pytest.param(c, marks=() if c == 'effects' else pytest.mark.qualify) for c in DISCOVER],
 )
 def test_discover(case: str, tmp_path: Path) -> None:
     options, verdict, mood, words = DISCOVER[case]
@@ -257,6 +259,7 @@ def test_causes_that_another_session_does_not_have_are_not_green(tmp_path: Path)
     assert 'The other session does not confirm it: its error is ' in page
 
 
+@pytest.mark.qualify
 def test_discover_without_validation(healthy: Path, tmp_path: Path) -> None:
     session = changed(healthy, tmp_path, only_fitted)
     out = tmp_path / 'causes'
