@@ -1,6 +1,6 @@
 """Remaster a robot arm in place: joint zero-offsets with honest uncertainty.
 
-The five functions here are all that a program needs; the rest may change between versions.
+The functions here are all that a program needs; the rest may change between versions.
 Randomness comes from a seed: the same one gives the same result.
 """
 
@@ -15,12 +15,21 @@ from remaster_ros.version import __version__
 # Each function imports what it needs: a node or a verb shall not wait for all of it.
 if TYPE_CHECKING:
     from remaster_ros.calibration.result import FitResult
+    from remaster_ros.compensation.file import Compensation
     from remaster_ros.discovery.discover import Discovery
     from remaster_ros.planning.tour_order import Tour
     from remaster_ros.simulation.simulated_workcell import SimulatedRun
     from remaster_ros.types import Priors, Session
 
-__all__ = ['__version__', 'discover', 'fit', 'plan', 'read_session', 'simulate']
+__all__ = [
+    '__version__',
+    'discover',
+    'fit',
+    'plan',
+    'read_compensation',
+    'read_session',
+    'simulate',
+]
 
 
 def read_session(folder: str | os.PathLike[str]) -> Session:
@@ -211,3 +220,29 @@ def plan(
     counts = {'optimization': poses, 'validation': validation_poses}
     rng = np.random.default_rng(seed)
     return plan_tour(workcell.chain(), workcell, None, counts, rng, without_meshes=False)
+
+
+def read_compensation(path: str | os.PathLike[str]) -> Compensation:
+    """Read ``apply/compensation.json``: the whole correction of an arm, ready to use.
+
+    Parameters
+    ----------
+    path
+        The file that fit, discover or report has written.
+
+    Raises
+    ------
+    InputError
+        One line naming the file, the place in it and the remedy.
+
+    Examples
+    --------
+    >>> import remaster_ros
+    >>> remaster_ros.read_compensation('no_such_file.json')
+    Traceback (most recent call last):
+    ...
+    remaster_ros.errors.InputError: no_such_file.json: no such file; give ...
+    """
+    from remaster_ros.compensation import file
+
+    return file.read_compensation(path)

@@ -23,6 +23,7 @@ import numpy as np
 from remaster_ros.calibration.comparison import predicted_rows
 from remaster_ros.calibration.estimate import Estimate, estimate
 from remaster_ros.calibration.identifiability import OPEN_ANGLE
+from remaster_ros.calibration.laplace import Mode
 from remaster_ros.calibration.priors import TIGHTEST_PRIOR, prior_rows
 from remaster_ros.discovery.effects import joint_axis_tilt, link_length
 from remaster_ros.discovery.effects.base import Cell
@@ -64,6 +65,8 @@ class GeometryModel:
         geometry and on the drawing.
     is_validation
         Which of them were held out, (n,).
+    mode
+        Of the fit of the members beside the offsets: ``members`` are its first further parameters.
     """
 
     tolerance_m: float
@@ -76,6 +79,7 @@ class GeometryModel:
     errors: FloatArray
     drawing_errors: FloatArray
     is_validation: BoolArray
+    mode: Mode
 
     @property
     def held_out_m(self) -> float:
@@ -163,6 +167,7 @@ def geometry_model(found: Estimate, causes: Sequence[Cell] = ()) -> GeometryMode
         *loaded,
         _errors(drawing),
         found.problem.measurements.is_validation,
+        mode,
     )
 
 

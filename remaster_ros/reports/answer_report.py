@@ -15,6 +15,8 @@ import numpy as np
 from markupsafe import Markup
 
 from remaster_ros.compensation.export import MODEL_FILE
+from remaster_ros.compensation.file import COMPENSATION_FILE
+from remaster_ros.compensation.file import FILE_LIMIT as COMPENSATION_BYTES
 from remaster_ros.discovery.words import clock_time
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.serial_chain import SerialChain
@@ -93,7 +95,15 @@ def write_answer(
     make_folder(folder)
     html = answer_html(subject, {name: inlined(name, svg) for name, svg in drawings.items()})
     source = found_folder if answer.uses_causes and found_folder else fit_folder
-    _copy_apply(source / APPLY_FOLDER, inputs.model, answer, folder)
+    compensation = next(
+        (
+            path
+            for one in (found_folder, fit_folder)
+            if one is not None and (path := one / APPLY_FOLDER / COMPENSATION_FILE).exists()
+        ),
+        None,
+    )
+    _copy_apply(source / APPLY_FOLDER, inputs.model, compensation, answer, folder)
     copy_plan(inputs.plan, folder)
     write_atomically(folder / REPORT_FILE, html)
     if printer is not None:
@@ -215,12 +225,18 @@ def worst_rows(inputs: Inputs, answer: Answer) -> list[WorstRow]:
     return rows
 
 
-def _copy_apply(source: Path, model: Path | None, answer: Answer, folder: Path) -> None:
+def _copy_apply(
+    source: Path, model: Path | None, compensation: Path | None, answer: Answer, folder: Path
+) -> None:
     """Copy the files of the deed, so that the page can be handed on with them."""
     make_folder(folder / APPLY_FOLDER)
     for name in ALL_FILES:
         # One of an earlier page would contradict this one.
         (folder / APPLY_FOLDER / name).unlink(missing_ok=True)
+    (folder / APPLY_FOLDER / COMPENSATION_FILE).unlink(missing_ok=True)
+    if answer.files and compensation is not None:
+        data = read_limited(compensation, COMPENSATION_BYTES, 'it was there')
+        write_atomically(folder / APPLY_FOLDER / COMPENSATION_FILE, data)
     for name in answer.files:
         path = model if model is not None and name == MODEL_FILE else source / name
         data = read_limited(path, FILE_LIMIT, 'fit or discover again, which write it')

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
 
+from remaster_ros.calibration.predictions import predict
 from remaster_ros.compensation.export import (
     LAYER_FILE,
     MODEL_FILE,
@@ -14,42 +16,102 @@ from remaster_ros.compensation.export import (
     URDF_FILE,
     exports,
 )
+from remaster_ros.compensation.file import COMPENSATION_FILE
+from remaster_ros.compensation.of_result import (
+    Described,
+    NotCorrected,
+    everything,
+    offsets_alone,
+)
 from remaster_ros.discovery.discover import Discovery
 from remaster_ros.discovery.explain import FoundEffect
 from remaster_ros.discovery.geometry_model import mean_length
 from remaster_ros.discovery.words import sentence_case
 from remaster_ros.reports.discovery_schema import Loadable
-from remaster_ros.reports.fit_json import APPLY_FOLDER, model_text
+from remaster_ros.reports.fit_json import APPLY_FOLDER, correction_text, model_text
 from remaster_ros.types import FloatArray
 
 
-def applied(discovery: Discovery) -> dict[str, str]:
-    """Return the files of the folder ``apply``: name -> text."""
+def applied(discovery: Discovery, widening: float, result_sha256: str) -> dict[str, str]:
+    """Return the files of the folder ``apply``: name -> text.
+
+    Parameters
+    ----------
+    discovery
+        What was found.
+    widening
+        Of its predictions.
+    result_sha256
+        Of discovery.json.
+    """
     files = exports(discovery.alone, _remarks(discovery))
     if discovery.loads_geometry:
         assert discovery.geometry is not None
         files[MODEL_FILE] = model_text(discovery.alone, discovery.geometry)
+    described = compensation_of(discovery, widening)
+    files[COMPENSATION_FILE] = correction_text(
+        described, discovery.fit.session, 'discover', result_sha256
+    )
     return files
+
+
+def compensation_of(discovery: Discovery, widening: float) -> Described:
+    """Return the arm that compensation.json holds: everything, where that predicts better.
+
+    Causes and zero-offsets belong together: where the causes are left out the zero-offsets are
+    those fitted without them.
+    """
+    if holds_everything(discovery):
+        fit, cells = discovery.fit, discovery.solution.cells
+        return everything(fit, cells, discovery.residuals, widening)
+    alone = discovery.alone
+    own = predict(alone, discovery.residuals.context.measurements).widening
+    notes = []
+    if discovery.solution.cells:
+        notes.append(
+            'zero-offsets alone: the model with everything that was found predicts held-out poses '
+            'no better'
+        )
+    described = offsets_alone(alone, own, notes)
+    left = tuple(
+        NotCorrected(e.name, e.joints, e.size_m, _ALONE, e.remedy) for e in discovery.effects
+    )
+    return replace(described, not_corrected=left)
+
+
+def holds_everything(discovery: Discovery) -> bool:
+    """Whether compensation.json holds everything in the model, and not the offsets alone."""
+    alone, every = (
+        _held_out_mean(discovery, fit.residuals_after) for fit in (discovery.alone, discovery.fit)
+    )
+    no_rows = np.isnan(alone)
+    return bool(discovery.solution.cells) and (no_rows or round(every, 3) < round(alone, 3))
+
+
+def _held_out_mean(discovery: Discovery, errors: FloatArray) -> float:
+    """Return the mean error on held-out poses, mm; gross errors do not count."""
+    m = discovery.residuals.context.measurements
+    gross = [observation for observation, _ in discovery.outliers]
+    return 1e3 * mean_length(errors[m.is_validation & ~np.isin(m.observation, gross)])
 
 
 def loadable(discovery: Discovery) -> list[Loadable]:
     """Return the results that a robot can load, the plainest first."""
-    m = discovery.residuals.context.measurements
-    gross = [observation for observation, _ in discovery.outliers]
-    held_out = m.is_validation & ~np.isin(m.observation, gross)
     results: list[tuple[Literal['offsets', 'geometry', 'everything'], FloatArray, str]] = [
         ('offsets', discovery.alone.residuals_after, f'{APPLY_FOLDER}/{URDF_FILE}')
     ]
     if discovery.geometry is not None:
         file = f'{APPLY_FOLDER}/{MODEL_FILE}' if discovery.loads_geometry else ''
         results.append(('geometry', discovery.geometry.errors, file))
-    results.append(('everything', discovery.fit.residuals_after, ''))
+    file = f'{APPLY_FOLDER}/{COMPENSATION_FILE}' if holds_everything(discovery) else ''
+    results.append(('everything', discovery.fit.residuals_after, file))
     rows: list[Loadable] = []
     # To what is shown: a difference in the fourth figure is no reason to load anything else.
     least = np.inf
     for name, errors, file in results:
-        mean_mm = round(1e3 * mean_length(errors[held_out]), 3)
-        rows.append(Loadable(name, mean_mm if held_out.any() else None, mean_mm < least, file))
+        mean_mm = round(_held_out_mean(discovery, errors), 3)
+        shown = None if np.isnan(mean_mm) else mean_mm
+        rows.append(Loadable(name, shown, mean_mm < least, file))
         least = min(least, mean_mm)
     return rows
 
@@ -59,9 +121,9 @@ def load_words(row: Loadable) -> tuple[str, str]:
     if row.result != 'offsets' and row.held_out_mean_mm is not None and not row.better:
         what_to_do = 'leave it: no better than what stands before it'
     elif row.file:
-        what_to_do = f'{row.file}{_PAD if row.result == "offsets" else ""}'
+        what_to_do = f'{row.file}{_MORE.get(row.result, "")}'
     else:
-        what_to_do = 'no file holds it: a compensation between planner and controller'
+        what_to_do = 'leave it: no file holds it'
     return _RESULTS[row.result], what_to_do
 
 
@@ -70,7 +132,11 @@ _RESULTS = {
     'geometry': 'all lengths, tilts and zero-offsets together',
     'everything': 'everything in the model',
 }
-_PAD = f', {REMASTER_FILE} or {LAYER_FILE}'
+_MORE = {
+    'offsets': f', {REMASTER_FILE} or {LAYER_FILE}',
+    'everything': ', for programs by remaster compensate',
+}
+_ALONE = 'only zero-offsets are corrected here'
 
 
 def _remarks(discovery: Discovery) -> list[str]:
@@ -90,8 +156,10 @@ def _remarks(discovery: Discovery) -> list[str]:
         remarks.append(f'Not corrected here: {_named(held)}; {where}.')
     if left:
         remarks.append(
-            f'Corrected in none of these files: {_named(left)}. That takes a compensation between '
-            'planner and controller.'
+            f'Not corrected here: {_named(left)}; {COMPENSATION_FILE} has all of it that can be '
+            'corrected, with zero-offsets of its own: use it in place of this file.'
+            if holds_everything(discovery)
+            else f'Corrected in none of these files: {_named(left)}.'
         )
     return remarks
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -162,15 +163,17 @@ def save_discovery(
     make_folder(folder)
     predictions = predictions_of(discovery) if predictions is None else predictions
     content = discovery_content(discovery, confirmation, predictions, decided)
-    write_atomically(folder / DISCOVERY_FILE, schemas.encode(content))
+    text = schemas.encode(content)
+    write_atomically(folder / DISCOVERY_FILE, text)
+    result_sha256 = hashlib.sha256(text).hexdigest()
     gross = {observation for observation, _ in discovery.fit.left_out}
-    text = predictions_text(discovery.fit.session, predictions, gross)
-    write_atomically(folder / PREDICTIONS_FILE, text)
+    rows = predictions_text(discovery.fit.session, predictions, gross)
+    write_atomically(folder / PREDICTIONS_FILE, rows)
     make_folder(folder / APPLY_FOLDER)
     # That of an earlier run would contradict the rest.
     (folder / APPLY_FOLDER / MODEL_FILE).unlink(missing_ok=True)
-    for name, text in applied(discovery).items():
-        write_atomically(folder / APPLY_FOLDER / name, text)
+    for name, file in applied(discovery, predictions.widening, result_sha256).items():
+        write_atomically(folder / APPLY_FOLDER / name, file)
     if not figures:
         remove_report(folder)
         return folder / DISCOVERY_FILE

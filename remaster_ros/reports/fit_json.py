@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import tempfile
 from collections.abc import Iterable, Sequence
@@ -12,6 +13,8 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 import numpy as np
 
+from remaster_ros.calibration.estimate import Problem
+from remaster_ros.calibration.predictions import predict
 from remaster_ros.compensation.export import (
     MODEL_FILE,
     URDF_FILE,
@@ -19,6 +22,8 @@ from remaster_ros.compensation.export import (
     calibrated_urdf,
     exports,
 )
+from remaster_ros.compensation.file import COMPENSATION_FILE, Source, written
+from remaster_ros.compensation.of_result import Described, geometry_too, offsets_alone
 from remaster_ros.discovery.geometry_model import GeometryModel, geometry_model
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.transforms import quaternion_xyzw
@@ -33,7 +38,7 @@ from remaster_ros.session.files import (
     write_atomically,
     writing,
 )
-from remaster_ros.types import FloatArray, Session
+from remaster_ros.types import FloatArray, Measurements, Session
 from remaster_ros.version import __version__
 
 if TYPE_CHECKING:
@@ -124,6 +129,33 @@ def model_text(result: FitResult, geometry: GeometryModel) -> str:
         [remark],
         Geometry(geometry.shifts, geometry.turns),
     )
+
+
+def compensation_text(result: FitResult, result_sha256: str) -> str:
+    """Return the correction of a fit: with all lengths and tilts where they predict better."""
+    geometry = geometry_of(result)
+    if geometry is not None and geometry.is_better:
+        described = geometry_too(result, geometry)
+    else:
+        widening = predict(result, _rows_of(result)).widening
+        described = offsets_alone(result, widening)
+    return correction_text(described, result.session, 'fit', result_sha256)
+
+
+def correction_text(
+    described: Described, session: Session, made_by: Source, result_sha256: str
+) -> str:
+    """Return compensation.json of the arm that a result describes."""
+    state = {'correction': session.extra.get('correction')}
+    hashes = (result_sha256, session.observations_sha256)
+    return written(described, session.urdf, made_by, hashes, state)
+
+
+def _rows_of(result: FitResult) -> Measurements:
+    """Return the rows with the indices of the sensors and markers that occur in them."""
+    if result.found is not None:
+        return result.found.problem.measurements
+    return Problem.of(result.session).measurements
 
 
 def _geometry(result: FitResult, geometry: GeometryModel) -> dict[str, Any]:
@@ -414,6 +446,7 @@ def save_fit(result: FitResult, folder: str | os.PathLike[str], figures: bool = 
     """
     folder = Path(folder)
     write_fit(result, folder / FIT_FILE)
+    result_sha256 = hashlib.sha256((folder / FIT_FILE).read_bytes()).hexdigest()
     write_atomically(folder / RESIDUALS_FILE, residuals_text(result))
     make_folder(folder / APPLY_FOLDER)
     # A model of an earlier fit would contradict the rest.
@@ -421,6 +454,7 @@ def save_fit(result: FitResult, folder: str | os.PathLike[str], figures: bool = 
     files = exports(result)
     if (geometry := geometry_of(result)) is not None and geometry.is_better:
         files[MODEL_FILE] = model_text(result, geometry)
+    files[COMPENSATION_FILE] = compensation_text(result, result_sha256)
     for name, text in files.items():
         write_atomically(folder / APPLY_FOLDER / name, text)
     if not figures:

@@ -122,12 +122,17 @@ class Curve:
         return self._others(peaks[:-DEGREE] if self.closed else peaks)
 
     @property
+    def heights(self) -> FloatArray:
+        """Heights of all splines of a unit of each free one, (m, m − 1)."""
+        heights: FloatArray = np.delete(np.eye(len(self.weights)), self._pivot, axis=1)
+        heights[self._pivot] = -self._others(self.weights) / self.weights[self._pivot]
+        return heights
+
+    @property
     def penalty(self) -> FloatArray:
         """Penalty on the free heights, (m − 1, m − 1)."""
-        count = len(self.weights)
-        heights = np.delete(np.eye(count), self._pivot, axis=1)
-        heights[self._pivot] = -self._others(self.weights) / self.weights[self._pivot]
-        found: FloatArray = heights.T @ roughness(count, self.closed) @ heights
+        heights = self.heights
+        found: FloatArray = heights.T @ roughness(len(heights), self.closed) @ heights
         return found
 
     def grid(self, per_knot: int = 8) -> FloatArray:

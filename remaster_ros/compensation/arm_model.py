@@ -1,0 +1,560 @@
+"""The arm as it was found to be: where its tool is at reported joint angles, and how surely.
+
+With q the reported angles, δ the zero-offsets and τ gravity's torques at q + δ::
+
+    true angle of joint j = q_j + δ_j + Σ terms of joint j
+    tool = base turn · Π_j (T_j · shift_j · turn_j · Rot(axis_j, true angle_j)) · T_tool
+
+T_j is the nominal origin of joint j. Shifts are in the frame of the link that the joint before
+moves, turns in the joint's own frame, and both may grow with the temperature. A link whose bearing
+gives way is turned about its joint's origin by gravity's moment across the joint's axis.
+
+Terms of an angle take the angle as it is reported; those of a torque or a moment take that of the
+nominal arm at q + δ.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Literal, TypeVar
+
+import numpy as np
+import scipy
+
+from remaster_ros.kinematics.serial_chain import SerialChain
+from remaster_ros.kinematics.transforms import (
+    apply,
+    inverse,
+    rotation_vector_to_matrix,
+    transform,
+)
+from remaster_ros.types import BoolArray, FloatArray
+
+Driver = Literal['none', 'angle', 'gravity_torque', 'gravity_moment', 'temperature']
+Form = Literal['constant', 'linear', 'quadratic', 'sin', 'cos', 'bspline']
+GRAVITY = (0.0, 0.0, -9.81)
+TURN = 2.0 * np.pi
+# Rows of a block: frames and derivatives of so many take some ten megabytes.
+BLOCK_ROWS = 2_000
+
+
+@dataclass(frozen=True, eq=False)
+class Function:
+    """A function of one driver, linear in its coefficients.
+
+    Attributes
+    ----------
+    driver
+        What it depends on; ``joint`` is the index of the joint whose angle or torque it is.
+    joint
+        -1 where the driver belongs to none.
+    form
+        Of the m coefficients' m features.
+    order
+        Of a sine or cosine: cycles per turn.
+    knots, degree
+        Of splines, in the driver's unit; beyond the ends the end value holds.
+    turn_start
+        The driver is brought to the turn that begins there, rad; NaN where it is not.
+    """
+
+    driver: Driver
+    form: Form
+    joint: int = -1
+    order: int = 0
+    knots: FloatArray = field(default_factory=lambda: np.zeros(0))
+    degree: int = 0
+    turn_start: float = np.nan
+
+    @property
+    def size(self) -> int:
+        """Number of coefficients m."""
+        return len(self.knots) - self.degree - 1 if self.form == 'bspline' else 1
+
+    def features(self, values: FloatArray) -> FloatArray:
+        """Return what a unit of each coefficient adds, (n, m), at values of the driver, (n,)."""
+        if self.form == 'bspline':
+            inside = np.clip(self._in_turn(values), *self.ends)
+            found = scipy.interpolate.BSpline.design_matrix(inside, self.knots, self.degree)
+            return np.asarray(found.toarray(), dtype=float)
+        if self.form == 'constant':
+            return np.ones((len(values), 1))
+        if self.form == 'linear':
+            return values[:, None]
+        if self.form == 'quadratic':
+            return values[:, None] ** 2
+        wave = np.sin if self.form == 'sin' else np.cos
+        return np.asarray(wave(self.order * values))[:, None]
+
+    def outside(self, values: FloatArray) -> BoolArray:
+        """Return where a value lies beyond the ends of splines, (n,)."""
+        if self.form != 'bspline':
+            return np.zeros(len(values), dtype=bool)
+        low, high = self.ends
+        at, margin = self._in_turn(values), 1e-9 * (high - low)
+        beyond: BoolArray = (at < low - margin) | (at > high + margin)
+        return beyond
+
+    @property
+    def ends(self) -> tuple[float, float]:
+        """Between which values splines are defined."""
+        return float(self.knots[self.degree]), float(self.knots[-self.degree - 1])
+
+    def _in_turn(self, values: FloatArray) -> FloatArray:
+        if np.isnan(self.turn_start):
+            return values
+        found: FloatArray = self.turn_start + np.mod(values - self.turn_start, TURN)
+        return found
+
+
+@dataclass(frozen=True, eq=False)
+class JointTerm:
+    """What adds to the angle of a joint beside its zero-offset.
+
+    Attributes
+    ----------
+    joint
+        Its index.
+    effect
+        The physical cause, as in discovery.json.
+    function, coefficients
+        Of its driver, rad, (m,).
+    """
+
+    joint: int
+    effect: str
+    function: Function
+    coefficients: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class BaseTerm:
+    """What turns the whole arm about the origin of R.
+
+    Attributes
+    ----------
+    effect
+        The physical cause.
+    function
+        Of one coefficient; of ``gravity_moment`` each axis of R has its own moment.
+    coefficients
+        About x, y and z of R, rad per unit of the function, (3,).
+    """
+
+    effect: str
+    function: Function
+    coefficients: FloatArray
+
+
+Term = TypeVar('Term', JointTerm, BaseTerm)
+
+
+@dataclass(frozen=True, eq=False)
+class Geometry:
+    """Shifts and turns of the joints' origins; the last row is the tool's.
+
+    Attributes
+    ----------
+    shifts
+        In the frame of the link that the joint before moves, m, (k + 1, 3).
+    turns
+        Rotation vectors in the joint's frame, rad, (k + 1, 3).
+    """
+
+    shifts: FloatArray
+    turns: FloatArray
+
+    @classmethod
+    def none(cls, joints: int) -> Geometry:
+        """Return that of the drawing."""
+        return cls(np.zeros((joints + 1, 3)), np.zeros((joints + 1, 3)))
+
+    @property
+    def is_any(self) -> bool:
+        """Whether it changes anything."""
+        return bool(np.any(self.shifts) or np.any(self.turns))
+
+
+@dataclass(frozen=True, eq=False)
+class Drivers:
+    """Values of the drivers in n rows.
+
+    Attributes
+    ----------
+    q
+        Reported angles, rad, (n, k).
+    warming
+        Temperature above that at which nothing has grown, K, (n,).
+    torque
+        Gravity's, N m, (n, k); zeros where no term takes it.
+    base_moment
+        Gravity's about the origin of R, N m, (n, 3); likewise.
+    moment
+        Gravity's on each link about its joint, N m, (n, k, 3); likewise.
+    """
+
+    q: FloatArray
+    warming: FloatArray
+    torque: FloatArray
+    base_moment: FloatArray
+    moment: FloatArray
+
+    def of(self, function: Function) -> FloatArray:
+        """Return the value of a function's driver, (n,)."""
+        if function.driver == 'angle':
+            return self.q[:, function.joint]
+        if function.driver == 'gravity_torque':
+            return self.torque[:, function.joint]
+        if function.driver == 'temperature':
+            return self.warming
+        return np.zeros(len(self.q))
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """Where the arm is in n rows.
+
+    Attributes
+    ----------
+    drivers
+        Values of the drivers.
+    angles
+        True joint angles, rad, (n, k).
+    before, frames
+        Frame of each joint before and after its turn, in R, (n, k, 4, 4).
+    tool
+        T_R_T, (n, 4, 4).
+    """
+
+    drivers: Drivers
+    angles: FloatArray
+    before: FloatArray
+    frames: FloatArray
+    tool: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class ArmModel:
+    """An arm of k joints as it was found to be.
+
+    Attributes
+    ----------
+    chain
+        The nominal robot; its masses are those that the torques were computed with.
+    joint_offsets
+        δ, rad, (k,).
+    joint_terms, base_terms
+        See there.
+    geometry, growth
+        Constant, and per kelvin.
+    lateral_compliance
+        Of each link's bearing across the joint's axis, rad/(N m), (k,).
+    reference_c
+        Temperature at which nothing has grown, °C; NaN where nothing does.
+    mean_c
+        That of the measurements, taken where none is given, °C.
+    T_R_N
+        Registrations that belong to the offsets, by sensor.
+    markers
+        Likewise, in T, m.
+    root
+        U with U' U the covariance of `parameter_names`, (r, p).
+    widening
+        How many times larger standard deviations were found on poses left out than in theory.
+    """
+
+    chain: SerialChain
+    joint_offsets: FloatArray
+    joint_terms: tuple[JointTerm, ...]
+    base_terms: tuple[BaseTerm, ...]
+    geometry: Geometry
+    growth: Geometry
+    lateral_compliance: FloatArray
+    reference_c: float
+    mean_c: float
+    T_R_N: Mapping[str, FloatArray]
+    markers: Mapping[str, FloatArray]
+    root: FloatArray
+    widening: float
+
+    @property
+    def joints(self) -> int:
+        """Number of joints k."""
+        return len(self.chain)
+
+    @property
+    def grows(self) -> bool:
+        """Whether anything depends on the temperature."""
+        return self.growth.is_any or 'temperature' in self._needs
+
+    @property
+    def is_joints_alone(self) -> bool:
+        """Whether all errors are those of joint angles."""
+        others = (self.geometry.is_any, self.growth.is_any, np.any(self.lateral_compliance))
+        return not (any(others) or self.base_terms)
+
+    @cached_property
+    def _needs(self) -> set[str]:
+        drivers: set[str] = {term.function.driver for term in self.joint_terms}
+        drivers |= {term.function.driver for term in self.base_terms}
+        return drivers | ({'lateral'} if np.any(self.lateral_compliance) else set())
+
+    def warming(self, rows: int, temperature_c: FloatArray | float | None) -> FloatArray:
+        """Return the temperature above the reference, K, (rows,)."""
+        if not self.grows:
+            return np.zeros(rows)
+        given = self.mean_c if temperature_c is None else np.asarray(temperature_c, dtype=float)
+        return np.broadcast_to(given - self.reference_c, (rows,))
+
+    def drivers(self, q: FloatArray, warming: FloatArray) -> Drivers:
+        """Return the values of the drivers at reported angles (n, k)."""
+        n, k = q.shape
+        torque, base, moment = np.zeros((n, k)), np.zeros((n, 3)), np.zeros((n, k, 3))
+        if self._needs & {'gravity_torque', 'gravity_moment', 'lateral'}:
+            chain = self.chain
+            frames = chain.frames(q + self.joint_offsets)
+            moments = chain.masses[:, None] * apply(frames, chain.centers_of_mass)
+            base = np.cross(moments.sum(axis=1), GRAVITY)
+            carried = np.cumsum(moments[:, ::-1], axis=1)[:, ::-1]
+            mass = np.cumsum(chain.masses[::-1])[::-1]
+            arms = carried - mass[:, None] * frames[..., :3, 3]
+            moment = np.cross(arms, GRAVITY)
+            torque = np.sum(chain.axes_in_base(frames) * moment, axis=-1)
+        return Drivers(q, warming, torque, base, moment)
+
+    def added_angles(self, drivers: Drivers) -> FloatArray:
+        """Return what offsets and terms add to the reported angles, rad, (n, k)."""
+        added = np.tile(self.joint_offsets, (len(drivers.q), 1))
+        for term in self.joint_terms:
+            values = term.function.features(drivers.of(term.function))
+            added[:, term.joint] += values @ term.coefficients
+        return added
+
+    def state(self, q: FloatArray, temperature_c: FloatArray | float | None = None) -> State:
+        """Return where the arm is at reported angles (n, k)."""
+        return self._state(self.drivers(q, self.warming(len(q), temperature_c)))
+
+    def _state(self, drivers: Drivers) -> State:
+        n, k = drivers.q.shape
+        angles = drivers.q + self.added_angles(drivers)
+        turned = transform(
+            rotation_vector_to_matrix(angles[..., None] * self.chain.axes), np.zeros(3)
+        )
+        origins = self._origins(drivers.warming)
+        before, frames = np.empty((n, k, 4, 4)), np.empty((n, k, 4, 4))
+        frame = transform(rotation_vector_to_matrix(self._base_turn(drivers)), np.zeros(3))
+        for j in range(k):
+            before[:, j] = frame @ origins[..., j, :, :]
+            frame = before[:, j] @ turned[:, j]
+            if self.lateral_compliance[j] != 0.0:
+                frame = frame.copy()
+                turn = self.lateral_compliance[j] * self._lateral(drivers, frame, j)
+                frame[:, :3, :3] = rotation_vector_to_matrix(turn) @ frame[:, :3, :3]
+            frames[:, j] = frame
+        return State(drivers, angles, before, frames, frame @ origins[..., k, :, :])
+
+    def _origins(self, warming: FloatArray) -> FloatArray:
+        """Return the joints' origins with shifts and turns, (k + 1, 4, 4) or (n, k + 1, 4, 4)."""
+        shifts, turns = self.geometry.shifts, self.geometry.turns
+        if self.growth.is_any:
+            shifts = shifts + warming[:, None, None] * self.growth.shifts
+            turns = turns + warming[:, None, None] * self.growth.turns
+        drawn = self.chain.T_fixed
+        rotation = drawn[:, :3, :3] @ rotation_vector_to_matrix(turns)
+        return transform(rotation, drawn[:, :3, 3] + shifts)
+
+    def _base_turn(self, drivers: Drivers) -> FloatArray:
+        turn = np.zeros((len(drivers.q), 3))
+        for term in self.base_terms:
+            turn += self._base_features(drivers, term) * term.coefficients
+        return turn
+
+    @staticmethod
+    def _base_features(drivers: Drivers, term: BaseTerm) -> FloatArray:
+        """Return what a unit about each axis turns, rad, (n, 3)."""
+        if term.function.driver == 'gravity_moment':
+            return drivers.base_moment
+        return np.repeat(term.function.features(drivers.of(term.function)), 3, axis=1)
+
+    def _lateral(self, drivers: Drivers, frame: FloatArray, joint: int) -> FloatArray:
+        own = frame[:, :3, :3] @ self.chain.axes[joint]
+        moment = drivers.moment[:, joint]
+        lateral: FloatArray = moment - np.sum(moment * own, axis=1)[:, None] * own
+        return lateral
+
+    def outside(self, q: FloatArray) -> BoolArray:
+        """Return which rows lie beyond the range of a curve, (n,)."""
+        drivers = self.drivers(q, np.zeros(len(q)))
+        found = np.zeros(len(q), dtype=bool)
+        for term in self.joint_terms:
+            if term.function.driver != 'temperature':
+                found |= term.function.outside(drivers.of(term.function))
+        return found
+
+    @cached_property
+    def parameter_names(self) -> tuple[str, ...]:
+        """Names of the parameters whose covariance is known, in order."""
+        joints = self.chain.joint_names
+        origins = (*joints, 'tool')
+        names = [f'joint_offset.{joint}' for joint in joints]
+        for sensor in self.T_R_N:
+            names += [f'registration.{sensor}.{axis}' for axis in ('x', 'y', 'z', *_TURNS)]
+        for marker in self.markers:
+            names += [f'marker.{marker}.{axis}' for axis in 'xyz']
+        for i, term in enumerate(self.joint_terms):
+            names += [f'joint_term.{i}.{j}' for j in range(term.function.size)]
+        for i in range(len(self.base_terms)):
+            names += [f'base_term.{i}.{axis}' for axis in 'xyz']
+        for kind in ('geometry', 'growth'):
+            for origin in origins:
+                names += [f'{kind}.{origin}.{axis}' for axis in ('x', 'y', 'z', *_TURNS)]
+        names += [f'lateral_compliance.{joint}' for joint in joints]
+        return tuple(names)
+
+    def registration(self, sensor: str) -> tuple[slice, slice]:
+        """Return where shifts and turns of a registration stand among the parameters."""
+        start = self.joints + 6 * list(self.T_R_N).index(sensor)
+        return slice(start, start + 3), slice(start + 3, start + 6)
+
+    def marker(self, marker: str) -> slice:
+        """Return where a marker stands among the parameters."""
+        start = self.joints + 6 * len(self.T_R_N) + 3 * list(self.markers).index(marker)
+        return slice(start, start + 3)
+
+    @cached_property
+    def parameter_units(self) -> tuple[str, ...]:
+        """Units of the parameters."""
+        units = {
+            'joint_offset': 'rad',
+            'marker': 'm',
+            'lateral_compliance': 'rad/(N m)',
+        }
+        found = []
+        for name in self.parameter_names:
+            kind, _, rest = name.partition('.')
+            if kind in units:
+                found.append(units[kind])
+            elif kind in ('joint_term', 'base_term'):
+                terms = self.joint_terms if kind == 'joint_term' else self.base_terms
+                found.append(unit_of(terms[int(rest.split('.')[0])].function))
+            else:
+                unit = 'rad' if rest.rpartition('.')[2] in _TURNS else 'm'
+                found.append(f'{unit}/K' if kind == 'growth' else unit)
+        return tuple(found)
+
+    @cached_property
+    def parameter_means(self) -> FloatArray:
+        """Values of the parameters; those of the registrations are steps from `T_R_N`, and 0."""
+        parts = [
+            self.joint_offsets,
+            np.zeros(6 * len(self.T_R_N)),
+            *self.markers.values(),
+            *(term.coefficients for term in self.joint_terms),
+            *(term.coefficients for term in self.base_terms),
+            *(
+                np.concatenate((one.shifts, one.turns), axis=1).ravel()
+                for one in (self.geometry, self.growth)
+            ),
+            self.lateral_compliance,
+        ]
+        return np.concatenate(parts)
+
+    def moved(self, step: FloatArray) -> ArmModel:
+        """Return the arm with its parameters moved, (p,)."""
+        k, at = self.joints, 0
+
+        def take(count: int) -> FloatArray:
+            nonlocal at
+            at += count
+            return step[at - count : at]
+
+        def origins(geometry: Geometry) -> Geometry:
+            both = take(6 * (k + 1)).reshape(k + 1, 6)
+            return Geometry(geometry.shifts + both[:, :3], geometry.turns + both[:, 3:])
+
+        def terms(given: tuple[Term, ...]) -> tuple[Term, ...]:
+            return tuple(
+                replace(one, coefficients=one.coefficients + take(len(one.coefficients)))
+                for one in given
+            )
+
+        # In the order of `parameter_names`.
+        joint_offsets = self.joint_offsets + take(k)
+        T_R_N = {}
+        for sensor, T in self.T_R_N.items():
+            shift, turn = take(3), take(3)
+            T_R_N[sensor] = transform(rotation_vector_to_matrix(turn), shift) @ T
+        return replace(
+            self,
+            joint_offsets=joint_offsets,
+            T_R_N=T_R_N,
+            markers={name: place + take(3) for name, place in self.markers.items()},
+            joint_terms=terms(self.joint_terms),
+            base_terms=terms(self.base_terms),
+            geometry=origins(self.geometry),
+            growth=origins(self.growth),
+            lateral_compliance=self.lateral_compliance + take(k),
+        )
+
+    def derivative(self, state: State, sensor: str, marker: str) -> FloatArray:
+        """Return the derivative of a marker's place, in R as `sensor` has it, (n, 3, p)."""
+        n, k, drivers = len(state.angles), self.joints, state.drivers
+        points = apply(state.tool, self.markers[marker])
+        axes = np.einsum('nkij,kj->nki', state.frames[..., :3, :3], self.chain.axes)
+        arms = points[:, None, :] - state.frames[..., :3, 3]
+        by_joint = np.swapaxes(np.cross(axes, arms), 1, 2)
+        parts = [by_joint]
+        for name in self.T_R_N:
+            mine = np.zeros((n, 3, 6))
+            if name == sensor:
+                # The sensor further along is the arm further back.
+                mine[:, :, :3] = -np.eye(3)
+                mine[:, :, 3:] = -_turned(np.eye(3)[None], points)
+            parts.append(mine)
+        for name in self.markers:
+            parts.append(state.tool[:, :3, :3] * (name == marker))
+        for term in self.joint_terms:
+            features = term.function.features(drivers.of(term.function))
+            parts.append(by_joint[:, :, [term.joint]] * features[:, None, :])
+        for base_term in self.base_terms:
+            features = self._base_features(drivers, base_term)
+            parts.append(_turned(np.eye(3)[None], points) * features[:, None, :])
+        moved = np.zeros((n, 3, k + 1, 6))
+        for j in range(k + 1):
+            link = state.frames[:, j - 1] if j else self._base_frame(drivers)
+            origin = state.before[:, j] if j < k else state.tool
+            moved[:, :, j, :3] = link[:, :3, :3]
+            moved[:, :, j, 3:] = _turned(origin[:, :3, :3], points - origin[:, :3, 3])
+        of_origins = moved.reshape(n, 3, -1)
+        parts += [of_origins, drivers.warming[:, None, None] * of_origins]
+        lateral = [
+            np.cross(self._lateral(drivers, state.frames[:, j], j), arms[:, j]) for j in range(k)
+        ]
+        parts.append(np.stack(lateral, axis=-1))
+        return np.concatenate(parts, axis=2)
+
+    def _base_frame(self, drivers: Drivers) -> FloatArray:
+        return transform(rotation_vector_to_matrix(self._base_turn(drivers)), np.zeros(3))
+
+    def in_sensor(self, state: State, sensor: str, marker: str) -> FloatArray:
+        """Return where a sensor sees a marker, in its frame N, m, (n, 3)."""
+        return apply(inverse(self.T_R_N[sensor]), apply(state.tool, self.markers[marker]))
+
+
+_TURNS = ('rx', 'ry', 'rz')
+_UNITS = {'angle': 'rad', 'gravity_torque': '(N m)', 'gravity_moment': '(N m)', 'temperature': 'K'}
+
+
+def unit_of(function: Function) -> str:
+    """Return the unit of a function's coefficients."""
+    if function.form in ('linear', 'quadratic'):
+        power = '^2' if function.form == 'quadratic' else ''
+        return f'rad/{_UNITS[function.driver]}{power}'
+    return 'rad'
+
+
+def _turned(axes: FloatArray, arms: FloatArray) -> FloatArray:
+    """Return what turning about the columns of rotations (n, 3, 3) does to arms (n, 3)."""
+    return np.swapaxes(np.cross(np.swapaxes(axes, -1, -2), arms[:, None, :]), -1, -2)

@@ -1,0 +1,258 @@
+"""What to command so that the tool comes to where the nominal robot would have it, and back.
+
+The tool pose that is wanted is that of the *nominal* robot at the wanted joints. First the errors
+of the joint angles are taken off, by fixed point; what lengths and tilts leave is taken off by
+Newton steps on the full pose, with the nominal Jacobian. Near a singularity a pose is corrected
+only along the directions in which the arm can move: each of them fades smoothly to nothing where
+it needs more than ``1 / FADES_BELOW`` of joint motion. There the errors of the joint angles are
+still taken off.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from remaster_ros.compensation.arm_model import BLOCK_ROWS, ArmModel
+from remaster_ros.kinematics.transforms import matrix_to_rotation_vector
+from remaster_ros.types import BoolArray, FloatArray
+
+# Singular values of the Jacobian, m/rad and rad/rad, below which a direction fades.
+FADES_BELOW = 0.2
+# The fixed point converges by the largest slope of the terms, some hundredths; the pose by the
+# square of the errors.
+FIXED_POINT_STEPS = 2
+NEWTON_STEPS = 2
+# Back to the wanted joints: fixed point of the command, up to this, rad.
+BACK_TO = 1e-12
+MOST_STEPS_BACK = 60
+
+
+@dataclass(frozen=True, eq=False)
+class Correction:
+    """What was done to n rows of wanted joint angles.
+
+    Attributes
+    ----------
+    command
+        What to command, rad, (n, k).
+    residual_m, residual_rad
+        How far the tool remains from where it is wanted, if the model is right, (n,).
+    faded
+        Rows near a singularity, in which not all of the pose is corrected, (n,).
+    outside_range
+        Rows beyond the angles at which a curve was measured: its end value holds, (n,).
+    """
+
+    command: FloatArray
+    residual_m: FloatArray
+    residual_rad: FloatArray
+    faded: BoolArray
+    outside_range: BoolArray
+
+
+class Compensator:
+    """A correction that is ready to use.
+
+    Parameters
+    ----------
+    model
+        The arm as it was found to be.
+    """
+
+    def __init__(self, model: ArmModel) -> None:
+        self.model = model
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """Of the k joints, base to tip."""
+        return self.model.chain.joint_names
+
+    def command(self, q: ArrayLike, temperature_c: ArrayLike | None = None) -> FloatArray:
+        """Return what to command so that the tool is where the nominal robot has it.
+
+        Parameters
+        ----------
+        q
+            Wanted joint angles, those of the nominal robot, rad, (..., k).
+        temperature_c
+            Of the arm, °C, one or one a row; None for that of the measurements.
+
+        Returns
+        -------
+        ndarray
+            rad, (..., k).
+        """
+        return self._rows(lambda rows, warm: self._solved(rows, warm)[0], q, temperature_c)
+
+    def true(self, q: ArrayLike, temperature_c: ArrayLike | None = None) -> FloatArray:
+        """Return the joint angles at which the nominal robot has its tool where the arm has it.
+
+        The inverse of `command`: ``true(command(q))`` is q, also near singularities.
+
+        Parameters
+        ----------
+        q, temperature_c
+            Reported joint angles, rad, (..., k), and as in `command`.
+        """
+
+        def back(rows: FloatArray, warming: FloatArray) -> FloatArray:
+            wanted = rows.copy()
+            for _ in range(MOST_STEPS_BACK):
+                step = rows - self._solved(wanted, warming)[0]
+                wanted += step
+                if np.abs(step).max(initial=0.0) < BACK_TO:
+                    break
+            return wanted
+
+        return self._rows(back, q, temperature_c)
+
+    def correct(self, q: ArrayLike, temperature_c: ArrayLike | None = None) -> Correction:
+        """Return commands (n, k) with what remains, and which rows are faded or out of range."""
+        wanted = self._checked(q).reshape(-1, self.model.joints)
+        warming = self.model.warming(len(wanted), _given(temperature_c))
+        parts = [self._solved(wanted[rows], warming[rows]) for rows in _blocks(len(wanted))] or [
+            self._solved(wanted, warming)
+        ]
+        command, left, faded = (np.concatenate(part) for part in zip(*parts, strict=True))
+        return Correction(
+            command,
+            np.linalg.norm(left[:, :3], axis=1),
+            np.linalg.norm(left[:, 3:], axis=1),
+            faded,
+            self.model.outside(command),
+        )
+
+    def tool(self, q: ArrayLike, temperature_c: ArrayLike | None = None) -> FloatArray:
+        """Return where the arm has its tool at reported joint angles, T_R_T, (..., 4, 4)."""
+        q = self._checked(q)
+        rows = q.reshape(-1, self.model.joints)
+        found = self.model.state(rows, self._temperature(q, temperature_c)).tool
+        return found.reshape(*q.shape[:-1], 4, 4)
+
+    def uncertainty(
+        self, q: ArrayLike, sensor: str | None = None, marker: str | None = None
+    ) -> FloatArray:
+        """Return the covariance of where the marker is, m², (..., 3, 3), along the axes of R.
+
+        Of its place in the frame of the sensor, at wanted joint angles after correction, as the
+        file's base frame and tool have it: uncertainty of offsets, causes, registration and marker
+        together, widened as poses that were left out have shown.
+
+        Parameters
+        ----------
+        q
+            rad, (..., k).
+        sensor, marker
+            Which of the file's; the first where None.
+        """
+        q = self._checked(q)
+        spread = self.spread(q, sensor, marker)
+        found: FloatArray = spread @ np.swapaxes(spread, -1, -2)
+        return found
+
+    def spread(
+        self, q: ArrayLike, sensor: str | None = None, marker: str | None = None
+    ) -> FloatArray:
+        """Return L, (..., 3, r), with L L' the covariance of all rows together; see `uncertainty`.
+
+        One column is one thing that is not known, and what it does to each row.
+        """
+        model = self.model
+        q = self._checked(q)
+        rows = q.reshape(-1, model.joints)
+        sensor = next(iter(model.T_R_N)) if sensor is None else sensor
+        marker = next(iter(model.markers)) if marker is None else marker
+        parts = [
+            model.widening
+            * (model.derivative(model.state(rows[block]), sensor, marker) @ model.root.T)
+            for block in _blocks(len(rows))
+        ]
+        found = np.concatenate(parts) if parts else np.zeros((0, 3, len(model.root)))
+        return found.reshape(*q.shape[:-1], 3, len(model.root))
+
+    def _rows(
+        self,
+        solve: Callable[[FloatArray, FloatArray], FloatArray],
+        q: ArrayLike,
+        temperature_c: ArrayLike | None,
+    ) -> FloatArray:
+        q = self._checked(q)
+        rows = q.reshape(-1, self.model.joints)
+        warming = self.model.warming(len(rows), self._temperature(q, temperature_c))
+        found = np.empty_like(rows)
+        for block in _blocks(len(rows)):
+            found[block] = solve(rows[block], warming[block])
+        return found.reshape(q.shape)
+
+    def _temperature(self, q: FloatArray, given: ArrayLike | None) -> FloatArray | None:
+        if given is None:
+            return None
+        return np.broadcast_to(np.asarray(given, dtype=float), q.shape[:-1]).reshape(-1)
+
+    def _checked(self, q: ArrayLike) -> FloatArray:
+        q = np.asarray(q, dtype=float)
+        if q.ndim == 0 or q.shape[-1] != self.model.joints:
+            raise ValueError(f'q has shape {q.shape}; its last size must be {self.model.joints}')
+        if not np.all(np.isfinite(q)):
+            raise ValueError('a joint angle is not a finite number')
+        return q
+
+    def _solved(
+        self, wanted: FloatArray, warming: FloatArray
+    ) -> tuple[FloatArray, FloatArray, BoolArray]:
+        """Return commands (n, k), what is left of each pose (n, 6), and which rows are faded."""
+        model, k = self.model, self.model.joints
+        command = wanted.copy()
+        for _ in range(FIXED_POINT_STEPS):
+            command = wanted - model.added_angles(model.drivers(command, warming))
+        frames = model.chain.frames(wanted)
+        target = frames[:, -1] @ model.chain.T_fixed[-1]
+        axes = model.chain.axes_in_base(frames)
+        arms = target[:, None, :3, 3] - frames[..., :3, 3]
+        jacobian = np.concatenate((np.cross(axes, arms), axes), axis=2).swapaxes(1, 2)
+        left, sizes, right = np.linalg.svd(jacobian, full_matrices=False)
+        share = np.minimum(sizes / FADES_BELOW, 1.0)
+        fade = share**2 * (3.0 - 2.0 * share)
+        # A direction of no size has nothing to divide by, and fades to nothing.
+        factor = np.divide(fade, sizes, out=np.zeros_like(sizes), where=sizes > 0.0)
+        if k > 6:
+            command = wanted + self._smallest(command - wanted, right, fade)
+        for step in range(NEWTON_STEPS + 1):
+            error = _pose_error(target, model._state(model.drivers(command, warming)).tool)
+            if step == NEWTON_STEPS:
+                break
+            along = np.einsum('nij,ni->nj', left, error) * factor
+            command = command - np.einsum('nij,ni->nj', right, along)
+        return command, error, np.asarray(fade.min(axis=1) < 1.0)
+
+    @staticmethod
+    def _smallest(change: FloatArray, right: FloatArray, fade: FloatArray) -> FloatArray:
+        """Return the part of changes (n, k) that moves the tool; at a singularity all of it.
+
+        There the direction in which the arm moves without its tool is not distinguished from the
+        one that has become singular: both have the same weight.
+        """
+        moving = np.einsum('nij,nj->ni', right, change)
+        of_tool = np.einsum('nij,ni->nj', right, moving)
+        of_itself = 1.0 - fade.min(axis=1)
+        smallest: FloatArray = of_tool + of_itself[:, None] * (change - of_tool)
+        return smallest
+
+
+def _pose_error(target: FloatArray, reached: FloatArray) -> FloatArray:
+    """Return how far poses are past their targets in R, m and rad (rotation vector), (n, 6)."""
+    turn = reached[:, :3, :3] @ np.swapaxes(target[:, :3, :3], 1, 2)
+    shift = reached[:, :3, 3] - target[:, :3, 3]
+    return np.concatenate((shift, matrix_to_rotation_vector(turn)), axis=1)
+
+
+def _blocks(rows: int) -> list[slice]:
+    return [slice(start, start + BLOCK_ROWS) for start in range(0, rows, BLOCK_ROWS)]
+
+
+def _given(temperature_c: ArrayLike | None) -> FloatArray | None:
+    return None if temperature_c is None else np.asarray(temperature_c, dtype=float)

@@ -1,0 +1,551 @@
+"""compensation.json: the whole correction of an arm in one file (``remaster-compensation/1``)."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, Literal
+
+import msgspec
+import numpy as np
+from msgspec import UNSET, Struct, UnsetType
+
+from remaster_ros.compensation.arm_model import (
+    GRAVITY,
+    ArmModel,
+    BaseTerm,
+    Driver,
+    Form,
+    Function,
+    Geometry,
+    JointTerm,
+)
+from remaster_ros.compensation.compensator import Compensator
+from remaster_ros.compensation.of_result import Described
+from remaster_ros.errors import InputError
+from remaster_ros.kinematics.serial_chain import SerialChain
+from remaster_ros.kinematics.transforms import (
+    matrix_from_quaternion_xyzw,
+    quaternion_xyzw,
+    transform,
+)
+from remaster_ros.session.files import read_limited
+from remaster_ros.types import FloatArray
+from remaster_ros.version import __version__
+
+FORMAT = 'remaster-compensation/1'
+COMPENSATION_FILE = 'compensation.json'
+FILE_LIMIT = 256 * 1024**2
+# Digits of what the covariance is made of: the errors of a marker are a millionth of those of its
+# parameters, which make up for each other.
+DIGITS = 10
+
+Triple = tuple[float, float, float]
+Source = Literal['fit', 'discover']
+
+
+class RobotPart(Struct):
+    """Whose correction it is: the nominal robot, whole."""
+
+    name: str
+    urdf_sha256: str
+    base_link: str
+    tip_link: str
+    joint_names: list[str]
+    urdf: str
+
+
+class SourcePart(Struct):
+    """What it was made of."""
+
+    made_by: Source
+    result_sha256: str
+    observations_sha256: str
+    version: str
+
+
+class TermPart(Struct):
+    """A function of one driver; see `Function`."""
+
+    effect: str
+    driver: Driver
+    form: Form
+    coefficients: list[float]
+    driver_joint: str | UnsetType = UNSET
+    driver_at: Literal['reported', 'with_offset'] | UnsetType = UNSET
+    order: int | UnsetType = UNSET
+    knots_rad: list[float] | UnsetType = UNSET
+    knots: list[float] | UnsetType = UNSET
+    degree: int | UnsetType = UNSET
+    turn_start_rad: float | UnsetType = UNSET
+
+
+class JointPart(Struct):
+    """What adds to a joint's angle."""
+
+    joint: str
+    offset_rad: float
+    identifiable: bool
+    why: str
+    range_rad: tuple[float, float]
+    terms: list[TermPart]
+
+
+class OriginPart(Struct):
+    """How the origin of a joint, or of the tool, is off."""
+
+    at: str
+    shift: Triple
+    turn: Triple
+
+
+class GeometryPart(Struct):
+    """Shifts (m) in the frame of the link before, turns (rad) in the joint's own frame."""
+
+    frames: str
+    origins: list[OriginPart]
+
+
+class MassPart(Struct):
+    """What hangs on a joint, in the frame after it."""
+
+    joint: str
+    mass_kg: float
+    center_m: Triple
+    lateral_compliance: float | UnsetType = UNSET
+
+
+class TemperaturePart(Struct):
+    """What grows: `origins` per kelvin above the reference."""
+
+    reference_c: float
+    measured_at_c: float
+    origins: list[OriginPart]
+
+
+class ParametersPart(Struct):
+    """Mean and covariance U' U; of U the rows of the upper triangle, from the diagonal on."""
+
+    names: list[str]
+    units: list[str]
+    mean: list[float]
+    covariance_root: list[list[float]]
+    widening: float
+
+
+class FramePart(Struct):
+    """Where a sensor's frame N is in R; std of shifts of R at its origin, and of its turns."""
+
+    translation_m: Triple
+    rotation_xyzw: tuple[float, float, float, float]
+    std_m: Triple
+    std_rad: Triple
+
+
+class MarkerPart(Struct):
+    """Where a marker is in T."""
+
+    position_m: Triple
+    std_m: Triple
+
+
+class LeftPart(Struct):
+    """What is not corrected."""
+
+    effect: str
+    joints: list[int]
+    size_mm: float
+    why: str
+    instead: str
+
+
+class CompensationPart(Struct):
+    """The file."""
+
+    format: str
+    robot: RobotPart
+    source: SourcePart
+    state: dict[str, Any]
+    joints: list[JointPart]
+    geometry: GeometryPart
+    masses: list[MassPart]
+    gravity_m_s2: Triple
+    parameters: ParametersPart
+    base_frame: dict[str, FramePart]
+    tool: dict[str, MarkerPart]
+    not_corrected: list[LeftPart]
+    notes: list[str]
+    base_terms: list[TermPart] = []
+    temperature: TemperaturePart | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Compensation:
+    """What a file holds.
+
+    Attributes
+    ----------
+    path
+        Where it was read from.
+    compensator
+        The correction, ready to use.
+    content
+        As it stands in the file.
+    sha256
+        Of the file.
+    """
+
+    path: Path
+    compensator: Compensator
+    content: CompensationPart
+    sha256: str
+
+    @property
+    def model(self) -> ArmModel:
+        """The arm as it was found to be."""
+        return self.compensator.model
+
+    def command(self, q: Any, temperature_c: Any = None) -> FloatArray:
+        """See `Compensator.command`."""
+        return self.compensator.command(q, temperature_c)
+
+    def true(self, q: Any, temperature_c: Any = None) -> FloatArray:
+        """See `Compensator.true`."""
+        return self.compensator.true(q, temperature_c)
+
+    def uncertainty(self, q: Any) -> FloatArray:
+        """See `Compensator.uncertainty`."""
+        return self.compensator.uncertainty(q)
+
+
+_FRAMES = (
+    'shift: m, in the frame of the link that the joint before moves (base_link for the first); '
+    "turn: rotation vector, rad, in the joint's own frame at angle 0. "
+    'Origin of a joint = T_nominal with shift added to its translation, times Rot(turn).'
+)
+
+
+def written(
+    described: Described,
+    urdf: str,
+    made_by: Source,
+    hashes: tuple[str, str],
+    state: Mapping[str, Any],
+) -> str:
+    """Return the text of compensation.json.
+
+    Parameters
+    ----------
+    described
+        The arm, and what is left.
+    urdf
+        The nominal robot's.
+    made_by
+        Which command.
+    hashes
+        SHA-256 of the result's file and of observations.csv.
+    state
+        Of the controller while it was measured.
+    """
+    model, chain = described.model, described.model.chain
+    names = chain.joint_names
+    std = np.linalg.norm(model.root, axis=0)
+    kept = np.flatnonzero(np.any(model.root != 0.0, axis=0))
+    root = np.asarray(np.linalg.qr(model.root[:, kept], 'r'))
+    content = CompensationPart(
+        format=FORMAT,
+        robot=RobotPart(
+            chain.name,
+            hashlib.sha256(urdf.encode()).hexdigest(),
+            chain.base_link,
+            chain.tip_link,
+            list(names),
+            urdf,
+        ),
+        source=SourcePart(made_by, *hashes, __version__),
+        state=dict(state),
+        joints=[
+            JointPart(
+                name,
+                float(model.joint_offsets[j]),
+                described.identifiable[j],
+                described.why[j],
+                _pair(described.range_rad[j]),
+                [
+                    _term(term.effect, term.function, term.coefficients, names)
+                    for term in model.joint_terms
+                    if term.joint == j
+                ],
+            )
+            for j, name in enumerate(names)
+        ],
+        geometry=GeometryPart(_FRAMES, _origins(model.geometry, names)),
+        masses=[
+            MassPart(
+                name,
+                float(chain.masses[j]),
+                _triple(chain.centers_of_mass[j]),
+                float(model.lateral_compliance[j]) if model.lateral_compliance[j] else UNSET,
+            )
+            for j, name in enumerate(names)
+        ],
+        gravity_m_s2=GRAVITY,
+        base_terms=[
+            _term(term.effect, term.function, term.coefficients, names)
+            for term in model.base_terms
+        ],
+        temperature=TemperaturePart(model.reference_c, model.mean_c, _origins(model.growth, names))
+        if model.grows
+        else None,
+        parameters=ParametersPart(
+            [model.parameter_names[i] for i in kept],
+            [model.parameter_units[i] for i in kept],
+            model.parameter_means[kept].tolist(),
+            [[float(f'{v:.{DIGITS}g}') for v in row[i:]] for i, row in enumerate(root.tolist())],
+            model.widening,
+        ),
+        base_frame={
+            sensor: FramePart(
+                _triple(T[:3, 3]),
+                _four(quaternion_xyzw(T[:3, :3])),
+                *(_triple(std[where]) for where in model.registration(sensor)),
+            )
+            for sensor, T in model.T_R_N.items()
+        },
+        tool={
+            marker: MarkerPart(_triple(place), _triple(std[model.marker(marker)]))
+            for marker, place in model.markers.items()
+        },
+        not_corrected=[
+            LeftPart(one.effect, list(one.joints), 1e3 * one.size_m, one.why, one.instead)
+            for one in described.not_corrected
+        ],
+        notes=list(described.notes),
+    )
+    encoder = msgspec.json.Encoder()
+    lines = [
+        f'  {encoder.encode(name).decode()}: {encoder.encode(value).decode()}'
+        for name, value in msgspec.structs.asdict(content).items()
+    ]
+    return '{\n' + ',\n'.join(lines) + '\n}\n'
+
+
+def _taken_at(driver: Driver) -> Literal['reported', 'with_offset']:
+    return 'with_offset' if driver.startswith('gravity') else 'reported'
+
+
+def _term(
+    effect: str, function: Function, coefficients: FloatArray, names: Sequence[str]
+) -> TermPart:
+    part = TermPart(effect, function.driver, function.form, coefficients.tolist())
+    if function.driver != 'none':
+        part.driver_at = _taken_at(function.driver)
+    if function.joint >= 0:
+        part.driver_joint = names[function.joint]
+    if function.order:
+        part.order = function.order
+    if function.form == 'bspline':
+        knots = function.knots.tolist()
+        if function.driver == 'angle':
+            part.knots_rad = knots
+        else:
+            part.knots = knots
+        part.degree = function.degree
+        if not np.isnan(function.turn_start):
+            part.turn_start_rad = float(function.turn_start)
+    return part
+
+
+def _origins(geometry: Geometry, names: Sequence[str]) -> list[OriginPart]:
+    return [
+        OriginPart(name, _triple(shift), _triple(turn))
+        for name, shift, turn in zip(
+            (*names, 'tool'), geometry.shifts, geometry.turns, strict=True
+        )
+        if np.any(shift) or np.any(turn)
+    ]
+
+
+def _triple(values: FloatArray) -> Triple:
+    x, y, z = (float(value) for value in values)
+    return x, y, z
+
+
+def _four(values: FloatArray) -> tuple[float, float, float, float]:
+    x, y, z, w = (float(value) for value in values)
+    return x, y, z, w
+
+
+def _pair(values: FloatArray) -> tuple[float, float]:
+    return float(values[0]), float(values[1])
+
+
+def read_compensation(path: str | os.PathLike[str]) -> Compensation:
+    """Read compensation.json.
+
+    Raises
+    ------
+    InputError
+        One line naming the file, the place in it and the remedy.
+    """
+    path = Path(path)
+    data = read_limited(
+        path, FILE_LIMIT, 'give apply/compensation.json that fit or discover has written'
+    )
+    try:
+        content = msgspec.json.decode(data, type=CompensationPart)
+    except msgspec.DecodeError as error:
+        raise _not_one(path, str(error)) from None
+    if content.format != FORMAT:
+        raise _not_one(path, f'its format is {content.format!r}, not {FORMAT!r}')
+    try:
+        model = _model(content)
+    except InputError as error:
+        raise InputError(f'{path}: {error}') from None
+    return Compensation(path, Compensator(model), content, hashlib.sha256(data).hexdigest())
+
+
+def _not_one(path: Path, why: str) -> InputError:
+    return InputError(
+        f'{path}: this is no {COMPENSATION_FILE} of remaster ({why}); give the one in the folder '
+        'apply that fit, discover or report has written'
+    )
+
+
+def _model(content: CompensationPart) -> ArmModel:
+    robot = content.robot
+    if hashlib.sha256(robot.urdf.encode()).hexdigest() != robot.urdf_sha256:
+        raise _broken('robot.urdf', 'is not the text whose hash is urdf_sha256')
+    chain = SerialChain.from_urdf(robot.urdf, robot.base_link, robot.tip_link)
+    names = chain.joint_names
+    for where, given in (
+        ('robot.joint_names', robot.joint_names),
+        ('joints', [part.joint for part in content.joints]),
+        ('masses', [part.joint for part in content.masses]),
+    ):
+        if tuple(given) != names:
+            raise _broken(where, f'are not the joints of its URDF, {", ".join(names)}')
+    for part in content.masses:
+        index = names.index(part.joint)
+        if (part.mass_kg, part.center_m) != (
+            chain.masses[index],
+            _triple(chain.centers_of_mass[index]),
+        ):
+            raise _broken(f'masses of {part.joint}', 'are not those of its URDF')
+    if content.gravity_m_s2 != GRAVITY:
+        raise _broken('gravity_m_s2', f'is not {GRAVITY}')
+    joint_terms = tuple(
+        JointTerm(j, term.effect, *_function(term, f'joints.{part.joint}.terms.{i}', names, 1))
+        for j, part in enumerate(content.joints)
+        for i, term in enumerate(part.terms)
+    )
+    base_terms = tuple(
+        BaseTerm(term.effect, *_function(term, f'base_terms.{i}', names, 3))
+        for i, term in enumerate(content.base_terms)
+    )
+    warm = content.temperature
+    model = ArmModel(
+        chain=chain,
+        joint_offsets=np.array([part.offset_rad for part in content.joints]),
+        joint_terms=joint_terms,
+        base_terms=base_terms,
+        geometry=_geometry(content.geometry.origins, names),
+        growth=_geometry(warm.origins if warm else [], names),
+        lateral_compliance=np.array(
+            [
+                0.0 if part.lateral_compliance is UNSET else part.lateral_compliance
+                for part in content.masses
+            ]
+        ),
+        reference_c=warm.reference_c if warm else np.nan,
+        mean_c=warm.measured_at_c if warm else np.nan,
+        T_R_N={
+            sensor: transform(matrix_from_quaternion_xyzw(part.rotation_xyzw), part.translation_m)
+            for sensor, part in content.base_frame.items()
+        },
+        markers={name: np.array(part.position_m) for name, part in content.tool.items()},
+        root=np.zeros((0, 0)),
+        widening=content.parameters.widening,
+    )
+    if not model.T_R_N or not model.markers:
+        raise _broken('base_frame and tool', 'are empty')
+    if model.grows and warm is None:
+        raise _broken('temperature', 'is missing, but something depends on it')
+    return _with_root(model, content.parameters)
+
+
+def _with_root(model: ArmModel, part: ParametersPart) -> ArmModel:
+    order = {name: i for i, name in enumerate(model.parameter_names)}
+    strangers = [name for name in part.names if name not in order]
+    count = len(part.names)
+    if strangers or len(set(part.names)) < count:
+        what = f'{strangers[0]!r} is no parameter of it' if strangers else 'a name stands twice'
+        raise _broken('parameters.names', what)
+    rows = part.covariance_root
+    if len(rows) > count or any(len(row) != count - i for i, row in enumerate(rows)):
+        raise _broken('parameters.covariance_root', 'is no upper triangle of its parameters')
+    root = np.zeros((len(rows), len(order)))
+    columns = np.array([order[name] for name in part.names], dtype=np.int64)
+    for i, row in enumerate(rows):
+        root[i, columns[i:]] = row
+    return replace(model, root=root)
+
+
+def _function(
+    part: TermPart, where: str, names: Sequence[str], axes: int
+) -> tuple[Function, FloatArray]:
+    joint = -1
+    if part.driver in ('angle', 'gravity_torque'):
+        if part.driver_joint not in names:
+            raise _broken(f'{where}.driver_joint', 'names no joint of the arm')
+        joint = names.index(str(part.driver_joint))
+    expected = _taken_at(part.driver)
+    if part.driver != 'none' and part.driver_at != expected:
+        raise _broken(f'{where}.driver_at', f'is not {expected!r}, as {part.driver} has it')
+    if (part.driver == 'none') != (part.form == 'constant'):
+        raise _broken(f'{where}.form', f'is {part.form!r} with the driver {part.driver!r}')
+    if part.driver == 'gravity_moment' and (axes == 1 or part.form != 'linear'):
+        raise _broken(f'{where}.driver', 'gravity_moment drives only the base, and linearly')
+    knots, degree = np.zeros(0), 0
+    if part.form == 'bspline':
+        given = part.knots_rad if part.driver == 'angle' else part.knots
+        if given is UNSET or part.degree is UNSET:
+            raise _broken(where, 'is a bspline without knots or degree')
+        assert not isinstance(given, UnsetType)
+        assert not isinstance(part.degree, UnsetType)
+        knots, degree = np.array(given), part.degree
+        ascending = all(a <= b for a, b in pairwise(given))
+        if not 0 <= degree <= 9 or len(given) < 2 * degree + 2 or not ascending:
+            raise _broken(
+                f'{where}.knots', f'are no ascending knots of splines of degree {degree}'
+            )
+    order = 0 if isinstance(part.order, UnsetType) else part.order
+    if part.form in ('sin', 'cos') and order < 1:
+        raise _broken(f'{where}.order', f'is {order}, but must be a whole number of at least 1')
+    start = np.nan if isinstance(part.turn_start_rad, UnsetType) else part.turn_start_rad
+    function = Function(part.driver, part.form, joint, order, knots, degree, start)
+    if len(part.coefficients) != function.size * axes:
+        raise _broken(
+            f'{where}.coefficients',
+            f'are {len(part.coefficients)}, but must be {function.size * axes}',
+        )
+    return function, np.array(part.coefficients)
+
+
+def _geometry(origins: Sequence[OriginPart], names: Sequence[str]) -> Geometry:
+    found = Geometry.none(len(names))
+    every = (*names, 'tool')
+    for part in origins:
+        if part.at not in every:
+            raise _broken('geometry', f'has an origin {part.at!r}, which is no joint of the arm')
+        found.shifts[every.index(part.at)] = part.shift
+        found.turns[every.index(part.at)] = part.turn
+    return found
+
+
+def _broken(where: str, what: str) -> InputError:
+    return InputError(f'{where} {what}; write the file again with fit or discover')

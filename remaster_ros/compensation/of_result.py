@@ -1,0 +1,447 @@
+"""From a fit and the cells of a discovery to the arm that they describe.
+
+Where a cell of `discovery.effects` goes follows from its place, its driver and its form, not from
+its name: one that a newcomer adds is corrected as well, if its place, driver and form are among
+these. What does not belong to the arm, or depends on what no controller is told (the time, the
+side a joint comes from), is listed with what to do instead.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from remaster_ros.calibration.comparison import predicted_rows
+from remaster_ros.calibration.estimate import Problem
+from remaster_ros.calibration.noise_estimate import noise_estimates
+from remaster_ros.calibration.predictions import predict
+from remaster_ros.calibration.predictive_accuracy import Predictive
+from remaster_ros.calibration.result import FitResult
+from remaster_ros.compensation.arm_model import (
+    ArmModel,
+    BaseTerm,
+    Driver,
+    Form,
+    Function,
+    Geometry,
+    JointTerm,
+)
+from remaster_ros.discovery.effects.base import Cell
+from remaster_ros.discovery.effects.registry import EFFECTS
+from remaster_ros.discovery.effects.splines import DEGREE, Curve
+from remaster_ros.discovery.geometry_model import GeometryModel
+from remaster_ros.discovery.residuals import Residuals
+from remaster_ros.kinematics.serial_chain import SerialChain
+from remaster_ros.kinematics.transforms import inverse, matrix_to_rotation_vector
+from remaster_ros.types import FloatArray, Measurements
+
+# Each takes away all of the difference but for what is of its second order.
+EXACT_STEPS = 2
+_DRIVERS: dict[str, Driver] = {
+    'own_angle': 'angle',
+    'angle': 'angle',
+    'gravity_torque': 'gravity_torque',
+    'temperature': 'temperature',
+}
+
+
+@dataclass(frozen=True)
+class Slot:
+    """Where in an `ArmModel` some coefficients stand.
+
+    Attributes
+    ----------
+    kind
+        ``joint``, ``base``, ``geometry``, ``growth`` or ``lateral``.
+    joint
+        Its index; k for the tool.
+    effect, function
+        Of a term; None for the others.
+    """
+
+    kind: str
+    joint: int = -1
+    effect: str = ''
+    function: Function | None = None
+
+
+@dataclass(frozen=True)
+class NotCorrected:
+    """What a correction leaves as it is.
+
+    Attributes
+    ----------
+    effect, joints
+        As in discovery.json.
+    size_m
+        RMS displacement of the marker over the rows of the session, m.
+    why, instead
+        A sentence each.
+    """
+
+    effect: str
+    joints: tuple[int, ...]
+    size_m: float
+    why: str
+    instead: str
+
+
+@dataclass(frozen=True, eq=False)
+class Described:
+    """The arm of a result, and what is not in it.
+
+    Attributes
+    ----------
+    model
+        The arm.
+    identifiable, why
+        Of each joint's offset, as of `FitResult`.
+    range_rad
+        Least and largest reported angle of each joint in the rows fitted, (k, 2).
+    not_corrected
+        What is left.
+    """
+
+    model: ArmModel
+    identifiable: tuple[bool, ...]
+    why: tuple[str, ...]
+    range_rad: FloatArray
+    not_corrected: tuple[NotCorrected, ...] = ()
+    notes: tuple[str, ...] = field(default=())
+
+
+def offsets_alone(fit: FitResult, widening: float, notes: Sequence[str] = ()) -> Described:
+    """Return the arm of a fit's zero-offsets; those that are not identifiable stay as they are."""
+    described = _described(fit, [], np.zeros(0), None, widening)
+    offsets = np.where(fit.identifiable, fit.joint_offsets, 0.0)
+    model = replace(described.model, joint_offsets=offsets)
+    return replace(described, model=model, notes=tuple(notes))
+
+
+def geometry_too(fit: FitResult, geometry: GeometryModel, notes: Sequence[str] = ()) -> Described:
+    """Return the arm with all lengths and tilts of a fit, and the zero-offsets that go with them.
+
+    Its covariance is that at the mode.
+    """
+    mode = geometry.mode
+    posterior = mode.linearisation.posterior
+    root = np.zeros((len(posterior.free), posterior.model.size))
+    root[:, posterior.free] = np.linalg.cholesky(mode.covariance).T
+    # As many points as make the covariance, on either side of the mode.
+    reach = np.sqrt(len(root) - 0.5)
+    draws = mode.z + np.concatenate((reach * root, -reach * root))
+    # No errors of the measurement are beside the members of a fit.
+    noise = posterior.noise(np.tile(mode.eta, (1, 2, 1)))
+    sigma = posterior.noise_model.total_noise(noise)
+    beside = replace(
+        fit,
+        predictive=Predictive(posterior.model, mode.z, draws, sigma.reshape(-1, *sigma.shape[2:])),
+        noise=noise_estimates(posterior, noise),
+    )
+    widening = predict(beside, fit.session.measurements).widening
+    theta = posterior.model.theta(posterior.model.natural(mode.z))
+    return replace(_described(beside, geometry.members, theta, None, widening), notes=tuple(notes))
+
+
+def everything(
+    fit: FitResult, cells: Sequence[Cell], data: Residuals, widening: float
+) -> Described:
+    """Return the arm of a sampled model with effects.
+
+    Parameters
+    ----------
+    fit
+        With the cells' parameters as ``theta``.
+    cells
+        Of the model, in that order.
+    data
+        What was searched.
+    widening
+        Of predictions, see `calibration.predictions`.
+    """
+    return _described(fit, cells, fit.theta, data, widening)
+
+
+def _described(
+    fit: FitResult,
+    cells: Sequence[Cell],
+    theta: FloatArray,
+    data: Residuals | None,
+    widening: float,
+) -> Described:
+    chain = fit.chain
+    slots: dict[Slot, int] = {}
+    maps: list[tuple[Slot, slice, FloatArray]] = []
+    left: list[tuple[Cell, slice]] = []
+    start = 0
+    for cell in cells:
+        where = slice(start, start + cell.size)
+        start += cell.size
+        found = None if cell.of_measurement else list(placed(cell, chain))
+        if not found:
+            left.append((cell, where))
+            continue
+        for slot, matrix in found:
+            slots.setdefault(slot, len(matrix))
+            maps.append((slot, where, matrix))
+    draws, mean = _draws(fit)
+    values = {slot: np.zeros(size) for slot, size in slots.items()}
+    spread = {slot: np.zeros((len(draws), size)) for slot, size in slots.items()}
+    theta_draws = fit.predictive.model.theta(fit.predictive.draws)
+    for slot, where, matrix in maps:
+        values[slot] += matrix @ theta[where]
+        spread[slot] += theta_draws[:, where] @ matrix.T
+    measurements = fit.session.measurements
+    model = _model(chain, fit, values, _temperatures(measurements), widening)
+    columns = _in_order(model, slots, spread, len(draws))
+    every = np.concatenate((draws, columns), axis=1)
+    every = (every - every.mean(axis=0)) / np.sqrt(max(1, len(every) - 1))
+    root = np.asarray(np.linalg.qr(every, 'r'))
+    fitted = measurements.q[~measurements.is_validation]
+    model = replace(model, root=root, joint_offsets=mean)
+    if cells and fit.found is not None:
+        measured = [where for cell, where in left if cell.of_measurement]
+        model = _as_predicted(model, fit, fit.found.problem, measured)
+    return Described(
+        model,
+        tuple(bool(known) for known in fit.identifiable),
+        tuple(fit.why),
+        np.stack((fitted.min(axis=0), fitted.max(axis=0)), axis=1),
+        tuple(_left(left, theta, data)) if data is not None else (),
+    )
+
+
+def _as_predicted(
+    model: ArmModel, fit: FitResult, problem: Problem, measured: Sequence[slice]
+) -> ArmModel:
+    """Return the arm that predicts the fitted rows as the fit does, errors of measuring left out.
+
+    The fit has lengths, tilts and the like to first order, about the zero-offsets that were found
+    without them; this model has them exactly. The difference is undone within what the posterior
+    leaves open: a step C J' d / σ² with its covariance C. Where the data determine all, C is
+    (J' J / σ²)⁻¹, and the largest eigenvalue of J C J' is σ².
+    """
+    z = fit.predictive.after.copy()
+    for where in measured:
+        z[fit.predictive.model.core :][where] = 0.0
+    rows = problem.fitted
+    m = problem.measurements.select(rows)
+    expected = predicted_rows(problem, fit.predictive.model, z)[rows]
+    for _ in range(EXACT_STEPS):
+        # Where it is unknown the fit has no growth.
+        known = np.isfinite(m.temperature_c)
+        state = model.state(m.q, np.where(known, m.temperature_c, model.reference_c))
+        error, parts = np.empty((len(rows), 3)), np.empty((len(rows), 3, len(model.root)))
+        for i, sensor in enumerate(model.T_R_N):
+            for j, marker in enumerate(model.markers):
+                mine = (m.sensor == i) & (m.marker == j)
+                if mine.any():
+                    turn = model.T_R_N[sensor][:3, :3]
+                    off = expected - model.in_sensor(state, sensor, marker)
+                    error[mine] = off[mine] @ turn.T
+                    parts[mine] = (model.derivative(state, sensor, marker) @ model.root.T)[mine]
+        spread = parts.reshape(-1, len(model.root))
+        gram = spread.T @ spread
+        step = spread.T @ error.ravel() / np.linalg.eigvalsh(gram)[-1]
+        model = model.moved(model.root.T @ step)
+    return model
+
+
+def _draws(fit: FitResult) -> tuple[FloatArray, FloatArray]:
+    """Return draws of offsets, registrations and markers, (draws, p), and the mean offsets.
+
+    Of the registrations the step from the mean, in R.
+    """
+    model, z = fit.predictive.model, fit.predictive.draws.copy()
+    # What the gauge holds is at zero, exactly.
+    held = np.flatnonzero(fit.predictive.after[: model.joints] == 0.0)
+    z[:, held] = 0.0
+    x, mean = model.natural(z), model.natural(fit.predictive.after)
+    steps = model.T_R_N(x) @ inverse(model.T_R_N(mean))
+    turns = matrix_to_rotation_vector(steps[..., :3, :3])
+    registrations = np.concatenate((steps[..., :3, 3], turns), axis=-1)
+    parts = (
+        model.offsets(x),
+        registrations.reshape(len(x), -1),
+        model.markers(x).reshape(len(x), -1),
+    )
+    return np.concatenate(parts, axis=1), model.offsets(mean)
+
+
+def _model(
+    chain: SerialChain,
+    fit: FitResult,
+    values: Mapping[Slot, FloatArray],
+    temperatures: tuple[float, float],
+    widening: float,
+) -> ArmModel:
+    joints = len(chain)
+    found = fit.predictive.model
+    x = found.natural(fit.predictive.after)
+    geometry, growth = Geometry.none(joints), Geometry.none(joints)
+    lateral = np.zeros(joints)
+    joint_terms, base_terms = [], []
+    for slot, value in values.items():
+        if slot.function is not None and slot.kind == 'joint':
+            joint_terms.append(JointTerm(slot.joint, slot.effect, slot.function, value))
+        elif slot.function is not None:
+            base_terms.append(BaseTerm(slot.effect, slot.function, value))
+        elif slot.kind == 'lateral':
+            lateral[slot.joint] = value[0]
+        else:
+            one = geometry if slot.kind == 'geometry' else growth
+            one.shifts[slot.joint] = value[:3]
+            one.turns[slot.joint] = value[3:]
+    return ArmModel(
+        chain=chain,
+        joint_offsets=np.zeros(joints),
+        joint_terms=tuple(joint_terms),
+        base_terms=tuple(base_terms),
+        geometry=geometry,
+        growth=growth,
+        lateral_compliance=lateral,
+        reference_c=temperatures[0],
+        mean_c=temperatures[1],
+        T_R_N=dict(zip(found.sensor_names, found.T_R_N(x), strict=True)),
+        markers=dict(zip(found.marker_names, found.markers(x), strict=True)),
+        root=np.zeros((0, 0)),
+        widening=widening,
+    )
+
+
+def _in_order(
+    model: ArmModel, slots: Mapping[Slot, int], spread: Mapping[Slot, FloatArray], count: int
+) -> FloatArray:
+    """Return the draws of the model's further parameters in its order, (count, p)."""
+    joints = model.joints
+    parts = [spread[slot] for slot in slots if slot.kind == 'joint']
+    parts += [spread[slot] for slot in slots if slot.kind == 'base']
+    for kind in ('geometry', 'growth'):
+        for joint in range(joints + 1):
+            parts.append(spread.get(Slot(kind, joint), np.zeros((count, 6))))
+    for joint in range(joints):
+        parts.append(spread.get(Slot('lateral', joint), np.zeros((count, 1))))
+    return np.concatenate(parts, axis=1)
+
+
+def _temperatures(measurements: Measurements) -> tuple[float, float]:
+    """Return the first known temperature, as `Context.warming` has it, and the mean, °C."""
+    known = np.isfinite(measurements.temperature_c)
+    if not known.any():
+        return np.nan, np.nan
+    given = measurements.temperature_c[known]
+    fitted = measurements.temperature_c[known & ~measurements.is_validation]
+    first = given[np.argmin(measurements.stamp_s[known])]
+    return float(first), float(fitted.mean() if len(fitted) else given.mean())
+
+
+def placed(cell: Cell, chain: SerialChain) -> Iterator[tuple[Slot, FloatArray]]:
+    """Give where a cell's parameters stand in an `ArmModel`; nothing where it has no place for it.
+
+    Each place with the matrix from the cell's m parameters to its coefficients.
+    """
+    if cell.model_change is not None:
+        change = cell.model_change
+        yield Slot('geometry', change.joint), np.concatenate((change.shifts, change.turns), 1).T
+    elif cell.place == 'joint_angle':
+        joint = cell.joints[0] - 1
+        for function, matrix in _functions(cell, joint):
+            yield Slot('joint', joint, cell.name, function), matrix
+    elif cell.place in ('link_translation', 'link_rotation') and cell.form == 'linear':
+        yield from _of_links(cell, chain)
+    elif cell.place == 'base_rotation' and not cell.happened:
+        yield from _of_base(cell)
+
+
+def _of_links(cell: Cell, chain: SerialChain) -> Iterator[tuple[Slot, FloatArray]]:
+    zeros = np.zeros((3, cell.size))
+    if cell.driver == 'gravity_moment' and cell.size == 1:
+        yield Slot('lateral', cell.joints[0] - 1), np.ones((1, 1))
+    if cell.driver != 'temperature':
+        return
+    if cell.size == 1:
+        # A length that grows, of one link or of all.
+        for link in cell.joints or range(len(chain) + 1):
+            vector = chain.T_fixed[link][:3, 3]
+            yield Slot('growth', link), np.concatenate((vector, np.zeros(3)))[:, None]
+    elif cell.size == 3 and cell.place == 'link_translation':
+        yield Slot('growth', cell.joints[0]), np.concatenate((np.eye(3), zeros))
+    elif cell.size == 3:
+        link = cell.joints[0]
+        yield Slot('growth', link), np.concatenate((zeros, chain.T_fixed[link][:3, :3].T))
+
+
+def _of_base(cell: Cell) -> Iterator[tuple[Slot, FloatArray]]:
+    if cell.driver == 'gravity_moment' and cell.form == 'linear':
+        axes = {'isotropic': np.ones((3, 1)), 'by axis': np.eye(3)[:, :2]}
+        if cell.variant in axes:
+            function = Function('gravity_moment', 'linear')
+            yield Slot('base', -1, cell.name, function), axes[cell.variant]
+        return
+    # Of each feature a parameter for every axis of R, next to each other.
+    for function, matrix in _functions(replace(cell, parameters=cell.parameters[::3]), 0):
+        if len(matrix) == 1:
+            every: FloatArray = np.kron(matrix, np.eye(3)).astype(float)
+            yield Slot('base', -1, cell.name, function), every
+
+
+def _functions(cell: Cell, joint: int) -> Iterator[tuple[Function, FloatArray]]:
+    """Give the functions that a cell's features are; ``joint`` is that of a driver without one."""
+    if cell.happened:
+        # The arm is as it was after what happened.
+        if cell.form == 'step':
+            yield Function('none', 'constant'), np.ones((1, cell.size))
+        return
+    stem, _, given = cell.driver.partition('_of_joint_')
+    driver = _DRIVERS.get(stem)
+    if driver is None:
+        return
+    of = -1 if driver == 'temperature' else int(given) - 1 if given else joint
+    if cell.form in ('linear', 'quadratic') and cell.size == 1:
+        form: Form = 'quadratic' if cell.form == 'quadratic' else 'linear'
+        yield Function(driver, form, of), np.ones((1, 1))
+    elif cell.form == 'sin/cos':
+        orders = [int(part) for part in cell.variant.split('+')] if cell.variant else [1]
+        if cell.size == 2 * len(orders):
+            # Sine and cosine of each order, in this order.
+            for i, order in enumerate(orders):
+                yield Function(driver, 'sin', of, order), np.eye(cell.size)[[2 * i]]
+                yield Function(driver, 'cos', of, order), np.eye(cell.size)[[2 * i + 1]]
+    elif cell.curve is not None and cell.size == len(cell.curve.places):
+        yield _splines(cell.curve, driver, of)
+
+
+def _splines(curve: Curve, driver: Driver, joint: int) -> tuple[Function, FloatArray]:
+    """Return a curve as splines, and the matrix from its free heights to all coefficients."""
+    heights = curve.heights
+    if curve.closed:
+        # The last splines are the first ones of the next turn.
+        heights = np.concatenate((heights, heights[:DEGREE]))
+    function = Function(
+        driver, 'bspline', joint, knots=curve.knots, degree=DEGREE, turn_start=curve.start
+    )
+    return function, heights
+
+
+_OF_MEASUREMENT = 'it is an error of the measurement and not of the arm'
+_NOT_TOLD = 'it depends on what no controller is told (time, the last move, or what happened once)'
+
+
+def _left(
+    cells: Sequence[tuple[Cell, slice]], theta: FloatArray, data: Residuals
+) -> Iterator[NotCorrected]:
+    """Give what is not corrected, all cells of an effect at the same joints together."""
+    together: dict[tuple[str, tuple[int, ...], bool], FloatArray] = {}
+    remedies = {}
+    for cell, where in cells:
+        key = (cell.name, cell.joints, cell.of_measurement or cell.place == 'marker')
+        moved = data.columns([cell]) @ theta[where]
+        together[key] = together[key] + moved if key in together else moved
+        remedies[key] = EFFECTS[cell.name].remedy
+    for (name, joints, of_measurement), moved in together.items():
+        size = float(np.sqrt(np.mean(np.sum(moved**2, axis=-1))))
+        why = _OF_MEASUREMENT if of_measurement else _NOT_TOLD
+        reported = EFFECTS[name].reported_as or name
+        yield NotCorrected(reported, joints, size, why, remedies[name, joints, of_measurement])

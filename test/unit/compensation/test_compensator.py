@@ -1,0 +1,277 @@
+"""The correction against what each effect is defined to do, and its behaviour at its limits."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from calibration_scenes import scene
+from discovery_scenes import residuals_of
+from hidden_tours import robot
+
+from remaster_ros.compensation.arm_model import ArmModel, Function, Geometry, JointTerm
+from remaster_ros.compensation.compensator import FADES_BELOW, Compensator
+from remaster_ros.compensation.of_result import placed
+from remaster_ros.discovery.effects.registry import EFFECTS
+from remaster_ros.kinematics.serial_chain import SerialChain
+from remaster_ros.kinematics.transforms import apply, matrix_to_rotation_vector
+
+
+def arm(name: str, **more: object) -> ArmModel:
+    """Return an arm as drawn, but for what is given."""
+    chain = SerialChain.from_urdf(robot(name), 'base_link', 'tool')
+    k = len(chain)
+    plain = ArmModel(
+        chain=chain,
+        joint_offsets=np.zeros(k),
+        joint_terms=(),
+        base_terms=(),
+        geometry=Geometry.none(k),
+        growth=Geometry.none(k),
+        lateral_compliance=np.zeros(k),
+        reference_c=20.0,
+        mean_c=20.0,
+        T_R_N={'mocap': np.eye(4)},
+        markers={'sir': np.array([0.1, 0.0, 0.02])},
+        root=np.zeros((0, 0)),
+        widening=1.0,
+    )
+    return replace(plain, **more)  # type: ignore[arg-type]
+
+
+def erring(name: str, seed: int) -> ArmModel:
+    """Return an arm with offsets of 0.3°, waves, compliances, lengths and tilts."""
+    rng = np.random.default_rng(seed)
+    k = len(arm(name).chain)
+    terms = [
+        JointTerm(j, 'x', Function(driver, form, j, order), 2e-4 * rng.standard_normal(1) * unit)
+        for j in range(k)
+        for driver, form, order, unit in (
+            ('angle', 'sin', 1, 1.0),
+            ('angle', 'cos', 2, 1.0),
+            ('gravity_torque', 'linear', 0, 0.1),
+        )
+    ]
+    geometry = Geometry(
+        3e-4 * rng.standard_normal((k + 1, 3)), 5e-4 * rng.standard_normal((k + 1, 3))
+    )
+    offsets = np.radians(0.3) * rng.standard_normal(k)
+    return arm(name, joint_offsets=offsets, joint_terms=tuple(terms), geometry=geometry)
+
+
+def configurations(model: ArmModel, count: int, seed: int) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    low, high = np.maximum(model.chain.lower, -2.5), np.minimum(model.chain.upper, 2.5)
+    return rng.uniform(low, high, (count, model.joints))
+
+
+@pytest.fixture(scope='module')
+def context():
+    """Effects of every kind can be tested in it: masses, times, moves and temperatures."""
+    session, _ = scene(3, poses=12, validation=4)
+    m = session.measurements
+    warm = 20.0 + 8.0 * (m.stamp_s - m.stamp_s.min()) / np.ptp(m.stamp_s)
+    session = replace(session, measurements=replace(m, temperature_c=warm))
+    return residuals_of(session).context
+
+
+def the_cells(context):
+    """Give a cell of each effect for each place, driver, form and size that it has."""
+    for effect in EFFECTS.values():
+        if effect.needs(context):
+            continue
+        seen = set()
+        for cell in effect.cells(context):
+            driver = cell.driver.rstrip('0123456789')
+            key = cell.place, driver, cell.form, cell.size, bool(cell.curve)
+            if key not in seen and not cell.of_measurement:
+                seen.add(key)
+                yield cell
+
+
+def test_each_cell_moves_the_arm_as_its_effect_defines(context):
+    """What the file says of an effect is what the fit meant, for all that the registry has."""
+    chain, m = context.chain, context.measurements
+    nothing = arm('iiwa7', chain=chain, joint_offsets=context.joint_offsets)
+    first = m.temperature_c[np.argmin(m.stamp_s)]
+    nothing = replace(nothing, reference_c=first, mean_c=first)
+    corrected, left = set(), set()
+    for cell in the_cells(context):
+        slots = list(placed(cell, chain))
+        if not slots:
+            left.add((cell.name, cell.place, cell.driver.partition('_of_')[0]))
+            continue
+        corrected.add(cell.name)
+        design = cell.columns(context)
+        expected = design.displacement(context)
+        for parameter in range(0, cell.size, max(1, cell.size // 4)):
+            size = 1e-5 / max(1e-12, np.abs(expected[:, :, parameter]).max())
+            model = nothing
+            for slot, matrix in slots:
+                value = size * matrix[:, parameter]
+                model = with_slot(model, slot, value)
+            points = [
+                apply(one.state(m.q, m.temperature_c).tool, context.markers[context.marker])
+                for one in (model, nothing)
+            ]
+            moved = points[0] - points[1]
+            if cell.happened:
+                # As it is since.
+                after = design.values[:, parameter] == 1.0
+                moved, wanted = moved[after], size * expected[after, :, parameter]
+            else:
+                wanted = size * expected[:, :, parameter]
+            np.testing.assert_allclose(moved, wanted, rtol=0, atol=2e-9, err_msg=str(cell.key))
+    assert {
+        *('joint_compliance', 'encoder_eccentricity', 'encoder_scale', 'gear_periodic'),
+        *('joint_error_curve', 'joint_coupling', 'link_length', 'joint_axis_tilt'),
+        *('thermal_growth', 'base_compliance', 'step', 'unnamed'),
+    } == corrected
+    # What remains depends on what no controller is told, or is at the marker.
+    assert {driver for _, place, driver in left if place != 'marker'} <= {
+        *('approach', 'last_move', 'time'),
+    }, left
+
+
+def with_slot(model, slot, value):
+    from remaster_ros.compensation.arm_model import BaseTerm
+
+    if slot.kind == 'joint':
+        term = JointTerm(slot.joint, slot.effect, slot.function, value)
+        return replace(model, joint_terms=(*model.joint_terms, term))
+    if slot.kind == 'base':
+        term = BaseTerm(slot.effect, slot.function, value)
+        return replace(model, base_terms=(*model.base_terms, term))
+    if slot.kind == 'lateral':
+        return replace(model, lateral_compliance=model.lateral_compliance + value * one_at(slot))
+    shifts, turns = np.zeros((2, model.joints + 1, 3))
+    shifts[slot.joint], turns[slot.joint] = value[:3], value[3:]
+    before = getattr(model, slot.kind)
+    changed = Geometry(before.shifts + shifts, before.turns + turns)
+    return replace(model, **{slot.kind: changed})
+
+
+def one_at(slot):
+    one = np.zeros(7)
+    one[slot.joint] = 1.0
+    return one
+
+
+@pytest.mark.parametrize('name', ['six', 'lwr4plus'])
+def test_derivative_is_that_of_the_model(name):
+    model = erring(name, 2)
+    q = configurations(model, 5, 1)
+    derivative = model.derivative(model.state(q), 'mocap', 'sir')
+    rng = np.random.default_rng(3)
+    step = 1e-7 * rng.standard_normal(derivative.shape[2])
+    units = np.array([1e-3 if 'growth' in name else 1.0 for name in model.parameter_names])
+    moved = model.moved(step * units)
+    change = moved.in_sensor(moved.state(q), 'mocap', 'sir') - model.in_sensor(
+        model.state(q), 'mocap', 'sir'
+    )
+    # That torques change with the offsets is left out: a ten-thousandth.
+    np.testing.assert_allclose(change, derivative @ (step * units), rtol=0, atol=2e-10)
+
+
+@pytest.mark.parametrize('name', ['six', 'lwr4plus', 'iiwa14'])
+def test_the_tool_is_where_the_nominal_robot_has_it(name):
+    model = erring(name, 4)
+    compensator = Compensator(model)
+    q = configurations(model, 400, 5)
+    found = compensator.correct(q)
+    wanted = model.chain.forward(q)
+    reached = compensator.tool(found.command)
+    off = np.linalg.norm(reached[:, :3, 3] - wanted[:, :3, 3], axis=1)
+    turned = np.linalg.norm(
+        matrix_to_rotation_vector(reached[:, :3, :3] @ np.swapaxes(wanted[:, :3, :3], 1, 2)),
+        axis=1,
+    )
+    np.testing.assert_allclose(found.residual_m, off, atol=1e-12)
+    np.testing.assert_allclose(found.residual_rad, turned, atol=1e-9)
+    alone = compensator.tool(q)
+    before = np.linalg.norm(alone[:, :3, 3] - wanted[:, :3, 3], axis=1)
+    sizes = np.linalg.svd(geometric_jacobian(model.chain, q), compute_uv=False)[:, -1]
+    whole = sizes >= FADES_BELOW
+    assert np.array_equal(~whole, found.faded)
+    if whole.any():
+        assert off[whole].max() < 2e-5
+        assert turned[whole].max() < 1e-4
+    # Never astray, wherever.
+    assert off.max() < before.max()
+    assert np.abs(found.command - q).max() < 0.1
+    np.testing.assert_allclose(compensator.true(found.command), q, rtol=0, atol=1e-9)
+    if name != 'six':
+        assert whole.mean() > 0.1
+
+
+def geometric_jacobian(chain, q):
+    frames = chain.frames(q)
+    axes = chain.axes_in_base(frames)
+    arms = chain.forward(q)[:, None, :3, 3] - frames[..., :3, 3]
+    return np.concatenate((np.cross(axes, arms), axes), axis=2).swapaxes(1, 2)
+
+
+def test_seven_joints_change_no_more_than_they_must():
+    model = erring('lwr4plus', 6)
+    q = configurations(model, 200, 7)
+    found = Compensator(model).correct(q)
+    jacobian = geometric_jacobian(model.chain, q)
+    null = np.linalg.svd(jacobian, full_matrices=True)[2][:, -1]
+    along = np.abs(np.sum(null * (found.command - q), axis=1))
+    assert along[~found.faded].max() < 1e-4
+
+
+@pytest.mark.parametrize('name', ['six', 'lwr4plus'])
+def test_nothing_jumps_on_a_path_through_a_singularity(name):
+    """The added speed is a small share, and finer steps add nothing to it."""
+    model = erring(name, 8)
+    start, end = configurations(model, 2, 9)
+    # The wrist stretched midway: two axes in one line.
+    wrist = 4 if name == 'six' else 5
+    start[wrist], end[wrist] = -0.6, 0.6
+    added = []
+    for count in (2_001, 8_001):
+        path = start + np.linspace(0.0, 1.0, count)[:, None] * (end - start)
+        change = Compensator(model).command(path) - path
+        speed = np.abs(np.diff(change, axis=0)) * (count - 1)
+        added.append(speed.max() / np.abs(end - start).max())
+    assert added[0] < 0.25
+    assert added[1] < 1.05 * added[0]
+
+
+def test_beyond_the_range_of_a_curve_its_end_holds_and_the_row_is_marked():
+    knots = np.concatenate((np.full(3, -1.0), np.linspace(-1.0, 1.0, 6), np.full(3, 1.0)))
+    curve = Function('angle', 'bspline', 1, knots=knots, degree=3)
+    heights = np.linspace(-1e-3, 2e-3, 8)
+    model = arm('six', joint_terms=(JointTerm(1, 'x', curve, heights),))
+    q = np.zeros((4, 6))
+    q[:, 1] = (-1.4, 0.0, 0.99, 1.7)
+    found = Compensator(model).correct(q)
+    assert found.outside_range.tolist() == [True, False, False, True]
+    np.testing.assert_allclose(model.state(q).angles[[0, 3], 1] - q[[0, 3], 1], [-1e-3, 2e-3])
+
+
+def test_temperatures_are_per_row_and_that_of_the_measurements_where_none_is_given():
+    shifts = np.zeros((7, 3))
+    shifts[:, 2] = 1e-5
+    growth = Geometry(shifts, np.zeros((7, 3)))
+    compensator = Compensator(arm('six', growth=growth, reference_c=20.0, mean_c=25.0))
+    q = configurations(compensator.model, 3, 1)
+    rows = compensator.command(q, [20.0, 25.0, 30.0])
+    assert np.array_equal(rows[0], q[0])
+    np.testing.assert_array_equal(rows[1], compensator.command(q[1]))
+    np.testing.assert_array_equal(rows[2], compensator.command(q, 30.0)[2])
+
+
+def test_any_shape_and_no_rows():
+    compensator = Compensator(erring('lwr4plus', 1))
+    q = configurations(compensator.model, 6, 2)
+    every = compensator.command(q)
+    np.testing.assert_array_equal(compensator.command(q.reshape(2, 3, 7)), every.reshape(2, 3, 7))
+    np.testing.assert_allclose(compensator.command(q[0]), every[0], rtol=0, atol=1e-14)
+    assert compensator.command(np.zeros((0, 7))).shape == (0, 7)
+    with pytest.raises(ValueError, match='7'):
+        compensator.command(np.zeros(6))
+    with pytest.raises(ValueError, match='finite'):
+        compensator.command(np.full(7, np.nan))
