@@ -26,6 +26,7 @@ WRONG_NOISES = {
     **{f'student_{dof}': Noise(0.15e-3, degrees_of_freedom=dof) for dof in (3, 5)},
     'mispaired': Noise(0.1e-3, 0.1e-3, mispaired_share=0.05),
 }
+PLAIN = {'plain': Noise(0.1e-3)}
 OUTLIER_SHARE = 0.03
 # An effect is drawn as one that plausibly leaves this much, then scaled.
 VISIBLE_M = 0.2e-3
@@ -94,7 +95,7 @@ def hidden_session(recipe: Recipe) -> HiddenSession:
     rng = np.random.default_rng([recipe.seed, 7])
     hidden = _world(recipe, rng)
     noise = replace(
-        {**NOISES, **WRONG_NOISES}[recipe.noise],
+        {**NOISES, **WRONG_NOISES, **PLAIN}[recipe.noise],
         outlier_share=OUTLIER_SHARE if recipe.outliers else 0.0,
         held_out_outliers=recipe.held_out_outliers,
     )

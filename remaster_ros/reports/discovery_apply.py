@@ -134,7 +134,7 @@ _RESULTS = {
 }
 _MORE = {
     'offsets': f', {REMASTER_FILE} or {LAYER_FILE}',
-    'everything': ', for programs by remaster compensate',
+    'everything': ', by remaster_ros.read_compensation',
 }
 _ALONE = 'only zero-offsets are corrected here'
 

@@ -230,11 +230,12 @@ def test_discover_writes_what_to_apply_and_says_what_it_leaves(saved, tmp_path):
     for place in (folder, tmp_path):
         names = {path.name for path in (place / 'apply').iterdir()}
         model = {'robot_model.urdf'} if found.loads_geometry else set()
-        assert names == {'remaster.txt', 'offset_layer.yaml', 'robot_calibrated.urdf'} | model
+        offsets = {'remaster.txt', 'offset_layer.yaml', 'robot_calibrated.urdf'}
+        assert names == offsets | {'compensation.json'} | model
         for path in (place / 'apply').iterdir():
             assert 'of an earlier run' not in path.read_text()
     text = (folder / 'apply' / 'remaster.txt').read_text()
-    assert 'Corrected in none of these files: encoder eccentricity of joint 2.' in text
+    assert 'Not corrected here: encoder eccentricity of joint 2; compensation.json has' in text
 
 
 def test_lengths_and_tilts_are_in_the_robot_model(saved):
