@@ -84,8 +84,8 @@ def holds_everything(discovery: Discovery) -> bool:
     alone, every = (
         _held_out_mean(discovery, fit.residuals_after) for fit in (discovery.alone, discovery.fit)
     )
-    no_rows = np.isnan(alone)
-    return bool(discovery.solution.cells) and (no_rows or round(every, 3) < round(alone, 3))
+    better = bool(np.isnan(alone)) or round(every, 3) < round(alone, 3)
+    return better and bool(discovery.solution.cells)
 
 
 def _held_out_mean(discovery: Discovery, errors: FloatArray) -> float:
