@@ -296,6 +296,7 @@ def test_what_is_no_better_in_the_figures_shown_is_not_to_be_loaded():
         alone=SimpleNamespace(residuals_after=2.0 * errors),
         geometry=SimpleNamespace(errors=errors),
         fit=SimpleNamespace(residuals_after=0.9999 * errors),
+        solution=SimpleNamespace(cells=(object(),)),
         loads_geometry=True,
     )
     results = loadable(found)
