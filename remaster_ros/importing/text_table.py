@@ -172,9 +172,13 @@ def read_table(
     width, first = _first_row(split, path)
     header, preamble, named = _header(split[:first], width, separator)
     rows, at = [], []
-    # Titles may hold numbers; below the names a line with numbers is a row.
-    above = split[named:first]
-    damaged = [entry for entry in above if _is_row(entry[2]) and not _COMMENT.match(entry[1])]
+    # Titles may hold numbers; below the names, and where there are none, that is a damaged row.
+    above = [entry for entry in split[named:first] if not _COMMENT.match(entry[1])]
+    damaged = [
+        entry
+        for entry in above
+        if any(map(str.isalnum, entry[1]) if named else map(_is_number, entry[2]))
+    ]
     for number, line, cells in (*damaged, *split[first:]):
         if _COMMENT.match(line):
             preamble += f'\n{line}'
@@ -328,6 +332,7 @@ def _header(
             names = [
                 f'{name} [{bare(unit)}]' if unit else name for name, unit in zip(names, cells)
             ]
+            named = at
         else:
             names, named = cells, at
     return names, '\n'.join(preamble), named

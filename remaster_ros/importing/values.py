@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import warnings
 from datetime import datetime
 
 import numpy as np
@@ -147,7 +148,10 @@ def _time(text: str, decimal: str) -> float | None:
     from dateutil import parser
 
     try:
-        moment = parser.parse(text, dayfirst='.' in text, default=datetime(2000, 1, 1))
+        with warnings.catch_warnings():
+            # A letter that is no time zone.
+            warnings.simplefilter('error')
+            moment = parser.parse(text, dayfirst='.' in text, default=datetime(2000, 1, 1))
         return float(moment.timestamp())
-    except (ValueError, OverflowError):
+    except (ValueError, OverflowError, RuntimeWarning):
         return None

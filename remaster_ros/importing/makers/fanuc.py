@@ -13,7 +13,7 @@ from remaster_ros.importing.makers.named import NUMBER, Named, axes_in_order, un
 _OPEN = re.compile(r'\s*(PR?\[\d+)(?:\s*:\s*"[^"]*")?\]\s*\{\s*')
 _CLOSE = re.compile(r'\s*\}\s*;?\s*')
 _IGNORED = re.compile(r"\s*(?:GP\d+\s*:|U[FT]\s*:\s*\w+|CONFIG\s*:\s*'[^']*')\s*,?\s*")
-_JOINT = re.compile(rf'\s*(J\d|E\d)\s*=\s*({NUMBER.pattern})\s*(deg|mm)\s*,?\s*')
+_JOINT = re.compile(rf'\s*(J\d|E\d)\s*=\s*({NUMBER.pattern})\s+(deg|mm)\s*,?\s*')
 _PLACE = re.compile(rf'\s*[XYZWPR]\s*=\s*{NUMBER.pattern}\s*(?:mm|deg)\s*,?\s*')
 
 

@@ -11,6 +11,7 @@ _AGGREGATE = re.compile(r'\{([^{}]*)\}')
 _AXES = re.compile(r'\b(?:E6)?AXIS\b|\$AXIS_ACT', re.IGNORECASE)
 _PLACE = re.compile(r'\bE6POS\b|\bPOS\b|\bFRAME\b|[{:,]\s*X\s+[-+.\d]', re.IGNORECASE)
 _ENTRY = re.compile(rf'\s*(?:(?:E6)?AXIS\s*:)?\s*([AE]\d)\s+({NUMBER.pattern})\s*', re.IGNORECASE)
+_AXIS = re.compile(r'\bA\d\s+[-+.\d]')
 _MOVE_TO = re.compile(r'\bS?PTP\s*\{', re.IGNORECASE)
 _NAME = re.compile(r'([A-Za-z]\w*)\s*=\s*$')
 _PROGRAM = re.compile(r'\s*(?:&[A-Z]|;\s*FOLD|DEF(?:DAT)?\s+\w[^:\n]*(?:\n|$))', re.IGNORECASE)
@@ -32,7 +33,11 @@ def read(text: str) -> Named | None:
                 found.append((number, *_position(number, line, code, aggregate)))
         elif _PLACE.search(code):
             places.append(number)
-        elif _MOVE_TO.search(code) or (_AXES.search(code) and re.search(r'[={}]', code)):
+        elif (
+            _MOVE_TO.search(code)
+            or len(_AXIS.findall(code)) > 1
+            or (_AXES.search(code) and re.search(r'[={}]', code))
+        ):
             raise unexpected(number, line, _EXPECTED)
     if not found:
         raise InputError(

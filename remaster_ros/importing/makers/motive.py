@@ -66,7 +66,9 @@ def read(text: str) -> Named | None:
             if axes[i] in of[asset] or axes[i] not in (*'XYZW',):
                 raise unexpected(*lines[at], f'X, Y and Z once for {" ".join(asset)}')
             of[asset][axes[i]] = i
-    places = {asset: columns for asset, columns in places.items() if {*columns} == {*'XYZ'}}
+    for asset, columns in places.items():
+        if {*columns} != {*'XYZ'}:
+            raise unexpected(*lines[at], f'X, Y and Z once for {" ".join(asset)}')
     names, used = ['Frame', 'Time [s]'], [0, 1]
     groups, quaternions = {}, {}
     alone = [name for _, name in places]

@@ -11,9 +11,10 @@ from remaster_ros.importing.makers.named import NUMBER, Named, axes_in_order, un
 _MOVE = re.compile(r'\b(?:movej|servoj)\s*\(\s*')
 _LIST = re.compile(r'\[([^\[\]]*)\]')
 _ASSIGNED = re.compile(r'\s*(?:global\s+|local\s+)?([A-Za-z]\w*)\s*=\s*')
+_LISTED = re.compile(rf'{_ASSIGNED.pattern}\[')
 _DEGREES = re.compile(rf'd2r\(\s*({NUMBER.pattern})\s*\)')
 # Six numbers in a list, and what takes such beside movej.
-_SIX = re.compile(r'\(\s*\[\s*(?:[-+.\deE]+\s*,\s*){5}')
+_SIX = re.compile(r'(?<!p)\[\s*(?:[-+.\deE]+\s*,\s*){5}')
 _OTHERS = re.compile(r'\b(?:speed[jl]|set_\w+|force_mode|inverse_\w+|textmsg|get_\w+)\s*\(')
 _EXPECTED = 'a list of the joints in rad, [0.1, -1.5, …],'
 
@@ -28,6 +29,8 @@ def read(text: str) -> Named | None:
     places = 0
     for number, line in enumerate(text.splitlines(), 1):
         code = line.partition('#')[0]
+        if len(_SIX.findall(code)) > 1:
+            raise unexpected(number, line, 'one move or waypoint a line')
         assigned, move = _ASSIGNED.match(code), _MOVE.search(code)
         name = ''
         if assigned and (assigned[1].endswith('_q') or assigned[1] in named):
@@ -36,7 +39,7 @@ def read(text: str) -> Named | None:
         elif move:
             start = move.end()
         else:
-            if _SIX.search(code) and not _OTHERS.search(code):
+            if _SIX.search(code) and not (_LISTED.match(code) or _OTHERS.search(code)):
                 raise unexpected(number, line, 'movej([…])')
             continue
         if re.match(r'p\[|pose_|get_inverse_kin', code[start:]):

@@ -1,0 +1,124 @@
+"""Plain tables and takes with one thing wrong: read right but for it, or refused."""
+
+from __future__ import annotations
+
+import random
+import re
+from collections import Counter
+
+import numpy as np
+import pytest
+from foreign_streams import arm_of, run_of, take_of
+from foreign_tables import text
+from test_makers import JOINTS, joints_of, mutated
+
+from remaster_ros.errors import InputError
+from remaster_ros.importing.columns import find_columns
+from remaster_ros.importing.text_table import read_table
+from remaster_ros.importing.values import labels, length_unit, numbers, times
+
+NAMES = [f'P{i:02d}' for i in range(1, 9)]
+
+
+def points_of(seed=5):
+    return (1000.0 * np.random.default_rng(seed).uniform(-2.0, 2.0, (8, 3))).round(4)
+
+
+def leica():
+    points = [[f'{value:.4f}'.replace('.', ',') for value in row] for row in points_of()]
+    rows = zip(NAMES, points, strict=True)
+    lines = ['Messprotokoll AT960   Auftrag 4711   1 2', 'Station 1   Einheit: mm   20,8 C', '']
+    lines += ['Punktname Rechtswert Hochwert H\u00f6he Datum Uhrzeit']
+    lines += [f'{n} {" ".join(p)} 12.03.2026 14:05:{i:02d}' for i, (n, p) in enumerate(rows)]
+    return '\r\n'.join(lines)
+
+
+def spatial_analyzer():
+    rows = [', '.join(f'{value:.4f}' for value in row) for row in points_of()]
+    lines = [f'A::KR6::{name}, {row}' for name, row in zip(NAMES, rows, strict=True)]
+    return '\n'.join(['// Working Frame: A::WORLD', '// Units: Millimeters', *lines])
+
+
+def one_table():
+    header = ['name', *[f'A{i} [deg]' for i in range(1, 7)], 'X [mm]', 'Y [mm]', 'Z [mm]']
+    return text(header, [NAMES, *joints_of(8).T, *points_of().T], ';', ',')
+
+
+def wide():
+    header = [f'q{i}' for i in range(1, 7)] + [f'm{i}_{axis}' for i in (1, 2, 3) for axis in 'xyz']
+    points = np.concatenate([points_of(seed) for seed in (5, 6, 7)], axis=1)
+    return text(header, [*joints_of(8).T, *points.T])
+
+
+def take():
+    return take_of(run_of(arm_of(4)), ends_s=0.4, rate_hz=20.0)
+
+
+KINDS = {
+    'leica': (leica, True),
+    'spatial_analyzer': (spatial_analyzer, True),
+    'one_table': (one_table, True),
+    'wide': (wide, True),
+    'take': (take, False),
+}
+
+
+def cells_of(table):
+    """Return the cells of joints and points, counted; () where the table has not both kinds."""
+    found = find_columns(table, JOINTS)
+    columns = (*found.joints, *found.point)
+    values = numbers(table, columns, optional=True)
+    assert np.all(np.isnan(values) | np.isfinite(values))
+    times(table, found)
+    labels(table, found.one('name'))
+    if found.point:
+        length_unit(table, found, '', values[:, -3:], values[:, -3:])
+    return columns, Counter(tuple(row[i] for i in columns) for row in table.rows)
+
+
+def check(kind, count, seed, path):
+    print(f'mutations of {kind}: {count}, seed {seed}')
+    rng = random.Random(seed)
+    make, one_line = KINDS[kind]
+    content = make()
+    path.write_bytes(content.encode())
+    columns, true = cells_of(read_table(path))
+    read, refusals = 0, []
+    for _ in range(count):
+        broken, may_lose = mutated(rng, content, one_line, [*'#/!*'])
+        path.write_bytes(broken.encode())
+        try:
+            found, rows = cells_of(read_table(path))
+        except InputError as error:
+            refusals.append(str(error))
+            continue
+        if len(found) != len(columns) or sum(rows.values()) < 2:
+            # What `read_rows` refuses: joints or points are not there; and a title left alone.
+            continue
+        read += 1
+        other = [row for row in (rows - true).elements() if row not in true]
+        assert len(other) <= 1, (broken, other)
+        for row in other:
+            best = min(true, key=lambda one: sum(a != b for a, b in zip(one, row, strict=True)))
+            changed = [b for a, b in zip(best, row, strict=True) if a != b]
+            assert len(changed) == 1, (broken, row)
+            number = re.escape(changed[0])
+            assert not number or re.search(rf'(?<![\w.]){number}(?![\w.])', broken), (
+                number,
+                broken,
+            )
+        lost = sum((true - rows).values())
+        assert may_lose or lost <= len(other), broken
+    assert read > 0
+    assert all(str(path) in text for text in refusals)
+
+
+@pytest.mark.parametrize('kind', KINDS)
+def test_a_mutated_table_is_read_right_or_refused(kind, tmp_path):
+    check(kind, 60, 21, tmp_path / 'table.txt')
+
+
+@pytest.mark.qualify
+@pytest.mark.parametrize('kind', KINDS)
+def test_two_thousand_mutated_tables_are_read_right_or_refused(kind, tmp_path):
+    check(kind, 2000, 22, tmp_path / 'table.txt')
