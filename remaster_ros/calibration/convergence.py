@@ -23,8 +23,6 @@ MINIMUM_DRAWS = 8
 R_HAT_LIMIT = 1.01
 # Effective draws enough for two digits of a 95 % interval.
 ESS_LIMIT = 400.0
-# Importance weights whose tail has a larger shape than this are not relied on.
-PARETO_LIMIT = 0.7
 
 
 def r_hat(draws: FloatArray) -> FloatArray:
@@ -91,22 +89,19 @@ class SamplerInfo:
     precision, precision_wanted
         Largest Monte Carlo error of a mean over its parameter's standard deviation, reached and
         asked for; None where a number of draws was asked for instead.
-    log_density_error, checked
-        Largest difference of the density that was sampled from the exact one, on so many of the
-        draws; NaN and 0 where the exact one was sampled.
     seconds
         By the clock passed in; NaN without one.
     converged
-        Every R-hat at most 1.01 (Pareto k below 0.7 of draws by importance; nothing of a Gaussian
-        that was asked for) and every effective
-        sample size at least what the precision takes, 400 where none was asked for.
+        Every R-hat at most 1.01 and every effective sample size at least what the precision takes,
+        400 where none was asked for. A Gaussian about the mode counts where the parameters are too
+        many to be sampled; not where chains were given up.
     message
         The verdict with its figures, for the report.
     method
-        'metropolis', 'importance' or 'laplace', as `Chains` has it. The latter two have no
-        R-hat, and are judged by their importance weights.
+        'metropolis' or 'laplace', as `Chains` has it. The latter has no R-hat.
     pareto_k
-        Shape of the tail of these weights; NaN for chains.
+        Where chains were given up: the shape of the tail of the proposals' importance weights.
+        Else NaN.
     """
 
     name: str
@@ -118,8 +113,6 @@ class SamplerInfo:
     ess_tail: FloatArray
     precision: float
     precision_wanted: float | None
-    log_density_error: float
-    checked: int
     seconds: float
     converged: bool
     message: str
@@ -159,14 +152,14 @@ class SamplerInfo:
         else:
             least = run.effective
             figures = (np.full(len(names), np.nan), *np.full((2, len(names)), least))
-            chosen = run.method == 'laplace' and np.isnan(run.pareto_k)
-            sound = chosen or (run.method == 'importance' and run.pareto_k < PARETO_LIMIT)
+            sound = bool(np.isnan(run.pareto_k))
             agreement = (
                 f'a Gaussian about the mode of {len(names)} parameters, which nothing has checked'
-                if chosen
-                else f'Pareto k of the importance weights {run.pareto_k:.2f}, '
-                f'{"below" if run.pareto_k < PARETO_LIMIT else "not below"} {PARETO_LIMIT:g}'
             )
+            if not sound:
+                agreement += (
+                    f' (no chain came to its end; Pareto k of the proposals {run.pareto_k:.2f})'
+                )
         converged = sound and least >= needed
         precision = float(1.0 / np.sqrt(least))
         message = 'converged' if converged else 'NOT converged'
@@ -188,8 +181,6 @@ class SamplerInfo:
             *figures,
             precision,
             wanted,
-            run.log_density_error,
-            run.checked,
             seconds,
             converged,
             message,

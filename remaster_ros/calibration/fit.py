@@ -14,14 +14,7 @@ from remaster_ros.calibration.extension import Extension
 from remaster_ros.calibration.mistakes import sound_estimate
 from remaster_ros.calibration.paper import BURN_IN_SHARE, STEPS, fit_paper
 from remaster_ros.calibration.result import FitResult, Sampled, build_result, sampled_columns
-from remaster_ros.calibration.sampling import (
-    MANY_PARAMETERS,
-    PRECISION,
-    Progress,
-    gaussian_draws,
-    sample_posterior,
-    silent,
-)
+from remaster_ros.calibration.sampling import PRECISION, Progress, sample_posterior, silent
 from remaster_ros.errors import InputError, InsufficientDataError
 from remaster_ros.linear_algebra import one_thread
 from remaster_ros.types import FloatArray, Priors, Session
@@ -141,18 +134,15 @@ def _fast(
         return sampled_columns(posterior, x, eta, posterior.free)
 
     try:
-        if len(posterior.free) > MANY_PARAMETERS:
-            run, name = gaussian_draws(found.mode, chains=chains, rng=rng)
-        else:
-            run, name = sample_posterior(
-                found.mode,
-                chains=chains,
-                rng=rng,
-                draws=draws,
-                precision=precision,
-                quantities=columns,
-                report=report,
-            )
+        run, name = sample_posterior(
+            found.mode,
+            chains=chains,
+            rng=rng,
+            draws=draws,
+            precision=precision,
+            quantities=columns,
+            report=report,
+        )
     except np.linalg.LinAlgError:
         raise InsufficientDataError(
             f'the posterior cannot be sampled: the observations hardly determine '

@@ -14,11 +14,8 @@ from remaster_ros.types import FloatArray
 
 # Proposals evaluated between two reports of progress.
 REPORTED = 2000
-# Shares of a Gaussian's best step that are tried for a walk, for so many steps each.
-STEP_SCALES = (1.0, 0.7, 0.5, 0.35, 0.25)
-SCALE_STEPS = 200
 LogDensity = Callable[[FloatArray], FloatArray]
-Method = Literal['metropolis', 'importance', 'laplace']
+Method = Literal['metropolis', 'laplace']
 
 
 class Chains(NamedTuple):
@@ -32,15 +29,11 @@ class Chains(NamedTuple):
         Share of proposals taken, over all chains.
     trace
         A thinned record from the first state on, warm-up included, (chains, records, d).
-    log_density_error, checked
-        Where an approximate density was sampled: its largest difference from the exact one on so
-        many of the draws. NaN and 0 where the exact density was.
     method
-        'metropolis'; 'importance' for draws resampled by importance weights; 'laplace' for draws
-        of the Gaussian about the mode. The latter two are no chains.
+        'metropolis', or 'laplace' for draws of the Gaussian about the mode, which are no chains.
     pareto_k, effective
-        Of importance weights: the shape of their tail, and how many independent draws they are
-        worth. NaN for chains.
+        Where chains of an adapted proposal were given up: the shape of the tail of the importance
+        weights of its draws, and how many independent draws they are worth. NaN for chains.
     figures
         R-hat and effective draws of bulk and tails of the quantities that the length of chains was
         judged by, (p,) each; None where it was not.
@@ -49,8 +42,6 @@ class Chains(NamedTuple):
     draws: FloatArray
     acceptance_rate: float
     trace: FloatArray
-    log_density_error: float = float('nan')
-    checked: int = 0
     method: Method = 'metropolis'
     pareto_k: float = float('nan')
     effective: float = float('nan')
@@ -179,32 +170,3 @@ def random_walk_sampler(
             if progress is not None:
                 progress(count / steps)
     return Chains(np.stack(kept, axis=1), taken / (steps * len(start)), np.stack(trace, axis=1))
-
-
-def step_scale(
-    log_density: LogDensity, factor: FloatArray, start: FloatArray, rng: np.random.Generator
-) -> float:
-    """Return the share of a Gaussian's best step that moves a walk farthest (Pasarica 2010).
-
-    The widths of a posterior with long tails are too long a step for its bulk.
-    """
-
-    def squared_jump(scale: float) -> float:
-        run = random_walk_sampler(
-            log_density,
-            gaussian_step(scale * factor, len(start)),
-            start=start,
-            steps=SCALE_STEPS,
-            burn_in=0,
-            rng=rng,
-        )
-        return scale**2 * run.acceptance_rate
-
-    return max(STEP_SCALES, key=squared_jump)
-
-
-def gaussian_step(factor: FloatArray, chains: int) -> Callable[[np.random.Generator], FloatArray]:
-    """Return moves of 2.38 / sqrt(d) widths, best for Gaussians (Gelman, Roberts, Gilks 1996)."""
-    d = len(factor)
-    scaled = 2.38 / np.sqrt(d) * factor
-    return lambda rng: rng.standard_normal((chains, d)) @ scaled.T

@@ -8,7 +8,9 @@ poses. What is gross with a probability of `CERTAIN` is left out.
 The standard deviations are robust: the larger of those by the median and by the 80 % quantile of
 the errors, so that errors with more than Gaussian tails, which real robots have, are kept.
 The mixture's limit then comes to lie between 6 and 7 of them: of Gaussian errors of known size it
-calls fewer than one in 5 million gross.
+calls fewer than one in 5 million gross. Their size is not known: errors are measured by it as by
+an estimate with the degrees of freedom that rows and poses leave (`as_of_known_size`), or in a
+session of eight poses one of fifty had a pose off by 7 standard deviations by chance.
 """
 
 from __future__ import annotations
@@ -17,6 +19,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import chdtri, fdtrc
 
 from remaster_ros.calibration.grouped_rows import Rows
 from remaster_ros.calibration.noise import RESOLUTION_M
@@ -38,8 +41,10 @@ _EXPECTED = np.array([1.5381722545, 2.1544437046])
 # The standard deviation by the 80 % quantile may be this many times that by the median; more than
 # a fifth of gross errors makes it larger.
 TAIL_LIMIT = 4.0
-# A sensor has some ten unknowns. With fewer rows the robust fit follows half of them closely,
-# whatever they are, and their errors cannot be compared with the others'.
+# Of a sensor: its registration, its marker, a part of the offsets.
+UNKNOWNS = 10
+# With fewer rows the robust fit follows half of them closely, whatever they are, and their errors
+# cannot be compared with the others'.
 FEWEST_TO_JUDGE = 60
 
 
@@ -119,8 +124,10 @@ def judge(rows: Rows, errors: FloatArray, gross: BoolArray) -> Judgement:
     sigmas = deviation / spread
 
     probability = np.zeros(len(rows))
-    for _, span in rows.spans:
-        probability[span] = gross_probability(sigmas[span])
+    for index, span in rows.spans:
+        poses = int(np.sum((rows.group_sensor == index) & (count > 0)))
+        freedom = 3 * (int(good[span].sum()) - poses) or 3 * poses - UNKNOWNS
+        probability[span] = gross_probability(as_of_known_size(sigmas[span], freedom))
     new = probability > CERTAIN
     worst = np.zeros(len(count))
     np.maximum.at(worst, group, np.where(gross, 0.0, sigmas))
@@ -139,7 +146,8 @@ def judge(rows: Rows, errors: FloatArray, gross: BoolArray) -> Judgement:
     off = np.zeros(len(count))
     for index, _ in rows.spans:
         mine = (rows.group_sensor == index) & (count > 1)
-        off[mine] = gross_probability(pose_sigmas[mine])
+        freedom = 3 * int(mine.sum()) - UNKNOWNS
+        off[mine] = gross_probability(as_of_known_size(pose_sigmas[mine], freedom))
     for index in np.flatnonzero(off > CERTAIN).tolist():
         start = int(rows.group_start[index])
         for row in range(start, start + rows.group_size[index]):
@@ -149,6 +157,29 @@ def judge(rows: Rows, errors: FloatArray, gross: BoolArray) -> Judgement:
                 f'{pose_sigmas[index]:.0f} sigma; gross with probability {_percent(off[index])}'
             )
     return Judgement(gross_now, tuple(why))
+
+
+def as_of_known_size(sigmas: FloatArray, freedom: int) -> FloatArray:
+    """Return lengths as rare among errors of known size as these are among those of estimated.
+
+    The square of a length of three-dimensional errors in estimated standard deviations is three
+    times F-distributed, in known ones chi-squared.
+
+    Parameters
+    ----------
+    sigmas
+        In estimated standard deviations, (n,).
+    freedom
+        Degrees of freedom of the estimate; with fewer than one it counts as one.
+
+    Returns
+    -------
+    ndarray
+        In known standard deviations, (n,).
+    """
+    rarity = fdtrc(3, max(freedom, 1), sigmas**2 / 3.0)
+    known: FloatArray = np.sqrt(chdtri(3, np.maximum(rarity, np.finfo(float).tiny)))
+    return known
 
 
 def gross_probability(sigmas: FloatArray) -> FloatArray:

@@ -1,6 +1,11 @@
-"""What the independence sampler proposes from: a Student t, or the linearised posterior.
+"""What the independence sampler proposes from: a Student t, moved to where the posterior is.
 
-The independence sampler corrects whatever they leave out.
+Independent draws of a proposal, weighted by density over proposal, have the moments of the density
+whatever the proposal, if the weights have a variance. Where it is poor its mean and covariance are
+moved to those of the weighted draws (population Monte Carlo; Cappé, Guillin, Marin and Robert
+2004, doi:10.1198/106186004X12803). The largest weights are smoothed by a Pareto distribution,
+whose shape k tells whether they can be relied on (Vehtari, Simpson, Gelman, Yao and Gabry 2024,
+"Pareto smoothed importance sampling", JMLR 25(72); as arviz-stats has it).
 """
 
 from __future__ import annotations
@@ -8,6 +13,7 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -15,19 +21,24 @@ from remaster_ros.calibration.laplace import Mode
 from remaster_ros.calibration.linearisation import log_determinant
 from remaster_ros.types import FloatArray
 
-# Tails of the proposal: of the noise always, of the parameters in this share of the draws. They
-# bound the importance weights where the linearised posterior is too narrow.
+# Of the noise by itself, where it is integrated over.
 NOISE_FREEDOM = 10.0
+# Of a twentieth of the draws, which bound the importance weights where the rest is too narrow
+# (Hesterberg 1995, doi:10.1080/00401706.1995.10484303).
 TAIL_SHARE = 0.05
 TAIL_FREEDOM = 5.0
 TAIL_WIDENING = 1.3
-# Draws by which it is seen whether a proposal has to be adapted, and the tails of what it then
-# becomes: in tens of dimensions a Student t of few degrees of freedom hardly ever hits the bulk.
-TRIED_DRAWS, ADAPTED_FREEDOM = 4000, 15.0
-# Draws at a time: the matrices of more do not fit into the processor's cache. With one matrix for
-# each draw they have so many entries at most.
-BLOCK = 1024
-BLOCK_ENTRIES = 2_000_000
+# Of most draws: hardly wider than a Gaussian, whose bulk a Student t of few degrees of freedom
+# hardly ever hits in tens of dimensions.
+FREEDOM = 30.0
+# Of the noise's coordinates, logarithms, about the mode.
+FARTHEST = 5.0
+# Of the matrices of draws that are worked on together.
+BLOCK_ENTRIES = 1_000_000
+# Effective draws that moments take for each dimension. Where weighted draws are worth fewer, their
+# weights are raised to a power below 1, which leads part of the way.
+DRAWS_PER_DIMENSION = 5.0
+POWERS = 0.7 ** np.arange(1.0, 25.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,26 +59,6 @@ class StudentT:
     factor: FloatArray
     freedom: float
 
-    # So many draws tell whether it has to be adapted; a draw costs as much as a density.
-    first_draws, cost = TRIED_DRAWS, 1.0
-
-    @classmethod
-    def of(cls, points: FloatArray, weight: FloatArray, freedom: float) -> StudentT:
-        """Return the one with the mean and covariance of weighted points (n, d)."""
-        mean = weight @ points
-        apart = points - mean
-        covariance = (apart * weight[:, None]).T @ apart
-        return cls(mean, np.asarray(np.linalg.cholesky(covariance)), freedom)
-
-    @property
-    def dimension(self) -> int:
-        """Of what is adapted."""
-        return len(self.mean)
-
-    def adapted(self, points: FloatArray, weight: FloatArray) -> StudentT:
-        """Return the one with the moments of weighted points (n, d)."""
-        return self.of(points, weight, self.freedom)
-
     def sample(self, count: int, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
         """Return points (count, d) and their log density (count,)."""
         normal = rng.standard_normal((count, len(self.mean)))
@@ -78,132 +69,183 @@ class StudentT:
     def log_density(self, points: FloatArray) -> FloatArray:
         """Return the normalised log density of points (n, d), (n,)."""
         whitened = np.linalg.solve(self.factor, (points - self.mean).T)
-        square = np.sum(whitened**2, axis=0)
-        return _log_student_t(square, len(self.mean), self.freedom) - log_determinant(self.factor)
+        square, d, freedom = np.sum(whitened**2, axis=0), len(self.mean), self.freedom
+        constant = math.lgamma(0.5 * (freedom + d)) - math.lgamma(0.5 * freedom)
+        constant -= 0.5 * d * math.log(freedom * math.pi) + float(log_determinant(self.factor))
+        density: FloatArray = constant - 0.5 * (freedom + d) * np.log1p(square / freedom)
+        return density
 
 
 @dataclass(frozen=True, eq=False)
-class LaplaceProposal:
-    """Noise from a Student t; parameters given the noise from their Gaussian, with t tails.
+class AdaptedProposal:
+    """A Student t about the linearised posterior, a part of its draws with wide tails.
+
+    It lies in coordinates in which the linearised posterior is standard: the noise as it is, the
+    parameters p of a draw whitened by their Gaussian given its noise, w = L' (p - mean). Where
+    poses are few the noise may be several times that of the mode, and the width of p with it.
 
     Attributes
     ----------
     mode
         About which it proposes.
-    factorised
-        Whether the precision of the parameters is factorised for the noise of every draw, which
-        takes ten times as long, or that of the mode's noise serves for all. For few poses: there
-        the noise may be several times that of the mode, and the width of the parameters with it.
+    centre
+        Of most draws: [w | noise], (d,).
     """
 
     mode: Mode
-    factorised: bool = False
+    centre: StudentT
 
-    # So many draws tell whether it has to be adapted; a draw costs as much as a density.
-    first_draws, cost = TRIED_DRAWS, 1.0
+    @classmethod
+    def about(cls, mode: Mode) -> AdaptedProposal:
+        """Begin with the linearised posterior at its mode."""
+        f, e = len(mode.linearisation.posterior.free), len(mode.eta)
+        factor = np.eye(f + e)
+        factor[f:, f:] = _factor(mode.eta_covariance)
+        centre = np.concatenate((np.zeros(f), mode.eta))
+        return cls(mode, StudentT(centre, factor, FREEDOM))
 
     @property
     def dimension(self) -> int:
-        """Of what is adapted."""
-        return len(self.mode.linearisation.posterior.free) + len(self.mode.eta)
+        """Number of coordinates."""
+        return len(self.centre.mean)
 
-    def adapted(self, points: FloatArray, weight: FloatArray) -> StudentT:
-        """Return a Student t with the moments of weighted points (n, d)."""
-        return StudentT.of(points, weight, ADAPTED_FREEDOM)
+    @property
+    def _tail(self) -> StudentT:
+        return StudentT(self.centre.mean, TAIL_WIDENING * self.centre.factor, TAIL_FREEDOM)
 
     def sample(self, count: int, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
         """Return points (count, d) of the posterior and their log density (count,)."""
-        block = BLOCK
-        if self.factorised:
-            entries = len(self.mode.linearisation.posterior.free) ** 2
-            block = min(BLOCK, max(1, BLOCK_ENTRIES // entries))
-        sizes = [min(block, count - start) for start in range(0, count, block)]
-        points, densities = zip(*(self._sample(size, rng) for size in sizes), strict=True)
-        return np.concatenate(points), np.concatenate(densities)
-
-    def _sample(self, count: int, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
-        eta = folded(self._noise.sample(count, rng)[0], self._shares)
-        mean, factor, _ = self._conditional(eta)
-        whitened = with_tails(rng.standard_normal((count, mean.shape[-1])), rng)
-        upper = np.swapaxes(factor, -1, -2)
-        if self.factorised:
-            step = np.linalg.solve(upper, whitened[..., None])[..., 0]
-        else:
-            step = np.linalg.solve(upper, whitened.T).T
-        return np.concatenate((mean + step, eta), axis=1), self._density(eta, whitened, factor)
+        inner, _ = self.centre.sample(count, rng)
+        far = np.flatnonzero(rng.random(count) < TAIL_SHARE)
+        inner[far] = self._tail.sample(len(far), rng)[0]
+        blocks = np.array_split(inner, max(1, len(inner) // self._block))
+        points, density = zip(*(self._points(block) for block in blocks), strict=True)
+        return np.concatenate(points), np.concatenate(density)
 
     def log_density(self, points: FloatArray) -> FloatArray:
         """Return the normalised log density of points (n, d), (n,)."""
-        parameters, eta = np.split(points, [points.shape[1] - len(self.mode.eta)], axis=1)
-        mean, factor, _ = self._conditional(eta)
-        whitened = np.einsum('...ji,...j->...i', factor, parameters - mean)
-        return self._density(eta, whitened, factor)
+        blocks = np.array_split(points, max(1, len(points) // self._block))
+        parts = [self._inner(block) for block in blocks]
+        return np.concatenate([self._log_density(inner) + volume for inner, volume in parts])
 
     def dispersed(self, count: int, rng: np.random.Generator) -> FloatArray:
-        """Return starts for chains: spread twice as far as the posterior, (count, d)."""
-        points, _ = self.sample(count, rng)
-        free = self.mode.linearisation.posterior.free
-        centre = np.concatenate((self.mode.z[free], self.mode.eta))
-        starts = centre + 2.0 * (points - centre)
-        return folded(starts, self._shares)
+        """Return starts for chains: spread twice as far as the draws, (count, d)."""
+        inner, _ = self.centre.sample(count, rng)
+        return self._points(self.centre.mean + 2.0 * (inner - self.centre.mean))[0]
 
-    def _conditional(self, eta: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return `Linearisation.conditional` of every draw's noise, or of the mode's."""
-        return self.mode.linearisation.conditional(eta if self.factorised else self.mode.eta)
+    def adapted(self, drawn: Weighted) -> AdaptedProposal:
+        """Return the one with the mean and covariance of weighted draws."""
+        weight = drawn.with_moments()
+        inner = self._inner(drawn.points)[0]
+        mean = weight @ inner
+        apart = inner - mean
+        return AdaptedProposal(
+            self.mode, StudentT(mean, _factor((apart * weight[:, None]).T @ apart), FREEDOM)
+        )
 
-    def _density(self, eta: FloatArray, whitened: FloatArray, factor: FloatArray) -> FloatArray:
-        """Return the log density (n,) of noise (n, e) and parameters at whitened places (n, f)."""
-        noise = folded_density(self._noise, eta, self._shares)
-        return noise + tail_density(whitened) + log_determinant(factor)
+    def _points(self, inner: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the points of inner coordinates, shared parts of the noise folded at zero."""
+        inner[:, self.dimension - self._shares :] = np.abs(
+            inner[:, self.dimension - self._shares :]
+        )
+        white, eta = np.split(inner, [self.dimension - len(self.mode.eta)], axis=1)
+        mean, factor = self._conditional(eta)
+        step = np.linalg.solve(np.swapaxes(factor, -1, -2), white[..., None])[..., 0]
+        points = np.concatenate((mean + step, eta), axis=1)
+        return points, self._log_density(inner) + log_determinant(factor)
+
+    def _inner(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the inner coordinates (n, d) of points, and the log of what a volume becomes."""
+        parameters, eta = np.split(points, [self.dimension - len(self.mode.eta)], axis=1)
+        mean, factor = self._conditional(eta)
+        white = np.einsum('nji,nj->ni', factor, parameters - mean)
+        return np.concatenate((white, eta), axis=1), log_determinant(factor)
+
+    def _conditional(self, eta: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return mean and factor of the precision of the parameters given noise (n, e)."""
+        # Beyond, rounding leaves no information. Any function of the noise would do.
+        near = np.clip(eta, self.mode.eta - FARTHEST, self.mode.eta + FARTHEST)
+        mean, factor, _ = self.mode.linearisation.conditional(near)
+        return mean, factor
+
+    @property
+    def _block(self) -> int:
+        """Draws at a time: each has a matrix."""
+        return max(1, BLOCK_ENTRIES // self.dimension**2)
+
+    def _log_density(self, inner: FloatArray) -> FloatArray:
+        # |x| has the density of x and of -x together.
+        kept = (1.0,) * (self.dimension - self._shares)
+        parts = []
+        for signs in itertools.product((1.0, -1.0), repeat=self._shares):
+            image = inner * np.array((*kept, *signs))
+            parts.append(math.log1p(-TAIL_SHARE) + self.centre.log_density(image))
+            parts.append(math.log(TAIL_SHARE) + self._tail.log_density(image))
+        density: FloatArray = np.logaddexp.reduce(parts)
+        return density
 
     @property
     def _shares(self) -> int:
-        """Number of noise coordinates that cannot be negative: all but those of sigma."""
+        """Number of last coordinates that cannot be negative: the shared parts of the noise."""
         return len(self.mode.linearisation.posterior.noise_model.shares)
 
+
+class Weighted(NamedTuple):
+    """Draws of a proposal with their weights.
+
+    Attributes
+    ----------
+    points
+        (n, d).
+    log_weight
+        Log density over proposal, (n,).
+    weight
+        Smoothed, with sum 1, (n,).
+    pareto_k
+        Shape of their upper tail.
+    """
+
+    points: FloatArray
+    log_weight: FloatArray
+    weight: FloatArray
+    pareto_k: float
+
+    @classmethod
+    def of(cls, points: FloatArray, log_weight: FloatArray) -> Weighted:
+        """Smooth the weights."""
+        from arviz_stats.base import array_stats
+
+        finite = np.isfinite(log_weight)
+        # Draws where there is no density count for nothing.
+        least = np.min(log_weight[finite], initial=0.0) - 100.0
+        log_weight = np.where(finite, log_weight, least)
+        # arviz-stats smooths the weights 1 / likelihood of a left-out observation: the sign turns.
+        smoothed, pareto_k = array_stats.psislw(-log_weight)
+        weight = np.exp(smoothed - np.max(smoothed))
+        return cls(points, log_weight, weight / weight.sum(), float(pareto_k))
+
     @property
-    def _noise(self) -> StudentT:
-        factor = np.asarray(np.linalg.cholesky(self.mode.eta_covariance))
-        return StudentT(self.mode.eta, factor, NOISE_FREEDOM)
+    def effective(self) -> float:
+        """What number of independent draws they are worth."""
+        return _effective(self.weight)
+
+    def with_moments(self) -> FloatArray:
+        """Return the weights, (n,), so even that they have moments."""
+        weight = self.weight
+        for power in POWERS:
+            if _effective(weight) >= DRAWS_PER_DIMENSION * self.points.shape[1]:
+                break
+            weight = np.exp(power * (self.log_weight - np.max(self.log_weight)))
+            weight /= weight.sum()
+        return weight
 
 
-def with_tails(normal: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Return standard normal draws (n, f), some of them replaced by those of a wider Student t."""
-    tail = np.flatnonzero(rng.random(len(normal)) < TAIL_SHARE)
-    mixing = np.sqrt(rng.chisquare(TAIL_FREEDOM, len(tail)) / TAIL_FREEDOM)
-    normal[tail] *= (TAIL_WIDENING / mixing)[:, None]
-    return normal
+def _effective(weight: FloatArray) -> float:
+    """Return what number of independent draws weights with sum 1 are worth (Kish 1965)."""
+    return float(1.0 / np.sum(weight**2))
 
 
-def tail_density(whitened: FloatArray) -> FloatArray:
-    """Return the log density (n,) of what `with_tails` returns, (n, f)."""
-    f = whitened.shape[1]
-    square = np.sum(whitened**2, axis=-1)
-    centre = np.log1p(-TAIL_SHARE) - 0.5 * square - 0.5 * f * np.log(2.0 * np.pi)
-    tail = np.log(TAIL_SHARE) - f * np.log(TAIL_WIDENING)
-    tail += _log_student_t(square / TAIL_WIDENING**2, f, TAIL_FREEDOM)
-    density: FloatArray = np.logaddexp(centre, tail)
-    return density
-
-
-def folded(points: FloatArray, count: int) -> FloatArray:
-    """Return points (n, d), the last coordinates without their sign: shared parts of a noise."""
-    points[:, points.shape[1] - count :] = np.abs(points[:, points.shape[1] - count :])
-    return points
-
-
-def folded_density(distribution: StudentT, points: FloatArray, count: int) -> FloatArray:
-    """Return the log density (n,) of what `folded` makes of draws."""
-    # |x| has the density of x and of -x together.
-    kept = (1.0,) * (points.shape[1] - count)
-    signs = itertools.product((1.0, -1.0), repeat=count)
-    images = [points * np.array((*kept, *sign)) for sign in signs]
-    density: FloatArray = np.logaddexp.reduce([distribution.log_density(one) for one in images])
-    return density
-
-
-def _log_student_t(square: FloatArray, d: int, freedom: float) -> FloatArray:
-    """Return the log density of a standard t in d dimensions at squared distances (...)."""
-    constant = math.lgamma(0.5 * (freedom + d)) - math.lgamma(0.5 * freedom)
-    constant -= 0.5 * d * math.log(freedom * math.pi)
-    return constant - 0.5 * (freedom + d) * np.log1p(square / freedom)
+def _factor(covariance: FloatArray) -> FloatArray:
+    """Return the Cholesky factor of a covariance whose units differ by many powers."""
+    unit = np.sqrt(np.diag(covariance))
+    return unit[:, None] * np.asarray(np.linalg.cholesky(covariance / np.outer(unit, unit)))

@@ -21,7 +21,7 @@ from remaster_ros.calibration.mistakes import sound_estimate
 from remaster_ros.calibration.outliers import find_outliers
 from remaster_ros.calibration.result import FitResult
 from remaster_ros.calibration.sampling import Progress, silent
-from remaster_ros.discovery.causes import NAMED, Search
+from remaster_ros.discovery.causes import NAMED, NEEDED, Search
 from remaster_ros.discovery.effects.base import Cell
 from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.discovery.evidence import solve
@@ -37,7 +37,7 @@ from remaster_ros.discovery.geometry_model import GeometryModel, better_of_two, 
 from remaster_ros.discovery.guard import Unexplained, harm_of, is_harmful, unfitted
 from remaster_ros.discovery.marker_offsets import loosened, moved_markers
 from remaster_ros.discovery.omnibus import structure_left
-from remaster_ros.discovery.random_effects import by_members, kinds
+from remaster_ros.discovery.random_effects import by_members, fit_kinds, kinds
 from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.discovery.solution import Solution
 from remaster_ros.discovery.thinning import Thinning, draw_rows, judge_by_others
@@ -56,9 +56,6 @@ Verdict = Literal['effects', 'none', 'undetermined', 'unexplained']
 PRECISION = 0.05
 # A cause with this share of the gain is one of the leaders.
 LEADING_SHARE = 0.1
-# A kind of error whose members displace the marker by less than this share of the noise, RMS,
-# moves no offset and no prediction by a noticeable part of its standard deviation.
-LEAST_SHOWN = 0.01
 NOT_LOADED = 'No robot model with it predicts held-out poses better than the zero-offsets do.'
 
 
@@ -356,11 +353,13 @@ def _sampled(
 
 
 def complete(found: Estimate, search: Search, named: Solution) -> tuple[Solution, FloatArray]:
-    """Return the model of the causes, and how errors of all other kinds would move it.
+    """Return the model of all kinds of errors, or of the causes and how the others would move it.
 
-    Kinds without a name join the model, one variance each, where the evidence misses them all
-    together as it would miss a cause; else a model with them predicts worse than one without
-    (chance gives half of all variances a value). Their variances then move what was fitted.
+    A name is a choice among thousands: two halves of one session are not given the same names.
+    Offsets, lengths and predictions come from all kinds at once, each with one variance for all
+    its members, named or not. Where so many members explain less than the few causes (one joint
+    errs and no other), or where nothing is there, the causes stay by themselves, and the variances
+    of all other kinds move what was fitted.
 
     Returns
     -------
@@ -368,24 +367,25 @@ def complete(found: Estimate, search: Search, named: Solution) -> tuple[Solution
         The fit, by members.
     moves
         Of all natural parameters of the fit and those of the solution, one standard deviation of
-        each weight of a kind that did not join, (size + m, c).
+        each weight of a kind that is not in it, (size + m, c).
     """
-    data = search.data
+    data, cells = search.data, search.catalogue.cells
     members = by_members(named, search.families)
-    rest = kinds(data, search.catalogue.cells, members.cells)
-    whole = solve(data, (*named.cells, *(family.cell for family in rest)), named) if rest else None
-    if whole is None:
-        return members, np.zeros((found.model.size + len(members.parameters), 0))
-    weights = dict(zip(whole.cells, whole.smoothness, strict=True))
-    if whole.log_evidence > named.log_evidence + NAMED:
-        least = LEAST_SHOWN * data.noise_model.sensor_noise(whole.noise).total.min()
-        shown = [family for family in rest if weights[family.cell] ** -0.5 > least]
-        whole = solve(data, (*named.cells, *(family.cell for family in shown)), whole) or whole
-        joined = [family for family in rest if family.cell in whole.cells]
-        joint = by_members(whole, [*search.families, *joined])
+    of_a_kind = {name for family in kinds(data, cells) for name in family.parameters}
+    own = [cell for cell in members.cells if not of_a_kind.issuperset(cell.parameters)]
+    every = kinds(data, cells, own)
+    whole = fit_kinds(data, own, every)
+    price = NAMED if not named.cells else -NEEDED
+    if whole is not None and whole.log_evidence > named.log_evidence + price:
+        joint = by_members(whole, every)
         return joint, np.zeros((found.model.size + len(joint.parameters), 0))
+    others = kinds(data, cells, members.cells)
+    beside = solve(data, (*named.cells, *(family.cell for family in others)), named)
+    if beside is None or not others:
+        return members, np.zeros((found.model.size + len(members.parameters), 0))
+    weights = dict(zip(beside.cells, beside.smoothness, strict=True))
     unseen = np.concatenate(
-        [data.columns([family.cell]) * weights[family.cell] ** -0.5 for family in rest], axis=2
+        [data.columns([family.cell]) * weights[family.cell] ** -0.5 for family in others], axis=2
     )
     return members, moved_by(found, data, members, unseen)
 

@@ -18,9 +18,11 @@ from functools import partial
 
 import numpy as np
 
+from remaster_ros.calibration.noise import Noise
 from remaster_ros.discovery.effects.base import Cell, Design
 from remaster_ros.discovery.effects.context import Context
 from remaster_ros.discovery.effects.registry import EFFECTS
+from remaster_ros.discovery.evidence import solve
 from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.discovery.solution import Covariances, Solution
 from remaster_ros.types import FloatArray
@@ -30,6 +32,10 @@ NOTHING = 1e-12
 # Directions of a penalised member with a smaller share of its largest displacement, in square.
 # Coarser, and a fit of curves ends on a plateau, four times as far from held-out poses.
 LEAST_SHARE = 1e-7
+# Share of the offsets model's errors that is noise, where the rest is of the arm: a search for the
+# likelihood's maximum begins there as well as at one.
+SMALL_NOISE = 0.3
+RANDOM = 'random'
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,6 +60,11 @@ class Family:
     members: tuple[Cell, ...]
     maps: tuple[FloatArray, ...]
     scales: tuple[FloatArray, ...]
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Names of the parameters of all members."""
+        return tuple(name for member in self.members for name in member.parameters)
 
     @classmethod
     def of(
@@ -99,7 +110,7 @@ class Family:
             name=name,
             place=seen[0].place,
             driver=seen[0].driver,
-            form='random',
+            form=RANDOM,
             parameters=tuple(f'{name}#{index}' for index in range(count)),
             unit='m',
             columns=partial(_columns, members=tuple(seen), maps=tuple(maps)),
@@ -145,6 +156,27 @@ def kinds(data: Residuals, cells: Sequence[Cell], apart: Sequence[Cell] = ()) ->
             taken |= set(cell.parameters)
     families = (Family.of(data, f'every {name}', mine) for name, mine in members.items())
     return [family for family in families if family is not None]
+
+
+def fit_kinds(
+    data: Residuals, cells: Sequence[Cell], families: Sequence[Family]
+) -> Solution | None:
+    """Fit cells and all members of some kinds; None where they cannot be distinguished.
+
+    The likelihood has two maxima where rows are few: errors are noise, or they are all of the arm
+    and the noise is small. Newton's steps go to the nearer one, so they begin at either.
+    """
+    every = (*cells, *(family.cell for family in families))
+    found = solve(data, every)
+    if found is None or not families:
+        return found
+    noise, least = data.noise, SMALL_NOISE
+    quiet = Noise(least * noise.sigma, least * noise.pose_sigma, least * noise.frame_sigma)
+    variance = float(np.max(data.noise_model.sensor_noise(noise).total)) ** 2 / len(families)
+    shared = [variance**-1.0 if cell.form == RANDOM else np.nan for cell in found.cells]
+    start = replace(found, noise=quiet, smoothness=np.array(shared))
+    other = solve(data, every, start)
+    return found if other is None or other.log_evidence < found.log_evidence else other
 
 
 def by_members(solution: Solution, families: Sequence[Family]) -> Solution:

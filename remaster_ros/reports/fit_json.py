@@ -98,8 +98,6 @@ def estimates(result: FitResult) -> dict[str, Any]:
             **vars(sampler),
             'r_hat_max': np.max(sampler.r_hat),
             'ess_min': np.min((sampler.ess_bulk, sampler.ess_tail)),
-            'log_density_error_max': sampler.log_density_error,
-            'log_density_checked_draws': sampler.checked,
         },
     }
 

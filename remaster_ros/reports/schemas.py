@@ -130,10 +130,8 @@ class Sampler(Struct):
     """How the posterior was sampled; ``draws`` are kept draws of each chain.
 
     ``precision`` is the Monte Carlo error of the worst mean in standard deviations;
-    ``log_density_error_max`` that of the second-order density on the draws that were checked.
-    ``method`` is 'metropolis' for chains, 'importance' for weighted draws, 'laplace' for a
-    Gaussian about the mode; for the latter two ``pareto_k`` is the check of their weights, passed
-    below 0.7.
+    ``method`` is 'metropolis' for chains, 'laplace' for a Gaussian about the mode; ``pareto_k``,
+    where chains were given up, is the shape of the tail of their proposals' weights.
     """
 
     name: str
@@ -147,9 +145,7 @@ class Sampler(Struct):
     message: str | UnsetType = UNSET
     precision: float | UnsetType | None = UNSET
     precision_wanted: float | UnsetType | None = UNSET
-    log_density_error_max: float | UnsetType | None = UNSET
-    log_density_checked_draws: int | UnsetType = UNSET
-    method: Literal['metropolis', 'importance', 'laplace'] | UnsetType = UNSET
+    method: Literal['metropolis', 'laplace'] | UnsetType = UNSET
     pareto_k: float | UnsetType | None = UNSET
 
 

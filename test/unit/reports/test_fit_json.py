@@ -240,12 +240,12 @@ def test_wider_intervals_and_their_reason_are_in_the_file(fit_result):
 def test_the_approximation_and_its_check_are_in_the_file(fit_result):
     sampler = replace(
         fit_result.sampler,
-        method='importance',
+        method='laplace',
         pareto_k=0.45,
         r_hat=np.full(len(fit_result.parameter_names), np.nan),
     )
     content = msgspec.to_builtins(fit_content(replace(fit_result, sampler=sampler)))
-    assert content['sampler']['method'] == 'importance'
+    assert content['sampler']['method'] == 'laplace'
     assert content['sampler']['pareto_k'] == 0.45
     assert content['sampler']['r_hat_max'] is None
     usual = msgspec.to_builtins(fit_content(fit_result))['sampler']
