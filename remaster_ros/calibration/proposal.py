@@ -30,7 +30,7 @@ TAIL_FREEDOM = 5.0
 TAIL_WIDENING = 1.3
 # Of most draws: hardly wider than a Gaussian, whose bulk a Student t of few degrees of freedom
 # hardly ever hits in tens of dimensions.
-FREEDOM = 30.0
+FREEDOM = 100.0
 # Of the noise's coordinates, logarithms, about the mode.
 FARTHEST = 5.0
 # Of the matrices of draws that are worked on together.
