@@ -1,0 +1,181 @@
+"""Several sessions of one arm as one: the arm is shared, all else is each session's own.
+
+Sensors and markers of a later session are further ones with names of their own: they stand
+elsewhere, err by themselves and have noise of their own. So registrations, markers, errors of the
+sensors and noise are fitted session by session, and the arm once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from remaster_ros.errors import InputError
+from remaster_ros.types import Measurements, Session
+
+
+def together(sessions: Sequence[tuple[str, Session]]) -> Session:
+    """Return one session of all rows.
+
+    Parameters
+    ----------
+    sessions
+        Name of each, for messages, and the session. Names of sensors and markers of the second end
+        in ``_2``; its observations count from `first_observation` on.
+
+    Raises
+    ------
+    InputError
+        Sessions of different robots, or one given twice.
+    """
+    (first_name, first), *others = sessions
+    for index, (name, session) in enumerate(others):
+        _require_same_arm(first_name, first, name, session)
+        for earlier_name, earlier in sessions[: index + 1]:
+            if session.observations_sha256 and (
+                session.observations_sha256 == earlier.observations_sha256
+            ):
+                raise InputError(
+                    f'{name} and {earlier_name} hold the same observations: give each session once'
+                )
+    if not others:
+        return first
+    timed = all(session.timed for _, session in sessions)
+    step = _power_of_ten(max(_largest(session, 'observation') for _, session in sessions))
+    poses = 1 + max(_largest(session, 'pose') for _, session in sessions)
+    configurations = 1 + max(_largest(session, 'configuration') for _, session in sessions)
+    joined, references = first, [first.references]
+    rows = [first.measurements]
+    frames = _next_frame(first.measurements)
+    stamp = _last_stamp(first)
+    for number, (_, session) in enumerate(others, start=2):
+        names = _renamed(session, joined, number)
+
+        def own(part: Measurements, number: int = number) -> Measurements:
+            later = number - 1
+            return replace(
+                part,
+                observation=part.observation + step * later,
+                pose=part.pose + poses * later,
+                configuration=part.configuration + configurations * later,
+                sensor=part.sensor + len(joined.sensors),
+                marker=part.marker + len(joined.markers),
+                # Without times stamps only order the rows.
+                stamp_s=part.stamp_s if timed else part.stamp_s - part.stamp_s.min() + stamp + 1.0,
+                frame=None
+                if part.frame is None
+                else np.where(part.frame < 0, -1, part.frame + frames),
+            )
+
+        rows.append(own(session.measurements))
+        if session.references is not None:
+            references.append(own(session.references))
+        frames += _next_frame(session.measurements)
+        stamp += _last_stamp(session) - float(session.measurements.stamp_s.min()) + 1.0
+        joined = replace(
+            joined,
+            sensors={
+                **joined.sensors,
+                **{names[one]: names[marker] for one, marker in session.sensors.items()},
+            },
+            markers={**joined.markers, **{names[one]: at for one, at in session.markers.items()}},
+            further_markers={
+                **joined.further_markers,
+                **{
+                    names[one]: tuple(names[marker] for marker in further)
+                    for one, further in session.further_markers.items()
+                },
+            },
+            base_prior={
+                **joined.base_prior,
+                **{names[one]: prior for one, prior in session.base_prior.items()},
+            },
+            oriented=joined.oriented | {names[one] for one in session.oriented},
+            # The less is known of any marker, the less is said of each.
+            marker_std_m=max(joined.marker_std_m, session.marker_std_m),
+            settle_s=joined.settle_s if joined.settle_s == session.settle_s else None,
+            notes='; '.join(note for note in (joined.notes, session.notes) if note),
+        )
+    given = [part for part in references if part is not None]
+    return replace(
+        joined,
+        timed=timed,
+        measurements=_stacked(rows),
+        references=_stacked(given) if given else None,
+        observations_sha256='',
+    )
+
+
+def first_observation(session: Session, others: Sequence[Session]) -> list[int]:
+    """Return what is added to the observation numbers of each of the others."""
+    step = _power_of_ten(max(_largest(one, 'observation') for one in (session, *others)))
+    return [step * (index + 1) for index in range(len(others))]
+
+
+def _require_same_arm(first_name: str, first: Session, name: str, session: Session) -> None:
+    for what, one, other in (
+        ('URDF', first.urdf_sha256[:12], session.urdf_sha256[:12]),
+        ('base link', first.base_link, session.base_link),
+        ('tip link', first.tip_link, session.tip_link),
+        ('serial number', first.serial_number, session.serial_number),
+    ):
+        if one and other and one != other:
+            raise InputError(
+                f'{first_name} and {name} are not of one arm: their {what} is {one} and {other}. '
+                'Fit them one by one, or import both with the same description'
+            )
+
+
+def _renamed(session: Session, joined: Session, number: int) -> dict[str, str]:
+    """Return new names of a session's sensors and markers, none of which is taken."""
+    taken = {*joined.sensors, *joined.markers}
+    names = {}
+    for name in dict.fromkeys((*session.sensors, *session.markers)):
+        new = f'{name}_{number}'
+        while new in taken:
+            new += f'_{number}'
+        names[name] = new
+    return names
+
+
+def _stacked(parts: Sequence[Measurements]) -> Measurements:
+    columns: dict[str, Any] = {}
+    for name in vars(parts[0]):
+        values = [getattr(part, name) for part in parts]
+        if all(value is None for value in values):
+            columns[name] = None
+            continue
+        known = next(value for value in values if value is not None)
+        columns[name] = np.concatenate(
+            [
+                _unknown(known, len(part)) if value is None else value
+                for part, value in zip(parts, values, strict=True)
+            ]
+        )
+    return Measurements(**columns)
+
+
+def _unknown(like: Any, count: int) -> Any:
+    """Return a column in which nothing is known: NaN, -1 or False, (count, ...)."""
+    fill = {'f': np.nan, 'i': -1, 'b': False}[like.dtype.kind]
+    return np.full((count, *like.shape[1:]), fill, dtype=like.dtype)
+
+
+def _power_of_ten(largest: int) -> int:
+    return int(10 ** len(str(largest)))
+
+
+def _largest(session: Session, column: str) -> int:
+    parts = [session.measurements, session.references]
+    return max(int(getattr(part, column).max(initial=0)) for part in parts if part is not None)
+
+
+def _next_frame(rows: Measurements) -> int:
+    return 0 if rows.frame is None else int(rows.frame.max(initial=-1)) + 1
+
+
+def _last_stamp(session: Session) -> float:
+    return float(session.measurements.stamp_s.max(initial=0.0))
