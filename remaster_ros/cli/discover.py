@@ -12,7 +12,8 @@ import numpy as np
 
 from remaster_ros.calibration.predictions import Coverage
 from remaster_ros.cli.console import progress_bar, show, show_file
-from remaster_ros.cli.sessions import read_to_fit
+from remaster_ros.cli.options import add_sessions
+from remaster_ros.cli.sessions import read_together
 from remaster_ros.discovery.confirmation import (
     Confirmation,
     confirm,
@@ -44,7 +45,7 @@ MOST_PARAMETERS = 8
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of ``remaster discover``."""
-    parser.add_argument('session', metavar='SESSION', type=Path, help='session folder')
+    add_sessions(parser)
     parser.add_argument('--out', metavar='DIR', type=Path, required=True, help='output folder')
     parser.add_argument(
         '--json', action='store_true', help='print discovery.json in place of a summary'
@@ -66,7 +67,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Search, extend, measure the gain, write, and print a summary of a few lines."""
-    session = read_to_fit(args.session)
+    session, named = read_together(args.session)
     other = None if args.confirm is None else read_session(args.confirm)
     if other is not None:
         # Not after the long search.
@@ -109,6 +110,8 @@ def run(args: argparse.Namespace) -> int:
         assert isinstance(content.judgement, Judgement)
         judged = content.judgement
         coverage = held_out_coverage(found, predictions)
+        for line in named:
+            show(args.quiet, line)
         show(args.quiet, summary(found, judged, confirmation, coverage, content.loadable or ()))
         for one in decided:
             show(args.quiet, one.describe())

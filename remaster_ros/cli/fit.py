@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from remaster_ros.cli.console import progress_bar, show, show_file
-from remaster_ros.cli.options import integer, number
+from remaster_ros.cli.options import add_sessions, integer, number
 
 # What fits and draws is imported where it does so: SciPy and the rest take a second to load, and
 # neither `remaster fit --help` nor a mistyped option needs them.
@@ -21,7 +21,7 @@ log = logging.getLogger('remaster_ros')
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of ``remaster fit``."""
-    parser.add_argument('session', metavar='SESSION', type=Path, help='session folder')
+    add_sessions(parser)
     parser.add_argument('--out', metavar='DIR', type=Path, required=True, help='output folder')
     parser.add_argument('--json', action='store_true', help='print fit.json in place of a summary')
     parser.add_argument(
@@ -61,12 +61,12 @@ def run(args: argparse.Namespace) -> int:
     import numpy as np
 
     from remaster_ros.calibration.fit import fit_session
-    from remaster_ros.cli.sessions import read_to_fit
+    from remaster_ros.cli.sessions import read_together
     from remaster_ros.reports.fit_json import FIT_FILE, prepare_folder, save_fit
     from remaster_ros.session.files import undone_on_failure
     from remaster_ros.session.priors import read_priors
 
-    session = read_to_fit(args.session)
+    session, named = read_together(args.session)
     priors = read_priors(args.prior) if args.prior is not None else None
     with undone_on_failure(), progress_bar(args.quiet or args.json) as progress:
         # Before the fit: an hour of sampling must not end at a folder that cannot be written.
@@ -89,7 +89,8 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         show_file(args.out / FIT_FILE)
     else:
-        show(args.quiet, summary(result))
+        for line in (*named, summary(result)):
+            show(args.quiet, line)
         show(args.quiet, f'written: {report}')
     return 0
 

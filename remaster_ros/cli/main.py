@@ -70,7 +70,10 @@ def build_parser(chosen: str | None) -> argparse.ArgumentParser:
 
 def _mending(args: argparse.Namespace, options: str) -> str:
     """Return the command that writes the session at hand without the mistake found in it."""
-    session = str(args.session).rstrip(os.sep)
+    given = args.session if isinstance(args.session, list) else [args.session]
+    if len(given) > 1:
+        return 'fit each session by itself: the one with the mistake then names the command'
+    session = str(given[0]).rstrip(os.sep)
     return f'remaster import {quote(session)} {options} --out {quote(f"{session}-mended")}'
 
 

@@ -106,3 +106,15 @@ def names(text: str) -> tuple[str, ...]:
     if len(set(found)) < len(found):
         raise argparse.ArgumentTypeError(f'{text!r} names one of them twice')
     return found
+
+
+def add_sessions(parser: argparse.ArgumentParser) -> None:
+    """Add the sessions of ``remaster fit`` and ``remaster discover``."""
+    parser.add_argument(
+        'session',
+        metavar='SESSION',
+        type=Path,
+        nargs='+',
+        help='session folder; of several the arm is one, all else is of each session: '
+        'registrations, markers, noise, errors of the sensors',
+    )

@@ -2,12 +2,28 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from remaster_ros.calibration.mistakes import sound_estimate
 from remaster_ros.errors import InputError, InsufficientDataError, MistakeFoundError
 from remaster_ros.session.reader import read_session
+from remaster_ros.session.together import together
 from remaster_ros.types import Session
+
+
+def read_together(folders: Sequence[Path]) -> tuple[Session, list[str]]:
+    """Read one session or several of one arm, and lines on how their rows are named.
+
+    Raises
+    ------
+    InputError
+        As `read_to_fit` and `together`.
+    """
+    sessions = [(str(folder), read_to_fit(folder)) for folder in folders]
+    if len(sessions) == 1:
+        return sessions[0][1], []
+    return together(sessions)
 
 
 def read_to_fit(folder: Path) -> Session:

@@ -7,7 +7,7 @@ sensors and noise are fitted session by session, and the arm once.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -17,14 +17,14 @@ from remaster_ros.errors import InputError
 from remaster_ros.types import Measurements, Session
 
 
-def together(sessions: Sequence[tuple[str, Session]]) -> Session:
-    """Return one session of all rows.
+def together(sessions: Sequence[tuple[str, Session]]) -> tuple[Session, list[str]]:
+    """Return one session of all rows, and for each later session a line on how its rows are named.
 
     Parameters
     ----------
     sessions
         Name of each, for messages, and the session. Names of sensors and markers of the second end
-        in ``_2``; its observations count from `first_observation` on.
+        in ``_2``; to the numbers of its observations a power of ten is added.
 
     Raises
     ------
@@ -41,8 +41,6 @@ def together(sessions: Sequence[tuple[str, Session]]) -> Session:
                 raise InputError(
                     f'{name} and {earlier_name} hold the same observations: give each session once'
                 )
-    if not others:
-        return first
     timed = all(session.timed for _, session in sessions)
     step = _power_of_ten(max(_largest(session, 'observation') for _, session in sessions))
     poses = 1 + max(_largest(session, 'pose') for _, session in sessions)
@@ -51,28 +49,26 @@ def together(sessions: Sequence[tuple[str, Session]]) -> Session:
     rows = [first.measurements]
     frames = _next_frame(first.measurements)
     stamp = _last_stamp(first)
-    for number, (_, session) in enumerate(others, start=2):
+    lines = []
+    for number, (name, session) in enumerate(others, start=2):
         names = _renamed(session, joined, number)
+        lines.append(
+            f'{name}: its sensors and markers are {", ".join(names.values())}, its observation 1 '
+            f'is {step * (number - 1) + 1}'
+        )
 
-        def own(part: Measurements, number: int = number) -> Measurements:
-            later = number - 1
-            return replace(
-                part,
-                observation=part.observation + step * later,
-                pose=part.pose + poses * later,
-                configuration=part.configuration + configurations * later,
-                sensor=part.sensor + len(joined.sensors),
-                marker=part.marker + len(joined.markers),
-                # Without times stamps only order the rows.
-                stamp_s=part.stamp_s if timed else part.stamp_s - part.stamp_s.min() + stamp + 1.0,
-                frame=None
-                if part.frame is None
-                else np.where(part.frame < 0, -1, part.frame + frames),
-            )
-
-        rows.append(own(session.measurements))
+        added = {
+            'observation': step * (number - 1),
+            'pose': poses * (number - 1),
+            'configuration': configurations * (number - 1),
+            'sensor': len(joined.sensors),
+            'marker': len(joined.markers),
+            # Without times stamps only order the rows.
+            'stamp_s': 0.0 if timed else stamp + 1.0 - float(session.measurements.stamp_s.min()),
+        }
+        rows.append(_counted_on(session.measurements, added, frames))
         if session.references is not None:
-            references.append(own(session.references))
+            references.append(_counted_on(session.references, added, frames))
         frames += _next_frame(session.measurements)
         stamp += _last_stamp(session) - float(session.measurements.stamp_s.min()) + 1.0
         joined = replace(
@@ -100,19 +96,14 @@ def together(sessions: Sequence[tuple[str, Session]]) -> Session:
             notes='; '.join(note for note in (joined.notes, session.notes) if note),
         )
     given = [part for part in references if part is not None]
-    return replace(
+    whole = replace(
         joined,
         timed=timed,
         measurements=_stacked(rows),
         references=_stacked(given) if given else None,
         observations_sha256='',
     )
-
-
-def first_observation(session: Session, others: Sequence[Session]) -> list[int]:
-    """Return what is added to the observation numbers of each of the others."""
-    step = _power_of_ten(max(_largest(one, 'observation') for one in (session, *others)))
-    return [step * (index + 1) for index in range(len(others))]
+    return whole, lines
 
 
 def _require_same_arm(first_name: str, first: Session, name: str, session: Session) -> None:
@@ -139,6 +130,14 @@ def _renamed(session: Session, joined: Session, number: int) -> dict[str, str]:
             new += f'_{number}'
         names[name] = new
     return names
+
+
+def _counted_on(part: Measurements, added: Mapping[str, float], frames: int) -> Measurements:
+    """Return rows with something added to their columns, and to the frames that there are."""
+    columns = {name: getattr(part, name) + more for name, more in added.items()}
+    if part.frame is not None:
+        columns['frame'] = np.where(part.frame < 0, -1, part.frame + frames)
+    return replace(part, **columns)
 
 
 def _stacked(parts: Sequence[Measurements]) -> Measurements:

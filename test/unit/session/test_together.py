@@ -1,0 +1,89 @@
+"""Several sessions of one arm: one set of offsets, registrations and markers of each session."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from command_line import refusal, remaster
+
+import remaster_ros
+from remaster_ros.calibration.estimate import Problem, estimate
+from remaster_ros.discovery.to_extension import offsets_of
+from remaster_ros.errors import InputError
+from remaster_ros.kinematics.transforms import rotation_vector_to_matrix
+from remaster_ros.session.reader import write_session
+from remaster_ros.session.together import together
+
+SEED = 5
+
+
+@pytest.fixture(scope='module')
+def made():
+    return remaster_ros.simulate(poses=40, validation_poses=12, seed=SEED)
+
+
+@pytest.fixture(scope='module')
+def halves(made):
+    """Two sessions with no pose in common; before the second the sensors were set up anew."""
+    session = made.session
+    poses = np.unique(session.measurements.pose)
+    first = np.isin(session.measurements.pose, poses[::2])
+    one, other = session.select(first), session.select(~first)
+    turned = rotation_vector_to_matrix(np.array([0.02, -0.3, 0.5]))
+    moved = other.measurements.position @ turned.T + np.array([0.3, -0.2, 0.1])
+    return one, replace(other, measurements=replace(other.measurements, position=moved))
+
+
+def test_the_arm_is_shared_and_registrations_are_not(made, halves) -> None:
+    print('seed', SEED)
+    whole, lines = together([('monday', halves[0]), ('tuesday', halves[1])])
+    assert len(whole.measurements) == sum(len(half.measurements) for half in halves)
+    assert len(np.unique(whole.measurements.observation)) == len(whole.measurements)
+    assert len(lines) == 1
+    assert 'tuesday' in lines[0]
+    assert 'mocap_2' in lines[0]
+    stds = []
+    for session in (*halves, whole):
+        offsets, std = offsets_of(estimate(Problem.of(session)))
+        known = std < np.radians(1.0)
+        assert known.sum() >= 5
+        # Beyond four standard deviations in one of 16,000 offsets.
+        error = np.abs(offsets - made.truth.joint_offsets)[known]
+        assert np.all(error < 4.0 * std[known])
+        stds.append(std[known])
+    assert np.all(stds[2] < np.minimum(stds[0], stds[1]))
+
+
+def test_what_is_not_of_one_arm_is_refused_by_name(halves) -> None:
+    other = replace(halves[1], urdf=halves[1].urdf + '<!-- another -->')
+    with pytest.raises(InputError, match='monday and tuesday are not of one arm: their URDF'):
+        together([('monday', halves[0]), ('tuesday', other)])
+    same = replace(halves[0], observations_sha256='ab' * 32)
+    with pytest.raises(InputError, match='give each session once'):
+        together([('monday', same), ('copy', same)])
+
+
+def test_sessions_without_times_stay_in_their_order(halves) -> None:
+    first, second = (replace(half, timed=False) for half in halves)
+    whole, _ = together([('a', first), ('b', second)])
+    assert not whole.timed
+    stamps, count = whole.measurements.stamp_s, len(first.measurements)
+    assert stamps[:count].max() < stamps[count:].min()
+    mixed, _ = together([('a', halves[0]), ('b', second)])
+    assert not mixed.timed
+
+
+def test_fit_takes_several_sessions(halves, tmp_path) -> None:
+    for name, half in zip('ab', halves, strict=True):
+        write_session(tmp_path / name, half)
+    out = tmp_path / 'fit'
+    sessions = [str(tmp_path / name) for name in 'ab']
+    done = remaster('fit', *sessions, '--out', out, '--no-figures')
+    assert 'its sensors and markers are mocap_2' in done.stdout
+    content = json.loads((out / 'fit.json').read_text())
+    assert {'mocap', 'mocap_2'} <= set(content['registration'])
+    said = refusal('fit', sessions[0], sessions[0], '--out', tmp_path / 'twice', '--no-figures')
+    assert 'give each session once' in said
