@@ -372,11 +372,20 @@ def complete(found: Estimate, search: Search, named: Solution) -> tuple[Solution
     data, cells = search.data, search.catalogue.cells
     members = by_members(named, search.families)
     of_a_kind = {name for family in kinds(data, cells) for name in family.parameters}
-    own = [cell for cell in members.cells if not of_a_kind.issuperset(cell.parameters)]
+    # A curve has a smoothness of its own: that of all together fits none of them.
+    own = [
+        cell
+        for cell in members.cells
+        if cell.penalty is not None or not of_a_kind.issuperset(cell.parameters)
+    ]
     every = kinds(data, cells, own)
     whole = fit_kinds(data, own, every)
-    price = NAMED if not named.cells else -NEEDED
-    if whole is not None and whole.log_evidence > named.log_evidence + price:
+    nothing = search.fit(())
+    assert nothing is not None
+    # Each choice may be wrong by the odds that decided it; and chance must not be a model.
+    least = named.log_evidence - NEEDED * len(named.cells)
+    least = max(least, nothing.log_evidence + NAMED)
+    if whole is not None and whole.log_evidence > least:
         joint = by_members(whole, every)
         return joint, np.zeros((found.model.size + len(joint.parameters), 0))
     others = kinds(data, cells, members.cells)
