@@ -148,9 +148,8 @@ class FoundEffect:
                 )
                 for cell in group
             )
-        found = replace(
-            self, parameters=parameters, sizes=sizes, cause=with_sizes(self.cause, sizes)
-        )
+        found = replace(self, parameters=parameters, sizes=sizes)
+        found = replace(found, cause=with_sizes(self.cause, found._clear_sizes(group)))
         if found.sigmas >= UNCERTAIN:
             return found
         doubt = (
@@ -159,6 +158,21 @@ class FoundEffect:
             'acted on.'
         )
         return replace(found, cause=f'{found.cause} {doubt}')
+
+    def _clear_sizes(self, group: Sequence[Cell]) -> tuple[str, ...]:
+        """Return the sizes that are more than their uncertainty, and how many others there are."""
+        sigmas = {one.name: abs(one.value) / one.std for one in self.parameters if one.std > 0.0}
+        clear = tuple(
+            size
+            for size, cell in zip(self.sizes, group, strict=False)
+            if max((sigmas.get(name, np.inf) for name in cell.parameters), default=np.inf)
+            >= UNCERTAIN
+        )
+        others = len(self.sizes) - len(clear)
+        if not clear or not others:
+            return self.sizes
+        rest = f'{others} more' if others > 1 else 'one more'
+        return (*clear, f'{rest} within two standard deviations of nothing')
 
     @property
     def sigmas(self) -> float:
