@@ -9,7 +9,7 @@ gain, and refuse a model that predicts them worse than the offsets do.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -189,7 +189,12 @@ def discover_session(
     unexplained: tuple[Unexplained, ...] = ()
     sampled: _Sampled | None = None
     try:
-        sampled = _sampled(session, before, found, search, named, described, rng, report, clock)
+        for every in (True, False):
+            sampled = _sampled(session, before, found, search, named, every, rng, report, clock)
+            # Kinds that nobody named may be what does harm.
+            if not is_harmful(sampled.gain) or sampled.by_name:
+                break
+        assert sampled is not None
         if is_harmful(sampled.gain):
             if described:
                 unexplained = (harm_of(before, sampled.fit, sampled.gain, described),)
@@ -202,7 +207,7 @@ def discover_session(
         empty = search.fit(())
         assert empty is not None
         named, groups, described = empty, (), ()
-        sampled = _sampled(session, before, found, search, named, (), rng, report, clock)
+        sampled = _sampled(session, before, found, search, named, False, rng, report, clock)
     data, solution, fit, gain = search.data, sampled.solution, sampled.fit, sampled.gain
     is_cause = [EFFECTS[group[0].name].is_cause for group in groups]
     structure = tuple(e for e, cause in zip(described, is_cause, strict=True) if not cause)
@@ -315,9 +320,12 @@ def _that_help(
 
 @dataclass(frozen=True, eq=False)
 class _Sampled:
+    """A sampled model, its gain, and whether it has nothing but what has a name."""
+
     solution: Solution
     fit: FitResult
     gain: Gain
+    by_name: bool
 
 
 def _sampled(
@@ -326,14 +334,19 @@ def _sampled(
     found: Estimate,
     search: Search,
     named: Solution,
-    described: Sequence[FoundEffect],
+    every: bool,
     rng: np.random.Generator,
     report: Progress,
     clock: Callable[[], float] | None,
 ) -> _Sampled:
-    """Sample the model of the causes and of all kinds of errors, and measure its gain."""
+    """Sample the model of the causes, or of all kinds of errors, and measure its gain."""
     data = search.data
-    solution, unmodelled = complete(found, search, named)
+    solution = of_all_kinds(search, named) if every else None
+    by_name = solution is None
+    if solution is None:
+        solution, unmodelled = by_names(found, search, named)
+    else:
+        unmodelled = np.zeros((found.model.size + len(solution.parameters), 0))
     if solution.cells:
         unmodelled = np.concatenate(
             (unmodelled, moved_by_open_offsets(found, data, solution)), axis=1
@@ -349,17 +362,39 @@ def _sampled(
         unmodelled=unmodelled,
         progress=lambda _, share: report('sampling the extended model', share),
     )
-    return _Sampled(solution, fit, gain_of(before, data, solution, fit, rng))
+    return _Sampled(solution, fit, gain_of(before, data, solution, fit, rng), by_name)
 
 
-def complete(found: Estimate, search: Search, named: Solution) -> tuple[Solution, FloatArray]:
-    """Return the model of all kinds of errors, or of the causes and how the others would move it.
+def of_all_kinds(search: Search, named: Solution) -> Solution | None:
+    """Return the model of all kinds of errors, by members; None where the causes say more.
 
     A name is a choice among thousands: two halves of one session are not given the same names.
     Offsets, lengths and predictions come from all kinds at once, each with one variance for all
-    its members, named or not. Where so many members explain less than the few causes (one joint
-    errs and no other), or where nothing is there, the causes stay by themselves, and the variances
-    of all other kinds move what was fitted.
+    its members, named or not. Not where so many members explain less than the few causes (one
+    joint errs and no other), or where nothing is there.
+    """
+    data, cells = search.data, search.catalogue.cells
+    of_a_kind = {name for family in kinds(data, cells) for name in family.parameters}
+    # A curve has a smoothness of its own: that of all together fits none of them.
+    own = [
+        cell
+        for cell in by_members(named, search.families).cells
+        if cell.penalty is not None or not of_a_kind.issuperset(cell.parameters)
+    ]
+    every = kinds(data, cells, own)
+    whole = fit_kinds(data, own, every)
+    nothing = search.fit(())
+    if whole is None or nothing is None:
+        return None
+    # Each choice may be wrong by the odds that decided it; and chance must not be a model.
+    least = named.log_evidence - NEEDED * len(named.cells)
+    if whole.log_evidence < max(least, nothing.log_evidence + NAMED):
+        return None
+    return by_members(whole, every)
+
+
+def by_names(found: Estimate, search: Search, named: Solution) -> tuple[Solution, FloatArray]:
+    """Return the model of the causes alone, and how errors of all other kinds would move it.
 
     Returns
     -------
@@ -369,26 +404,9 @@ def complete(found: Estimate, search: Search, named: Solution) -> tuple[Solution
         Of all natural parameters of the fit and those of the solution, one standard deviation of
         each weight of a kind that is not in it, (size + m, c).
     """
-    data, cells = search.data, search.catalogue.cells
+    data = search.data
     members = by_members(named, search.families)
-    of_a_kind = {name for family in kinds(data, cells) for name in family.parameters}
-    # A curve has a smoothness of its own: that of all together fits none of them.
-    own = [
-        cell
-        for cell in members.cells
-        if cell.penalty is not None or not of_a_kind.issuperset(cell.parameters)
-    ]
-    every = kinds(data, cells, own)
-    whole = fit_kinds(data, own, every)
-    nothing = search.fit(())
-    assert nothing is not None
-    # Each choice may be wrong by the odds that decided it; and chance must not be a model.
-    least = named.log_evidence - NEEDED * len(named.cells)
-    least = max(least, nothing.log_evidence + NAMED)
-    if whole is not None and whole.log_evidence > least:
-        joint = by_members(whole, every)
-        return joint, np.zeros((found.model.size + len(joint.parameters), 0))
-    others = kinds(data, cells, members.cells)
+    others = kinds(data, search.catalogue.cells, members.cells)
     beside = solve(data, (*named.cells, *(family.cell for family in others)), named)
     if beside is None or not others:
         return members, np.zeros((found.model.size + len(members.parameters), 0))
