@@ -7,8 +7,8 @@ Randomness comes from a seed: the same one gives the same result.
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, Literal
 
 from remaster_ros.version import __version__
 
@@ -25,9 +25,11 @@ __all__ = [
     '__version__',
     'discover',
     'fit',
+    'import_table',
     'plan',
     'read_compensation',
     'read_session',
+    'session_from',
     'simulate',
 ]
 
@@ -56,6 +58,115 @@ def read_session(folder: str | os.PathLike[str]) -> Session:
     from remaster_ros.session import reader
 
     return reader.read_session(folder)
+
+
+def session_from(
+    joints: Any,
+    points: Any,
+    urdf: str | os.PathLike[str],
+    *,
+    base_link: str | None = None,
+    tip_link: str | None = None,
+    seed: int = 0,
+) -> Session:
+    """Make a session of arrays.
+
+    Parameters
+    ----------
+    joints
+        Reported joint angles, rad, (n, k), base to tip; or a data frame (or a dict of arrays) with
+        a column for each joint of the URDF.
+    points
+        Measured marker positions in the sensor's own frame, m, (n, 3); or columns x, y and z.
+    urdf
+        File of the nominal arm.
+    base_link, tip_link
+        Ends of the arm; None for the likely ones.
+    seed
+        Of the poses that are held out.
+
+    Raises
+    ------
+    InputError
+        What is wrong, with the row or column.
+    InsufficientDataError
+        The data do not fit the robot; which change would make them.
+
+    Examples
+    --------
+    >>> import remaster_ros
+    >>> remaster_ros.session_from([[0.0]], [[0.0, 0.0, 0.0]], 'no_such.urdf')
+    Traceback (most recent call last):
+    ...
+    remaster_ros.errors.InputError: no_such.urdf: ...
+    """
+    from remaster_ros.importing import in_python
+
+    robot = in_python.robot_of(urdf, base_link, tip_link)
+    return in_python.of_arrays(joints, points, robot, seed)
+
+
+def import_table(
+    *files: str | os.PathLike[str],
+    urdf: str | os.PathLike[str],
+    base_link: str | None = None,
+    tip_link: str | None = None,
+    joints: Sequence[str] = (),
+    points: Sequence[str] = (),
+    join: Literal['', 'name', 'time', 'order'] = '',
+    couple: Mapping[str, str] | None = None,
+    reverse: Sequence[str] = (),
+    offset_deg: Mapping[str, float] | None = None,
+    seed: int = 0,
+) -> Session:
+    """Make a session of one table with joints and points, or of two, as ``remaster import`` does.
+
+    Parameters
+    ----------
+    files
+        Tables, or makers' own texts.
+    urdf, base_link, tip_link, seed
+        As of `session_from`.
+    joints, points, join
+        Names of columns, and how two tables are joined, where that is not found.
+    couple, reverse, offset_deg
+        Corrections of the joints: joint -> another one that is added (``'-J2'``: subtracted),
+        those that count the other way round, and joint -> angle that is added, degrees.
+
+    Raises
+    ------
+    InputError
+        What is wrong, with file, line and column.
+    InsufficientDataError
+        The data do not fit the robot; which change would make them.
+
+    Examples
+    --------
+    >>> import remaster_ros
+    >>> remaster_ros.import_table('no_such.csv', urdf='no_such.urdf')
+    Traceback (most recent call last):
+    ...
+    remaster_ros.errors.InputError: no_such.urdf: ...
+    """
+    from remaster_ros.importing import in_python
+    from remaster_ros.importing.assemble import SessionOptions
+    from remaster_ros.importing.columns import Told
+    from remaster_ros.importing.rows import TableOptions
+
+    added = (
+        (name, (other.lstrip('+-'), other[:1] == '-')) for name, other in (couple or {}).items()
+    )
+    return in_python.of_files(
+        files,
+        in_python.robot_of(urdf, base_link, tip_link),
+        TableOptions(told=Told(tuple(joints), tuple(points)), join=join),
+        SessionOptions(
+            couple=tuple((name, (other, -1 if minus else 1)) for name, (other, minus) in added),
+            reverse=tuple(reverse),
+            add_deg=tuple((offset_deg or {}).items()),
+        ),
+        seed,
+    )
 
 
 def fit(session: Session, *, seed: int = 0, priors: Priors | None = None) -> FitResult:

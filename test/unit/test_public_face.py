@@ -23,8 +23,9 @@ def test_the_example_of_each_function_runs(name):
     assert result.failed == 0
 
 
-def test_there_are_six():
-    expected = ['discover', 'fit', 'plan', 'read_compensation', 'read_session', 'simulate']
+def test_there_are_eight():
+    expected = ['discover', 'fit', 'import_table', 'plan', 'read_compensation', 'read_session']
+    expected += ['session_from', 'simulate']
     assert sorted(FUNCTIONS) == expected
 
 
