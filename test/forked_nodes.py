@@ -22,6 +22,7 @@ import socket
 import subprocess
 import sys
 import tempfile
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +39,7 @@ CORE = (
 )
 _PR_SET_NAME, _PR_SET_CHILD_SUBREAPER = 15, 36
 _MOST_BYTES = 1 << 20
+_asking = threading.Lock()
 
 
 class NodeProcess(subprocess.Popen):
@@ -55,10 +57,11 @@ class NodeProcess(subprocess.Popen):
             'environment': dict(os.environ if given['env'] is None else given['env']),
             'folder': str(given['cwd'] or os.getcwd()),
         }
-        server, _ = _server()
+        server, _ = _server(os.getpid())
         given_streams = [stream if stream != -1 else at for at, stream in enumerate(streams)]
-        socket.send_fds(server, [json.dumps(request).encode()], given_streams)
-        self.pid = int(server.recv(32))
+        with _asking:
+            socket.send_fds(server, [json.dumps(request).encode()], given_streams)
+            self.pid = int(server.recv(32))
         self._child_created = True
         self._close_pipe_fds(
             *(given[name] for name in ('p2cread', 'p2cwrite', 'c2pread', 'c2pwrite')),
@@ -67,8 +70,11 @@ class NodeProcess(subprocess.Popen):
 
 
 @functools.cache
-def _server() -> tuple[socket.socket, subprocess.Popen[bytes]]:
-    """Start the process that forks nodes; return a connection, whose end ends it."""
+def _server(_owner: int) -> tuple[socket.socket, subprocess.Popen[bytes]]:
+    """Start the process that forks nodes; return a connection, whose end ends it.
+
+    A process of its own has each process that starts nodes.
+    """
     # A fork of it is a child of this process once it has no parent: it is waited for as any other.
     if ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0):
         raise OSError(ctypes.get_errno(), 'prctl')
