@@ -85,6 +85,8 @@ class CollectionRun:
                 reason = f'{" and ".join(others)} did not take part in its run'
             elif bridge.halted:
                 reason = f'the arm is halted: {bridge.halted}'
+            elif bridge.asks_for_collect:
+                reason = bridge.asks_for_collect
             elif recorder.changed_run in (self.left, ''):
                 reason = recorder.changed
         left, self.left = self.left, ''

@@ -119,6 +119,8 @@ class BridgeState(Body, frozen=True, kw_only=True, tag='bridge'):
         Stamp of the pose whose solutions the bridge has, '' for none.
     run
         Token of the last run that the bridge has seen running.
+    asks_for_collect
+        Why nothing moves in this run before a person calls /remaster/collect, and that; ''.
     joints_age_s, joints_trouble
         Time since the last usable joint_states, None for never, s; what is wrong with them.
     """
@@ -127,6 +129,7 @@ class BridgeState(Body, frozen=True, kw_only=True, tag='bridge'):
     halted: str
     pose: str = ''
     run: str = ''
+    asks_for_collect: str = ''
     joints_age_s: float | None = None
     joints_trouble: str = ''
 

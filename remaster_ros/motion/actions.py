@@ -133,6 +133,9 @@ class SupervisorRules:
         An arm may be so far behind its trajectory (robot time).
     failures_in_a_row
         So many configurations that the robot did not reach, and it is halted.
+    resume_alone_s
+        After a longer interruption only a person goes on, unless the robot's safety circuit was
+        known to be released all the time (wall time).
     """
 
     settle: SettleRules = field(default_factory=SettleRules)
@@ -143,3 +146,4 @@ class SupervisorRules:
     reaction_s: float = 0.5
     lag_s: float = 0.35
     failures_in_a_row: int = 3
+    resume_alone_s: float = 5.0

@@ -15,6 +15,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+import numpy as np
+
 from remaster_ros.motion.actions import (
     Action,
     Drive,
@@ -30,7 +32,14 @@ from remaster_ros.motion.joint_reports import JointReport, JointReports
 from remaster_ros.motion.limits import MotionLimits
 from remaster_ros.motion.motion_gate import MotionGate, MotionRefusedError, StartMovedError
 from remaster_ros.motion.motion_under_way import MotionUnderWay
-from remaster_ros.motion.move_queue import NO_WAYPOINTS, PROBE, STANDING, WAY_OUT, MoveQueue
+from remaster_ros.motion.move_queue import (
+    NO_WAYPOINTS,
+    PROBE,
+    STANDING,
+    WAY_OUT,
+    MoveQueue,
+    probe_path,
+)
 from remaster_ros.motion.path_check import FreePath
 from remaster_ros.motion.visit import Visit
 from remaster_ros.types import FloatArray
@@ -57,6 +66,9 @@ class ArmSupervisor:
         See `SupervisorRules`.
     halted
         Why the arm was halted already before this process started; ''.
+    end
+        Where the last command led before this process started, rad, (k,); None where that is not
+        known.
 
     Attributes
     ----------
@@ -65,13 +77,23 @@ class ArmSupervisor:
     """
 
     def __init__(
-        self, gate: MotionGate, reports: JointReports, rules: SupervisorRules, halted: str = ''
+        self,
+        gate: MotionGate,
+        reports: JointReports,
+        rules: SupervisorRules,
+        halted: str = '',
+        end: FloatArray | None = None,
     ) -> None:
         self.gate, self.reports, self.rules = gate, reports, rules
         self.halted = halted
-        self._interlocks = Interlocks(rules.heartbeat_s)
+        self._interlocks = Interlocks(rules.heartbeat_s, rules.resume_alone_s)
         self._queue = MoveQueue()
-        self._motion = MotionUnderWay(gate, rules)
+        self._motion = MotionUnderWay(gate, rules, end)
+        # Where the arm is reported, which a person was asked to compare with the pad; whether a
+        # person has confirmed it, and no probe has been made since.
+        self._asked: FloatArray | None = None
+        self._confirmed = False
+        self._wall = -np.inf
         self._failures = self._refusals = 0
         self._paused = False
         self._seen: Seen | None = None
@@ -89,6 +111,8 @@ class ArmSupervisor:
         self._paused = state == 'paused'
         if self._interlocks.planner(reason, run, wall_s):
             self._failures = self._refusals = 0
+            # A person may have moved the arm meanwhile.
+            self._queue.begin_anew()
         return self.tick(wall_s)
 
     def recorder_waits(self, waiting_for: str, wall_s: float) -> list[Action]:
@@ -173,6 +197,7 @@ class ArmSupervisor:
             # clock was set. In a pause it is not, or late reports would be usual afterwards.
             self.reports.forget()
             self._seen = None
+            self._queue.begin_anew()
         return self.tick(wall_s)
 
     def path_found(self, number: int, answer: PathAnswer, wall_s: float) -> list[Action]:
@@ -186,7 +211,7 @@ class ArmSupervisor:
         solution = request[1]
         if answer.path is None and answer.at_start:
             return self._halt(self._queue.offer(answer, self.gate.limits.names))
-        if solution == STANDING:
+        if solution == STANDING and answer.path is not None:
             self._queue.must_look = False
             return self.tick(wall_s)
         if answer.path is None:
@@ -197,12 +222,20 @@ class ArmSupervisor:
         """End the halt, on behalf of a person; return why that is refused, '' if it is not.
 
         Other reasons not to move remain, and nothing moves before a person begins the collection
-        again.
+        again. Where the arm is reported elsewhere than the last command led, a person is told so
+        first: the halt is ended by a second call, while it is still reported there.
         """
         if self._interlocks.reason('safety'):
             return self._interlocks.reason('safety')
         if not self.halted:
             return 'the arm is not halted'
+        seen = self._seen
+        if seen is not None and seen.is_fresh(self._wall) and self._elsewhere(seen.q):
+            asked, self._asked = self._asked, seen.q
+            if asked is None or self._differs(asked, seen.q):
+                return self._elsewhere(seen.q)
+            self._motion.end, self._confirmed = seen.q, True
+        self._asked = None
         self.halted = ''
         self._interlocks.must_collect = 'the halt was cleared'
         self._queue.start_over()
@@ -232,16 +265,19 @@ class ArmSupervisor:
         self._motion.braking = None
         return [] if self.halted else self._halt(why)
 
+    def interrupted(self, since_wall_s: float) -> None:
+        """Process since when a bridge before this one has been gone, s of wall time."""
+        self._interlocks.interrupted(since_wall_s)
+
     def not_sent(self, command: Drive | Stop, wall_s: float) -> list[Action]:
         """Process that a command was not published, as this process was paused since its decision.
 
         A move is decided again after all that arrived meanwhile is processed. An arm that was to
         be stopped goes on, and where it is now is not known.
         """
+        self._motion.take_back()
         if isinstance(command, Drive):
-            self._motion.visit = None
             return []
-        self._motion.braking = None
         late_s = wall_s - command.wall_s
         return self._halt(
             f'{command.reason}; this process was paused for {late_s:.2f} s just then: nothing is '
@@ -250,13 +286,17 @@ class ArmSupervisor:
 
     def tick(self, wall_s: float) -> list[Action]:
         """Check the time: stop or halt on silence, go on when nothing is in the way."""
+        self._wall = wall_s
         self._interlocks.look(wall_s)
+        self._interlocks.look_at_interruption(wall_s)
         if self.halted:
             return []
         emergency = self._interlocks.reason('safety')
         if emergency:
             return self._halt(emergency)
         silent = self._interlocks.fell_silent('robot', wall_s)
+        if silent:
+            self._queue.begin_anew()
         if silent and self._engaged:
             return self._halt(silent)
         blocked = self.blocked(wall_s)
@@ -269,6 +309,16 @@ class ArmSupervisor:
         """Whether a collection runs, or the arm may still move by a command of this program."""
         running = self._interlocks.was_right('planner')
         return running or not self._motion.is_idle or self._queue.pending is not None
+
+    @property
+    def asks_for_collect(self) -> str:
+        """Why nothing moves in this run before a person calls /remaster/collect; ''."""
+        return self._interlocks.asks_for_collect
+
+    @property
+    def end(self) -> FloatArray | None:
+        """Where the last command led, rad, (k,); None where that is not known."""
+        return self._motion.end
 
     @property
     def busy(self) -> bool:
@@ -315,6 +365,36 @@ class ArmSupervisor:
             return ''
         return f'the robot was not observed for {gap_s / self._rate:.1f} s'
 
+    # Inside: where the arm is
+
+    def _differs(self, q: FloatArray, other: FloatArray) -> bool:
+        return bool(np.max(np.abs(q - other)) > self.rules.settle.arrive_tolerance)
+
+    def _elsewhere(self, q: FloatArray) -> str:
+        """Return that the arm is reported elsewhere than the last command led, and what to do; ''.
+
+        Parameters
+        ----------
+        q
+            Where it is reported, rad, (k,).
+        """
+        end = self._motion.end
+        if end is None or not self._differs(q, end):
+            return ''
+        off = np.abs(q - end) > self.rules.settle.arrive_tolerance
+        joints = ', '.join(
+            f'{name} at {is_at:.2f} deg, {is_at - led:+.2f} deg from there'
+            for name, is_at, led, differs in zip(
+                self.gate.limits.names, np.rad2deg(q), np.rad2deg(end), off
+            )
+            if differs
+        )
+        return (
+            f'the arm is not reported where the last command led: {joints}; compare with the '
+            "robot's own display: where it shows the same angles, /remaster/clear_halt confirms "
+            'them; where it does not, joint_states are wrong: see to the driver first'
+        )
+
     # Inside: the next configuration
 
     def _go_on(self, wall_s: float) -> list[Action]:
@@ -323,12 +403,17 @@ class ArmSupervisor:
         idle = self._motion.is_idle and queue.pending is None
         if seen is None or not idle or not seen.stands(wall_s):
             return []
+        elsewhere = self._elsewhere(seen.q)
+        if elsewhere:
+            self._asked = seen.q
+            return self._halt(elsewhere)
+        if queue.probe_is_next:
+            return self._drive(PROBE, probe_path(seen.q, self.gate.limits), seen, wall_s)
         if queue.way_out is not None:
             path, queue.way_out = queue.way_out, None
             return self._drive(WAY_OUT, path, seen, wall_s)
-        before = queue.preparation(seen.q, self.gate.limits)
-        if before is not None:
-            return [before]
+        if queue.must_look:
+            return [queue.ask(STANDING, seen.q, seen.q)]
         actions: list[Action] = []
         while (target := queue.target) is not None and not self.halted:
             outside = self.gate.limits.outside(target)
@@ -338,8 +423,12 @@ class ArmSupervisor:
         return actions
 
     def _drive(self, solution: int, path: FreePath, seen: Seen, wall_s: float) -> list[Action]:
+        doubtful = None
+        if solution == PROBE:
+            unknown = self._motion.end is None or self._confirmed
+            doubtful = np.logical_or(seen.frozen(), unknown)
         try:
-            return [self._motion.begin(solution, path, seen, wall_s, self._rate)]
+            return [self._motion.begin(solution, path, seen, wall_s, self._rate, doubtful)]
         except StartMovedError:
             # The arm has moved since the path was asked for: it is asked for again.
             return []
@@ -372,7 +461,8 @@ class ArmSupervisor:
         if visit is None:
             return []
         if outcome == 'over':
-            self._motion.visit, self._queue.must_probe = None, visit.solution != PROBE
+            self._motion.visit, self._queue.must_probe = None, False
+            self._confirmed = False
         if outcome == 'settled':
             self._failures = self._refusals = 0
             return [visit.settled_at(seen)]
@@ -398,7 +488,8 @@ class ArmSupervisor:
         """Halt; with a time the arm is stopped first, where it is known to follow its path."""
         stops: list[Stop] = []
         seen = self._seen
-        if stop_wall_s is not None and seen is not None and self._motion.is_moving:
+        moving = self._motion.is_moving and not self._motion.is_probing
+        if stop_wall_s is not None and seen is not None and moving:
             known = not self._motion.lost(seen, stop_wall_s)
             stops = self._motion.stop(reason, seen, stop_wall_s, self._rate) if known else []
         self.halted = reason
@@ -411,6 +502,10 @@ class ArmSupervisor:
         An arm that has settled stands already: its reading goes on, only no command follows it.
         """
         if self._seen is None or not self._motion.is_moving:
+            return []
+        if self._motion.is_probing:
+            # A micrometre needs no stop; one would be fast for an arm that is not as reported.
+            self._motion.visit = None
             return []
         lost = self._motion.lost(self._seen, wall_s)
         if lost:

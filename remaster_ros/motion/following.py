@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from remaster_ros.motion.actions import SupervisorRules
 from remaster_ros.motion.joint_reports import JointReport
 from remaster_ros.motion.trajectory import RAMP_S, Trajectory
-from remaster_ros.types import FloatArray
+from remaster_ros.types import BoolArray, FloatArray
 
 STANDING_S = 0.25
 """An arm that has not moved for so long stands; it must before it is sent anywhere, s."""
@@ -34,6 +34,9 @@ SLOWED_SHARE = 0.5
 """An arm that has gone less than this share of it is being stopped."""
 LAG_CHANGES_S = 0.1
 """By so much the lag of an arm that follows may have changed in this time, s."""
+VARIES_S = 1.0
+"""A measured joint position differs from the report before it at least once in so much time: no
+encoder reads the same to the last bit for long. One that does may be frozen, s."""
 STOPPED_ON_ITS_WAY = 'the robot stopped on its way: an emergency or protective stop?'
 
 
@@ -51,6 +54,8 @@ class Seen:
         Where (rad, (k,)) and since when (robot time, s) the arm has been standing.
     late_s
         How much later than usual it came, s: the arm has gone on meanwhile.
+    changed
+        When each joint's position last differed from the report before (robot time, s, (k,)).
     """
 
     q: FloatArray
@@ -60,6 +65,7 @@ class Seen:
     stands_at: FloatArray
     stands_since: float
     late_s: float
+    changed: FloatArray = field(default_factory=lambda: np.array(-np.inf))
 
     @classmethod
     def after(
@@ -68,12 +74,14 @@ class Seen:
         """Follow robot time and standstill; a gap begins the standstill anew."""
         q, stamp, wall = report.q, report.stamp_s, report.wall_s
         if last is None:
-            return cls(q, stamp, wall, stamp, q, stamp, late_s)
+            return cls(q, stamp, wall, stamp, q, stamp, late_s, np.full(len(q), -np.inf))
         time = last.time + stamp - last.stamp
+        changed = np.where(q != last.q, time, last.changed)
         moved = np.any(np.abs(q - last.stands_at) > rules.settle.still_tolerance)
         if moved or stamp - last.stamp > rules.settle.max_gap_s:
-            return cls(q, stamp, wall, time, q, time, late_s)
-        return cls(q, stamp, wall, time, last.stands_at, last.stands_since, late_s)
+            return cls(q, stamp, wall, time, q, time, late_s, changed)
+        at, since = last.stands_at, last.stands_since
+        return cls(q, stamp, wall, time, at, since, late_s, changed)
 
     def is_fresh(self, wall_s: float) -> bool:
         """Whether it shows where the arm is now."""
@@ -82,6 +90,10 @@ class Seen:
     def stands(self, wall_s: float) -> bool:
         """Whether the arm stands now."""
         return self.time - self.stands_since >= STANDING_S and self.is_fresh(wall_s)
+
+    def frozen(self) -> BoolArray:
+        """Which joints are reported the same to the last bit again and again, (k,)."""
+        return self.time - self.changed > VARIES_S
 
     def now(self, wall_s: float, rate: float) -> float:
         """Return robot time now, s, for a clock that runs at `rate`."""

@@ -22,15 +22,24 @@ class Interlocks:
     ----------
     heartbeat_s
         Longest silence of those in `NAMES`, s of wall time.
+    resume_alone_s
+        After a longer interruption of a run only a person goes on, s of wall time.
 
     Attributes
     ----------
     must_collect
         Why nothing moves before a person begins a collection (again); ''.
+    run
+        The run of a collection that was reported last; '' before the first.
     """
 
-    def __init__(self, heartbeat_s: float) -> None:
-        self.must_collect = self._run = ''
+    def __init__(self, heartbeat_s: float, resume_alone_s: float) -> None:
+        self.must_collect = self.run = ''
+        self._resume_alone_s = resume_alone_s
+        # Since when nothing may move, and whether the robot reported all the time since that it
+        # is not stopped.
+        self._blocked_since_wall: float | None = None
+        self._released = False
         self._planner_since_wall = -np.inf
         self._heartbeat_s = heartbeat_s
         self._seen: dict[str, float] = {}
@@ -59,12 +68,12 @@ class Interlocks:
         """
         if self.silence_s('planner', wall_s) > self._heartbeat_s:
             self._planner_since_wall = wall_s
-        is_new = bool(run) and run != self._run
-        began_another = is_new and bool(self._run)
+        is_new = bool(run) and run != self.run
+        began_another = is_new and bool(self.run)
         if is_new:
-            self._run = run
+            self.run = run
             if wall_s - self._planner_since_wall >= KNOWN_S:
-                self.must_collect = ''
+                self.must_collect, self._blocked_since_wall = '', None
         self.note_alive('planner', reason, wall_s)
         return began_another
 
@@ -104,13 +113,43 @@ class Interlocks:
         """Whether the planner runs a collection that a person began."""
         return 'planner' in self._seen and not self.reason('planner') and not self.must_collect
 
+    def interrupted(self, since_wall_s: float) -> None:
+        """Process that nobody has looked at the arm since then, s: this process was not there."""
+        self._blocked_since_wall, self._released = since_wall_s, False
+
+    def look_at_interruption(self, wall_s: float) -> None:
+        """After a long interruption let a person go on, who may stand beside the arm meanwhile.
+
+        Where the robot itself reported all the time that nobody has stopped it, none is needed.
+        """
+        released = self.was_right('safety') and not self.reason('safety_link')
+        reason = self._hindrance(wall_s)
+        if self._blocked_since_wall is None:
+            if not reason or not self.run:
+                return
+            self._blocked_since_wall, self._released = wall_s, released
+        self._released &= released
+        lasted_s = wall_s - self._blocked_since_wall
+        if self.run and not self._released and lasted_s > self._resume_alone_s:
+            self.must_collect = self.must_collect or (
+                f'the collection was interrupted for more than {self._resume_alone_s:g} s'
+                f'{f" ({reason})" if reason else ""}'
+            )
+        if not reason:
+            self._blocked_since_wall = None
+
     def blocked(self, wall_s: float) -> str:
         """Return why the arm must not move; '' if it may."""
+        return self._hindrance(wall_s) or self.asks_for_collect
+
+    @property
+    def asks_for_collect(self) -> str:
+        """Why nothing moves before a person begins a collection, and what to call; ''."""
+        return f'{self.must_collect}: /remaster/collect goes on' if self.must_collect else ''
+
+    def _hindrance(self, wall_s: float) -> str:
         limit = self._heartbeat_s
         silent = [name for name in NAMES if self.silence_s(name, wall_s) > limit]
         if silent:
             return f'no sign of {", ".join(silent)} for {limit:g} s'
-        reason = next(filter(None, map(self.reason, (*NAMES, *OBSERVED))), '')
-        if not reason and self.must_collect:
-            return f'{self.must_collect}: /remaster/collect goes on'
-        return reason
+        return next(filter(None, map(self.reason, (*NAMES, *OBSERVED))), '')

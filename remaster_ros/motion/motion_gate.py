@@ -20,8 +20,14 @@ from remaster_ros.errors import RemasterError
 from remaster_ros.motion.limits import MotionLimits
 from remaster_ros.motion.path_check import FreePath, PointSpeeds
 from remaster_ros.motion.stopping import stop_on_line
-from remaster_ros.motion.trajectory import Trajectory, Waypoint, plan_trajectory
-from remaster_ros.types import FloatArray
+from remaster_ros.motion.trajectory import (
+    RAMP_S,
+    Line,
+    Trajectory,
+    Waypoint,
+    plan_trajectory,
+)
+from remaster_ros.types import BoolArray, FloatArray
 
 START_RAD = 2e-3
 """A move begins so near to where the arm stands, rad: the way between is not checked."""
@@ -33,6 +39,11 @@ TOLERANCE = 1e-3
 """Share by which speeds and accelerations may exceed their limits: noise of the present state."""
 SAMPLE_RAD = 0.05
 """The speed of the fastest point is looked at every so many radians of the fastest joint."""
+CUBIC_PEAK, CUBIC_BEND = 1.5, 6.0
+"""A cubic from rest to rest over a way d in a time T has at most the speed 1.5 d/T and the
+acceleration 6 d/T²."""
+FULL_TURN = 2 * np.pi
+"""Taken for the range of a joint without limits, rad."""
 WAY_OUT_SPEED = 0.1
 """Share of the joint speeds on a way out of a contact or a margin."""
 WAY_OUT_TOOL_SPEED = 0.05
@@ -113,6 +124,52 @@ class MotionGate:
             self.refused += 1
             raise
         self._under_way = trajectory, limits
+        return Admitted(waypoints, trajectory)
+
+    def admit_probe(self, path: FreePath, q: FloatArray, doubtful: BoolArray) -> Admitted:
+        """Return a move of next to nothing that is harmless where the arm is not as reported.
+
+        A controller begins it where the arm really is. It has a single waypoint, so far ahead in
+        time that from anywhere within the limits of the doubtful joints no speed and no
+        acceleration is above its limit.
+
+        Parameters
+        ----------
+        path
+            From `q` to a place next to it.
+        q
+            Where the arm is reported, rad, (k,).
+        doubtful
+            Which joints may be elsewhere, (k,).
+
+        Raises
+        ------
+        MotionRefusedError
+            As of `admit`.
+        """
+        limits = self.limits
+        farthest = np.maximum(q - limits.lower, limits.upper - q)
+        farthest = np.where(np.isfinite(farthest), farthest, FULL_TURN)
+        way = np.where(doubtful, np.maximum(farthest, START_RAD), START_RAD)
+        times = [
+            2 * RAMP_S,
+            *(CUBIC_PEAK * way / limits.velocity),
+            *np.sqrt(CUBIC_BEND * way / limits.acceleration),
+        ]
+        if self._speeds is not None:
+            point_m = float(np.sum(way * self._speeds.reach_m))
+            times.append(CUBIC_PEAK * point_m / limits.tool_speed)
+        time_s = max(times)
+        start, end = path.points
+        # A line that takes as long; what the controller is sent is its end alone.
+        trajectory = Trajectory((Line(start, end, 1.0 / (time_s - RAMP_S)),))
+        waypoints = (Waypoint(time_s, end, np.zeros_like(end)),)
+        try:
+            self._check(waypoints, q, path, limits)
+        except MotionRefusedError:
+            self.refused += 1
+            raise
+        self._under_way = None
         return Admitted(waypoints, trajectory)
 
     def stop(self, low_s: float, high_s: float) -> Admitted:

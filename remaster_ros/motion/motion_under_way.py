@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from remaster_ros.motion.actions import Drive, Stop, SupervisorRules
 from remaster_ros.motion.following import Following, Seen, allowed_lag_s
 from remaster_ros.motion.motion_gate import MotionGate
+from remaster_ros.motion.move_queue import PROBE
 from remaster_ros.motion.path_check import FreePath
 from remaster_ros.motion.settling import SettleDetector
 from remaster_ros.motion.visit import UNDER_WAY, Braking, Outcome, Visit
+from remaster_ros.types import BoolArray, FloatArray
 
 STOPPED_S = 1.0
 """After the end of a stop the arm stands within so much time, s; the lag comes on top."""
+OTHER_PLACES = 2.0
+"""An arm may stand so many times as far from its end as it was seen to elsewhere: a servo that
+gives way under the arm's weight does so by another amount in every configuration."""
 
 
 class MotionUnderWay:
@@ -22,17 +29,25 @@ class MotionUnderWay:
         Every command comes from it.
     rules
         See `SupervisorRules`.
+    end
+        Where the last command led that was sent before this process was started, rad, (k,); None
+        where that is not known.
 
     Attributes
     ----------
+    end
+        Where the last command led, rad, (k,).
     visit
         The configuration under way, to its end; None where none is.
     braking
         The stop under way, until the arm stands.
     """
 
-    def __init__(self, gate: MotionGate, rules: SupervisorRules) -> None:
+    def __init__(self, gate: MotionGate, rules: SupervisorRules, end: FloatArray | None) -> None:
         self.gate, self.rules = gate, rules
+        self.end = self._end_before = end
+        # The farthest that the arm was reported from an end while it stood there, rad.
+        self._stood_off = -np.inf
         self.visit: Visit | None = None
         self.braking: Braking | None = None
 
@@ -46,8 +61,32 @@ class MotionUnderWay:
         """Whether the arm is on its way to a configuration, and could be stopped."""
         return self.visit is not None and not self.visit.settled
 
+    @property
+    def is_probing(self) -> bool:
+        """Whether the move under way is the probe."""
+        return self.visit is not None and self.visit.solution == PROBE
+
+    @property
+    def near(self) -> float:
+        """How far from the end of a command the arm may stand, rad.
+
+        What counts as still, and what the reports were off where it has stood: their noise, and
+        what the servo leaves. Never more than the distance at which it counts as arrived.
+        """
+        settle = self.rules.settle
+        if not np.isfinite(self._stood_off):
+            return settle.arrive_tolerance
+        off = settle.still_tolerance + OTHER_PLACES * self._stood_off
+        return min(off, settle.arrive_tolerance)
+
     def begin(
-        self, solution: int, path: FreePath, seen: Seen, wall_s: float, rate: float
+        self,
+        solution: int,
+        path: FreePath,
+        seen: Seen,
+        wall_s: float,
+        rate: float,
+        doubtful: BoolArray | None = None,
     ) -> Drive:
         """Return the move along a free path, which is under way from now on.
 
@@ -63,13 +102,18 @@ class MotionUnderWay:
             Now, s.
         rate
             Seconds of the robot per second of wall time.
+        doubtful
+            For a probe, which joints may be elsewhere than reported, (k,).
 
         Raises
         ------
         MotionRefusedError
             As of `MotionGate.admit`; nothing is under way then.
         """
-        admitted = self.gate.admit(path, seen.q)
+        if doubtful is None:
+            admitted = self.gate.admit(path, seen.q)
+        else:
+            admitted = self.gate.admit_probe(path, seen.q, doubtful)
         trajectory, rules = admitted.trajectory, self.rules
         assert trajectory is not None
         time = seen.now(wall_s, rate)
@@ -77,6 +121,7 @@ class MotionUnderWay:
         detector = SettleDetector(trajectory.end, rules.settle)
         following = Following(trajectory, time, wall_s, rules)
         self.visit = Visit(solution, following, detector, rules, seen.stamp, deadline)
+        self._lead_to(trajectory.end)
         return Drive(solution, admitted, wall_s)
 
     def judge(self, seen: Seen, rate: float, *, recorder_waits: bool) -> Outcome:
@@ -84,7 +129,10 @@ class MotionUnderWay:
         if self.visit is not None and self.visit.settled:
             return self.visit.judge_settled(seen, recorder_waits=recorder_waits)
         if self.visit is not None:
-            return self.visit.judge(seen, rate)
+            outcome = self.visit.judge(seen, rate)
+            if outcome[0] == 'settled':
+                self._stood_off = max(self._stood_off, self.visit.detector.farthest)
+            return outcome
         if self.braking is None:
             return UNDER_WAY
         outcome = self.braking.judge(seen)
@@ -109,5 +157,13 @@ class MotionUnderWay:
         admitted = self.gate.stop(*following.window(seen, wall_s, rate))
         (stop,) = admitted.waypoints
         over = seen.now(wall_s, rate) + stop.time_s + allowed_lag_s(self.rules, rate)
-        self.braking = Braking(stop.q, over, over + STOPPED_S)
+        self.braking = Braking(seen.q, stop.q, over, over + STOPPED_S, self.near, self.rules)
+        self._lead_to(stop.q)
         return [Stop(admitted, reason, wall_s)]
+
+    def take_back(self) -> None:
+        """Process that the last command was not sent."""
+        self.visit, self.braking, self.end = None, None, self._end_before
+
+    def _lead_to(self, end: FloatArray) -> None:
+        self._end_before, self.end = self.end, end

@@ -55,9 +55,13 @@ class MoveQueue:
         self._solutions, self._waypoints, self.next = solutions, waypoints, 0
         self.pending = None
 
-    def start_over(self) -> None:
-        """Begin as at the start: a person has cleared the halt, and so allowed the way out."""
+    def begin_anew(self) -> None:
+        """Begin as at the start: where the arm is may be other than it is reported."""
         self.must_look = self.must_probe = True
+
+    def start_over(self) -> None:
+        """Begin anew: a person has cleared the halt, and so allowed the way out."""
+        self.begin_anew()
         self.way_out, self._offered = self._offered, None
 
     @property
@@ -65,21 +69,11 @@ class MoveQueue:
         """The next configuration, rad, (k,); None where none is left."""
         return self._solutions[self.next] if self.next < len(self._solutions) else None
 
-    def preparation(self, q: FloatArray, limits: MotionLimits) -> CheckPath | None:
-        """Return what must be asked for before any configuration; None if nothing is left.
-
-        Parameters
-        ----------
-        q
-            Where the arm stands, rad, (k,).
-        limits
-            For the direction of the probe.
-        """
-        if self.must_look:
-            return self.ask(STANDING, q, q)
-        if self.must_probe and self.target is not None:
-            return self.ask(PROBE, q, _probe(q, limits))
-        return None
+    @property
+    def probe_is_next(self) -> bool:
+        """Whether the probe comes before the move that is to be made."""
+        has_move = not self.must_look and self.target is not None
+        return self.must_probe and (has_move or self.way_out is not None)
 
     def ask(self, solution: int, start: FloatArray, target: FloatArray) -> CheckPath:
         """Return the question whether the way to a solution is free, rad, (k,) each."""
@@ -112,7 +106,10 @@ class MoveQueue:
         )
 
 
-def _probe(q: FloatArray, limits: MotionLimits) -> FloatArray:
-    """Return a place a microradian away: a measurement does not agree with it to the last bit."""
+def probe_path(q: FloatArray, limits: MotionLimits) -> FreePath:
+    """Return the way to a place a microradian from `q`, where the arm stands (rad, (k,)).
+
+    A measurement does not agree with it to the last bit.
+    """
     low, high = np.clip((limits.lower, limits.upper), -1e3, 1e3)
-    return q + np.where(2 * q > low + high, -PROBE_RAD, PROBE_RAD)
+    return FreePath(np.array([q, q + np.where(2 * q > low + high, -PROBE_RAD, PROBE_RAD)]))

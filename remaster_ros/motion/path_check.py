@@ -28,12 +28,26 @@ class PointSpeeds:
     extents
         For each joint points in the frame after it, m, (n, 3), whose convex hull holds all that
         moves with it: a speed is largest at a corner of a convex body.
+
+    Attributes
+    ----------
+    reach_m
+        How far from each joint a point that it moves can be in any configuration, m, (k,).
     """
 
     def __init__(self, chain: SerialChain, extents: Sequence[FloatArray]) -> None:
         if len(extents) != len(chain):
             raise ValueError(f'{len(extents)} bodies for {len(chain)} joints')
         self._chain, self._extents = chain, extents
+        # The way from each joint along the links behind it to the farthest point, at full stretch.
+        links = [0.0, *np.linalg.norm(chain.T_fixed[1:-1, :3, 3], axis=1)]
+        origins = np.cumsum(links)
+        bodies = [
+            origin + max(np.linalg.norm(points, axis=1), default=0.0) if len(points) else 0.0
+            for origin, points in zip(origins, extents)
+        ]
+        farthest = np.maximum.accumulate(bodies[::-1])[::-1]
+        self.reach_m: FloatArray = np.maximum(farthest - origins, 0.0)
 
     def fastest(self, q: FloatArray, velocity: FloatArray) -> FloatArray:
         """Return the speed of the fastest point, m/s, (n,), at q and joint velocities (n, k)."""

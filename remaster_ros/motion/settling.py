@@ -100,6 +100,13 @@ class SettleDetector:
         return None if self._still is None else self._still.since
 
     @property
+    def farthest(self) -> float:
+        """Largest distance of a report from the target since the arm stands still, rad."""
+        assert self._still is not None
+        ends = np.array([self._still.low, self._still.high])
+        return float(np.max(np.abs(ends - self.target)))
+
+    @property
     def mean(self) -> FloatArray:
         """Mean reported position since the arm stands still, rad, (k,)."""
         assert self._still is not None

@@ -18,8 +18,6 @@ PROBE_WAIT_S = 0.5
 MOVED_RAD = 0.02
 """An arm at rest that has moved by so much was not moved by a command, rad."""
 ELSEWHERE = 'an emergency stop, or an arm less precise than arrive_tolerance?'
-ELSEWHERE_RAD = 0.05
-"""An arm that stands so far from its target does not follow, rad; nearer it is inaccurate."""
 
 Outcome = tuple[Literal['', 'over', 'settled', 'failed', 'halted'], str]
 """The outcome, and why, as text; '' while it is under way."""
@@ -99,33 +97,48 @@ class Visit:
         return UNDER_WAY
 
 
-@dataclass(frozen=True)
+@dataclass
 class Braking:
     """A stop under way.
 
     Attributes
     ----------
+    begun
+        Where the arm was reported when the stop was sent, rad, (k,).
     end
         Where it leads, rad, (k,).
     over
         Robot time at which the arm has come to its end, however late it reacts, s. Before that an
         arm that stands may not yet have begun to move.
     deadline
-        Robot time until which it must stand, s.
+        Robot time until which it must stand there, s.
+    near
+        How far from the end it may stand: what this arm was seen to stand off, rad.
+    rules
+        The tolerances.
+    moved
+        Whether the arm has been seen to move since.
     """
 
+    begun: FloatArray
     end: FloatArray
     over: float
     deadline: float
+    near: float
+    rules: SupervisorRules
+    moved: bool = False
 
     def judge(self, seen: Seen) -> Outcome:
         """Return whether the arm has come to rest where its stop ends, by a report."""
+        settle, stands = self.rules.settle, seen.stands(seen.wall)
+        self.moved |= bool(np.any(np.abs(seen.q - self.begun) > settle.still_tolerance))
+        off = float(np.max(np.abs(seen.q - self.end)))
+        elsewhere = f'the arm stands {off:.4f} rad from where its stop led: an emergency stop?'
         if seen.time < self.over:
-            return UNDER_WAY
-        if seen.stands(seen.wall):
-            if np.max(np.abs(seen.q - self.end)) <= ELSEWHERE_RAD:
-                return 'over', ''
-            return 'halted', 'the arm stands, but not where its stop led'
+            early = self.moved and stands and off > settle.arrive_tolerance
+            return ('halted', elsewhere) if early else UNDER_WAY
+        if stands and off <= self.near:
+            return 'over', ''
         if seen.time > self.deadline:
-            return 'halted', 'the arm goes on after a stop'
+            return 'halted', elsewhere if stands else 'the arm goes on after a stop'
         return UNDER_WAY

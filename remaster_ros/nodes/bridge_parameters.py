@@ -106,6 +106,14 @@ class Parameters(SimulationParameters):
     emergency_stop_topic: str = parameter(
         '', "std_msgs/Bool, true while the robot's own safety stops it; empty where there is none"
     )
+    resume_alone_s: float = parameter(
+        5.0,
+        'after a longer interruption of a collection /remaster/collect is needed, unless '
+        'emergency_stop_topic was false all the time, wall time',
+        unit='s',
+        low=0.0,
+        high=60.0,
+    )
 
     def rules(self) -> SupervisorRules:
         """Return what of them the supervisor keeps."""
@@ -117,6 +125,7 @@ class Parameters(SimulationParameters):
             stall_s=self.stall_s,
             reaction_s=self.reaction_s,
             lag_s=self.lag_s,
+            resume_alone_s=self.resume_alone_s,
         )
 
     def raised_from(self, before: Parameters) -> str:

@@ -246,6 +246,10 @@ class PosePlanner(RemasterNode):
             case events.ArmHalted(reason=why) | events.BridgeState(halted=why) if why:
                 # It goes on when a person has looked at the arm and calls /remaster/collect.
                 self._end('paused', why)
+            case events.BridgeState(asks_for_collect=why, run=run) if why:
+                # An earlier run's may come late: a person has begun another one since.
+                if run == self.run.token:
+                    self._end('paused', why)
             case events.SetupChanged(stops=True, text=why):
                 self._end('paused', why)
             case events.ConfigurationEnded() as end:

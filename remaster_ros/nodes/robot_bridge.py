@@ -406,6 +406,7 @@ class RobotBridge(RemasterNode):
             halted=supervisor.halted,
             pose=self._pose_stamp,
             run=self._run,
+            asks_for_collect=supervisor.asks_for_collect,
             joints_age_s=age_s if np.isfinite(age_s) else None,
             joints_trouble=supervisor.trouble,
         )

@@ -29,6 +29,7 @@ RULES = SupervisorRules(
     settle=SettleRules(settle_s=1.0), arrive_timeout_s=5.0, answer_timeout_s=20.0
 )
 HOME = np.array([0.1, 0.2])
+ASKED = 'the arm is not reported where the last command led: '
 STOPPED = 'the robot stopped on its way: an emergency or protective stop?'
 NOT_TAKEN = 'the robot does not take commands: see its controller, and its driver'
 
@@ -40,11 +41,12 @@ class Rig:
     is found out about a path, `delay_s` how long a report takes.
     """
 
-    def __init__(self, rules=RULES, wall_s=1000.0, begun=True, halted='', rate=1.0):
+    def __init__(self, rules=RULES, wall_s=1000.0, begun=True, halted='', rate=1.0, end=HOME):
         gate = MotionGate(LIMITS)
         # The robot itself may be three times as fast.
         reports = JointReports(LIMITS.lower, LIMITS.upper, 3 * SPEED)
-        self.supervisor = ArmSupervisor(gate, reports, rules, halted)
+        # By default it is known from before where the last command led.
+        self.supervisor = ArmSupervisor(gate, reports, rules, halted, end)
         self.t, self.wall = 50.0, wall_s
         self.arm = servo.Motion(self.t, HOME)
         self.rng = np.random.default_rng(2)
@@ -161,19 +163,28 @@ class Rig:
     def answer(self, solution):
         self.do(self.supervisor.answered(solution, self.wall))
 
+    def clear(self):
+        """Clear the halt as a person does who has compared the robot's display, where asked."""
+        asked = self.supervisor.clear_halt()
+        assert not asked or ASKED in asked
+        if asked:
+            assert self.supervisor.halted
+            assert self.supervisor.clear_halt() == ''
+        assert self.supervisor.halted == ''
+
     def collect(self):
         """What a person does after a halt."""
-        assert self.supervisor.clear_halt() == ''
+        self.clear()
         self.state = 'paused'
         self.run(1.0)
         self.state = 'running'
         self.run(1.0)
 
 
-def supervisor(rules=RULES, limits=LIMITS):
+def supervisor(rules=RULES, limits=LIMITS, end=None):
     """Return one that is fed by hand."""
     reports = JointReports(limits.lower, limits.upper, 3 * SPEED)
-    return ArmSupervisor(MotionGate(limits), reports, rules)
+    return ArmSupervisor(MotionGate(limits), reports, rules, end=end)
 
 
 def report(t, q, wall):
@@ -208,8 +219,7 @@ def stays_halted(rig, reason):
 def goes_on(rig):
     """Only a person's word and a collection that is begun again let it go on, by a probe."""
     commands = len(rig.commands)
-    assert rig.supervisor.clear_halt() == ''
-    assert rig.supervisor.halted == ''
+    rig.clear()
     reason = 'the halt was cleared: /remaster/collect goes on'
     assert rig.supervisor.blocked(rig.wall) == reason
     rig.run(3.0)

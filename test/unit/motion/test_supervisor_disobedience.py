@@ -80,10 +80,8 @@ def test_a_stop_that_is_not_obeyed(rig):
     rig.state = 'paused'
     rig.run(5.0, lambda: rig.said(Halted))
     assert len(rig.said(Stop)) == 1
-    assert rig.last(Halted).reason in (
-        'the arm goes on after a stop',
-        'the arm stands, but not where its stop led',
-    )
+    reason = rig.last(Halted).reason
+    assert 'rad from where its stop led' in reason or reason == 'the arm goes on after a stop'
     stays_halted(rig, rig.last(Halted).reason)
 
 
@@ -103,7 +101,11 @@ def test_an_arm_that_is_moved_by_somebody_else_while_it_is_measured(rig):
     begun = rig.t
     rig.alter = lambda t, q: np.add(q, [min(0.05 * (t - begun), 0.1), 0.0])
     rig.run(5.0, lambda: rig.said(Halted))
-    assert rig.last(Halted).reason == 'the arm was moved by 1.2 deg, and not by a command'
+    # 0.02 rad are 1.146 deg; it moves by 0.06 deg between two reports.
+    assert rig.last(Halted).reason in (
+        'the arm was moved by 1.1 deg, and not by a command',
+        'the arm was moved by 1.2 deg, and not by a command',
+    )
     assert not rig.said(Stop)
 
 

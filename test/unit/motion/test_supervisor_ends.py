@@ -4,10 +4,9 @@ import dataclasses
 
 import numpy as np
 import pytest
-from supervisor_rig import HOME, LIMITS
+from supervisor_rig import LIMITS
 
 from remaster_ros.motion.actions import Drive, Failed, Halted, Settled, Stop
-from remaster_ros.motion.visit import ELSEWHERE_RAD
 from remaster_ros.simulation import arm_motion as servo
 
 
@@ -35,7 +34,7 @@ def test_an_emergency_stop_in_a_stop_halts(rig):
     rig.step()
     freeze(rig)
     rig.run(2.0, lambda: rig.said(Halted))
-    assert rig.last(Halted).reason == 'the arm stands, but not where its stop led'
+    assert 'rad from where its stop led: an emergency stop?' in rig.last(Halted).reason
     assert len(rig.said(Stop)) == 1
 
 
@@ -97,12 +96,13 @@ def test_a_collection_that_is_begun_at_once_after_the_halt_was_cleared_goes_on(r
     rig.alive.discard('planner')
     planner('running', 'first')
     rig.plan([0.9, -1.9])
-    rig.run(0.8)
+    rig.run(5.0, lambda: rig.speed() > 0.3)
     freeze(rig)
     rig.run(2.0, lambda: rig.said(Halted))
+    rig.run(0.5)
     if paused:
         planner('paused', '')
-    assert rig.supervisor.clear_halt() == ''
+    rig.clear()
     count = len(rig.said(Drive))
     if not paused:
         planner('running', 'first')
@@ -172,8 +172,6 @@ def test_a_stop_of_an_arm_that_has_hardly_begun_to_move(rig, moved_s, delay_s):
     rig.run(5.0, lambda: len(rig.said(Drive)) == 2)
     (stop,) = rig.said(Stop)
     (end,) = stop.admitted.waypoints
-    # Where it leads is elsewhere, or so near that it would be taken for the end of the stop.
-    assert (np.max(np.abs(end.q - HOME)) > ELSEWHERE_RAD) == (moved_s > 0.05)
     _, q, velocity, _ = rig.commands[-1]
     np.testing.assert_allclose(q, end.q, atol=1e-4)
     assert np.max(np.abs(velocity)) < 1e-3

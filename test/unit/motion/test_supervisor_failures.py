@@ -78,7 +78,7 @@ def test_a_collection_that_is_begun_again_counts_refusals_anew(rig):
     rig.run(1.0)
     rig.state = 'running'
     rig.plan(*[[9.0, 9.0]] * 11)
-    rig.run(1.0)
+    rig.run(3.0)
     assert len(rig.said(Failed)) == 22
     assert not rig.said(Halted)
 

@@ -24,12 +24,12 @@ from remaster_ros.motion.visit import PROBE_WAIT_S
 def copying(low=(-1.0, -2.0), high=(1.0, 2.0), home=HOME):
     """Return what is done with a robot that reports what it was commanded."""
     limits = MotionLimits(('a', 'b'), np.array(low), np.array(high), SPEED, LIMITS.acceleration)
-    arm = supervisor(limits=limits)
+    arm = supervisor(limits=limits, end=home)
     arm.planner_is('running', 0.0)
     arm.recorder_waits('', 0.0)
     arm.plan(np.array([[0.5, 0.5]]), 0.0)
     actions, q, t = [], home, 0.0
-    while t < 4.0 and not any(isinstance(action, Halted) for action in actions):
+    while t < 40.0 and not any(isinstance(action, Halted) for action in actions):
         t += 0.1
         todo = arm.report(report(t, q, t))
         while todo:
@@ -48,8 +48,7 @@ def copying(low=(-1.0, -2.0), high=(1.0, 2.0), home=HOME):
 def test_a_robot_that_repeats_commands_is_found_before_it_is_sent_anywhere():
     probe, halted = copying()
     assert probe.solution == PROBE
-    (end,) = probe.admitted.waypoints[1:]
-    assert end.time_s == 1.0
+    (end,) = probe.admitted.waypoints
     np.testing.assert_allclose(end.q, HOME, rtol=0, atol=1.01e-6)
     assert np.all(end.q != HOME)
     assert halted.reason == (
@@ -103,7 +102,8 @@ def test_the_probe_that_was_stopped_is_made_again():
     rig.run(1.0, lambda: rig.said(Drive))
     rig.state = 'paused'
     rig.run(3.0)
-    assert len(rig.said(Stop)) == 1
+    # It needs no stop: that would be fast for an arm that is not where it is reported.
+    assert not rig.said(Stop)
     rig.state = 'running'
     rig.run(20.0, lambda: rig.said(Settled))
     assert [d.solution for d in rig.said(Drive)] == [PROBE, PROBE, 0]

@@ -48,12 +48,13 @@ def test_a_way_out_is_offered_confirmed_and_gone_slowly(rig):
     rig.plan([0.9, 0.2])
     rig.collect()
     drives = rig.said(Drive)
-    assert [d.solution for d in drives] == [WAY_OUT]
-    fastest = max(np.max(np.abs(p.velocity)) for p in drives[0].admitted.waypoints)
+    rig.run(2.0)
+    drives = rig.said(Drive)
+    assert [d.solution for d in drives] == [PROBE, WAY_OUT]
+    fastest = max(np.max(np.abs(p.velocity)) for p in drives[1].admitted.waypoints)
     assert fastest <= 0.1 * LIMITS.velocity[0]
     rig.run(40.0, lambda: rig.said(Settled))
-    # Outside it probes again, and then visits.
-    assert [d.solution for d in rig.said(Drive)] == [WAY_OUT, PROBE, 0]
+    assert [d.solution for d in rig.said(Drive)] == [PROBE, WAY_OUT, 0]
     assert len(rig.said(Halted)) == 1
 
 
@@ -77,11 +78,12 @@ def test_a_way_out_is_not_gone_twice_or_by_an_arm_that_was_moved(rig):
     rig.run(1.0)
     assert rig.said(Halted)
     # Somebody moves it by hand, within the margin still.
-    rig.alter = lambda t, q: np.add(q, [0.0, 0.05])
+    rig.arm = servo.Motion(rig.t, rig.arm.at(rig.t)[0] + [0.0, 0.05])
     rig.run(0.3)
     rig.collect()
-    rig.run(2.0)
-    assert not rig.said(Drive)
+    rig.run(7.0)
+    # The person has confirmed where it is; the probe is made from there, and nothing else.
+    assert [d.solution for d in rig.said(Drive)] == [PROBE]
     assert len(rig.said(Halted)) == 2, 'it is asked again, and the person too'
     assert len(rig.said(CheckPath)) >= 2
 
@@ -112,12 +114,12 @@ def test_an_emergency_stop_on_a_way_out_halts(rig):
     rig.plan([0.9, 0.2])
     rig.run(1.0)
     rig.collect()
-    rig.run(2.0)
+    rig.run(3.0)
     assert rig.last(Drive).solution == WAY_OUT
     rig.arm = servo.Motion(rig.t, rig.arm.at(rig.t)[0])
     rig.run(3.0)
     assert rig.last(Halted).reason == STOPPED
-    assert len(rig.said(Drive)) == 1
+    assert [d.solution for d in rig.said(Drive)] == [PROBE, WAY_OUT]
 
 
 def test_a_way_out_that_the_gate_refuses_halts(rig):
@@ -129,5 +131,6 @@ def test_a_way_out_that_the_gate_refuses_halts(rig):
     rig.plan([0.9, 0.2])
     rig.run(1.0)
     rig.collect()
+    rig.run(2.0)
     assert rig.last(Halted).reason.startswith('a would go to 1')
-    assert not rig.said(Drive)
+    assert [d.solution for d in rig.said(Drive)] == [PROBE]

@@ -9,7 +9,7 @@ from remaster_ros.motion.actions import SupervisorRules
 from remaster_ros.motion.following import Following, Seen
 from remaster_ros.motion.settling import SettleDetector, SettleRules
 from remaster_ros.motion.trajectory import Line, Trajectory
-from remaster_ros.motion.visit import ELSEWHERE_RAD, MOVED_RAD, PROBE_WAIT_S, Braking, Visit
+from remaster_ros.motion.visit import MOVED_RAD, PROBE_WAIT_S, Braking, Visit
 
 RULES = SupervisorRules(
     settle=SettleRules(settle_s=1.0, arrive_tolerance=2.0**-8, still_tolerance=2.0**-12),
@@ -90,25 +90,43 @@ def test_an_arm_that_has_stood_for_long_enough_has_settled():
     assert made.deadline == SENT_S + 3.5 + 16.0
 
 
-@pytest.mark.parametrize(
-    ('off', 'outcome'), [(ELSEWHERE_RAD, 'over'), (ELSEWHERE_RAD + 1e-12, 'halted')]
-)
+NEAR = 2.0**-11
+BEGUN = np.array([1.0, 0.0])
+
+
+def braking(over=0.0, deadline=4.0):
+    return Braking(BEGUN, np.zeros(2), SENT_S + over, SENT_S + deadline, NEAR, RULES)
+
+
+@pytest.mark.parametrize(('off', 'outcome'), [(NEAR, 'over'), (NEAR + 1e-12, 'halted')])
 def test_how_far_from_its_stop_an_arm_may_stand(off, outcome):
-    stop = Braking(np.zeros(2), SENT_S, SENT_S + 4.0)
-    said, why = stop.judge(at([off, 0.0], SENT_S, 1.0))
-    assert said == outcome
-    assert bool(why) == (outcome == 'halted')
-    assert stop.judge(at([0.0, -off], SENT_S, 1.0))[0] == outcome
+    """One that stands further off has until the deadline: a servo may creep to its end."""
+    for q in ([off, 0.0], [0.0, -off]):
+        stop = braking()
+        first = stop.judge(at(q, SENT_S, 1.0))
+        assert first[0] == ('over' if outcome == 'over' else '')
+        said, why = stop.judge(at(q, SENT_S + 4.0 + 2.0**-20, 1.0))
+        assert said == outcome
+        assert bool(why) == (outcome == 'halted')
 
 
-@pytest.mark.parametrize(('q', 'outcome'), [(0.0, 'over'), (1.0, 'halted')])
-def test_an_arm_that_stands_before_its_stop_is_over_may_not_have_begun_to_move(q, outcome):
-    stop = Braking(np.zeros(2), SENT_S + 2.0, SENT_S + 4.0)
-    assert stop.judge(at([q, 0.0], SENT_S + 2.0 - 2.0**-30, 1.0)) == ('', '')
-    assert stop.judge(at([q, 0.0], SENT_S + 2.0, 1.0))[0] == outcome
+@pytest.mark.parametrize(
+    ('q', 'outcome'), [(1.0, ''), (1.0 - 2.0**-12, ''), (1.0 - 2.0**-11, 'halted'), (0.0, '')]
+)
+def test_an_arm_that_stands_before_its_stop_is_over_has_not_begun_to_move_or_is_stopped(
+    q, outcome
+):
+    """Where it was when the stop was sent it may not have begun; at the end it has arrived."""
+    stop = braking(over=2.0)
+    assert stop.judge(at([q, 0.0], SENT_S + 2.0 - 2.0**-30, 1.0))[0] == outcome
+
+
+def test_an_arm_that_still_brakes_before_its_stop_is_over_is_waited_for():
+    stop = braking(over=2.0)
+    assert stop.judge(at([0.5, 0.0], SENT_S + 1.0, 0.1)) == ('', '')
 
 
 @pytest.mark.parametrize(('late', 'outcome'), [(0.0, ''), (2.0**-30, 'halted')])
 def test_how_long_a_stop_may_take(late, outcome):
-    stop = Braking(np.zeros(2), SENT_S, SENT_S + 4.0)
+    stop = braking()
     assert stop.judge(at([1.0, 0.0], SENT_S + 4.0 + late))[0] == outcome

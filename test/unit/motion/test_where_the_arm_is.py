@@ -1,0 +1,209 @@
+"""What is done where it is not sure that the arm is where it is reported; who goes on when."""
+
+import numpy as np
+import pytest
+from supervisor_rig import ASKED, HOME, LIMITS, RULES, SPEED, Rig
+
+from remaster_ros.motion.actions import Drive, Halted, Settled, Stop
+from remaster_ros.motion.motion_gate import Cubic, MotionGate
+from remaster_ros.motion.move_queue import PROBE, probe_path
+from remaster_ros.motion.trajectory import Waypoint
+from remaster_ros.simulation import arm_motion as servo
+
+SEED = 34
+
+
+def freeze(rig):
+    """The safety circuit stops the arm where it is."""
+    rig.arm = servo.Motion(rig.t, rig.arm.at(rig.t)[0])
+
+
+@pytest.mark.parametrize('trial', range(12))
+def test_an_emergency_stop_while_it_brakes_halts(trial):
+    """Released at once; a sensor is missing for two seconds. It never goes on by itself."""
+    rng = np.random.default_rng([SEED, trial])
+    print(f'seed {SEED}, trial {trial}')
+    rig = Rig()
+    rig.go([0.9, -1.9], rng.uniform(0.8, 2.0))
+    rig.waiting_for = 'mocap'
+    rig.do(rig.supervisor.recorder_waits('mocap', rig.wall))
+    (stop,) = rig.said(Stop)
+    # In the last tenth of a second no more is left than it may stand off.
+    rig.run(rng.uniform(0.02, stop.admitted.waypoints[0].time_s - 0.1))
+    freeze(rig)
+    rig.run(2.0)
+    rig.waiting_for = ''
+    rig.run(5.0)
+    assert rig.said(Halted)
+    assert len(rig.said(Drive)) == 1
+
+
+@pytest.mark.parametrize('noise', [1e-6, 2e-5])
+@pytest.mark.parametrize('sag', [0.0, 8e-4])
+def test_an_arm_that_stops_as_ever_goes_on(noise, sag):
+    """Also one whose servo gives way under its weight, and reports with noise."""
+    rng = np.random.default_rng([SEED, 1])
+    rig = Rig(begun=False)
+    rig.alter = lambda t, q: q + [sag, -sag] + rng.normal(0.0, noise, 2)
+    rig.plan([0.3, 0.3], [0.9, -1.9])
+    rig.run(20.0, lambda: rig.said(Settled))
+    rig.answer(0)
+    for _ in range(2):
+        rig.run(5.0, lambda: rig.speed() > 0.2)
+        rig.waiting_for = 'mocap'
+        rig.run(3.0)
+        rig.waiting_for = ''
+    rig.run(30.0, lambda: len(rig.said(Settled)) == 2)
+    assert not rig.said(Halted)
+    assert len(rig.said(Stop)) == 2
+
+
+@pytest.mark.parametrize(
+    ('seconds', 'released', 'alone'),
+    [(4.0, None, True), (7.0, None, False), (7.0, 'always', True), (7.0, 'lately', False)],
+)
+@pytest.mark.parametrize('place', ['moving', 'settled'])
+def test_who_goes_on_after_an_interruption(seconds, released, alone, place):
+    """A person, unless the robot reported all the time that nobody has stopped it."""
+    rig = Rig()
+    if released == 'always':
+        rig.do(rig.supervisor.emergency(False, rig.wall))
+    if place == 'moving':
+        rig.go([0.9, -1.9], 1.2)
+    else:
+        rig.plan([0.3, 0.0], [0.9, -1.9])
+        rig.run(20.0, lambda: rig.said(Settled))
+    rig.waiting_for = 'mocap'
+    rig.run(seconds / 2)
+    if released == 'lately':
+        rig.do(rig.supervisor.emergency(False, rig.wall))
+    rig.run(seconds / 2)
+    rig.waiting_for = ''
+    if place == 'settled':
+        rig.answer(0)
+    count = len(rig.said(Drive))
+    rig.run(4.0)
+    assert (len(rig.said(Drive)) > count) == alone
+    assert not rig.said(Halted)
+    if alone:
+        return
+    assert rig.supervisor.blocked(rig.wall) == (
+        'the collection was interrupted for more than 5 s (waiting for mocap): '
+        '/remaster/collect goes on'
+    )
+    # As the planner does that is told so, and then a person.
+    rig.state = 'paused'
+    rig.run(1.0)
+    rig.state = 'running'
+    rig.run(5.0)
+    assert len(rig.said(Drive)) > count
+
+
+def test_a_bridge_that_was_away_for_long_waits_for_a_person():
+    for gone_s, alone in ((3.0, True), (20.0, False)):
+        rig = Rig(begun=False)
+        rig.supervisor.interrupted(rig.wall - gone_s)
+        rig.plan([0.3, 0.0])
+        rig.run(4.0)
+        assert bool(rig.said(Drive)) == alone
+
+
+def test_the_next_move_begins_only_where_the_last_command_led():
+    rig = Rig()
+    count = len(rig.said(Drive))
+    rig.alter = lambda t, q: np.add(q, [0.1, 0.0])
+    rig.supervisor.reports.forget()
+    rig.run(1.5)
+    rig.plan([0.5, 0.5])
+    rig.run(2.0)
+    (halted,) = rig.said(Halted)
+    assert halted.reason.startswith(f'{ASKED}a at 11.46 deg, +5.73 deg from there; compare ')
+    assert len(rig.said(Drive)) == count
+
+
+def test_frozen_reports_and_a_person_who_clears_the_halt():
+    """It is asked for a comparison first; whoever does not compare sends the arm off slowly."""
+    rig = Rig()
+    rig.go([0.9, -1.9], 1.0)
+    q = rig.arm.at(rig.t)[0]
+    rig.alter = lambda t, _: q
+    rig.run(5.0, lambda: rig.said(Halted))
+    # It has completed its move, unseen.
+    rig.run(5.0)
+    np.testing.assert_allclose(rig.arm.at(rig.t)[0], [0.9, -1.9], atol=1e-3)
+    asked = rig.supervisor.clear_halt()
+    assert asked.startswith(ASKED)
+    assert rig.supervisor.halted
+    rig.collect()
+    probe = rig.said(Drive)[-1]
+    assert probe.solution == PROBE
+    (end,) = probe.admitted.waypoints
+    assert end.time_s > 3.0
+    cubic = list(rig.cubics())[-1]
+    assert np.max(np.abs(cubic.coefficients[0] - q)) > 0.5
+    assert np.all(cubic.largest_speed() <= SPEED * 1.001)
+
+
+def test_reports_that_move_on_after_the_question_are_not_what_was_confirmed():
+    rig = Rig()
+    rig.go([0.9, -1.9], 1.0)
+    freeze(rig)
+    rig.run(5.0, lambda: rig.said(Halted))
+    rig.run(0.5)
+    first = rig.supervisor.clear_halt()
+    rig.alter = lambda t, q: np.add(q, [0.02, 0.0])
+    rig.run(0.5)
+    second = rig.supervisor.clear_halt()
+    assert first.startswith(ASKED)
+    assert second.startswith(ASKED)
+    assert first != second
+    assert rig.supervisor.clear_halt() == ''
+
+
+def test_the_probe_is_slow_from_wherever_the_arm_may_be():
+    """From any true place within the limits: no joint beyond its speed and acceleration."""
+    rng = np.random.default_rng(SEED)
+    print(f'seed {SEED}')
+    for _ in range(200):
+        gate = MotionGate(LIMITS)
+        reported, true = rng.uniform(LIMITS.lower, LIMITS.upper, (2, 2))
+        path = probe_path(reported, LIMITS)
+        admitted = gate.admit_probe(path, reported, np.array([True, True]))
+        (end,) = admitted.waypoints
+        cubic = Cubic.between(Waypoint(0.0, true, np.zeros(2)), end)
+        assert np.all(cubic.largest_speed() <= LIMITS.velocity * (1 + 1e-9))
+        assert np.all(cubic.largest_acceleration() <= LIMITS.acceleration * (1 + 1e-9))
+        assert admitted.trajectory.duration_s == pytest.approx(end.time_s)
+        sure = gate.admit_probe(path, reported, np.array([False, False]))
+        assert sure.waypoints[0].time_s == 1.0
+
+
+@pytest.mark.parametrize(
+    ('end', 'frozen', 'slow'), [(HOME, False, False), (HOME, True, True), (None, False, True)]
+)
+def test_when_the_probe_takes_its_time(end, frozen, slow):
+    """Where the last command is unknown, or a joint reads the same to the last bit."""
+    rig = Rig(begun=False, end=end)
+    if frozen:
+        rig.alter = lambda t, q: np.array([HOME[0], q[1]])
+    rig.run(2.0)
+    rig.plan([0.5, 0.5])
+    rig.run(3.0, lambda: rig.said(Drive))
+    (probe,) = rig.said(Drive)
+    assert probe.solution == PROBE
+    assert (probe.admitted.waypoints[0].time_s > 1.0) == slow
+
+
+def test_raised_limits_ask_for_another_run():
+    rig = Rig()
+    assert rig.supervisor.under_way
+    rig.state = 'paused'
+    rig.run(1.0)
+    assert not rig.supervisor.under_way
+    rig.do(rig.supervisor.use_limits(LIMITS, rig.wall, raised=True))
+    assert rig.supervisor.asks_for_collect == 'a limit was raised: /remaster/collect goes on'
+    rig.state = 'running'
+    rig.plan([0.3, 0.0])
+    rig.run(1.0)
+    assert rig.supervisor.asks_for_collect == ''
+    assert RULES.resume_alone_s == 5.0
