@@ -428,7 +428,9 @@ class ArmSupervisor:
             unknown = self._motion.end is None or self._confirmed
             doubtful = np.logical_or(seen.frozen(), unknown)
         try:
-            return [self._motion.begin(solution, path, seen, wall_s, self._rate, doubtful)]
+            drive = self._motion.begin(solution, path, seen, wall_s, self._rate, doubtful)
+            self._interlocks.note_moved()
+            return [drive]
         except StartMovedError:
             # The arm has moved since the path was asked for: it is asked for again.
             return []

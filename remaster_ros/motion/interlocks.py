@@ -36,6 +36,8 @@ class Interlocks:
     def __init__(self, heartbeat_s: float, resume_alone_s: float) -> None:
         self.must_collect = self.run = ''
         self._resume_alone_s = resume_alone_s
+        # Whether the arm was moved in this run: what is waited for before is no interruption.
+        self._moved = False
         # Since when nothing may move, and whether the robot reported all the time since that it
         # is not stopped.
         self._blocked_since_wall: float | None = None
@@ -71,7 +73,7 @@ class Interlocks:
         is_new = bool(run) and run != self.run
         began_another = is_new and bool(self.run)
         if is_new:
-            self.run = run
+            self.run, self._moved = run, False
             if wall_s - self._planner_since_wall >= KNOWN_S:
                 self.must_collect, self._blocked_since_wall = '', None
         self.note_alive('planner', reason, wall_s)
@@ -113,6 +115,10 @@ class Interlocks:
         """Whether the planner runs a collection that a person began."""
         return 'planner' in self._seen and not self.reason('planner') and not self.must_collect
 
+    def note_moved(self) -> None:
+        """Process that the arm is moved."""
+        self._moved = True
+
     def interrupted(self, since_wall_s: float) -> None:
         """Process that nobody has looked at the arm since then, s: this process was not there."""
         self._blocked_since_wall, self._released = since_wall_s, False
@@ -125,7 +131,7 @@ class Interlocks:
         released = self.was_right('safety') and not self.reason('safety_link')
         reason = self._hindrance(wall_s)
         if self._blocked_since_wall is None:
-            if not reason or not self.run:
+            if not reason or not self._moved:
                 return
             self._blocked_since_wall, self._released = wall_s, released
         self._released &= released

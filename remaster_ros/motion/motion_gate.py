@@ -42,6 +42,8 @@ SAMPLE_RAD = 0.05
 CUBIC_PEAK, CUBIC_BEND = 1.5, 6.0
 """A cubic from rest to rest over a way d in a time T has at most the speed 1.5 d/T and the
 acceleration 6 d/T²."""
+PROBE_S = 2 * RAMP_S
+"""A probe takes so long at least, s."""
 FULL_TURN = 2 * np.pi
 """Taken for the range of a joint without limits, rad."""
 WAY_OUT_SPEED = 0.1
@@ -152,7 +154,7 @@ class MotionGate:
         farthest = np.where(np.isfinite(farthest), farthest, FULL_TURN)
         way = np.where(doubtful, np.maximum(farthest, START_RAD), START_RAD)
         times = [
-            2 * RAMP_S,
+            PROBE_S,
             *(CUBIC_PEAK * way / limits.velocity),
             *np.sqrt(CUBIC_BEND * way / limits.acceleration),
         ]

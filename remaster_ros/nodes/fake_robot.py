@@ -1,4 +1,4 @@
-"""ROS shell of the fake arm: joint_trajectory_controller, joint_states, and a clock.
+"""ROS shell of the fake arm: joint_trajectory_controller, joint_states, safety circuit, a clock.
 
 The clock is relative like every name here: in a namespace, nodes that use it are started with the
 remapping ``/clock:=clock`` (rclpy itself subscribes to /clock).
@@ -14,10 +14,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock as ClockMessage
 from sensor_msgs.msg import JointState
-from std_msgs.msg import Header
+from std_msgs.msg import Bool, Header
 from trajectory_msgs.msg import JointTrajectory
 
 from remaster_ros.collection.message_fields import seconds
@@ -83,6 +83,9 @@ class FakeRobotNode(RemasterNode):
         reliable = QoSProfile(depth=50, reliability=ReliabilityPolicy.RELIABLE)
         self._states = self.create_publisher(JointState, 'joint_states', reliable)
         self._clock_publisher = self.create_publisher(ClockMessage, 'clock', 10)
+        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        self._safety = self.create_publisher(Bool, 'emergency_stop', latched)
+        self._reported_stop: bool | None = None
         self.create_subscription(
             JointTrajectory,
             'joint_trajectory_controller/joint_trajectory',
@@ -119,6 +122,9 @@ class FakeRobotNode(RemasterNode):
             self._pace.took(int(message.frame_id), seconds(message.stamp))
 
     def _publish_state(self) -> None:
+        if self.arm.reports_stop != self._reported_stop:
+            self._reported_stop = self.arm.reports_stop
+            self._safety.publish(Bool(data=self._reported_stop))
         state = self.arm.joint_state()
         if state is None:
             return

@@ -38,7 +38,8 @@ from remaster_ros.motion.actions import (
 )
 from remaster_ros.motion.arm_supervisor import ArmSupervisor
 from remaster_ros.motion.joint_reports import JointReport, JointReports
-from remaster_ros.motion.motion_gate import Admitted, MotionGate
+from remaster_ros.motion.motion_gate import PROBE_S, Admitted, MotionGate
+from remaster_ros.motion.move_queue import PROBE
 from remaster_ros.motion.path_check import PointSpeeds
 from remaster_ros.motion.path_search import PathSearch
 from remaster_ros.nodes.background import Background
@@ -59,6 +60,7 @@ from remaster_ros.nodes.simulated_clock import ReportsTaken, SteadyTime
 from remaster_ros.nodes.status import RELIABLE, NodeStatus, Summary, listen
 from remaster_ros.nodes.waypoints import waypoints_by_solution
 from remaster_ros.session.halt_file import HaltFile
+from remaster_ros.session.last_command import LastCommandFile
 from remaster_ros.session.workcell import read_cell
 
 JOINTS = 'joint_states'
@@ -107,17 +109,27 @@ class RobotBridge(RemasterNode):
         self._offsets = offsets
         self._acceleration = cell.acceleration_limits(self.chain)
         self._halt_file = HaltFile(self.get_fully_qualified_name())
+        self._command_file = LastCommandFile(
+            self.get_fully_qualified_name(), self.chain.joint_names
+        )
+        # A simulated arm begins anew with each World: nothing holds from the one before.
+        is_kept = not self.p.simulated_clock_rate
+        last = self._command_file.read(time.time_ns()) if is_kept else None
         self.supervisor = ArmSupervisor(
             MotionGate(self.p.limits(self.chain, offsets, self._acceleration), speeds),
             JointReports(self.chain.lower, self.chain.upper, self.chain.velocity_limits),
             self.p.rules(),
             self._halt_file.read(),
+            None if last is None else last.end,
         )
+        self._keeps_end, self._kept_end = is_kept, self.supervisor.end
         self._search = PathSearch(model, speeds)
         self._paths, self._disk = Background(self), Background(self)
         self._pose_stamp = self._run = ''
         self.steady_s = SteadyTime(self, self.p.simulated_clock_rate)
         self._taken = ReportsTaken(self, self.p.simulated_clock_rate)
+        if last is not None:
+            self.supervisor.interrupted(self.steady_s() - last.age_s)
         self._settled_wall = self.steady_s()
         self._waypoints = JointTrajectory()
         self.counts = {'commanded': 0, 'settled': 0, 'failed': 0, 'stopped': 0}
@@ -253,6 +265,7 @@ class RobotBridge(RemasterNode):
         response.message = refusal or 'cleared; /remaster/collect goes on'
         if not refusal:
             self._disk.submit(self._halt_file.clear, self._on_written)
+            self._keep_end()
             self.status.event(events.HaltCleared(stamp=self._pose_stamp))
             self.status.publish()
         return response
@@ -314,7 +327,7 @@ class RobotBridge(RemasterNode):
                     self._do(self.supervisor.not_sent(action, self.steady_s()))
                 case Drive():
                     self._publish(action.admitted)
-                    self._on_commanded(action.solution)
+                    self._on_commanded(action)
                 case Stop(admitted, reason):
                     self._publish(admitted, stop=True)
                     self.counts['stopped'] += 1
@@ -337,6 +350,22 @@ class RobotBridge(RemasterNode):
                     self.status.event(events.ArmHalted(stamp=self._pose_stamp, reason=reason))
                     self.status.publish()
                     self.get_logger().error(f'halted: {reason}')
+        self._keep_end()
+
+    def _keep_end(self) -> None:
+        """Write down where the last command leads, for a bridge after this one."""
+        end = self.supervisor.end
+        if not self._keeps_end or end is None or end is self._kept_end:
+            return
+        self._kept_end = end
+        write = partial(self._command_file.write, end, time.time_ns())
+        self._disk.submit(write, self._on_end_written)
+
+    def _on_end_written(self, result: object) -> None:
+        if isinstance(result, Exception):
+            self.get_logger().error(
+                f'{self._command_file.path}: where the arm was led last is not kept ({result})'
+            )
 
     def _publish(self, admitted: Admitted, *, stop: bool = False) -> None:
         """Publish what the gate has admitted; nothing else is ever published to a controller."""
@@ -354,7 +383,13 @@ class RobotBridge(RemasterNode):
         assert self._controller is not None
         self._controller.send(message, stop=stop)
 
-    def _on_commanded(self, solution: int) -> None:
+    def _on_commanded(self, drive: Drive) -> None:
+        solution, duration_s = drive.solution, drive.admitted.waypoints[-1].time_s
+        if solution == PROBE and duration_s > PROBE_S:
+            self.get_logger().info(
+                f'for {duration_s:.0f} s the arm is led to where it is reported, as it is not '
+                'sure that it is there; where it is, it stands meanwhile'
+            )
         if solution < 0:
             return
         self.counts['commanded'] += 1

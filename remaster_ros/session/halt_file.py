@@ -22,6 +22,15 @@ class _Halt(msgspec.Struct):
     since: str
 
 
+def bridge_file(kind: str, node: str, environment: Mapping[str, str]) -> Path:
+    """Return where a bridge keeps something, by its fully qualified name and the ROS domain."""
+    home = Path(environment.get('ROS_HOME') or Path.home() / '.ros')
+    # No name of a node has a point: /a/b and /a_b have a file each.
+    name = node.strip('/').replace('/', '.')
+    domain = environment.get('ROS_DOMAIN_ID') or '0'
+    return home / 'remaster_ros' / f'{kind}_{domain}_{name}.json'
+
+
 class HaltFile:
     """Keep why an arm is halted until a person clears it.
 
@@ -39,11 +48,7 @@ class HaltFile:
     """
 
     def __init__(self, node: str, environment: Mapping[str, str] = os.environ) -> None:
-        home = Path(environment.get('ROS_HOME') or Path.home() / '.ros')
-        # No name of a node has a point: /a/b and /a_b have a file each.
-        name = node.strip('/').replace('/', '.')
-        domain = environment.get('ROS_DOMAIN_ID') or '0'
-        self.path = home / 'remaster_ros' / f'halt_{domain}_{name}.json'
+        self.path = bridge_file('halt', node, environment)
 
     def read(self) -> str:
         """Return why the arm is halted, '' if it is not; a damaged file is a halt, too."""

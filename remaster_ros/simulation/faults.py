@@ -10,6 +10,7 @@ The robot:
 ``off``            reports nothing and takes no command
 ``dropped``        takes no command
 ``estop``          stands still at once and takes no command
+``estop_reported`` the same, and its safety circuit reports it
 ``elsewhere``      goes so many rad beside its target, at every joint
 ``slow``           needs so many times as long
 ``late``           reports what was so many seconds ago

@@ -117,7 +117,7 @@ class FakeArm:
         None where nothing is reported: a robot that is off, or a report that is lost.
         """
         now, faults = self.world.now(), self.world.faults('robot')
-        if 'estop' not in faults:
+        if not _is_stopped(faults):
             self._braked = False
         elif not self._braked:
             self._brake(now)
@@ -149,6 +149,11 @@ class FakeArm:
         return self._last
 
     @property
+    def reports_stop(self) -> bool:
+        """Whether its safety circuit reports that it stops the arm."""
+        return 'estop_reported' in self.world.faults('robot')
+
+    @property
     def copies(self) -> int:
         """How often each report is sent."""
         return 2 if 'doubled' in self.world.faults('robot') else 1
@@ -172,9 +177,13 @@ class FakeArm:
         self.world.begin_motion(now, [ServoPoint(braking_s, end, np.zeros_like(end))])
 
 
+def _is_stopped(faults: Numbers) -> bool:
+    return 'estop' in faults or 'estop_reported' in faults
+
+
 def _fault_reason(faults: Numbers, now: float) -> str:
     """Why a faulty robot takes no command; '' if it does."""
-    for name in ('off', 'dropped', 'estop'):
+    for name in ('off', 'dropped', 'estop', 'estop_reported'):
         if name in faults:
             return f'fault injected: {name}'
     return 'fault injected: intermittent' if is_out(faults.get('intermittent'), now) else ''

@@ -32,6 +32,7 @@ from remaster_ros.collection.events import (
 )
 from remaster_ros.collection.message_fields import seconds
 from remaster_ros.nodes import emergency_link, rivals, robot_bridge, simulated_clock, status
+from remaster_ros.session.last_command import LastCommandFile
 from remaster_ros.session.workcell import read_cell
 
 CELL = read_cell('demo')
@@ -128,13 +129,15 @@ class Rig:
         By node, the arms that others than the bridge's compute with.
     names, order
         The joints' names, and in which order joint_states has them.
+    first
+        Whether no bridge before this one has led the arm to its home.
     alter
         Changes a message of joint_states before it is published.
     commands, events, summaries, settled
         What came from the bridge; summaries as (level, message, values).
     """
 
-    def __init__(self, monkeypatch, folder, home=HOME, controller=True, **parameters):
+    def __init__(self, monkeypatch, folder, home=HOME, controller=True, first=False, **parameters):
         self.wall = 1000.0
         clock = SimpleNamespace(monotonic=lambda: self.wall, time_ns=time.time_ns)
         for module in (robot_bridge, simulated_clock, status, rivals, emergency_link):
@@ -142,6 +145,8 @@ class Rig:
         monkeypatch.setenv('ROS_HOME', str(folder))
         monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
         self.names = list(CHAIN.joint_names)
+        if not first:
+            LastCommandFile('/robot_bridge', self.names).write(home, time.time_ns())
         self.order = np.random.default_rng(3).permutation(len(HOME))
         self.arm = HostileArm(home, self.wall)
         self.rng = np.random.default_rng(4)

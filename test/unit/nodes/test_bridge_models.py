@@ -30,7 +30,7 @@ def stays(r):
 
 @pytest.mark.parametrize('node', ['/pose_planner', '/recorder'])
 def test_nothing_moves_by_a_node_of_another_arm(rig, node):
-    r = rig(ready=False)
+    r = rig(ready=False, first=True)
     r.models[node] = IIWA
     r.alone()
     r.run(2.0)

@@ -43,6 +43,7 @@ def test_the_summary(rig):
         'failed': '0',
         'stopped': '0',
         'halted': '',
+        'asks_for_collect': '',
         'joints_age_s': '0.1',
         'joints_trouble': '',
         'moves_refused': '0',

@@ -13,6 +13,7 @@ from remaster_ros.nodes.bridge_parameters import Parameters
 pytestmark = pytest.mark.ros
 
 RANGES = {
+    'resume_alone_s': (5.0, 0.0, 60.0, 's'),
     'simulated_clock_rate': (0.0, 0.0, 100.0, ''),
     'cell': ('', None, None, ''),
     'speed_share': (0.3, 0.01, 1.0, ''),

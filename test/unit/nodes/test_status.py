@@ -150,7 +150,14 @@ def test_another_start_of_this_name_is_a_rival_only_where_another_node_publishes
         ),
         (
             BridgeState(halted='', joints_age_s=0.25),
-            {'halted': '', 'pose': '', 'run': '', 'joints_age_s': '0.2', 'joints_trouble': ''},
+            {
+                'halted': '',
+                'pose': '',
+                'run': '',
+                'asks_for_collect': '',
+                'joints_age_s': '0.2',
+                'joints_trouble': '',
+            },
         ),
     ],
 )
