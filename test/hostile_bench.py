@@ -35,6 +35,7 @@ from hostile_lines import (
 )
 from hostile_process import BridgeProcess
 from rclpy.executors import SingleThreadedExecutor
+from ros_rig import ASKED
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool, String
 from std_srvs.srv import Trigger
@@ -52,6 +53,7 @@ from remaster_ros.collection.events import (
     decode,
     encode,
 )
+from remaster_ros.session.last_command import LastCommandFile
 from remaster_ros.session.workcell import read_cell
 from remaster_ros.types import FloatArray
 
@@ -114,9 +116,15 @@ class Bench(BridgeProcess):
         self._frozen: FloatArray | None = None
         self._stopped_stamp: float | None = None
         self._ending = threading.Event()
+        self._led_to(home)
         self._context = rclpy.Context()
         rclpy.init(context=self._context, domain_id=int(environment['ROS_DOMAIN_ID']))
         self._open()
+
+    def _led_to(self, q: FloatArray) -> None:
+        """Let the bridge that is started next find that one before it has led the arm there."""
+        file = LastCommandFile('/robot_bridge', self.names, self.environment)
+        file.write(q, time.time_ns())
 
     def _open(self) -> None:
         self.node = node = rclpy.create_node('hostile_controller', context=self._context)
@@ -223,11 +231,19 @@ class Bench(BridgeProcess):
         return f'{stamp.sec}.{stamp.nanosec:09d}'
 
     def clear_halt(self, timeout_s: float = 5.0) -> bool | None:
-        """Call the service as a person would; None where the bridge has none."""
+        """Call the service as a person would; None where the bridge has none.
+
+        Asked to compare the pad with what is reported, a person does, and calls again.
+        """
         if not self._clear.service_is_ready():
             return None
-        future = self._clear.call_async(Trigger.Request())
-        return self.until(future.done, timeout_s) and future.result().success
+        for _ in range(2):
+            future = self._clear.call_async(Trigger.Request())
+            if not self.until(future.done, timeout_s):
+                return False
+            if not future.result().message.startswith(ASKED):
+                break
+        return future.result().success
 
     def on_its_way(self) -> bool:
         """Whether the arm is in the middle of a move: one that is being stopped is not."""
@@ -262,6 +278,7 @@ class Bench(BridgeProcess):
             old = self.arm
             self.arm = HostileArm(q, time.monotonic(), old.exact, old.open_loop)
             self.arm.commands = old.commands
+        self._led_to(q)
 
     # Threads
 

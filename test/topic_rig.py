@@ -3,7 +3,7 @@
 import numpy as np
 from collection_rig import Cell
 from foreign_source import SIGMA_RAD, orientation
-from ros_rig import call
+from ros_rig import call, clear_halt
 from scipy.spatial.transform import Rotation
 
 from remaster_ros import fit
@@ -55,7 +55,7 @@ class Collection:
         def turn():
             planner = said.get('pose_planner', {})
             if said.get('robot_bridge', {}).get('halted'):
-                call(self.cell.client, '/remaster/clear_halt')
+                clear_halt(self.cell.client)
             elif planner.get('resuming') == 'no' and planner['state'] in ('idle', 'paused'):
                 call(self.cell.client, '/remaster/collect')
             return condition()

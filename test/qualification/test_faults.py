@@ -9,7 +9,7 @@ import time
 
 import numpy as np
 import pytest
-from ros_rig import call, wait_until
+from ros_rig import call, clear_halt, wait_until
 
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.session.reader import read_session
@@ -98,7 +98,7 @@ def test_one_fault_after_the_other_and_the_run_completes(start, client, tmp_path
         inject(world, {})
         listener.stands()
         assert call(client, '/remaster/collect').success is False
-        assert call(client, '/remaster/clear_halt').success
+        assert clear_halt(client).success
         listener.stands()
         assert call(client, '/remaster/collect').success
 

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 from browser import Browser
 from collection_rig import Cell
-from ros_rig import ROOT, call, node_arguments
+from ros_rig import ROOT, clear_halt, node_arguments
 from simple_cells import write_cell
 
 from remaster_ros.nodes.demo import free_ports
@@ -82,7 +82,7 @@ class Person:
             assert self.is_off('collect')
             self.halts += 1
             assert self.halts <= MOST_HALTS, self.browser.text('body')
-            call(self.client, '/remaster/clear_halt')
+            clear_halt(self.client)
             self.until(lambda: not self.browser.text('#halt'), 'the end of the halt')
         if 'waits for your confirmation' in self.browser.text('#plan-state'):
             self.confirm()

@@ -9,7 +9,7 @@ import time
 
 import numpy as np
 import pytest
-from ros_rig import ROOT, call, node_arguments, wait_until
+from ros_rig import ROOT, call, clear_halt, node_arguments, wait_until
 
 pytest.importorskip('rclpy', reason='needs ROS 2 Jazzy or its wheels')
 pytest.importorskip('pinocchio', reason='the judge needs pinocchio (pip install .[test])')
@@ -20,6 +20,7 @@ from hostile_lines import RELIABLE
 from hostile_scene import demo_body
 
 from remaster_ros.nodes.demo import free_ports
+from remaster_ros.session.last_command import LastCommandFile
 from remaster_ros.session.workcell import read_cell
 from remaster_ros.simulation.setup import make_world
 
@@ -101,7 +102,9 @@ class Relay:
 def relay(start, client, ros_environment, tmp_path):
     # A halt outlives the bridge: not into the next test.
     ros_environment['ROS_HOME'] = str(tmp_path / 'ros_home')
-    make_world(tmp_path / 'world', read_cell('demo'), SEED, 1.0)
+    world = make_world(tmp_path / 'world', read_cell('demo'), SEED, 1.0)
+    last = LastCommandFile('/robot_bridge', world.chain.joint_names, ros_environment)
+    last.write(world.start_q, time.time_ns())
     command, data = free_ports(socket.SOCK_DGRAM, socket.SOCK_DGRAM)
     ports = {'command_port': command, 'data_port': data}
     own = {
@@ -150,7 +153,7 @@ def test_what_the_real_nodes_command_when_the_joint_states_are_spoiled(relay):
         relay.until(relay.halted, 'a halt', 10)
         relay.stays_halted(since)
         relay.spoil = lambda message: message
-        response = call(relay.client, '/remaster/clear_halt')
+        response = clear_halt(relay.client)
         assert response.success, response.message
         relay.until(lambda: not relay.halted() and not relay.moves(), 'the halt to end')
         call(relay.client, '/remaster/pause')
