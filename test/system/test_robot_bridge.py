@@ -46,6 +46,9 @@ def bridge(tmp_path, ros_environment):
             bench.start()
         assert bench.until(lambda: bench.seen.summaries, 30), bench.log.read_text()
         if running:
+            # A person begins where everything has been up for a while.
+            bench.until(lambda: bench.seen.summaries[-1][1] == 'planner is waiting', 30)
+            settle(bench, 1.2)
             bench.plan_state('running')
         return bench
 
