@@ -89,10 +89,10 @@ class ArmSupervisor:
         self._interlocks = Interlocks(rules.heartbeat_s, rules.resume_alone_s)
         self._queue = MoveQueue()
         self._motion = MotionUnderWay(gate, rules, end)
-        # Where the arm is reported, which a person was asked to compare with the pad; whether a
-        # person has confirmed it, and no probe has been made since.
+        # Where the arm is reported, which a person was asked to compare with the pad.
         self._asked: FloatArray | None = None
-        self._confirmed = False
+        # Whether it may be elsewhere than reported, until a probe has led it there to its end.
+        self._unsure = end is None
         self._wall = -np.inf
         self._failures = self._refusals = 0
         self._paused = False
@@ -234,7 +234,7 @@ class ArmSupervisor:
             asked, self._asked = self._asked, seen.q
             if asked is None or self._differs(asked, seen.q):
                 return self._elsewhere(seen.q)
-            self._motion.end, self._confirmed = seen.q, True
+            self._motion.end, self._unsure = seen.q, True
         self._asked = None
         self.halted = ''
         self._interlocks.must_collect = 'the halt was cleared'
@@ -317,8 +317,8 @@ class ArmSupervisor:
 
     @property
     def end(self) -> FloatArray | None:
-        """Where the last command led, rad, (k,); None where that is not known."""
-        return self._motion.end
+        """Where the last command led, rad, (k,); None before it is sure that the arm is there."""
+        return None if self._unsure else self._motion.end
 
     @property
     def busy(self) -> bool:
@@ -425,8 +425,7 @@ class ArmSupervisor:
     def _drive(self, solution: int, path: FreePath, seen: Seen, wall_s: float) -> list[Action]:
         doubtful = None
         if solution == PROBE:
-            unknown = self._motion.end is None or self._confirmed
-            doubtful = np.logical_or(seen.frozen(), unknown)
+            doubtful = np.logical_or(seen.frozen(), self._unsure)
         try:
             drive = self._motion.begin(solution, path, seen, wall_s, self._rate, doubtful)
             self._interlocks.note_moved()
@@ -464,7 +463,7 @@ class ArmSupervisor:
             return []
         if outcome == 'over':
             self._motion.visit, self._queue.must_probe = None, False
-            self._confirmed = False
+            self._unsure = False
         if outcome == 'settled':
             self._failures = self._refusals = 0
             return [visit.settled_at(seen)]

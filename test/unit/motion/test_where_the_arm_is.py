@@ -193,6 +193,25 @@ def test_when_the_probe_takes_its_time(end, frozen, slow):
     assert (probe.admitted.waypoints[0].time_s > 1.0) == slow
 
 
+@pytest.mark.parametrize('pause_s', [0.5, 4.0])
+def test_a_slow_probe_that_was_interrupted_is_slow_again(pause_s):
+    """It has not led the arm to its end: where the arm is, is as open as before."""
+    rig = Rig(begun=False, end=None)
+    rig.plan([0.5, 0.5])
+    rig.run(3.0, lambda: rig.said(Drive))
+    rig.run(1.0)
+    assert rig.supervisor.end is None
+    rig.state = 'paused'
+    rig.run(pause_s)
+    rig.state = 'running'
+    rig.run(3.0, lambda: len(rig.said(Drive)) == 2)
+    for probe in rig.said(Drive):
+        assert probe.solution == PROBE
+        assert probe.admitted.waypoints[0].time_s > 3.0
+    rig.run(20.0, lambda: rig.said(Settled))
+    assert rig.supervisor.end is not None
+
+
 def test_raised_limits_ask_for_another_run():
     rig = Rig()
     assert rig.supervisor.under_way
