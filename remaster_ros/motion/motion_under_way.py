@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from remaster_ros.motion.actions import Drive, Stop, SupervisorRules
-from remaster_ros.motion.following import Following, Seen, allowed_lag_s
+from remaster_ros.motion.following import ASTRAY_S, Following, Seen, allowed_lag_s
 from remaster_ros.motion.motion_gate import MotionGate
 from remaster_ros.motion.move_queue import PROBE
 from remaster_ros.motion.path_check import FreePath
@@ -156,8 +156,10 @@ class MotionUnderWay:
             return []
         admitted = self.gate.stop(*following.window(seen, wall_s, rate))
         (stop,) = admitted.waypoints
-        over = seen.now(wall_s, rate) + stop.time_s + allowed_lag_s(self.rules, rate)
-        self.braking = Braking(seen.q, stop.q, over, over + STOPPED_S, self.near, self.rules)
+        begins = seen.now(wall_s, rate) + allowed_lag_s(self.rules, rate)
+        over, patience_s = begins + stop.time_s, ASTRAY_S * max(rate, 1.0)
+        deadline = over + max(STOPPED_S, patience_s)
+        self.braking = Braking(stop.q, begins, over, deadline, self.near, patience_s)
         self._lead_to(stop.q)
         return [Stop(admitted, reason, wall_s)]
 

@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 
 from remaster_ros.motion.actions import Settled, SupervisorRules
-from remaster_ros.motion.following import Following, Seen
+from remaster_ros.motion.following import ON_PATH_RAD, Following, Seen
 from remaster_ros.motion.settling import SettleDetector
 from remaster_ros.motion.trajectory import Trajectory
 from remaster_ros.types import FloatArray
@@ -103,39 +103,36 @@ class Braking:
 
     Attributes
     ----------
-    begun
-        Where the arm was reported when the stop was sent, rad, (k,).
     end
         Where it leads, rad, (k,).
+    begins
+        Robot time at which the arm has begun it, however late it reacts, s. Before that an arm may
+        stand where its move ended.
     over
-        Robot time at which the arm has come to its end, however late it reacts, s. Before that an
-        arm that stands may not yet have begun to move.
+        Robot time at which it has come to its end, s.
     deadline
         Robot time until which it must stand there, s.
     near
         How far from the end it may stand: what this arm was seen to stand off, rad.
-    rules
-        The tolerances.
-    moved
-        Whether the arm has been seen to move since.
+    patience_s
+        `ASTRAY_S`, s of robot time.
     """
 
-    begun: FloatArray
     end: FloatArray
+    begins: float
     over: float
     deadline: float
     near: float
-    rules: SupervisorRules
-    moved: bool = False
+    patience_s: float
 
     def judge(self, seen: Seen) -> Outcome:
         """Return whether the arm has come to rest where its stop ends, by a report."""
-        settle, stands = self.rules.settle, seen.stands(seen.wall)
-        self.moved |= bool(np.any(np.abs(seen.q - self.begun) > settle.still_tolerance))
-        off = float(np.max(np.abs(seen.q - self.end)))
+        stands, off = seen.stands(seen.wall), float(np.max(np.abs(seen.q - self.end)))
         elsewhere = f'the arm stands {off:.4f} rad from where its stop led: an emergency stop?'
         if seen.time < self.over:
-            early = self.moved and stands and off > settle.arrive_tolerance
+            stood_s = seen.time - max(seen.stands_since, self.begins)
+            # Nearer to its end it comes to rest.
+            early = stands and off > ON_PATH_RAD and stood_s >= self.patience_s
             return ('halted', elsewhere) if early else UNDER_WAY
         if stands and off <= self.near:
             return 'over', ''

@@ -38,7 +38,7 @@ class Rig:
     """The supervisor with everybody alive, at 50 Hz.
 
     `alter` changes what the arm reports, `obey` what becomes of a trajectory, `answer_path` what
-    is found out about a path, `delay_s` how long a report takes.
+    is found out about a path, `delay_s` how long a report takes, `stop_s` a stop to the arm.
     """
 
     def __init__(self, rules=RULES, wall_s=1000.0, begun=True, halted='', rate=1.0, end=HOME):
@@ -56,7 +56,8 @@ class Rig:
         self.obey = lambda waypoints: waypoints
         self.alter = lambda t, q: q
         self.answer_path = self._free
-        self.delay_s = self.stamp_shift = 0.0
+        self.delay_s = self.stamp_shift = self.stop_s = 0.0
+        self.on_its_way = None
         self.rate = rate
         self.told_wall = -np.inf
         self.told_state, self.runs = '', 0
@@ -83,7 +84,11 @@ class Rig:
                 if answer is not None:
                     self.do(self.supervisor.path_found(action.number, answer, self.wall))
             elif isinstance(action, Drive | Stop):
-                self._command(self.obey(action.admitted.waypoints))
+                points = self.obey(action.admitted.waypoints)
+                if isinstance(action, Stop) and self.stop_s:
+                    self.on_its_way = self.t + self.stop_s, points
+                else:
+                    self._command(points)
 
     def _command(self, points):
         if not points:
@@ -102,6 +107,9 @@ class Rig:
 
     def step(self, dt=0.02):
         self.t, self.wall = self.t + dt, self.wall + dt / self.rate
+        if self.on_its_way is not None and self.t >= self.on_its_way[0]:
+            (_, points), self.on_its_way = self.on_its_way, None
+            self._command(points)
         self.under_way.append((self.t, self.alter(self.t, self.noisy())))
         if 'bridge' not in self.alive:
             return

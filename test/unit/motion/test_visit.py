@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from remaster_ros.motion.actions import SupervisorRules
-from remaster_ros.motion.following import Following, Seen
+from remaster_ros.motion.following import ON_PATH_RAD, Following, Seen
 from remaster_ros.motion.settling import SettleDetector, SettleRules
 from remaster_ros.motion.trajectory import Line, Trajectory
 from remaster_ros.motion.visit import MOVED_RAD, PROBE_WAIT_S, Braking, Visit
@@ -90,12 +90,12 @@ def test_an_arm_that_has_stood_for_long_enough_has_settled():
     assert made.deadline == SENT_S + 3.5 + 16.0
 
 
-NEAR = 2.0**-11
-BEGUN = np.array([1.0, 0.0])
+NEAR, PATIENCE_S = 2.0**-11, 0.5
 
 
-def braking(over=0.0, deadline=4.0):
-    return Braking(BEGUN, np.zeros(2), SENT_S + over, SENT_S + deadline, NEAR, RULES)
+def braking(begins=0.0, over=0.0, deadline=4.0):
+    times = (SENT_S + after_s for after_s in (begins, over, deadline))
+    return Braking(np.zeros(2), *times, NEAR, PATIENCE_S)
 
 
 @pytest.mark.parametrize(('off', 'outcome'), [(NEAR, 'over'), (NEAR + 1e-12, 'halted')])
@@ -111,19 +111,25 @@ def test_how_far_from_its_stop_an_arm_may_stand(off, outcome):
 
 
 @pytest.mark.parametrize(
-    ('q', 'outcome'), [(1.0, ''), (1.0 - 2.0**-12, ''), (1.0 - 2.0**-11, 'halted'), (0.0, '')]
+    ('off', 'time_s', 'stood_s', 'outcome'),
+    [
+        (1.0, 1.5, 9.0, 'halted'),
+        # It may stand until its stop gets to it.
+        (1.0, 1.5 - 2.0**-20, 9.0, ''),
+        (1.0, 1.75, 0.5, 'halted'),
+        (1.0, 1.75, 0.5 - 2.0**-20, ''),
+        (ON_PATH_RAD, 1.75, 9.0, ''),
+        (0.0, 1.75, 9.0, ''),
+    ],
 )
-def test_an_arm_that_stands_before_its_stop_is_over_has_not_begun_to_move_or_is_stopped(
-    q, outcome
-):
-    """Where it was when the stop was sent it may not have begun; at the end it has arrived."""
-    stop = braking(over=2.0)
-    assert stop.judge(at([q, 0.0], SENT_S + 2.0 - 2.0**-30, 1.0))[0] == outcome
+def test_how_long_an_arm_may_stand_that_should_brake(off, time_s, stood_s, outcome):
+    stop = braking(begins=1.0, over=2.0)
+    assert stop.judge(at([-off, 0.0], SENT_S + time_s, stood_s))[0] == outcome
 
 
 def test_an_arm_that_still_brakes_before_its_stop_is_over_is_waited_for():
     stop = braking(over=2.0)
-    assert stop.judge(at([0.5, 0.0], SENT_S + 1.0, 0.1)) == ('', '')
+    assert stop.judge(at([0.5, 0.0], SENT_S + 1.9, 0.1)) == ('', '')
 
 
 @pytest.mark.parametrize(('late', 'outcome'), [(0.0, ''), (2.0**-30, 'halted')])

@@ -1,10 +1,13 @@
 """What is done where it is not sure that the arm is where it is reported; who goes on when."""
 
+import copy
+
 import numpy as np
 import pytest
 from supervisor_rig import ASKED, HOME, LIMITS, RULES, SPEED, Rig
 
 from remaster_ros.motion.actions import Drive, Halted, Settled, Stop
+from remaster_ros.motion.following import allowed_lag_s
 from remaster_ros.motion.motion_gate import Cubic, MotionGate
 from remaster_ros.motion.move_queue import PROBE, probe_path
 from remaster_ros.motion.trajectory import Waypoint
@@ -35,6 +38,37 @@ def test_an_emergency_stop_while_it_brakes_halts(trial):
     rig.run(5.0)
     assert rig.said(Halted)
     assert len(rig.said(Drive)) == 1
+
+
+@pytest.mark.parametrize('rate', [1.0, 10.0])
+def test_a_stop_that_is_long_on_its_way_is_no_emergency_stop(rate):
+    """The arm has come to the end of its move meanwhile, stands there and then goes back."""
+    rng = np.random.default_rng([SEED, int(rate)])
+    print(f'seed {SEED}')
+    begun = Rig(rate=rate)
+    # The rate is learned.
+    begun.run(1.0 * rate)
+    stops = farthest = 0
+    for _ in range(12):
+        rig = copy.deepcopy(begun)
+        # It is reported with its own rig's values.
+        rig.alter, rig.obey, rig.answer_path = (lambda t, q: q), (lambda points: points), rig._free
+        rig.plan(rng.uniform(-0.9, 0.9, 2))
+        duration_s = rig.last(Drive).admitted.waypoints[-1].time_s
+        rig.run(duration_s - rng.uniform(0.05, 0.8))
+        rig.stop_s = rng.uniform(0.8, 1.0) * allowed_lag_s(RULES, rate) - 0.02
+        rig.state = 'paused'
+        rig.do(rig.supervisor.planner_is('paused', rig.wall))
+        if not rig.said(Stop):
+            continue
+        (end,) = rig.last(Stop).admitted.waypoints
+        rig.run(allowed_lag_s(RULES, rate) + end.time_s + 4.0)
+        assert not rig.said(Halted)
+        stops += 1
+        farthest = max(farthest, np.max(np.abs(rig.last(Drive).admitted.trajectory.end - end.q)))
+    assert stops >= 6
+    # Where it stood meanwhile is no place for the end of a stop.
+    assert farthest > 2 * RULES.settle.arrive_tolerance
 
 
 @pytest.mark.parametrize('noise', [1e-6, 2e-5])
