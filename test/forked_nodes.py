@@ -99,21 +99,25 @@ def _serve(tests: socket.socket) -> list[str]:
         message, streams, _, _ = socket.recv_fds(tests, _MOST_BYTES, 3)
         if not message:
             os._exit(0)
+        born, bears = os.pipe()
         between = os.fork()
         if between:
             os.waitpid(between, 0)
-            for stream in streams:
-                os.close(stream)
+            # Only now is it a child of the tests: one that is no child counts as ended.
+            tests.send(os.read(born, 32))
+            for number in (born, bears, *streams):
+                os.close(number)
             continue
         ready, go = os.pipe()
         node = os.fork()
         if node:
-            tests.send(str(node).encode())
+            os.write(bears, str(node).encode())
             os._exit(0)
         # Not before its parent has ended, whose death it may be told of.
         os.close(go)
         os.read(ready, 1)
-        os.close(ready)
+        for number in (ready, born, bears):
+            os.close(number)
         tests.close()
         for number, stream in enumerate(streams):
             os.dup2(stream, number)
