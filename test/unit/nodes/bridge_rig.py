@@ -140,13 +140,16 @@ class Rig:
     def __init__(self, monkeypatch, folder, home=HOME, controller=True, first=False, **parameters):
         self.wall = 1000.0
         clock = SimpleNamespace(monotonic=lambda: self.wall, time_ns=time.time_ns)
-        for module in (robot_bridge, simulated_clock, status, rivals, emergency_link):
+        for module in (simulated_clock, status, rivals, emergency_link):
             monkeypatch.setattr(module, 'time', clock)
+        # The age of the last command follows the test's clock as well.
+        dated = SimpleNamespace(monotonic=clock.monotonic, time_ns=self.time_ns)
+        monkeypatch.setattr(robot_bridge, 'time', dated)
         monkeypatch.setenv('ROS_HOME', str(folder))
         monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
         self.names = list(CHAIN.joint_names)
         if not first:
-            LastCommandFile('/robot_bridge', self.names).write(home, time.time_ns())
+            LastCommandFile('/robot_bridge', self.names).write(home, self.time_ns())
         self.order = np.random.default_rng(3).permutation(len(HOME))
         self.arm = HostileArm(home, self.wall)
         self.rng = np.random.default_rng(4)
@@ -160,6 +163,10 @@ class Rig:
         self._closing = []
         self._open_peer(controller)
         self._open_bridge(parameters)
+
+    def time_ns(self):
+        """The system's clock of the bridge, ns: as far on as its wall clock."""
+        return round(1e9 * (1.7e9 + self.wall))
 
     # Made and ended
 

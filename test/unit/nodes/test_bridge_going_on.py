@@ -1,7 +1,5 @@
 """The bridge's shell: the first move after a start, and who goes on after an interruption."""
 
-import time
-
 import numpy as np
 import pytest
 
@@ -36,7 +34,7 @@ def test_where_the_last_command_led_is_kept_for_the_next_bridge(rig):
     r = rig()
     r.settle(TARGET)
     r.bridge.close()
-    last = commands_file(r).read(time.time_ns())
+    last = commands_file(r).read(r.time_ns())
     assert last.end.tolist() == TARGET.tolist()
     assert last.age_s < 60.0
 
@@ -45,7 +43,7 @@ def test_a_bridge_that_is_started_again_moves_the_arm_only_from_where_it_was_led
     """The driver of another arm, or one that reports what was: it halts, and says by how much."""
     r = rig(ready=False)
     moved = HOME + np.array([0.0, 0.1, 0.0, 0.0, 0.0, 0.0, 0.0])
-    commands_file(r).write(moved, time.time_ns())
+    commands_file(r).write(moved, r.time_ns())
     r.end_bridge()
     r._open_bridge({})
     r.ready()
@@ -67,7 +65,7 @@ def test_the_first_move_of_all_is_slow(rig):
     r.plan(TARGET)
     r.run(5.0, lambda: r.commands)
     assert r.commands[0].times_s[-1] > 20.0
-    r.run(60.0, r.moves, dt=0.05)
+    r.run(60.0, r.moves, dt=0.2)
 
 
 @pytest.mark.parametrize('released', [False, True])
@@ -104,7 +102,7 @@ def test_who_goes_on_after_an_interruption(rig, released):
 def test_a_bridge_that_was_away_in_a_run_for_long_waits_for_a_person(rig, gone_s, alone):
     r = rig(ready=False)
     r.end_bridge()
-    commands_file(r).write(HOME, time.time_ns() - round(gone_s * 1e9))
+    commands_file(r).write(HOME, r.time_ns() - round(gone_s * 1e9))
     r._open_bridge({})
     r.ready() if alone else r.alone()
     r.plan(TARGET)
