@@ -48,7 +48,7 @@ FAST = {
 """Parameters of a bridge whose decisions come soon."""
 DOMAIN = int(os.environ.get('REMASTER_TEST_DOMAIN', 215 + os.getpid() % 15))
 """Of ROS; never that of the user's shell, in which an arm may be."""
-PATIENCE_S = 5.0
+PATIENCE_S = 30.0
 """So long a message or a path check may take on a busy machine, s."""
 STEP_S = 0.02
 

@@ -12,7 +12,7 @@ from std_msgs.msg import Bool
 
 from remaster_ros.session.last_command import LastCommandFile
 
-pytestmark = [pytest.mark.ros, pytest.mark.timeout(60)]
+pytestmark = [pytest.mark.ros, pytest.mark.timeout(300)]
 
 EMERGENCY = 'robot/emergency_stop'
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
