@@ -134,7 +134,7 @@ _RESULTS = {
 }
 _MORE = {
     'offsets': f', {REMASTER_FILE} or {LAYER_FILE}',
-    'everything': ', by remaster_ros.read_compensation',
+    'everything': ', by remaster compensate or remaster_ros.read_compensation',
 }
 _ALONE = 'only zero-offsets are corrected here'
 

@@ -1,0 +1,208 @@
+"""Correct a table of joint targets, for controllers that take nothing but programs."""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import io
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from remaster_ros.cli.console import show
+from remaster_ros.cli.options import names, number
+from remaster_ros.compensation.compensator import Compensator, Correction
+from remaster_ros.compensation.file import Compensation, read_compensation
+from remaster_ros.errors import InputError
+from remaster_ros.importing.columns import Columns, Told, find_columns
+from remaster_ros.importing.text_table import TextTable, read_table
+from remaster_ros.importing.units import ANGLES
+from remaster_ros.importing.values import angle_unit, numbers, times
+from remaster_ros.session.files import write_atomically
+from remaster_ros.types import FloatArray
+
+FORMAT = 'remaster-compensate/1'
+# A hundred-thousandth of a degree is a fifth of a micrometre a metre away.
+DIGITS = {'deg': 6, 'rad': 8}
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of ``remaster compensate``."""
+    parser.add_argument(
+        'compensation', metavar='COMPENSATION', type=Path, help='apply/compensation.json'
+    )
+    parser.add_argument(
+        'table', metavar='TABLE', type=Path, help='joint targets, columns as in import'
+    )
+    parser.add_argument('--out', metavar='FILE', type=Path, required=True, help='the new table')
+    parser.add_argument(
+        '--inverse',
+        action='store_true',
+        help='from reported angles to those at which the nominal robot has its tool there',
+    )
+    parser.add_argument(
+        '--joints', type=names, default=(), help='columns of the joints, base to tip'
+    )
+    parser.add_argument(
+        '--angles', choices=sorted(ANGLES), help='unit, where the header has none: never guessed'
+    )
+    parser.add_argument(
+        '--temperature',
+        metavar='C',
+        type=number(-50.0, 150.0, 'degrees Celsius'),
+        help='of the arm, where the table has none (default: as it was measured)',
+    )
+    parser.add_argument(
+        '--max-change-deg',
+        metavar='DEG',
+        type=number(0.0, 90.0, 'degrees'),
+        default=2.0,
+        help='refuse where a joint would change by more (default 2)',
+    )
+    parser.add_argument('--json', action='store_true', help='print what was done as JSON')
+
+
+def run(args: argparse.Namespace) -> int:
+    """Read, correct, check, write and state what was done."""
+    compensation = read_compensation(args.compensation)
+    if args.out.exists() and args.out.samefile(args.table):
+        raise InputError(f'{args.out}: is the table itself; name another file for --out')
+    table = read_table(args.table)
+    chain = compensation.model.chain
+    columns = find_columns(table, chain.joint_names, Told(joints=args.joints))
+    if len(columns.joints) != len(chain):
+        raise InputError(
+            f'{args.table}: {len(columns.joints)} columns are joint angles, but the arm of '
+            f'{args.compensation} has {len(chain)} ({", ".join(chain.joint_names)}); name them, '
+            'base to tip, with --joints'
+        )
+    unit, known = angle_unit(table, columns, args.angles or '')
+    if known == 'guessed':
+        raise InputError(
+            f'{args.table}: the header states no unit of the joint angles; say --angles deg or '
+            '--angles rad'
+        )
+    given = numbers(table, columns.joints) * ANGLES[unit]
+    temperature = _temperature(table, columns, args.temperature)
+    compensator = compensation.compensator
+    if args.inverse:
+        result = compensator.true(given, temperature)
+        done = compensator.correct(result, temperature)
+    else:
+        done = compensator.correct(given, temperature)
+        result = done.command
+    _refuse_beyond(table, columns, given, result, done, compensator, args)
+    write_atomically(args.out, _text(table, columns, result / ANGLES[unit], DIGITS.get(unit, 8)))
+    wanted = result if args.inverse else given
+    facts = _facts(compensation, given, result, wanted, done, times(table, columns))
+    if args.json:
+        print(json.dumps(facts))
+    else:
+        show(args.quiet, _summary(facts, args.out))
+    return 0
+
+
+def _temperature(table: TextTable, columns: Columns, told: float | None) -> FloatArray | None:
+    column = columns.one('temperature')
+    if told is not None:
+        return np.full(len(table.rows), told)
+    return None if column is None else numbers(table, (column,))[:, 0]
+
+
+def _refuse_beyond(
+    table: TextTable,
+    columns: Columns,
+    given: FloatArray,
+    result: FloatArray,
+    done: Correction,
+    compensator: Compensator,
+    args: argparse.Namespace,
+) -> None:
+    """Refuse changes that no correction makes, and commands beyond the joints' limits."""
+    change = np.abs(np.degrees(result - given))
+    joints = compensator.joint_names
+    for row, j in np.argwhere(change > args.max_change_deg)[:1]:
+        raise InputError(
+            f'{table.path}, line {table.lines[row]}: {joints[j]} would change by '
+            f'{change[row, j]:.2f} degrees, more than {args.max_change_deg:g}; is it the '
+            'compensation of this arm, and the unit right? (--max-change-deg)'
+        )
+    chain = compensator.model.chain
+    beyond = (done.command < chain.lower) | (done.command > chain.upper)
+    for row, j in np.argwhere(beyond)[:1]:
+        raise InputError(
+            f'{table.path}, line {table.lines[row]}, column '
+            f'{table.names[columns.joints[j]]}: the command of {joints[j]} is '
+            f'{np.degrees(done.command[row, j]):.3f} degrees, beyond its limits '
+            f'({np.degrees(chain.lower[j]):.1f} to {np.degrees(chain.upper[j]):.1f}); keep '
+            'further away from them'
+        )
+
+
+def _text(table: TextTable, columns: Columns, angles: FloatArray, digits: int) -> str:
+    """Return the table with other joint angles, all else as it was."""
+    separator = table.separator if len(table.separator) == 1 else ','
+    text = io.StringIO()
+    writer = csv.writer(text, delimiter=separator, lineterminator='\n')
+    if table.has_header:
+        writer.writerow(table.names)
+    for cells, row in zip(table.rows, angles, strict=True):
+        new = list(cells)
+        for column, angle in zip(columns.joints, row, strict=True):
+            new[column] = f'{angle:.{digits}f}'.replace('.', table.decimal or '.')
+        writer.writerow(new)
+    return text.getvalue()
+
+
+def _facts(
+    compensation: Compensation,
+    given: FloatArray,
+    result: FloatArray,
+    wanted: FloatArray,
+    done: Correction,
+    times_s: FloatArray | None,
+) -> dict[str, Any]:
+    joints = compensation.compensator.joint_names
+    change = np.degrees(np.abs(result - given).max(axis=0, initial=0.0))
+    added: dict[str, float | None] = dict.fromkeys(joints)
+    if times_s is not None and len(times_s) > 1 and np.all(np.diff(times_s) > 0.0):
+        step = np.diff(times_s)[:, None]
+        before, after = (np.abs(np.diff(q, axis=0) / step).max(axis=0) for q in (given, result))
+        for j, joint in enumerate(joints):
+            if before[j] > 0.0:
+                added[joint] = 100.0 * float(after[j] / before[j] - 1.0)
+    covariance = compensation.uncertainty(wanted)
+    square = np.trace(covariance, axis1=1, axis2=2) + done.residual_m**2
+    residual_mm = 1e3 * done.residual_m
+    return {
+        'format': FORMAT,
+        'rows': len(given),
+        'residual_mm': {
+            'rms': float(np.sqrt(np.mean(residual_mm**2))),
+            'max': float(residual_mm.max()),
+        },
+        'change_deg': dict(zip(joints, change.tolist(), strict=True)),
+        'added_speed_percent': added,
+        'faded_rows': (np.flatnonzero(done.faded) + 1).tolist(),
+        'outside_range_rows': (np.flatnonzero(done.outside_range) + 1).tolist(),
+        'expected_error_mm': 1e3 * float(np.sqrt(np.mean(square))),
+    }
+
+
+def _summary(facts: dict[str, Any], out: Path) -> str:
+    most = max(facts['change_deg'], key=lambda joint: facts['change_deg'][joint])
+    residual = facts['residual_mm']
+    lines = [
+        f'{facts["rows"]} rows; {most} changes most, by {facts["change_deg"][most]:.3f} deg',
+        f'left of the correction: {residual["rms"]:.3f} mm RMS, {residual["max"]:.3f} mm at most; '
+        f'expected error of the marker {facts["expected_error_mm"]:.3f} mm RMS',
+    ]
+    for key, what in (
+        ('faded_rows', 'are near a singularity, where not all of the pose is corrected'),
+        ('outside_range_rows', 'are beyond the angles at which a curve was measured'),
+    ):
+        if facts[key]:
+            lines.append(f'{len(facts[key])} rows {what} (--json lists them)')
+    return '\n'.join([*lines, f'written: {out}'])

@@ -1,0 +1,141 @@
+"""``remaster compensate``: a table of joint targets, corrected and back, and what is refused."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hidden_tours import robot
+
+import remaster_ros
+from remaster_ros.cli.main import main
+from remaster_ros.compensation.arm_model import ArmModel, Function, Geometry, JointTerm
+from remaster_ros.compensation.file import written
+from remaster_ros.compensation.of_result import Described
+from remaster_ros.kinematics.serial_chain import SerialChain
+
+URDF = robot('lwr4plus')
+JOINTS = 7
+
+
+@pytest.fixture(scope='module')
+def file(tmp_path_factory):
+    """Return the compensation of an arm with offsets, a soft joint and a length."""
+    chain = SerialChain.from_urdf(URDF, 'base_link', 'tool')
+    rng = np.random.default_rng(1)
+    shifts = np.zeros((JOINTS + 1, 3))
+    shifts[3, 2] = 5e-4
+    model = ArmModel(
+        chain=chain,
+        joint_offsets=np.radians(0.3) * rng.standard_normal(JOINTS),
+        joint_terms=(
+            JointTerm(1, 'x', Function('gravity_torque', 'linear', 1), np.full(1, 3e-5)),
+        ),
+        base_terms=(),
+        geometry=Geometry(shifts, np.zeros((JOINTS + 1, 3))),
+        growth=Geometry.none(JOINTS),
+        lateral_compliance=np.zeros(JOINTS),
+        reference_c=np.nan,
+        mean_c=np.nan,
+        T_R_N={'mocap': np.eye(4)},
+        markers={'sir': np.zeros(3)},
+        root=np.zeros((0, 0)),
+        widening=1.0,
+    )
+    root = np.zeros((3, len(model.parameter_names)))
+    root[:, :3] = 1e-5 * np.eye(3)
+    known = (True,) * JOINTS
+    described = Described(
+        replace(model, root=root), known, ('',) * JOINTS, np.tile([-2.0, 2.0], (JOINTS, 1))
+    )
+    path = tmp_path_factory.mktemp('apply') / 'compensation.json'
+    path.write_text(written(described, URDF, 'fit', ('', ''), {}), encoding='utf-8')
+    assert hashlib.sha256(path.read_bytes()).hexdigest()
+    return path
+
+
+def table(path, q, unit='deg', separator=',', decimal='.', time=True):
+    names = ['name', *(['time_s'] if time else []), *(f'joint_{j + 1} [{unit}]' for j in range(7))]
+    values = np.degrees(q) if unit == 'deg' else q
+    with path.open('w', encoding='utf-8', newline='') as out:
+        writer = csv.writer(out, delimiter=separator)
+        writer.writerow(names)
+        for i, row in enumerate(values):
+            numbers = [f'{v:.9f}'.replace('.', decimal) for v in row]
+            writer.writerow([f'P{i}', *([str(2 * i)] if time else []), *numbers])
+    return path
+
+
+def angles(path, separator=',', decimal='.'):
+    with path.open(encoding='utf-8', newline='') as lines:
+        rows = list(csv.reader(lines, delimiter=separator))
+    return rows[0], np.array([[float(v.replace(decimal, '.')) for v in r[-7:]] for r in rows[1:]])
+
+
+def wanted(count=20):
+    return np.random.default_rng(2).uniform(-1.4, 1.4, (count, JOINTS))
+
+
+@pytest.mark.parametrize(('unit', 'separator', 'decimal'), [('deg', ',', '.'), ('rad', ';', ',')])
+def test_a_table_is_corrected_and_comes_back(file, tmp_path, capsys, unit, separator, decimal):
+    q = wanted()
+    given = table(tmp_path / 'program.csv', q, unit, separator, decimal)
+    out, back = tmp_path / 'corrected.csv', tmp_path / 'back.csv'
+    assert main(['compensate', str(file), str(given), '--out', str(out), '--json']) == 0
+    facts = json.loads(capsys.readouterr().out)
+    header, found = angles(out, separator, decimal)
+    assert header == angles(given, separator, decimal)[0]
+    found = np.radians(found) if unit == 'deg' else found
+    correction = remaster_ros.read_compensation(file)
+    np.testing.assert_allclose(found, correction.command(q), rtol=0, atol=2e-8)
+    done = correction.compensator.correct(q)
+    assert facts['rows'] == len(q)
+    assert facts['faded_rows'] == (np.flatnonzero(done.faded) + 1).tolist()
+    assert facts['residual_mm']['max'] == pytest.approx(1e3 * done.residual_m.max(), abs=1e-4)
+    changes = np.degrees(np.abs(found - q).max(axis=0))
+    np.testing.assert_allclose(list(facts['change_deg'].values()), changes, atol=1e-5)
+    assert all(abs(share) < 10.0 for share in facts['added_speed_percent'].values())
+    assert facts['expected_error_mm'] > 0.0
+    args = ['compensate', str(file), str(out), '--out', str(back), '--inverse', '--quiet']
+    assert main(args) == 0
+    again = angles(back, separator, decimal)[1]
+    np.testing.assert_allclose(np.radians(again) if unit == 'deg' else again, q, rtol=0, atol=5e-8)
+
+
+def test_without_times_there_is_no_added_speed(file, tmp_path, capsys):
+    given = table(tmp_path / 'program.csv', wanted(3), time=False)
+    args = ['compensate', str(file), str(given), '--out', str(tmp_path / 'o.csv'), '--json']
+    assert main(args) == 0
+    assert set(json.loads(capsys.readouterr().out)['added_speed_percent'].values()) == {None}
+
+
+def test_what_is_refused_is_one_line(file, tmp_path, capsys):
+    q = wanted(4)
+    out = tmp_path / 'out.csv'
+
+    def refused(given, *more):
+        assert main(['compensate', str(file), str(given), '--out', str(out), *more]) == 2
+        assert not out.exists()
+        (line,) = capsys.readouterr().err.splitlines()
+        return line
+
+    good = table(tmp_path / 'good.csv', q)
+    bare = tmp_path / 'bare.csv'
+    bare.write_text(good.read_text(encoding='utf-8').replace(' [deg]', ''), encoding='utf-8')
+    assert '--angles' in refused(bare)
+    assert '--max-change-deg' in refused(good, '--max-change-deg', '0.01')
+    six = tmp_path / 'six.csv'
+    six.write_text(
+        '\n'.join(line.rpartition(',')[0] for line in good.read_text().splitlines()) + '\n'
+    )
+    assert '--joints' in refused(six)
+    beyond = q.copy()
+    beyond[2, 1] = np.radians(125.0)
+    assert 'line 4' in refused(table(tmp_path / 'beyond.csv', beyond))
+    assert str(tmp_path / 'none.csv') in refused(tmp_path / 'none.csv')
+    assert main(['compensate', str(good), str(good), '--out', str(out)]) == 2
+    assert 'compensation.json' in capsys.readouterr().err
