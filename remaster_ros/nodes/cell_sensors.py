@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from geometry_msgs.msg import PointStamped, PoseStamped
+from rclpy.client import Client
+from rclpy.task import Future
 from sensor_msgs.msg import Temperature
 from std_srvs.srv import Trigger
 
@@ -20,9 +23,74 @@ from remaster_ros.motion.liveness import Liveness
 from remaster_ros.nodes.bagging import BagRecorder
 from remaster_ros.nodes.running import RemasterNode
 from remaster_ros.nodes.simulated_clock import SteadyTime
-from remaster_ros.nodes.triggered_sensors import TriggeredSensors
 from remaster_ros.session.session_recorder import Parameters, SessionRecorder
 from remaster_ros.session.workcell import Workcell
+
+PATIENCE_WALL_S = 1.0
+"""An answer counts after so long: in this time the status of the node may show that the instrument
+is gone, and the reading of a measurement arrives."""
+MISSING_WALL_S = 5.0
+"""A service that is not there counts after so long: by then a node that died is absent."""
+
+
+@dataclass
+class _Shot:
+    """A measurement: since when it is needed, the request, and when it was answered."""
+
+    since_wall: float
+    future: Future | None = None
+    answered_wall: float | None = None
+
+
+class TriggeredSensors:
+    """The measurements that one configuration after the other needs.
+
+    Parameters
+    ----------
+    clients
+        Client of the measure service (std_srvs/Trigger), per sensor.
+    """
+
+    def __init__(self, clients: Mapping[str, Client]) -> None:
+        self._clients = clients
+        self._pairing: Pairing | None = None
+        self._shots: dict[str, _Shot] = {}
+
+    def look(self, pairing: Pairing, absent: Mapping[str, str], now: float) -> None:
+        """Send the requests that this pairing still needs, and note the refusals.
+
+        ``now`` is of the recorder's watchdogs, s.
+
+        The request is sent again to a sensor that was absent meanwhile, and to one whose reading
+        was lost.
+        """
+        if pairing is not self._pairing:
+            self._pairing, self._shots = pairing, {}
+        for name, client in self._clients.items():
+            if name in absent or name in pairing.decided:
+                self._shots.pop(name, None)
+                continue
+            shot = self._shots.setdefault(name, _Shot(now))
+            if shot.future is not None:
+                self._take_answer(name, shot, pairing, now)
+            elif client.service_is_ready():
+                shot.future = client.call_async(Trigger.Request())
+            elif now - shot.since_wall > MISSING_WALL_S:
+                pairing.fail(name, f'the service {client.srv_name} is not there')
+
+    def _take_answer(self, name: str, shot: _Shot, pairing: Pairing, now: float) -> None:
+        assert shot.future is not None
+        response = shot.future.result() if shot.future.done() else None
+        if response is None:
+            return
+        if shot.answered_wall is None:
+            shot.answered_wall = now
+        if now - shot.answered_wall <= PATIENCE_WALL_S:
+            return
+        if not response.success:
+            pairing.fail(name, response.message)
+        elif not pairing.has_reading(name):
+            del self._shots[name]
 
 
 class CellSensors:

@@ -18,12 +18,16 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Callable, Collection, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from geometry_msgs.msg import TransformStamped
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
+from rclpy.client import Client
+from rclpy.clock import Clock
+from rclpy.node import Node
 from rclpy.subscription import Subscription
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
@@ -33,6 +37,7 @@ from remaster_ros.collection.announcements import Announcements
 from remaster_ros.collection.collection_run import CollectionRun
 from remaster_ros.collection.events import OptimizerState
 from remaster_ros.collection.message_fields import JointOrder
+from remaster_ros.collection.pace import Pace, progress_text
 from remaster_ros.collection.peer_models import PeerModels
 from remaster_ros.collection.plan_confirmation import service_name
 from remaster_ros.collection.preflight_facts import PreflightFacts
@@ -40,22 +45,94 @@ from remaster_ros.collection.tour_progress import TourProgress
 from remaster_ros.errors import InputError, RemasterError
 from remaster_ros.motion.preflight import preflight
 from remaster_ros.nodes.further_measuring import FurtherMeasuring
-from remaster_ros.nodes.measure_calls import MeasureCalls
 from remaster_ros.nodes.messages import transform_array
 from remaster_ros.nodes.parameters import declare
 from remaster_ros.nodes.plan_preview import PlanPreview
 from remaster_ros.nodes.planner_parameters import Parameters
 from remaster_ros.nodes.planning_thread import PlanningThread
 from remaster_ros.nodes.pose_publisher import PosePublisher
-from remaster_ros.nodes.progress_lines import ProgressLines
 from remaster_ros.nodes.run_token import LivingRun, new_token, silence_s
 from remaster_ros.nodes.running import RemasterNode, run
 from remaster_ros.nodes.status import JOINT_STATES, LATCHED, RELIABLE, NodeStatus, Summary, listen
 from remaster_ros.planning.collection_plan import session_time_s
 from remaster_ros.planning.tour_order import REGISTRATION, PoseVisit
 from remaster_ros.session.plan_journal import NO_FREE_PATH, PlanJournal
-from remaster_ros.session.workcell import read_cell
+from remaster_ros.session.workcell import Workcell, read_cell
 from remaster_ros.types import FloatArray
+
+MEASURE_EVERY_WALL_S = 5.0
+"""How often a single-shot sensor measures until its marker was seen, wall time."""
+
+
+class MeasureCalls:
+    """Have single-shot sensors show that they see their markers.
+
+    Parameters
+    ----------
+    node
+        The node that calls.
+    cell
+        Its sensors.
+    """
+
+    def __init__(self, node: Node, cell: Workcell) -> None:
+        self._clients: dict[str, Client] = {
+            name: node.create_client(Trigger, sensor.measure_service)
+            for name, sensor in cell.sensors.items()
+            if sensor.single_shot and sensor.measure_service
+        }
+        self._called_wall = dict.fromkeys(self._clients, float('-inf'))
+
+    def call(self, names: Collection[str], now: float) -> None:
+        """Call the measure services of these sensors, each now and then; wall time, s."""
+        for name, client in self._clients.items():
+            due = now - self._called_wall[name] >= MEASURE_EVERY_WALL_S
+            if name in names and due and client.service_is_ready():
+                self._called_wall[name] = now
+                client.call_async(Trigger.Request())
+
+
+LOOK_S = 1.0
+EVERY_S = 20.0
+"""A line comes no more often than this, wall time, and only when there is something new."""
+
+
+class ProgressLines:
+    """Logs the progress of a collection while it runs, and where it ends.
+
+    Parameters
+    ----------
+    node
+        Its log is used.
+    clock
+        Steady.
+    counts, state
+        Return the figures of `TourProgress.counts`, and the state of the run.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        clock: Clock,
+        counts: Callable[[], Mapping[str, Any]],
+        state: Callable[[], str],
+    ) -> None:
+        self._log, self._counts, self._state = node.get_logger(), counts, state
+        self._pace, self._last, self._last_s = Pace(), ('', 0), float('-inf')
+        node.create_timer(LOOK_S, self._look, clock=clock)
+
+    def _look(self) -> None:
+        now, counts, state = time.monotonic(), self._counts(), self._state()
+        done, of = counts['configurations_done'], counts['configurations']
+        self._pace.update(done, now, running=state == 'running')
+        if (state, done) == self._last or (state == 'running' and now - self._last_s < EVERY_S):
+            return
+        changed, self._last = state != self._last[0], (state, done)
+        text = progress_text(counts, self._pace.left_s(of - done) if state == 'running' else None)
+        if text and (changed or state == 'running'):
+            self._last_s = now
+            self._log.info(f'{state}: {text}')
+
 
 RETRY_WALL_S = 1.0
 """How often a full disk is tried again, wall time."""

@@ -288,7 +288,6 @@ def marker_rows(fit: Mapping[str, Any], session: Session) -> list[dict[str, Any]
 
 if TYPE_CHECKING:
     from remaster_ros.calibration.result import FitResult
-    from remaster_ros.reports.report import View3D
 
 
 def write_fit_report(result: FitResult, folder: Path) -> Path:
@@ -317,8 +316,6 @@ def report_html(result: FitResult, drawings: dict[str, str]) -> str:
     """Return the page; with drawings (of `draw_figures`) it also has the 3-D view."""
     scene: View3D | None = None
     if drawings:
-        from remaster_ros.reports.report import draw_view
-
         scene = draw_view(result)
     inputs = inputs_of(result)
     fit = msgspec.to_builtins(inputs.fit)
