@@ -76,6 +76,7 @@ def page(html):
 def test_all_files_are_there(folder):
     names = sorted(str(p.relative_to(folder)) for p in folder.rglob('*') if p.is_file())
     assert names == [
+        'apply/compensation.json',
         'apply/offset_layer.yaml',
         'apply/remaster.txt',
         'apply/robot_calibrated.urdf',
