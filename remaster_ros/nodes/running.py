@@ -72,7 +72,7 @@ class RemasterNode(Node):
 
     # rclpy gives every endpoint an event handler that only warns of QoS mismatches, and looks at
     # each of them for every message: half of what a message costs. The status shows now and then
-    # what the graph shows not to match (`qos_mismatch`).
+    # what the graph shows not to match (`status.mismatches`).
 
     def create_publisher(self, *args: Any, **kwargs: Any) -> Publisher:
         """As in rclpy, without default event handlers."""
