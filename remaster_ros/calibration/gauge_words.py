@@ -15,6 +15,7 @@ from remaster_ros.types import FloatArray
 # than so many only some are listed.
 MOST_NAMED, MOST_LISTED = 5, 20
 LEAST_SHARE = 0.2
+EFFECTS_PRIOR = 'the prior on the effects'
 
 
 def in_words(model: Model, direction: FloatArray) -> str:
@@ -116,7 +117,5 @@ def resolving_priors(
         )
         for prior in priors
     }
-    pull['the prior on the effects'] = float(
-        np.linalg.norm(model.extension_root @ model.theta(direction))
-    )
+    pull[EFFECTS_PRIOR] = float(np.linalg.norm(model.extension_root @ model.theta(direction)))
     return listed([name for name, p in pull.items() if p > 1e-3 * max(pull.values())])

@@ -13,7 +13,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from remaster_ros.calibration.gauge_words import in_words, resolving_priors, together
+from remaster_ros.calibration.gauge_words import (
+    EFFECTS_PRIOR,
+    in_words,
+    resolving_priors,
+    together,
+)
 from remaster_ros.calibration.grouped_rows import Rows
 from remaster_ros.calibration.initial_guess import robust_spread
 from remaster_ros.calibration.model import Model
@@ -117,6 +122,9 @@ def find_gauge(
             fixed_by = f'{model.names[pivot]} = {at:g}'
         else:
             fixed_by = resolving_priors(priors, x, null[:, column], model)
+            if fixed_by == EFFECTS_PRIOR:
+                # How large such errors are is known: how well the offsets then are is in `weak`.
+                continue
         directions.append(GaugeDirection(_entries(model, combination), words, fixed_by))
         for joint in np.flatnonzero(combination[: model.joints]):
             text = f'the data do not determine it: {words}; fixed by {fixed_by}'

@@ -37,7 +37,7 @@ from remaster_ros.discovery.geometry_model import GeometryModel, better_of_two, 
 from remaster_ros.discovery.guard import Unexplained, harm_of, is_harmful, unfitted
 from remaster_ros.discovery.marker_offsets import loosened, moved_markers
 from remaster_ros.discovery.omnibus import structure_left
-from remaster_ros.discovery.random_effects import by_members, fit_kinds, kinds
+from remaster_ros.discovery.random_effects import Family, by_members, fit_kinds, kinds
 from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.discovery.solution import Solution
 from remaster_ros.discovery.thinning import Thinning, draw_rows, judge_by_others
@@ -370,8 +370,8 @@ def of_all_kinds(search: Search, named: Solution) -> Solution | None:
 
     A name is a choice among thousands: two halves of one session are not given the same names.
     Offsets, lengths and predictions come from all kinds at once, each with one variance for all
-    its members, named or not. Not where so many members explain less than the few causes (one
-    joint errs and no other), or where nothing is there.
+    its members, named or not. Not where so many members explain less than the few causes and
+    nothing is beside these (one joint errs and no other), or where nothing is there at all.
     """
     data, cells = search.data, search.catalogue.cells
     of_a_kind = {name for family in kinds(data, cells) for name in family.parameters}
@@ -384,13 +384,21 @@ def of_all_kinds(search: Search, named: Solution) -> Solution | None:
     every = kinds(data, cells, own)
     whole = fit_kinds(data, own, every)
     nothing = search.fit(())
-    if whole is None or nothing is None:
+    if whole is None or nothing is None or whole.log_evidence < nothing.log_evidence + NAMED:
         return None
-    # Each choice may be wrong by the odds that decided it; and chance must not be a model.
-    least = named.log_evidence - NEEDED * len(named.cells)
-    if whole.log_evidence < max(least, nothing.log_evidence + NAMED):
-        return None
+    if whole.log_evidence < named.log_evidence:
+        beside = _beside(search, named)[1]
+        if beside is None or beside.log_evidence < named.log_evidence + NEEDED:
+            return None
     return by_members(whole, every)
+
+
+def _beside(search: Search, named: Solution) -> tuple[list[Family], Solution | None]:
+    """Return all other kinds of errors, and the fit of the causes with them beside."""
+    members = by_members(named, search.families).cells
+    others = kinds(search.data, search.catalogue.cells, members)
+    every = (*named.cells, *(family.cell for family in others))
+    return others, solve(search.data, every, named) if others else None
 
 
 def by_names(found: Estimate, search: Search, named: Solution) -> tuple[Solution, FloatArray]:
@@ -406,9 +414,8 @@ def by_names(found: Estimate, search: Search, named: Solution) -> tuple[Solution
     """
     data = search.data
     members = by_members(named, search.families)
-    others = kinds(data, search.catalogue.cells, members.cells)
-    beside = solve(data, (*named.cells, *(family.cell for family in others)), named)
-    if beside is None or not others:
+    others, beside = _beside(search, named)
+    if beside is None:
         return members, np.zeros((found.model.size + len(members.parameters), 0))
     weights = dict(zip(beside.cells, beside.smoothness, strict=True))
     unseen = np.concatenate(
