@@ -28,6 +28,9 @@ NOISE_FREEDOM = 10.0
 TAIL_SHARE = 0.05
 TAIL_FREEDOM = 5.0
 TAIL_WIDENING = 1.3
+# Of the noise beside its curvature at the mode: it has longer tails. Of 20 poses 2,000 draws are
+# worth 700 in the tails with it, 280 without, and 370 with 1.4.
+NOISE_WIDENING = 1.2
 # Of most draws: hardly wider than a Gaussian, whose bulk a Student t of few degrees of freedom
 # hardly ever hits in tens of dimensions.
 FREEDOM = 100.0
@@ -100,7 +103,7 @@ class AdaptedProposal:
         """Begin with the linearised posterior at its mode."""
         f, e = len(mode.linearisation.posterior.free), len(mode.eta)
         factor = np.eye(f + e)
-        factor[f:, f:] = _factor(mode.eta_covariance)
+        factor[f:, f:] = NOISE_WIDENING * _factor(mode.eta_covariance)
         centre = np.concatenate((np.zeros(f), mode.eta))
         return cls(mode, StudentT(centre, factor, FREEDOM))
 

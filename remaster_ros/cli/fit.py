@@ -42,7 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         '--precision',
-        type=number(),
+        type=number(0.002, 0.1),
         default=0.02,
         metavar='P',
         help='sample until every mean is known to P standard deviations of its parameter '

@@ -95,12 +95,17 @@ def _notes(result: FitResult, remarks: Sequence[str] = ()) -> list[str]:
             if words
             else ()
         ),
-        *(f'CHECK FIRST: {line}' for line in result.implausible),
+        *check_first(result),
         *(
             f'left out, not identifiable: {joint}: {" ".join(why.split())}'
             for joint, why in left_out(result).items()
         ),
     ]
+
+
+def check_first(result: FitResult) -> list[str]:
+    """Return what must be checked before anything is loaded."""
+    return [f'CHECK FIRST: {line}' for line in result.implausible]
 
 
 def left_out(result: FitResult) -> dict[str, str]:
@@ -128,7 +133,7 @@ def remaster_text(result: FitResult, remarks: Sequence[str] = ()) -> str:
             f'Joint zero-offsets of robot {result.chain.name!r}',
             f'(URDF with SHA-256 {session.urdf_sha256})',
             '',
-            *(f'CHECK FIRST: {line}' for line in result.implausible),
+            *check_first(result),
             *(('',) if result.implausible else ()),
             'The true joint angle is the reported one plus the offset. Use ONE of three ways,',
             'never two at once:',

@@ -28,6 +28,7 @@ from remaster_ros.compensation.arm_model import (
     Geometry,
     JointTerm,
 )
+from remaster_ros.compensation.export import check_first
 from remaster_ros.discovery.effects.base import Cell
 from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.discovery.effects.splines import DEGREE, Curve
@@ -117,13 +118,18 @@ def offsets_alone(fit: FitResult, widening: float, notes: Sequence[str] = ()) ->
     described = _described(fit, [], np.zeros(0), None, widening)
     offsets = np.where(fit.identifiable, fit.joint_offsets, 0.0)
     model = replace(described.model, joint_offsets=offsets)
-    return replace(described, model=model, notes=tuple(notes))
+    return replace(described, model=model, notes=(*described.notes, *notes))
 
 
-def geometry_too(fit: FitResult, geometry: GeometryModel, notes: Sequence[str] = ()) -> Described:
+def geometry_too(
+    fit: FitResult,
+    geometry: GeometryModel,
+    measurements: Measurements,
+) -> Described:
     """Return the arm with all lengths and tilts of a fit, and the zero-offsets that go with them.
 
-    Its covariance is that at the mode.
+    Its covariance is that at the mode. ``measurements`` are those that were fitted, with the
+    indices of the sensors and markers that occur in them.
     """
     mode = geometry.mode
     posterior = mode.linearisation.posterior
@@ -140,9 +146,9 @@ def geometry_too(fit: FitResult, geometry: GeometryModel, notes: Sequence[str] =
         predictive=Predictive(posterior.model, mode.z, draws, sigma.reshape(-1, *sigma.shape[2:])),
         noise=noise_estimates(posterior, noise),
     )
-    widening = predict(beside, fit.session.measurements).widening
+    widening = predict(beside, measurements).widening
     theta = posterior.model.theta(posterior.model.natural(mode.z))
-    return replace(_described(beside, geometry.members, theta, None, widening), notes=tuple(notes))
+    return _described(beside, geometry.members, theta, None, widening)
 
 
 def everything(
@@ -210,6 +216,7 @@ def _described(
         tuple(fit.why),
         np.stack((fitted.min(axis=0), fitted.max(axis=0)), axis=1),
         tuple(_left(left, theta, data)) if data is not None else (),
+        tuple(check_first(fit)),
     )
 
 

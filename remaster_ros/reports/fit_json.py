@@ -131,12 +131,11 @@ def model_text(result: FitResult, geometry: GeometryModel) -> str:
 
 def compensation_text(result: FitResult, result_sha256: str) -> str:
     """Return the correction of a fit: with all lengths and tilts where they predict better."""
-    geometry = geometry_of(result)
+    geometry, rows = geometry_of(result), _rows_of(result)
     if geometry is not None and geometry.is_better:
-        described = geometry_too(result, geometry)
+        described = geometry_too(result, geometry, rows)
     else:
-        widening = predict(result, _rows_of(result)).widening
-        described = offsets_alone(result, widening)
+        described = offsets_alone(result, predict(result, rows).widening)
     return correction_text(described, result.session, 'fit', result_sha256)
 
 

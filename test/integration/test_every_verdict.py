@@ -199,9 +199,7 @@ def test_causes_that_do_harm_on_held_out_poses_are_not_returned(tmp_path: Path) 
         return with_positions(session, np.where(held, opposite, session.measurements.position))
 
     out = tmp_path / 'causes'
-    process = remaster(
-        'discover', changed(tilted, tmp_path, mirrored), '--out', out, '--no-figures'
-    )
+    process = remaster('discover', changed(tilted, tmp_path, mirrored), '--out', out)
     assert process.returncode == 0, process.stderr
     assert 'verdict: unexplained' in process.stdout
     assert 'nothing beyond' not in process.stdout

@@ -35,7 +35,7 @@ def run(tmp_path):
 
 
 def arguments_of(tmp_path):
-    return {path.stem: path.read_text().split() for path in tmp_path.glob('*.arguments')}
+    return {path.stem: path.read_text().split() for path in tmp_path.glob('[a-z]*.arguments')}
 
 
 def test_each_test_file_is_in_one_group(run, tmp_path):
