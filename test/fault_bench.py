@@ -21,7 +21,6 @@ from pathlib import Path
 import numpy as np
 from fault_observer import Observer
 from fault_relay import Relay
-from forked_nodes import NodeProcess
 from ros_rig import ASKED, PATIENCE
 
 from remaster_ros.collection.events import ConfigurationEnded, PoseAnnounced, SolutionSettled
@@ -200,7 +199,7 @@ class Bench:
             for written in (topic, f'/{topic}'):
                 command += ['-r', f'{written}:=/bench/{topic}']
         with (self.folder / 'log' / f'{name}.log').open('ab') as log:
-            self.processes[name] = NodeProcess(
+            self.processes[name] = subprocess.Popen(
                 command, stdout=log, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL,
                 env=self._environment,
             )  # fmt: skip

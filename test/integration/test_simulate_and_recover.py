@@ -36,7 +36,7 @@ def fits() -> list[tuple[FitResult, SessionTruth]]:
     found = []
     for seed in SEEDS:
         session, truth = scene(seed, poses=20, sensor_count=1 + seed % 2)
-        found.append((fit(session, draws=500), truth))
+        found.append((fit(session, draws=1000), truth))
     return found
 
 
@@ -87,7 +87,7 @@ def test_the_chains_agree_and_say_so(fits) -> None:
         assert info.chains == 4
         assert info.acceptance_rate > 0.6
         assert len(info.r_hat) == len(result.parameter_names) == result.draws.shape[2]
-        assert result.joint_offset_draws.shape == (4, 500, 7)
+        assert result.joint_offset_draws.shape == (4, 1000, 7)
 
 
 def test_held_out_poses_are_predicted_to_the_noise() -> None:
