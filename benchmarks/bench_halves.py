@@ -1,9 +1,9 @@
 """Do two halves of one session agree within what each of them states?
 
 Each set of `../shared/data` is split at random into two halves that share no pose; `discover` runs
-on both. RMS of the differences over the stated standard deviations, of zero-offsets, and of all link
-lengths and axis tilts. Below 1 the intervals are too wide, as they must be of what neither half
-determines: there both have the prior.
+on both. RMS of the differences over the stated standard deviations, of zero-offsets, and of all
+link lengths and axis tilts. Below 1 the intervals are too wide, as they must be of what neither
+half determines: there both have the prior.
 
     python benchmarks/bench_halves.py --sets panda_left --splits 10
 """
