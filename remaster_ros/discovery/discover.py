@@ -21,7 +21,7 @@ from remaster_ros.calibration.mistakes import sound_estimate
 from remaster_ros.calibration.outliers import find_outliers
 from remaster_ros.calibration.result import FitResult
 from remaster_ros.calibration.sampling import Progress, silent
-from remaster_ros.discovery.causes import NAMED, NEEDED, Search
+from remaster_ros.discovery.causes import NAMED, NEEDED, Search, p_value
 from remaster_ros.discovery.effects.base import Cell
 from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.discovery.evidence import solve
@@ -34,7 +34,7 @@ from remaster_ros.discovery.gain import (
     residuals_of,
 )
 from remaster_ros.discovery.geometry_model import GeometryModel, better_of_two, geometry_model
-from remaster_ros.discovery.guard import Unexplained, harm_of, is_harmful, unfitted
+from remaster_ros.discovery.guard import Unexplained, harm_of, is_harmful, nameless, unfitted
 from remaster_ros.discovery.marker_offsets import loosened, moved_markers
 from remaster_ros.discovery.omnibus import structure_left
 from remaster_ros.discovery.random_effects import Family, by_members, fit_kinds, kinds
@@ -188,20 +188,21 @@ def discover_session(
     named, groups, described = _that_help(search, named, report)
     unexplained: tuple[Unexplained, ...] = ()
     sampled: _Sampled | None = None
-    try:
-        for every in (True, False):
+    # Kinds that nobody named may be what does harm, or what the poses do not determine.
+    for every in (True, False):
+        try:
             sampled = _sampled(session, before, found, search, named, every, rng, report, clock)
-            # Kinds that nobody named may be what does harm.
-            if not is_harmful(sampled.gain) or sampled.by_name:
-                break
-        assert sampled is not None
-        if is_harmful(sampled.gain):
-            if described:
-                unexplained = (harm_of(before, sampled.fit, sampled.gain, described),)
-            sampled = None
-    except InsufficientDataError as error:
-        if described:
-            unexplained = (unfitted(residuals.errors, described, error),)
+        except InsufficientDataError as error:
+            if described and not every:
+                unexplained = (unfitted(residuals.errors, described, error),)
+            continue
+        if not is_harmful(sampled.gain):
+            break
+        if described and sampled.by_name:
+            unexplained = (harm_of(before, sampled.fit, sampled.gain, described),)
+        by_name, sampled = sampled.by_name, None
+        if by_name:
+            break
     if sampled is None:
         found, search = before, Search(Residuals.of(before), ())
         empty = search.fit(())
@@ -219,14 +220,17 @@ def discover_session(
         for effect, group in zip(itertools.compress(described, is_cause), groups, strict=True)
     )
     effects += tuple(effect.sampled(fit) for effect in moved_markers(found, data, named))
+    empty = search.fit(())
+    assert empty is not None
+    if not effects and not sampled.by_name:
+        gain_of_kinds = solution.log_evidence - empty.log_evidence
+        unexplained += (nameless(data, solution, p_value(gain_of_kinds)),)
     verdict: Verdict = 'effects' if effects else 'unexplained' if unexplained else 'none'
     # A tie over a small remainder does not put the rest in doubt. The largest leads in any case:
     # where held-out poses gain nothing no share is known.
     leading = [effect for effect in effects if (effect.share or 0.0) > LEADING_SHARE]
     if any(effect.tied for effect in (*effects[:1], *leading)):
         verdict = 'undetermined'
-    empty = search.fit(())
-    assert empty is not None
     report('fitting what can be loaded', 0.0)
     measured = [cell for group in groups if group[0].of_measurement for cell in group]
     alone = fit

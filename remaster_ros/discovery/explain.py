@@ -207,7 +207,7 @@ def describe(
     members = by_members(solution, search.families)
     if not members.cells:
         return (), ()
-    groups = sorted(grouped(members.cells), key=lambda group: -_size(data, members, group))
+    groups = sorted(grouped(members.cells), key=lambda group: -size_of(data, members, group))
     parts = shares(data, groups, members)
     effects = []
     for count, (group, share) in enumerate(zip(groups, parts, strict=True)):
@@ -257,7 +257,7 @@ def _described(
         log_evidence_gain=float(min(gain, solution.log_evidence)),
         confusable_with=alike,
         cause=in_words(group, data.part) + _also_called(alike),
-        size_m=_size(data, members, group),
+        size_m=size_of(data, members, group),
         share=share,
         remedy=EFFECTS[first.name].remedy.format(driver=first.driver.replace('_', ' ')),
         title=titled(first, _joints(group)),
@@ -346,10 +346,10 @@ def _same(data: Residuals, solution: Solution, cell: Cell, other: Cell) -> bool:
     return bool(cosines.min() > SAME)
 
 
-def _size(
+def size_of(
     data: Residuals,
     solution: Solution,
-    group: tuple[Cell, ...],
+    group: Sequence[Cell],
 ) -> float:
     """Return the RMS of a cause's displacement after absorption by the offsets model, m."""
     wheres = dict(zip(solution.cells, solution.slices(), strict=True))

@@ -12,12 +12,17 @@ from remaster_ros.calibration.comparison import predicted_rows
 from remaster_ros.calibration.estimate import Estimate
 from remaster_ros.calibration.gauge_words import listed
 from remaster_ros.calibration.result import FitResult
-from remaster_ros.discovery.explain import FoundEffect
+from remaster_ros.discovery.effects.base import Cell
+from remaster_ros.discovery.explain import FoundEffect, size_of
 from remaster_ros.discovery.gain import Gain
+from remaster_ros.discovery.residuals import Residuals
+from remaster_ros.discovery.solution import Solution
 from remaster_ros.discovery.words import sentence_case
 from remaster_ros.errors import InsufficientDataError
 from remaster_ros.types import FloatArray
 
+# Kinds of errors that a sentence lists.
+MOST_LISTED = 3
 # Causes with an error on the held-out poses of so many times that of the offsets are not returned.
 MOST_HARM = 1.05
 
@@ -133,5 +138,38 @@ def unfitted(
             f'The residuals suggest {names}, but these poses do not determine that together with '
             f'everything else ({reason}): it is not taken as a cause. Measure poses that are '
             'spread further and turn the tool, and search again.'
+        ),
+    )
+
+
+def nameless(data: Residuals, solution: Solution, p_value: float) -> Unexplained:
+    """Return what is left unexplained where errors are there and no cause stands out of them.
+
+    Parameters
+    ----------
+    data, solution
+        What was searched, and the model of all kinds of errors, by members.
+    p_value
+        Of gaining as much evidence where nothing is there.
+    """
+    kinds: dict[str, list[Cell]] = {}
+    for cell in solution.cells:
+        kinds.setdefault(cell.name, []).append(cell)
+    sizes = {name: size_of(data, solution, cells) for name, cells in kinds.items()}
+    order = sorted(sizes, key=lambda name: -sizes[name])
+    first, size = kinds[order[0]][0], size_of(data, solution, solution.cells)
+    words = [
+        f'{name.replace("_", " ")} ({1e3 * sizes[name]:.3f} mm)' for name in order[:MOST_LISTED]
+    ]
+    return Unexplained(
+        where=first.place,
+        driver=first.driver,
+        size_m=size,
+        p_value=p_value,
+        next=(
+            f'Errors of {1e3 * size:.3f} mm RMS at the marker are more than noise, but no single '
+            f'cause stands out of them; the most may be {listed(words)}. Offsets and predictions '
+            'have them in their uncertainty. Measure more poses, spread further and with the tool '
+            'turned, and search again.'
         ),
     )
