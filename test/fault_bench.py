@@ -104,7 +104,8 @@ class Bench:
         ports = {'command_port': command, 'data_port': data}
         hidden = {'world': str(folder / 'world')}
         self._values = {
-            'fake_robot': hidden,
+            # Faults begin between two messages of the clock: as fine as the page has it.
+            'fake_robot': {**hidden, 'clock_rate': 100.0},
             'fake_optitrack': {**hidden, **ports, 'rate': 20.0},
             'fake_laser_tracker': {**hidden, 'port': tracker},
             'pose_planner': {

@@ -131,6 +131,23 @@ class AdaptedProposal:
         parts = [self._inner(block) for block in blocks]
         return np.concatenate([self._log_density(inner) + volume for inner, volume in parts])
 
+    def linearised(self, points: FloatArray) -> FloatArray:
+        """Return the log density of the linearised posterior (n,), up to a constant.
+
+        What it costs does not depend on the number of observations.
+        """
+        eta = points[:, self.dimension - len(self.mode.eta) :]
+        blocks = np.array_split(points, max(1, len(points) // self._block))
+        parts = []
+        for block in blocks:
+            inner, log_volume = self._inner(block)
+            white, noise = np.split(inner, [self.dimension - len(self.mode.eta)], axis=1)
+            marginal = self._conditional(noise)[2]
+            parts.append(marginal + log_volume - 0.5 * np.sum(white**2, axis=1))
+        near = np.all(np.abs(eta - self.mode.eta) <= FARTHEST, axis=1)
+        inside = self.mode.linearisation.posterior.inside(points)
+        return np.where(near & inside, np.concatenate(parts), -np.inf)
+
     def dispersed(self, count: int, rng: np.random.Generator) -> FloatArray:
         """Return starts for chains: spread twice as far as the draws, (count, d)."""
         inner, _ = self.centre.sample(count, rng)
@@ -152,7 +169,7 @@ class AdaptedProposal:
             inner[:, self.dimension - self._shares :]
         )
         white, eta = np.split(inner, [self.dimension - len(self.mode.eta)], axis=1)
-        mean, factor = self._conditional(eta)
+        mean, factor, _ = self._conditional(eta)
         step = np.linalg.solve(np.swapaxes(factor, -1, -2), white[..., None])[..., 0]
         points = np.concatenate((mean + step, eta), axis=1)
         return points, self._log_density(inner) + log_determinant(factor)
@@ -160,16 +177,15 @@ class AdaptedProposal:
     def _inner(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the inner coordinates (n, d) of points, and the log of what a volume becomes."""
         parameters, eta = np.split(points, [self.dimension - len(self.mode.eta)], axis=1)
-        mean, factor = self._conditional(eta)
+        mean, factor, _ = self._conditional(eta)
         white = np.einsum('nji,nj->ni', factor, parameters - mean)
         return np.concatenate((white, eta), axis=1), log_determinant(factor)
 
-    def _conditional(self, eta: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return mean and factor of the precision of the parameters given noise (n, e)."""
-        # Beyond, rounding leaves no information. Any function of the noise would do.
+    def _conditional(self, eta: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return `Linearisation.conditional` of noise (n, e)."""
+        # Beyond, rounding leaves no information. To propose, any function of the noise would do.
         near = np.clip(eta, self.mode.eta - FARTHEST, self.mode.eta + FARTHEST)
-        mean, factor, _ = self.mode.linearisation.conditional(near)
-        return mean, factor
+        return self.mode.linearisation.conditional(near)
 
     @property
     def _block(self) -> int:
