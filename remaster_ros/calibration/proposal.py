@@ -129,7 +129,7 @@ class AdaptedProposal:
         """Return the normalised log density of points (n, d), (n,)."""
         blocks = np.array_split(points, max(1, len(points) // self._block))
         parts = [self._inner(block) for block in blocks]
-        return np.concatenate([self._log_density(inner) + volume for inner, volume in parts])
+        return np.concatenate([self._log_density(inner) + volume for inner, volume, _ in parts])
 
     def linearised(self, points: FloatArray) -> FloatArray:
         """Return the log density of the linearised posterior (n,), up to a constant.
@@ -140,9 +140,8 @@ class AdaptedProposal:
         blocks = np.array_split(points, max(1, len(points) // self._block))
         parts = []
         for block in blocks:
-            inner, log_volume = self._inner(block)
-            white, noise = np.split(inner, [self.dimension - len(self.mode.eta)], axis=1)
-            marginal = self._conditional(noise)[2]
+            inner, log_volume, marginal = self._inner(block)
+            white = inner[:, : self.dimension - len(self.mode.eta)]
             parts.append(marginal + log_volume - 0.5 * np.sum(white**2, axis=1))
         near = np.all(np.abs(eta - self.mode.eta) <= FARTHEST, axis=1)
         inside = self.mode.linearisation.posterior.inside(points)
@@ -174,12 +173,15 @@ class AdaptedProposal:
         points = np.concatenate((mean + step, eta), axis=1)
         return points, self._log_density(inner) + log_determinant(factor)
 
-    def _inner(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the inner coordinates (n, d) of points, and the log of what a volume becomes."""
+    def _inner(self, points: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return the inner coordinates (n, d) of points, and the log of what a volume becomes.
+
+        And the log density of their noise with the parameters integrated out.
+        """
         parameters, eta = np.split(points, [self.dimension - len(self.mode.eta)], axis=1)
-        mean, factor, _ = self._conditional(eta)
+        mean, factor, marginal = self._conditional(eta)
         white = np.einsum('nji,nj->ni', factor, parameters - mean)
-        return np.concatenate((white, eta), axis=1), log_determinant(factor)
+        return np.concatenate((white, eta), axis=1), log_determinant(factor), marginal
 
     def _conditional(self, eta: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return `Linearisation.conditional` of noise (n, e)."""

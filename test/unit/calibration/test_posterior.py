@@ -218,6 +218,19 @@ def test_poor_proposals_are_adapted() -> None:
     np.testing.assert_allclose(ours.std(axis=0), theirs.std(axis=0), rtol=0.25)
 
 
+def test_the_linearised_density_gives_the_moments_of_the_exact_one(found, monkeypatch) -> None:
+    """A good session of 12 poses, by either; five standard errors of the effective draws."""
+    runs = []
+    for limit, name in ((sampling.DENSITY_ERROR_LIMIT, 'linearised'), (-1.0, 'exact')):
+        monkeypatch.setattr(sampling, 'DENSITY_ERROR_LIMIT', limit)
+        run, stated = sample_posterior(found.mode, chains=4, rng=np.random.default_rng(3))
+        assert f'on the {name} density' in stated
+        runs.append(run.draws.reshape(-1, found.posterior.size))
+    shift = np.abs(runs[0].mean(axis=0) - runs[1].mean(axis=0)) / runs[1].std(axis=0)
+    assert shift.max() < 5.0 * np.sqrt(2.0 / 2500.0)
+    np.testing.assert_allclose(runs[0].std(axis=0), runs[1].std(axis=0), rtol=0.1)
+
+
 def test_chains_that_cannot_reach_the_precision_leave_the_gaussian_and_a_message(monkeypatch):
     """With too few evaluations: `converged` is false, and what is shown is named."""
     monkeypatch.setattr(sampling, 'EVALUATED_ROWS', 0)
