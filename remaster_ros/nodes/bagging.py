@@ -24,6 +24,8 @@ from remaster_ros.session.bag_writer import BagWriter
 
 DEEP = QoSProfile(depth=2000, reliability=ReliabilityPolicy.RELIABLE)
 """What a busy recorder has not yet taken is kept for it: seconds of the fastest stream."""
+MOST_AT_ONCE = 100
+"""Of one topic, before the others have their turn."""
 MOST_EARLY = 20_000
 """Messages that are kept while there is no clock: some ten seconds of the fastest streams."""
 
@@ -128,7 +130,18 @@ class BagRecorder:
                 receive(deserialize_message(data, kind))
                 self.taken[name] += 1
 
-        self._node.create_subscription(kind, topic, take, qos, raw=True)
+        def take_all(data: bytes) -> None:
+            # rclpy takes one message of each topic in turn: those of a fast sensor would wait for
+            # ever longer while the joint states, of which there are fewer, are up to date.
+            take(data)
+            for _ in range(MOST_AT_ONCE):
+                with subscription.handle:
+                    further = subscription.handle.take_message(kind, True)
+                if further is None:
+                    return
+                take(further[0])
+
+        subscription = self._node.create_subscription(kind, topic, take_all, qos, raw=True)
 
     def subscribe_rest(self) -> None:
         """Record the topics that the recorder itself has no use for."""

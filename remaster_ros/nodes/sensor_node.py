@@ -12,6 +12,7 @@ import importlib
 import math
 import threading
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -34,6 +35,7 @@ from remaster_ros.nodes.endpoints import node_of
 from remaster_ros.nodes.messages import stamp_of, transform_array
 from remaster_ros.nodes.parameters import declare
 from remaster_ros.nodes.running import RemasterNode, fault_of_this_program, run
+from remaster_ros.nodes.simulated_clock import ReportsTaken
 from remaster_ros.nodes.status import LATCHED, RELIABLE, NodeStatus, Summary
 from remaster_ros.sensors.driver import SensorClock, StreamDriver, TriggeredDriver
 from remaster_ros.sensors.registry import TOPIC, kind_of, load_driver
@@ -339,10 +341,13 @@ class SensorNode(RemasterNode):
         self._started = False
         simulated = bool(self.get_parameter('use_sim_time').value)
         self.driver = driver(p, SensorClock(self.now_s, self._sleep, simulated))
+        # What measures on request waits for a world that would wait for it.
+        streams = isinstance(self.driver, StreamDriver)
+        self._taken = ReportsTaken(self, simulated and streams)
         if isinstance(self.driver, TopicDriver):
             subscribe_to_source(self, self.driver, described)
         if isinstance(self.driver, TriggeredDriver):
-            self._step = MeasureService(self, self.driver, cell, self._ending).step
+            self._step: Callable[[], float | None] = MeasureService(self, self.driver, cell, self._ending).step
         elif isinstance(self.driver, StreamDriver):
             self._step = partial(self._read, self.driver)
         self.status = NodeStatus(self, self._summary, self.sensor, cell.model())
@@ -359,10 +364,12 @@ class SensorNode(RemasterNode):
         """Keep the device open and serve it; the body of the thread."""
         try:
             while not (self._ending.is_set() or self.failure):
+                came_s = None
                 if self.driver.phase == 'ready' and self.driver.connected:
-                    self._step()
+                    came_s = self._step()
                 else:
                     self._open()
+                self._taken.take(stamp_of(self.now_s() if came_s is None else came_s))
         except Exception as error:
             if not self._ending.is_set():
                 self.failure = fault_of_this_program(error)
@@ -390,8 +397,8 @@ class SensorNode(RemasterNode):
         if over and not (self._started or self._ending.is_set()):
             self.failure = error
 
-    def _read(self, driver: StreamDriver) -> None:
-        """Publish the next reading of a stream."""
+    def _read(self, driver: StreamDriver) -> float | None:
+        """Publish the next reading of a stream; return when it came, s, None where none did."""
         try:
             reading = driver.read()
         except DeviceError as error:
@@ -399,13 +406,14 @@ class SensorNode(RemasterNode):
             driver.close()
             self._require_start(error)
             self._ending.wait(RETRY_S)
-            return
+            return None
         if reading is not None:
             self._started = True
             self.publish_reading(reading)
-        else:
-            why = driver.state().trouble or 'no reading of the marker'
-            self._require_start(DeviceError(f'{driver.device}: {why}'))
+            return driver.received_s
+        why = driver.state().trouble or 'no reading of the marker'
+        self._require_start(DeviceError(f'{driver.device}: {why}'))
+        return None
 
     def publish_reading(self, reading: MarkerReading) -> None:
         """Publish a measured position under its time of capture."""

@@ -80,22 +80,22 @@ class SteadyTime:
 
 
 class ReportsTaken:
-    """Publishes, in a simulation, up to which stamp a node has taken `joint_states`.
+    """Publishes, in a simulation, until when a node has taken what came.
 
     Parameters
     ----------
     node
         The node.
-    rate
-        `simulated_clock_rate`; with 0 nothing is published.
+    simulated
+        `simulated_clock_rate`, or whether the clock is simulated; else nothing is published.
     """
 
-    def __init__(self, node: RemasterNode, rate: float) -> None:
-        self._publisher = node.create_publisher(Header, TAKEN, 10) if rate else None
+    def __init__(self, node: RemasterNode, simulated: float) -> None:
+        self._publisher = node.create_publisher(Header, TAKEN, 10) if simulated else None
         self._last_s = -TAKEN_EVERY_S
 
     def take(self, stamp: Time) -> None:
-        """Process that a report with this stamp was taken."""
+        """Process that all was taken: up to the report with this stamp, or until this time."""
         if self._publisher is None or abs(seconds(stamp) - self._last_s) < TAKEN_EVERY_S:
             return
         self._last_s = seconds(stamp)

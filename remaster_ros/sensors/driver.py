@@ -123,6 +123,9 @@ class Driver(ABC):
 class StreamDriver(Driver):
     """A device that sends readings by itself."""
 
+    received_s: float = 0.0
+    """When what `read` returned last has come, by the driver's clock, s."""
+
     @abstractmethod
     def read(self) -> MarkerReading | None:
         """Return the next reading, stamped with its time of capture.

@@ -237,8 +237,8 @@ class OptiTrackScene:
             )
         )
 
-    def frame(self, number: int, version: Version) -> Frame:
-        """Look at the world now.
+    def frame(self, number: int, version: Version, t: float | None = None) -> Frame:
+        """Look at the world now, or as it was at time t, s.
 
         Parameters
         ----------
@@ -248,7 +248,7 @@ class OptiTrackScene:
             Bitstream of the server: NatNet 2 has fewer flags and no residual.
         """
         behaviour, size = self._behaviour, len(self._offsets)
-        t = self._world.now()
+        t = self._world.now() if t is None else t
         tracked = self._world.line_of_sight(self._sensor, t)
         hidden_params = self._hidden(t, tracked)
         points = self._rng.standard_normal((len(self._labels), 3))
@@ -355,6 +355,8 @@ if TYPE_CHECKING:
     from remaster_ros.simulation.world import World
 
 MAX_CLIENTS = 16
+PAUSED_S = 2.0
+"""A bar that is later than this was paused, s: the World goes ahead of a busy one by less."""
 _POLL_WALL_S = 0.1
 _REFUSED = natnet.Response(b'\x01\0\0\0')
 _UNRECOGNIZED = natnet.Notice(MessageId.UNRECOGNIZED_REQUEST)
@@ -516,16 +518,18 @@ class FakeOptiTrackServer:
         self.stop()
 
     def _stream(self) -> None:
-        """Send frames at the rate in world time; those that come too late are left out."""
+        """Send frames at the rate in world time, each as it was when it was due."""
         start_s = self._world.now()
         number = 0
         while not self._closing.is_set():
-            number = max(number + 1, int((self._world.now() - start_s) * self._rate_hz))
+            # The World waits for this bar; one that was paused does not make up for the pause.
+            latest = int((self._world.now() - start_s - PAUSED_S) * self._rate_hz)
+            number = max(number + 1, latest)
             due_s = start_s + number / self._rate_hz
             # Before the wait: time that stood until this frame is sent would never get there.
             self._world.kept_up(self._sensor, due_s)
             self._world.sleep_until(due_s)
-            frame = self._scene.frame(number, self._version)
+            frame = self._scene.frame(number, self._version, due_s)
             self._latest = frame
             for message in self._spoiler.spoil(frame, self._world.faults(self._sensor)):
                 self._distribute(message)

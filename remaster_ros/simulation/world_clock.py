@@ -25,9 +25,10 @@ from pathlib import Path
 # How far world time may go: no further than the programs in it have kept up.
 #
 # Two kinds of participants count: nodes that publish which of the robot's reports they have
-# taken, and fake sensors, which note until when they have done what was due (`world_clock`). One
-# that was killed or paused (SIGSTOP) is not waited for, since that is a fault that a test
-# injects; one that is merely busy is, up to `PATIENCE_WALL_S`.
+# taken, or until when all that came from a sensor, and fake sensors, which note until when they
+# have done what was due (`world_clock`). One that was killed or paused (SIGSTOP) is not waited
+# for, since that is a fault that a test injects; one that is merely busy is, up to
+# `PATIENCE_WALL_S`.
 
 
 AHEAD_S, AHEAD_WALL_S = 0.15, 0.05
@@ -76,13 +77,17 @@ class Pace:
             self._reports.append((stamp_s, self._clock.now()))
 
     def took(self, pid: int, stamp_s: float) -> None:
-        """Note that a process has taken all reports up to the one with this stamp."""
+        """Note that a process has taken all reports up to the one with this stamp.
+
+        A stamp of no report is a time of the World, until which it has done all.
+        """
         with self._lock:
+            now = self._clock.now()
             known = [published_s for stamp, published_s in self._reports if stamp == stamp_s]
+            known = known or [min(stamp_s, now)]
             if pid in self._took:
                 known.append(self._took[pid].done_s)
-            if known:
-                self._took[pid] = _Participant(max(known), time.monotonic())
+            self._took[pid] = _Participant(max(known), time.monotonic())
 
     def go_on(self) -> None:
         """Let world time run as far as it may."""

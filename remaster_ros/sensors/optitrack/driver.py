@@ -19,7 +19,8 @@ from remaster_ros.sensors.optitrack.natnetclient_backend import READS, NatNetCli
 from remaster_ros.sensors.optitrack.settings import NatNetSettings
 from remaster_ros.types import MarkerReading
 
-WAIT_S = 0.2
+WAIT_S = 0.05
+"""A simulated world waits for this node, and goes on by 0.15 s and more meanwhile."""
 
 
 @dataclass(frozen=True)
@@ -82,6 +83,7 @@ class OptiTrackDriver(StreamDriver):
             sample = self._samples.get(timeout=WAIT_S)
         except queue.Empty:
             return None
+        self.received_s = sample.received_s
         if sample.received_s <= 0.0:
             # By a simulated clock that has not begun, no time of capture can be given.
             return None

@@ -82,7 +82,8 @@ READERS: dict[str, Callable[[Any, str], Sighting]] = {
 """Message type -> what reads it; the second argument is the name or the number of the marker."""
 
 
-WAIT_S = 0.2
+WAIT_S = 0.05
+"""A simulated world waits for this node, and goes on by 0.15 s and more meanwhile."""
 SILENT_S = 1.0
 """Without a message for so long, wall time, nothing comes any more."""
 JUDGED = 200
@@ -133,7 +134,7 @@ class TopicDriver(StreamDriver):
     def __init__(self, parameters: Parameters, clock: SensorClock) -> None:
         self.p, self._clock = parameters, clock
         self._early_s = parameters.max_age_s if clock.simulated else EARLY_S
-        self._readings: queue.SimpleQueue[MarkerReading] = queue.SimpleQueue()
+        self._readings: queue.SimpleQueue[tuple[MarkerReading, float]] = queue.SimpleQueue()
         self._lock = threading.Lock()
         self._recent: deque[MarkerReading] = deque(maxlen=JUDGED)
         self._counts: Counter[str] = Counter()
@@ -202,7 +203,7 @@ class TopicDriver(StreamDriver):
             self._stamp_s = stamp_s
             reading = MarkerReading(stamp_s, found.position, orientation=found.orientation)
             self._recent.append(reading)
-        self._readings.put(reading)
+        self._readings.put((reading, now))
 
     def _refused(self, frame: str, stamp_s: float) -> tuple[str, str]:
         """Return why a message is left out, in a word and as a sentence; '' where it is not."""
@@ -225,9 +226,10 @@ class TopicDriver(StreamDriver):
     def read(self) -> MarkerReading | None:
         """Return the next position; see `StreamDriver.read`."""
         try:
-            return self._readings.get(timeout=WAIT_S)
+            reading, self.received_s = self._readings.get(timeout=WAIT_S)
         except queue.Empty:
             return None
+        return reading
 
     def state(self) -> SensorState:
         """Return what the messages show."""
