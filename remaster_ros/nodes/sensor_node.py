@@ -347,7 +347,9 @@ class SensorNode(RemasterNode):
         if isinstance(self.driver, TopicDriver):
             subscribe_to_source(self, self.driver, described)
         if isinstance(self.driver, TriggeredDriver):
-            self._step: Callable[[], float | None] = MeasureService(self, self.driver, cell, self._ending).step
+            self._step: Callable[[], float | None] = MeasureService(
+                self, self.driver, cell, self._ending
+            ).step
         elif isinstance(self.driver, StreamDriver):
             self._step = partial(self._read, self.driver)
         self.status = NodeStatus(self, self._summary, self.sensor, cell.model())

@@ -15,6 +15,7 @@ import rclpy
 from geometry_msgs.msg import PointStamped, PoseStamped, TransformStamped
 from rclpy.executors import MultiThreadedExecutor, SingleThreadedExecutor
 from sensor_msgs.msg import JointState, Temperature
+from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
 from remaster_ros.collection.message_fields import seconds
@@ -22,6 +23,7 @@ from remaster_ros.errors import DeviceError, InputError
 from remaster_ros.kinematics.transforms import transform
 from remaster_ros.nodes.messages import transform_message
 from remaster_ros.nodes.sensor_node import SensorNode
+from remaster_ros.nodes.simulated_clock import TAKEN
 from remaster_ros.nodes.status import LATCHED, pairs
 from remaster_ros.parameters import parameter
 from remaster_ros.sensors import registry
@@ -204,6 +206,22 @@ def test_a_stream_is_published_under_its_time_of_capture(rig):
     assert (seconds(point.header.stamp), point.header.frame_id) == (7.25, 'mocap')
     assert (point.point.x, point.point.y, point.point.z) == tuple(PLACE)
     assert {'sensor': 'mocap', 'ready': 'yes', 'published': 1}.items() <= r.values().items()
+
+
+@pytest.mark.parametrize('simulated', [True, False])
+def test_a_simulated_world_learns_until_when_a_stream_has_been_taken(rig, simulated):
+    r = rig(Stream, use_sim_time=str(simulated).lower())
+    taken = []
+    r.peer.create_subscription(Header, TAKEN, taken.append, 10)
+    r.wait(lambda: r.node._readings[''].get_subscription_count(), 'the match')
+    assert r.node.count_publishers(TAKEN) == simulated
+    r.wait(lambda: r.peer.count_publishers(TAKEN) == simulated, 'the match')
+    r.driver.received_s = 7.5
+    r.driver.readings.append(MarkerReading(7.25, PLACE))
+    r.wait(lambda: r.points, 'the point')
+    if simulated:
+        r.wait(lambda: 7.5 in [seconds(message.stamp) for message in taken], 'that it was taken')
+        assert {message.frame_id for message in taken} == {str(os.getpid())}
 
 
 class Body(Stream):

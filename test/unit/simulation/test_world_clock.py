@@ -105,13 +105,31 @@ def test_a_bar_that_is_held_up_anywhere_gets_to_its_next_frame(scene, monkeypatc
     world.kept_up = lambda sensor, t: scene.other.kept_up(0, t)
 
     def distribute(server, frame):
-        sent.append(scene.passed())
+        sent.append(frame)
         if len(sent) == 30:
             server._closing.set()
 
     monkeypatch.setattr(FakeOptiTrackServer, '_distribute', distribute)
     FakeOptiTrackServer(world, SENSOR, rng, rate_hz=rate_hz)._stream()
-    assert len(sent) == 30
+    # None is left out once the World waits, and each is as it was when it was due.
+    later = sent[1:]
+    assert np.all(np.diff([frame.number for frame in later]) == 1)
+    steps = np.diff([frame.timestamp for frame in later])
+    np.testing.assert_allclose(steps, 1.0 / rate_hz, rtol=1e-6)
+
+
+def test_it_waits_for_a_node_that_takes_no_reports(scene):
+    """The node of a sensor notes until when it has taken all frames."""
+    scene.run(0.2, taken=True)
+    begun = scene.clock.now()
+    scene.pace.took(os.getppid(), begun)
+    scene.run(5.0, taken=True)
+    assert scene.clock.now() - begun <= AHEAD + RATE * TICK_WALL_S
+    # A clock that is ahead is none to wait for, and does not let the World run away.
+    scene.pace.took(os.getppid(), begun + 1e6)
+    before = scene.clock.now()
+    scene.run(5.0, taken=True)
+    assert scene.clock.now() - before <= AHEAD + RATE * TICK_WALL_S
 
 
 def test_a_process_that_does_nothing_for_long_is_not_waited_for(scene):
