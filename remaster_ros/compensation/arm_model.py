@@ -279,6 +279,26 @@ class ArmModel:
     root: FloatArray
     widening: float
 
+    @classmethod
+    def nominal(cls, chain: SerialChain) -> ArmModel:
+        """Return the arm as drawn, with no sensor and no marker."""
+        k = len(chain)
+        return cls(
+            chain=chain,
+            joint_offsets=np.zeros(k),
+            joint_terms=(),
+            base_terms=(),
+            geometry=Geometry.none(k),
+            growth=Geometry.none(k),
+            lateral_compliance=np.zeros(k),
+            reference_c=np.nan,
+            mean_c=np.nan,
+            T_R_N={},
+            markers={},
+            root=np.zeros((0, 0)),
+            widening=1.0,
+        )
+
     @property
     def joints(self) -> int:
         """Number of joints k."""

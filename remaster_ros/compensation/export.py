@@ -10,6 +10,7 @@ Each file lists the joints that are left out, and why.
 
 from __future__ import annotations
 
+import hashlib
 import re
 import textwrap
 from collections.abc import Sequence
@@ -19,12 +20,13 @@ from xml.etree import ElementTree
 
 import numpy as np
 
+from remaster_ros.compensation.arm_model import Geometry
 from remaster_ros.compensation.mastering import MasteringStep, mastering
 from remaster_ros.kinematics.pad_angles import pad_in_words
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.transforms import matrix_from_rpy, rotation_vector_to_matrix
 from remaster_ros.session.yaml_records import dump_yaml
-from remaster_ros.types import FloatArray
+from remaster_ros.types import BoolArray, Controller, FloatArray
 
 if TYPE_CHECKING:
     from remaster_ros.calibration.result import FitResult
@@ -42,24 +44,58 @@ _LIMITS = {
 
 
 @dataclass(frozen=True, eq=False)
-class Geometry:
-    """What is corrected in a robot model of k joints beyond the zero-offsets.
+class ZeroOffsets:
+    """Zero-offsets of k joints as they are written for a controller.
 
     Attributes
     ----------
-    shifts
-        Of each joint's origin, in the frame of the link that the joint before it moves, m, (k, 3).
-    turns
-        Of each joint's frame, as a rotation vector in that frame, rad, (k, 3).
+    urdf, chain
+        The nominal robot, text and joints.
+    joint_offsets, std
+        rad, (k,).
+    identifiable
+        Whether the data determine each, (k,); the others are not applied.
+    why
+        Of those that are not.
+    controller
+        How the pad writes the joints; None where it writes them as the URDF, in degrees.
+    check_first
+        What must be checked before anything is loaded, a line each.
     """
 
-    shifts: FloatArray
-    turns: FloatArray
+    urdf: str
+    chain: SerialChain
+    joint_offsets: FloatArray
+    std: FloatArray
+    identifiable: BoolArray
+    why: Sequence[str]
+    controller: Controller | None = None
+    check_first: Sequence[str] = ()
+
+    @classmethod
+    def of(cls, result: FitResult) -> ZeroOffsets:
+        """Return those of a fit."""
+        return cls(
+            result.session.urdf,
+            result.chain,
+            result.joint_offsets,
+            result.joint_offsets_std,
+            result.identifiable,
+            result.why,
+            result.session.controller,
+            check_first(result),
+        )
 
     @property
-    def is_any(self) -> bool:
-        """Whether it changes anything."""
-        return bool(np.any(self.shifts) or np.any(self.turns))
+    def applied(self) -> FloatArray:
+        """What is applied, rad, (k,): 0 where the data determine nothing."""
+        return np.where(self.identifiable, self.joint_offsets, 0.0)
+
+    @property
+    def left_out(self) -> dict[str, str]:
+        """The joints whose offsets are not applied, and why."""
+        unknown = np.flatnonzero(~self.identifiable).tolist()
+        return {self.chain.joint_names[i]: self.why[i] for i in unknown}
 
 
 def exports(result: FitResult, remarks: Sequence[str] = ()) -> dict[str, str]:
@@ -72,19 +108,18 @@ def exports(result: FitResult, remarks: Sequence[str] = ()) -> dict[str, str]:
     remarks
         For the user: what is not corrected, a line each.
     """
-    offsets = np.where(result.identifiable, result.joint_offsets, 0.0)
-    notes = _notes(result, remarks)
+    offsets = ZeroOffsets.of(result)
+    notes = written_notes(offsets, remarks)
     return {
-        REMASTER_FILE: remaster_text(result, remarks),
-        LAYER_FILE: layer_text(result, remarks),
-        URDF_FILE: calibrated_urdf(result.session.urdf, result.chain, offsets, notes),
+        REMASTER_FILE: remaster_text(offsets, remarks),
+        LAYER_FILE: layer_text(offsets, remarks),
+        URDF_FILE: calibrated_urdf(offsets.urdf, offsets.chain, offsets.applied, notes),
     }
 
 
-def _notes(result: FitResult, remarks: Sequence[str] = ()) -> list[str]:
+def written_notes(offsets: ZeroOffsets, remarks: Sequence[str] = ()) -> list[str]:
     """Return the warnings for the user of a file, a line each."""
-    controller = result.session.controller
-    words = [] if controller is None else pad_in_words(controller)
+    words = [] if offsets.controller is None else pad_in_words(offsets.controller)
     return [
         *remarks,
         *(
@@ -95,10 +130,10 @@ def _notes(result: FitResult, remarks: Sequence[str] = ()) -> list[str]:
             if words
             else ()
         ),
-        *check_first(result),
+        *offsets.check_first,
         *(
             f'left out, not identifiable: {joint}: {" ".join(why.split())}'
-            for joint, why in left_out(result).items()
+            for joint, why in offsets.left_out.items()
         ),
     ]
 
@@ -108,51 +143,59 @@ def check_first(result: FitResult) -> list[str]:
     return [f'CHECK FIRST: {line}' for line in result.implausible]
 
 
-def left_out(result: FitResult) -> dict[str, str]:
-    """Return the joints whose offsets are not applied, and why."""
-    unknown = np.flatnonzero(~result.identifiable)
-    return {result.joint_names[i]: result.why[i] for i in unknown}
+def remaster_text(
+    offsets: ZeroOffsets, remarks: Sequence[str] = (), *, alone: bool = False
+) -> str:
+    """Return the instructions for re-mastering on the robot's own pad, in the pad's numbers.
 
-
-def remaster_text(result: FitResult, remarks: Sequence[str] = ()) -> str:
-    """Return the instructions for re-mastering on the robot's own pad, in the pad's numbers."""
-    session = result.session
+    With ``alone`` none of the other files of a fit is beside it.
+    """
     groups = mastering(
-        session.controller,
-        result.chain,
-        result.joint_offsets,
-        result.joint_offsets_std,
-        result.identifiable,
+        offsets.controller,
+        offsets.chain,
+        offsets.joint_offsets,
+        offsets.std,
+        offsets.identifiable,
     )
     steps = [step for group in groups for step in group]
     plain = len(groups) == len(steps) and all(step.is_plain for step in steps)
-    notes = [f'  {joint}: {why}' for joint, why in left_out(result).items()]
-    words = [] if session.controller is None else pad_in_words(session.controller)
+    left_out, checks = offsets.left_out, offsets.check_first
+    notes = [f'  {joint}: {why}' for joint, why in left_out.items()]
+    words = [] if offsets.controller is None else pad_in_words(offsets.controller)
+    way = _PLAIN if plain else _PAD
+    where = 'Left out' if alone else 'Left out of all three'
+    urdf_sha256 = hashlib.sha256(offsets.urdf.encode()).hexdigest()
     return '\n'.join(
         [
-            f'Joint zero-offsets of robot {result.chain.name!r}',
-            f'(URDF with SHA-256 {session.urdf_sha256})',
+            f'Joint zero-offsets of robot {offsets.chain.name!r}',
+            f'(URDF with SHA-256 {urdf_sha256})',
             '',
-            *check_first(result),
-            *(('',) if result.implausible else ()),
-            'The true joint angle is the reported one plus the offset. Use ONE of three ways,',
-            'never two at once:',
-            '',
-            *(_PLAIN if plain else _PAD),
-            f'2. An offset layer between planner and controller: {LAYER_FILE}.',
-            f'3. A corrected robot model for planner and controller: {URDF_FILE}.',
+            *checks,
+            *(('',) if checks else ()),
+            *(('The true joint angle is the reported one plus the offset. Use no other form of',
+               'this correction beside it.',
+               '',
+               *(line[3:] for line in way)) if alone else
+              ('The true joint angle is the reported one plus the offset. Use ONE of three ways,',
+               'never two at once:',
+               '',
+               *way,
+               f'2. An offset layer between planner and controller: {LAYER_FILE}.',
+               f'3. A corrected robot model for planner and controller: {URDF_FILE}.')),
             '',
             *(line for remark in remarks for line in textwrap.wrap(remark, 88)),
             *(('',) if remarks else ()),
             *((_plain_rows(steps) if plain else _pad_rows(groups)) if steps else
               ('  No joint: these data determine no offset.',)),
-            *(('', 'Left out of all three, as the data do not determine their offsets. Leave',
+            *(('', f'{where}, as the data do not determine their offsets. Leave',
                'these joints as they are'
                f'{"" if all(step.determined for step in steps) else ", but for the table above"}:',
                *notes) if notes else ()),
             *(('', 'How the angles of the robot description (URDF) come from those on the pad, as',
                'told when the session was made:', *(f'  {line}' for line in words),
-               'The offsets above, and ways 2 and 3, are in the numbers of the description.')
+               'The offsets above'
+               f'{" are" if alone else ", and ways 2 and 3, are"} in the numbers of the '
+               'description.')
               if words else ()),
             '',
             'Afterwards measure a few poses again and run "remaster accuracy": it shows whether',
@@ -227,7 +270,7 @@ def _pad_rows(groups: Sequence[Sequence[MasteringStep]]) -> list[str]:
     return rows
 
 
-def layer_text(result: FitResult, remarks: Sequence[str] = ()) -> str:
+def layer_text(offsets: ZeroOffsets, remarks: Sequence[str] = ()) -> str:
     """Return the offsets as a ROS 2 parameter file for an offset layer."""
     head = (
         '# Joint zero-offsets, rad. A layer between planner and controller:\n'
@@ -235,17 +278,17 @@ def layer_text(result: FitResult, remarks: Sequence[str] = ()) -> str:
         '#   angle to the planner      = reported angle + offset\n'
         "# Shift the joint limits as well: the controller's limits apply to its own angles.\n"
     )  # fmt: skip
-    head += ''.join(f'# {note}\n' for note in _notes(result, remarks))
-    known = np.flatnonzero(result.identifiable)
+    head += ''.join(f'# {note}\n' for note in written_notes(offsets, remarks))
+    known = np.flatnonzero(offsets.identifiable)
     lists: dict[str, list[str] | list[float]] = {
-        'joint_names': [result.joint_names[i] for i in known],
-        'joint_offsets': [float(result.joint_offsets[i]) for i in known],
-        'joint_offsets_std': [float(result.joint_offsets_std[i]) for i in known],
-        'left_out': list(left_out(result)),
+        'joint_names': [offsets.chain.joint_names[i] for i in known],
+        'joint_offsets': offsets.joint_offsets[known].tolist(),
+        'joint_offsets_std': offsets.std[known].tolist(),
+        'left_out': list(offsets.left_out),
     }
     parameters = {
-        'robot': result.chain.name,
-        'urdf_sha256': result.session.urdf_sha256,
+        'robot': offsets.chain.name,
+        'urdf_sha256': hashlib.sha256(offsets.urdf.encode()).hexdigest(),
         # ROS has no type for an empty list.
         **{key: values for key, values in lists.items() if values},
     }
@@ -279,8 +322,7 @@ def calibrated_urdf(
     geometry
         Changes of the joints' origins beside the offsets.
     """
-    parser = ElementTree.XMLParser(target=ElementTree.TreeBuilder(insert_comments=True))
-    root = ElementTree.fromstring(urdf, parser)
+    root = parsed_xml(urdf)
     # The robot's own children: a <transmission> or <ros2_control> has joints of the same names.
     joints = {joint.get('name'): joint for joint in root.findall('joint')}
     for i, (name, axis, offset) in enumerate(
@@ -300,7 +342,7 @@ def calibrated_urdf(
         drawn = matrix_from_rpy(rpy)
         turned = drawn @ rotation_vector_to_matrix(turn)
         turned = turned @ rotation_vector_to_matrix(offset * axis)
-        origin.set('rpy', ' '.join(repr(angle) for angle in _rpy(turned)))
+        origin.set('rpy', ' '.join(repr(angle) for angle in rpy_of(turned)))
         if np.any(shift):
             # From the link that the joint before moves, through fixed joints, to the parent link.
             to_parent = drawn @ chain.T_fixed[i][:3, :3].T
@@ -320,18 +362,29 @@ def calibrated_urdf(
         first.append('joint origins and limits hold the calibrated zero-offsets')
     if geometry is not None and geometry.is_any:
         first.append('joint origins hold the lengths and tilts that were found')
-    for text in (*reversed(notes), *(first or ['nothing is changed'])):
+    return xml_text(urdf, root, (*(first or ['nothing is changed']), *notes))
+
+
+def parsed_xml(text: str) -> ElementTree.Element:
+    """Return the outermost element of a description, comments kept."""
+    parser = ElementTree.XMLParser(target=ElementTree.TreeBuilder(insert_comments=True))
+    return ElementTree.fromstring(text, parser)
+
+
+def xml_text(before: str, root: ElementTree.Element, notes: Sequence[str]) -> str:
+    """Return a description that was changed, with comments in it and what stood before it."""
+    for text in reversed(notes):
         # Two hyphens would end the comment.
         note = ElementTree.Comment(f' {re.sub("-(?=-)", "- ", text).rstrip("-")} ')
         note.tail = '\n  '
         root.insert(0, note)
     # What stands before the root (who made the model, under which licence) is no part of the tree.
-    prolog = _PROLOG.match(urdf)
+    prolog = _PROLOG.match(before)
     head = prolog.group() if prolog else ''
     return head + ElementTree.tostring(root, encoding='unicode') + '\n'
 
 
-def _rpy(rotation: FloatArray) -> tuple[float, float, float]:
+def rpy_of(rotation: FloatArray) -> tuple[float, float, float]:
     """Return roll, pitch, yaw of R = Rz(yaw) Ry(pitch) Rx(roll), exact at pitch ±90° too.
 
     The roll is taken after undoing the yaw, so that where the two act alike, an error in one is

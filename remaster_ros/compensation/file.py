@@ -27,6 +27,7 @@ from remaster_ros.compensation.arm_model import (
 from remaster_ros.compensation.compensator import Compensator
 from remaster_ros.compensation.of_result import Described
 from remaster_ros.errors import InputError
+from remaster_ros.kinematics.pad_angles import coupled_in_circle
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.transforms import (
     matrix_from_quaternion_xyzw,
@@ -34,7 +35,7 @@ from remaster_ros.kinematics.transforms import (
     transform,
 )
 from remaster_ros.session.files import read_limited
-from remaster_ros.types import FloatArray
+from remaster_ros.types import Controller, FloatArray
 from remaster_ros.version import __version__
 
 FORMAT = 'remaster-compensation/1'
@@ -181,6 +182,7 @@ class CompensationPart(Struct):
     notes: list[str]
     base_terms: list[TermPart] = []
     temperature: TemperaturePart | None = None
+    controller: Controller | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -235,6 +237,7 @@ def written(
     made_by: Source,
     hashes: tuple[str, str],
     state: Mapping[str, Any],
+    controller: Controller | None = None,
 ) -> str:
     """Return the text of compensation.json.
 
@@ -250,6 +253,8 @@ def written(
         SHA-256 of the result's file and of observations.csv.
     state
         Of the controller while it was measured.
+    controller
+        How the robot's own pad writes the joints.
     """
     model, chain = described.model, described.model.chain
     names = chain.joint_names
@@ -325,6 +330,7 @@ def written(
             for one in described.not_corrected
         ],
         notes=list(described.notes),
+        controller=controller,
     )
     encoder = msgspec.json.Encoder()
     lines = [
@@ -436,6 +442,12 @@ def _model(content: CompensationPart) -> ArmModel:
             _triple(chain.centers_of_mass[index]),
         ):
             raise _broken(f'masses of {part.joint}', 'are not those of its URDF')
+    pad = {} if content.controller is None else content.controller.joints
+    told = [*pad, *(other for joint in pad.values() for other in joint.coupling)]
+    if any(name not in names for name in told):
+        raise _broken('controller', 'names joints that are none of the arm')
+    if coupled_in_circle({name: joint.coupling for name, joint in pad.items()}):
+        raise _broken('controller', 'couples a joint to itself')
     if content.gravity_m_s2 != GRAVITY:
         raise _broken('gravity_m_s2', f'is not {GRAVITY}')
     joint_terms = tuple(

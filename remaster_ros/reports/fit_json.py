@@ -15,10 +15,10 @@ import numpy as np
 
 from remaster_ros.calibration.estimate import Problem
 from remaster_ros.calibration.predictions import predict
+from remaster_ros.compensation.arm_model import Geometry
 from remaster_ros.compensation.export import (
     MODEL_FILE,
     URDF_FILE,
-    Geometry,
     calibrated_urdf,
     exports,
 )
@@ -125,7 +125,7 @@ def model_text(result: FitResult, geometry: GeometryModel) -> str:
         result.chain,
         offsets,
         [remark],
-        Geometry(geometry.shifts, geometry.turns),
+        Geometry(*(np.vstack((v, np.zeros(3))) for v in (geometry.shifts, geometry.turns))),
     )
 
 
@@ -145,7 +145,7 @@ def correction_text(
     """Return compensation.json of the arm that a result describes."""
     state = {'correction': session.extra.get('correction')}
     hashes = (result_sha256, session.observations_sha256)
-    return written(described, session.urdf, made_by, hashes, state)
+    return written(described, session.urdf, made_by, hashes, state, session.controller)
 
 
 def _rows_of(result: FitResult) -> Measurements:

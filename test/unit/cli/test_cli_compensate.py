@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 import csv
-import hashlib
 import json
-from dataclasses import replace
 
 import numpy as np
 import pytest
+from compensation_files import arm, save
 from hidden_tours import robot
 
 import remaster_ros
 from remaster_ros.cli.main import main
-from remaster_ros.compensation.arm_model import ArmModel, Function, Geometry, JointTerm
-from remaster_ros.compensation.file import written
-from remaster_ros.compensation.of_result import Described
-from remaster_ros.kinematics.serial_chain import SerialChain
+from remaster_ros.compensation.arm_model import Function, Geometry, JointTerm
 
 URDF = robot('lwr4plus')
 JOINTS = 7
@@ -25,37 +21,17 @@ JOINTS = 7
 @pytest.fixture(scope='module')
 def file(tmp_path_factory):
     """Return the compensation of an arm with offsets, a soft joint and a length."""
-    chain = SerialChain.from_urdf(URDF, 'base_link', 'tool')
     rng = np.random.default_rng(1)
     shifts = np.zeros((JOINTS + 1, 3))
     shifts[3, 2] = 5e-4
-    model = ArmModel(
-        chain=chain,
+    soft = JointTerm(1, 'x', Function('gravity_torque', 'linear', 1), np.full(1, 3e-5))
+    model = arm(
+        URDF,
         joint_offsets=np.radians(0.3) * rng.standard_normal(JOINTS),
-        joint_terms=(
-            JointTerm(1, 'x', Function('gravity_torque', 'linear', 1), np.full(1, 3e-5)),
-        ),
-        base_terms=(),
+        joint_terms=(soft,),
         geometry=Geometry(shifts, np.zeros((JOINTS + 1, 3))),
-        growth=Geometry.none(JOINTS),
-        lateral_compliance=np.zeros(JOINTS),
-        reference_c=np.nan,
-        mean_c=np.nan,
-        T_R_N={'mocap': np.eye(4)},
-        markers={'sir': np.zeros(3)},
-        root=np.zeros((0, 0)),
-        widening=1.0,
     )
-    root = np.zeros((3, len(model.parameter_names)))
-    root[:, :3] = 1e-5 * np.eye(3)
-    known = (True,) * JOINTS
-    described = Described(
-        replace(model, root=root), known, ('',) * JOINTS, np.tile([-2.0, 2.0], (JOINTS, 1))
-    )
-    path = tmp_path_factory.mktemp('apply') / 'compensation.json'
-    path.write_text(written(described, URDF, 'fit', ('', ''), {}), encoding='utf-8')
-    assert hashlib.sha256(path.read_bytes()).hexdigest()
-    return path
+    return save(tmp_path_factory.mktemp('apply'), model, URDF)
 
 
 def table(path, q, unit='deg', separator=',', decimal='.', time=True):

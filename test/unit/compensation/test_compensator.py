@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from calibration_scenes import scene
+from compensation_files import arm as arm_of
 from discovery_scenes import residuals_of
 from hidden_tours import robot
 
@@ -14,30 +15,12 @@ from remaster_ros.compensation.arm_model import ArmModel, Function, Geometry, Jo
 from remaster_ros.compensation.compensator import FADES_BELOW, Compensator
 from remaster_ros.compensation.of_result import placed
 from remaster_ros.discovery.effects.registry import EFFECTS
-from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.transforms import apply, matrix_to_rotation_vector
 
 
 def arm(name: str, **more: object) -> ArmModel:
     """Return an arm as drawn, but for what is given."""
-    chain = SerialChain.from_urdf(robot(name), 'base_link', 'tool')
-    k = len(chain)
-    plain = ArmModel(
-        chain=chain,
-        joint_offsets=np.zeros(k),
-        joint_terms=(),
-        base_terms=(),
-        geometry=Geometry.none(k),
-        growth=Geometry.none(k),
-        lateral_compliance=np.zeros(k),
-        reference_c=20.0,
-        mean_c=20.0,
-        T_R_N={'mocap': np.eye(4)},
-        markers={'sir': np.array([0.1, 0.0, 0.02])},
-        root=np.zeros((0, 0)),
-        widening=1.0,
-    )
-    return replace(plain, **more)  # type: ignore[arg-type]
+    return arm_of(robot(name), **{'reference_c': 20.0, 'mean_c': 20.0, **more})
 
 
 def erring(name: str, seed: int) -> ArmModel:

@@ -12,11 +12,12 @@ import yaml
 
 from remaster_ros.calibration.residual_structure import ResidualStructure, StructureTest
 from remaster_ros.compensation.export import (
-    _rpy,
+    ZeroOffsets,
     calibrated_urdf,
     exports,
     layer_text,
     remaster_text,
+    rpy_of,
 )
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.serial_chain import SerialChain
@@ -160,13 +161,13 @@ def test_roll_pitch_yaw_are_exact_at_and_near_the_singularity():
             rpy = rng.uniform(-3, 3, 3)
             rpy[1] = sign * (np.pi / 2 - away)
             rotation = matrix_from_rpy(rpy)
-            np.testing.assert_allclose(matrix_from_rpy(_rpy(rotation)), rotation, atol=1e-14)
+            np.testing.assert_allclose(matrix_from_rpy(rpy_of(rotation)), rotation, atol=1e-14)
 
 
 def test_the_offset_layer_is_a_ros_parameter_file(fit_result):
     known = fit_result.identifiable
     assert 0 < known.sum() < len(known)
-    parameters = yaml.safe_load(layer_text(fit_result))['/**']['ros__parameters']
+    parameters = yaml.safe_load(layer_text(ZeroOffsets.of(fit_result)))['/**']['ros__parameters']
     names = np.array(fit_result.joint_names)
     assert parameters['joint_names'] == names[known].tolist()
     assert parameters['joint_offsets'] == fit_result.joint_offsets[known].tolist()
@@ -175,7 +176,7 @@ def test_the_offset_layer_is_a_ros_parameter_file(fit_result):
 
 
 def test_the_instructions_are_for_minus_the_offset(fit_result):
-    text = remaster_text(fit_result)
+    text = remaster_text(ZeroOffsets.of(fit_result))
     table, _, notes = text.partition('Left out of all three')
     for i, joint in enumerate(fit_result.joint_names):
         lines = [line for line in table.splitlines() if line.split()[:1] == [joint]]

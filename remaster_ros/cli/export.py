@@ -1,0 +1,132 @@
+"""Write a correction in the form that a controller or driver takes."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+
+from remaster_ros.cli.console import show
+from remaster_ros.compensation.controller_forms import FORMS, exported, held
+from remaster_ros.compensation.file import read_compensation
+from remaster_ros.compensation.pad_pages import MotorNumber
+from remaster_ros.errors import InputError
+from remaster_ros.session.files import (
+    URDF_LIMIT,
+    decode_text,
+    make_new_folder,
+    read_limited,
+    undone_on_failure,
+    write_atomically,
+)
+
+FORMAT = 'remaster-export/1'
+LEFT_OUT_FILE = 'left_out.txt'
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of ``remaster export``."""
+    parser.add_argument(
+        'compensation', metavar='COMPENSATION', type=Path, help='apply/compensation.json'
+    )
+    parser.add_argument(
+        '--to',
+        choices=FORMS,
+        required=True,
+        help='urdf; ur: kinematics file of a Universal Robots arm; ros2_control: offsets of '
+        'transmissions; rising: calibration of the URDF; pad: what to set by hand; json, csv: DH, '
+        'Hayati and POE',
+    )
+    parser.add_argument('--out', metavar='DIR', type=Path, required=True, help='a new folder')
+    parser.add_argument(
+        '--base',
+        metavar='FILE',
+        type=Path,
+        help="what is changed: the arm's own kinematics file (ur), a URDF (ros2_control, rising; "
+        'default: the nominal one)',
+    )
+    parser.add_argument(
+        '--driver-param',
+        action='store_true',
+        help='ros2_control: <param name="offset"> for drivers that report raw angle - offset',
+    )
+    parser.add_argument(
+        '--motor',
+        metavar='JOINT=OLD,COUNTS,DIRECTION',
+        type=_motor,
+        action='append',
+        default=[],
+        help='pad: a number that the controller has stored of a motor, counts per degree, and 1 '
+        'or -1 as the reported angle grows or falls with it; may be repeated',
+    )
+    parser.add_argument('--json', action='store_true', help='print what was done as JSON')
+
+
+def _motor(text: str) -> tuple[str, MotorNumber]:
+    name, _, rest = text.partition('=')
+    parts = rest.split(',')
+    try:
+        old, counts = (float(part) for part in parts[:2])
+        direction = int(parts[2]) if len(parts) == 3 else 0
+    except ValueError:
+        old, counts, direction = np.nan, np.nan, 0
+    if not (name and np.isfinite(old) and 0.0 < counts < np.inf and direction in (1, -1)):
+        raise argparse.ArgumentTypeError(
+            f'{text!r} is not JOINT=OLD,COUNTS_PER_DEGREE,DIRECTION, such as '
+            'joint_2=123456,1137.8,-1'
+        )
+    return name, MotorNumber(old, counts, direction)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Read, compare with the whole correction, write, and state what is left out."""
+    for given, forms, option in (
+        (args.base, ('ur', 'ros2_control', 'rising'), '--base'),
+        (args.driver_param, ('ros2_control',), '--driver-param'),
+        (args.motor, ('pad',), '--motor'),
+    ):
+        if given and args.to not in forms:
+            raise InputError(f'{option} goes with --to {" or ".join(forms)}; leave it out')
+    compensation = read_compensation(args.compensation)
+    names = compensation.compensator.joint_names
+    motors = dict(args.motor)
+    for name in motors:
+        if name not in names:
+            raise InputError(
+                f'--motor: {name!r} is not among the joints ({", ".join(names)}); correct the name'
+            )
+    base = None
+    if args.base is not None:
+        data = read_limited(args.base, URDF_LIMIT, 'name the file that is to be changed')
+        base = args.base, decode_text(data, args.base)
+    one = held(compensation, args.to, np.random.default_rng(args.seed))
+    files = exported(
+        compensation, args.to, one, base, driver_param=args.driver_param, motors=motors
+    )
+    files[LEFT_OUT_FILE] = '\n'.join([*one.words, ''])
+    with undone_on_failure():
+        make_new_folder(args.out)
+        for name, text in files.items():
+            write_atomically(args.out / name, text)
+    if args.json:
+        print(
+            json.dumps(
+                {
+                    'format': FORMAT,
+                    'form': args.to,
+                    'files': list(files),
+                    'left_out': {
+                        'rms_mm': one.rms_mm,
+                        'max_mm': one.max_mm,
+                        'parts': [asdict(part) for part in one.parts],
+                        'corrected_in_no_form': [left.effect for left in one.never],
+                    },
+                }
+            )
+        )
+    else:
+        show(args.quiet, '\n'.join([*one.words, f'written: {args.out} ({", ".join(files)})']))
+    return 0

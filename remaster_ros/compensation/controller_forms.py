@@ -1,0 +1,433 @@
+"""A correction in the forms that controllers and drivers take, with what each leaves out.
+
+Where a form cannot hold all of a correction its zero-offsets are fitted again to the whole one,
+base and marker too: those that belong to causes which are left out would be worse than none.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping, Sequence
+from csv import writer as csv_writer
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, Literal, get_args
+from xml.etree import ElementTree
+
+import msgspec
+import numpy as np
+
+from remaster_ros.compensation.arm_model import ArmModel, Geometry
+from remaster_ros.compensation.export import (
+    REMASTER_FILE,
+    URDF_FILE,
+    ZeroOffsets,
+    calibrated_urdf,
+    parsed_xml,
+    remaster_text,
+    written_notes,
+    xml_text,
+)
+from remaster_ros.compensation.file import Compensation, LeftPart
+from remaster_ros.compensation.kinematic_tables import tables
+from remaster_ros.compensation.pad_pages import PAD_PAGES, MotorNumber, motor_text
+from remaster_ros.errors import InputError
+from remaster_ros.kinematics.transforms import matrix_from_rpy, transform
+from remaster_ros.kinematics.urdf import parse_urdf
+from remaster_ros.session.yaml_records import YamlError, dump_yaml, load_yaml
+from remaster_ros.types import FloatArray
+
+Form = Literal['urdf', 'ur', 'ros2_control', 'rising', 'pad', 'json', 'csv']
+FORMS: tuple[Form, ...] = get_args(Form)
+WITH_GEOMETRY = frozenset({'urdf', 'ur', 'json', 'csv'})
+KINEMATICS_FORMAT = 'remaster-kinematics/1'
+# Configurations in the measured range over which a form is compared with the whole correction.
+COMPARED = 400
+# Of Gauss and Newton: what is left out is at most some millimetres, so each leaves a thousandth.
+STEPS = 3
+# Links of a UR's kinematics file, by the ends of its joints' names.
+UR_LINKS = {
+    'shoulder_pan_joint': 'shoulder',
+    'shoulder_lift_joint': 'upper_arm',
+    'elbow_joint': 'forearm',
+    'wrist_1_joint': 'wrist_1',
+    'wrist_2_joint': 'wrist_2',
+    'wrist_3_joint': 'wrist_3',
+}
+# A micrometre, and a micrometre a metre away: files have so many digits.
+SAME = 1e-6
+
+
+@dataclass(frozen=True)
+class Part:
+    """One part of a correction that a form does not hold: RMS displacement of the marker, mm."""
+
+    what: str
+    rms_mm: float
+
+
+@dataclass(frozen=True, eq=False)
+class Held:
+    """What of a correction a form holds.
+
+    Attributes
+    ----------
+    model
+        The arm that it makes of the nominal one.
+    parts
+        What it does not hold.
+    rms_mm, max_mm
+        At the marker after all, over the measured range.
+    never
+        What no form corrects.
+    """
+
+    model: ArmModel
+    parts: tuple[Part, ...]
+    rms_mm: float
+    max_mm: float
+    never: tuple[LeftPart, ...] = ()
+
+    @property
+    def words(self) -> list[str]:
+        """What is left out, a line each."""
+        never = [
+            f'Corrected in no form: {left.effect}'
+            f'{" of joints " + ", ".join(map(str, left.joints)) if left.joints else ""}, '
+            f'{left.size_mm:.3f} mm RMS: {left.instead}'
+            for left in self.never
+        ]
+        if not self.parts:
+            return ['Left out: nothing that can be corrected.', *never]
+        return [
+            f'Left out: {self.rms_mm:.3f} mm RMS at the marker, {self.max_mm:.3f} mm at most, '
+            'over the measured range, with the zero-offsets fitted to the whole correction.',
+            *(f'Left out: {part.what}, alone {part.rms_mm:.3f} mm RMS.' for part in self.parts),
+            *never,
+        ]
+
+
+def held(compensation: Compensation, form: Form, rng: np.random.Generator) -> Held:
+    """Return what of a correction a form holds, and what it leaves out."""
+    model, content = compensation.model, compensation.content
+    known = np.array([part.identifiable for part in content.joints])
+    k = model.joints
+    geometry = Geometry.none(k)
+    if form in WITH_GEOMETRY:
+        # A shift of the tool frame is one of the marker, which is fitted again.
+        geometry.shifts[:k], geometry.turns[:k] = (
+            model.geometry.shifts[:k],
+            model.geometry.turns[:k],
+        )
+    plain = replace(
+        model,
+        joint_offsets=np.where(known, model.joint_offsets, 0.0),
+        joint_terms=(),
+        base_terms=(),
+        geometry=geometry,
+        growth=Geometry.none(k),
+        lateral_compliance=np.zeros(k),
+    )
+    low, high = np.array([part.range_rad for part in content.joints]).T
+    q = rng.uniform(low, high, (COMPARED, k))
+    sensor, marker = next(iter(model.T_R_N)), next(iter(model.markers))
+
+    def place(one: ArmModel) -> FloatArray:
+        return one.in_sensor(one.state(q), sensor, marker)
+
+    wanted, turn = place(model), model.T_R_N[sensor][:3, :3]
+    free = np.zeros(len(plain.parameter_names), dtype=bool)
+    free[:k] = known
+    for where in (*plain.registration(sensor), plain.marker(marker)):
+        free[where] = True
+    for _ in range(STEPS):
+        columns = plain.derivative(plain.state(q), sensor, marker)[..., free]
+        error = (wanted - place(plain)) @ turn.T
+        step = np.zeros(len(free))
+        # Of what base and marker do as well as an offset, the smallest step.
+        step[free] = np.linalg.lstsq(
+            columns.reshape(-1, columns.shape[-1]), error.ravel(), rcond=1e-9
+        )[0]
+        plain = plain.moved(step)
+    left = np.linalg.norm(wanted - place(plain), axis=1)
+    parts = tuple(
+        Part(what, 1e3 * float(np.sqrt(np.mean(np.sum((wanted - place(one)) ** 2, axis=1)))))
+        for what, one in _without(model, form)
+    )
+    return Held(
+        plain,
+        parts,
+        1e3 * float(np.sqrt(np.mean(left**2))),
+        1e3 * float(left.max(initial=0.0)),
+        tuple(content.not_corrected),
+    )
+
+
+def _without(model: ArmModel, form: Form) -> list[tuple[str, ArmModel]]:
+    """Return the arm without each part that a form does not hold."""
+    names, none = model.chain.joint_names, Geometry.none(model.joints)
+    found = []
+    for effect, joint in dict.fromkeys((term.effect, term.joint) for term in model.joint_terms):
+        rest = tuple(t for t in model.joint_terms if (t.effect, t.joint) != (effect, joint))
+        found.append((f'{effect} of {names[joint]}', replace(model, joint_terms=rest)))
+    for effect in dict.fromkeys(term.effect for term in model.base_terms):
+        terms = tuple(term for term in model.base_terms if term.effect != effect)
+        found.append((f'{effect} of the base', replace(model, base_terms=terms)))
+    if model.growth.is_any:
+        found.append(('growth with the temperature', replace(model, growth=none)))
+    for joint in np.flatnonzero(model.lateral_compliance).tolist():
+        rest_of = model.lateral_compliance.copy()
+        rest_of[joint] = 0.0
+        what = f'the soft bearing of {names[joint]}'
+        found.append((what, replace(model, lateral_compliance=rest_of)))
+    if form not in WITH_GEOMETRY and model.geometry.is_any:
+        found.append(('lengths and tilts', replace(model, geometry=none)))
+    return found
+
+
+def exported(
+    compensation: Compensation,
+    form: Form,
+    one: Held,
+    base: tuple[Path, str] | None = None,
+    *,
+    driver_param: bool = False,
+    motors: Mapping[str, MotorNumber] | None = None,
+) -> dict[str, str]:
+    """Return the files of a form, name -> text.
+
+    Parameters
+    ----------
+    compensation, form
+        Which correction in which form.
+    one
+        What the form holds of it.
+    base
+        The file that is changed, path and text; the nominal URDF where None.
+    driver_param
+        Of ``ros2_control``: ``<param name="offset">`` in place of transmissions.
+    motors
+        Of ``pad``: what the controller has stored, by joint.
+
+    Raises
+    ------
+    InputError
+        The file that is to be changed is not of this arm, or has not what is to be changed.
+    """
+    offsets = _offsets(compensation, one)
+    notes = written_notes(offsets, one.words)
+    if form == 'urdf':
+        return {URDF_FILE: _urdf(compensation, offsets, one, notes)}
+    if form == 'ur':
+        if base is None:
+            raise InputError("--to ur changes the arm's own kinematics file: name it with --base")
+        return {base[0].name: _ur_yaml(compensation, offsets, one, *base, notes)}
+    if form == 'json':
+        return {'kinematics.json': _json(compensation, one)}
+    if form == 'csv':
+        return {'kinematics.csv': _csv(one)}
+    if form == 'pad':
+        files = {REMASTER_FILE: remaster_text(offsets, one.words, alone=True), **PAD_PAGES}
+        if motors:
+            files['motor_numbers.txt'] = motor_text(offsets, motors)
+        return files
+    path, text = base or (Path(URDF_FILE), compensation.content.robot.urdf)
+    try:
+        root = parsed_xml(text)
+    except ElementTree.ParseError as error:
+        raise InputError(f'{path}: not well-formed XML ({error}); give a URDF') from None
+    by_joint = {
+        name: float(value)
+        for name, value in zip(offsets.chain.joint_names, offsets.applied, strict=True)
+        if value != 0.0
+    }
+    if form == 'rising':
+        _rising(root, by_joint, path)
+        how = 'angle = position read + rising; many drivers ignore <calibration>: look into yours'
+    elif driver_param:
+        _driver_params(root, by_joint, path)
+        how = (
+            'for a driver that reports raw angle - offset, as some do: look into yours for a '
+            'parameter of this name and its sign'
+        )
+    else:
+        _transmissions(root, by_joint, path)
+        how = (
+            'joint = actuator / reduction + offset; acts only where the hardware component loads '
+            'transmissions, which no controller manager does for it: look into yours'
+        )
+    limits = 'the limits of the joints stay as they are: keep away from them by the offsets'
+    return {path.name: xml_text(text, root, [how, limits, *notes])}
+
+
+def _offsets(compensation: Compensation, one: Held) -> ZeroOffsets:
+    content, model = compensation.content, compensation.model
+    std = model.widening * np.linalg.norm(model.root[:, : model.joints], axis=0)
+    return ZeroOffsets(
+        content.robot.urdf,
+        model.chain,
+        one.model.joint_offsets,
+        std,
+        np.array([part.identifiable for part in content.joints]),
+        [part.why for part in content.joints],
+        content.controller,
+        [note for note in content.notes if note.startswith('CHECK FIRST')],
+    )
+
+
+def _urdf(
+    compensation: Compensation, offsets: ZeroOffsets, one: Held, notes: Sequence[str]
+) -> str:
+    return calibrated_urdf(
+        compensation.content.robot.urdf, offsets.chain, offsets.applied, notes, one.model.geometry
+    )
+
+
+def _ur_yaml(
+    compensation: Compensation,
+    offsets: ZeroOffsets,
+    one: Held,
+    path: Path,
+    text: str,
+    notes: Sequence[str],
+) -> str:
+    """Return the arm's own kinematics file with the origins of the corrected robot model."""
+    try:
+        content = load_yaml(text)
+    except YamlError as error:
+        raise InputError(f'{path}: {error}') from None
+    links = content.get('kinematics') if isinstance(content, dict) else None
+    if not isinstance(links, dict):
+        raise InputError(
+            f"{path}: no key 'kinematics'; give the arm's own kinematics file of a UR"
+        )
+    nominal = {joint.name: joint for joint in _joints(compensation.content.robot.urdf)}
+    changed = parsed_xml(_urdf(compensation, offsets, one, ()))
+    origins = {joint.get('name'): joint.find('origin') for joint in changed.findall('joint')}
+    for name in offsets.chain.joint_names:
+        link = next((link for end, link in UR_LINKS.items() if name.endswith(end)), '')
+        numbers = links.get(link)
+        keys = ('x', 'y', 'z', 'roll', 'pitch', 'yaw')
+        if not isinstance(numbers, dict) or not all(
+            isinstance(numbers.get(key), int | float) for key in keys
+        ):
+            raise InputError(
+                f'{path}: no numbers {" ".join(keys)} in kinematics.{link or "?"} for {name}; '
+                "give the arm's own kinematics file of a UR"
+            )
+        given = np.array([float(numbers[key]) for key in keys])
+        drawn = transform(matrix_from_rpy(given[3:]), given[:3])
+        off = np.abs(drawn - nominal[name].origin).max()
+        if off > SAME:
+            raise InputError(
+                f'{path}: kinematics.{link} is not that of the robot that was measured (off by '
+                f'{off:.2g}); give the file that its description was made with, or measure again '
+                'with kinematics_params:=FILE'
+            )
+        origin = origins[name]
+        if origin is None:
+            continue
+        words = [*origin.get('xyz', '0 0 0').split(), *origin.get('rpy', '0 0 0').split()]
+        found = np.array([float(word) for word in words])
+        if np.any(transform(matrix_from_rpy(found[3:]), found[:3]) != nominal[name].origin):
+            numbers.update(zip(keys, found.tolist(), strict=True))
+    head = [
+        "The arm's own kinematics, corrected: give it to ur.urdf.xacro as kinematics_params, to "
+        'planner and driver alike, and beside it no other form of this correction.',
+        'The hash is that of the arm, which the driver compares: leave it. What the arm itself '
+        'computes (moves in its base frame, the pose on its pad) stays as it was.',
+        'Joint limits stay as they are: keep away from them by the offsets.',
+        *notes,
+    ]
+    return ''.join(f'# {line}\n' for line in head) + dump_yaml(content)
+
+
+def _joints(urdf: str) -> list[Any]:
+    return list(parse_urdf(urdf).parent_joint.values())
+
+
+def _rising(root: ElementTree.Element, by_joint: Mapping[str, float], path: Path) -> None:
+    joints = {joint.get('name'): joint for joint in root.findall('joint')}
+    for name, offset in by_joint.items():
+        joint = joints.get(name)
+        if joint is None:
+            raise InputError(f'{path}: no joint {name!r}; give a URDF of this arm')
+        element = joint.find('calibration')
+        if element is None:
+            element = ElementTree.SubElement(joint, 'calibration')
+        element.set('rising', repr(_number(element.get('rising', '0'), path, name) + offset))
+
+
+def _transmissions(root: ElementTree.Element, by_joint: Mapping[str, float], path: Path) -> None:
+    found = {
+        joint.get('name'): joint for joint in root.findall('.//ros2_control/transmission/joint')
+    }
+    missing = [name for name in by_joint if name not in found]
+    if missing:
+        raise InputError(
+            f'{path}: no <transmission> in <ros2_control> has joint {", ".join(missing)}; where '
+            'the hardware component loads none there is nothing to correct: take another form, '
+            '--driver-param perhaps'
+        )
+    for name, offset in by_joint.items():
+        element = found[name].find('offset')
+        if element is None:
+            element = ElementTree.SubElement(found[name], 'offset')
+        element.text = repr(_number(element.text or '0', path, name) + offset)
+
+
+def _driver_params(root: ElementTree.Element, by_joint: Mapping[str, float], path: Path) -> None:
+    found = {joint.get('name'): joint for joint in root.findall('.//ros2_control/joint')}
+    missing = [name for name in by_joint if name not in found]
+    if missing:
+        raise InputError(
+            f'{path}: no joint {", ".join(missing)} in <ros2_control>; give the URDF of the driver'
+        )
+    for name, offset in by_joint.items():
+        params = [p for p in found[name].findall('param') if p.get('name') == 'offset']
+        element = params[0] if params else ElementTree.SubElement(found[name], 'param')
+        element.set('name', 'offset')
+        element.text = repr(_number(element.text or '0', path, name) - offset)
+
+
+def _number(text: str, path: Path, joint: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = np.nan
+    if not np.isfinite(value):
+        raise InputError(
+            f'{path}: the offset of {joint} is {text.strip()[:40]!r}, no number; expand the xacro'
+        )
+    return value
+
+
+def _json(compensation: Compensation, one: Held) -> str:
+    robot = compensation.content.robot
+    content = {
+        'format': KINEMATICS_FORMAT,
+        'compensation_sha256': compensation.sha256,
+        'robot': {
+            key: getattr(robot, key)
+            for key in ('name', 'urdf_sha256', 'base_link', 'tip_link', 'joint_names')
+        },
+        'steps': {
+            'dh': 'Rz(q + theta) Tz(d) Tx(a) Rx(alpha)',
+            'hayati': 'Rz(q + theta) Tx(a) Rx(alpha) Ry(beta)',
+            'tool': 'base, the steps, Rz(q + theta) of the last joint, end',
+            'poe': 'exp of each screw (w, v) times its q, base to tip, then home',
+            'base, end, home': 'x y z in m, roll pitch yaw in rad: Rz(yaw) Ry(pitch) Rx(roll)',
+        },
+        'left_out': {'rms_mm': one.rms_mm, 'max_mm': one.max_mm, 'parts': list(one.parts)},
+        'rows': tables(one.model),
+    }
+    return msgspec.json.format(msgspec.json.encode(content)).decode() + '\n'
+
+
+def _csv(one: Held) -> str:
+    text = io.StringIO()
+    writer = csv_writer(text, lineterminator='\n')
+    rows = [asdict(row) for row in tables(one.model)]
+    writer.writerow(rows[0])
+    writer.writerows(row.values() for row in rows)
+    return text.getvalue()

@@ -1,0 +1,44 @@
+"""Arms with known errors, and their compensation.json."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from remaster_ros.compensation.arm_model import ArmModel
+from remaster_ros.compensation.file import written
+from remaster_ros.compensation.of_result import Described
+from remaster_ros.kinematics.serial_chain import SerialChain
+from remaster_ros.types import Controller
+
+
+def arm(urdf: str, base: str = 'base_link', tip: str = 'tool', **more: object) -> ArmModel:
+    """Return an arm as drawn, but for what is given, before one sensor with one marker."""
+    plain = ArmModel.nominal(SerialChain.from_urdf(urdf, base, tip))
+    seen = {'T_R_N': {'mocap': np.eye(4)}, 'markers': {'sir': np.array([0.1, 0.0, 0.02])}}
+    return replace(plain, **{**seen, **more})  # type: ignore[arg-type]
+
+
+def save(
+    folder: Path,
+    model: ArmModel,
+    urdf: str,
+    offset_std: float = 1e-5,
+    known: Sequence[bool] = (),
+    controller: Controller | None = None,
+) -> Path:
+    """Write the compensation of an arm measured from -2 to 2 rad; return the file."""
+    k = model.joints
+    root = np.zeros((k, len(model.parameter_names)))
+    root[:, :k] = offset_std * np.eye(k)
+    identifiable = tuple(known) or (True,) * k
+    why = tuple('' if one else 'not told' for one in identifiable)
+    described = Described(
+        replace(model, root=root), identifiable, why, np.tile([-2.0, 2.0], (k, 1))
+    )
+    path = folder / 'compensation.json'
+    path.write_text(written(described, urdf, 'fit', ('', ''), {}, controller), encoding='utf-8')
+    return path
