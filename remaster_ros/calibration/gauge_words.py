@@ -49,7 +49,7 @@ def in_words(model: Model, direction: FloatArray) -> str:
         if joints[0] == model.joints - 1 and not sensors:
             per_degree = 1e3 * np.radians(1.0) / abs(amount)
             moved = [
-                f'marker {model.marker_names[m]} moved tangentially, '
+                f'{the("marker", model.marker_names[m])} moved tangentially, '
                 f'{per_degree * np.linalg.norm(direction[model.marker(m)]):.3f} mm per degree'
                 for m in markers
             ]

@@ -105,9 +105,9 @@ class StructureTest:
             'position': 'follows the position in front of the sensor',
             'time': 'follows time',
             'joint_angle': "follows the joints' angles",
-            'joint_time': 'is that of zero-offsets that change with time',
-            'link': 'is that of links of other lengths',
-            'axis': 'is that of tilted axes',
+            'joint_time': 'looks like that of zero-offsets that change with time',
+            'link': 'looks like that of links of other lengths',
+            'axis': 'looks like that of tilted axes',
             'reading_before': 'resembles that of the reading before',
         }[self.driver]
         return f'the error{whose} {what} {where}'

@@ -136,7 +136,7 @@ def summary(
             if effect.share is None
             else f', without it {percent(effect.share)} of the gain is lost'
         )
-        lines.append(f'{effect.title}: {1e3 * effect.size_m:.3f} mm{share}; {effect.cause}')
+        lines.append(f'{effect.title}: {1e3 * effect.size_m:.3f} mm{share}. {effect.cause}')
         if effect.remedy:
             lines.append(f'    to do: {effect.remedy}')
         for alike in effect.confusable_with:

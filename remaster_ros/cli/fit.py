@@ -131,13 +131,14 @@ def summary(result: FitResult) -> str:
     from remaster_ros.reports.judgement import verdict
 
     lines = []
-    for joint, mean, std, seen in zip(
+    for joint, mean, std, seen, why in zip(
         result.joint_names,
         np.rad2deg(result.joint_offsets),
         np.rad2deg(result.joint_offsets_std),
         result.identifiable,
+        result.why,
     ):
-        value = f'{mean:+9.4f} ± {std:.4f} deg' if seen else '   not identifiable'
+        value = f'{mean:+9.4f} ± {std:.4f} deg' if seen else f'   not identifiable: {why}'
         lines.append(f'{joint:12s} {value}')
     for split, metrics in result.accuracy.items():
         if metrics is None:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
+from remaster_ros.calibration.gauge_words import listed
 from remaster_ros.calibration.measured_again import MeasuredAgain
 from remaster_ros.calibration.noise_check import NoiseCheck
 from remaster_ros.calibration.residual_structure import FEWEST_POSES
@@ -120,8 +121,8 @@ def verdict(result: FitResult) -> Judgement:
     count = len(result.joint_names)
     if unknown:
         points.append(
-            f'{count - len(unknown)} of {count} zero-offsets are measured. The data do not '
-            f'distinguish {" and ".join(unknown)} from something else; the table names it.'
+            f'{count - len(unknown)} of {count} zero-offsets are measured; the data do not '
+            f'distinguish {listed(unknown)} from what the table names.'
         )
     else:
         points.append(f'All {count} zero-offsets are measured.')

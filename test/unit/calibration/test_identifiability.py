@@ -30,7 +30,7 @@ def test_one_sensor_leaves_the_first_and_the_last_joint() -> None:
     assert tool.combination['joint_7'] == 1.0
     # The marker 100 mm from the axis moves against the turn: 1.745 mm per degree.
     assert tool.combination['marker.sir.y'] == pytest.approx(-0.1, abs=2e-3)
-    assert 'joint_7 offset = marker sir moved tangentially, 1.7' in tool.why
+    assert 'joint_7 offset = the marker sir moved tangentially, 1.7' in tool.why
     assert 'mm per degree' in tool.why
     assert tool.fixed_by == 'the prior on marker sir, 0.5 mm per axis'
     assert gauge.held.tolist() == [0]

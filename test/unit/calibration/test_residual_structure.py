@@ -110,7 +110,7 @@ def test_a_slip_of_a_joint_is_found_before_it_passes_for_an_offset() -> None:
     found = structure_of(session_with(87, slipped, poses=20, validation=0)).found
     assert [test.driver for test in found] == ['joint_time']
     assert found[0].words == (
-        'the error is that of zero-offsets that change with time within the poses'
+        'the error looks like that of zero-offsets that change with time within the poses'
     )
 
 
