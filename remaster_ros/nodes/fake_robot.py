@@ -24,7 +24,7 @@ from remaster_ros.collection.message_fields import seconds
 from remaster_ros.nodes.messages import stamp_of
 from remaster_ros.nodes.parameters import declare, parameter
 from remaster_ros.nodes.running import RemasterNode, run
-from remaster_ros.nodes.simulated_clock import TAKEN
+from remaster_ros.nodes.simulated_clock import TAKEN, TAKEN_EVERY_S
 from remaster_ros.session.workcell import read_cell
 from remaster_ros.simulation.arm_motion import ServoPoint
 from remaster_ros.simulation.robot import FakeArm
@@ -92,7 +92,7 @@ class FakeRobotNode(RemasterNode):
             self._on_trajectory,
             reliable,
         )
-        self._pace = Pace(self.world.clock)
+        self._pace = Pace(self.world.clock, TAKEN_EVERY_S)
         self.create_subscription(Header, TAKEN, self._on_taken, reliable)
         # A thread of its own: a timer of rclpy costs several times what the message does.
         self._ending = threading.Event()

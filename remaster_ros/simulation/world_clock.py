@@ -58,10 +58,13 @@ class Pace:
     ----------
     clock
         Of the World; its owner is whoever has this.
+    confirmed_every_s
+        What was taken is confirmed no more often, s: the last reports before a silence may never
+        be confirmed, and count as taken.
     """
 
-    def __init__(self, clock: WorldClock) -> None:
-        self._clock = clock
+    def __init__(self, clock: WorldClock, confirmed_every_s: float = 0.0) -> None:
+        self._clock, self._confirmed_every_s = clock, confirmed_every_s
         self._ahead_s = AHEAD_S + AHEAD_WALL_S * clock.rate
         # Reports arrive and are taken in different threads.
         self._lock = threading.Lock()
@@ -98,6 +101,7 @@ class Pace:
                 self._fakes[pid] = _Participant(done_s, wall)
         with self._lock:
             taken_s = min(_waited_for(self._took, wall), default=math.inf)
+            taken_s += self._confirmed_every_s
             while self._reports and self._reports[0][1] <= taken_s:
                 self._reports.popleft()
             since = [published_s for _, published_s in list(self._reports)[:1]]

@@ -132,6 +132,18 @@ def test_it_waits_for_a_node_that_takes_no_reports(scene):
     assert scene.clock.now() - before <= AHEAD + RATE * TICK_WALL_S
 
 
+def test_a_robot_that_falls_silent_holds_nobody_up(scene):
+    """The last reports are never confirmed: what was taken is said ten times a second at most."""
+    scene.pace = Pace(scene.clock, 0.1)
+    scene.run(0.1, taken=True)
+    scene.pace.published(scene.clock.now())
+    before = scene.clock.now()
+    for _ in range(500):
+        scene.wall += TICK_WALL_S
+        scene.pace.go_on()
+    assert scene.clock.now() - before > 0.9 * RATE
+
+
 def test_a_process_that_does_nothing_for_long_is_not_waited_for(scene):
     scene.run(0.1, taken=True)
     scene.run(PATIENCE_WALL_S + 5.0)
