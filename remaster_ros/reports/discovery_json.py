@@ -107,16 +107,19 @@ def discovery_content(
 
 
 def _covariance(discovery: Discovery) -> dict[str, Any]:
-    fit, solution = discovery.fit, discovery.solution
-    units = {name: cell.unit for cell in solution.cells for name in cell.parameters}
+    """Return that of the offsets and the causes; of all kinds it stands in compensation.json."""
+    fit = discovery.fit
+    units = {n: c.unit for group in discovery.groups for c in group for n in c.parameters}
     known = np.flatnonzero(fit.identifiable)
-    draws = np.concatenate((fit.joint_offset_draws[..., known], fit.theta_draws), axis=-1)
+    causes = [i for i, name in enumerate(fit.theta_names) if name in units]
+    draws = np.concatenate((fit.joint_offset_draws[..., known], fit.theta_draws[..., causes]), -1)
     size = draws.shape[-1]
     # A few poses may determine no joint, and show no cause.
     matrix = np.atleast_2d(np.cov(draws.reshape(-1, size), rowvar=False)) if size else ()
+    names = [fit.theta_names[i] for i in causes]
     return {
-        'names': [*(fit.joint_names[i] for i in known), *fit.theta_names],
-        'units': [*('rad' for _ in known), *(units[name] for name in fit.theta_names)],
+        'names': [*(fit.joint_names[i] for i in known), *names],
+        'units': [*('rad' for _ in known), *(units[name] for name in names)],
         'matrix': [[float(f'{value:.5e}') for value in row] for row in matrix],
     }
 
