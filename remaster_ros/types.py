@@ -168,6 +168,12 @@ class Measurements:
     orientation
         Of the measured body in N, unit quaternions x, y, z, w, (n, 4); NaN where it was not
         measured. None where the file has no such columns.
+    wanted
+        Joint positions that were wanted before any correction, those at which the nominal robot
+        has the pose, rad, (n, k); NaN where unknown. None where the file has no such columns.
+    correction
+        1 where a correction was on, 0 where it was off, (n,); -1 where unknown. None where the
+        file has no such column.
     """
 
     observation: IntArray
@@ -187,6 +193,8 @@ class Measurements:
     is_reference: BoolArray | None = None
     frame: IntArray | None = None
     orientation: FloatArray | None = None
+    wanted: FloatArray | None = None
+    correction: IntArray | None = None
 
     def __len__(self) -> int:
         """Return the number of observations."""
@@ -264,6 +272,22 @@ class Controller:
 
 
 @dataclass(frozen=True)
+class Correction:
+    """The correction that was on while a session was measured.
+
+    Attributes
+    ----------
+    form
+        In which it was loaded, such as ``pad`` or ``urdf``.
+    sha256
+        Of its compensation.json; '' where unknown.
+    """
+
+    form: str
+    sha256: str = ''
+
+
+@dataclass(frozen=True)
 class Session:
     """A session: the robot, the markers and sensors, and what was measured.
 
@@ -299,6 +323,8 @@ class Session:
     controller
         How the robot's own pad writes the joints; None where it writes them as the URDF, in
         degrees, or nothing is known.
+    correction
+        That was on while it was measured; None where none is stated.
     extra
         Keys of session.yaml this version does not know, kept as they are.
     observations_sha256
@@ -326,6 +352,7 @@ class Session:
     oriented: frozenset[str] = frozenset()
     observations_sha256: str = ''
     controller: Controller | None = None
+    correction: Correction | None = None
 
     @property
     def urdf_sha256(self) -> str:

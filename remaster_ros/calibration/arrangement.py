@@ -61,7 +61,7 @@ _QUARTER = np.pi / 2.0
 # What belongs to the joints of a row and not to its point.
 _OF_JOINTS = (
     *('pose', 'configuration', 'is_validation', 'is_reference'),
-    *('q', 'from_q', 'effort'),
+    *('q', 'from_q', 'effort', 'wanted', 'correction'),
 )
 # Of angles that are degrees taken for radians, and the other way round.
 _SCALES = (1.0, np.pi / 180.0, 180.0 / np.pi)
@@ -203,6 +203,7 @@ def arranged(session: Session, arrangement: Arrangement) -> Session:
         effort=None
         if m.effort is None
         else m.effort[:, list(arrangement.order)] * np.array(arrangement.signs),
+        wanted=None if m.wanted is None else arrangement.joints(m.wanted),
         position=arrangement.points(m.position),
     )
     concerned = between(m, arrangement.since, arrangement.until)

@@ -198,8 +198,8 @@ def remaster_text(
                'description.')
               if words else ()),
             '',
-            'Afterwards measure a few poses again and run "remaster accuracy": it shows whether',
-            'the offsets are in use.',
+            'Afterwards measure ten new poses and run "remaster verify": it shows whether the',
+            'offsets are in use, once.',
             '',
         ]
     )  # fmt: skip

@@ -269,6 +269,9 @@ FRAME = 'frame'
 """The column that names the rows of one sensor which come from one frame."""
 ORIENTATION = ('orientation_x', 'orientation_y', 'orientation_z', 'orientation_w')
 """Columns of the orientation of the measured body, a unit quaternion."""
+CORRECTION = 'correction'
+"""The column that has whether a correction was on."""
+STATES = ('off', 'on')
 LENGTH_TOLERANCE = 1e-3
 """By so much the length of a quaternion may differ from 1."""
 
@@ -282,6 +285,8 @@ class ColumnNames:
         Reported joint positions, and those that the arm came from.
     effort
         Measured joint torques; these columns are optional, and so are `FRAME` and `ORIENTATION`.
+    wanted
+        Joint positions wanted before any correction; optional, and so is `CORRECTION`.
     """
 
     position = ('x_m', 'y_m', 'z_m')
@@ -289,9 +294,11 @@ class ColumnNames:
 
     def __init__(self, joints: int) -> None:
         self.joints = joints
-        self.q, self.from_q, self.effort = (
+        self.q, self.from_q, self.effort, self.wanted = (
             [f'{prefix}{i}_{unit}' for i in range(1, joints + 1)]
-            for prefix, unit in (('q', 'rad'), ('from_q', 'rad'), ('effort', 'nm'))
+            for prefix, unit in (
+                *(('q', 'rad'), ('from_q', 'rad'), ('effort', 'nm'), ('wanted', 'rad')),
+            )
         )
 
     @property
@@ -300,7 +307,12 @@ class ColumnNames:
         return (*self.from_q, *self.std, 'samples', 'temperature_c')
 
     def names(
-        self, with_effort: bool = False, with_frame: bool = False, with_orientation: bool = False
+        self,
+        with_effort: bool = False,
+        with_frame: bool = False,
+        with_orientation: bool = False,
+        with_wanted: bool = False,
+        with_correction: bool = False,
     ) -> list[str]:
         """Return every column's name."""
         return [
@@ -309,6 +321,8 @@ class ColumnNames:
             *([FRAME] if with_frame else ()),
             *(ORIENTATION if with_orientation else ()),
             *(self.effort if with_effort else ()),
+            *(self.wanted if with_wanted else ()),
+            *([CORRECTION] if with_correction else ()),
         ]
 
 
@@ -437,6 +451,15 @@ class RowFormat:
             orientation=table.whole_or_empty(ORIENTATION)
             if ORIENTATION[0] in table.cells
             else None,
+            wanted=table.whole_or_empty(columns.wanted)
+            if columns.wanted[0] in table.cells
+            else None,
+            correction=table.choices(
+                CORRECTION, ('', *STATES), 'is neither on nor off; leave it empty where unknown'
+            )
+            - 1
+            if CORRECTION in table.cells
+            else None,
         )
         if measurements.orientation is not None:
             length = np.linalg.norm(measurements.orientation, axis=1, keepdims=True)
@@ -455,7 +478,10 @@ class RowFormat:
             'right?'
             for joint, lower, upper in zip(chain.joint_names, chain.lower, chain.upper)
         ]
-        for names, q in ((columns.q, measurements.q), (columns.from_q, measurements.from_q)):
+        given = [(columns.q, measurements.q), (columns.from_q, measurements.from_q)]
+        if measurements.wanted is not None:
+            given.append((columns.wanted, measurements.wanted))
+        for names, q in given:
             below = q < chain.lower - LIMIT_TOLERANCE_RAD
             above = q > chain.upper + LIMIT_TOLERANCE_RAD
             if self._within_limits:
@@ -494,9 +520,13 @@ def format_header(
     with_effort: bool = False,
     with_frame: bool = False,
     with_orientation: bool = False,
+    with_wanted: bool = False,
+    with_correction: bool = False,
 ) -> str:
     """Return the header line of observations.csv."""
-    names = ColumnNames(joints).names(with_effort, with_frame, with_orientation)
+    names = ColumnNames(joints).names(
+        with_effort, with_frame, with_orientation, with_wanted, with_correction
+    )
     return ','.join(names) + '\n'
 
 
@@ -547,10 +577,21 @@ def format_measurements(m: Measurements, sensors: Sequence[str], markers: Sequen
         ),
         *(numbers(m.orientation) if m.orientation is not None else ()),
         *(numbers(m.effort) if m.effort is not None else ()),
+        *(numbers(m.wanted) if m.wanted is not None else ()),
+        *(
+            [['' if state < 0 else STATES[state] for state in m.correction.tolist()]]
+            if m.correction is not None
+            else ()
+        ),
     ]
     lines = map(','.join, zip(*cells, strict=True))
     header = format_header(
-        m.q.shape[1], m.effort is not None, m.frame is not None, m.orientation is not None
+        m.q.shape[1],
+        m.effort is not None,
+        m.frame is not None,
+        m.orientation is not None,
+        m.wanted is not None,
+        m.correction is not None,
     )
     return header + ''.join(f'{row}\n' for row in lines)
 
@@ -567,7 +608,7 @@ def _check_names(names: list[str], columns: ColumnNames, path: Path) -> None:
             f'{where}: of the columns {", ".join(ORIENTATION)} only {", ".join(turned)} are '
             'there; give all or none'
         )
-    for wanted in (columns.q, columns.from_q, columns.effort):
+    for wanted in (columns.q, columns.from_q, columns.effort, columns.wanted):
         prefix, suffix = wanted[0].split('1')
         pattern = re.compile(f'{prefix}[0-9]+{suffix}')
         found = [name for name in names if pattern.fullmatch(name)]
@@ -583,7 +624,7 @@ def _check_names(names: list[str], columns: ColumnNames, path: Path) -> None:
             f'{where}: column {", ".join(missing)} is missing; add it (docs/session-format.md), '
             'or let "remaster import" make a session of this table'
         )
-    unknown = [name for name in names if name not in columns.names(True, True, True)]
+    unknown = [name for name in names if name not in columns.names(*[True] * 5)]
     if unknown:
         log.warning('%s: unknown columns are not used: %s', where, ', '.join(map(repr, unknown)))
 

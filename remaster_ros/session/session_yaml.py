@@ -24,7 +24,7 @@ from remaster_ros.session.yaml_records import (
     out_of_bounds,
     to_plain,
 )
-from remaster_ros.types import AngleUnit, Controller, Measurements, PadJoint, Session
+from remaster_ros.types import AngleUnit, Controller, Correction, Measurements, PadJoint, Session
 
 FORMAT = 'remaster-session/1'
 ExitStatus = Literal['complete', 'stopped', 'aborted']
@@ -86,6 +86,7 @@ class SessionHeader(msgspec.Struct):
     serial_number: str = ''
     notes: str = ''
     controller: _Controller | None = None
+    correction: Correction | None = None
     extra: dict[str, Any] = {}
 
     def session(
@@ -118,6 +119,7 @@ class SessionHeader(msgspec.Struct):
             serial_number=self.serial_number,
             extra=self.extra,
             controller=None if self.controller is None else self.controller.record(),
+            correction=self.correction,
             references=references,
         )
 
@@ -182,6 +184,7 @@ def write_header(session: Session, urdf_name: str, exit_status: str) -> str:
         'serial_number': session.serial_number,
         'notes': session.notes,
         'controller': session.controller,
+        'correction': session.correction,
     }
     header = _checked(to_plain(content), 'session to be written: ')
     given = {key: value for key, value in to_plain(header).items() if value not in ('', {}, None)}

@@ -20,6 +20,7 @@ from remaster_ros.errors import InputError
 from remaster_ros.reports.discovery_apply import compensation_of, holds_everything
 from remaster_ros.reports.discovery_json import predictions_of, save_discovery
 from remaster_ros.reports.fit_json import save_fit
+from remaster_ros.types import Correction
 
 # Few poses: one search of some seconds.
 RECIPE = Recipe(
@@ -82,14 +83,14 @@ def test_file_and_memory_are_one(found):
 
 
 def test_of_a_fit_the_file_has_its_offsets_and_nothing_else(hidden, tmp_path):
-    fit = remaster_ros.fit(replace(hidden.session, extra={'correction': {'form': 'urdf'}}))
+    fit = remaster_ros.fit(replace(hidden.session, correction=Correction('urdf')))
     save_fit(fit, tmp_path, figures=False)
     file = remaster_ros.read_compensation(tmp_path / 'apply' / 'compensation.json')
     known = fit.identifiable
     if not file.model.geometry.is_any:
         np.testing.assert_allclose(file.model.joint_offsets[known], fit.joint_offsets[known])
     assert not any(joint.terms for joint in file.content.joints)
-    assert file.content.state == {'correction': {'form': 'urdf'}}
+    assert file.content.state == {'correction': {'form': 'urdf', 'sha256': ''}}
     assert [joint.identifiable for joint in file.content.joints] == known.tolist()
     assert all(joint.why for joint in file.content.joints if not joint.identifiable)
     q = fit.session.measurements.q[:20]

@@ -1,0 +1,206 @@
+"""Is a correction in use, once, and what remains?"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import logging
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from remaster_ros.cli.console import show
+from remaster_ros.compensation.file import Compensation, read_compensation
+from remaster_ros.compensation.verification import Estimate, Verdict, Verified, Visits, verify
+from remaster_ros.errors import InputError
+from remaster_ros.kinematics.serial_chain import SerialChain
+from remaster_ros.session.reader import HEADER, ROWS, read_session
+from remaster_ros.types import BoolArray, FloatArray, Session
+
+FORMAT = 'remaster-verify/1'
+# Loaded there, the reported angles are the true ones: what was wanted is what is reported.
+INSIDE = ('pad', 'rising', 'ros2_control')
+WORDS: dict[Verdict, str] = {
+    'in_use': 'The correction is in use, once.',
+    'not_in_use': 'The correction does not act: load it, or see why it is not taken.',
+    'twice': 'The correction acts twice: take it out of one of the two places (the zeros on the '
+    'pad and a layer or model, say).',
+    'wrong_sign': 'The correction acts with the wrong sign: turn the sign of what you entered.',
+    'other': 'Something acts that is not this correction as a whole: see the joints.',
+    'unclear': 'These rows do not tell.',
+}
+
+log = logging.getLogger('remaster_ros')
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of ``remaster verify``."""
+    parser.add_argument(
+        'session',
+        metavar='SESSION',
+        type=Path,
+        help='session folder: some ten poses that no fit has used, each with the correction on, '
+        'or off and on; columns wanted1_rad … and correction',
+    )
+    parser.add_argument(
+        '--compensation',
+        metavar='FILE',
+        type=Path,
+        required=True,
+        help='apply/compensation.json of the correction',
+    )
+    parser.add_argument('--json', action='store_true', help='print what was found as JSON')
+
+
+def run(args: argparse.Namespace) -> int:
+    """Read, judge, print."""
+    session, compensation = read_session(args.session), read_compensation(args.compensation)
+    _require_same_arm(session, compensation, args.session)
+    found = verify(compensation.compensator, visits(session, args.session))
+    warnings = _warnings(session, compensation)
+    for warning in warnings:
+        log.warning('%s: %s', args.session, warning)
+    if args.json:
+        print(json.dumps(_content(found, warnings)))
+    else:
+        show(args.quiet, _text(found))
+    return 0
+
+
+def visits(session: Session, folder: Path) -> Visits:
+    """Return the rows with what was wanted there; `folder` is for messages."""
+    m = session.measurements
+    on = _on(session, folder)
+    return Visits(
+        _wanted(session, folder, on),
+        on,
+        m.configuration,
+        tuple(session.sensor_names[i] for i in m.sensor.tolist()),
+        tuple(session.marker_names[i] for i in m.marker.tolist()),
+        m.position,
+    )
+
+
+def _on(session: Session, folder: Path) -> BoolArray:
+    m = session.measurements
+    state = np.full(len(m), -1) if m.correction is None else m.correction
+    if session.correction is not None:
+        state = np.where(state < 0, 1, state)
+    for row in np.flatnonzero(state < 0)[:1]:
+        raise InputError(
+            f'{folder / ROWS}: observation {m.observation[row]} does not tell whether the '
+            f'correction was on; fill the column correction with on or off, or give {HEADER} the '
+            'key correction: {form: pad}'
+        )
+    return state == 1
+
+
+def _wanted(session: Session, folder: Path, on: BoolArray) -> FloatArray:
+    m = session.measurements
+    wanted = np.full_like(m.q, np.nan) if m.wanted is None else m.wanted.copy()
+    missing = np.isnan(wanted[:, 0])
+    if session.correction is not None and session.correction.form in INSIDE:
+        missing_on = missing & on
+        wanted[missing_on] = m.q[missing_on]
+        missing &= ~on
+    for row in np.flatnonzero(missing)[:1]:
+        raise InputError(
+            f'{folder / ROWS}: observation {m.observation[row]} does not tell what was wanted; '
+            'fill the columns wanted1_rad … with the joints at which the nominal robot has the '
+            'pose, before any correction: what is reported tells nothing where the correction is '
+            'made outside of the controller'
+        )
+    return wanted
+
+
+def _require_same_arm(session: Session, compensation: Compensation, folder: Path) -> None:
+    chain = SerialChain.from_urdf(session.urdf, session.base_link, session.tip_link)
+    robot = compensation.content.robot
+    for what, own, other in (
+        ('joints', list(chain.joint_names), robot.joint_names),
+        ('base link', session.base_link, robot.base_link),
+        ('tip link', session.tip_link, robot.tip_link),
+    ):
+        if own != other:
+            raise InputError(
+                f'{folder}: its {what} {_named(own)} are not those of {compensation.path} '
+                f'({_named(other)}); give the correction of this arm'
+            )
+    for marker in {session.marker_names[i] for i in session.measurements.marker.tolist()}:
+        if marker not in compensation.model.markers:
+            raise InputError(
+                f'{folder}: marker {marker!r} is none of {compensation.path} '
+                f'({_named(list(compensation.model.markers))}); rename it, or measure one of these'
+            )
+    if session.observations_sha256 == compensation.content.source.observations_sha256:
+        raise InputError(
+            f'{folder}: is the session that the correction was made of; measure ten poses that '
+            'were never used'
+        )
+
+
+def _named(names: Any) -> str:
+    return names if isinstance(names, str) else ', '.join(names)
+
+
+def _warnings(session: Session, compensation: Compensation) -> list[str]:
+    stated, before = session.correction, compensation.content.state.get('correction')
+    found = []
+    if stated is not None and stated.sha256 not in ('', compensation.sha256):
+        found.append('the correction that was on is another file than the one given')
+    if session.measurements.wanted is None:
+        found.append(
+            'what was wanted is not recorded, so that a layer or model beside the controller is '
+            'not seen'
+        )
+    if before:
+        found.append(
+            f'the correction was measured on top of another one ({before.get("form", "?")}), '
+            'which must still be on'
+        )
+    return found
+
+
+def _content(found: Verified, warnings: list[str]) -> dict[str, Any]:
+    return {
+        'format': FORMAT,
+        'verdict': found.verdict,
+        'toggle': found.toggle and asdict(found.toggle),
+        'absolute': asdict(found.absolute),
+        'joints': [{'joint': name, **asdict(one)} for name, one in found.joints.items()],
+        'error_mm': {
+            'off': found.error_off and asdict(found.error_off),
+            'on': asdict(found.error_on),
+        },
+        'remains_mm': found.remains_mm,
+        'noise_mm': found.noise_mm,
+        'poses': found.poses,
+        'warnings': warnings,
+    }
+
+
+def _text(found: Verified) -> str:
+    lines = [f'{found.verdict}: {WORDS[found.verdict]}']
+    if found.verdict == 'unclear':
+        lines.append(
+            f'Some {found.poses} poses would do.'
+            if found.poses
+            else 'No number of poses would do: the correction is about as small as what is not '
+            'known of it.'
+        )
+    lines.append(f'share that acts, of the rows with it on: {_share(found.absolute)}')
+    if found.toggle is not None:
+        lines.append(f'share that is switched, of on - off: {_share(found.toggle)}')
+    lines += [f'  {name}: {_share(one)}' for name, one in found.joints.items()]
+    for side, error in (('off', found.error_off), ('on', found.error_on)):
+        if error is not None:
+            low, high = error.interval95_mm
+            lines.append(f'mean error {side}: {error.mean_mm:.3f} mm [{low:.3f}, {high:.3f}]')
+    noise = '' if found.noise_mm is None else f'; noise of a row {found.noise_mm:.3f} mm'
+    return '\n'.join([*lines, f'remains: {found.remains_mm:.3f} mm RMS{noise}'])
+
+
+def _share(one: Estimate) -> str:
+    return f'{one.share:+.3f} ± {one.std:.3f} ({one.verdict})'

@@ -1,0 +1,394 @@
+"""Is a correction in use, once, and what remains? From poses with what was wanted there.
+
+A marker is measured where the arm went for wanted joint angles w, those of the nominal robot.
+Four states predict where that is, exactly: the correction acts (its command of w), does not (w),
+acts twice, or with the wrong sign. Beside them, ``other``: each joint has a share of its own.
+
+*Absolute*: of the rows with the correction on, base and marker fitted again. *Toggle*: of the
+differences on - off of one configuration; it sees only what is switched, not what the controller
+has besides. A state is called where its odds against each of the others are `ODDS`, and ``other``
+is less likely than it; ``other``, where its odds are `ODDS`. The noise is not known: likelihoods
+are integrated over its logarithm.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from remaster_ros.calibration.registration import register_points
+from remaster_ros.compensation.compensator import Compensator
+from remaster_ros.errors import InsufficientDataError
+from remaster_ros.kinematics.transforms import apply
+from remaster_ros.types import BoolArray, FloatArray, IntArray
+
+Verdict = Literal['in_use', 'not_in_use', 'twice', 'wrong_sign', 'other', 'unclear']
+STATES: Mapping[Verdict, float] = {
+    'in_use': 1.0,
+    'not_in_use': 0.0,
+    'twice': 2.0,
+    'wrong_sign': -1.0,
+}
+ODDS = 1000.0
+# Prior std of a joint's share under `other`: between the states there are 1 to 3.
+SHARE_STD = 2.0
+# From a tenth of the best tracker's noise to ten times a poor camera's, m, in steps of a tenth.
+SIGMAS = np.geomspace(1e-6, 1e-2, 98)
+# The odds of 1000 are exceeded in 97.5 % where their expected logarithm is this: it has the
+# variance of twice its mean, m - 2 sqrt(2 m) = log 1000.
+ENOUGH = float((np.sqrt(2.0) + np.sqrt(2.0 + np.log(ODDS))) ** 2)
+MOST_POSES = 1000
+# Steps of Gauss and Newton for the shares: moves are linear in them to some per cent.
+STEPS = 3
+# Two-sided, of odds of 1000.
+BEYOND_STD = 3.3
+
+
+@dataclass(frozen=True, eq=False)
+class Visits:
+    """Rows that were measured for wanted joint angles; n rows of k joints.
+
+    Attributes
+    ----------
+    wanted
+        Of the nominal robot, rad, (n, k).
+    on
+        Whether the correction was on, (n,).
+    configuration
+        Rows of one belong together, on and off, (n,).
+    sensor, marker
+        Names of them, (n,).
+    position
+        In the sensor's frame, m, (n, 3).
+    """
+
+    wanted: FloatArray
+    on: BoolArray
+    configuration: IntArray
+    sensor: tuple[str, ...]
+    marker: tuple[str, ...]
+    position: FloatArray
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A share of the correction that acts, with the std of its posterior, and what it is."""
+
+    share: float
+    std: float
+    verdict: Verdict
+
+
+@dataclass(frozen=True)
+class Mean:
+    """Mean error of the marker and its 95 % interval, mm."""
+
+    mean_mm: float
+    interval95_mm: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Verified:
+    """What the rows say.
+
+    Attributes
+    ----------
+    verdict
+        Of the absolute estimate.
+    toggle
+        None without configurations that were visited on and off.
+    absolute, joints
+        Of the rows with the correction on; of each joint, by name.
+    error_on, error_off
+        Against what was wanted, base and marker fitted to each; None where there are too few.
+    remains_mm
+        RMS of what the rows with the correction on leave, less what base and marker take up.
+    noise_mm
+        RMS of the differences on - off less the best share of the predicted move, of one row;
+        None without toggles.
+    poses
+        How many would do, where it is unclear; None where none would, or where it is clear.
+    """
+
+    verdict: Verdict
+    toggle: Estimate | None
+    absolute: Estimate
+    joints: Mapping[str, Estimate]
+    error_on: Mean
+    error_off: Mean | None
+    remains_mm: float
+    noise_mm: float | None
+    poses: int | None
+
+
+def verify(compensator: Compensator, visits: Visits) -> Verified:
+    """Judge whether a correction is in use.
+
+    Raises
+    ------
+    InsufficientDataError
+        Too few rows with the correction on to fit base and marker again.
+    """
+    on = _Side(compensator, visits, np.flatnonzero(visits.on))
+    off_rows = np.flatnonzero(~visits.on)
+    spread = 3 * len(visits.on[visits.on]) - on.base_columns
+    if spread <= 3:
+        raise InsufficientDataError(
+            f'{int(visits.on.sum())} rows with the correction on do not tell base, marker and '
+            'what acts of the correction; measure ten poses'
+        )
+    absolute, joints = _absolute(on)
+    toggle, noise = _toggle(compensator, visits)
+    off = None
+    if len(off_rows) and 3 * len(off_rows) > on.base_columns + 3:
+        off = _Side(compensator, visits, off_rows).error()
+    left = on.projected(on.measured - on.at['in_use'])
+    poses = _poses(on) if absolute.verdict == 'unclear' else None
+    return Verified(
+        absolute.verdict,
+        toggle,
+        absolute,
+        dict(zip(compensator.joint_names, joints, strict=True)),
+        on.error(),
+        off,
+        1e3 * float(np.sqrt(3.0 * left @ left / len(left))),
+        noise,
+        poses,
+    )
+
+
+class _Side:
+    """Rows with the correction on, or off: what is measured and what each state predicts, in R."""
+
+    def __init__(self, compensator: Compensator, visits: Visits, rows: IntArray) -> None:
+        self.compensator, self.model = compensator, compensator.model
+        self.wanted = visits.wanted[rows]
+        self.markers = [visits.marker[row] for row in rows]
+        sensors = [visits.sensor[row] for row in rows]
+        self.places = np.array([self.model.markers[name] for name in self.markers])
+        self.command = compensator.command(self.wanted)
+        self.commands = commands(compensator, self.wanted)
+        self.at = {state: self.seen(q).ravel() for state, q in self.commands.items()}
+        nominal = apply(self.model.chain.forward(self.wanted), self.places)
+        measured = np.empty((len(rows), 3))
+        tool = self.model.chain.forward(self.wanted)[:, :3, :3]
+        columns = []
+        for sensor in dict.fromkeys(sensors):
+            mine = np.array([one == sensor for one in sensors])
+            T, _ = register_points(nominal[mine], visits.position[rows][mine])
+            measured[mine] = apply(T, visits.position[rows][mine])
+            frame = np.zeros((len(rows), 3, 6))
+            frame[mine, :, :3] = np.eye(3)
+            frame[mine, :, 3:] = np.cross(np.eye(3), nominal[mine][:, None, :]).swapaxes(1, 2)
+            columns.append(frame)
+        for marker in dict.fromkeys(self.markers):
+            mine = np.array([one == marker for one in self.markers])
+            columns.append(tool * mine[:, None, None])
+        self.nominal, self.measured = nominal, measured.ravel()
+        free = np.concatenate(columns, axis=2).reshape(3 * len(rows), -1)
+        left, sizes, _ = np.linalg.svd(free)
+        self.base_columns = int(np.sum(sizes > 1e-9 * sizes[0]))
+        self._rest = left[:, self.base_columns :]
+
+    def seen(self, q: FloatArray) -> FloatArray:
+        """Return where the markers are at commanded angles, in R, (n, 3)."""
+        return apply(self.compensator.tool(q), self.places)
+
+    def projected(self, columns: FloatArray) -> FloatArray:
+        """Return what base and marker cannot take up, of rows of R."""
+        found: FloatArray = self._rest.T @ columns
+        return found
+
+    def moves(self, q: FloatArray) -> FloatArray:
+        """Return what a share of 1 of each joint's correction does, (3 n, k)."""
+        change = self.command - self.wanted
+        return (self._derivative(q)[:, :, : self.model.joints] * change[:, None, :]).reshape(
+            3 * len(q), -1
+        )
+
+    def unsure(self, q: FloatArray) -> FloatArray:
+        """Return what one standard deviation of each thing that is not known does, (3 n, r)."""
+        spread = self.model.widening * (self._derivative(q) @ self.model.root.T)
+        return spread.reshape(3 * len(q), -1)
+
+    def _derivative(self, q: FloatArray) -> FloatArray:
+        sensor, state = next(iter(self.model.T_R_N)), self.model.state(q)
+        found = np.zeros((len(q), 3, len(self.model.parameter_names)))
+        for marker in dict.fromkeys(self.markers):
+            mine = np.array([one == marker for one in self.markers])
+            found[mine] = self.model.derivative(state, sensor, marker)[mine]
+        return found
+
+    def error(self) -> Mean:
+        """Return the error against what was wanted, base and marker fitted again."""
+        left = self._rest @ self.projected(self.measured - self.nominal.ravel())
+        return _mean(np.linalg.norm(left.reshape(-1, 3), axis=1))
+
+
+def commands(compensator: Compensator, wanted: FloatArray) -> dict[Verdict, FloatArray]:
+    """Return what reaches the joints for wanted ones in each state, rad, (n, k)."""
+    once = compensator.command(wanted)
+    return {
+        'in_use': once,
+        'not_in_use': wanted,
+        'twice': compensator.command(once),
+        'wrong_sign': 2.0 * wanted - once,
+    }
+
+
+def _mean(errors: FloatArray) -> Mean:
+    mean = float(errors.mean())
+    half = 1.96 * float(errors.std(ddof=1)) / np.sqrt(len(errors)) if len(errors) > 1 else np.inf
+    return Mean(1e3 * mean, (1e3 * max(0.0, mean - half), 1e3 * (mean + half)))
+
+
+def _log_likelihood(residual: FloatArray, columns: FloatArray) -> FloatArray:
+    """Return the log density of a residual (d,) for each of `SIGMAS`.
+
+    Its covariance is σ² and that of standard normal coefficients of ``columns`` (d, m).
+    """
+    left, sizes, _ = np.linalg.svd(columns, full_matrices=False)
+    along = left.T @ residual
+    rest = max(0.0, float(residual @ residual - along @ along))
+    var = SIGMAS[:, None] ** 2
+    wide = var + sizes**2
+    d, m = len(residual), len(sizes)
+    found: FloatArray = -0.5 * (
+        np.sum(along**2 / wide + np.log(wide), axis=1)
+        + rest / SIGMAS**2
+        + 2.0 * (d - m) * np.log(SIGMAS)
+    )
+    return found
+
+
+def _integrated(values: FloatArray) -> float:
+    top = values.max()
+    return float(top + np.log(np.mean(np.exp(values - top))))
+
+
+def _absolute(side: _Side) -> tuple[Estimate, list[Estimate]]:
+    states, other = {}, {}
+    for state, q in side.commands.items():
+        residual = side.projected(side.measured - side.at[state])
+        unsure = side.projected(side.unsure(q))
+        moves = SHARE_STD * side.projected(side.moves(q))
+        states[state] = _integrated(_log_likelihood(residual, unsure))
+        other[state] = _log_likelihood(residual, np.hstack((unsure, moves)))
+    best = max(states, key=lambda state: states[state])
+    verdict = _called(states, _integrated(other[best]))
+    sigma = SIGMAS[np.argmax(other[best])]
+    share, std = _shares(side, best, sigma, whole=True)
+    every, stds = _shares(side, best, sigma, whole=False)
+    joints = [
+        Estimate(float(one), float(s), _nearest(float(one), float(s)))
+        for one, s in zip(every, stds, strict=True)
+    ]
+    return Estimate(float(share[0]), float(std[0]), verdict), joints
+
+
+def _called(states: Mapping[Verdict, float], other: float) -> Verdict:
+    """Return the state that the log evidence is for, if its odds are enough."""
+    first, second = sorted(states, key=lambda state: states[state], reverse=True)[:2]
+    if other - states[first] > np.log(ODDS):
+        return 'other'
+    if states[first] - states[second] > np.log(ODDS) and other < states[first]:
+        return first
+    return 'unclear'
+
+
+def _shares(
+    side: _Side, start: Verdict, sigma: float, whole: bool
+) -> tuple[FloatArray, FloatArray]:
+    """Return shares and their std: one of the whole correction, or one of each joint."""
+    begin = STATES[start]
+    change = side.command - side.wanted
+    k = change.shape[1]
+    shares = np.full(1 if whole else k, begin)
+    unsure = side.projected(side.unsure(side.commands[start]))
+    covariance = sigma**2 * np.eye(len(unsure)) + unsure @ unsure.T
+    inverse = np.linalg.inv(covariance)
+    prior = np.eye(len(shares)) / SHARE_STD**2
+    for _ in range(STEPS):
+        q = side.wanted + shares * change
+        moves = side.moves(q)
+        if whole:
+            moves = moves.sum(axis=1, keepdims=True)
+        moves = side.projected(moves)
+        residual = side.projected(side.measured - side.seen(q).ravel())
+        precision = moves.T @ inverse @ moves + prior
+        shares = shares + np.linalg.solve(
+            precision, moves.T @ inverse @ residual + prior @ (begin - shares)
+        )
+    return shares, np.sqrt(np.diag(np.linalg.inv(precision)))
+
+
+def _nearest(share: float, std: float) -> Verdict:
+    """Return the state that a share is, if its odds against the others are enough."""
+    off = {state: ((share - value) / std) ** 2 for state, value in STATES.items()}
+    first, second = sorted(off, key=lambda state: off[state])[:2]
+    if std >= 0.5 * SHARE_STD or 0.5 * (off[second] - off[first]) < np.log(ODDS):
+        return 'unclear'
+    return first if off[first] < BEYOND_STD**2 else 'other'
+
+
+def _toggle(compensator: Compensator, visits: Visits) -> tuple[Estimate | None, float | None]:
+    """Return the share that is switched, and the noise of a row in mm."""
+    pairs = []
+    for row in np.flatnonzero(visits.on):
+        same = [
+            int(other)
+            for other in np.flatnonzero(
+                ~visits.on & (visits.configuration == visits.configuration[row])
+            )
+            if (visits.sensor[other], visits.marker[other])
+            == (visits.sensor[row], visits.marker[row])
+        ]
+        pairs += [(int(row), other) for other in same[:1]]
+    if len(pairs) < 2:
+        return None, None
+    on, off = (np.array(rows) for rows in zip(*pairs, strict=True))
+    side = _Side(compensator, visits, on)
+    turned = np.empty((len(pairs), 3))
+    for sensor in dict.fromkeys(visits.sensor[row] for row in on):
+        mine = np.array([visits.sensor[row] == sensor for row in on])
+        T, _ = register_points(side.nominal[mine], visits.position[on][mine])
+        turned[mine] = (visits.position[on] - visits.position[off])[mine] @ T[:3, :3].T
+    difference, before = turned.ravel(), side.at['not_in_use']
+    unsure_off = side.unsure(side.commands['not_in_use'])
+    states = {}
+    for state, q in side.commands.items():
+        moved = side.at[state] - before
+        states[state] = _log_likelihood(difference - moved, side.unsure(q) - unsure_off)
+    best = max(states, key=lambda state: _integrated(states[state]))
+    move = side.at['in_use'] - before
+    unsure = side.unsure(side.command) - unsure_off
+    other = _log_likelihood(
+        difference - move, np.hstack((unsure, SHARE_STD * side.moves(side.command)))
+    )
+    sigma = SIGMAS[np.argmax(states[best])]
+    inverse = np.linalg.inv(sigma**2 * np.eye(len(move)) + unsure @ unsure.T)
+    precision = float(move @ inverse @ move)
+    share = float(move @ inverse @ difference) / precision
+    verdict = _called({s: _integrated(v) for s, v in states.items()}, _integrated(other))
+    left = difference - share * move
+    noise = 1e3 * float(np.sqrt(3.0 * left @ left / (len(left) - 1) / 2.0))
+    return Estimate(share, precision**-0.5, verdict), noise
+
+
+def _poses(side: _Side) -> int | None:
+    """Return how many poses would tell the states apart; None where so many would not."""
+    residual = side.projected(side.measured - side.at['in_use'])
+    values = _log_likelihood(residual, side.projected(side.unsure(side.command)))
+    sigma = SIGMAS[np.argmax(values)]
+    count = len(side.wanted)
+    step = side.projected(side.at['not_in_use'] - side.at['in_use'])
+    unsure = side.projected(side.unsure(side.command))
+    for poses in (count * factor for factor in np.geomspace(1.0, MOST_POSES / count, 60)):
+        noise = sigma * np.sqrt(count / poses)
+        covariance = noise**2 * np.eye(len(step)) + unsure @ unsure.T
+        if 0.5 * float(step @ np.linalg.solve(covariance, step)) > ENOUGH:
+            return int(np.ceil(poses))
+    return None

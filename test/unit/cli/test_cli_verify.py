@@ -1,0 +1,115 @@
+"""``remaster verify``: what a session must tell, and what is printed."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from compensation_files import save
+from hidden_tours import robot
+from verified_arms import Case, found_arm, measured
+
+from remaster_ros.cli.main import main
+from remaster_ros.compensation.file import read_compensation
+from remaster_ros.session.reader import write_session
+from remaster_ros.types import Correction, Measurements, Session
+
+CASE = Case(11, 0.2, 0.1, 'in_use', toggled=True)
+
+
+def session_of(case: Case) -> Session:
+    """Return a session as a recorder writes it: reported angles are those commanded."""
+    compensator, visits = measured(case)
+    rows = len(visits.on)
+    reported = np.where(visits.on[:, None], compensator.command(visits.wanted), visits.wanted)
+    plain = Measurements.empty(compensator.model.joints)
+    m = replace(
+        plain,
+        observation=np.arange(rows),
+        pose=visits.configuration,
+        configuration=visits.configuration,
+        is_validation=np.ones(rows, bool),
+        stamp_s=np.arange(float(rows)),
+        sensor=np.zeros(rows, np.int64),
+        marker=np.zeros(rows, np.int64),
+        q=reported,
+        from_q=np.full_like(reported, np.nan),
+        position=visits.position,
+        std=np.full((rows, 3), np.nan),
+        samples=np.full(rows, -1),
+        temperature_c=np.full(rows, np.nan),
+        wanted=visits.wanted,
+        correction=visits.on.astype(np.int64),
+    )
+    marker = compensator.model.markers['sir']
+    return Session(robot(case.name), 'base_link', 'tool', {'sir': marker}, {'mocap': 'sir'}, m)
+
+
+@pytest.fixture
+def file(tmp_path):
+    return save(tmp_path, found_arm(CASE)[1], robot(CASE.name))
+
+
+def verified(session, folder, file, capsys):
+    write_session(folder, session)
+    assert main(['verify', str(folder), '--compensation', str(file), '--json']) == 0
+    return json.loads(capsys.readouterr().out)
+
+
+@pytest.mark.parametrize('state', ['in_use', 'not_in_use'])
+def test_a_recorded_session_with_the_layer_on(tmp_path, file, capsys, state):
+    """Where raw joint states are recorded a new fit would find the old offsets in any case."""
+    found = verified(session_of(replace(CASE, state=state)), tmp_path / 's', file, capsys)
+    assert found['format'] == 'remaster-verify/1'
+    assert found['verdict'] == found['toggle']['verdict'] == state
+    assert [one['joint'] for one in found['joints']] == list(
+        read_compensation(file).compensator.joint_names
+    )
+    assert found['error_mm']['on'].keys() == {'mean_mm', 'interval95_mm'}
+    assert main(['verify', str(tmp_path / 's'), '--compensation', str(file)]) == 0
+    assert capsys.readouterr().out.startswith(f'{state}: ')
+
+
+def test_on_the_pad_what_is_reported_was_wanted(tmp_path, file, capsys):
+    session = session_of(replace(CASE, toggled=False))
+    m = session.measurements
+    mastered = replace(m, q=m.wanted, wanted=None, correction=None)
+    found = verified(
+        replace(session, measurements=mastered, correction=Correction('pad', 'x')),
+        *(tmp_path / 's', file, capsys),
+    )
+    assert found['verdict'] == 'in_use'
+    assert found['toggle'] is None
+    assert found['error_mm']['off'] is None
+    assert 'another file' in found['warnings'][0]
+    # It could act twice, and nothing would show it.
+    assert 'not seen' in found['warnings'][1]
+
+
+def test_what_is_refused_is_one_line(tmp_path, file, capsys):
+    session = session_of(CASE)
+    m = session.measurements
+
+    def refused(changed, given=file, status=2):
+        folder = tmp_path / str(len(list(tmp_path.iterdir())))
+        write_session(folder, changed)
+        assert main(['verify', str(folder), '--compensation', str(given)]) == status
+        (line,) = capsys.readouterr().err.splitlines()
+        assert str(folder) in line or status == 1
+        return line
+
+    assert 'column correction' in refused(
+        replace(session, measurements=replace(m, correction=None))
+    )
+    layer = replace(session, correction=Correction('layer'))
+    assert 'wanted1_rad' in refused(replace(layer, measurements=replace(m, wanted=None)))
+    other = save(tmp_path, found_arm(replace(CASE, name='six'))[1], robot('six'))
+    assert 'its joints' in refused(session, other)
+    few = m.select(np.r_[0:3, 10:13])
+    assert 'rows' in refused(
+        replace(session, measurements=few),
+        save(tmp_path, found_arm(CASE)[1], robot(CASE.name)),
+        status=1,
+    )
