@@ -26,6 +26,7 @@ from remaster_ros.compensation.arm_model import (
 )
 from remaster_ros.compensation.compensator import Compensator
 from remaster_ros.compensation.of_result import Described
+from remaster_ros.compensation.trajectories import CorrectedTrajectory, corrected_trajectory
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.pad_angles import coupled_in_circle
 from remaster_ros.kinematics.serial_chain import SerialChain
@@ -222,6 +223,12 @@ class Compensation:
     def uncertainty(self, q: Any) -> FloatArray:
         """See `Compensator.uncertainty`."""
         return self.compensator.uncertainty(q)
+
+    def trajectory(
+        self, times_s: Any, positions: Any, velocities: Any = None, **more: Any
+    ) -> CorrectedTrajectory:
+        """See `corrected_trajectory`."""
+        return corrected_trajectory(self.compensator, times_s, positions, velocities, **more)
 
 
 _FRAMES = (
