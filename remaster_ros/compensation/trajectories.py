@@ -113,7 +113,7 @@ def corrected_trajectory(
         if np.diff(times)[far].min() < 2.0 * SHORTEST_S:
             raise InputError(
                 f'behind {times[:-1][far][0]:.3f} s the tool leaves the wanted path between '
-                f'points by {1e3 * off.max():.3f} mm, more than {1e3 * tolerance_m:g}, also with a '
+                f'points by {1e3 * off.max():.3f} mm (not {1e3 * tolerance_m:g}), even with a '
                 'point per millisecond; go slower there, or give velocities'
             )
         times = np.sort(np.concatenate((times, 0.5 * (times[:-1] + times[1:])[far])))
