@@ -17,6 +17,8 @@ BoolArray = NDArray[np.bool_]
 
 Split = Literal['optimization', 'validation', 'reference']
 AngleUnit = Literal['deg', 'rad', 'gon']
+AccuracyOption = Literal['', 'active', 'inactive']
+"""Whether a controller corrects by a calibration of its maker's; '' where it is not known."""
 
 FARTHEST_M = 200.0
 """More than any tracker's range: such a number is in millimetres, or broken."""
@@ -325,6 +327,8 @@ class Session:
         degrees, or nothing is known.
     correction
         That was on while it was measured; None where none is stated.
+    accuracy_option
+        Whether the maker's own accuracy option was on in the controller.
     extra
         Keys of session.yaml this version does not know, kept as they are.
     observations_sha256
@@ -353,6 +357,7 @@ class Session:
     observations_sha256: str = ''
     controller: Controller | None = None
     correction: Correction | None = None
+    accuracy_option: AccuracyOption = ''
 
     @property
     def urdf_sha256(self) -> str:

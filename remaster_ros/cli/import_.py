@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import logging
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -196,6 +197,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='the arm went from row to row and nowhere between: fills from_q, for backlash',
     )
     session.add_argument(
+        '--accuracy-option',
+        choices=('active', 'inactive'),
+        default='',
+        help="the maker's own (KUKA $ABS_ACCUR, ABB Absolute Accuracy), while it was measured",
+    )
+    session.add_argument(
         '--unchecked', action='store_true', help='write it also where it does not fit the robot'
     )
 
@@ -268,9 +275,16 @@ def run(args: argparse.Namespace) -> int:
             shift=args.shift_points, exchange=args.exchange_markers, turn=args.turn_tool
         )
         session = mended(session, arrangement_of(told, session, chain.joint_names))
+        session = replace(session, accuracy_option=args.accuracy_option)
         sense = check_sense(session, rows, progress)
     session, turned = without_whole_turns(session, chain)
     how += [*counted, *filter(None, [turned])]
+    # RAPID is written by others than ABB too: such targets do not tell the maker.
+    if rows.maker == 'KUKA' and not args.accuracy_option:
+        how.append(
+            "was the maker's accuracy option ($ABS_ACCUR) on? The result belongs to that state "
+            'alone: say --accuracy-option active or inactive'
+        )
     if not args.json:
         show(args.quiet, _as_text(rows, session, how))
     if sense.fits or args.unchecked:
@@ -317,6 +331,8 @@ def _mend(args: argparse.Namespace) -> int:
     with progress_bar(args.quiet or args.json) as progress:
         progress('trying', 0.0)
         session = mended(session, arrangement_of(told, session, chain.joint_names))
+        if args.accuracy_option:
+            session = replace(session, accuracy_option=args.accuracy_option)
         if not args.unchecked:
             try:
                 sound_estimate(session)

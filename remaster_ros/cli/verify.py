@@ -146,10 +146,17 @@ def _named(names: Any) -> str:
 
 
 def _warnings(session: Session, compensation: Compensation) -> list[str]:
-    stated, before = session.correction, compensation.content.state.get('correction')
+    state = compensation.content.state
+    stated, before = session.correction, state.get('correction')
     found = []
     if stated is not None and stated.sha256 not in ('', compensation.sha256):
         found.append('the correction that was on is another file than the one given')
+    was, option = state.get('accuracy_option', ''), session.accuracy_option
+    if was and option and was != option:
+        found.append(
+            f"the maker's accuracy option is {option}, and was {was} when the correction was "
+            'measured, which belongs to that state alone'
+        )
     if session.measurements.wanted is None:
         found.append(
             'what was wanted is not recorded, so that a layer or model beside the controller is '

@@ -262,6 +262,9 @@ def exported(
 
 def _offsets(compensation: Compensation, one: Held) -> ZeroOffsets:
     content, model = compensation.content, compensation.model
+    was = content.state.get('accuracy_option', '')
+    option = [f"Measured with the maker's accuracy option {was}: right in that state alone."]
+    option = option if was else []
     std = model.widening * np.linalg.norm(model.root[:, : model.joints], axis=0)
     return ZeroOffsets(
         content.robot.urdf,
@@ -271,7 +274,7 @@ def _offsets(compensation: Compensation, one: Held) -> ZeroOffsets:
         np.array([part.identifiable for part in content.joints]),
         [part.why for part in content.joints],
         content.controller,
-        [note for note in content.notes if note.startswith('CHECK FIRST')],
+        [*(note for note in content.notes if note.startswith('CHECK FIRST')), *option],
     )
 
 

@@ -143,7 +143,7 @@ def correction_text(
     described: Described, session: Session, made_by: Source, result_sha256: str
 ) -> str:
     """Return compensation.json of the arm that a result describes."""
-    state = {'correction': session.correction}
+    state = {'correction': session.correction, 'accuracy_option': session.accuracy_option}
     hashes = (result_sha256, session.observations_sha256)
     return written(described, session.urdf, made_by, hashes, state, session.controller)
 

@@ -24,7 +24,15 @@ from remaster_ros.session.yaml_records import (
     out_of_bounds,
     to_plain,
 )
-from remaster_ros.types import AngleUnit, Controller, Correction, Measurements, PadJoint, Session
+from remaster_ros.types import (
+    AccuracyOption,
+    AngleUnit,
+    Controller,
+    Correction,
+    Measurements,
+    PadJoint,
+    Session,
+)
 
 FORMAT = 'remaster-session/1'
 ExitStatus = Literal['complete', 'stopped', 'aborted']
@@ -87,6 +95,7 @@ class SessionHeader(msgspec.Struct):
     notes: str = ''
     controller: _Controller | None = None
     correction: Correction | None = None
+    accuracy_option: AccuracyOption = ''
     extra: dict[str, Any] = {}
 
     def session(
@@ -120,6 +129,7 @@ class SessionHeader(msgspec.Struct):
             extra=self.extra,
             controller=None if self.controller is None else self.controller.record(),
             correction=self.correction,
+            accuracy_option=self.accuracy_option,
             references=references,
         )
 
@@ -185,6 +195,7 @@ def write_header(session: Session, urdf_name: str, exit_status: str) -> str:
         'notes': session.notes,
         'controller': session.controller,
         'correction': session.correction,
+        'accuracy_option': session.accuracy_option,
     }
     header = _checked(to_plain(content), 'session to be written: ')
     given = {key: value for key, value in to_plain(header).items() if value not in ('', {}, None)}

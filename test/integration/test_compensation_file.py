@@ -90,7 +90,7 @@ def test_of_a_fit_the_file_has_its_offsets_and_nothing_else(hidden, tmp_path):
     if not file.model.geometry.is_any:
         np.testing.assert_allclose(file.model.joint_offsets[known], fit.joint_offsets[known])
     assert not any(joint.terms for joint in file.content.joints)
-    assert file.content.state == {'correction': {'form': 'urdf', 'sha256': ''}}
+    assert file.content.state['correction'] == {'form': 'urdf', 'sha256': ''}
     assert [joint.identifiable for joint in file.content.joints] == known.tolist()
     assert all(joint.why for joint in file.content.joints if not joint.identifiable)
     q = fit.session.measurements.q[:20]

@@ -88,6 +88,20 @@ def test_on_the_pad_what_is_reported_was_wanted(tmp_path, file, capsys):
     assert 'not seen' in found['warnings'][1]
 
 
+def test_the_makers_accuracy_option_is_compared(tmp_path, file, capsys):
+    content = json.loads(file.read_text())
+    content['state'] = {'accuracy_option': 'active'}
+    file.write_text(json.dumps(content))
+    other = replace(session_of(CASE), accuracy_option='inactive')
+    (warning,) = verified(other, tmp_path / 's', file, capsys)['warnings']
+    assert "maker's accuracy option is inactive, and was active" in warning
+    same = replace(other, accuracy_option='active')
+    assert verified(same, tmp_path / 't', file, capsys)['warnings'] == []
+    out = tmp_path / 'pad'
+    assert main(['export', str(file), '--to', 'pad', '--out', str(out), '--quiet']) == 0
+    assert 'accuracy option active' in (out / 'remaster.txt').read_text()
+
+
 def test_what_is_refused_is_one_line(tmp_path, file, capsys):
     session = session_of(CASE)
     m = session.measurements

@@ -258,3 +258,23 @@ def test_a_mutated_text_is_read_right_or_refused(kind, tmp_path):
 @pytest.mark.parametrize('kind', KINDS)
 def test_two_thousand_mutations_are_read_right_or_refused(kind, tmp_path):
     assert check_mutations(kind, 2000, 12, tmp_path / 'program.txt') > 0
+
+
+def test_the_accuracy_option_of_a_kuka_is_asked_for_and_kept(tmp_path, capsys):
+    arm = measured(rows=30)
+    names = names_of('kuka_src', len(arm.q))
+    program = write(tmp_path, 'calib.src', KINDS['kuka_src'].write(names, np.rad2deg(arm.q)))
+    points = write(tmp_path, 'points.csv', text(['Name', 'X', 'Y', 'Z'], [names, *arm.points.T]))
+    (tmp_path / 'robot.urdf').write_text(arm.urdf)
+    args = ['import', str(program), str(points), '--urdf', str(tmp_path / 'robot.urdf')]
+    args += ['--length', 'm', '--join', 'order', '--unchecked']
+    assert main([*args, '--out', str(tmp_path / 'a')]) == 0
+    assert '--accuracy-option' in capsys.readouterr().out
+    told = ['--accuracy-option', 'active']
+    assert main([*args, '--out', str(tmp_path / 'b'), *told]) == 0
+    assert '--accuracy-option' not in capsys.readouterr().out
+    assert [read_session(tmp_path / s).accuracy_option for s in 'ab'] == ['', 'active']
+    # Of a session it can be said afterwards.
+    told = ['--accuracy-option', 'inactive', '--unchecked', '--quiet']
+    assert main(['import', str(tmp_path / 'b'), '--out', str(tmp_path / 'c'), *told]) == 0
+    assert read_session(tmp_path / 'c').accuracy_option == 'inactive'

@@ -24,6 +24,7 @@ def corrected() -> Session:
         session,
         measurements=replace(m, wanted=wanted, correction=state),
         correction=Correction('layer', 'abc'),
+        accuracy_option='inactive',
     )
 
 
@@ -34,6 +35,7 @@ def test_they_survive_the_round_trip(tmp_path):
     np.testing.assert_array_equal(read.measurements.wanted, made.measurements.wanted)
     np.testing.assert_array_equal(read.measurements.correction, made.measurements.correction)
     assert read.correction == Correction('layer', 'abc')
+    assert read.accuracy_option == 'inactive'
     assert not read.extra
     header, first = (tmp_path / 'observations.csv').read_text().splitlines()[:2]
     assert header.split(',')[-1] == 'correction'
