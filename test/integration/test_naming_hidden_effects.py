@@ -23,6 +23,7 @@ from hidden_sessions import (
 )
 from hidden_third import predicted_by, predicted_by_offsets, third_errors
 
+from remaster_ros import discover, simulate
 from remaster_ros.discovery.confirmation import confirm
 from remaster_ros.discovery.discover import Discovery, discover_session
 from remaster_ros.simulation.hidden_effects import NAMED
@@ -143,3 +144,14 @@ def test_what_was_found_predicts_a_third_set_better_than_the_offsets() -> None:
     print(third)
     assert third.returned_m < 0.5 * third.offsets_m
     assert not third.harm
+
+
+@pytest.mark.qualify
+@pytest.mark.parametrize('seed', [10, 24, 25])
+def test_a_wave_of_half_a_millimetre_is_no_noise(seed: int) -> None:
+    """Two causes of a third to half a millimetre, 25 poses: both are named."""
+    simulated = simulate(poses=25, validation_poses=15, effects=['random', 'random'], seed=seed)
+    found = discover(simulated.session)
+    hidden = {(effect.kind, effect.joints) for effect in simulated.truth.effects}
+    print(seed, hidden, [(effect.name, effect.joints) for effect in found.effects])
+    assert {(effect.name, effect.joints) for effect in found.effects} == hidden
