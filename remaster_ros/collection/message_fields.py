@@ -41,6 +41,11 @@ class JointOrder:
         self._seen: tuple[str, ...] = ()
         self._columns: list[int] = []
 
+    def concerns(self, message: Any) -> bool:
+        """Whether a message names any of the joints; another device's (a gripper's) does not."""
+        names = tuple(message.name)
+        return names == self._seen or not set(self.names).isdisjoint(names)
+
     def positions(self, message: Any) -> FloatArray:
         """Return the positions in the wanted order, rad, (k,).
 

@@ -98,6 +98,8 @@ class ArmSupervisor:
         self._paused = False
         self._seen: Seen | None = None
         self._doubted_wall: float | None = None
+        # What else came on joint_states, and when (wall time, s).
+        self._others, self._others_wall = '', -np.inf
 
     # What comes in
 
@@ -178,6 +180,13 @@ class ArmSupervisor:
             actions = self._conclude(*outcome, seen)
         self._interlocks.note_alive('robot', '', wall_s)
         return actions + self.tick(wall_s)
+
+    def other_joints(self, why: str, wall_s: float) -> None:
+        """Process a message on joint_states that has none of the arm's joints: a gripper's, say.
+
+        ``why`` is for whom no other comes.
+        """
+        self._others, self._others_wall = why, wall_s
 
     def doubt(self, why: str, wall_s: float, *, jumped: bool = False) -> list[Action]:
         """Process a report that is not believed or not readable; if that lasts, halt a collection.
@@ -298,7 +307,7 @@ class ArmSupervisor:
         if silent:
             self._queue.begin_anew()
         if silent and self._engaged:
-            return self._halt(silent)
+            return self._halt('; '.join(filter(None, (silent, self.trouble))))
         blocked = self.blocked(wall_s)
         return self._stop(blocked, wall_s) if blocked else self._go_on(wall_s)
 
@@ -328,7 +337,10 @@ class ArmSupervisor:
     @property
     def trouble(self) -> str:
         """What is wrong with the reports of the joints; ''."""
-        return self._interlocks.reason('robot')
+        limit = self.rules.heartbeat_s
+        silent = self._interlocks.silence_s('robot', self._wall) > limit
+        others = silent and self._wall - self._others_wall <= limit
+        return self._interlocks.reason('robot') or (self._others if others else '')
 
     def report_age_s(self, wall_s: float) -> float:
         """Time since a report was believed, s; infinite if none was."""

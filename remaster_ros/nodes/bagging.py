@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -109,10 +109,14 @@ class BagRecorder:
         self,
         kind: Any,
         topic: str,
-        receive: Callable[[Any], None] | None = None,
+        receive: Callable[..., None] | None = None,
         qos: QoSProfile = DEEP,
+        *,
+        with_info: bool = False,
     ) -> None:
         """Record `topic`; call `receive` with each decoded message, if given.
+
+        ``with_info`` gives it the message's info of rclpy as well.
 
         In the bag it has the name of `name_in_bag`: without this node's namespace and as if it was
         not remapped, so that a bag can be replayed in any namespace.
@@ -123,25 +127,33 @@ class BagRecorder:
         if receive is not None:
             self.taken[name] = 0
 
-        def take(data: bytes) -> None:
+        def take(data: bytes, info: Mapping[str, Any]) -> None:
             # Raw, because serialising again can leave uninitialised bytes behind the message.
             self._write(name, type_name, data)
             if receive is not None:
-                receive(deserialize_message(data, kind))
+                message = deserialize_message(data, kind)
+                receive(message, info) if with_info else receive(message)
                 self.taken[name] += 1
 
-        def take_all(data: bytes) -> None:
+        def take_all(data: bytes, info: Mapping[str, Any]) -> None:
             # rclpy takes one message of each topic in turn: those of a fast sensor would wait for
             # ever longer while the joint states, of which there are fewer, are up to date.
-            take(data)
+            take(data, info)
             for _ in range(MOST_AT_ONCE):
                 with subscription.handle:
                     further = subscription.handle.take_message(kind, True)
                 if further is None:
                     return
-                take(further[0])
+                take(*further)
 
-        subscription = self._node.create_subscription(kind, topic, take_all, qos, raw=True)
+        # rclpy's types have no callback with a message's info beside raw bytes.
+        subscription = self._node.create_subscription(
+            kind,
+            topic,
+            take_all,  # type: ignore[arg-type]
+            qos,
+            raw=True,
+        )
 
     def subscribe_rest(self) -> None:
         """Record the topics that the recorder itself has no use for."""

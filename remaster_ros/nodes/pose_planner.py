@@ -300,6 +300,8 @@ class PosePlanner(RemasterNode):
 
     def _on_joint_state(self, message: JointState) -> None:
         """Learn where the arm is before the first pose; after that by /remaster/settled."""
+        if not self._order.concerns(message):
+            return
         self._on_settled(message)
         if self._q is not None and self._joint_states is not None:
             self.destroy_subscription(self._joint_states)

@@ -11,6 +11,7 @@ from __future__ import annotations
 import json
 import logging
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,7 @@ from trajectory_msgs.msg import JointTrajectory
 from remaster_ros.collection import events
 from remaster_ros.collection.recording import EndedReading
 from remaster_ros.errors import DiskError
+from remaster_ros.nodes.arm_states import JOINTS, ArmStates
 from remaster_ros.nodes.cell_sensors import CellSensors
 from remaster_ros.nodes.controller_link import COMMANDS, COPIES
 from remaster_ros.nodes.messages import transform_message
@@ -79,6 +81,7 @@ class Recorder(RemasterNode):
         )
         self.journal = self.keeper.journal
         self._taken = ReportsTaken(self, self.p.simulated_clock_rate)
+        self._states = ArmStates(self, self.cell.chain().joint_names, self.p.heartbeat_s)
         self.recorder = SessionRecorder(self.cell, self.p, self.keeper, _Outlet(self))
         self._subscribe()
         # A group of its own: while it waits for the reading, what makes the reading goes on.
@@ -94,7 +97,7 @@ class Recorder(RemasterNode):
     def _subscribe(self) -> None:
         """Take each topic once, raw: into the bag as it came, then decoded."""
         bag, recorder = self.keeper.bag, self.recorder
-        bag.subscribe(JointState, 'joint_states', self._on_joint_state, JOINT_STATES)
+        bag.subscribe(JointState, JOINTS, self._on_joint_state, JOINT_STATES, with_info=True)
         bag.subscribe(JointState, 'remaster/settled', recorder.take_settled)
         bag.subscribe(JointTrajectory, 'remaster/joint_solutions', recorder.take_solutions)
         for commands in (COMMANDS, COPIES):
@@ -103,9 +106,13 @@ class Recorder(RemasterNode):
         bag.subscribe(String, EVENTS, receiver(self, self._on_record))
         bag.subscribe_rest()
 
-    def _on_joint_state(self, message: JointState) -> None:
+    def _on_joint_state(self, message: JointState, info: Mapping[str, Any]) -> None:
         self._taken.take(message.header.stamp)
-        self.recorder.take_joints(message)
+        self._states.note(message, info)
+        if rival := self._states.rival():
+            self.recorder.trouble = rival
+        else:
+            self.recorder.take_joints(message)
 
     def _on_record(self, record: events.EventRecord) -> None:
         self._records[taken_key(record)] += 1

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -22,7 +22,7 @@ from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from remaster_ros.collection import events
-from remaster_ros.collection.message_fields import JointOrder, seconds, solutions_of, stamp_key
+from remaster_ros.collection.message_fields import seconds, solutions_of, stamp_key
 from remaster_ros.collection.peer_models import PeerModels
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.same_arm import difference
@@ -42,6 +42,7 @@ from remaster_ros.motion.motion_gate import PROBE_S, Admitted, MotionGate
 from remaster_ros.motion.move_queue import PROBE
 from remaster_ros.motion.path_check import PointSpeeds
 from remaster_ros.motion.path_search import PathSearch
+from remaster_ros.nodes.arm_states import JOINTS, ArmStates
 from remaster_ros.nodes.background import Background
 from remaster_ros.nodes.bridge_parameters import Parameters
 from remaster_ros.nodes.controller_link import (
@@ -63,7 +64,6 @@ from remaster_ros.session.halt_file import HaltFile
 from remaster_ros.session.last_command import LastCommandFile
 from remaster_ros.session.workcell import read_cell
 
-JOINTS = 'joint_states'
 SOLUTIONS = 'remaster/joint_solutions'
 WAYPOINTS = 'remaster/joint_waypoints'
 DESCRIPTION = 'robot_description'
@@ -100,7 +100,6 @@ class RobotBridge(RemasterNode):
             )
         cell = read_cell(self.p.cell)
         self.chain = cell.chain()
-        self._order = JointOrder(self.chain.joint_names)
         offsets, unknown_rad = self.p.known_offsets(self.chain)
         # Paths are checked where the arm is, not where its encoders put it.
         true_arm = self.chain if offsets is None else self.chain.with_offsets(offsets)
@@ -131,6 +130,7 @@ class RobotBridge(RemasterNode):
         if last is not None:
             self.supervisor.interrupted(self.steady_s() - last.age_s)
         self._settled_wall = self.steady_s()
+        self._states = ArmStates(self, self.chain.joint_names, self.p.heartbeat_s)
         self._waypoints = JointTrajectory()
         self.counts = {'commanded': 0, 'settled': 0, 'failed': 0, 'stopped': 0}
         by_action = self.p.command_interface == 'action'
@@ -159,7 +159,6 @@ class RobotBridge(RemasterNode):
         self._only = [
             OnlyPublisher(self, topic, kind, allowed)
             for topic, kind, allowed in (
-                (JOINTS, JointState, 1),
                 (SOLUTIONS, JointTrajectory, 1),
                 (WAYPOINTS, JointTrajectory, 1),
                 (COMMANDS, JointTrajectory, 0 if by_action else 1),
@@ -237,21 +236,28 @@ class RobotBridge(RemasterNode):
         self._pose_stamp = stamp_key(message.header.stamp)
         self._do(self.supervisor.plan(targets, self.steady_s(), waypoints))
 
-    def _on_joint_state(self, message: JointState) -> None:
-        self._take_report(message)
+    def _on_joint_state(self, message: JointState, info: Mapping[str, Any]) -> None:
+        self._take_report(message, info)
         # Last: what was decided by this report has been published.
         self._taken.take(message.header.stamp)
 
-    def _take_report(self, message: JointState) -> None:
+    def _take_report(self, message: JointState, info: Mapping[str, Any]) -> None:
         now = self.steady_s()
         if self.clock_trouble:
             self._do(self.supervisor.observe('clock', self.clock_trouble, now))
             return
         try:
-            q = self._order.positions(message)
+            q = self._states.take(message, info)
         except InputError as error:
             self.supervisor.reports.refused['joints'] += 1
             self._do(self.supervisor.doubt(str(error), now))
+            return
+        if q is None:
+            self.supervisor.other_joints(self._states.others, now)
+            return
+        if rival := self._states.rival():
+            # Whose report this is, is not known.
+            self._do(self.supervisor.observe('rivals', rival, now))
             return
         report = JointReport(seconds(message.header.stamp), q, self.now_s(), now)
         self._do(self.supervisor.report(report))
@@ -272,7 +278,8 @@ class RobotBridge(RemasterNode):
 
     def _watch(self) -> None:
         now = self.steady_s()
-        rivals = next(filter(None, (only.trouble() for only in self._only)), '')
+        others = (only.trouble() for only in self._only)
+        rivals = self._states.rival() or next(filter(None, others), '')
         if self._controller is not None:
             rivals = rivals or self._controller.rival()
         for name, trouble in (

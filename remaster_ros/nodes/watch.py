@@ -181,8 +181,9 @@ class Watch(RemasterNode):
             self.view.take_plan_page(PlanPage(plan, self.page.show_plan(found)))
 
     def _on_joint_state(self, message: JointState) -> None:
-        self._q = self._order.positions(message)
-        self.view.take_joints(self._q)
+        if self._order.concerns(message):
+            self._q = self._order.positions(message)
+            self.view.take_joints(self._q)
 
     def _on_point(self, sensor: str, marker: str, message: PointStamped) -> None:
         position = np.array([message.point.x, message.point.y, message.point.z])

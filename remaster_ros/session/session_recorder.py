@@ -271,8 +271,8 @@ class SessionRecorder:
             return None
 
     def take_joints(self, message: Any) -> None:
-        """Take a sensor_msgs/JointState of the robot."""
-        if (q := self._positions(message)) is not None:
+        """Take a sensor_msgs/JointState of the robot; one of a gripper's joints is left out."""
+        if self._order.concerns(message) and (q := self._positions(message)) is not None:
             self.trouble = ''
             self.recording.take_joints(seconds(message.header.stamp), q)
             self.end_reading()

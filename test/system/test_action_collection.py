@@ -32,6 +32,13 @@ def with_control_messages(ros_environment):
 def test_a_collection_by_the_action_with_a_pause_and_a_bridge_that_is_killed(
     with_control_messages, start, client, tmp_path
 ):
+    from sensor_msgs.msg import JointState
+
+    # As a gripper's driver does, whose joints are none of the arm's.
+    gripper = client.create_publisher(JointState, 'joint_states', 10)
+    client.create_timer(
+        0.02, lambda: gripper.publish(JointState(name=['finger'], position=[0.01]))
+    )
     cell = Cell(start, client, tmp_path, 'mocap', ['mocap'], by_action=True, candidates=3)
 
     def stops():

@@ -74,7 +74,7 @@ class Rig:
             'remaster_ros.nodes.recorder',
             *node_arguments(cell=cell, session=self.session, call_measure=False, bag=False),
         )
-        self.events, self.summary, self.message = [], {}, ''
+        self.events, self.summaries, self.summary, self.message = [], [], {}, ''
         listen(client, self._record, self._summary)
         self.joints = client.create_publisher(JointState, '/joint_states', 100)
         self.settled = client.create_publisher(JointState, '/remaster/settled', RELIABLE)
@@ -100,6 +100,7 @@ class Rig:
     def _summary(self, node, message, values):
         if node == 'recorder':
             self.summary, self.message = values, message
+            self.summaries.append(message)
 
     def header(self, message, t):
         from remaster_ros.nodes.messages import stamp_of
@@ -112,6 +113,29 @@ class Rig:
 
         message = JointState(name=list(CHAIN.joint_names), position=[float(x) for x in q])
         self.joints.publish(self.header(message, self.t))
+
+    def another_publisher_of_joints(self):
+        """One of a gripper's joints does no harm; one of the arm's is named."""
+        from sensor_msgs.msg import JointState
+
+        other = self.client.create_publisher(JointState, '/joint_states', 100)
+        wait_until(lambda: self.client.spin_some() or other.get_subscription_count(), 20, 'it')
+
+        def shown(names, said):
+            def look():
+                self.t += 0.02
+                self.report(Q)
+                other.publish(JointState(name=names, position=[0.01] * len(names)))
+                self.spin()
+                return said(self.message)
+
+            wait_until(look, 20, f'what is said of {names}')
+
+        number = len(self.summaries)
+        shown(['finger'], lambda message: len(self.summaries) > number + 2)
+        assert {message for message in self.summaries[number:]} == {'waiting'}
+        several = "the arm's joints come on /joint_states from more than one publisher"
+        shown(list(CHAIN.joint_names), lambda message: message.startswith(several))
 
     def read(self, q, shift=(0.0, 0.0, 0.0)):
         """Publish where the sensor has the marker with the arm at q, moved by `shift`, m."""
@@ -218,6 +242,7 @@ def test_what_is_recorded_and_never_twice_and_from_where(rig):
         rig.spin()
     rig.stand(third)
     assert rig.decided(4).result == 'recorded'
+    rig.another_publisher_of_joints()
 
     rows = rig.rows()
     assert rows.pose.tolist() == [number] * 3

@@ -31,7 +31,14 @@ from remaster_ros.collection.events import (
     encode,
 )
 from remaster_ros.collection.message_fields import seconds
-from remaster_ros.nodes import emergency_link, rivals, robot_bridge, simulated_clock, status
+from remaster_ros.nodes import (
+    arm_states,
+    emergency_link,
+    rivals,
+    robot_bridge,
+    simulated_clock,
+    status,
+)
 from remaster_ros.session.last_command import LastCommandFile
 from remaster_ros.session.workcell import read_cell
 
@@ -89,8 +96,8 @@ class CountedBridge(robot_bridge.RobotBridge):
     def get_logger(self):
         return LogBook(super().get_logger(), self.logged)
 
-    def _on_joint_state(self, message):
-        super()._on_joint_state(message)
+    def _on_joint_state(self, message, info):
+        super()._on_joint_state(message, info)
         self.taken['states'] += 1
 
     def _on_record(self, record):
@@ -140,7 +147,7 @@ class Rig:
     def __init__(self, monkeypatch, folder, home=HOME, controller=True, first=False, **parameters):
         self.wall = 1000.0
         clock = SimpleNamespace(monotonic=lambda: self.wall, time_ns=time.time_ns)
-        for module in (simulated_clock, status, rivals, emergency_link):
+        for module in (simulated_clock, status, rivals, arm_states, emergency_link):
             monkeypatch.setattr(module, 'time', clock)
         # The age of the last command follows the test's clock as well.
         dated = SimpleNamespace(monotonic=clock.monotonic, time_ns=self.time_ns)

@@ -10,7 +10,7 @@ pytest.importorskip('rclpy', reason='needs ROS 2 Jazzy or its wheels')
 
 import rclpy
 from bridge_places import AWAY
-from bridge_rig import DOMAIN, HOME
+from bridge_rig import DOMAIN, HOME, stamp
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool
@@ -25,7 +25,6 @@ pytestmark = [pytest.mark.ros, pytest.mark.timeout(60)]
 
 COMMANDS = 'joint_trajectory_controller/joint_trajectory'
 TOPICS = [
-    ('joint_states', JointState, 'peer'),
     ('remaster/joint_solutions', JointTrajectory, 'peer'),
     ('remaster/joint_waypoints', JointTrajectory, 'peer'),
     (COMMANDS, JointTrajectory, 'robot_bridge'),
@@ -74,6 +73,80 @@ def test_a_second_publisher_halts_a_collection(rig, intruder, topic, kind, first
     assert r.reason('rivals') == r.halted()
 
 
+def test_a_second_publisher_of_the_arms_joints_halts_a_collection(rig, intruder):
+    """Noticed by the numbers of the messages, as others may publish other joints there."""
+    r = rig()
+    states = intruder.create_publisher(JointState, 'joint_states', 200)
+    r.wait(listed(r.bridge, 'joint_states', 2), 'the intruder')
+    r.wait(states.get_subscription_count, 'the match')
+    r.go(AWAY, speed=0.2)
+    sent = r.bridge.published
+    message = JointState(name=r.names, position=r.arm.q.tolist())
+    message.header.stamp = stamp(r.wall + 0.001)
+    r.taken(states, message, 'states')
+    assert r.halted() == (
+        "the arm's joints come on /joint_states from more than one publisher, or from one that "
+        'was started again; on it are /intruder, /peer: end all others that publish the '
+        "arm's joints"
+    )
+    # It follows its path: it is stopped there.
+    r.wait(lambda: len(r.commands) == sent + 1, 'the stop')
+    assert np.all(r.commands[-1].v[-1] == 0.0)
+    r.bridge._watch()
+    assert r.reason('rivals') == r.halted()
+    # Gone for as long as the robot may be silent: then a person may go on.
+    r.run(0.9)
+    assert r.reason('rivals')
+    r.run(0.3)
+    assert r.reason('rivals') == ''
+
+
+def test_a_gripper_may_publish_its_own_joints(rig, intruder):
+    r = rig()
+    gripper = intruder.create_publisher(JointState, 'joint_states', 200)
+    r.wait(listed(r.bridge, 'joint_states', 2), 'the gripper')
+    r.wait(gripper.get_subscription_count, 'the match')
+
+    def beside(message):
+        # Its clock and its numbers are its own.
+        r.taken(gripper, JointState(name=['finger'], position=[0.01]), 'states')
+        return message
+
+    r.alter = beside
+    r.settle(AWAY)
+    assert not r.halted()
+    assert not r.bridge.supervisor.reports.refused
+    assert r.summary()[2]['joints_trouble'] == ''
+
+
+def test_another_robots_joints_are_named(rig):
+    r = rig()
+    r.settle(AWAY)
+    r.alter = lambda m: setattr(m, 'name', [f'other_{name}' for name in m.name]) or m
+    r.run(0.9)
+    assert not r.halted()
+    r.run(0.3)
+    found = ', '.join(f'other_{r.names[i]}' for i in r.order)
+    trouble = (
+        f"joint_states has {found}, none of the cell's joints: does the cell file name the robot "
+        'that is running?'
+    )
+    assert r.halted() == f'no sign of robot for 1 s; {trouble}'
+    assert r.summary()[2]['joints_trouble'] == trouble
+
+
+def test_without_numbers_the_graph_tells_who_publishes(rig, intruder):
+    """As with a middleware that gives messages none."""
+    r = rig()
+    r.quiet()
+    intruder.create_publisher(JointState, 'joint_states', 10)
+    r.wait(listed(r.bridge, 'joint_states', 2), 'the intruder')
+    states, message = r.bridge._states, JointState(name=r.names)
+    assert states.rival() == ''
+    assert states.note(message, {'publication_sequence_number': None})
+    assert states.rival().startswith('2 publishers on /joint_states, where one may be: ')
+
+
 def test_another_bridge_with_a_lease_halts_a_collection(rig, intruder):
     """Another one's commands have a lease as ours: it counts as soon as a killed one would not."""
     r = rig()
@@ -82,7 +155,7 @@ def test_another_bridge_with_a_lease_halts_a_collection(rig, intruder):
     r.wait(listed(r.bridge, COMMANDS, 2), 'the intruder')
     r.bridge._watch()
     assert not r.halted()
-    only = r.bridge._only[3]
+    only = r.bridge._only[2]
     r.wait(lambda: only._alive == 1, 'its lease')
     r.run(3.2, r.halted, dt=0.05)
     assert r.halted().startswith(f'2 publishers on /{COMMANDS}, where one may be: ')
@@ -349,7 +422,8 @@ def test_every_rule_is_asked_at_the_time_it_is(rig):
     r.say(RecorderState(waiting_for='x'))
     r.say(PlannerState(state='running', run='its'))
     r.report()
-    r.report(name=[])
+    r.report(name=r.names[:1])
+    r.report(name=['finger'])
     r.plan(HOME + 0.05)
     r.bridge._watch()
     r.answer('1.000000000', 3)
@@ -370,6 +444,7 @@ def test_every_rule_is_asked_at_the_time_it_is(rig):
     assert {args[2] for args in seen['observe']} == {r.wall}
     assert seen['plan'][0][1:] == (r.wall, {})
     assert seen['doubt'][0][1] == r.wall
+    assert seen['other_joints'][0][1] == r.wall
     (report,) = seen['report'][0]
     assert report.wall_s == r.wall
     assert report.clock_s == r.wall + 0.25
