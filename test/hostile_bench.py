@@ -34,6 +34,8 @@ from hostile_lines import (
     Seen,
 )
 from hostile_process import BridgeProcess
+from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
+from rcl_interfaces.srv import SetParameters
 from rclpy.executors import SingleThreadedExecutor
 from ros_rig import ASKED
 from sensor_msgs.msg import JointState
@@ -150,6 +152,7 @@ class Bench(BridgeProcess):
         node.create_subscription(DiagnosticArray, '/remaster/status', self._on_status, RELIABLE)
         node.create_subscription(String, '/remaster/events', self._on_record, RELIABLE)
         self._clear = node.create_client(Trigger, '/remaster/clear_halt')
+        self._set = node.create_client(SetParameters, '/robot_bridge/set_parameters')
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(node)
         self._threads = [
@@ -244,6 +247,16 @@ class Bench(BridgeProcess):
             if not future.result().message.startswith(ASKED):
                 break
         return future.result().success
+
+    def set_parameter(self, name: str, value: float, timeout_s: float = 5.0) -> str:
+        """Ask the bridge for another value; returns why it refuses, or is silent; ''."""
+        kind = ParameterType.PARAMETER_DOUBLE
+        wanted = Parameter(name=name, value=ParameterValue(type=kind, double_value=value))
+        future = self._set.call_async(SetParameters.Request(parameters=[wanted]))
+        if not self.until(future.done, timeout_s):
+            return 'no answer'
+        (result,) = future.result().results
+        return '' if result.successful else result.reason
 
     def on_its_way(self) -> bool:
         """Whether the arm is in the middle of a move: one that is being stopped is not."""
@@ -359,6 +372,11 @@ class Bench(BridgeProcess):
                 self._stopped_stamp = sampled
             sampled = self._stopped_stamp
         message = self.state_message(q, v, lines.clock_s + sampled - time.monotonic())
+        message.name = [lines.prefix + name for name in message.name]
+        if lines.twice:
+            message.name = [*message.name, *message.name]
+            message.position = [*message.position, *message.position]
+            message.velocity = [*message.velocity, *message.velocity]
         for _ in range(2 if rng.random() < lines.double else 1):
             if rng.random() >= lines.loss:
                 due = now + lines.delay_s + lines.jitter_s * rng.random()

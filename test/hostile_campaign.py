@@ -11,7 +11,7 @@ import numpy as np
 from hostile_bench import Bench
 from hostile_injections import restart
 from hostile_judge import GRACE_S, Body, Judge, Rules, after
-from hostile_kinds import INJECTIONS, WITH_TOPIC, Injection
+from hostile_kinds import INJECTIONS, WITH_TOPIC, WITHOUT_TOPIC, Injection
 from hostile_lines import EMERGENCY
 from hostile_outcomes import Outcome
 from hostile_scene import HOME, Scene, begin, bench_of, demo_body, target
@@ -20,6 +20,11 @@ from remaster_ros.collection.events import SolutionFailed
 
 HALT_WITHIN_S = 4.0
 """A halt not shown so long after the injection was not made, s: see `hostile_scene.FAST`."""
+
+BEGUN_S = 3.0
+"""A bridge has been up for so long before a collection is begun, s."""
+ANEW = 0.8
+"""How often a bridge is started again after a halt, in place of a slow probe of half a minute."""
 
 
 class Campaign:
@@ -57,6 +62,7 @@ class Campaign:
         self.rng = np.random.default_rng(seed)
         self.outcomes: list[Outcome] = []
         self._bench: Bench | None = None
+        self._has_topic = True
         self._life = 0
 
     # Running
@@ -67,8 +73,12 @@ class Campaign:
             for kind in self._draw(count):
                 if time.monotonic() > deadline_s:
                     break
+                topic = self._has_topic if kind.topic is None else kind.topic
+                if self._bench is not None and topic != self._has_topic:
+                    self._bench.close()
+                    self._bench = None
                 if self._bench is None:
-                    self._bench = self._open()
+                    self._bench = self._open(topic)
                 outcome = self._inject(self._bench, kind)
                 self.outcomes.append(outcome)
                 lost = not outcome.moved or not self._recover(self._bench)
@@ -83,18 +93,20 @@ class Campaign:
 
     def _draw(self, count: int) -> Iterable[Injection]:
         """Every kind in turn while that is fair, the rest by weight."""
-        kinds = self.injections or INJECTIONS + WITH_TOPIC
+        kinds = self.injections or INJECTIONS + WITH_TOPIC + WITHOUT_TOPIC
         weights = np.array([kind.weight for kind in kinds])
         shares = weights / weights.sum() * count
         whole = [kind for kind, share in zip(kinds, shares) for _ in range(int(share))]
         rest = self.rng.choice(len(kinds), count - len(whole), p=weights / weights.sum())
         drawn = [*whole, *(kinds[i] for i in rest)]
         self.rng.shuffle(drawn)  # type: ignore[arg-type]
-        return drawn
+        # Another bridge is started for the other half.
+        return sorted(drawn, key=lambda kind: kind.topic is False)
 
-    def _open(self) -> Bench:
+    def _open(self, topic: bool) -> Bench:
         rng = self.rng
         self._life += 1
+        self._has_topic = topic
         bench = bench_of(
             self.domain,
             self.folder / f'life_{self.seed}_{self._life}',
@@ -106,13 +118,13 @@ class Campaign:
             stamp_noise_s=float(rng.choice([0.0, 0.0, 2e-4])),
             exact=bool(rng.random() < 0.3),
             open_loop=bool(rng.random() < 0.3),
-            emergency_stop_topic=EMERGENCY,
+            **({'emergency_stop_topic': EMERGENCY} if topic else {}),
         )
-        bench.emergency_shown = False
+        bench.emergency_shown = False if topic else None
         bench.start()
         bench.until(lambda: bench.seen.summaries, 30.0)
         # As in a cell: everything has been up for a while before the collection is begun.
-        time.sleep(3.0)
+        time.sleep(BEGUN_S)
         return bench
 
     def _inject(self, bench: Bench, kind: Injection) -> Outcome:
@@ -158,10 +170,11 @@ class Campaign:
     def _act(self, kind: Injection, scene: Scene, outcome: Outcome, settled: int) -> None:
         bench, since = scene.bench, time.monotonic()
         kind.act(scene)
+        outcome.expected, outcome.alone = scene.expected or kind.expected, scene.alone
         shown_from = since if scene.note != 'restarted' else time.monotonic() - 0.5
-        if kind.expected == 'halt':
+        if outcome.expected == 'halt':
             bench.until(lambda: bench.seen.halted(shown_from), HALT_WITHIN_S)
-        elif kind.expected == 'go on':
+        elif outcome.expected == 'go on':
             bench.until(
                 lambda: bench.seen.halted(since) or len(bench.seen.settled) > settled, 12.0
             )
@@ -169,7 +182,7 @@ class Campaign:
         else:
             time.sleep(1.0)
         outcome.halted = bench.seen.halted(shown_from)
-        if kind.expected == 'halt' and not outcome.halted and bench.seen.summaries:
+        if outcome.expected == 'halt' and not outcome.halted and bench.seen.summaries:
             _, text, values = bench.seen.summaries[-1]
             scene.note += f'; {bench.planner}; {text}; {values}'
         silent_from = scene.silent_from
@@ -202,6 +215,12 @@ class Campaign:
         if bench.seen.halted():
             if bench.clear_halt() is False:
                 return False
+            if self.rng.random() < ANEW:
+                # Led to where it is by hand, and the bridge begun anew.
+                bench.kill()
+                bench.reset_arm(bench.arm.q)
+                restart(bench)
+                time.sleep(BEGUN_S)
             # Only a collection that is begun after that goes on.
             bench.plan_state('stopped')
             time.sleep(0.1)

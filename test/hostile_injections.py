@@ -19,6 +19,9 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from remaster_ros.types import FloatArray
 
+MOST_OFF_RAD = 2e-3
+"""`arrive_tolerance` of the bridge: an arm that is no further from its end has arrived."""
+
 
 def control(s: Scene) -> None:
     """Nothing is wrong."""
@@ -60,6 +63,81 @@ def sensor_missing(s: Scene) -> None:
     s.bench.waiting_for = 'mocap'
     s.wait(0.3, 1.0)
     s.bench.waiting_for = ''
+
+
+def _waits(s: Scene, pressed: bool) -> None:
+    """A sensor is missing for longer than a program may go on after; then it is back."""
+    bench = s.bench
+    bench.waiting_for = 'mocap'
+    s.wait(1.0, 1.3)
+    if pressed:
+        # Somebody goes to the arm, and is back before the sensor is.
+        bench.arm.stop_by_brakes(time.monotonic())
+        s.wait(0.3, 1.0)
+        bench.arm.release(time.monotonic())
+    s.wait(2.5, 3.0)
+    bench.waiting_for = ''
+
+
+def long_wait(s: Scene) -> None:
+    """The robot reports all the time that nobody has stopped it."""
+    _waits(s, pressed=False)
+
+
+def emergency_in_a_wait(s: Scene) -> None:
+    _waits(s, pressed=bool(s.rng.random() < 0.7))
+    back = time.monotonic()
+    s.wait(1.5, 2.5)
+    s.alone = len(s.bench.commands_since(back))
+
+
+def emergency_while_braking(s: Scene) -> None:
+    """Pressed on the way of a stop, and released; a sensor was missing for a moment."""
+    bench, asked = s.bench, time.monotonic()
+    bench.waiting_for = 'mocap'
+    if not bench.until(lambda: bench.commands_since(asked), 1.5):
+        s.expected, bench.waiting_for = 'any', ''
+        return
+    stop = bench.commands_since(asked)[0]
+    s.wait(0.0, stop.times_s[-1])
+    pressed = time.monotonic()
+    bench.arm.stop_by_brakes(pressed)
+    s.wait(0.3, 1.5)
+    off = np.max(np.abs(bench.arm.q - stop.q[-1]))
+    s.note = f'{np.rad2deg(off):.2f} deg before the end of its stop'
+    # Where it has as good as arrived nothing shows it.
+    s.silent_from, s.expected = (pressed, '') if off > MOST_OFF_RAD else (None, 'any')
+    bench.arm.release(time.monotonic())
+    bench.waiting_for = ''
+
+
+def named_twice(s: Scene) -> None:
+    """Two arms merged without prefix."""
+    s.bench.disturb(twice=True)
+    s.maybe_pause(0.6)
+
+
+def another_robots_joints(s: Scene) -> None:
+    s.bench.disturb(prefix='other_')
+    s.wait(1.3, 1.8)
+
+
+def gripper_beside(s: Scene) -> None:
+    """Its driver publishes its own joints, on its own clock."""
+    publisher = s.bench.intruder.create_publisher(JointState, '/joint_states', RELIABLE)
+    try:
+        s.bench.until(lambda: publisher.get_subscription_count() > 0, 2.0)
+        for _ in range(100):
+            publisher.publish(JointState(name=['finger'], position=[0.01]))
+            time.sleep(0.01)
+    finally:
+        s.bench.intruder.destroy_publisher(publisher)
+
+
+def limit_raised(s: Scene) -> None:
+    """It is refused while the arm moves; what is commanded is judged by the limit before."""
+    s.note = s.bench.set_parameter('speed_share', 1.0)[:60]
+    s.maybe_pause(0.6)
 
 
 def lost_states(s: Scene) -> None:

@@ -54,6 +54,10 @@ class Lines:
         The stamp of the first message from now on comes again and again.
     silent
         Nothing is published.
+    twice
+        Each joint is named twice in joint_states.
+    prefix
+        Before the names of the joints.
     command_delay_s, command_loss, command_double
         The same for commands.
     """
@@ -69,6 +73,8 @@ class Lines:
     frozen: bool = False
     stopped_stamps: bool = False
     silent: bool = False
+    twice: bool = False
+    prefix: str = ''
     command_delay_s: float = 0.0
     command_loss: float = 0.0
     command_double: bool = False

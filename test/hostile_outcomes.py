@@ -23,6 +23,8 @@ class Outcome:
         Of the injection.
     judgements
         One for each command of the bridge.
+    alone
+        Commands after a long wait that no person had ended.
     late_commands
         Commands after the arm or the bridge had stopped for good.
     halted
@@ -43,6 +45,7 @@ class Outcome:
     expected: str
     note: str = ''
     judgements: list[Judgement] = field(default_factory=list)
+    alone: int = 0
     late_commands: int = 0
     halted: str = ''
     moved: bool = True
@@ -54,6 +57,8 @@ class Outcome:
     def wrong(self, rules: Rules) -> list[str]:
         """Return everything that must not be, in words."""
         out = [f'{j.kind}: {text}' for j in self.judgements for text in j.wrong(rules)]
+        if self.alone:
+            out.append(f'{self.alone} commands without a person after a wait')
         if self.late_commands:
             out.append(f'{self.late_commands} commands to an arm that has been stopped')
         if not self.moved:
@@ -79,7 +84,7 @@ def table(outcomes: Sequence[Outcome], rules: Rules) -> str:
     header = (
         'injection', 'expected', 'runs', 'commands', 'joint speed, of what is allowed',
         'arm itself', 'm/s', 'surface m/s', 'rad/s²', 'outside, deg', 'stop off path, deg',
-        'back, deg', 'beyond, deg', 'commands to a stopped arm', 'not halted',
+        'back, deg', 'beyond, deg', 'commands to a stopped arm', 'without a person', 'not halted',
         'halted without reason', 'did not go on', 'runs with anything wrong',
     )  # fmt: skip
     lines = ['| ' + ' | '.join(header) + ' |', '|' + '---|' * len(header)]
@@ -111,6 +116,7 @@ def _row(outcomes: Sequence[Outcome], rules: Rules) -> list[str]:
         worst('acceleration', form='.1f'),
         *(worst(f'{name}_rad', True) for name in ('outside', 'off_path', 'back', 'beyond')),
         str(sum(o.late_commands for o in outcomes)),
+        str(sum(o.alone for o in outcomes)),
         count('not halted'),
         count('halted without'),
         count('did not go on'),

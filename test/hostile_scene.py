@@ -17,7 +17,13 @@ from remaster_ros.types import FloatArray
 
 HOME = np.array([0.0, 0.3, 0.0, 1.0, 0.0, 0.5, 0.0])
 SPREAD = np.array([1.2, 0.35, 0.6, 0.5, 1.0, 0.5, 1.2])
-FAST = {'settle_s': 0.3, 'heartbeat_s': 1.0, 'reaction_s': 0.8, 'stall_s': 0.5}
+FAST = {
+    'settle_s': 0.3,
+    'heartbeat_s': 1.0,
+    'reaction_s': 0.8,
+    'stall_s': 0.5,
+    'resume_alone_s': 3.0,
+}
 """Parameters of a bridge whose decisions come soon, so that a campaign gets through many."""
 
 
@@ -73,7 +79,13 @@ def begin(bench: Bench, solutions: Sequence[FloatArray], timeout_s: float = 15.0
         bench.plan_state('running')
     since = time.monotonic()
     bench.send(solutions)
-    bench.until(lambda: moving(bench, since) or bench.seen.halted(since + 0.2), timeout_s)
+
+    def waited():
+        # A slow probe comes first where it is not sure that the arm is where it is reported.
+        ends = [command.end_s for command in bench.commands_since(since)]
+        return time.monotonic() > max([since, *ends]) + timeout_s
+
+    bench.until(lambda: moving(bench, since) or bench.seen.halted(since + 0.2) or waited(), np.inf)
     return moving(bench, since)
 
 
@@ -100,6 +112,10 @@ class Scene:
         How long the arm is still to move when the injection begins, s.
     silent_from
         From when on nothing may be commanded any more; None if that depends on the halt.
+    expected
+        Of the bridge, where that depends on the moment; else '', and it is that of the kind.
+    alone
+        Commands after a wait that only a person may end.
     latencies
         Times from a request to stop to the stop's arrival, s; infinite where none came.
     note
@@ -114,6 +130,8 @@ class Scene:
     silent_from: float | None = None
     latencies: list[float] = field(default_factory=list)
     note: str = ''
+    expected: str = ''
+    alone: int = 0
 
     def wait(self, low_s: float, high_s: float) -> float:
         """Let a random time pass; returns it, s."""
