@@ -84,7 +84,8 @@ INJECTIONS = (
     *(Injection(act, 'go on') for act in (sensor_missing, lost_states, short_silence)),
     *(Injection(act, 'go on') for act in (a_little_late, command_doubled, pose_taken_back)),
     Injection(pauses, 'go on', 3.0),
-    Injection(process_killed, 'go on', 0.5),
+    # Where the move before it was long, a person goes on after it.
+    Injection(process_killed, 'any', 0.5),
     *(Injection(act, 'halt', 1.5) for act in (emergency, emergency_driver_silent)),
     *(Injection(act, 'halt') for act in (emergency_released, emergency_while_measuring)),
     *(Injection(act, 'halt') for act in (emergency_while_paused, process_paused_emergency)),
