@@ -505,6 +505,9 @@ class ArmSupervisor:
         if stop_wall_s is not None and seen is not None and moving:
             known = not self._motion.lost(seen, stop_wall_s)
             stops = self._motion.stop(reason, seen, stop_wall_s, self._rate) if known else []
+        if self.halted and not reason.startswith(self.halted):
+            # Why it was halted first is what a person has to see to.
+            reason = f'{self.halted}; {reason}'
         self.halted = reason
         self._motion.visit, self._queue.pending = None, None
         return [*stops, Halted(reason)]

@@ -40,6 +40,21 @@ def test_an_emergency_stop_while_it_brakes_halts(trial):
     assert len(rig.said(Drive)) == 1
 
 
+def test_what_halts_an_arm_that_is_being_halted_does_not_hide_why_it_was():
+    """An emergency stop while it brakes, as a second publisher was noticed."""
+    rig = Rig()
+    rig.go([0.9, -1.9], 1.2)
+    rig.do(rig.supervisor.observe('rivals', 'two publishers', rig.wall))
+    assert rig.said(Stop)
+    rig.run(0.1)
+    freeze(rig)
+    rig.run(4.0)
+    first, second = rig.said(Halted)
+    assert first.reason == 'two publishers'
+    assert second.reason.startswith('two publishers; the arm stands ')
+    assert rig.supervisor.halted == second.reason
+
+
 @pytest.mark.parametrize('rate', [1.0, 10.0])
 def test_a_stop_that_is_long_on_its_way_is_no_emergency_stop(rate):
     """The arm has come to the end of its move meanwhile, stands there and then goes back."""
