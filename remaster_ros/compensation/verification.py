@@ -6,9 +6,10 @@ acts twice, or with the wrong sign. Beside them, ``other``: each joint has a sha
 
 *Absolute*: of the rows with the correction on, base and marker fitted again. *Toggle*: of the
 differences on - off of one configuration; it sees only what is switched, not what the controller
-has besides. A state is called where its odds against each of the others are `ODDS`, and ``other``
-is less likely than it; ``other``, where its odds are `ODDS`. The noise is not known: likelihoods
-are integrated over its logarithm.
+has besides. A state is called where its odds are `ODDS` against each of the others, and neither
+``other`` nor a single joint in another state, where these rows can tell it, is more likely;
+``other``, where its odds are `ODDS`. The noise is not known: likelihoods are integrated over its
+logarithm.
 """
 
 from __future__ import annotations
@@ -140,13 +141,15 @@ def verify(compensator: Compensator, visits: Visits) -> Verified:
             f'{int(visits.on.sum())} rows with the correction on do not tell base, marker and '
             'what acts of the correction; measure ten poses'
         )
-    absolute, joints = _absolute(on)
+    absolute, joints, rivals = _absolute(on)
     toggle, noise = _toggle(compensator, visits)
     off = None
     if len(off_rows) and 3 * len(off_rows) > on.base_columns + 3:
         off = _Side(compensator, visits, off_rows).error()
     left = on.projected(on.measured - on.at['in_use'])
-    poses = _poses(on) if absolute.verdict == 'unclear' else None
+    poses = None
+    if absolute.verdict == 'unclear':
+        poses = _poses(on, rivals)
     return Verified(
         absolute.verdict,
         toggle,
@@ -269,7 +272,8 @@ def _integrated(values: FloatArray) -> float:
     return float(top + np.log(np.mean(np.exp(values - top))))
 
 
-def _absolute(side: _Side) -> tuple[Estimate, list[Estimate]]:
+def _absolute(side: _Side) -> tuple[Estimate, list[Estimate], list[FloatArray]]:
+    """Return the estimates, and the displacements by what was not excluded, projected."""
     states, other = {}, {}
     for state, q in side.commands.items():
         residual = side.projected(side.measured - side.at[state])
@@ -278,15 +282,46 @@ def _absolute(side: _Side) -> tuple[Estimate, list[Estimate]]:
         states[state] = _integrated(_log_likelihood(residual, unsure))
         other[state] = _log_likelihood(residual, np.hstack((unsure, moves)))
     best = max(states, key=lambda state: states[state])
+    sigma = float(SIGMAS[np.argmax(other[best])])
+    rivals = [
+        side.projected(side.at[state] - side.at[best])
+        for state, value in states.items()
+        if state != best and states[best] - value < np.log(ODDS)
+    ]
+    rivals += _odd_joints(side, best, sigma, states[best])
     verdict = _called(states, _integrated(other[best]))
-    sigma = SIGMAS[np.argmax(other[best])]
+    if verdict == best and rivals:
+        verdict = 'unclear'
     share, std = _shares(side, best, sigma, whole=True)
     every, stds = _shares(side, best, sigma, whole=False)
     joints = [
         Estimate(float(one), float(s), _nearest(float(one), float(s)))
         for one, s in zip(every, stds, strict=True)
     ]
-    return Estimate(float(share[0]), float(std[0]), verdict), joints
+    return Estimate(float(share[0]), float(std[0]), verdict), joints, rivals
+
+
+def _odd_joints(side: _Side, best: Verdict, sigma: float, evidence: float) -> list[FloatArray]:
+    """Return what single joints in another state would do that these rows can tell, and do not."""
+    unsure = side.projected(side.unsure(side.commands[best]))
+    residual = side.projected(side.measured - side.at[best])
+    moves = side.projected(side.moves(side.commands[best]))
+    found = []
+    for move in moves.T:
+        for share in STATES.values():
+            step = (share - STATES[best]) * move
+            if _expected(step, unsure, sigma) > ENOUGH:
+                odd = _integrated(_log_likelihood(residual - step, unsure))
+                # Of what can be told, one in a thousand is on the wrong side of even odds.
+                if odd > evidence:
+                    found.append(step)
+    return found
+
+
+def _expected(step: FloatArray, unsure: FloatArray, sigma: float) -> float:
+    """Return the expected logarithm of the odds between two states that are a step apart."""
+    covariance = sigma**2 * np.eye(len(step)) + unsure @ unsure.T
+    return 0.5 * float(step @ np.linalg.solve(covariance, step))
 
 
 def _called(states: Mapping[Verdict, float], other: float) -> Verdict:
@@ -378,17 +413,15 @@ def _toggle(compensator: Compensator, visits: Visits) -> tuple[Estimate | None, 
     return Estimate(share, precision**-0.5, verdict), noise
 
 
-def _poses(side: _Side) -> int | None:
-    """Return how many poses would tell the states apart; None where so many would not."""
-    residual = side.projected(side.measured - side.at['in_use'])
-    values = _log_likelihood(residual, side.projected(side.unsure(side.command)))
-    sigma = SIGMAS[np.argmax(values)]
-    count = len(side.wanted)
-    step = side.projected(side.at['not_in_use'] - side.at['in_use'])
+def _poses(side: _Side, rivals: list[FloatArray]) -> int | None:
+    """Return how many poses would exclude what these do not; None where so many would not."""
     unsure = side.projected(side.unsure(side.command))
-    for poses in (count * factor for factor in np.geomspace(1.0, MOST_POSES / count, 60)):
+    residual = side.projected(side.measured - side.at['in_use'])
+    sigma = float(SIGMAS[np.argmax(_log_likelihood(residual, unsure))])
+    count = len(side.wanted)
+    # At least half as many again: so many were too few.
+    for poses in count * np.geomspace(1.5, MOST_POSES / count, 60):
         noise = sigma * np.sqrt(count / poses)
-        covariance = noise**2 * np.eye(len(step)) + unsure @ unsure.T
-        if 0.5 * float(step @ np.linalg.solve(covariance, step)) > ENOUGH:
+        if all(_expected(step, unsure, noise) > ENOUGH for step in rivals):
             return int(np.ceil(poses))
     return None
