@@ -56,6 +56,8 @@ class Seen:
         How much later than usual it came, s: the arm has gone on meanwhile.
     changed
         When each joint's position last differed from the report before (robot time, s, (k,)).
+    resumed
+        Of the first report after the last gap, robot time, s.
     """
 
     q: FloatArray
@@ -66,6 +68,7 @@ class Seen:
     stands_since: float
     late_s: float
     changed: FloatArray = field(default_factory=lambda: np.array(-np.inf))
+    resumed: float = -np.inf
 
     @classmethod
     def after(
@@ -74,14 +77,16 @@ class Seen:
         """Follow robot time and standstill; a gap begins the standstill anew."""
         q, stamp, wall = report.q, report.stamp_s, report.wall_s
         if last is None:
-            return cls(q, stamp, wall, stamp, q, stamp, late_s, np.full(len(q), -np.inf))
+            return cls(q, stamp, wall, stamp, q, stamp, late_s, np.full(len(q), -np.inf), stamp)
         time = last.time + stamp - last.stamp
         changed = np.where(q != last.q, time, last.changed)
         moved = np.any(np.abs(q - last.stands_at) > rules.settle.still_tolerance)
-        if moved or stamp - last.stamp > rules.settle.max_gap_s:
-            return cls(q, stamp, wall, time, q, time, late_s, changed)
+        is_gap = stamp - last.stamp > rules.settle.max_gap_s
+        resumed = time if is_gap else last.resumed
+        if moved or is_gap:
+            return cls(q, stamp, wall, time, q, time, late_s, changed, resumed)
         at, since = last.stands_at, last.stands_since
-        return cls(q, stamp, wall, time, at, since, late_s, changed)
+        return cls(q, stamp, wall, time, at, since, late_s, changed, resumed)
 
     def is_fresh(self, wall_s: float) -> bool:
         """Whether it shows where the arm is now."""

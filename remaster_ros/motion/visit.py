@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 
 from remaster_ros.motion.actions import Settled, SupervisorRules
-from remaster_ros.motion.following import ON_PATH_RAD, Following, Seen
+from remaster_ros.motion.following import ON_PATH_RAD, STANDING_S, Following, Seen
 from remaster_ros.motion.settling import SettleDetector
 from remaster_ros.motion.trajectory import Trajectory
 from remaster_ros.types import FloatArray
@@ -136,6 +136,7 @@ class Braking:
             return ('halted', elsewhere) if early else UNDER_WAY
         if stands and off <= self.near:
             return 'over', ''
-        if seen.time > self.deadline:
+        # Whether an arm stands shows in its reports after a while; one may still come to rest.
+        if seen.time > max(self.deadline, seen.resumed + 2.0 * STANDING_S):
             return 'halted', elsewhere if stands else 'the arm goes on after a stop'
         return UNDER_WAY

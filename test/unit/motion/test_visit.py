@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from remaster_ros.motion.actions import SupervisorRules
-from remaster_ros.motion.following import ON_PATH_RAD, Following, Seen
+from remaster_ros.motion.following import ON_PATH_RAD, STANDING_S, Following, Seen
 from remaster_ros.motion.settling import SettleDetector, SettleRules
 from remaster_ros.motion.trajectory import Line, Trajectory
 from remaster_ros.motion.visit import MOVED_RAD, PROBE_WAIT_S, Braking, Visit
@@ -136,3 +136,19 @@ def test_an_arm_that_still_brakes_before_its_stop_is_over_is_waited_for():
 def test_how_long_a_stop_may_take(late, outcome):
     stop = braking()
     assert stop.judge(at([1.0, 0.0], SENT_S + 4.0 + late))[0] == outcome
+
+
+@pytest.mark.parametrize(
+    ('after_gap_s', 'off', 'stood_s', 'outcome'),
+    [
+        # A report alone does not show whether the arm stands: neither that it goes on.
+        (0.0, 0.0, 0.0, ''),
+        (2.0 * STANDING_S, 1.0, 0.0, ''),
+        (2.0 * STANDING_S + 2.0**-20, 1.0, 0.0, 'halted'),
+        (STANDING_S, 0.0, STANDING_S, 'over'),
+    ],
+)
+def test_what_the_first_reports_after_a_silence_show(after_gap_s, off, stood_s, outcome):
+    seen = at([off, 0.0], SENT_S + 9.0, stood_s)
+    seen = dataclasses.replace(seen, resumed=SENT_S + 9.0 - after_gap_s)
+    assert braking(over=2.0).judge(seen)[0] == outcome
