@@ -231,7 +231,7 @@ def exported(
         if motors:
             files['motor_numbers.txt'] = motor_text(offsets, motors)
         return files
-    path, text = base or (Path(URDF_FILE), compensation.content.robot.urdf)
+    path, text = base or (Path('robot.urdf'), compensation.content.robot.urdf)
     try:
         root = parsed_xml(text)
     except ElementTree.ParseError as error:

@@ -290,7 +290,7 @@ def test_transmissions_give_the_true_angle(tmp_path):
 def test_parameters_of_drivers_have_the_other_sign(tmp_path):
     file, offsets = only_offsets(tmp_path)
     out = export(file, 'ros2_control', tmp_path / 'o', '--driver-param')
-    root = ElementTree.fromstring((out / 'robot_calibrated.urdf').read_text())
+    root = ElementTree.fromstring((out / 'robot.urdf').read_text())
     q = configurations()
     # dynamixel_hardware: reported = raw - offset.
     given = [
@@ -364,7 +364,7 @@ def test_what_is_left_out_is_stated_and_no_offset_without_its_cause(tmp_path, ca
     out = tmp_path / 'o'
     assert main(['export', str(file), '--to', 'rising', '--out', str(out), '--json']) == 0
     left = json.loads(capsys.readouterr().out)['left_out']
-    root = ElementTree.fromstring((out / 'robot_calibrated.urdf').read_text())
+    root = ElementTree.fromstring((out / 'robot.urdf').read_text())
     rising = np.array(
         [float(root.find(f"joint[@name='{n}']/calibration").get('rising')) for n in NAMES]
     )

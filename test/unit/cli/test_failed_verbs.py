@@ -70,6 +70,9 @@ VERBS: dict[str, Callable[[Path, Path], list[object]]] = {
     'report': lambda made, out: [
         *(made / 'session', made / 'fit', '--out', out / 'new/page', '--no-figures')
     ],
+    'export': lambda made, out: [
+        *(made / 'fit/apply/compensation.json', '--to', 'json', '--out', out / 'new/tables')
+    ],
     'accuracy': lambda made, out: [
         *(made / 'session', '--offsets', made / 'fit/fit.json', '--out', out / 'new/metrics.json')
     ],
