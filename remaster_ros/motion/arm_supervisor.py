@@ -505,11 +505,9 @@ class ArmSupervisor:
         if stop_wall_s is not None and seen is not None and moving:
             known = not self._motion.lost(seen, stop_wall_s)
             stops = self._motion.stop(reason, seen, stop_wall_s, self._rate) if known else []
-        if self.halted and not reason.startswith(self.halted):
-            # Why it was halted first is what a person has to see to.
-            reason = f'{self.halted}; {reason}'
         self.halted = reason
-        self._motion.visit, self._queue.pending = None, None
+        # Nothing is judged any more: why it was halted first is what a person has to see to.
+        self._motion.visit, self._motion.braking, self._queue.pending = None, None, None
         return [*stops, Halted(reason)]
 
     def _stop(self, reason: str, wall_s: float) -> list[Action]:
