@@ -505,10 +505,11 @@ class ArmSupervisor:
         if stop_wall_s is not None and seen is not None and moving:
             known = not self._motion.lost(seen, stop_wall_s)
             stops = self._motion.stop(reason, seen, stop_wall_s, self._rate) if known else []
-        self.halted = reason
-        # Nothing is judged any more: why it was halted first is what a person has to see to.
-        self._motion.visit, self._motion.braking, self._queue.pending = None, None, None
-        return [*stops, Halted(reason)]
+        # Why it was halted first is what a person has to see to. An arm that does not brake after
+        # that is halted once more all the same: a controller by action is cancelled then.
+        self.halted = self.halted or reason
+        self._motion.visit, self._queue.pending = None, None
+        return [*stops, Halted(self.halted)]
 
     def _stop(self, reason: str, wall_s: float) -> list[Action]:
         """Stop an arm that is on its way; the configuration is commanded again later.
