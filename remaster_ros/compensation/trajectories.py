@@ -11,8 +11,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike
-from scipy.interpolate import CubicHermiteSpline
 
 from remaster_ros.compensation.compensator import Compensator
 from remaster_ros.errors import InputError
@@ -142,7 +142,7 @@ class _Path:
 
     def __init__(self, t: FloatArray, q: FloatArray, v: FloatArray | None) -> None:
         self.t, self.q, self.v = t, q, v
-        self._cubic = None if v is None else CubicHermiteSpline(t, q, v)
+        self._cubic = None if v is None else scipy.interpolate.CubicHermiteSpline(t, q, v)
 
     def at(self, times: FloatArray) -> FloatArray:
         """Return positions, (n, k)."""
