@@ -27,7 +27,8 @@ WORDS: dict[Verdict, str] = {
     'not_in_use': 'The correction does not act: load it, or see why it is not taken.',
     'twice': 'The correction acts twice: take it out of one of the two places (the zeros on the '
     'pad and a layer or model, say).',
-    'wrong_sign': 'The correction acts with the wrong sign: turn the sign of what you entered.',
+    'wrong_sign': 'The correction acts with the wrong sign: undo what you entered, then enter it '
+    'with the other sign.',
     'other': 'Something acts that is not this correction as a whole: see the joints.',
     'unclear': 'These rows do not tell.',
 }

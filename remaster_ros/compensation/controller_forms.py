@@ -1,7 +1,8 @@
 """A correction in the forms that controllers and drivers take, with what each leaves out.
 
-Where a form cannot hold all of a correction its zero-offsets are fitted again to the whole one,
-base and marker too: those that belong to causes which are left out would be worse than none.
+Where a form cannot hold all of a correction what it holds is fitted again to the whole one, base
+and marker too: offsets, lengths and tilts that belong to causes which are left out would be worse
+than none.
 """
 
 from __future__ import annotations
@@ -45,6 +46,15 @@ KINEMATICS_FORMAT = 'remaster-kinematics/1'
 COMPARED = 400
 # Of Gauss and Newton: what is left out is at most some millimetres, so each leaves a thousandth.
 STEPS = 3
+# How far lengths (m) and tilts (rad) go from those of the correction: what a drawing is wrong by,
+# a metre away. What is hardly told of them stays.
+GEOMETRY_STD = 1e-3
+NEARER = (
+    'The compensation.json that "remaster fit" writes of the same session holds offsets, lengths '
+    'and tilts alone, fitted to what was measured: export that one, it is nearer.'
+)
+# Of parts that are listed one by one: half of the last digit shown, RMS.
+LEAST_PART_MM = 5e-3
 # Links of a UR's kinematics file, by the ends of its joints' names.
 UR_LINKS = {
     'shoulder_pan_joint': 'shoulder',
@@ -80,6 +90,8 @@ class Held:
         At the marker after all, over the measured range.
     never
         What no form corrects.
+    nearer
+        Which file's export is nearer to what was measured; ''.
     """
 
     model: ArmModel
@@ -87,6 +99,7 @@ class Held:
     rms_mm: float
     max_mm: float
     never: tuple[LeftPart, ...] = ()
+    nearer: str = ''
 
     @property
     def words(self) -> list[str]:
@@ -99,10 +112,14 @@ class Held:
         ]
         if not self.parts:
             return ['Left out: nothing that can be corrected.', *never]
+        shown = [part for part in self.parts if part.rms_mm >= LEAST_PART_MM]
+        rest = len(self.parts) - len(shown)
         return [
             f'Left out: {self.rms_mm:.3f} mm RMS at the marker, {self.max_mm:.3f} mm at most, '
-            'over the measured range, with the zero-offsets fitted to the whole correction.',
-            *(f'Left out: {part.what}, alone {part.rms_mm:.3f} mm RMS.' for part in self.parts),
+            'over the measured range, with what it holds fitted to the whole correction.',
+            *(f'Left out: {part.what}, alone {part.rms_mm:.2f} mm RMS.' for part in shown),
+            *([f'Left out: {rest} more below 0.01 mm each.'] if rest else []),
+            *filter(None, [self.nearer]),
             *never,
         ]
 
@@ -112,8 +129,8 @@ def held(compensation: Compensation, form: Form, rng: np.random.Generator) -> He
     model, content = compensation.model, compensation.content
     known = np.array([part.identifiable for part in content.joints])
     k = model.joints
-    geometry = Geometry.none(k)
-    if form in WITH_GEOMETRY:
+    geometry, with_geometry = Geometry.none(k), form in WITH_GEOMETRY and model.geometry.is_any
+    if with_geometry:
         # A shift of the tool frame is one of the marker, which is fitted again.
         geometry.shifts[:k], geometry.turns[:k] = (
             model.geometry.shifts[:k],
@@ -140,14 +157,23 @@ def held(compensation: Compensation, form: Form, rng: np.random.Generator) -> He
     free[:k] = known
     for where in (*plain.registration(sensor), plain.marker(marker)):
         free[where] = True
+    of_geometry = np.array([_is_of_a_joint(name) for name in plain.parameter_names])
+    free |= of_geometry & with_geometry
+    total = np.zeros(len(free))
     for _ in range(STEPS):
         columns = plain.derivative(plain.state(q), sensor, marker)[..., free]
-        error = (wanted - place(plain)) @ turn.T
+        columns = columns.reshape(-1, columns.shape[-1])
+        error = ((wanted - place(plain)) @ turn.T).ravel()
+        held_back = np.eye(len(free))[of_geometry & with_geometry][:, free]
+        held_back *= np.sqrt(np.mean(error**2)) / GEOMETRY_STD
         step = np.zeros(len(free))
         # Of what base and marker do as well as an offset, the smallest step.
         step[free] = np.linalg.lstsq(
-            columns.reshape(-1, columns.shape[-1]), error.ravel(), rcond=1e-9
+            np.concatenate((columns, held_back)),
+            np.concatenate((error, -held_back @ total[free])),
+            rcond=1e-9,
         )[0]
+        total += step
         plain = plain.moved(step)
     left = np.linalg.norm(wanted - place(plain), axis=1)
     parts = tuple(
@@ -160,7 +186,14 @@ def held(compensation: Compensation, form: Form, rng: np.random.Generator) -> He
         1e3 * float(np.sqrt(np.mean(left**2))),
         1e3 * float(left.max(initial=0.0)),
         tuple(content.not_corrected),
+        NEARER if with_geometry and parts and content.source.made_by == 'discover' else '',
     )
+
+
+def _is_of_a_joint(name: str) -> bool:
+    """Whether a parameter is a length or tilt before a joint, and not of the tool."""
+    kind, _, rest = name.partition('.')
+    return kind == 'geometry' and rest.rpartition('.')[0] != 'tool'
 
 
 def _without(model: ArmModel, form: Form) -> list[tuple[str, ArmModel]]:

@@ -264,6 +264,8 @@ def written(
         How the robot's own pad writes the joints.
     """
     model, chain = described.model, described.model.chain
+    joints = [term.joint for term in model.joint_terms]
+    assert joints == sorted(joints), 'parameters of terms are counted as they stand in the file'
     names = chain.joint_names
     std = np.linalg.norm(model.root, axis=0)
     kept = np.flatnonzero(np.any(model.root != 0.0, axis=0))

@@ -192,6 +192,8 @@ def _described(
         for slot, matrix in found:
             slots.setdefault(slot, len(matrix))
             maps.append((slot, where, matrix))
+    # The file has the terms of one joint after those of another, and counts parameters so.
+    slots = dict(sorted(slots.items(), key=lambda item: item[0].joint))
     draws, mean = _draws(fit)
     values = {slot: np.zeros(size) for slot, size in slots.items()}
     spread = {slot: np.zeros((len(draws), size)) for slot, size in slots.items()}

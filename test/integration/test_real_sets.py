@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from remaster_ros import read_compensation
 from remaster_ros.calibration.fit import FitResult, fit_session
+from remaster_ros.compensation.compensator import Compensator
+from remaster_ros.compensation.controller_forms import held
 from remaster_ros.discovery.discover import discover_session
+from remaster_ros.reports.discovery_apply import compensation_of
+from remaster_ros.reports.discovery_json import predictions_of, save_discovery
 from remaster_ros.session.reader import read_session
 from remaster_ros.types import Session
 
@@ -72,3 +78,24 @@ def test_errors_that_no_cause_stands_out_of_are_never_nothing() -> None:
     assert 'no single cause stands out of them' in left.next
     # The model that has it does no harm.
     assert found.gain.held_out_rms_after_m < found.gain.held_out_rms_before_m
+
+
+def test_what_can_be_loaded_of_a_panda(tmp_path: Path) -> None:
+    """Its kinds of errors have many terms at each joint: the file is read as it was meant."""
+    found = discover_session(real('panda_left'), rng=np.random.default_rng(0))
+    save_discovery(found, tmp_path, figures=False)
+    file = read_compensation(tmp_path / 'apply/compensation.json')
+    memory = Compensator(compensation_of(found, predictions_of(found).widening).model)
+    q = found.residuals.context.measurements.q
+    tools = [one.tool(one.command(q)) for one in (memory, file.compensator)]
+    assert np.abs(tools[0] - tools[1]).max() < 1e-9
+    covariances = [one.uncertainty(q) for one in (memory, file.compensator)]
+    np.testing.assert_allclose(covariances[0], covariances[1], rtol=1e-4, atol=1e-18)
+    # A URDF holds lengths and tilts: those beside its soft base would leave 1.16 mm.
+    left = held(file, 'urdf', np.random.default_rng(0))
+    assert left.rms_mm < 0.9
+    assert 'export that one' in left.nearer
+    loadable = json.loads((tmp_path / 'discovery.json').read_text())['loadable']
+    offsets, geometry, everything = (row['held_out_mean_mm'] for row in loadable)
+    assert offsets > 1.0
+    assert everything < geometry < 0.33
