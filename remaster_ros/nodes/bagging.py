@@ -25,7 +25,7 @@ from remaster_ros.session.bag_writer import BagWriter
 DEEP = QoSProfile(depth=2000, reliability=ReliabilityPolicy.RELIABLE)
 """What a busy recorder has not yet taken is kept for it: seconds of the fastest stream."""
 MOST_AT_ONCE = 100
-"""Of one topic, before the others have their turn."""
+"""Of one topic, before the others have their turn: some 20 ms of a processor."""
 MOST_EARLY = 20_000
 """Messages that are kept while there is no clock: some ten seconds of the fastest streams."""
 
