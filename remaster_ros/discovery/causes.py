@@ -106,7 +106,9 @@ class Search:
 
     def fit(self, cells: Sequence[Cell], start: Solution | None = None) -> Solution | None:
         """Fit a set; None for two cells of the same parameters, or of a sign physics excludes."""
-        names = [name for cell in cells for name in cell.parameters]
+        # A family has the parameters of its members: none of these is fitted beside it.
+        of_family = {family.cell: family.parameters for family in self.families}
+        names = [name for cell in cells for name in of_family.get(cell, cell.parameters)]
         if len(set(names)) < len(names) or not self.data.leaves_noise(cells):
             return None
         wanted = frozenset(cells)

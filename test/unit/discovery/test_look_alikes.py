@@ -89,6 +89,16 @@ def test_what_two_cells_explain_may_be_one_other_or_one_of_them():
     assert effect.tied
 
 
+def test_a_curve_is_not_fitted_beside_a_family_that_has_it():
+    """Its parameters would be there twice, and `discover` ended in a traceback."""
+    data = eccentric()
+    curves = cells_of(data, 'joint_error_curve', 2, 3, 4)
+    search = Search(data, curves)
+    (family,) = search.families
+    assert search.fit([family.cell]) is not None
+    assert search.fit([family.cell, curves[0]]) is None
+
+
 @pytest.mark.qualify
 def test_the_largest_cause_is_in_doubt_also_where_held_out_poses_gain_nothing(monkeypatch):
     session = session_with(41, lambda s: at_joint(2, ARC_MINUTE * np.sin(s.measurements.q[:, 1])))
