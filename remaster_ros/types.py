@@ -76,6 +76,10 @@ class Observation:
     orientation
         Mean orientation of the measured body in N over the dwell, unit quaternion x, y, z, w,
         (4,); None where it was not measured.
+    wanted
+        The reported joint positions less what a correction changed, rad, (k,); None where unknown.
+    correction
+        Whether a correction was on; None where unknown.
     """
 
     observation: int
@@ -93,6 +97,8 @@ class Observation:
     temperature_c: float | None = None
     frame: int | None = None
     orientation: FloatArray | None = None
+    wanted: FloatArray | None = None
+    correction: bool | None = None
 
 
 @dataclass(frozen=True)
@@ -273,6 +279,10 @@ class Controller:
     maker: str = ''
 
 
+BRIDGE = 'robot_bridge'
+"""The form of a correction that the robot bridge makes of what it commands."""
+
+
 @dataclass(frozen=True)
 class Correction:
     """The correction that was on while a session was measured.
@@ -287,6 +297,19 @@ class Correction:
 
     form: str
     sha256: str = ''
+
+    @property
+    def is_inside(self) -> bool:
+        """Whether it is in the controller: the joint angles that this reports have it in them."""
+        return self.form in ('pad', 'rising', 'ros2_control')
+
+    @property
+    def is_beside(self) -> bool:
+        """Whether it is outside of the controller, whose joint angles are as without it."""
+        return self.form in (BRIDGE, 'layer', 'urdf')
+
+    def __str__(self) -> str:
+        return self.form + (f', checksum {self.sha256[:8]}' if self.sha256 else '')
 
 
 @dataclass(frozen=True)
@@ -373,6 +396,61 @@ class Session:
     def marker_names(self) -> tuple[str, ...]:
         """Marker names in index order."""
         return tuple(self.markers)
+
+    @property
+    def is_corrected(self) -> BoolArray:
+        """Where a correction was on, (n,); unknown rows of a session that states one count."""
+        given, unknown = self.measurements.correction, self.correction is not None
+        if given is None:
+            return np.full(len(self.measurements), unknown)
+        return np.where(given < 0, unknown, given == 1)
+
+    @property
+    def correction_note(self) -> str:
+        """What zero-offsets of the reported angles are beside the correction; '' without one."""
+        on = self.is_corrected
+        if not on.any():
+            return ''
+        measured = f'Measured with a correction on ({self.correction or "its form is not stated"})'
+        if self.correction is None or not (self.correction.is_inside or self.correction.is_beside):
+            return (
+                f'{measured}: whether the zero-offsets found here come on top of it or take its '
+                'place cannot be told; give session.yaml the key correction with form '
+                'robot_bridge, layer, urdf, pad, rising or ros2_control.'
+            )
+        if self.correction.is_inside:
+            return (
+                f'{measured}, in the controller: the zero-offsets found here are what remains, '
+                'and come on top of it.'
+            )
+        return (
+            f'{measured}, beside the controller, whose reported angles are as without it: the '
+            'zero-offsets found here are the whole ones again, take its place and never come on '
+            'top of it; whether it is in use, and what remains, tells remaster verify.'
+        )
+
+    def through_correction(self) -> Session:
+        """Return the rows with the correction on as the nominal robot: at the angles wanted.
+
+        What is found of them is what remains beside the correction, and nothing to be loaded.
+
+        Raises
+        ------
+        ValueError
+            No row has a correction on, or one of these does not tell what was wanted.
+        """
+        on = self.is_corrected
+        found = replace(self.select(on), correction=None, references=None)
+        m = found.measurements
+        if m.wanted is None or not len(m) or np.isnan(m.wanted).any():
+            raise ValueError(
+                'a row with the correction on does not tell what was wanted (wanted1_rad …)'
+                if len(m)
+                else 'no row has a correction on'
+            )
+        unknown = np.full_like(m.q, np.nan)
+        plain = replace(m, q=m.wanted, from_q=unknown, wanted=None, correction=None)
+        return replace(found, measurements=plain)
 
     def select(self, rows: BoolArray | IntArray) -> Session:
         """Return this session with only the given rows."""

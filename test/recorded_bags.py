@@ -9,6 +9,7 @@ import numpy as np
 from rosbags.typesys import Stores, get_typestore
 
 from remaster_ros.collection import events
+from remaster_ros.collection.message_fields import WANTED
 from remaster_ros.kinematics.transforms import apply, inverse, transform
 from remaster_ros.session.bag_writer import BagWriter
 from remaster_ros.session.session_recorder import Parameters
@@ -35,12 +36,14 @@ class RecordedArm:
         Now.
     frames
         What the camera saw at each configuration after it had settled: (stamps, positions).
+    change
+        What the bridge's correction changes of what was wanted, rad, (k,); None without one.
     """
 
     def __init__(self, folder, seed):
         self.rng, self.t, self.poses = np.random.default_rng(seed), 100.0, 0
         self.writer, self.frames, self.shots = BagWriter(folder), [], []
-        self.q = np.zeros(len(CHAIN))
+        self.q, self.change = np.zeros(len(CHAIN)), None
 
     def header(self, t):
         ns = round(t * 1e9)
@@ -62,10 +65,13 @@ class RecordedArm:
         self.record('/recorder', events.RecorderBegan(parameters=p, cell=cell))
 
     def joints(self, topic='/joint_states'):
-        empty = np.zeros(0)
+        empty, names, position = np.zeros(0), list(CHAIN.joint_names), self.q.copy()
+        if topic == '/remaster/settled' and self.change is not None:
+            names += [f'{WANTED}{name}' for name in names]
+            position = np.concatenate((position, position - self.change))
         message = ros(
-            STATE, header=self.header(self.t), name=list(CHAIN.joint_names),
-            position=self.q.copy(), velocity=empty, effort=empty,
+            STATE, header=self.header(self.t), name=names,
+            position=position, velocity=empty, effort=empty,
         )  # fmt: skip
         self.write(topic, STATE, message)
 
@@ -98,7 +104,7 @@ class RecordedArm:
 
     def stand(self, q, seconds, *, camera=True, shot_after=None):
         """Stand at a configuration from now on: what robot and sensors publish, frame by frame."""
-        self.q = q
+        self.q = q if self.change is None else q + self.change
         self.joints('/remaster/settled')
         self.stand_on(seconds, camera=camera, shot_after=shot_after)
 

@@ -20,7 +20,7 @@ from remaster_ros.session.recovery import recover_session
 from remaster_ros.session.session_opening import PLAN
 from remaster_ros.session.session_writer import SessionWriter
 from remaster_ros.session.yaml_records import load_yaml
-from remaster_ros.types import Measurements, Observation, Session
+from remaster_ros.types import Correction, Measurements, Observation, Session
 
 JOINT = """<joint name="joint_{n}" type="revolute">
   <parent link="{parent}"/><child link="{child}"/>
@@ -70,6 +70,9 @@ class Life(NamedTuple):
         return [observation for group in self.groups for observation in group]
 
 
+CORRECTION = Correction('robot_bridge', 'ab12')
+
+
 def session_header() -> Session:
     return Session(
         urdf=URDF,
@@ -105,6 +108,8 @@ def make_observations(seed: int, configurations: int) -> list[list[Observation]]
                     position=rng.normal(size=3),
                     from_q=rng.uniform(-2, 2, 2) if rng.random() < 0.8 else None,
                     samples=1,
+                    wanted=rng.uniform(-2, 2, 2) if seed % 2 == 0 else None,
+                    correction=bool(configuration % 3) if seed % 2 == 0 else None,
                 )
             )
             number += 1
@@ -127,6 +132,8 @@ def live(root: Path, seed: int, configurations: int = 8) -> Life:
         plan = Journal(root / 'new' / 'session' / PLAN)
         status = 'aborted'
         mark()
+        if seed % 2 == 0:
+            writer.correct(CORRECTION)
         for number, group in enumerate(groups):
             if chooser.random() < 0.4:
                 plan.append({'kind': 'pose', 'pose': number, 'name': 'größer'})
@@ -217,6 +224,9 @@ def go_on(session: Path, life: Life, acknowledged: int, possible: int):
         assert acknowledged == possible == len(life.observations)
         return
     assert acknowledged <= writer.observations <= possible
+    if life.observations[0].wanted is not None:
+        assert writer.correction in ((CORRECTION,) if acknowledged else (None, CORRECTION))
+        writer.correct(CORRECTION)
     # All rows of a configuration are there, or none is.
     numbers = [record['number'] for record in writer.records if record['kind'] == 'configuration']
     assert numbers == list(range(len(numbers)))
@@ -240,6 +250,10 @@ def compare(session: Path, life: Life, counts: range, statuses: set[str]):
         assert m.stamp_s[i] == wanted.stamp_s
         assert (m.q[i] == wanted.q).all()
         assert (m.position[i] == wanted.position).all()
+        if wanted.wanted is not None:
+            assert read.correction == CORRECTION
+            assert (m.wanted[i] == wanted.wanted).all()
+            assert m.correction[i] == wanted.correction
 
 
 def snapshot(folder: Path) -> dict[str, bytes]:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from remaster_ros.calibration.mistakes import sound_estimate
 from remaster_ros.errors import InputError, InsufficientDataError, MistakeFoundError
-from remaster_ros.session.reader import read_session
+from remaster_ros.session.reader import ROWS, read_session
 from remaster_ros.session.together import together
 from remaster_ros.types import Session
 
@@ -26,6 +26,19 @@ def read_together(folders: Sequence[Path]) -> tuple[Session, list[str]]:
     return together(sessions)
 
 
+def _one_arm(session: Session, folder: Path) -> Session:
+    """Refuse reported angles that mean two things: a correction in the controller on, and off."""
+    on = session.is_corrected
+    correction = session.correction
+    if correction is not None and correction.is_inside and on.any() and not on.all():
+        raise InputError(
+            f'{folder / ROWS}: {int(on.sum())} rows have the correction on and {int((~on).sum())} '
+            f'off, and it is in the controller ({correction}), so that reported angles mean two '
+            'things: fit a session of one of them; remaster verify takes both'
+        )
+    return session
+
+
 def read_to_fit(folder: Path) -> Session:
     """Read a session; where its joints are outside their limits, look for the mistake behind it.
 
@@ -37,7 +50,7 @@ def read_to_fit(folder: Path) -> Session:
         Joints outside their limits, and the mistake without which the session fits its robot.
     """
     try:
-        return read_session(folder)
+        return _one_arm(read_session(folder), folder)
     except InputError as refused:
         try:
             session = read_session(folder, within_limits=False)

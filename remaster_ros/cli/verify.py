@@ -17,11 +17,9 @@ from remaster_ros.compensation.verification import Estimate, Verdict, Verified, 
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.session.reader import HEADER, ROWS, read_session
-from remaster_ros.types import BoolArray, FloatArray, Session
+from remaster_ros.types import BoolArray, Correction, FloatArray, Session
 
 FORMAT = 'remaster-verify/1'
-# Loaded there, the reported angles are the true ones: what was wanted is what is reported.
-INSIDE = ('pad', 'rising', 'ros2_control')
 WORDS: dict[Verdict, str] = {
     'in_use': 'The correction is in use, once.',
     'not_in_use': 'The correction does not act: load it, or see why it is not taken.',
@@ -102,7 +100,8 @@ def _wanted(session: Session, folder: Path, on: BoolArray) -> FloatArray:
     m = session.measurements
     wanted = np.full_like(m.q, np.nan) if m.wanted is None else m.wanted.copy()
     missing = np.isnan(wanted[:, 0])
-    if session.correction is not None and session.correction.form in INSIDE:
+    if session.correction is not None and session.correction.is_inside:
+        # The reported angles are the true ones: what was wanted is what is reported.
         missing_on = missing & on
         wanted[missing_on] = m.q[missing_on]
         missing &= ~on
@@ -163,7 +162,7 @@ def _warnings(session: Session, compensation: Compensation) -> list[str]:
             'what was wanted is not recorded, so that a layer or model beside the controller is '
             'not seen'
         )
-    if before:
+    if before and not Correction(before.get('form', '')).is_beside:
         found.append(
             f'the correction was measured on top of another one ({before.get("form", "?")}), '
             'which must still be on'

@@ -123,6 +123,8 @@ class BridgeState(Body, frozen=True, kw_only=True, tag='bridge'):
         Why nothing moves in this run before a person calls /remaster/collect, and that; ''.
     joints_age_s, joints_trouble
         Time since the last usable joint_states, None for never, s; what is wrong with them.
+    correction
+        SHA-256 of the compensation.json by which it corrects what it commands; '' for none.
     """
 
     sender: ClassVar[str] = 'robot_bridge'
@@ -132,6 +134,7 @@ class BridgeState(Body, frozen=True, kw_only=True, tag='bridge'):
     asks_for_collect: str = ''
     joints_age_s: float | None = None
     joints_trouble: str = ''
+    correction: str = ''
 
 
 class Decided(msgspec.Struct, frozen=True):

@@ -71,6 +71,22 @@ class JointOrder:
         return np.array([positions[column] for column in self._columns])
 
 
+WANTED = 'wanted/'
+"""Before the name of a joint in remaster/settled: where it was wanted, before a correction."""
+
+
+def wanted_of(message: Any, joint_names: Sequence[str]) -> FloatArray | None:
+    """Return what was wanted where an arm has settled, rad, (k,); None without a correction.
+
+    Raises
+    ------
+    InputError
+        As `JointOrder.positions`.
+    """
+    order = JointOrder([f'{WANTED}{name}' for name in joint_names])
+    return order.positions(message) if order.concerns(message) else None
+
+
 def refuse_repeated(wanted: Sequence[str], given: Sequence[str], topic: str) -> None:
     """Refuse a message in which a wanted joint stands twice: which value is right is not known.
 

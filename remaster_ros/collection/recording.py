@@ -30,12 +30,16 @@ BY_HAND = PoseAnnounced(stamp='', pose=-1_000_000, split=REGISTRATION, ids=(0,))
 
 @dataclass(frozen=True)
 class SettledArm:
-    """The arm stands at a joint solution of a pose: joints, rad, (k,), and since when, s."""
+    """The arm stands at a joint solution of a pose: joints, rad, (k,), and since when, s.
+
+    `change` is what a correction changed of what was wanted, rad, (k,); None where it is off.
+    """
 
     q: FloatArray
     stamp_s: float
     pose: PoseAnnounced
     solution: int
+    change: FloatArray | None = None
 
     @property
     def id(self) -> int:
@@ -165,8 +169,8 @@ class Recording:
         self.q: FloatArray | None = None
         self.now_s = 0.0
         self._from_q: FloatArray | None = None
-        # Settled where no announced pose has a solution (yet): joints, rad, and when, s.
-        self._unknown: tuple[FloatArray, float] | None = None
+        # Settled where no announced pose has a solution (yet): joints, rad, when, s, and change.
+        self._unknown: tuple[FloatArray, float, FloatArray | None] | None = None
 
     # What comes in
 
@@ -196,16 +200,20 @@ class Recording:
         """Take a temperature, degrees Celsius."""
         self._temperatures.append((stamp_s, temperature_c))
 
-    def take_settled(self, stamp_s: float, q: FloatArray) -> bool:
+    def take_settled(
+        self, stamp_s: float, q: FloatArray, change: FloatArray | None = None
+    ) -> bool:
         """Take it that the arm has settled; return whether it is at a known solution.
 
+        Solutions are what was wanted: of joints, rad, (k,), that a correction has changed, the
+        change is taken off first.
         Where it is not, either the planner finds by the recorder's state that the pose is not
         known here and announces it again, or the announcement is on its way.
         """
         self._unknown = None
-        if self._queue(q, stamp_s):
+        if self._queue(q, stamp_s, change):
             return True
-        self._unknown = q, stamp_s
+        self._unknown = q, stamp_s, change
         return False
 
     def take_stop(self) -> None:
@@ -225,15 +233,15 @@ class Recording:
         """Whether no reading is under way and none is due."""
         return self.pairing is None and not self._due
 
-    def _queue(self, q: FloatArray, stamp_s: float) -> bool:
+    def _queue(self, q: FloatArray, stamp_s: float, change: FloatArray | None) -> bool:
         """Queue a configuration; return False where no solution of the pose is there."""
         pose = self.pose
         if pose is None or self._solutions is None:
             return False
-        solution = nearest_solution(self._solutions, q)
+        solution = nearest_solution(self._solutions, q if change is None else q - change)
         if solution is None:
             return False
-        self._due.append(SettledArm(q, stamp_s, pose, solution))
+        self._due.append(SettledArm(q, stamp_s, pose, solution, change))
         return True
 
     # The readings, one after the other
@@ -242,10 +250,10 @@ class Recording:
         """Take up an unknown configuration whose pose has come, if the arm still stands there."""
         if self._unknown is None or self.pose is None:
             return
-        q, settled_s = self._unknown
+        q, settled_s, change = self._unknown
         since = [joints for stamp_s, joints in self._joints if stamp_s > settled_s]
         stands = all(np.max(np.abs(joints - q)) <= self._tolerance for joints in since)
-        if not stands or self._queue(q, settled_s):
+        if not stands or self._queue(q, settled_s, change):
             self._unknown = None
 
     def next(self) -> SettledArm | None:

@@ -141,7 +141,9 @@ class Recorder(RemasterNode):
             self.sensors.trigger(recording.pairing)
             self.sensors.give_up(recording)
         self.recorder.look()
-        is_waiting = bool(self.keeper.full or self.sensors.missing())
+        is_waiting = bool(
+            self.keeper.full or self.recorder.another_correction or self.sensors.missing()
+        )
         if is_waiting != self._was_waiting:
             self._was_waiting = is_waiting
             self.status.publish()
@@ -172,7 +174,8 @@ class Recorder(RemasterNode):
         recorder, recording = self.recorder, self.recorder.recording
         busy = self.keeper.full or recording.pairing is not None
         state = 'closed' if self.journal.closed else 'measuring' if busy else 'waiting'
-        waiting_for = self.keeper.waits_for or self.sensors.missing()
+        another = recorder.another_correction
+        waiting_for = self.keeper.waits_for or another or self.sensors.missing()
         changed, pose = recorder.changes.describe(), recording.pose
         reasons = (
             recorder.trouble,

@@ -43,11 +43,12 @@ def judgement(
     again = MeasuredAgain.of(discovery.fit.session.measurements)
     proven = _is_proven(discovery, confirmation) and not more and not again.most
     points = in_words(discovery, confirmation) if confirmation is not None else []
+    note = discovery.fit.session.correction_note
     return Judgement(
         mood='good' if proven else 'caution',
         headline=headline(discovery, confirmation, more),
         points=points,
-        doubts=[again.words] if again.again else [],
+        doubts=[words for words in (again.words if again.again else '', note) if words],
     )
 
 

@@ -87,6 +87,8 @@ def verdict(result: FitResult) -> Judgement:
         points = [*result.implausible, *points]
     if again.again:
         points.append(again.words)
+    if note := result.session.correction_note:
+        points.append(note)
     if few:
         points.append(
             'So few poses do not show whether other errors than noise are left, which the offsets '

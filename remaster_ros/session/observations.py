@@ -337,8 +337,9 @@ class RowFormat:
         The robot, for the number of joints and their limits.
     sensors, markers
         The names in session.yaml, in their order.
-    with_frame, with_orientation
-        Whether the rows that are to be written have the columns `FRAME` and `ORIENTATION`.
+    with_frame, with_orientation, with_correction
+        Whether the rows that are to be written have the columns `FRAME`, `ORIENTATION`, and those
+        of what was wanted before a correction.
     within_limits
         Whether joint angles outside the robot's limits are refused.
     """
@@ -351,11 +352,12 @@ class RowFormat:
         markers: Sequence[str],
         with_frame: bool = False,
         with_orientation: bool = False,
+        with_correction: bool = False,
         within_limits: bool = True,
     ) -> None:
         self._path, self._chain = path, chain
         self._sensors, self._markers = sensors, markers
-        self._with_frame, self._with_orientation = with_frame, with_orientation
+        self._with = False, with_frame, with_orientation, with_correction, with_correction
         self._within_limits = within_limits
         self._columns = ColumnNames(len(chain))
 
@@ -413,7 +415,7 @@ class RowFormat:
         """
         if not rows:
             return []
-        names = self._columns.names(False, self._with_frame, self._with_orientation)
+        names = self._columns.names(*self._with)
         table = Table(self._path, names, list(rows), first_line)
         return self._accept(self._convert(table), first_line, rules)
 
@@ -531,7 +533,10 @@ def format_header(
 
 
 def format_observation(
-    observation: Observation, with_frame: bool = False, with_orientation: bool = False
+    observation: Observation,
+    with_frame: bool = False,
+    with_orientation: bool = False,
+    with_correction: bool = False,
 ) -> str:
     """Return one observation as a line without its end; numbers survive the round trip exactly."""
     o = observation
@@ -549,6 +554,9 @@ def format_observation(
     ]
     if with_orientation:
         cells += [''] * 4 if o.orientation is None else map(_text, o.orientation)
+    if with_correction:
+        cells += unknown if o.wanted is None else map(_text, o.wanted)
+        cells.append('' if o.correction is None else STATES[o.correction])
     return ','.join(cells)
 
 

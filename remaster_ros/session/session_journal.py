@@ -22,7 +22,7 @@ from remaster_ros.session.session_opening import JOURNAL
 from remaster_ros.session.session_writer import SessionWriter
 from remaster_ros.session.session_yaml import ExitStatus
 from remaster_ros.session.yaml_records import from_plain, to_plain
-from remaster_ros.types import FloatArray, Observation, Session, Split
+from remaster_ros.types import Correction, FloatArray, Observation, Session, Split
 
 SHIFT_S = 1.0
 """Time that is put between two rows where the clock ran backwards, s."""
@@ -139,6 +139,16 @@ class SessionJournal:
         result = self._results.get((pose, solution))
         return next((final for final in _FINAL if final == result), None)
 
+    @property
+    def correction(self) -> Correction | None:
+        """The correction that the rows are measured with; None for none, or before the first."""
+        return None if self._writer is None else self._writer.correction
+
+    def take_correction(self, correction: Correction) -> None:
+        """Note before the first row that a correction is on; `DiskError` as of `write`."""
+        assert self._writer is not None
+        self._writer.correct(correction)
+
     def decided(self) -> Decided | None:
         """Return the solutions recorded at the last pose; None before the first."""
         if self._last_pose is None:
@@ -161,6 +171,7 @@ class SessionJournal:
         readings: Sequence[PairedReading],
         from_q: FloatArray | None,
         temperatures_c: Sequence[float | None],
+        change: FloatArray | None = None,
     ) -> int:
         """Write what became of a configuration; durable on return.
 
@@ -176,6 +187,8 @@ class SessionJournal:
             What was accepted, and the temperature with each, degrees Celsius, None if unknown.
         from_q
             Where the arm came from, rad, (k,); None if unknown.
+        change
+            What a correction changed of what was wanted, rad, (k,); None where it was off.
 
         Returns
         -------
@@ -202,7 +215,8 @@ class SessionJournal:
             if split == REFERENCE:
                 record['number'] = number
                 record['readings'] = _plain(readings)
-            self._append(record, self._rows(pose, split, readings, from_q, temperatures_c))
+            rows = self._rows(pose, split, readings, from_q, temperatures_c, change)
+            self._append(record, rows)
             self.observations += len(readings)
         self._decide(pose, solution, result)
         return number
@@ -218,6 +232,7 @@ class SessionJournal:
         readings: Sequence[PairedReading],
         from_q: FloatArray | None,
         temperatures_c: Sequence[float | None],
+        change: FloatArray | None,
     ) -> list[Observation]:
         writer = self._writer
         if not readings or writer is None:
@@ -237,6 +252,11 @@ class SessionJournal:
                 frame=writer.configurations
                 if markers[reading.sensor] > 1 and reading.std is not None
                 else None,
+                # Less the change, not the target: what the arm stands off its command counts too.
+                wanted=None
+                if writer.correction is None
+                else reading.q - (0.0 if change is None else change),
+                correction=None if writer.correction is None else change is not None,
                 **self._columns(reading),
             )
             for number, (reading, temperature_c) in enumerate(pairs)

@@ -26,6 +26,7 @@ from remaster_ros.collection.message_fields import (
     solutions_of,
     stamp_key,
     unit_quaternion,
+    wanted_of,
 )
 from remaster_ros.collection.pairing import PairedReading, SensorRules
 from remaster_ros.collection.plausibility import Plausibility
@@ -38,7 +39,14 @@ from remaster_ros.planning.tour_order import REFERENCE, REGISTRATION
 from remaster_ros.session.session_journal import SessionJournal
 from remaster_ros.session.session_yaml import ExitStatus
 from remaster_ros.session.workcell import Workcell
-from remaster_ros.types import FloatArray, MarkerReading, Measurements, Session
+from remaster_ros.types import (
+    BRIDGE,
+    Correction,
+    FloatArray,
+    MarkerReading,
+    Measurements,
+    Session,
+)
 
 
 @dataclass(frozen=True)
@@ -210,6 +218,8 @@ class SessionRecorder:
         The token of the planner's run; in memory alone, so that it lives no longer than this.
     from_bag
         Whether the messages are those of a bag.
+    correction
+        SHA-256 of the compensation.json that the bridge has on; '' for none, None before it tells.
     """
 
     def __init__(self, cell: Workcell, p: Parameters, keeper: Keeper, outlet: Outlet) -> None:
@@ -222,6 +232,9 @@ class SessionRecorder:
         self.waited_s = dict.fromkeys(cell.sensors, 0.0)
         self.trouble = self.run = ''
         self.from_bag = False
+        self.correction: str | None = None
+        # The one at the beginning of the reading under way.
+        self._read_with = ''
         self._p = p
         self._begin()
 
@@ -290,10 +303,16 @@ class SessionRecorder:
         """Take a sensor_msgs/JointState of an arm that has settled."""
         if (q := self._positions(message)) is None:
             return
+        try:
+            wanted = wanted_of(message, self.chain.joint_names)
+        except InputError as error:
+            self.trouble = str(error)
+            return
         if self.from_bag and self.recording.is_by_hand:
             # Its end is in no message; the arm has gone on.
             self._end_as_recorded('rejected', '')
-        if self.recording.take_settled(seconds(message.header.stamp), q):
+        change = None if wanted is None else q - wanted
+        if self.recording.take_settled(seconds(message.header.stamp), q, change):
             # The bridge waits for an answer, but a bag does not: a reading under way is
             # finished first, by the stamps of its own messages.
             self.take_next()
@@ -331,6 +350,8 @@ class SessionRecorder:
                 self._on_pose(pose)
             case events.PlannerState() as planner:
                 self._on_planner(planner)
+            case events.BridgeState() as bridge:
+                self.correction = bridge.correction
             case events.ArmStopped():
                 self.recording.take_stop()
             case events.RecorderBegan() as began:
@@ -395,6 +416,21 @@ class SessionRecorder:
             self._take_back()
         self._outlet.state()
 
+    @property
+    def another_correction(self) -> str:
+        """Why the rows of this session cannot go on with the bridge's correction; ''."""
+        noted, now = self.journal.correction, self.correction
+        if not now or self.journal.closed or (noted is not None and noted.sha256 == now):
+            return ''
+        if noted is None and not self.journal.observations:
+            return ''
+        begun = 'without a correction' if noted is None else f'with another correction ({noted})'
+        return (
+            f'a bridge that corrects as this session does: it was begun {begun}, and the bridge '
+            f'has one with checksum {now[: events.SHORT]}; name a new folder, or start the bridge '
+            'as before'
+        )
+
     # A configuration
 
     def look(self) -> None:
@@ -410,8 +446,14 @@ class SessionRecorder:
             if self.journal.closed or not self.journal.follow(pose.plan):
                 self.trouble = 'settled, but the session is closed, or was begun with another plan'
                 continue
+            if settled.change is not None and (self.another_correction or not self.correction):
+                self.trouble = (
+                    self.another_correction or 'the bridge does not tell what it corrects'
+                )
+                continue
             known = self.journal.result(pose.pose, settled.id)
             if known is None:
+                self._read_with = self.correction or ''
                 self.recording.begin(settled)
                 self._outlet.measure()
                 continue
@@ -448,6 +490,9 @@ class SessionRecorder:
     def _write_down(self, ended: EndedReading) -> None:
         """Write what became of a configuration; publish it after that, and not before."""
         settled, pose = ended.settled, ended.settled.pose
+        if settled.change is not None and ended.accepted and pose.split != REGISTRATION:
+            # Before the first row: it decides which columns there are.
+            self.journal.take_correction(Correction(BRIDGE, self._read_with))
         number = self.journal.write(
             pose=pose.pose,
             solution=settled.id,
@@ -457,6 +502,7 @@ class SessionRecorder:
             readings=ended.accepted,
             from_q=ended.from_q,
             temperatures_c=[ended.temperature_c] * len(ended.accepted),
+            change=settled.change,
         )
         if pose.split == REGISTRATION:
             self._register(ended.accepted)

@@ -12,6 +12,7 @@ import contextlib
 import hashlib
 import os
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from types import TracebackType
 
@@ -37,8 +38,13 @@ from remaster_ros.session.session_opening import (
     remove_beginnings,
     reopen,
 )
-from remaster_ros.session.session_yaml import ExitStatus, with_exit_status, write_header
-from remaster_ros.types import Observation, Session
+from remaster_ros.session.session_yaml import (
+    ExitStatus,
+    with_correction,
+    with_exit_status,
+    write_header,
+)
+from remaster_ros.types import Correction, Observation, Session
 
 FILES = (HEADER, URDF, ROWS, JOURNAL)
 
@@ -81,6 +87,8 @@ class SessionWriter:
     beyond_repair
         What others destroyed and the journal has not; '' where nothing is. Such a session is not
         closed as complete.
+    correction
+        That `correct` was told of; None for none.
 
     Raises
     ------
@@ -103,9 +111,16 @@ class SessionWriter:
         chain = read_chain(header.urdf, self.folder / URDF, header.base_link, header.tip_link)
         names = header.sensor_names, header.marker_names
         # Columns for what may come: of frames with several markers, of bodies' orientations.
-        self._columns = bool(header.further_markers), bool(header.oriented)
-        self._format = RowFormat(self._rows_path, chain, *names, *self._columns)
-        self._empty_rows = format_header(len(chain), False, *self._columns).encode()
+        self._columns = bool(header.further_markers), bool(header.oriented), False
+        self._row_format, self._joints = (
+            partial(RowFormat, self._rows_path, chain, *names),
+            len(chain),
+        )
+        self._use_columns()
+        plain_rows = self._empty_rows
+        self.correction: Correction | None = None
+        # Files that are to be written again for it.
+        self._due: list[str] = []
         self._text = write_header(header, URDF, 'aborted')
         self._urdf = header.urdf.encode()
         files = {URDF: self._urdf, ROWS: self._empty_rows, HEADER: self._text.encode()}
@@ -126,13 +141,70 @@ class SessionWriter:
             undo.callback(self._journal.close)
             self._guard = SessionGuard(self.folder, FILES, self._content)
             undo.callback(self._guard.close)
-            self._rows = AppendFile(self._rows_path)
-            undo.callback(lambda: self._rows.close())
             if self.resumed:
                 self._text = reopen(self.folder, keep_status=even_complete)
+                self._take_up_correction(plain_rows)
+            self._rows = AppendFile(self._rows_path)
+            undo.callback(lambda: self._rows.close())
             self._take_up_rows(even_complete)
             self._guard.note_all()
             undo.pop_all()
+
+    def _use_columns(self) -> None:
+        self._format = self._row_format(*self._columns)
+        frame, orientation, correction = self._columns
+        self._empty_rows = format_header(
+            self._joints, False, frame, orientation, correction, correction
+        ).encode()
+
+    def _take_up_correction(self, plain_rows: bytes) -> None:
+        """Write columns and key of a correction that was noted, if a crash came in between."""
+        noted = [record for record in self.records if record['kind'] == 'correction']
+        if not noted:
+            return
+        self._use_correction(Correction(noted[-1]['form'], noted[-1]['sha256']))
+        found = read_limited(self._rows_path, OBSERVATIONS_LIMIT, f'a session folder holds {ROWS}')
+        if found == plain_rows:
+            write_atomically(self._rows_path, self._empty_rows)
+        if (self.folder / HEADER).read_bytes() != self._text.encode():
+            write_atomically(self.folder / HEADER, self._text)
+
+    def _use_correction(self, correction: Correction) -> None:
+        self.correction = correction
+        self._columns = (*self._columns[:2], True)
+        self._use_columns()
+        self._text = with_correction(self._text, correction)
+
+    def correct(self, correction: Correction) -> None:
+        """Note the correction that is on, before the first row: what was wanted gets columns.
+
+        Raises
+        ------
+        InputError
+            There are rows already, or the writer is closed.
+        DiskError
+            The disk does not take it; try again when there is room.
+        """
+        if self.correction is None:
+            if self._closed or self.observations:
+                raise InputError(f'{self.folder}: the session was begun without a correction')
+            self.check()
+            record = {'form': correction.form, 'sha256': correction.sha256}
+            self._journal.append({'kind': 'correction', **record})
+            self._guard.note(JOURNAL)
+            self._use_correction(correction)
+            self._due = [ROWS, HEADER]
+        self._write_due()
+
+    def _write_due(self) -> None:
+        while self._due:
+            name = self._due[0]
+            write_atomically(self.folder / name, self._content(name))
+            if name == ROWS:
+                self._rows.close()
+                self._rows = AppendFile(self._rows_path)
+            self._guard.note(name)
+            self._due.pop(0)
 
     @property
     def records(self) -> list[Record]:
@@ -196,6 +268,7 @@ class SessionWriter:
         """
         if self._closed:
             raise InputError(f'{self.folder}: the session is closed; start a new one')
+        self._write_due()
         self.check()
         rows = [format_observation(row, *self._columns) for row in observations]
         keys = self._format.check(rows, self._line, self._rules.branch())
@@ -306,6 +379,7 @@ class SessionWriter:
         """
         if self._closed:
             return self._closed_as
+        self._write_due()
         self.check(content=True)
         if self.beyond_repair and exit_status == 'complete':
             exit_status = 'aborted'

@@ -219,6 +219,11 @@ def with_exit_status(text: str, exit_status: str) -> str:
     return dump_yaml({**load_yaml(text), 'exit_status': exit_status})
 
 
+def with_correction(text: str, correction: Correction) -> str:
+    """Return the text of a session.yaml that states a correction."""
+    return dump_yaml({**load_yaml(text), 'correction': to_plain(correction)})
+
+
 def _checked(content: Mapping[str, Any], where: str) -> SessionHeader:
     """Return the header that `content` holds; an `InputError` begins with `where`."""
     known = {key: value for key, value in content.items() if key != 'extra'}

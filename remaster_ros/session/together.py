@@ -107,6 +107,18 @@ def together(sessions: Sequence[tuple[str, Session]]) -> tuple[Session, list[str
 
 
 def _require_same_arm(first_name: str, first: Session, name: str, session: Session) -> None:
+    inside = [
+        str(given.correction)
+        if given.correction is not None and given.correction.is_inside
+        else ''
+        for given in (first, session)
+    ]
+    if inside[0] != inside[1]:
+        states = ' and '.join(f'{one!r}' if one else 'none' for one in inside)
+        raise InputError(
+            f'{first_name} and {name} were measured with different corrections in the controller '
+            f'({states}), so that their reported angles mean different things: fit them one by one'
+        )
     for what, one, other in (
         ('URDF', first.urdf_sha256[:12], session.urdf_sha256[:12]),
         ('base link', first.base_link, session.base_link),

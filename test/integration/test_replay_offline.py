@@ -8,9 +8,10 @@ import pytest
 from command_line import remaster
 from recorded_bags import CHAIN, RecordedArm
 
-from remaster_ros.collection.events import ReadByHand
+from remaster_ros.collection.events import BridgeState, ReadByHand
 from remaster_ros.session.journal import read_journal
 from remaster_ros.session.reader import read_session
+from remaster_ros.types import Correction
 
 SEED = 7
 
@@ -205,3 +206,57 @@ def test_a_bag_with_a_damaged_message_leaves_no_half_a_session_in_the_way(arm, t
         done = replay(arm, tmp_path, out='new/again', status=2)
         assert 'a damaged message' in done.stderr
         assert not (tmp_path / 'new').exists()
+
+
+def test_what_was_wanted_before_a_correction_of_the_bridge(arm, tmp_path):
+    """Half a degree and more: a solution is found by what was wanted, and a row has both."""
+    arm.record('/robot_bridge', BridgeState(halted='', correction='ab12'))
+    arm.change = np.linspace(-0.03, 0.03, len(CHAIN))
+    arm.register()
+    first = arm.visit()
+    # The bridge was started again without: the rows go on, and tell it.
+    arm.record('/robot_bridge', BridgeState(halted=''))
+    arm.change = None
+    second = arm.visit('validation')
+    arm.close()
+    replay(arm, tmp_path)
+    read = read_session(tmp_path / 'again')
+    m = read.measurements
+    assert read.correction == Correction('robot_bridge', 'ab12')
+    assert m.correction.tolist() == 4 * [1] + 4 * [0]
+    visited = np.repeat([*first, *second], 2, axis=0)
+    np.testing.assert_allclose(m.wanted, visited, atol=1e-12)
+    change = np.where(m.correction[:, None], np.linspace(-0.03, 0.03, len(CHAIN)), 0.0)
+    np.testing.assert_allclose(m.q - m.wanted, change, atol=1e-12)
+    journal = read_journal(tmp_path / 'again' / 'journal.jsonl').records
+    assert [record['kind'] for record in journal].count('correction') == 1
+
+
+@pytest.mark.parametrize('before', ['', 'ab12'])
+def test_rows_of_two_corrections_are_not_mixed(arm, tmp_path, before):
+    if before:
+        arm.record('/robot_bridge', BridgeState(halted='', correction=before))
+        arm.change = np.full(len(CHAIN), 0.01)
+    arm.register()
+    arm.visit()
+    arm.record('/robot_bridge', BridgeState(halted='', correction='cd34'))
+    arm.change = np.full(len(CHAIN), 0.02)
+    arm.visit()
+    arm.close()
+    replay(arm, tmp_path)
+    read = read_session(tmp_path / 'again')
+    assert len(read.measurements) == 4
+    assert (read.correction.sha256 if read.correction else '') == before
+
+
+def test_a_correction_of_which_nothing_is_told_is_not_recorded(arm, tmp_path):
+    arm.change = np.full(len(CHAIN), 0.01)
+    arm.register()
+    arm.visit()
+    arm.change = None
+    arm.visit()
+    arm.close()
+    replay(arm, tmp_path)
+    read = read_session(tmp_path / 'again')
+    assert read.correction is None
+    assert read.measurements.pose.tolist() == 4 * [4]

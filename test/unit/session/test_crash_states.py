@@ -33,7 +33,7 @@ MANY = int(os.environ.get('CRASH_STATES', '1000'))
 
 
 @pytest.mark.timeout(600 + MANY // 4)
-@pytest.mark.parametrize('states', [100, pytest.param(MANY, marks=pytest.mark.qualify)])
+@pytest.mark.parametrize('states', [200, pytest.param(MANY, marks=pytest.mark.qualify)])
 def test_no_crash_loses_what_was_acknowledged(states, quick_folder, caplog):
     caplog.set_level(logging.CRITICAL, 'remaster_ros')
     found: Counter[str] = Counter()
