@@ -46,6 +46,7 @@ def test_the_summary(rig):
         'asks_for_collect': '',
         'joints_age_s': '0.1',
         'joints_trouble': '',
+        'correction': '',
         'moves_refused': '0',
         'pose': named,
         'run': 'token',

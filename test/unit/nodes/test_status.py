@@ -157,6 +157,7 @@ def test_another_start_of_this_name_is_a_rival_only_where_another_node_publishes
                 'asks_for_collect': '',
                 'joints_age_s': '0.2',
                 'joints_trouble': '',
+                'correction': '',
             },
         ),
     ],
