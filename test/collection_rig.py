@@ -26,7 +26,7 @@ class Cell:
 
     `foreign` gives sensors that are read from the topic of a node of another package: sensor ->
     (message type, topic), as in the cell file. `by_action` gives the arm's controller the action
-    FollowJointTrajectory in place of the topic.
+    FollowJointTrajectory in place of the topic. `compensation` is that of the bridge.
     """
 
     def __init__(
@@ -46,6 +46,7 @@ class Cell:
         discovery='',
         hidden=(),
         by_action=False,
+        compensation='',
     ):
         from remaster_ros.nodes.controller_link import COMMANDS
         from remaster_ros.nodes.status import listen
@@ -83,6 +84,8 @@ class Cell:
         }
         if by_action:
             own['robot_bridge']['command_interface'] = 'action'
+        if compensation:
+            own['robot_bridge']['compensation'] = compensation
         if 'mocap' in sensors:
             ports = {'command_port': command, 'data_port': data}
             own['fake_optitrack'] = {'world': folder / 'world', 'rate': 20.0, **ports}

@@ -356,6 +356,14 @@ class ArmModel:
         """Return where the arm is at reported angles (n, k)."""
         return self._state(self.drivers(q, self.warming(len(q), temperature_c)))
 
+    def rigid(self) -> SerialChain:
+        """Return the arm with zero-offsets, lengths and tilts built in, for reported angles.
+
+        It is at the temperature of the measurements, and nothing depends on its angles or torques.
+        """
+        origins = self._origins(self.warming(1, None)).reshape(-1, 4, 4)
+        return replace(self.chain, T_fixed=origins).with_offsets(self.joint_offsets)
+
     def _state(self, drivers: Drivers) -> State:
         n, k = drivers.q.shape
         angles = drivers.q + self.added_angles(drivers)

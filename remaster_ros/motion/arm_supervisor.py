@@ -33,6 +33,7 @@ from remaster_ros.motion.limits import MotionLimits
 from remaster_ros.motion.motion_gate import MotionGate, MotionRefusedError, StartMovedError
 from remaster_ros.motion.motion_under_way import MotionUnderWay
 from remaster_ros.motion.move_queue import (
+    NO_REFUSALS,
     NO_WAYPOINTS,
     PROBE,
     STANDING,
@@ -128,14 +129,16 @@ class ArmSupervisor:
         solutions: FloatArray,
         wall_s: float,
         waypoints: Mapping[int, FloatArray] = NO_WAYPOINTS,
+        refused: Mapping[int, str] = NO_REFUSALS,
     ) -> list[Action]:
         """Begin to visit the solutions of a pose, rad, (m, k), in this order; none: stop.
 
-        ``waypoints`` has configurations on the way to a solution, rad, (n, k), by its number.
+        ``waypoints`` has configurations on the way to a solution, rad, (n, k), by its number;
+        ``refused`` why one of them must not be commanded.
         """
         actions = self._stop('another pose' if len(solutions) else 'stopped', wall_s)
         self._motion.visit = None
-        self._queue.begin(solutions, waypoints)
+        self._queue.begin(solutions, waypoints, refused)
         return actions + self.tick(wall_s)
 
     def answered(self, solution: int, wall_s: float) -> list[Action]:
@@ -428,7 +431,7 @@ class ArmSupervisor:
             return [queue.ask(STANDING, seen.q, seen.q)]
         actions: list[Action] = []
         while (target := queue.target) is not None and not self.halted:
-            outside = self.gate.limits.outside(target)
+            outside = queue.refused or self.gate.limits.outside(target)
             if not outside:
                 return [*actions, queue.ask(queue.next, seen.q, target)]
             actions += self._refuse(queue.next, outside)

@@ -70,19 +70,21 @@ class MotionLimits:
         speed_share
             Share (0 to 1) of its velocity limits that is used.
         offsets
-            Joint zero-offsets in use, rad, (k,); None for none.
+            What true angles have on top of reported ones, rad: zero-offsets in use, (k,), or the
+            least and the largest of what is in use, (2, k); None for none.
         acceleration
             rad/s², for all joints or (k,).
         tool_speed, margin
             See the attributes.
         """
         shift = np.zeros(len(chain)) if offsets is None else offsets
+        least, largest = np.broadcast_to(shift, (2, len(chain)))
         known = np.isfinite(chain.velocity_limits)
         velocity = np.where(known, chain.velocity_limits, UNKNOWN_VELOCITY)
         return cls(
             chain.joint_names,
-            np.maximum(chain.lower, chain.lower - shift),
-            np.minimum(chain.upper, chain.upper - shift),
+            np.maximum(chain.lower, chain.lower - least),
+            np.minimum(chain.upper, chain.upper - largest),
             speed_share * velocity,
             np.broadcast_to(acceleration, velocity.shape),
             tool_speed,

@@ -21,6 +21,7 @@ STANDING = -3
 PROBE_RAD = 1e-6
 """How far the probe goes, rad: less than the arm repeats, more than the last bit."""
 NO_WAYPOINTS: Mapping[int, FloatArray] = {}
+NO_REFUSALS: Mapping[int, str] = {}
 
 
 class MoveQueue:
@@ -43,6 +44,7 @@ class MoveQueue:
     def __init__(self) -> None:
         self._solutions: FloatArray | tuple[()] = ()
         self._waypoints = NO_WAYPOINTS
+        self._refused = NO_REFUSALS
         self.next = 0
         self._requests = 0
         self.pending: tuple[int, int] | None = None
@@ -50,9 +52,15 @@ class MoveQueue:
         self.way_out: FreePath | None = None
         self._offered: FreePath | None = None
 
-    def begin(self, solutions: FloatArray, waypoints: Mapping[int, FloatArray]) -> None:
+    def begin(
+        self,
+        solutions: FloatArray,
+        waypoints: Mapping[int, FloatArray],
+        refused: Mapping[int, str],
+    ) -> None:
         """Begin another pose; see `ArmSupervisor.plan`."""
         self._solutions, self._waypoints, self.next = solutions, waypoints, 0
+        self._refused = refused
         self.pending = None
 
     def begin_anew(self) -> None:
@@ -68,6 +76,11 @@ class MoveQueue:
     def target(self) -> FloatArray | None:
         """The next configuration, rad, (k,); None where none is left."""
         return self._solutions[self.next] if self.next < len(self._solutions) else None
+
+    @property
+    def refused(self) -> str:
+        """Why the next configuration must not be commanded; ''."""
+        return self._refused.get(self.next, '')
 
     @property
     def probe_is_next(self) -> bool:

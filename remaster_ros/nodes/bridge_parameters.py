@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
@@ -12,19 +14,22 @@ from remaster_ros.motion.limits import MotionLimits
 from remaster_ros.motion.settling import SettleRules
 from remaster_ros.nodes.parameters import parameter
 from remaster_ros.parameters import SimulationParameters
-from remaster_ros.reports.fit_json import joint_offsets_rad, read_fit
+from remaster_ros.session.workcell import Workcell
 from remaster_ros.types import FloatArray
 
-KNOWN_OFFSET_RAD = float(np.deg2rad(0.1))
-"""What may still be wrong with a joint whose offset is in use, for the clearance of paths."""
-OFFSET_STDS = 3.0
-"""Or so many standard deviations of the offset that is known least."""
+if TYPE_CHECKING:
+    from remaster_ros.compensation.in_use import CorrectionInUse
 
 
 @dataclass(frozen=True)
 class Parameters(SimulationParameters):
     """Parameters of the bridge."""
 
+    REPLACED: ClassVar[Mapping[str, str]] = {
+        'offsets': 'give compensation the apply/compensation.json that fit has written beside '
+        'fit.json: limits and paths are checked by it as before, and what is commanded is '
+        'corrected'
+    }
     cell: str = parameter('', 'cell file: a path, or the name of a shipped one; must be given')
     speed_share: float = parameter(
         0.3,
@@ -46,9 +51,10 @@ class Parameters(SimulationParameters):
     limit_margin_deg: float = parameter(
         0.5, 'distance kept from the joint limits', unit='deg', low=0.0, high=45.0
     )
-    offsets: str = parameter(
+    compensation: str = parameter(
         '',
-        'fit.json whose joint offsets shift the joint limits; empty for offsets not known yet',
+        'compensation.json by which every configuration is corrected before it is checked and '
+        'commanded; read once, at the start; empty for none',
     )
     settle_s: float = parameter(
         3.0, 'how long the arm must stand still before a reading', unit='s', low=0.1, high=60.0
@@ -135,27 +141,33 @@ class Parameters(SimulationParameters):
         now, then = (p.cartesian_speed_limit_m_s or np.inf for p in (self, before))
         return 'cartesian_speed_limit_m_s' if now > then else ''
 
-    def known_offsets(self, chain: SerialChain) -> tuple[FloatArray | None, float | None]:
-        """Return the offsets in use, rad, (k,), and what a joint's may still be off by, rad.
+    def correction(self, cell: Workcell, chain: SerialChain) -> CorrectionInUse | None:
+        """Return the correction in use; `InputError` where it is not of this arm, or too large."""
+        if not self.compensation:
+            return None
+        # It loads SciPy, which a bridge without a correction needs not.
+        from remaster_ros.compensation.in_use import CorrectionInUse
 
-        An offset that the fit could not identify counts as 0, and is known as little as before:
-        the clearance of the cell file remains then (None).
-        """
-        if not self.offsets:
-            return None, None
-        offsets, std = joint_offsets_rad(read_fit(self.offsets), chain.joint_names)
-        known = std > 0.0
-        left = max(KNOWN_OFFSET_RAD, OFFSET_STDS * float(np.max(std))) if known.all() else None
-        return np.where(known, offsets, 0.0), left
+        return CorrectionInUse(self.compensation, chain, cell.urdf_text, cell.robot.urdf)
 
     def limits(
-        self, chain: SerialChain, offsets: FloatArray | None, acceleration: FloatArray | float
+        self, chain: SerialChain, shifts: FloatArray | None, acceleration: FloatArray | float
     ) -> MotionLimits:
-        """Return the limits of every motion: offsets in use, rad, acceleration, rad/s^2, (k,)."""
+        """Return the limits of every motion.
+
+        Parameters
+        ----------
+        chain
+            The arm as drawn.
+        shifts
+            Least and largest that a correction adds to reported angles, rad, (2, k); None without.
+        acceleration
+            rad/s², (k,) or for all.
+        """
         return MotionLimits.of(
             chain,
             self.speed_share,
-            offsets,
+            shifts,
             acceleration,
             self.cartesian_speed_limit_m_s or np.inf,
             float(np.deg2rad(self.limit_margin_deg)),

@@ -36,7 +36,7 @@ from remaster_ros.collection import events
 from remaster_ros.collection.announcements import Announcements
 from remaster_ros.collection.collection_run import CollectionRun
 from remaster_ros.collection.events import OptimizerState
-from remaster_ros.collection.message_fields import JointOrder
+from remaster_ros.collection.message_fields import JointOrder, wanted_of
 from remaster_ros.collection.pace import Pace, progress_text
 from remaster_ros.collection.peer_models import PeerModels
 from remaster_ros.collection.plan_confirmation import service_name
@@ -309,7 +309,9 @@ class PosePlanner(RemasterNode):
 
     def _on_settled(self, message: JointState) -> None:
         try:
-            self._q = self._order.positions(message)
+            # Where the nominal arm has its tool where the arm has it, if the bridge corrects.
+            wanted = wanted_of(message, self._order.names)
+            self._q = self._order.positions(message) if wanted is None else wanted
         except InputError as error:
             self.run.why = str(error)
 

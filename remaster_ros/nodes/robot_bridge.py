@@ -22,7 +22,7 @@ from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from remaster_ros.collection import events
-from remaster_ros.collection.message_fields import seconds, solutions_of, stamp_key
+from remaster_ros.collection.message_fields import WANTED, seconds, solutions_of, stamp_key
 from remaster_ros.collection.peer_models import PeerModels
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.same_arm import difference
@@ -100,12 +100,16 @@ class RobotBridge(RemasterNode):
             )
         cell = read_cell(self.p.cell)
         self.chain = cell.chain()
-        offsets, unknown_rad = self.p.known_offsets(self.chain)
-        # Paths are checked where the arm is, not where its encoders put it.
-        true_arm = self.chain if offsets is None else self.chain.with_offsets(offsets)
+        self._correction = correction = self.p.correction(cell, self.chain)
+        true_arm, unknown_rad, self._shifts = self.chain, None, None
+        if correction is not None:
+            # Paths are checked where the arm is, not where its encoders put it.
+            true_arm, self._shifts = correction.true_arm, correction.shifts
+            unknown_rad = correction.unknown_rad(np.deg2rad(cell.unknown_offset_deg))
+        # What it has changed of each solution of the pose, rad, (m, k).
+        self._changes = np.zeros((0, len(self.chain)))
         model = cell.collision_model(true_arm, unknown_rad)
         speeds = PointSpeeds(true_arm, model.extent_points)
-        self._offsets = offsets
         self._acceleration = cell.acceleration_limits(self.chain)
         self._halt_file = HaltFile(self.get_fully_qualified_name())
         self._command_file = LastCommandFile(
@@ -115,7 +119,7 @@ class RobotBridge(RemasterNode):
         is_kept = not self.p.simulated_clock_rate
         last = self._command_file.read(time.time_ns()) if is_kept else None
         self.supervisor = ArmSupervisor(
-            MotionGate(self.p.limits(self.chain, offsets, self._acceleration), speeds),
+            MotionGate(self.p.limits(self.chain, self._shifts, self._acceleration), speeds),
             JointReports(self.chain.lower, self.chain.upper, self.chain.velocity_limits),
             self.p.rules(),
             self._halt_file.read(),
@@ -169,6 +173,15 @@ class RobotBridge(RemasterNode):
         self.create_timer(WATCH_WALL_S, self._watch, clock=self.status.steady)
         if self.supervisor.halted:
             self.get_logger().error(f'halted: {self.supervisor.halted}')
+        if correction is not None:
+            self.counts |= {'corrected_near_singularity': 0, 'corrected_outside_range': 0}
+            self.get_logger().info(
+                f'what is commanded is corrected by {correction.path}, checksum '
+                f'{correction.sha256[: events.SHORT]}, as it is now: a file that changes is read '
+                'when the bridge is started again'
+            )
+            for remark in correction.remarks:
+                self.get_logger().warning(remark)
         for pair in model.left_out:
             self.get_logger().info(f'collisions: {pair}')
         if not self.p.cartesian_speed_limit_m_s:
@@ -186,7 +199,7 @@ class RobotBridge(RemasterNode):
                 '/remaster/pause, set it when the arm stands, then call /remaster/collect'
             )
         self.p = p
-        limits = p.limits(self.chain, self._offsets, self._acceleration)
+        limits = p.limits(self.chain, self._shifts, self._acceleration)
         self._do(self.supervisor.use_limits(limits, self.steady_s(), raised=bool(raised)))
         self.get_logger().info(
             f'speed_share is {p.speed_share:g}, cartesian_speed_limit_m_s '
@@ -233,8 +246,23 @@ class RobotBridge(RemasterNode):
         except InputError as error:
             self.get_logger().error(f'joint_solutions dropped: {error}')
             return
+        refused: dict[int, str] = {}
+        if self._correction is not None:
+            # Before all checks: they are of what is commanded.
+            done = self._correction.commands(targets)
+            targets, self._changes = done.command, done.change
+            for number, points in waypoints.items():
+                way = self._correction.commands(points)
+                waypoints[number] = way.command
+                for why in way.refused.values():
+                    refused[number] = f'on its way {why}'
+            refused |= done.refused
+            self.counts['corrected_near_singularity'] += int(done.faded.sum())
+            self.counts['corrected_outside_range'] += int(done.outside_range.sum())
+            for note in done.notes:
+                self.get_logger().info(note)
         self._pose_stamp = stamp_key(message.header.stamp)
-        self._do(self.supervisor.plan(targets, self.steady_s(), waypoints))
+        self._do(self.supervisor.plan(targets, self.steady_s(), waypoints, refused))
 
     def _on_joint_state(self, message: JointState, info: Mapping[str, Any]) -> None:
         self._take_report(message, info)
@@ -421,7 +449,11 @@ class RobotBridge(RemasterNode):
     def _announce(self, settled: Settled) -> None:
         self._settled_wall = self.steady_s()
         self.counts['settled'] += 1
-        message = JointState(name=list(self.chain.joint_names), position=settled.q.tolist())
+        names, q = list(self.chain.joint_names), settled.q
+        if self._correction is not None:
+            names += [f'{WANTED}{name}' for name in names]
+            q = np.concatenate((q, q - self._changes[settled.solution]))
+        message = JointState(name=names, position=q.tolist())
         message.header.stamp = stamp_of(settled.stamp_s)
         self._settled.publish(message)
         self.status.event(
@@ -451,6 +483,7 @@ class RobotBridge(RemasterNode):
             asks_for_collect=supervisor.asks_for_collect,
             joints_age_s=age_s if np.isfinite(age_s) else None,
             joints_trouble=supervisor.trouble,
+            correction='' if self._correction is None else self._correction.sha256,
         )
         level = 'error' if supervisor.halted else 'warn' if blocked else 'ok'
         return Summary(level, blocked or text, values, state)

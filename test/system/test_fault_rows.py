@@ -26,12 +26,12 @@ TRIES = 3
 ENOUGH = 12
 """So many configurations must be left for another row."""
 FIVE_HEADING = 'situation', 'commanded before', 'commanded now', 'what is said', 'how it goes on'
-BAD_FITS = {'no gauge': '{"format": "remaster-fit/1", "joint_offsets": []}', 'garbage': '\0{"f'}
+BAD_CORRECTIONS = {'no robot': '{"format": "remaster-compensation/1"}', 'garbage': '\0{"f'}
 
 
 COPIED = 'robot', 'publishes what was commanded as measured, from the start'
-NO_OFFSETS = 'offsets that are none: {}'
-OTHERS = [COPIED, *(('optimizer', NO_OFFSETS.format(fault)) for fault in BAD_FITS)]
+NO_CORRECTION = 'a correction that is none: {}'
+OTHERS = [COPIED, *(('optimizer', NO_CORRECTION.format(fault)) for fault in BAD_CORRECTIONS)]
 
 
 class Benches:
@@ -163,9 +163,9 @@ def test_a_robot_that_copies_its_commands_never_moves(tmp_path):
     compare('nodes', (*COPIED, said[0].upper() + said[1:], 'a micrometre', goes_on))
 
 
-@pytest.mark.parametrize('fault', BAD_FITS)
-def test_offsets_that_are_none(fault, tmp_path):
-    """The optimizer takes no part in a collection; what it can do is hand on wrong offsets."""
+@pytest.mark.parametrize('fault', BAD_CORRECTIONS)
+def test_a_correction_that_is_none(fault, tmp_path):
+    """The optimizer takes no part in a collection; what it can do is hand on a wrong result."""
     environment = {
         **os.environ,
         'PYTHONPATH': os.pathsep.join(filter(None, (str(ROOT), os.environ.get('PYTHONPATH')))),
@@ -173,17 +173,17 @@ def test_offsets_that_are_none(fault, tmp_path):
         'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
     }
     command = [sys.executable, '-m', 'remaster_ros.nodes', 'robot_bridge', '--ros-args']
-    path = tmp_path / 'fit.json'
-    path.write_text(BAD_FITS[fault])
+    path = tmp_path / 'compensation.json'
+    path.write_text(BAD_CORRECTIONS[fault])
     done = subprocess.run(
-        [*command, '-p', 'cell:=demo', '-p', f'offsets:={path}'],
+        [*command, '-p', 'cell:=demo', '-p', f'compensation:={path}'],
         env=environment, capture_output=True, text=True, timeout=900, check=False,
     )  # fmt: skip
     assert done.returncode == 2, done.stderr
     (line,) = [line for line in done.stderr.splitlines() if line.startswith('error:')]
     said = line.removeprefix('error: ').replace(f'{path}: ', '')
     row = (
-        'optimizer', NO_OFFSETS.format(fault), f'The bridge does not start: {said}',
-        'nothing', 'with a fit.json',
+        'optimizer', NO_CORRECTION.format(fault), f'The bridge does not start: {said}',
+        'nothing', 'with a compensation.json',
     )  # fmt: skip
     compare('nodes', row)

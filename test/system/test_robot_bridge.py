@@ -1,6 +1,5 @@
 """The bridge as a process between a plan and an arm that obeys everything: what it commands."""
 
-import json
 import time
 
 import numpy as np
@@ -9,6 +8,7 @@ import pytest
 pytest.importorskip('rclpy', reason='needs ROS 2 Jazzy or its wheels')
 pytest.importorskip('pinocchio', reason='the judge needs pinocchio (pip install .[test])')
 
+from compensation_files import arm, save
 from hostile_bench import Bench
 from hostile_lines import EMERGENCY
 from hostile_process import environment
@@ -155,43 +155,22 @@ def test_silence_holds_the_arm_and_it_goes_on_by_itself(bridge, silent):
     wait(bench, lambda: bench.seen.settled)
 
 
-@pytest.mark.parametrize(('sign', 'allowed'), [(1.0, False), (-1.0, True)])
-def test_offsets_in_use_shift_the_limits(bridge, tmp_path, sign, allowed):
-    """True angle = reported + offset: with +2 degrees at joint 2 the last two degrees are out."""
-    path = tmp_path / 'fit.json'
-    path.write_text(json.dumps(fit_with({'joint_2': sign * 2.0})))
-    bench = bridge(offsets=str(path), limit_margin_deg=0.0)
+@pytest.mark.parametrize(('sign', 'allowed'), [(1.0, True), (-1.0, False)])
+def test_what_is_wanted_is_corrected_before_the_limits_are_looked_at(
+    bridge, tmp_path, sign, allowed
+):
+    """True angle = reported + offset: one of -1.9 degrees is commanded 0.9 beyond the stop."""
+    offsets = np.zeros(len(CHAIN))
+    offsets[1] = np.deg2rad(1.9 * sign)
+    urdf = read_cell('demo').urdf_text
+    model = arm(urdf, CHAIN.base_link, CHAIN.tip_link, joint_offsets=offsets)
+    bench = bridge(compensation=str(save(tmp_path, model, urdf)), limit_margin_deg=0.0)
     q = HOME.copy()
     q[1] = CHAIN.upper[1] - np.deg2rad(1.0)
     bench.send([q])
     wait(bench, lambda: failures(bench) or moves(bench))
     refused = any('outside its limits' in failed.reason for failed in failures(bench))
     assert refused != allowed
-
-
-def fit_with(offsets_deg):
-    joints = [
-        {
-            'joint': name,
-            'mean_deg': offsets_deg.get(name, 0.0),
-            'std_deg': 0.01,
-            'interval95_deg': [-0.02, 0.02],
-            'identifiable': True,
-            'why': '',
-        }
-        for name in CHAIN.joint_names
-    ]
-    empty = {'gauge': [], 'registration': {}, 'markers': {}, 'noise': {}, 'left_out': []}
-    sampler = {'name': 'x', 'chains': 1, 'draws': 1}
-    sampler |= dict.fromkeys(('r_hat_max', 'ess_min', 'seconds'))
-    accuracy = {'optimization': None, 'validation': None}
-    return {
-        'format': 'remaster-fit/1',
-        'joint_offsets': joints,
-        'sampler': sampler,
-        'accuracy': accuracy,
-        **empty,
-    }
 
 
 def test_a_halt_survives_a_restart_and_only_a_person_ends_it(bridge):

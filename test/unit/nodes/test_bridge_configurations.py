@@ -1,5 +1,6 @@
 """Configurations and ways that the robot bridge commands, and what it makes of bad ones."""
 
+import hashlib
 import json
 
 import numpy as np
@@ -9,6 +10,7 @@ pytest.importorskip('rclpy', reason='needs ROS 2 Jazzy or its wheels')
 
 from bridge_places import AWAY, LOW, POST, TARGET, TOOL, turned
 from bridge_rig import CHAIN, HOME, stamp
+from compensation_files import arm, save
 from simple_cells import write_cell
 from std_msgs.msg import String
 from trajectory_msgs.msg import JointTrajectory
@@ -19,6 +21,8 @@ from remaster_ros.collection.events import (
     SolutionFailed,
     SolutionSettled,
 )
+from remaster_ros.compensation.arm_model import Function, JointTerm
+from remaster_ros.compensation.compensator import Compensator
 from remaster_ros.nodes import robot_bridge
 from remaster_ros.session.workcell import read_cell
 
@@ -26,6 +30,81 @@ pytestmark = [pytest.mark.ros, pytest.mark.timeout(60)]
 
 
 # What it commands
+
+
+def test_what_is_commanded_is_corrected_before_it_is_checked(rig, tmp_path):
+    """Limits are those of the true arm: what is wanted within them may be commanded beyond."""
+    urdf = read_cell('demo').urdf_text
+    offsets = np.deg2rad([0.5, -0.7, 0.4, 0.9, -1.2, 0.3, 0.6])
+    model = arm(urdf, CHAIN.base_link, CHAIN.tip_link, joint_offsets=offsets)
+    file = save(tmp_path, model, urdf)
+    r = rig(compensation=file)
+    command = Compensator(model).command(TARGET)
+    assert np.max(np.abs(command - TARGET)) > 0.01
+    way = 0.5 * (HOME + TARGET) + 0.02
+    sha256 = hashlib.sha256(file.read_bytes()).hexdigest()
+    # What becomes of the file is of no effect.
+    file.write_text('')
+    limit = np.array(TARGET)
+    # Wanted beyond what the true arm can; then within it, commanded outside of what is left.
+    limit[1] = r.bridge.supervisor.gate.limits.upper[1]
+    named = r.plan(limit, TARGET, ways=[(1, [way])])
+    r.run(30.0, lambda: r.settled)
+    (refused,) = r.named(SolutionFailed)
+    assert (refused.stamp, refused.solution) == (named, 0)
+    assert 'joint_2 at' in refused.reason
+    (move,) = r.moves()
+    np.testing.assert_allclose(move.q[-1], command, atol=1e-9)
+    # The way to it is corrected as well: the path goes through the corrected waypoint.
+    q, _, _ = move.spline().sample(200)
+    off = np.max(np.abs(q - Compensator(model).command(way)), axis=1)
+    assert off.min() < 2e-3
+    (message,) = r.settled
+    assert list(message.name) == [*r.names, *(f'wanted/{name}' for name in r.names)]
+    np.testing.assert_allclose(message.position[:7], command, atol=1e-4)
+    change = np.array(message.position[:7]) - message.position[7:]
+    np.testing.assert_allclose(change, command - TARGET, atol=1e-12)
+    assert r.bridge.summarised.state.correction == sha256
+
+
+def test_a_configuration_that_the_correction_changes_too_much_is_given_up(
+    rig, tmp_path, monkeypatch
+):
+    urdf = read_cell('demo').urdf_text
+    model = arm(urdf, CHAIN.base_link, CHAIN.tip_link, joint_offsets=np.full(7, 0.01))
+    r = rig(compensation=save(tmp_path, model, urdf))
+    monkeypatch.setattr('remaster_ros.compensation.in_use.MOST_DEG', 0.1)
+    r.plan(TARGET)
+    r.run(2.0, lambda: r.named(SolutionFailed))
+    (failed,) = r.named(SolutionFailed)
+    assert 'the correction would change joint_' in failed.reason
+    assert not r.moves()
+
+
+def test_a_waypoint_that_the_correction_changes_too_much_is_not_gone_through(
+    rig, tmp_path, monkeypatch
+):
+    """A soft arm, changed more where it is stretched out."""
+    urdf = read_cell('demo').urdf_text
+    soft = Function('gravity_torque', 'linear', 1, 0)
+    model = arm(
+        urdf,
+        CHAIN.base_link,
+        CHAIN.tip_link,
+        joint_terms=(JointTerm(1, 'x', soft, np.array([1e-4])),),
+    )
+    r = rig(compensation=save(tmp_path, model, urdf))
+    ways = HOME + np.linspace(-0.4, 0.4, 9)[:, None] * np.eye(7)[1]
+    change = np.degrees(np.abs(Compensator(model).command(ways) - ways).max(axis=1))
+    at_target = np.degrees(np.abs(Compensator(model).command(TARGET) - TARGET).max())
+    assert change.max() > at_target + 1e-3
+    most = 0.5 * (change.max() + at_target)
+    monkeypatch.setattr('remaster_ros.compensation.in_use.MOST_DEG', most)
+    r.plan(TARGET, ways=[(0, [ways[np.argmax(change)]])])
+    r.run(2.0, lambda: r.named(SolutionFailed))
+    (failed,) = r.named(SolutionFailed)
+    assert 'on its way the correction would change joint_' in failed.reason
+    assert not r.moves()
 
 
 def test_a_configuration_is_commanded_settles_and_is_announced(rig):

@@ -1,7 +1,5 @@
 """What parameters, cell and offsets make of the limits that the robot bridge keeps."""
 
-import json
-
 import numpy as np
 import pytest
 
@@ -9,6 +7,7 @@ pytest.importorskip('rclpy', reason='needs ROS 2 Jazzy or its wheels')
 
 from bridge_places import AWAY, POST, turned
 from bridge_rig import CHAIN, HOME
+from compensation_files import arm, save
 from rclpy.parameter import Parameter
 from simple_cells import write_cell
 
@@ -143,38 +142,28 @@ def test_the_fastest_point_keeps_the_cartesian_limit(rig):
     assert 0.09 < fastest < 0.1002
 
 
-def fit_with(folder, offsets_deg, std_deg=0.01, unknown=()):
-    joints = [
-        {
-            'joint': name,
-            'mean_deg': offsets_deg.get(name, 0.0),
-            'std_deg': std_deg,
-            'interval95_deg': [-0.02, 0.02],
-            'identifiable': name not in unknown,
-            'why': '',
-        }
-        for name in CHAIN.joint_names
-    ]
-    empty = {'gauge': [], 'registration': {}, 'markers': {}, 'noise': {}, 'left_out': []}
-    sampler = {'name': 'x', 'chains': 1, 'draws': 1}
-    sampler |= dict.fromkeys(('r_hat_max', 'ess_min', 'seconds'))
-    fit = {'format': 'remaster-fit/1', 'joint_offsets': joints, 'sampler': sampler, **empty}
-    fit['accuracy'] = {'optimization': None, 'validation': None}
-    path = folder / 'fit.json'
-    path.write_text(json.dumps(fit))
-    return path
+def corrected_by(folder, offsets_deg, known=()):
+    """Write the compensation.json of the demo's arm with these offsets; return its path."""
+    names = list(CHAIN.joint_names)
+    offsets = np.zeros(len(names))
+    for name, degrees in offsets_deg.items():
+        offsets[names.index(name)] = np.deg2rad(degrees)
+    urdf = read_cell('demo').urdf_text
+    model = arm(urdf, CHAIN.base_link, CHAIN.tip_link, joint_offsets=offsets)
+    return save(folder, model, urdf, known=known)
 
 
 @pytest.mark.parametrize('sign', [1.0, -1.0])
 def test_offsets_in_use_shift_the_limits(rig, tmp_path, sign):
     """True angle = reported + offset: with +2 degrees the upper stop comes 2 degrees earlier."""
-    fit = fit_with(tmp_path, {'joint_2': 2.0 * sign})
-    limits = rig(ready=False, offsets=fit, limit_margin_deg=0.0).bridge.supervisor.gate.limits
+    file = corrected_by(tmp_path, {'joint_2': 1.9 * sign})
+    r = rig(ready=False, compensation=file, limit_margin_deg=0.0)
+    limits = r.bridge.supervisor.gate.limits
     lower, upper = CHAIN.lower.copy(), CHAIN.upper.copy()
     if sign > 0:
-        upper[1] -= np.deg2rad(2.0)
+        upper[1] -= np.deg2rad(1.9)
     else:
-        lower[1] += np.deg2rad(2.0)
+        lower[1] += np.deg2rad(1.9)
     np.testing.assert_allclose(limits.lower, lower)
     np.testing.assert_allclose(limits.upper, upper)
 
@@ -182,37 +171,41 @@ def test_offsets_in_use_shift_the_limits(rig, tmp_path, sign):
 @pytest.mark.parametrize(('sign', 'free'), [(1.0, False), (-1.0, True)])
 def test_paths_are_checked_where_the_arm_is_with_its_offsets(rig, tmp_path, sign, free):
     """A post on the left: an arm that is further to the left than it reports reaches it."""
-    fit = fit_with(tmp_path, {'joint_1': 3.0 * sign})
+    file = corrected_by(tmp_path, {'joint_1': 1.9 * sign})
     cell = write_cell(tmp_path / 'cell.yaml', obstacles={'post': POST})
     nominal = read_cell(cell).collision_model(CHAIN, np.deg2rad(0.1))
     turns = np.linspace(-0.8, 0.0, 161)
     touching = next(turn for turn in turns if nominal.trouble(turned(turn)))
-    q = turned(touching - np.deg2rad(1.5))
+    q = turned(touching - np.deg2rad(1.0))
     assert not nominal.trouble(q)
-    bridge = rig(ready=False, cell=cell, offsets=fit).bridge
+    bridge = rig(ready=False, cell=cell, compensation=file).bridge
     assert bool(bridge._search._model.trouble(q)) != free
     # So are the speeds of its points.
-    v, offsets = np.ones(7), np.deg2rad([3.0 * sign, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    v, offsets = np.ones(7), np.deg2rad([1.9 * sign, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
     at = PointSpeeds(CHAIN, nominal.extent_points).fastest(q[None] + offsets, v[None])
     np.testing.assert_allclose(bridge._search._speeds.fastest(q[None], v[None]), at)
     np.testing.assert_allclose(bridge.supervisor.gate._speeds.fastest(q[None], v[None]), at)
 
 
-@pytest.mark.parametrize(
-    ('options', 'unknown_deg'),
-    [
-        ({}, 0.1),
-        ({'std_deg': 0.2}, 0.6),
-        # One that a fit could not tell is as unknown as before: the cell file's clearance.
-        ({'unknown': ['joint_1']}, 1.0),
-    ],
-)
-def test_the_clearance_covers_what_is_still_unknown(rig, tmp_path, options, unknown_deg):
-    fit = fit_with(tmp_path, {'joint_1': 5.0}, **options)
-    bridge = rig(ready=False, offsets=fit).bridge
+@pytest.mark.parametrize(('known', 'unknown_deg'), [((), 0.1), (6 * (True,) + (False,), 1.0)])
+def test_the_clearance_covers_what_is_still_unknown(rig, tmp_path, known, unknown_deg):
+    file = corrected_by(tmp_path, {'joint_1': 1.5}, known)
+    bridge = rig(ready=False, compensation=file).bridge
     assert bridge._search._model.unknown_offset == pytest.approx(np.deg2rad(unknown_deg))
-    shifted = bridge.supervisor.gate.limits.upper[0] < CHAIN.upper[0] - 0.01
-    assert shifted == ('unknown' not in options)
+
+
+def test_a_compensation_of_another_arm_or_by_the_old_name_is_refused_at_the_start(rig, tmp_path):
+    file = corrected_by(tmp_path, {'joint_1': 1.0})
+    cell = write_cell(tmp_path / 'cell.yaml')
+    (tmp_path / 'other.urdf').write_text(read_cell('demo').urdf_text + '<!-- another -->')
+    text = cell.read_text()
+    urdf = next(line for line in text.splitlines() if line.strip().startswith('urdf:'))
+    indent = urdf[: len(urdf) - len(urdf.lstrip())]
+    cell.write_text(text.replace(urdf, f'{indent}urdf: other.urdf'))
+    with pytest.raises(InputError, match='is of another URDF'):
+        rig(ready=False, cell=cell, compensation=file)
+    with pytest.raises(InputError, match="no parameter 'offsets' any more; give compensation"):
+        rig(ready=False, offsets=tmp_path / 'fit.json')
 
 
 def test_without_offsets_the_clearance_is_the_cell_files(rig):

@@ -19,7 +19,7 @@ RANGES = {
     'speed_share': (0.3, 0.01, 1.0, ''),
     'cartesian_speed_limit_m_s': (0.25, 0.0, 10.0, 'm/s'),
     'limit_margin_deg': (0.5, 0.0, 45.0, 'deg'),
-    'offsets': ('', None, None, ''),
+    'compensation': ('', None, None, ''),
     'settle_s': (3.0, 0.1, 60.0, 's'),
     'arrive_tolerance': (2e-3, 1e-6, 0.1, 'rad'),
     'still_tolerance': (2e-4, 1e-7, 0.01, 'rad'),

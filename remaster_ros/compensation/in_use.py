@@ -1,0 +1,228 @@
+"""A correction of what an arm is commanded, and where the arm then is.
+
+It is held against the arm first: one of another robot, or one that changes a joint by more than
+any mastering is off by, is refused before anything moves. Paths are to be checked for the true
+arm: zero-offsets, lengths and tilts are built into it, and what bends it by its angles and
+gravity's torques is bounded in sampled configurations.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from remaster_ros.compensation.compensator import Compensator
+from remaster_ros.compensation.file import Compensation, read_compensation
+from remaster_ros.errors import InputError
+from remaster_ros.kinematics.serial_chain import SerialChain
+from remaster_ros.kinematics.transforms import inverse, matrix_to_rotation_vector
+from remaster_ros.types import BoolArray, Correction, FloatArray
+
+MOST_DEG = 2.0
+"""A joint is changed by so much at most, degrees: zeros are off by fractions of one, and an arm
+that is off by more was dismounted or has another model."""
+KNOWN_OFFSET_RAD = float(np.deg2rad(0.1))
+"""What may still be wrong with a joint whose offset is in use, for the clearance of paths."""
+OFFSET_STDS = 3.0
+"""Or so many standard deviations of the offset that is known least."""
+SAMPLED = 2000
+"""Configurations in which largest changes are looked for: they are smooth in the angles, and of
+seven joints some hundreds come near each extreme."""
+SEED = 22
+
+
+@dataclass(frozen=True, eq=False)
+class Commands:
+    """What is commanded for n wanted configurations.
+
+    Attributes
+    ----------
+    command, change
+        What to command, and how much that is from what was wanted, rad, (n, k); of a refused
+        row the command is not a number.
+    refused
+        Row -> why it must not be commanded.
+    notes
+        What a person is to know of a row, a line each.
+    faded, outside_range
+        As of a `compensator.Correction`, (n,).
+    """
+
+    command: FloatArray
+    change: FloatArray
+    refused: dict[int, str]
+    notes: tuple[str, ...]
+    faded: BoolArray
+    outside_range: BoolArray
+
+
+class CorrectionInUse:
+    """A correction that is made of every configuration commanded.
+
+    Parameters
+    ----------
+    path
+        Its compensation.json, which is read now and never again.
+    chain, urdf
+        The arm that is commanded, and its URDF's text.
+    urdf_file
+        Of that, for messages.
+
+    Attributes
+    ----------
+    sha256
+        Of the file as it was read.
+
+    Raises
+    ------
+    InputError
+        One line: no such file, of another arm, or larger than `MOST_DEG`.
+    """
+
+    def __init__(self, path: str, chain: SerialChain, urdf: str, urdf_file: str) -> None:
+        found = read_compensation(path)
+        self.path, self.sha256 = path, found.sha256
+        self._compensation = found
+        self._compensator: Compensator = found.compensator
+        self._names = chain.joint_names
+        _refuse_another_arm(found, chain, urdf, urdf_file)
+        self._sampled = _sampled(chain)
+        change = np.abs(self._compensator.command(self._sampled) - self._sampled).max(axis=0)
+        if np.any(change > np.radians(MOST_DEG)):
+            joint = int(np.argmax(change))
+            raise InputError(
+                f'{path}: would change {self._names[joint]} by up to '
+                f'{np.degrees(change[joint]):.2f} degrees, and {MOST_DEG:g} are the most: master '
+                'the arm, measure again, and give the new file'
+            )
+
+    @cached_property
+    def true_arm(self) -> SerialChain:
+        """The arm with zero-offsets, lengths and tilts built in: it takes reported angles."""
+        return self._compensator.model.rigid()
+
+    @cached_property
+    def _bends(self) -> FloatArray:
+        """Turn of each joint that `true_arm` has not, rad, (n, k), in sampled configurations."""
+        frames = self._compensator.model.state(self._sampled).frames
+        rigid = self.true_arm.frames(self._sampled)
+        steps = [_steps(one) for one in (frames, rigid)]
+        turns = matrix_to_rotation_vector(
+            np.swapaxes(steps[1][..., :3, :3], -1, -2) @ steps[0][..., :3, :3]
+        )
+        return np.asarray(np.linalg.norm(turns, axis=-1))
+
+    def unknown_rad(self, before_rad: float) -> float:
+        """Return what a joint's true angle may be off from that of `true_arm`, rad.
+
+        Clearances grow by it times the root of the sum of the squares of the levers: no bodies
+        come nearer by what turns each joint, if it is the root of the sum of the squares of these
+        turns (Cauchy and Schwarz). Turns across an axis count by the levers of other joints.
+
+        Parameters
+        ----------
+        before_rad
+            The same without a correction: it remains where an offset could not be identified.
+        """
+        model = self._compensator.model
+        std = model.widening * np.linalg.norm(model.root[:, : model.joints], axis=0)
+        known = all(part.identifiable for part in self._compensation.content.joints)
+        left = max(KNOWN_OFFSET_RAD, OFFSET_STDS * float(std.max())) if known else before_rad
+        return left + float(np.linalg.norm(self._bends, axis=1).max())
+
+    @cached_property
+    def shifts(self) -> FloatArray:
+        """The least and the largest that is to be added to reported angles, rad, (2, k)."""
+        model = self._compensator.model
+        drivers = model.drivers(self._sampled, model.warming(len(self._sampled), None))
+        added = model.added_angles(drivers)
+        return np.array([added.min(axis=0), added.max(axis=0)])
+
+    @property
+    def remarks(self) -> list[str]:
+        """What a person is to know of it when it is put in use, a line each."""
+        lines = []
+        model, state = self._compensator.model, self._compensation.content.state
+        if model.grows:
+            lines.append(
+                f'{self.path}: depends on the temperature, and {model.mean_c:.1f} degrees Celsius '
+                'are taken, as it was measured'
+            )
+        before = state.get('correction')
+        if before and not (one := Correction(**before)).is_beside:
+            lines.append(
+                f'{self.path}: was measured with a correction on ({one}), which must still be on'
+            )
+        return lines
+
+    def commands(self, wanted: FloatArray) -> Commands:
+        """Return what to command for wanted configurations, rad, (n, k)."""
+        finite = np.all(np.isfinite(wanted), axis=-1)
+        done = self._compensator.correct(np.where(finite[:, None], wanted, 0.0))
+        change = done.command - wanted
+        refused = {int(row): 'it is no finite number' for row in np.flatnonzero(~finite)}
+        most = np.abs(change).max(axis=1, initial=0.0)
+        for row in map(int, np.flatnonzero(most > np.radians(MOST_DEG))):
+            joint = int(np.argmax(np.abs(change[row])))
+            refused[row] = (
+                f'the correction would change {self._names[joint]} by '
+                f'{np.degrees(change[row, joint]):.2f} degrees; {MOST_DEG:g} are the most'
+            )
+        notes = []
+        for row in map(int, np.flatnonzero(finite)):
+            if done.faded[row]:
+                notes.append(
+                    f'solution {row} is near a singularity: of its pose '
+                    f'{1e3 * done.residual_m[row]:.3f} mm and '
+                    f'{np.degrees(done.residual_rad[row]):.4f} degrees are not corrected'
+                )
+            if done.outside_range[row]:
+                notes.append(
+                    f'solution {row} is beyond the angles at which a curve of the correction was '
+                    'measured: its end value is taken'
+                )
+        command = done.command.copy()
+        # No check lets it pass either.
+        command[list(refused)] = np.nan
+        faded, outside = done.faded & finite, done.outside_range & finite
+        return Commands(command, change, refused, tuple(notes), faded, outside)
+
+
+def _refuse_another_arm(
+    found: Compensation, chain: SerialChain, urdf: str, urdf_file: str
+) -> None:
+    robot = found.content.robot
+    sha256 = hashlib.sha256(urdf.encode()).hexdigest()
+    if robot.urdf_sha256 != sha256:
+        raise InputError(
+            f'{found.path}: is of another URDF (checksum {robot.urdf_sha256[:8]}) than '
+            f'{urdf_file} ({sha256[:8]}); give the one that was measured with this description'
+        )
+    for what, its, own in (
+        ('base link', robot.base_link, chain.base_link),
+        ('tip link', robot.tip_link, chain.tip_link),
+        ('joints', ', '.join(robot.joint_names), ', '.join(chain.joint_names)),
+    ):
+        if its != own:
+            raise InputError(
+                f"{found.path}: its {what} ({its}) differ from the cell's ({own}); give the one "
+                'that was measured with this cell'
+            )
+
+
+def _sampled(chain: SerialChain) -> FloatArray:
+    """Return configurations within the limits, rad, (n, k)."""
+    lower = np.where(np.isfinite(chain.lower), chain.lower, -np.pi)
+    upper = np.where(np.isfinite(chain.upper), chain.upper, np.pi)
+    return np.random.default_rng(SEED).uniform(lower, upper, (SAMPLED, len(chain)))
+
+
+def _steps(frames: FloatArray) -> FloatArray:
+    """Return each joint's frame in the one before, (n, k, 4, 4)."""
+    found: FloatArray = np.concatenate(
+        (frames[:, :1], inverse(frames[:, :-1]) @ frames[:, 1:]), axis=1
+    )
+    return found

@@ -1,0 +1,70 @@
+"""A collection through a bridge that corrects what it commands, with real nodes."""
+
+import hashlib
+
+import numpy as np
+import pytest
+from collection_rig import SEED, Cell
+from command_line import remaster
+from compensation_files import save
+
+from remaster_ros.calibration.fit import fit_session
+from remaster_ros.cli.verify import visits
+from remaster_ros.compensation.arm_model import ArmModel
+from remaster_ros.compensation.file import read_compensation
+from remaster_ros.compensation.verification import verify
+from remaster_ros.session.workcell import read_cell
+from remaster_ros.simulation.setup import make_world
+from remaster_ros.types import Correction
+
+pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(900)]
+
+
+def true_correction(folder):
+    """Write the compensation.json of the offsets that the world of the rig hides."""
+    from dataclasses import replace
+
+    cell = read_cell('demo')
+    truth = make_world(folder / 'twin', cell, SEED, 1.0).truth
+    model = replace(
+        ArmModel.nominal(cell.chain()),
+        joint_offsets=truth.joint_offsets,
+        T_R_N={'mocap': np.eye(4)},
+        markers={name: np.array(at) for name, at in cell.markers.items()},
+    )
+    return save(folder, model, cell.urdf_text), truth.joint_offsets
+
+
+def test_offsets_fitted_through_the_bridge_are_zero(start, client, tmp_path):
+    """A fixed seed: of 99 % intervals of five joints one would be outside in a session of twenty.
+
+    At the reported angles the same rows have the hidden offsets again.
+    """
+    file, hidden = true_correction(tmp_path)
+    compensator = read_compensation(file).compensator
+    cell = Cell(start, client, tmp_path, 'mocap', ['mocap'], candidates=8, compensation=file)
+    session = cell.complete()
+    cell.check(session)
+    m = session.measurements
+    assert session.correction == Correction(
+        'robot_bridge', hashlib.sha256(file.read_bytes()).hexdigest()
+    )
+    assert m.correction.tolist() == [1] * len(m)
+    # What was commanded is what the file makes of what was wanted, to the arm's repeatability.
+    np.testing.assert_allclose(m.q, compensator.command(m.wanted), atol=1e-4)
+    assert np.max(np.abs(m.q - m.wanted)) > np.deg2rad(0.2)
+    assert cell.events
+    assert not [e for e in cell.events if type(e).__name__ == 'ArmHalted']
+
+    raw = fit_session(session, rng=np.random.default_rng(1), draws=400)
+    known = raw.identifiable
+    assert known.sum() >= 5
+    assert np.all(np.abs((raw.joint_offsets - hidden) / raw.joint_offsets_std)[known] < 2.58)
+    assert np.max(np.abs(raw.joint_offsets / raw.joint_offsets_std)[known]) > 10.0
+    left = fit_session(session.through_correction(), rng=np.random.default_rng(1), draws=400)
+    assert np.all(np.abs(left.joint_offsets / left.joint_offsets_std)[known] < 2.58)
+
+    assert verify(compensator, visits(session, cell.session)).verdict == 'in_use'
+    done = remaster('replay', cell.session, '--out', tmp_path / 'again')
+    assert done.returncode == 0, done.stderr
+    assert 'all rows are those of' in done.stdout
