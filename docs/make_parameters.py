@@ -23,6 +23,7 @@ FIRST = (
     'optimizer',
     'replay',
     'watch',
+    'compensator',
 )
 HEAD = """\
 # Parameters of the nodes

@@ -67,47 +67,62 @@ class CorrectionInUse:
     path
         Its compensation.json, which is read now and never again.
     chain, urdf
-        The arm that is commanded, and its URDF's text.
+        The arm that is commanded, and its URDF's text; that of the file where None.
     urdf_file
         Of that, for messages.
+    most_deg
+        By so much a joint is changed at most, degrees.
 
     Attributes
     ----------
     sha256
         Of the file as it was read.
+    compensator
+        What it does.
 
     Raises
     ------
     InputError
-        One line: no such file, of another arm, or larger than `MOST_DEG`.
+        One line: no such file, of another arm, or larger than `most_deg`.
     """
 
-    def __init__(self, path: str, chain: SerialChain, urdf: str, urdf_file: str) -> None:
+    def __init__(
+        self,
+        path: str,
+        chain: SerialChain | None = None,
+        urdf: str = '',
+        urdf_file: str = '',
+        most_deg: float = MOST_DEG,
+    ) -> None:
         found = read_compensation(path)
         self.path, self.sha256 = path, found.sha256
         self._compensation = found
-        self._compensator: Compensator = found.compensator
+        self.compensator: Compensator = found.compensator
+        if chain is None:
+            chain = found.model.chain
+        else:
+            _refuse_another_arm(found, chain, urdf, urdf_file)
         self._names = chain.joint_names
-        _refuse_another_arm(found, chain, urdf, urdf_file)
+        self._most_deg = most_deg
         self._sampled = _sampled(chain)
-        change = np.abs(self._compensator.command(self._sampled) - self._sampled).max(axis=0)
-        if np.any(change > np.radians(MOST_DEG)):
+        change = np.abs(self.compensator.command(self._sampled) - self._sampled).max(axis=0)
+        if np.any(change > np.radians(self._most_deg)):
             joint = int(np.argmax(change))
             raise InputError(
                 f'{path}: would change {self._names[joint]} by up to '
-                f'{np.degrees(change[joint]):.2f} degrees, and {MOST_DEG:g} are the most: master '
-                'the arm, measure again, and give the new file'
+                f'{np.degrees(change[joint]):.2f} degrees, and {self._most_deg:g} are the most: '
+                'master the arm, measure again, and give the new file'
             )
 
     @cached_property
     def true_arm(self) -> SerialChain:
         """The arm with zero-offsets, lengths and tilts built in: it takes reported angles."""
-        return self._compensator.model.rigid()
+        return self.compensator.model.rigid()
 
     @cached_property
     def _bends(self) -> FloatArray:
         """Turn of each joint that `true_arm` has not, rad, (n, k), in sampled configurations."""
-        frames = self._compensator.model.state(self._sampled).frames
+        frames = self.compensator.model.state(self._sampled).frames
         rigid = self.true_arm.frames(self._sampled)
         steps = [_steps(one) for one in (frames, rigid)]
         turns = matrix_to_rotation_vector(
@@ -127,7 +142,7 @@ class CorrectionInUse:
         before_rad
             The same without a correction: it remains where an offset could not be identified.
         """
-        model = self._compensator.model
+        model = self.compensator.model
         std = model.widening * np.linalg.norm(model.root[:, : model.joints], axis=0)
         known = all(part.identifiable for part in self._compensation.content.joints)
         left = max(KNOWN_OFFSET_RAD, OFFSET_STDS * float(std.max())) if known else before_rad
@@ -136,7 +151,7 @@ class CorrectionInUse:
     @cached_property
     def shifts(self) -> FloatArray:
         """The least and the largest that is to be added to reported angles, rad, (2, k)."""
-        model = self._compensator.model
+        model = self.compensator.model
         drivers = model.drivers(self._sampled, model.warming(len(self._sampled), None))
         added = model.added_angles(drivers)
         return np.array([added.min(axis=0), added.max(axis=0)])
@@ -145,7 +160,7 @@ class CorrectionInUse:
     def remarks(self) -> list[str]:
         """What a person is to know of it when it is put in use, a line each."""
         lines = []
-        model, state = self._compensator.model, self._compensation.content.state
+        model, state = self.compensator.model, self._compensation.content.state
         if model.grows:
             lines.append(
                 f'{self.path}: depends on the temperature, and {model.mean_c:.1f} degrees Celsius '
@@ -158,19 +173,25 @@ class CorrectionInUse:
             )
         return lines
 
-    def commands(self, wanted: FloatArray) -> Commands:
-        """Return what to command for wanted configurations, rad, (n, k)."""
-        finite = np.all(np.isfinite(wanted), axis=-1)
-        done = self._compensator.correct(np.where(finite[:, None], wanted, 0.0))
-        change = done.command - wanted
-        refused = {int(row): 'it is no finite number' for row in np.flatnonzero(~finite)}
+    def too_large(self, change: FloatArray) -> dict[int, str]:
+        """Return which rows change a joint by too much, and how, for changes (n, k), rad."""
+        refused = {}
         most = np.abs(change).max(axis=1, initial=0.0)
-        for row in map(int, np.flatnonzero(most > np.radians(MOST_DEG))):
+        for row in map(int, np.flatnonzero(most > np.radians(self._most_deg))):
             joint = int(np.argmax(np.abs(change[row])))
             refused[row] = (
                 f'the correction would change {self._names[joint]} by '
-                f'{np.degrees(change[row, joint]):.2f} degrees; {MOST_DEG:g} are the most'
+                f'{np.degrees(change[row, joint]):.2f} degrees; {self._most_deg:g} are the most'
             )
+        return refused
+
+    def commands(self, wanted: FloatArray) -> Commands:
+        """Return what to command for wanted configurations, rad, (n, k)."""
+        finite = np.all(np.isfinite(wanted), axis=-1)
+        done = self.compensator.correct(np.where(finite[:, None], wanted, 0.0))
+        change = done.command - wanted
+        refused = {int(row): 'it is no finite number' for row in np.flatnonzero(~finite)}
+        refused |= self.too_large(change)
         notes = []
         for row in map(int, np.flatnonzero(finite)):
             if done.faded[row]:

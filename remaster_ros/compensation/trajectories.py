@@ -14,7 +14,7 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike
 
-from remaster_ros.compensation.compensator import Compensator
+from remaster_ros.compensation.compensator import Compensator, Correction
 from remaster_ros.errors import InputError
 from remaster_ros.types import BoolArray, FloatArray
 
@@ -41,6 +41,8 @@ class CorrectedTrajectory:
         From the start, (n,).
     positions, velocities
         rad and rad/s, (n, k); velocities are None where none were given.
+    change
+        Of the positions, by the correction, rad, (n, k).
     stretched
         How many times longer it takes than it was to.
     deviation_m
@@ -55,6 +57,7 @@ class CorrectedTrajectory:
     times_s: FloatArray
     positions: FloatArray
     velocities: FloatArray | None
+    change: FloatArray
     stretched: float
     deviation_m: float
     added_speed: FloatArray
@@ -103,7 +106,7 @@ def corrected_trajectory(
         velocity_limits = compensator.model.chain.velocity_limits
     times = _spread(compensator, wanted)
     while True:
-        sent = _sent(compensator, wanted, times, temperature_c)
+        sent, done = _sent(compensator, wanted, times, temperature_c)
         middle = times[:-1, None] + np.diff(times)[:, None] * COMPARED
         exact = compensator.command(wanted.at(middle.ravel()), temperature_c)
         off = _distance(compensator, sent.at(middle.ravel()), exact).reshape(middle.shape)
@@ -123,11 +126,11 @@ def corrected_trajectory(
     if acceleration_limits is not None and sent.v is not None:
         ratio = np.max(acceleration / np.asarray(acceleration_limits, dtype=float))
         stretched = max(stretched, float(np.sqrt(ratio)))
-    done = compensator.correct(wanted.at(times), temperature_c)
     return CorrectedTrajectory(
         times[0] + (times - times[0]) * stretched,
         sent.q,
         None if sent.v is None else sent.v / stretched,
+        sent.q - wanted.at(times),
         stretched,
         float(off.max()),
         _added(before[0], speed),
@@ -135,6 +138,13 @@ def corrected_trajectory(
         done.faded,
         done.outside_range,
     )
+
+
+def largest_speeds(
+    times_s: FloatArray, positions: FloatArray, velocities: FloatArray | None
+) -> FloatArray:
+    """Return the largest speed of each joint of what a controller draws, rad/s, (k,)."""
+    return _Path(times_s, positions, velocities).largest()[0]
 
 
 class _Path:
@@ -217,18 +227,37 @@ def _spread(compensator: Compensator, wanted: _Path) -> FloatArray:
 
 def _sent(
     compensator: Compensator, wanted: _Path, times: FloatArray, temperature_c: float | None
-) -> _Path:
-    """Return the corrected path through points at these times."""
-    q = wanted.at(times)
-    command = compensator.command(q, temperature_c)
-    if wanted.v is None:
-        return _Path(times, command, None)
-    v = wanted.speed(times)
+) -> tuple[_Path, Correction]:
+    """Return the corrected path through points at these times, and what was done to them."""
+    v = None if wanted.v is None else wanted.speed(times)
+    done, speeds = corrected_points(compensator, wanted.at(times), v, temperature_c)
+    return _Path(times, done.command, speeds), done
+
+
+def corrected_points(
+    compensator: Compensator,
+    q: FloatArray,
+    v: FloatArray | None,
+    temperature_c: float | None = None,
+) -> tuple[Correction, FloatArray | None]:
+    """Return what to command for points, and their velocities.
+
+    Parameters
+    ----------
+    compensator, temperature_c
+        As of `corrected_trajectory`.
+    q, v
+        Wanted, rad and rad/s, (n, k); None where there are no velocities.
+    """
+    done = compensator.correct(q, temperature_c)
+    if v is None:
+        return done, None
     # The correction is a function of the joints: its change along the way there.
     size = np.abs(v).max(axis=1, keepdims=True)
     step = STEP_RAD * np.divide(v, size, out=np.zeros_like(v), where=size > 0.0)
-    ahead, behind = (compensator.command(q + sign * step, temperature_c) for sign in (1.0, -1.0))
-    return _Path(times, command, (ahead - behind) * size / (2.0 * STEP_RAD))
+    both = compensator.command(np.concatenate((q + step, q - step)), temperature_c)
+    ahead, behind = both[: len(q)], both[len(q) :]
+    return done, (ahead - behind) * size / (2.0 * STEP_RAD)
 
 
 def _distance(compensator: Compensator, a: FloatArray, b: FloatArray) -> FloatArray:

@@ -35,22 +35,10 @@ def difference(chain: SerialChain, description: str) -> str:
     description
         URDF text.
     """
-    try:
-        model = parse_urdf(description)
-        links = {joint.name: link for link, joint in model.parent_joint.items()}
-        missing = [name for name in chain.joint_names if name not in links]
-        if missing:
-            return f'it has no joint {", ".join(missing)}'
-        has_base = chain.base_link in model.links
-        base = chain.base_link if has_base else model.root
-        # A gripper or a tool changer behind the tip does not matter, nor that there is none.
-        last = links[chain.joint_names[-1]]
-        has_tip = model.carrier(chain.tip_link, [last])[0] == last
-        other = SerialChain.from_urdf(description, base, chain.tip_link if has_tip else last)
-    except InputError as error:
-        return str(error)
-    if other.joint_names != chain.joint_names:
-        return f'its joints are {", ".join(other.joint_names)}, in this order'
+    read = _read(chain, description)
+    if isinstance(read, str):
+        return read
+    other, has_base, has_tip = read
     # A place and a direction of each axis.
     (places, own), (others, theirs) = _axes(chain, has_base), _axes(other, has_base)
     apart = places - others
@@ -74,6 +62,39 @@ def difference(chain: SerialChain, description: str) -> str:
         if np.linalg.norm(T[:3, 3]) > PLACE_M or np.max(np.abs(T[:3, :3] - np.eye(3))) > TURN_RAD:
             return f'{chain.tip_link} lies elsewhere there with all joints at zero'
     return ''
+
+
+def axes_apart(chain: SerialChain, description: str) -> float:
+    """Return how far the axes of a description are turned from those of an arm, rad.
+
+    Root of the sum of the squares; infinite where it is another arm.
+    """
+    read = _read(chain, description)
+    if isinstance(read, str):
+        return np.inf
+    other, has_base, _ = read
+    return float(np.linalg.norm(_axes(chain, has_base)[1] - _axes(other, has_base)[1]))
+
+
+def _read(chain: SerialChain, description: str) -> tuple[SerialChain, bool, bool] | str:
+    """Return the arm of a description, and whether it has base and tip; or why it is another."""
+    try:
+        model = parse_urdf(description)
+        links = {joint.name: link for link, joint in model.parent_joint.items()}
+        missing = [name for name in chain.joint_names if name not in links]
+        if missing:
+            return f'it has no joint {", ".join(missing)}'
+        has_base = chain.base_link in model.links
+        base = chain.base_link if has_base else model.root
+        # A gripper or a tool changer behind the tip does not matter, nor that there is none.
+        last = links[chain.joint_names[-1]]
+        has_tip = model.carrier(chain.tip_link, [last])[0] == last
+        other = SerialChain.from_urdf(description, base, chain.tip_link if has_tip else last)
+    except InputError as error:
+        return str(error)
+    if other.joint_names != chain.joint_names:
+        return f'its joints are {", ".join(other.joint_names)}, in this order'
+    return other, has_base, has_tip
 
 
 def _axes(chain: SerialChain, from_base: bool) -> tuple[FloatArray, FloatArray]:

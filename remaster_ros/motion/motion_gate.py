@@ -69,11 +69,15 @@ class Admitted:
     waypoints
         For the controller, which begins at once.
     trajectory
-        The lines that the arm will be on; None for a stop, which stays on those of its move.
+        The lines that the arm will be on; None for a stop, which stays on those of its move, and
+        for the trajectory of another planner.
+    is_straight
+        Whether the controller is given no velocities, and draws straight lines.
     """
 
     waypoints: tuple[Waypoint, ...]
     trajectory: Trajectory | None = None
+    is_straight: bool = False
 
 
 class MotionGate:
@@ -242,6 +246,78 @@ class MotionGate:
             )
 
 
+class ForeignGate:
+    """Admit trajectories of other planners.
+
+    What leads where is theirs: no path was found free here, and nothing is known of what stands
+    in the way. What is looked at is what the controller makes of a trajectory, from where the arm
+    is: positions, speeds, accelerations, and that it ends at rest.
+
+    Parameters
+    ----------
+    limits
+        Positions, speeds and accelerations, without a margin.
+    """
+
+    def __init__(self, limits: MotionLimits) -> None:
+        self.limits = limits
+
+    def admit(
+        self,
+        waypoints: Sequence[Waypoint],
+        q: FloatArray,
+        velocity: FloatArray,
+        *,
+        is_straight: bool = False,
+    ) -> Admitted:
+        """Return a trajectory that begins at once.
+
+        Parameters
+        ----------
+        waypoints
+            At times that ascend; none for a controller that is to hold the arm.
+        q, velocity
+            Where the arm is, rad and rad/s, (k,); no velocity at all where it stands.
+        is_straight
+            Whether the controller is given no velocities.
+
+        Raises
+        ------
+        MotionRefusedError
+            With the limit, the value and the joint.
+        """
+        if not waypoints:
+            return Admitted(())
+        limits = self.limits
+        low, high = np.minimum(limits.lower, q), np.maximum(limits.upper, q)
+        points = list(waypoints)
+        if points[0].time_s > 0.0:
+            points.insert(0, Waypoint(0.0, q, velocity))
+        else:
+            self._check_start(points[0], q, velocity)
+        if not is_straight and np.any(points[-1].velocity != 0.0):
+            raise MotionRefusedError('the trajectory does not end at rest')
+        for before, after in pairwise(points):
+            piece = Cubic.line(before, after) if is_straight else Cubic.between(before, after)
+            if not piece.duration_s > 0.0 or not np.all(np.isfinite(piece.coefficients)):
+                raise MotionRefusedError('the times of the trajectory do not increase')
+            _check_range(piece, low, high, limits)
+            _check_rate('speed', piece.largest_speed(), limits.velocity, 'rad/s', limits)
+            largest = piece.largest_acceleration()
+            _check_rate('acceleration', largest, limits.acceleration, 'rad/s2', limits)
+        return Admitted(tuple(waypoints), None, is_straight)
+
+    def _check_start(self, first: Waypoint, q: FloatArray, velocity: FloatArray) -> None:
+        """Look whether the controller could begin there at once: it would jump there."""
+        off = np.abs(first.q - q)
+        if not np.max(off) <= START_RAD:
+            joint = int(np.argmax(off))
+            name, deg = self.limits.names[joint], float(np.rad2deg(off[joint]))
+            raise StartMovedError(f'it begins {deg:.2f} deg from where {name} is')
+        if np.any(velocity != 0.0):
+            raise StartMovedError('it begins at once while the arm moves')
+
+
 def _way_out_limits(limits: MotionLimits) -> MotionLimits:
     return replace(
         limits,
@@ -299,6 +375,15 @@ class Cubic:
             second = (3 * gap / duration - 2 * before.velocity - after.velocity) / duration
             third = (before.velocity + after.velocity - 2 * gap / duration) / duration**2
         return cls(duration, np.array([before.q, before.velocity, second, third]))
+
+    @classmethod
+    def line(cls, before: Waypoint, after: Waypoint) -> Cubic:
+        """Return the line that a controller draws without velocities."""
+        duration = after.time_s - before.time_s
+        with np.errstate(divide='ignore', invalid='ignore'):
+            slope = (after.q - before.q) / duration
+        none = np.zeros_like(slope)
+        return cls(duration, np.array([before.q, slope, none, none]))
 
     def at(self, time_s: float | FloatArray) -> FloatArray:
         """Return positions, rad, (k,) or (n, k) for times (n,)."""

@@ -15,6 +15,7 @@ NODES = {
     'recorder': 'pairs robot and sensors, and writes the session',
     'optimizer': 'fits a session, publishes the offsets, looks for causes',
     'replay': 'publishes a recorded session again',
+    'compensator': 'corrects what other planners send to the controller',
     'watch': 'shows a collection on a local web page',
     'fake_robot': 'a simulated arm',
     'fake_optitrack': 'a simulated OptiTrack system',

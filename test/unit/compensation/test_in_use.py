@@ -121,7 +121,7 @@ def test_rows_that_are_no_numbers_or_too_far_are_refused_each_by_itself(tmp_path
     # What is refused cannot be commanded by mistake.
     assert np.all(np.isnan(done.command[1]))
     largest = np.degrees(np.abs(done.change[[0, 2]]).max(axis=1))
-    monkeypatch.setattr('remaster_ros.compensation.in_use.MOST_DEG', float(np.mean(largest)))
+    monkeypatch.setattr(correction, '_most_deg', float(np.mean(largest)))
     beyond = [0, 2][int(np.argmax(largest))]
     done = correction.commands(wanted)
     refused = done.refused

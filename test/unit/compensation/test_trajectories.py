@@ -6,23 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from drawn_moves import drawn
 from test_compensator import arm, configurations, erring
 
 from remaster_ros.compensation.arm_model import Function, JointTerm
 from remaster_ros.compensation.compensator import Compensator
 from remaster_ros.compensation.trajectories import corrected_trajectory
 from remaster_ros.errors import InputError
-
-
-def drawn(times, q, v, at):
-    """Evaluate as ros2_control's trajectory.cpp does: a cubic, or a line without velocities."""
-    i = np.clip(np.searchsorted(times, at, 'right') - 1, 0, len(times) - 2)
-    T, s = (times[i + 1] - times[i])[:, None], (at - times[i])[:, None]
-    if v is None:
-        return q[i] + (q[i + 1] - q[i]) / T * s
-    c2 = (3 * (q[i + 1] - q[i]) - (2 * v[i] + v[i + 1]) * T) / T**2
-    c3 = (-2 * (q[i + 1] - q[i]) + (v[i] + v[i + 1]) * T) / T**3
-    return q[i] + v[i] * s + c2 * s**2 + c3 * s**3
 
 
 def a_path(model, seed, points=4):

@@ -73,7 +73,7 @@ def test_a_configuration_that_the_correction_changes_too_much_is_given_up(
     urdf = read_cell('demo').urdf_text
     model = arm(urdf, CHAIN.base_link, CHAIN.tip_link, joint_offsets=np.full(7, 0.01))
     r = rig(compensation=save(tmp_path, model, urdf))
-    monkeypatch.setattr('remaster_ros.compensation.in_use.MOST_DEG', 0.1)
+    monkeypatch.setattr(r.bridge._correction, '_most_deg', 0.1)
     r.plan(TARGET)
     r.run(2.0, lambda: r.named(SolutionFailed))
     (failed,) = r.named(SolutionFailed)
@@ -99,7 +99,7 @@ def test_a_waypoint_that_the_correction_changes_too_much_is_not_gone_through(
     at_target = np.degrees(np.abs(Compensator(model).command(TARGET) - TARGET).max())
     assert change.max() > at_target + 1e-3
     most = 0.5 * (change.max() + at_target)
-    monkeypatch.setattr('remaster_ros.compensation.in_use.MOST_DEG', most)
+    monkeypatch.setattr(r.bridge._correction, '_most_deg', most)
     r.plan(TARGET, ways=[(0, [ways[np.argmax(change)]])])
     r.run(2.0, lambda: r.named(SolutionFailed))
     (failed,) = r.named(SolutionFailed)

@@ -1,0 +1,315 @@
+"""Trajectories of other planners, corrected on their way to the controller, and the way back.
+
+A planner that knows nothing of a correction plans for the nominal arm. It must be told where that
+would have to be to have its tool where the arm has it (`TrueAngles`); what it then wants is
+corrected and handed to the motion gate (`passed_on`). Both ways fit: what is planned from the
+angles it was told begins where the arm is.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+
+from remaster_ros.compensation.compensator import Compensator
+from remaster_ros.compensation.in_use import CorrectionInUse
+from remaster_ros.compensation.trajectories import (
+    corrected_points,
+    corrected_trajectory,
+    largest_speeds,
+)
+from remaster_ros.errors import InputError
+from remaster_ros.motion.following import FRESH_S, STANDING_S
+from remaster_ros.motion.limits import MotionLimits
+from remaster_ros.motion.motion_gate import Admitted, ForeignGate, MotionRefusedError
+from remaster_ros.motion.settling import SettleRules
+from remaster_ros.motion.trajectory import Waypoint
+from remaster_ros.types import BoolArray, FloatArray
+
+SPEED_TOLERANCE = 0.01
+"""A planner's speeds may exceed the limits by this share: its splines are sampled."""
+REST_RAD_S = 1e-7
+"""An end speed that is rounding, rad/s: joint_trajectory_controller takes no larger one (the
+resolution of a float)."""
+NEAR_RAD = 2e-4
+"""So near to angles whose correction is known it is taken as it is there, rad: it changes by some
+hundredths of the way."""
+KNOWN_RAD = 1e-7
+"""It is known where a further step changes less, rad: an encoder of 23 bits reads 7e-7."""
+EVERY_S = 0.02
+"""While the arm moves the correction of reported angles is found anew so often, s."""
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """A planner's trajectory: n points of k joints in the arm's order.
+
+    Attributes
+    ----------
+    times_s
+        From its start, (n,).
+    positions, velocities
+        rad and rad/s, (n, k); velocities are None where the controller draws lines.
+    """
+
+    times_s: FloatArray
+    positions: FloatArray
+    velocities: FloatArray | None
+
+
+@dataclass(frozen=True)
+class Passed:
+    """What is sent in place of a planner's trajectory.
+
+    Attributes
+    ----------
+    admitted
+        What the gate has let pass.
+    end_s
+        When it ends, from its start.
+    notes
+        What a person is to know of it, a line each.
+    """
+
+    admitted: Admitted
+    end_s: float
+    notes: tuple[str, ...] = ()
+
+
+class Present:
+    """Where an arm is by its last reports, how fast, and whether it stands."""
+
+    def __init__(self) -> None:
+        self._reports: deque[tuple[float, FloatArray]] = deque()
+        self._wall_s = -np.inf
+        self._still_rad = SettleRules().still_tolerance
+
+    def take(self, stamp_s: float, q: FloatArray, wall_s: float) -> None:
+        """Take a report: its stamp, positions, rad, (k,), and when it came.
+
+        One that is not later than the one before begins anew: a clock was set back.
+        """
+        reports = self._reports
+        if reports and stamp_s <= reports[-1][0]:
+            reports.clear()
+        reports.append((stamp_s, q))
+        while len(reports) > 2 and reports[1][0] <= stamp_s - STANDING_S:
+            reports.popleft()
+        self._wall_s = wall_s
+
+    def is_fresh(self, wall_s: float) -> bool:
+        """Whether the last report still shows where the arm is."""
+        return wall_s - self._wall_s <= FRESH_S
+
+    @property
+    def q(self) -> FloatArray:
+        """Where it is, rad, (k,)."""
+        return self._reports[-1][1]
+
+    @property
+    def is_known(self) -> bool:
+        """Whether there are two reports, which it takes to know how fast it is."""
+        return len(self._reports) > 1
+
+    @property
+    def velocity(self) -> FloatArray:
+        """How fast, rad/s, (k,): none at all where it stands."""
+        if self.stands:
+            return np.zeros_like(self.q)
+        (before_s, before), (stamp_s, q) = self._reports[-2], self._reports[-1]
+        return (q - before) / (stamp_s - before_s)
+
+    @property
+    def stands(self) -> bool:
+        """Whether it has not moved for `following.STANDING_S`."""
+        reports = self._reports
+        if not reports or reports[-1][0] - reports[0][0] < STANDING_S:
+            return False
+        return bool(np.ptp([q for _, q in reports], axis=0).max() <= self._still_rad)
+
+
+class TrueAngles:
+    """Angles of the nominal arm with its tool where the arm has it, report by report.
+
+    Parameters
+    ----------
+    compensator
+        The correction.
+    """
+
+    def __init__(self, compensator: Compensator) -> None:
+        self._compensator = compensator
+        # What is to be added to reported angles, rad, where that was found, and when (s).
+        self.added: FloatArray = np.zeros(compensator.model.joints)
+        self._at: FloatArray | None = None
+        self._warm: float | None = None
+        self._found_s = -np.inf
+        self._is_known = False
+
+    def at(self, q: FloatArray, temperature_c: float | None, now_s: float) -> FloatArray:
+        """Return them for reported angles, rad, (k,).
+
+        The correction found for the report before is brought up to date by one step of the fixed
+        point, at most every `EVERY_S` while the arm moves and until it is known where it stands.
+        Between, it is off by the way in that time times the slope of the correction.
+        """
+        if self._at is None:
+            wanted = self._compensator.true(q, temperature_c)
+            self.added, self._is_known = wanted - q, True
+        else:
+            is_near = np.abs(q - self._at).max() <= NEAR_RAD and temperature_c == self._warm
+            if (is_near and self._is_known) or 0.0 <= now_s - self._found_s < EVERY_S:
+                return q + self.added
+            step = q - self._compensator.command(q + self.added, temperature_c)
+            self.added = self.added + step
+            self._is_known = bool(np.abs(step).max() <= KNOWN_RAD)
+        self._at, self._warm, self._found_s = q, temperature_c, now_s
+        return q + self.added
+
+
+def passed_on(
+    wanted: Trajectory,
+    arm: Present,
+    gate: ForeignGate,
+    correction: CorrectionInUse | None,
+    tolerance_m: float,
+    temperature_c: float | None = None,
+) -> Passed:
+    """Return what to send to the controller for a planner's trajectory.
+
+    From where the arm stands on, points are added and time is stretched as
+    `trajectories.corrected_trajectory` does. While it moves the points alone are corrected: how
+    the controller comes to the first of them is its own.
+
+    Parameters
+    ----------
+    wanted
+        The trajectory, which begins at once; of no points: the arm is to be held.
+    arm
+        Where it is now.
+    gate
+        Checks what is sent.
+    correction
+        None: sent as it is.
+    tolerance_m
+        How far the tool may leave the wanted path between points, m.
+    temperature_c
+        Of the arm.
+
+    Raises
+    ------
+    InputError
+        The trajectory is refused; one line.
+    """
+    t, q, v = wanted.times_s, wanted.positions, wanted.velocities
+    if not len(t):
+        return Passed(gate.admit((), arm.q, arm.velocity), 0.0)
+    _refuse_bad_numbers(wanted)
+    notes: list[str] = []
+    if correction is not None:
+        t, q, v, notes = _corrected(wanted, arm, gate, correction, tolerance_m, temperature_c)
+    velocities = np.zeros_like(q) if v is None else v.copy()
+    if np.abs(velocities[-1]).max() <= REST_RAD_S:
+        velocities[-1] = 0.0
+    rows = zip(t, q, velocities, strict=True)
+    waypoints = [Waypoint(float(at), place, speed) for at, place, speed in rows]
+    try:
+        admitted = gate.admit(waypoints, arm.q, arm.velocity, is_straight=v is None)
+    except MotionRefusedError as error:
+        hint = ''
+        if wanted.times_s[0] <= 0.0 and 'it begins' in str(error) and correction is not None:
+            hint = (
+                ": the planner must read this node's joint_states, which have the correction in "
+                'them, and begin where the arm stands'
+            )
+        raise InputError(f'{error}{hint}') from None
+    return Passed(admitted, float(t[-1]), tuple(notes))
+
+
+def _refuse_bad_numbers(wanted: Trajectory) -> None:
+    t, q, v = wanted.times_s, wanted.positions, wanted.velocities
+    if not all(np.all(np.isfinite(one)) for one in (t, q, v) if one is not None):
+        raise InputError('a number of it is not finite')
+    if t[0] < 0.0 or np.any(np.diff(t) <= 0.0):
+        raise InputError('its times do not ascend from 0 on')
+
+
+def _refuse_too_fast(
+    t: FloatArray, q: FloatArray, v: FloatArray | None, limits: MotionLimits
+) -> None:
+    """Refuse what a planner wants itself beyond the limits; time is stretched for ours alone."""
+    largest = largest_speeds(t, q, v)
+    if np.any(largest > limits.velocity * (1.0 + SPEED_TOLERANCE)):
+        joint = int(np.argmax(largest / limits.velocity))
+        raise InputError(
+            f'{limits.names[joint]} is to turn at {largest[joint]:.3f} rad/s; '
+            f'{limits.velocity[joint]:.3f} are its limit'
+        )
+
+
+def _corrected(
+    wanted: Trajectory,
+    arm: Present,
+    gate: ForeignGate,
+    correction: CorrectionInUse,
+    tolerance_m: float,
+    temperature_c: float | None,
+) -> tuple[FloatArray, FloatArray, FloatArray | None, list[str]]:
+    """Return times, positions, velocities and notes of what is to be sent."""
+    compensator, t, q, v = (
+        correction.compensator, wanted.times_s, wanted.positions, wanted.velocities,
+    )  # fmt: skip
+    notes: list[str] = []
+    if not arm.stands:
+        done, v = corrected_points(compensator, q, v, temperature_c)
+        _refuse_too_large(correction, done.command - q)
+        return t, done.command, v, _notes(done.faded, done.outside_range)
+    begins_at_once = t[0] <= 0.0
+    if not begins_at_once:
+        start = compensator.true(arm.q, temperature_c)
+        t, q = np.concatenate(([0.0], t)), np.concatenate((start[None], q))
+        v = None if v is None else np.concatenate((np.zeros((1, q.shape[1])), v))
+    if len(t) == 1:
+        raise InputError('it has a single point, for now: give it a time_from_start')
+    _refuse_too_fast(t, q, v, gate.limits)
+    found = corrected_trajectory(
+        compensator,
+        t,
+        q,
+        v,
+        tolerance_m=tolerance_m,
+        velocity_limits=gate.limits.velocity,
+        acceleration_limits=gate.limits.acceleration,
+        temperature_c=temperature_c,
+    )
+    _refuse_too_large(correction, found.change)
+    if found.stretched > 1.0:
+        notes.append(
+            f'slowed down to {100.0 / found.stretched:.1f} %: it would pass a limit of speed or '
+            'acceleration'
+        )
+    notes += _notes(found.faded, found.outside_range)
+    # A controller begins where the arm is by itself.
+    sent = slice(0 if begins_at_once else 1, None)
+    speeds = None if found.velocities is None else found.velocities[sent]
+    return found.times_s[sent], found.positions[sent], speeds, notes
+
+
+def _refuse_too_large(correction: CorrectionInUse, change: FloatArray) -> None:
+    refused = correction.too_large(change)
+    if refused:
+        raise InputError(next(iter(refused.values())))
+
+
+def _notes(faded: BoolArray, outside_range: BoolArray) -> list[str]:
+    notes = []
+    if count := int(np.sum(faded)):
+        notes.append(f'{count} of {len(faded)} points near a singularity: not all is corrected')
+    if count := int(np.sum(outside_range)):
+        notes.append(
+            f'{count} of {len(outside_range)} points beyond the angles at which a curve was '
+            'measured: its end value is taken'
+        )
+    return notes

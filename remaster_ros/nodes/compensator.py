@@ -1,0 +1,543 @@
+"""Correct what other planners send to an arm's controller, and tell them where the arm is.
+
+A planner (MoveIt, say) that plans for the nominal arm sends its trajectories to this node in place
+of the controller, and reads this node's joint_states in place of the arm's. What is sent on comes
+from the motion gate (`motion.motion_gate.ForeignGate`). Nothing is known here of what stands in
+the way: that is the planner's.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+from action_msgs.msg import GoalStatus
+from rclpy.action import ActionClient, ActionServer, CancelResponse
+from rclpy.clock import Clock, ClockType
+from rclpy.task import Future
+from sensor_msgs.msg import JointState, Temperature
+from std_msgs.msg import String
+from std_srvs.srv import Trigger
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
+
+from remaster_ros.collection.message_fields import JointOrder, refuse_repeated, seconds
+from remaster_ros.errors import InputError
+from remaster_ros.kinematics.same_arm import axes_apart, difference
+from remaster_ros.motion.limits import ACCELERATION, MotionLimits
+from remaster_ros.motion.motion_gate import Admitted, ForeignGate
+from remaster_ros.nodes.arm_states import JOINTS, ArmStates
+from remaster_ros.nodes.controller_link import control_messages
+from remaster_ros.nodes.messages import duration_of
+from remaster_ros.nodes.parameters import declare, parameter
+from remaster_ros.nodes.rivals import OnlyPublisher
+from remaster_ros.nodes.robot_bridge import DESCRIPTION, DESCRIPTION_QOS, NEWEST_STATES
+from remaster_ros.nodes.running import RemasterNode, run
+from remaster_ros.nodes.status import LEASED, RELIABLE
+from remaster_ros.types import FloatArray
+
+NOW_S = 0.1
+"""A trajectory whose stamp is so near to now begins at once, s: it was stamped when it was sent.
+One for another time would begin where nobody has looked."""
+NEARER = 0.5
+"""A description holds the correction if its axes are turned from those of the corrected arm by
+less than this share of what they are from the nominal one's: its form may leave out a part."""
+WATCH_S = 0.1
+"""How often it is looked at whether it may begin, s of wall time."""
+HOLD_S = 3.0
+"""A second publisher of the arm's joints counts for so long after it was noticed last, s."""
+LAST_ANSWER_WALL_S = 0.5
+"""A node that ends waits so long for the answer to a cancelling, s."""
+SAME_WORDS_S = 1.0
+"""The same refusal is said once in so much time, s: some programs send ten times a second."""
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """Parameters of the compensator."""
+
+    compensation: str = parameter(
+        '',
+        'compensation.json by which everything is corrected; must be given; read at the start '
+        'and by ~/enable',
+    )
+    controller: str = parameter(
+        'joint_trajectory_controller',
+        'name of the controller: its topic …/joint_trajectory and its action '
+        '…/follow_joint_trajectory',
+    )
+    tolerance_mm: float = parameter(
+        0.02,
+        'how far the tool may leave the wanted path between two points',
+        unit='mm',
+        low=0.001,
+        high=10.0,
+    )
+    max_change_deg: float = parameter(
+        2.0, 'what changes a joint by more is refused', unit='deg', low=0.0, high=10.0
+    )
+    acceleration_limit_rad_s2: float = parameter(
+        ACCELERATION,
+        'largest acceleration of each joint: a trajectory that would pass it is slowed down; give '
+        "that of the planner's joint limits",
+        unit='rad/s^2',
+        low=0.01,
+        high=1000.0,
+    )
+    temperature_topic: str = parameter(
+        '',
+        "sensor_msgs/Temperature of the arm, degrees Celsius; empty: that of the file's "
+        'measurements',
+    )
+
+
+@dataclass(eq=False)
+class _Goal:
+    """A goal of a client, and what became of it at the controller."""
+
+    handle: Any
+    sent: Any = None
+    cancelled: bool = False
+    over: bool = False
+
+
+class CompensatorNode(RemasterNode):
+    """See the module's text."""
+
+    def __init__(self) -> None:
+        super().__init__('compensator')
+        self.p = declare(self, Parameters)
+        if not self.p.compensation:
+            raise InputError(
+                'compensator: parameter compensation is empty; give the apply/compensation.json '
+                'that fit, discover or report has written'
+            )
+        # It loads SciPy's interpolation, which other nodes need not.
+        from remaster_ros.compensation import foreign_motion
+
+        self._motion = foreign_motion
+        self._correction = self._read()
+        self._chain = self._correction.compensator.model.chain
+        self._names = self._chain.joint_names
+        self._true = foreign_motion.TrueAngles(self._correction.compensator)
+        self._present = foreign_motion.Present()
+        self._order = JointOrder(self._names)
+        self._states = ArmStates(self, self._names, HOLD_S)
+        # Whether it corrects; None before the arm was seen to stand.
+        self._on: bool | None = None
+        self._description: str | None = None
+        self._described = ''
+        self._temperature_c: float | None = None
+        self._end_s = -np.inf
+        self._said: dict[str, float] = {}
+        self._told = ''
+        self._goals: list[_Goal] = []
+        controller = self.p.controller
+        self._commands_topic = self.resolve_topic_name(f'{controller}/joint_trajectory')
+        self._only = OnlyPublisher(self, self._commands_topic, JointTrajectory)
+        self._commands = self.create_publisher(JointTrajectory, self._commands_topic, LEASED)
+        self._angles = self.create_publisher(JointState, '~/joint_states', RELIABLE)
+        self._state = self.create_publisher(String, '~/state', DESCRIPTION_QOS)
+        self.create_subscription(String, DESCRIPTION, self._on_description, DESCRIPTION_QOS)
+        self.create_subscription(JointState, JOINTS, self._on_joint_state, NEWEST_STATES)
+        self.create_subscription(
+            JointTrajectory, '~/joint_trajectory', self._on_trajectory, RELIABLE
+        )
+        if self.p.temperature_topic:
+            self.create_subscription(
+                Temperature, self.p.temperature_topic, self._on_temperature, RELIABLE
+            )
+        self.create_service(Trigger, '~/enable', partial(self._switch, True))
+        self.create_service(Trigger, '~/disable', partial(self._switch, False))
+        self._client: ActionClient | None = None
+        try:
+            self._offer_action(f'{controller}/follow_joint_trajectory')
+        except InputError:
+            self.get_logger().warning(
+                'control_msgs is not installed (apt install ros-jazzy-control-msgs): there is the '
+                'topic ~/joint_trajectory alone, and MoveIt sends by the action'
+            )
+        for remark in self._correction.remarks if not self.p.temperature_topic else []:
+            self.get_logger().warning(remark)
+        # Of wall time: a simulated one may not have come.
+        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self.create_timer(WATCH_S, self._look, clock=self._steady)
+
+    def _read(self) -> Any:
+        from remaster_ros.compensation.in_use import CorrectionInUse
+
+        return CorrectionInUse(self.p.compensation, most_deg=self.p.max_change_deg)
+
+    # Whether it may pass anything on
+
+    def _on_description(self, message: String) -> None:
+        self._description = message.data
+        self._described = self._described_trouble()
+
+    def _described_trouble(self) -> str:
+        """Return how the description contradicts the correction; ''."""
+        topic = self.resolve_topic_name(DESCRIPTION)
+        if self._description is None:
+            return (
+                f'nobody publishes {topic}: start robot_state_publisher with the URDF that the '
+                'planner has'
+            )
+        why = difference(self._chain, self._description)
+        true_arm = self._correction.true_arm
+        apart = [axes_apart(arm, self._description) for arm in (true_arm, self._chain)]
+        if why and apart[0] < NEARER * apart[1]:
+            return (
+                f'{topic} holds this correction already: give robot_state_publisher and the '
+                'planner the nominal description, or end the compensator'
+            )
+        return why and (
+            f'{self._correction.path} is of another URDF than {topic}: {why}; give the one that '
+            'was measured with this arm'
+        )
+
+    def _trouble(self) -> str:
+        """Return why nothing is passed on; ''."""
+        topic = self.resolve_topic_name(JOINTS)
+        if self._description is None:
+            self._described = self._described_trouble()
+        chained = f'{self._commands_topic.rpartition("/")[0]}/joint_states'
+        if self.count_publishers(chained):
+            return (
+                f'{self.p.controller} is a compensator itself ({chained} has a publisher): '
+                'corrected twice; end one of them'
+            )
+        if not (self._present.is_known and self._present.is_fresh(time.monotonic())):
+            others = f' ({self._states.others})' if self._states.others else ''
+            return f'{topic} does not come{others}'
+        if self.p.temperature_topic and self._temperature_c is None:
+            return f'{self.resolve_topic_name(self.p.temperature_topic)} has not come yet'
+        return (
+            self.clock_trouble or self._described or self._states.rival() or self._only.trouble()
+        )
+
+    def _moves(self) -> str:
+        """Return that the arm moves, or is about to; ''."""
+        if not self._present.is_fresh(time.monotonic()):
+            return f'{self.resolve_topic_name(JOINTS)} does not come'
+        if not self._present.stands:
+            return 'the arm moves: wait until it stands'
+        left_s = self._end_s - self.now_s()
+        return f'a trajectory is under way for {left_s:.1f} s more' if left_s > 0.0 else ''
+
+    def _look(self) -> None:
+        trouble = self._trouble()
+        if self._on is None and not (trouble or self._moves()):
+            self._turn(True)
+        self._tell(trouble)
+        if self._goals and self._client is not None and not self._client.server_is_ready():
+            for goal in list(self._goals):
+                why = f'{self._controllers}: the controller has gone'
+                self._end(goal, GoalStatus.STATUS_ABORTED, self._refused(why))
+
+    def _switch(self, on: bool, request: Trigger.Request, response: Trigger.Response) -> Any:
+        why = self._moves()
+        if on and not why:
+            try:
+                correction = self._read()
+                if correction.compensator.joint_names != self._names:
+                    raise InputError(
+                        f'{correction.path}: has other joints now; start the compensator again'
+                    )
+                self._correction, before = correction, self._correction
+                self._chain = correction.compensator.model.chain
+                if why := self._described_trouble():
+                    self._correction = before
+                    self._chain = before.compensator.model.chain
+                self._described = self._described_trouble()
+            except InputError as error:
+                why = str(error)
+        response.success = not why
+        response.message = why or self._turn(on)
+        self._tell(self._trouble())
+        return response
+
+    def _turn(self, on: bool) -> str:
+        """Begin or end to correct, and return what is said of it."""
+        self._on = on
+        self._true = self._motion.TrueAngles(self._correction.compensator)
+        shifts = self._correction.shifts if on else None
+        self._gate = ForeignGate(
+            MotionLimits.of(self._chain, 1.0, shifts, self.p.acceleration_limit_rad_s2)
+        )
+        checksum = self._correction.sha256[:8]
+        text = f'{self._correction.path}, checksum {checksum}: ' + (
+            'everything is corrected by it, as it is now'
+            if on
+            else 'not in use; all is passed on as it comes'
+        )
+        self.get_logger().info(text)
+        return text
+
+    def _tell(self, trouble: str) -> None:
+        state = {
+            'correction': 'on' if self._on else 'off',
+            'sha256': self._correction.sha256,
+            'why': trouble or ('' if self._on is not None else self._moves()),
+        }
+        text = json.dumps(state)
+        if text != self._told:
+            self._told = text
+            self._state.publish(String(data=text))
+            if state['why']:
+                self._say(f'nothing is passed on: {state["why"]}')
+
+    def _say(self, words: str) -> None:
+        now = time.monotonic()
+        if now - self._said.get(words, -np.inf) >= SAME_WORDS_S:
+            self._said = {words: now}
+            self.get_logger().error(words)
+
+    # Where the arm is
+
+    def _on_temperature(self, message: Temperature) -> None:
+        if np.isfinite(message.temperature):
+            self._temperature_c = message.temperature
+
+    @property
+    def _warm(self) -> float | None:
+        return self._temperature_c if self._correction.compensator.model.grows else None
+
+    def _on_joint_state(self, message: JointState, info: Any) -> None:
+        if not self._order.concerns(message):
+            # A gripper's: the planner wants to know of it too.
+            self._states.note(message, info)
+            self._angles.publish(message)
+            return
+        try:
+            q = self._states.take(message, info)
+        except InputError as error:
+            self._say(str(error))
+            return
+        if q is None or not np.all(np.isfinite(q)):
+            self._say(f'{self.resolve_topic_name(JOINTS)}: a position is no finite number')
+            return
+        stamp_s = seconds(message.header.stamp)
+        self._present.take(stamp_s, q, time.monotonic())
+        if self._on is None:
+            return
+        if self._on:
+            true = self._true.at(q, self._warm, time.monotonic())
+            at = {name: i for i, name in enumerate(message.name)}
+            for name, value in zip(self._names, true, strict=True):
+                message.position[at[name]] = float(value)
+        self._angles.publish(message)
+
+    # What is passed on
+
+    def _passed(self, message: JointTrajectory) -> Any:
+        """Return what is to be sent for a planner's trajectory.
+
+        Raises
+        ------
+        InputError
+            One line: why it is not sent.
+        """
+        why = self._trouble()
+        if not why and self._on is None:
+            why = self._moves() or 'the compensator has just been started'
+        if why:
+            raise InputError(why)
+        stamp_s = seconds(message.header.stamp)
+        if stamp_s and abs(stamp_s - self.now_s()) > NOW_S:
+            raise InputError(
+                f'its stamp is {stamp_s - self.now_s():+.2f} s from now: give none, for at once'
+            )
+        wanted = self._motion.Trajectory(*_points(message, self._names))
+        passed = self._motion.passed_on(
+            wanted,
+            self._present,
+            self._gate,
+            self._correction if self._on else None,
+            1e-3 * self.p.tolerance_mm,
+            self._warm,
+        )
+        for note in passed.notes:
+            self.get_logger().info(note)
+        self._end_s = self.now_s() + passed.end_s
+        return passed
+
+    def _message(self, admitted: Admitted) -> JointTrajectory:
+        """Return what the gate has admitted as a message; nothing else is ever sent."""
+        message = JointTrajectory(joint_names=list(self._names))
+        message.points = [
+            JointTrajectoryPoint(
+                positions=point.q.tolist(),
+                velocities=[] if admitted.is_straight else point.velocity.tolist(),
+                time_from_start=duration_of(point.time_s),
+            )
+            for point in admitted.waypoints
+        ]
+        return message
+
+    def _on_trajectory(self, message: JointTrajectory) -> None:
+        try:
+            passed = self._passed(message)
+            if not self._commands.get_subscription_count():
+                raise InputError(f'no controller listens to {self._commands_topic}')
+        except InputError as error:
+            self._say(f'trajectory refused: {error}')
+            return
+        self._commands.publish(self._message(passed.admitted))
+
+    # The same by the action
+
+    def _offer_action(self, controllers: str) -> None:
+        self._action, _ = control_messages()
+        self._controllers = self.resolve_topic_name(controllers)
+        self._client = ActionClient(self, self._action, self._controllers)
+        # It is executed when the controller has a result: rclpy would poll one that waits.
+        self._server = ActionServer(
+            self,
+            self._action,
+            '~/follow_joint_trajectory',
+            lambda handle: self._action.Result(),
+            handle_accepted_callback=self._on_goal,
+            cancel_callback=self._on_cancel,
+        )
+
+    def _on_goal(self, handle: Any) -> None:
+        goal = _Goal(handle)
+        request = handle.request
+        try:
+            if request.multi_dof_trajectory.points:
+                raise InputError('it has a multi_dof_trajectory, which is not corrected')
+            assert self._client is not None
+            if not self._client.server_is_ready():
+                raise InputError(f'no controller has the action {self._controllers}')
+            request.trajectory = self._message(self._passed(request.trajectory).admitted)
+        except InputError as error:
+            self._say(f'goal refused: {error}')
+            self._end(goal, GoalStatus.STATUS_ABORTED, self._refused(str(error)))
+            return
+        self._goals.append(goal)
+        sent = self._client.send_goal_async(request, partial(self._on_feedback, goal))
+        sent.add_done_callback(partial(self._on_answer, goal))
+
+    def _refused(self, why: str) -> Any:
+        return self._action.Result(error_code=self._action.Result.INVALID_GOAL, error_string=why)
+
+    def _on_answer(self, goal: _Goal, future: Future) -> None:
+        if future.cancelled() or future.result() is None:
+            return
+        if not future.result().accepted:
+            why = f'{self._controllers}: the controller refuses it; its log has why'
+            self._say(f'goal refused: {why}')
+            self._end(goal, GoalStatus.STATUS_ABORTED, self._refused(why))
+            return
+        goal.sent = future.result()
+        goal.sent.get_result_async().add_done_callback(partial(self._on_result, goal))
+        if goal.cancelled:
+            goal.sent.cancel_goal_async()
+
+    def _on_feedback(self, goal: _Goal, message: Any) -> None:
+        feedback = message.feedback
+        if goal.over or not goal.handle.is_active:
+            return
+        if self._on:
+            added = dict(zip(self._names, self._true.added, strict=True))
+            for point in (feedback.desired, feedback.actual):
+                point.positions = [
+                    position + added[name]
+                    for name, position in zip(feedback.joint_names, point.positions)
+                    if name in added
+                ]
+        goal.handle.publish_feedback(feedback)
+
+    def _on_cancel(self, handle: Any) -> CancelResponse:
+        for goal in self._goals:
+            if goal.handle.goal_id == handle.goal_id:
+                goal.cancelled = True
+                if goal.sent is not None:
+                    goal.sent.cancel_goal_async()
+                return CancelResponse.ACCEPT
+        return CancelResponse.REJECT
+
+    def _on_result(self, goal: _Goal, future: Future) -> None:
+        if not future.cancelled() and future.result() is not None:
+            if goal is self._goals[-1]:
+                self._end_s = self.now_s()
+            self._end(goal, future.result().status, future.result().result)
+
+    def _end(self, goal: _Goal, status: int, result: Any) -> None:
+        """Tell the client how its goal has ended."""
+        if goal.over:
+            return
+        goal.over = True
+        if goal in self._goals:
+            self._goals.remove(goal)
+
+        def ended(handle: Any) -> Any:
+            if status == GoalStatus.STATUS_SUCCEEDED:
+                handle.succeed()
+            elif status == GoalStatus.STATUS_CANCELED and handle.is_cancel_requested:
+                handle.canceled()
+            else:
+                # Replaced by another goal, too, which is no cancelling of this client's.
+                handle.abort()
+            return result
+
+        goal.handle.execute(ended)
+
+    def close(self) -> None:
+        """Let the controller hold an arm whose goal nobody can cancel any more."""
+        awaited = [goal.sent.cancel_goal_async() for goal in self._goals if goal.sent is not None]
+        executor, end = self.executor, time.monotonic() + LAST_ANSWER_WALL_S
+        while executor is not None and not all(one.done() for one in awaited):
+            if time.monotonic() > end or not self.context.ok():
+                return
+            executor.spin_once(timeout_sec=0.01)
+
+
+def _points(
+    message: JointTrajectory, names: tuple[str, ...]
+) -> tuple[FloatArray, FloatArray, FloatArray | None]:
+    """Return times (n,), positions and velocities (n, k), joints in the order of `names`.
+
+    Raises
+    ------
+    InputError
+        Other joints than the arm's, or points that are not whole.
+    """
+    given = tuple(message.joint_names)
+    none = np.zeros((0, len(names)))
+    if not message.points:
+        return np.zeros(0), none, None
+    refuse_repeated(names, given, 'the trajectory')
+    if set(given) != set(names):
+        raise InputError(
+            f"its joints are {', '.join(given) or 'none'}, the arm's {', '.join(names)}: give all "
+            'of these and no others'
+        )
+    columns = [given.index(name) for name in names]
+    counts = {len(point.velocities) for point in message.points}
+    if {len(point.positions) for point in message.points} != {len(names)} or counts - {
+        0,
+        len(names),
+    }:
+        raise InputError('a point has not a position, or a velocity, for each joint')
+    if len(counts) > 1:
+        raise InputError('some points have velocities and others have not: give all or none')
+    times = np.array([seconds(point.time_from_start) for point in message.points])
+    positions = np.array([point.positions for point in message.points])[:, columns]
+    if counts == {0}:
+        return times, positions, None
+    return times, positions, np.array([point.velocities for point in message.points])[:, columns]
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run the node."""
+    make: Callable[[], RemasterNode] = CompensatorNode
+    return run(make, args)
+
+
+if __name__ == '__main__':
+    raise SystemExit(main())

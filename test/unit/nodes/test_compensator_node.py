@@ -1,0 +1,452 @@
+"""The compensator between a planner and a controller, all on real DDS: both are fakes."""
+
+import contextlib
+import json
+import os
+import time
+
+import numpy as np
+import pytest
+
+pytest.importorskip('rclpy', reason='needs ROS 2 Jazzy or its wheels')
+
+import rclpy
+from action_controller import ActionController, follow_joint_trajectory
+from compensation_files import arm, save
+from drawn_moves import drawn, line
+from rclpy.action import ActionClient
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from sensor_msgs.msg import JointState, Temperature
+from std_msgs.msg import String
+from std_srvs.srv import Trigger
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
+
+from remaster_ros.collection.message_fields import seconds
+from remaster_ros.compensation.arm_model import Geometry
+from remaster_ros.compensation.compensator import Compensator
+from remaster_ros.compensation.controller_forms import exported, held
+from remaster_ros.compensation.file import read_compensation
+from remaster_ros.errors import InputError
+from remaster_ros.nodes.compensator import CompensatorNode
+from remaster_ros.nodes.messages import duration_of, stamp_of
+from remaster_ros.session.workcell import read_cell
+
+pytestmark = [pytest.mark.ros, pytest.mark.timeout(120)]
+
+DOMAIN = 184 + os.getpid() % 15
+CELL = read_cell('demo')
+CHAIN, URDF = CELL.chain(), CELL.urdf_text
+NAMES = list(CHAIN.joint_names)
+HOME = np.array([0.2, 0.4, -0.1, -1.2, 0.1, 0.9, 0.3])
+TARGET = HOME + np.array([0.2, -0.1, 0.1, 0.15, -0.2, 0.1, 0.1])
+LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+CONTROLLER = '/joint_trajectory_controller'
+
+
+def erring(seed=1):
+    print('seed', seed)
+    rng = np.random.default_rng(seed)
+    k = len(CHAIN)
+    geometry = Geometry(
+        3e-4 * rng.standard_normal((k + 1, 3)), 5e-4 * rng.standard_normal((k + 1, 3))
+    )
+    offsets = np.radians(0.3) * rng.standard_normal(k)
+    return arm(URDF, CHAIN.base_link, CHAIN.tip_link, joint_offsets=offsets, geometry=geometry)
+
+
+def message_of(t, q, v, names=NAMES):
+    message = JointTrajectory(joint_names=list(names))
+    for i, at in enumerate(t):
+        point = JointTrajectoryPoint(positions=q[i].tolist(), time_from_start=duration_of(at))
+        point.velocities = [] if v is None else v[i].tolist()
+        message.points.append(point)
+    return message
+
+
+class Rig:
+    """The node, and in a context of their own a planner, a controller and its arm."""
+
+    def __init__(self, folder, model, description=URDF, name='compensator', **parameters):
+        self.file = save(folder, model, URDF)
+        self.compensator = Compensator(model)
+        self.context, self.node = rclpy.Context(), None
+        given = {'compensation': self.file, **parameters}
+        args = ['--ros-args', '--log-level', 'fatal', '-r', f'__node:={name}']
+        for parameter, value in given.items():
+            args += ['-p', f'{parameter}:={value}']
+        rclpy.init(args=args, domain_id=DOMAIN)
+        rclpy.init(context=self.context, domain_id=DOMAIN)
+        self.peer = rclpy.create_node('controller', context=self.context)
+        self.executor, self.own = SingleThreadedExecutor(context=self.context), None
+        self.executor.add_node(self.peer)
+        self.q, self.drive, self.due = HOME, None, 0.0
+        self.came, self.told, self.states = [], [], []
+        self.joint_states = self.peer.create_publisher(JointState, 'joint_states', 10)
+        self.description = self.peer.create_publisher(String, 'robot_description', LATCHED)
+        self.planned = self.peer.create_publisher(
+            JointTrajectory, 'compensator/joint_trajectory', 10
+        )
+        peer = self.peer
+        peer.create_subscription(JointTrajectory, f'{CONTROLLER}/joint_trajectory', self.obey, 10)
+        peer.create_subscription(JointState, 'compensator/joint_states', self.take, 10)
+        peer.create_subscription(String, 'compensator/state', self.hear, LATCHED)
+        self.node = CompensatorNode()
+        self.own = SingleThreadedExecutor()
+        self.own.add_node(self.node)
+        if description:
+            self.description.publish(String(data=description))
+
+    def take(self, message):
+        if set(message.name) == set(NAMES):
+            self.told.append(np.array([message.position[message.name.index(n)] for n in NAMES]))
+
+    def hear(self, message):
+        self.states.append(json.loads(message.data))
+
+    def obey(self, message):
+        self.came.append(message)
+        if message.points:
+            assert message.joint_names == NAMES
+            t = np.array([seconds(point.time_from_start) for point in message.points])
+            q = np.array([point.positions for point in message.points])
+            v = np.array([point.velocities for point in message.points])
+            v = v if v.size else None
+            if t[0] > 0.0:
+                t, q = np.r_[0.0, t], np.vstack((self.q, q))
+                v = None if v is None else np.vstack((np.zeros(7), v))
+            self.drive = time.monotonic(), t, q, v
+
+    def step(self):
+        now = time.monotonic()
+        if self.drive is not None:
+            began, t, q, v = self.drive
+            self.q = drawn(t, q, v, np.array([min(now - began, t[-1])]))[0]
+        if now >= self.due:
+            self.due = now + 0.02
+            # In another order, as drivers do.
+            message = JointState(name=NAMES[::-1], position=self.q[::-1].tolist())
+            message.header.stamp = self.peer.get_clock().now().to_msg()
+            self.joint_states.publish(message)
+        for executor in (self.executor, self.own):
+            executor.spin_once(timeout_sec=0.002)
+
+    def run(self, seconds, until=lambda: False):
+        end = time.monotonic() + seconds
+        while time.monotonic() < end and not until():
+            self.step()
+        return until()
+
+    def ready(self):
+        assert self.run(20.0, lambda: self.told and self.node._on), self.node._trouble()
+        # The planner, the controller: each sees the other side.
+        assert self.run(10.0, lambda: self.node._commands.get_subscription_count())
+        assert self.run(10.0, lambda: self.planned.get_subscription_count())
+        return self
+
+    def plan(self, start, target, **more):
+        wanted = line(start, target, 2.0, CHAIN)
+        t, q, v = wanted.times_s, wanted.positions, wanted.velocities
+        return message_of(t, q, v, **more)
+
+    def call(self, name):
+        client = self.peer.create_client(Trigger, f'compensator/{name}')
+        assert self.run(10.0, client.service_is_ready)
+        future = client.call_async(Trigger.Request())
+        assert self.run(20.0, future.done)
+        return future.result()
+
+    def refused(self, message):
+        """Send a trajectory; return why it was not passed on."""
+        before = len(self.came)
+        said = []
+        self.node._say = said.append
+        self.planned.publish(message)
+        assert self.run(10.0, lambda: said)
+        self.run(0.1)
+        assert len(self.came) == before
+        assert '\n' not in said[0]
+        return said[0]
+
+    def close(self):
+        if self.node is not None:
+            self.node.close()
+            self.node.destroy_node()
+        rclpy.try_shutdown()
+        self.peer.destroy_node()
+        self.context.try_shutdown()
+
+
+@pytest.fixture
+def rig(monkeypatch, tmp_path):
+    """Return a function that makes a rig of an arm and parameters."""
+    monkeypatch.setenv('ROS_HOME', str(tmp_path))
+    monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+    made = []
+
+    @contextlib.contextmanager
+    def closing():
+        try:
+            yield
+        finally:
+            for one in made:
+                one.close()
+            rclpy.try_shutdown()
+
+    def make(model=None, **options):
+        made.append(Rig(tmp_path, erring() if model is None else model, **options))
+        return made[-1]
+
+    with closing():
+        yield make
+
+
+def test_a_planner_of_the_nominal_arm_moves_the_true_one(rig):
+    """From the angles it is told, by the topic; the joints of each message in their own order."""
+    r = rig().ready()
+    np.testing.assert_allclose(r.told[-1], r.compensator.true(HOME), atol=1e-7)
+    assert np.abs(r.told[-1] - HOME).max() > 1e-3
+    message = r.plan(r.told[-1], TARGET)
+    message.joint_names.reverse()
+    for point in message.points:
+        point.positions.reverse()
+        point.velocities.reverse()
+    # Stamped when it was sent.
+    message.header.stamp = r.peer.get_clock().now().to_msg()
+    r.planned.publish(message)
+    assert r.run(20.0, lambda: r.came and time.monotonic() > r.drive[0] + r.drive[1][-1] + 0.5)
+    (sent,) = r.came
+    assert sent.header.stamp.sec == 0
+    np.testing.assert_allclose(r.q, r.compensator.command(TARGET), atol=1e-8)
+    np.testing.assert_allclose(sent.points[0].positions, HOME, atol=1e-7)
+    # What the planner is told: it is where it was to go.
+    assert r.run(5.0, lambda: np.abs(r.told[-1] - TARGET).max() < 1e-7)
+    # A gripper's joints are passed on as they come.
+    other = []
+    r.peer.create_subscription(JointState, 'compensator/joint_states', other.append, 10)
+    r.joint_states.publish(JointState(name=['finger'], position=[0.01]))
+    assert r.run(5.0, lambda: any(list(one.name) == ['finger'] for one in other))
+    assert r.states[-1] == {'correction': 'on', 'sha256': r.node._correction.sha256, 'why': ''}
+
+
+def test_what_is_refused_has_its_reason(rig):
+    r = rig().ready()
+    told = r.told[-1]
+    assert "must read this node's joint_states" in r.refused(r.plan(HOME, TARGET))
+    assert 'its joints are' in r.refused(r.plan(told, TARGET, names=['x', *NAMES[1:]]))
+    broken = r.plan(told, TARGET)
+    broken.points[3].velocities = []
+    assert 'give all or none' in r.refused(broken)
+    broken.points[3].positions = broken.points[3].positions[:3]
+    assert 'not a position' in r.refused(broken)
+    later = r.plan(told, TARGET)
+    later.header.stamp = stamp_of(time.time() + 5.0)
+    assert 'from now: give none' in r.refused(later)
+    # Somebody who sends past it.
+    rival = r.peer.create_publisher(JointTrajectory, f'{CONTROLLER}/joint_trajectory', 10)
+    assert r.run(10.0, lambda: '2 publishers' in r.node._trouble())
+    assert '2 publishers' in r.refused(r.plan(told, TARGET))
+    r.peer.destroy_publisher(rival)
+    assert r.run(10.0, lambda: not r.node._trouble())
+    # A description that has the correction in it, another arm's, and then the nominal one again.
+    one = held(read_compensation(r.file), 'urdf', np.random.default_rng(1))
+    urdf = exported(read_compensation(r.file), 'urdf', one)['robot_calibrated.urdf']
+    for text, words in (
+        (urdf, 'holds this correction already'),
+        (URDF.replace('xyz="0 0 0.2085"', 'xyz="0 0 0.25"'), 'is of another URDF than'),
+    ):
+        r.description.publish(String(data=text))
+        assert r.run(10.0, lambda words=words: words in r.node._trouble()), r.node._trouble()
+        assert words in r.refused(r.plan(told, TARGET))
+    assert r.run(5.0, lambda: 'another URDF' in r.states[-1]['why'])
+    r.description.publish(String(data=URDF))
+    assert r.run(10.0, lambda: not r.node._trouble())
+    # Joints that nobody reports any more.
+    r.due = np.inf
+    r.run(0.4)
+    assert 'joint_states does not come' in r.refused(r.plan(told, TARGET))
+
+
+def test_it_is_switched_while_the_arm_stands_alone(rig, tmp_path):
+    r = rig().ready()
+    first = r.node._correction.sha256
+    # A file that changes is of no effect before it is enabled again.
+    again = save(tmp_path, erring(2), URDF)
+    assert again == r.file
+    r.run(0.3)
+    np.testing.assert_allclose(r.told[-1], r.compensator.true(HOME), atol=1e-7)
+    r.planned.publish(r.plan(r.told[-1], TARGET))
+    assert r.run(10.0, lambda: r.drive and time.monotonic() > r.drive[0] + 0.3)
+    for name in ('enable', 'disable'):
+        answer = r.call(name)
+        assert not answer.success
+        assert 'the arm moves' in answer.message or 'is under way' in answer.message
+    assert r.run(20.0, lambda: not r.node._moves())
+    assert r.node._correction.sha256 == first
+    answer = r.call('enable')
+    assert answer.success, answer.message
+    second = r.node._correction.sha256
+    assert second != first
+    assert second[:8] in answer.message
+    seen = len(r.told)
+    assert r.run(5.0, lambda: len(r.told) > seen + 3)
+    np.testing.assert_allclose(r.told[-1], Compensator(erring(2)).true(r.q), atol=1e-7)
+    # One that cannot be read leaves what is.
+    again.write_text('')
+    answer = r.call('enable')
+    assert not answer.success
+    assert 'compensation.json' in answer.message
+    assert r.node._correction.sha256 == second
+    assert r.call('disable').success
+    seen = len(r.told)
+    assert r.run(5.0, lambda: len(r.told) > seen + 3)
+    np.testing.assert_allclose(r.told[-1], r.q, atol=1e-12)
+    back = r.plan(r.q, HOME)
+    before = len(r.came)
+    r.planned.publish(back)
+    assert r.run(10.0, lambda: len(r.came) > before)
+    np.testing.assert_array_equal(r.came[-1].points[5].positions, back.points[5].positions)
+    assert r.run(5.0, lambda: r.states[-1]['correction'] == 'off')
+
+
+def test_nothing_moves_before_all_that_it_must_know_has_come(rig):
+    r = rig(description='', temperature_topic='/arm_temperature')
+    assert r.run(10.0, lambda: 'has not come yet' in r.node._trouble())
+    heat = r.peer.create_publisher(Temperature, '/arm_temperature', 10)
+    assert r.run(10.0, heat.get_subscription_count)
+    heat.publish(Temperature(temperature=30.0))
+    assert r.run(10.0, lambda: 'nobody publishes /robot_description' in r.node._trouble())
+    r.run(0.5)
+    assert r.node._on is None
+    assert not r.told
+    assert 'nobody publishes' in r.refused(r.plan(HOME, TARGET))
+    r.description.publish(String(data=URDF))
+    assert r.run(10.0, lambda: r.node._on)
+
+
+@pytest.mark.parametrize(
+    ('parameters', 'words'),
+    [
+        ({'max_change_deg': 0.1}, 'and 0.1 are the most'),
+        ({'compensation': "''"}, 'parameter compensation is empty'),
+    ],
+)
+def test_what_it_cannot_begin_with_is_one_line(rig, parameters, words):
+    with pytest.raises(InputError, match=words):
+        # rclpy keeps a node that could not be made for a while.
+        rig(name=f'not_{len(words)}', **parameters)
+
+
+# The action
+
+
+class ByAction:
+    """A rig whose controller has the action too, and a client of the compensator's."""
+
+    def __init__(self, r):
+        self.r, self.action = r, follow_joint_trajectory()
+        self.controller = ActionController(
+            r.peer, f'{CONTROLLER}/follow_joint_trajectory', r.obey, self.hold, time.monotonic
+        )
+        self.client = ActionClient(r.peer, self.action, 'compensator/follow_joint_trajectory')
+        assert r.run(10.0, self.client.server_is_ready)
+        assert r.run(10.0, lambda: r.node._client.server_is_ready())
+        self.feedback = []
+
+    def hold(self):
+        self.r.drive = None
+
+    def send(self, trajectory):
+        goal = self.action.Goal(trajectory=trajectory)
+        sent = self.client.send_goal_async(
+            goal, lambda message: self.feedback.append(message.feedback)
+        )
+        assert self.r.run(10.0, sent.done)
+        self.handle = sent.result()
+        assert self.handle.accepted
+        self.result = self.handle.get_result_async()
+
+    def ended(self):
+        def look():
+            self.controller.look()
+            return self.result.done()
+
+        assert self.r.run(20.0, look)
+        return self.result.result()
+
+    def close(self):
+        self.client.destroy()
+        self.controller.close()
+
+
+@pytest.fixture
+def by_action(rig):
+    # Where it is not installed it is made now; the node looks for it when it starts.
+    follow_joint_trajectory()
+    r = ByAction(rig().ready())
+    yield r
+    r.close()
+
+
+def test_a_goal_is_corrected_and_its_feedback_and_result_translated_back(by_action):
+    from action_msgs.msg import GoalStatus
+
+    a, r = by_action, by_action.r
+    a.send(r.plan(r.told[-1], TARGET))
+    assert r.run(10.0, lambda: a.controller.goals)
+    assert r.run(10.0, lambda: a.controller._active is not None)
+    feedback = a.action.Feedback(joint_names=NAMES)
+    actual = r.q
+    feedback.desired.positions = (actual + 0.01).tolist()
+    feedback.actual.positions = actual.tolist()
+    feedback.error.positions = 7 * [0.01]
+    a.controller._active.publish_feedback(feedback)
+    assert r.run(10.0, lambda: a.feedback)
+    (back,) = a.feedback
+    true = r.compensator.true(actual)
+    assert np.abs(true - actual).max() > 2e-3
+    # The arm has gone on meanwhile: the correction is that of where it was just then.
+    np.testing.assert_allclose(back.actual.positions, true, atol=5e-4)
+    np.testing.assert_allclose(back.desired.positions, true + 0.01, atol=5e-4)
+    np.testing.assert_allclose(back.error.positions, 0.01)
+    done = a.ended()
+    assert done.status == GoalStatus.STATUS_SUCCEEDED
+    assert done.result.error_code == 0
+    np.testing.assert_allclose(r.q, r.compensator.command(TARGET), atol=1e-6)
+    # One that is refused says why.
+    a.send(r.plan(TARGET + 0.1, HOME))
+    done = a.ended()
+    assert done.status == GoalStatus.STATUS_ABORTED
+    assert done.result.error_code == a.action.Result.INVALID_GOAL
+    assert 'it begins' in done.result.error_string
+    assert len(a.controller.goals) == 1
+    # What the controller says of its end is passed on.
+    assert r.run(10.0, lambda: r.node._present.stands and np.abs(r.told[-1] - TARGET).max() < 1e-6)
+    a.send(r.plan(r.told[-1], HOME))
+    assert r.run(10.0, lambda: a.controller._active is not None)
+    a.controller.end('PATH_TOLERANCE_VIOLATED', 'too far')
+    done = a.ended()
+    assert done.status == GoalStatus.STATUS_ABORTED
+    assert done.result.error_code == a.action.Result.PATH_TOLERANCE_VIOLATED
+    assert done.result.error_string == 'too far'
+
+
+def test_a_goal_is_cancelled_at_the_controller(by_action):
+    from action_msgs.msg import GoalStatus
+
+    a, r = by_action, by_action.r
+    a.send(r.plan(r.told[-1], TARGET))
+    assert r.run(10.0, lambda: a.controller._active is not None)
+    r.run(0.2)
+    cancel = a.handle.cancel_goal_async()
+    assert r.run(10.0, cancel.done)
+    assert a.ended().status == GoalStatus.STATUS_CANCELED
+    assert a.controller.cancelled == 1
+    assert np.abs(r.q - r.compensator.command(TARGET)).max() > 0.01
+    # A controller that refuses, and one that is not there.
+    assert r.run(10.0, lambda: not r.node._moves())
+    a.controller.refuses = lambda goal: True
+    a.send(r.plan(r.told[-1], TARGET))
+    done = a.ended()
+    assert done.status == GoalStatus.STATUS_ABORTED
+    assert 'the controller refuses it' in done.result.error_string
