@@ -23,7 +23,12 @@ from remaster_ros.compensation.trajectories import (
 from remaster_ros.errors import InputError
 from remaster_ros.motion.following import FRESH_S, STANDING_S
 from remaster_ros.motion.limits import MotionLimits
-from remaster_ros.motion.motion_gate import Admitted, ForeignGate, MotionRefusedError
+from remaster_ros.motion.motion_gate import (
+    Admitted,
+    ForeignGate,
+    MotionRefusedError,
+    StartMovedError,
+)
 from remaster_ros.motion.settling import SettleRules
 from remaster_ros.motion.trajectory import Waypoint
 from remaster_ros.types import BoolArray, FloatArray
@@ -89,10 +94,13 @@ class Present:
     def take(self, stamp_s: float, q: FloatArray, wall_s: float) -> None:
         """Take a report: its stamp, positions, rad, (k,), and when it came.
 
-        One that is not later than the one before begins anew: a clock was set back.
+        One of the same time is the one before again; an earlier one begins anew: a clock was set
+        back.
         """
         reports = self._reports
-        if reports and stamp_s <= reports[-1][0]:
+        if reports and stamp_s == reports[-1][0]:
+            return
+        if reports and stamp_s < reports[-1][0]:
             reports.clear()
         reports.append((stamp_s, q))
         while len(reports) > 2 and reports[1][0] <= stamp_s - STANDING_S:
@@ -173,7 +181,7 @@ def passed_on(
     wanted: Trajectory,
     arm: Present,
     gate: ForeignGate,
-    correction: CorrectionInUse | None,
+    correction: CorrectionInUse,
     tolerance_m: float,
     temperature_c: float | None = None,
 ) -> Passed:
@@ -192,7 +200,7 @@ def passed_on(
     gate
         Checks what is sent.
     correction
-        None: sent as it is.
+        May be one that corrects nothing.
     tolerance_m
         How far the tool may leave the wanted path between points, m.
     temperature_c
@@ -203,13 +211,10 @@ def passed_on(
     InputError
         The trajectory is refused; one line.
     """
-    t, q, v = wanted.times_s, wanted.positions, wanted.velocities
-    if not len(t):
+    if not len(wanted.times_s):
         return Passed(gate.admit((), arm.q, arm.velocity), 0.0)
     _refuse_bad_numbers(wanted)
-    notes: list[str] = []
-    if correction is not None:
-        t, q, v, notes = _corrected(wanted, arm, gate, correction, tolerance_m, temperature_c)
+    t, q, v, notes = _corrected(wanted, arm, gate, correction, tolerance_m, temperature_c)
     velocities = np.zeros_like(q) if v is None else v.copy()
     if np.abs(velocities[-1]).max() <= REST_RAD_S:
         velocities[-1] = 0.0
@@ -219,7 +224,7 @@ def passed_on(
         admitted = gate.admit(waypoints, arm.q, arm.velocity, is_straight=v is None)
     except MotionRefusedError as error:
         hint = ''
-        if wanted.times_s[0] <= 0.0 and 'it begins' in str(error) and correction is not None:
+        if isinstance(error, StartMovedError):
             hint = (
                 ": the planner must read this node's joint_states, which have the correction in "
                 'them, and begin where the arm stands'
@@ -262,11 +267,11 @@ def _corrected(
         correction.compensator, wanted.times_s, wanted.positions, wanted.velocities,
     )  # fmt: skip
     notes: list[str] = []
-    if not arm.stands:
+    begins_at_once = t[0] <= 0.0
+    if not (arm.stands or begins_at_once):
         done, v = corrected_points(compensator, q, v, temperature_c)
         _refuse_too_large(correction, done.command - q)
         return t, done.command, v, _notes(done.faded, done.outside_range)
-    begins_at_once = t[0] <= 0.0
     if not begins_at_once:
         start = compensator.true(arm.q, temperature_c)
         t, q = np.concatenate(([0.0], t)), np.concatenate((start[None], q))

@@ -8,12 +8,14 @@ gravity's torques is bounded in sampled configurations.
 
 from __future__ import annotations
 
+import copy
 import hashlib
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
+from remaster_ros.compensation.arm_model import ArmModel
 from remaster_ros.compensation.compensator import Compensator
 from remaster_ros.compensation.file import Compensation, read_compensation
 from remaster_ros.errors import InputError
@@ -113,6 +115,14 @@ class CorrectionInUse:
                 f'{np.degrees(change[joint]):.2f} degrees, and {self._most_deg:g} are the most: '
                 'master the arm, measure again, and give the new file'
             )
+
+    def off(self) -> CorrectionInUse:
+        """Return what corrects nothing, of the same arm."""
+        other = copy.copy(self)
+        for name in ('true_arm', 'shifts', '_bends'):
+            other.__dict__.pop(name, None)
+        other.compensator = Compensator(ArmModel.nominal(self.compensator.model.chain))
+        return other
 
     @cached_property
     def true_arm(self) -> SerialChain:

@@ -31,6 +31,9 @@ from remaster_ros.types import BoolArray, FloatArray
 
 START_RAD = 2e-3
 """A move begins so near to where the arm stands, rad: the way between is not checked."""
+SLOW_RAD_S = START_RAD / 0.1
+"""An arm that is no faster has hardly moved when it begins, rad/s: a tenth of a second may be
+between a report of it and the command (as much as a busy machine may add to its lag)."""
 ON_PATH_RAD = 1e-6
 """A waypoint is so near to the path that was checked, rad."""
 BETWEEN = 9
@@ -314,7 +317,7 @@ class ForeignGate:
             joint = int(np.argmax(off))
             name, deg = self.limits.names[joint], float(np.rad2deg(off[joint]))
             raise StartMovedError(f'it begins {deg:.2f} deg from where {name} is')
-        if np.any(velocity != 0.0):
+        if np.any(np.abs(velocity) > SLOW_RAD_S):
             raise StartMovedError('it begins at once while the arm moves')
 
 

@@ -52,6 +52,8 @@ HOLD_S = 3.0
 """A second publisher of the arm's joints counts for so long after it was noticed last, s."""
 LAST_ANSWER_WALL_S = 0.5
 """A node that ends waits so long for the answer to a cancelling, s."""
+WARM_S = 60.0
+"""A temperature holds for so long, s: arms warm up over tens of minutes."""
 SAME_WORDS_S = 1.0
 """The same refusal is said once in so much time, s: some programs send ten times a second."""
 
@@ -132,6 +134,7 @@ class CompensatorNode(RemasterNode):
         self._description: str | None = None
         self._described = ''
         self._temperature_c: float | None = None
+        self._warm_wall_s = -np.inf
         self._end_s = -np.inf
         self._said: dict[str, float] = {}
         self._told = ''
@@ -213,8 +216,9 @@ class CompensatorNode(RemasterNode):
         if not (self._present.is_known and self._present.is_fresh(time.monotonic())):
             others = f' ({self._states.others})' if self._states.others else ''
             return f'{topic} does not come{others}'
-        if self.p.temperature_topic and self._temperature_c is None:
-            return f'{self.resolve_topic_name(self.p.temperature_topic)} has not come yet'
+        if self.p.temperature_topic and time.monotonic() - self._warm_wall_s > WARM_S:
+            topic = self.resolve_topic_name(self.p.temperature_topic)
+            return f'{topic} has not come for {WARM_S:.0f} s'
         return (
             self.clock_trouble or self._described or self._states.rival() or self._only.trouble()
         )
@@ -264,15 +268,14 @@ class CompensatorNode(RemasterNode):
         """Begin or end to correct, and return what is said of it."""
         self._on = on
         self._true = self._motion.TrueAngles(self._correction.compensator)
-        shifts = self._correction.shifts if on else None
-        self._gate = ForeignGate(
-            MotionLimits.of(self._chain, 1.0, shifts, self.p.acceleration_limit_rad_s2)
-        )
+        self._in_use = used = self._correction if on else self._correction.off()
+        limits = MotionLimits.of(self._chain, 1.0, used.shifts, self.p.acceleration_limit_rad_s2)
+        self._gate = ForeignGate(limits)
         checksum = self._correction.sha256[:8]
         text = f'{self._correction.path}, checksum {checksum}: ' + (
             'everything is corrected by it, as it is now'
             if on
-            else 'not in use; all is passed on as it comes'
+            else 'not in use; nothing is corrected'
         )
         self.get_logger().info(text)
         return text
@@ -300,7 +303,7 @@ class CompensatorNode(RemasterNode):
 
     def _on_temperature(self, message: Temperature) -> None:
         if np.isfinite(message.temperature):
-            self._temperature_c = message.temperature
+            self._temperature_c, self._warm_wall_s = message.temperature, time.monotonic()
 
     @property
     def _warm(self) -> float | None:
@@ -356,7 +359,7 @@ class CompensatorNode(RemasterNode):
             wanted,
             self._present,
             self._gate,
-            self._correction if self._on else None,
+            self._in_use,
             1e-3 * self.p.tolerance_mm,
             self._warm,
         )

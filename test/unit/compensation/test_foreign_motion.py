@@ -127,9 +127,13 @@ def test_what_is_planned_from_the_angles_it_was_told_begins_where_the_arm_is(tmp
         passed_on(wrong, arm, gate, correction, TOLERANCE_M)
     assert '\n' not in str(error.value)
     # Not in use: as it comes.
-    t, q, v = points(passed_on(wrong, arm, gate_of(correction), None, TOLERANCE_M))
-    np.testing.assert_array_equal(q, wrong.positions)
-    np.testing.assert_array_equal(v, wrong.velocities)
+    off = correction.off()
+    t, q, v = points(passed_on(wrong, arm, gate_of(off), off, TOLERANCE_M))
+    np.testing.assert_allclose(t, wrong.times_s, rtol=1e-3)
+    np.testing.assert_allclose(q, wrong.positions, atol=1e-12)
+    np.testing.assert_allclose(v, wrong.velocities, rtol=1e-3, atol=1e-9)
+    assert np.any(correction.shifts)
+    assert not np.any(off.shifts)
 
 
 def test_lines_and_single_points_and_a_hold(tmp_path):
@@ -177,8 +181,13 @@ def test_while_the_arm_moves_its_points_are_corrected(tmp_path):
     assert np.all(v == 0.0)
     wanted = Trajectory(np.array([0.1, 0.4]), np.array([to, to]), None)
     assert passed_on(wanted, arm, gate, correction, TOLERANCE_M).admitted.is_straight
-    # The controller would jump there.
+    # The controller would jump there; an arm that is coming to rest it follows.
     wanted = Trajectory(np.array([0.0, 0.4]), np.array([there, to]), np.zeros((2, 6)))
+    slow = Present()
+    for i in range(20):
+        slow.take(0.02 * i, arm.q + 0.01 * (0.02 * i - 0.38), 0.02 * i)
+    assert not slow.stands
+    assert len(points(passed_on(wanted, slow, gate, correction, TOLERANCE_M))[0]) >= 2
     with pytest.raises(InputError, match='begins at once while the arm moves'):
         passed_on(wanted, arm, gate, correction, TOLERANCE_M)
     # From its speed to rest in no time.
@@ -218,9 +227,11 @@ def test_what_is_refused_is_one_line(tmp_path):
     refused('is to turn at', Trajectory(np.array([0.0, 0.1]), way, np.zeros((2, 6))))
     beyond = chain.upper - 0.001
     refused('would go to', line(told, beyond + 0.05, ACCELERATION, chain))
-    # What is not corrected is looked at as well, but not slowed down.
-    fast = line(at, target, 4 * ACCELERATION, chain)
-    refused('would have an? acceleration', fast, None)
+    # What is planned faster than the limit of acceleration is slowed down.
+    fast = line(told, target, 4 * ACCELERATION, chain)
+    slowed = passed_on(fast, arm, gate, correction, TOLERANCE_M)
+    assert 'slowed down to' in slowed.notes[0]
+    assert slowed.end_s > 1.5 * fast.times_s[-1]
     far = CorrectionInUse(
         save(tmp_path, compensator.model, robot('six')),
         most_deg=float(np.degrees(np.abs(compensator.command(target) - target).max())) + 2.0,
