@@ -105,6 +105,7 @@ setup(
         'test': [
             'pytest>=7.4',
             'pytest-timeout',
+            'pytest-xdist',
             'hypothesis',
             'colcon-common-extensions',
             *JUDGES,

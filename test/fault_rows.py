@@ -37,7 +37,7 @@ from fault_injections import (
 from fault_observation import Row
 
 FIVE = (
-    Row('robot', 'emergency stop pressed and driver silent', robot(estop=1, off=1), quick=True),
+    Row('robot', 'emergency stop pressed and driver silent', robot(estop=1, off=1)),
     Row(
         'robot_bridge',
         'its process is paused (SIGSTOP), and the emergency stop is pressed meanwhile',
@@ -62,7 +62,6 @@ FIVE = (
         'one message on joint_states off by 2π, then a pause',
         then_pause(robot(wrapped_once=1)),
         lasts_s=2.5,
-        quick=True,
     ),
     Row(
         'robot',
@@ -123,7 +122,6 @@ ROBOT = (
 
 
 def _common(name: str) -> tuple[Row, ...]:
-    quick = {'recorder': 'stuck', 'laser_tracker_markers': 'stuck'}
     rows = (
         ('off', 'killed, and started after 6 s', killed(name), started(name), 6.0),
         ('restarted', 'killed, and started at once', restarted(name), nothing, 5.0),
@@ -139,7 +137,7 @@ def _common(name: str) -> tuple[Row, ...]:
             inject,
             end,
             lasts_s,
-            quick=kind == quick.get(name),
+            quick=(name, kind) == ('recorder', 'stuck'),
             times=name == 'robot_bridge',
         )
         for kind, fault, inject, end, lasts_s in rows
@@ -179,7 +177,7 @@ RECORDER = (
     Row('recorder', 'answers to another pose', answers(stamp='1.000000000'), strangers_leave,
         lasts_s=0.0),
     Row('recorder', 'answers in no number', answers(solution='garbage'), strangers_leave,
-        lasts_s=0.0, quick=True),
+        lasts_s=0.0),
 )  # fmt: skip
 DEVICES = (
     Row('optitrack_markers', 'its bar stops streaming',

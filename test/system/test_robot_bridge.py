@@ -175,7 +175,8 @@ def test_what_is_wanted_is_corrected_before_the_limits_are_looked_at(
 
 def test_a_halt_survives_a_restart_and_only_a_person_ends_it(bridge):
     """An emergency stop in motion; a restart, a new pose, a planner that runs: no motion."""
-    bench = bridge()
+    # The probe behind it takes as long as full turns of all joints: half a minute at 0.5 m/s.
+    bench = bridge(cartesian_speed_limit_m_s=5.0)
     bench.send([HOME + np.array([0.9, 0, 0, 0, 0, 0, 0])])
     wait(bench, lambda: bench.arm.speed() > 0.1)
     bench.arm.stop_by_brakes(time.monotonic())

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
-GROUPS = ('motion', 'nodes', 'integration', 'estimation', 'unit')
+GROUPS = ('motion', 'others')
 # In place of Python: notes its arguments, and ends with the status that is set for its group.
 STUB = """#!/bin/bash
 group=$(grep -o 'pytest_cache/[a-z]*' <<< "$*")
@@ -44,13 +44,10 @@ def test_each_test_file_is_in_one_group(run, tmp_path):
     assert set(groups) == set(GROUPS)
     assert all(arguments[-2:] == ['-k', 'name'] for arguments in groups.values())
     paths = {group: [w for w in groups[group] if w.startswith('test/')] for group in GROUPS}
-    for part, whole in (('motion', 'nodes'), ('estimation', 'unit')):
-        left_out = [word.split('=')[1] for word in groups[whole] if word.startswith('--ignore=')]
-        assert paths[part] == left_out
-        assert all((ROOT / path).exists() for path in left_out)
-    assert paths['nodes'] == ['test/system']
-    assert paths['integration'] == ['test/integration']
-    assert paths['unit'] == ['test/unit']
+    left_out = [word.split('=')[1] for word in groups['others'] if word.startswith('--ignore=')]
+    assert paths['motion'] == left_out
+    assert all((ROOT / path).exists() for path in left_out)
+    assert paths['others'] == ['test/system', 'test/integration', 'test/unit']
 
 
 @pytest.mark.parametrize('group', GROUPS)
@@ -60,8 +57,9 @@ def test_a_failure_in_any_group_is_a_failure(run, group):
 
 def test_a_group_without_a_test_of_the_name_is_none(run):
     """Pytest ends with 5 where it has selected no test."""
-    assert run(motion=5, nodes=5, integration=5, estimation=5, unit=0) == 0
-    assert run(motion=5, nodes=5, integration=5, estimation=5, unit=5) == 5
+    assert run(motion=5, others=0) == 0
+    assert run(motion=0, others=5) == 0
+    assert run(motion=5, others=5) == 5
 
 
 def test_files_that_are_named_run_alone(run, tmp_path):
