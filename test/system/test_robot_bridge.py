@@ -87,7 +87,7 @@ def collect_again(bench, condition):
         bench.plan_state('paused')
         settle(bench, 0.5)
         bench.plan_state('running')
-        if bench.until(condition, 12):
+        if bench.until(condition, 30):
             return
     pytest.fail(bench.log.read_text()[-2000:])
 
@@ -198,10 +198,7 @@ def test_a_halt_survives_a_restart_and_only_a_person_ends_it(bridge):
     bench.send([HOME + 0.1])
     settle(bench, 1.5)
     assert not bench.commands_since(after), 'it moved before /remaster/collect'
-    bench.plan_state('paused')
-    settle(bench, 0.5)
-    bench.plan_state('running')
-    wait(bench, lambda: bench.seen.settled)
+    collect_again(bench, lambda: bench.seen.settled)
     assert not list(files.glob('halt_*'))
     assert bench.clear_halt() is False, 'there was nothing to clear'
 

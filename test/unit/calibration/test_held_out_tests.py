@@ -11,13 +11,13 @@ from scipy.linalg import block_diag
 
 from remaster_ros.calibration.estimate import Estimate, Problem, estimate
 from remaster_ros.calibration.fit import fit_session
-from remaster_ros.calibration.held_out_tests import (
+from remaster_ros.calibration.residual_structure import StructureTest
+from remaster_ros.calibration.result import (
     Part,
     held_out_tests,
     left_out_distances,
     parts_of,
 )
-from remaster_ros.calibration.residual_structure import StructureTest
 from remaster_ros.calibration.smooth_functions import whitened
 from remaster_ros.reports.judgement import verdict
 from remaster_ros.types import FloatArray, Session

@@ -14,7 +14,7 @@ from session_shapes import repeats
 from remaster_ros.calibration.estimate import Estimate, Problem, estimate
 from remaster_ros.calibration.fit import fit_session
 from remaster_ros.calibration.residual_structure import ResidualStructure, residual_structure
-from remaster_ros.calibration.robust_intervals import robust_std
+from remaster_ros.calibration.result import robust_std
 from remaster_ros.calibration.smooth_functions import MOST_ROWS, spread_poses
 from remaster_ros.simulation.effect_sampling import EffectSpec
 from remaster_ros.types import FloatArray, Measurements, Session
