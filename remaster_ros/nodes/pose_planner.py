@@ -8,7 +8,7 @@ next in `collection.tour_progress`, whether it is announced again in `collection
 
 The plan, the pose under way and what became of each configuration are in the session folder
 before the arm moves. A planner that was killed goes on by itself where it was, if the run still
-lives: recorder and bridge hold its token (see `run_token`).
+lives: recorder and bridge hold its token (see `LivingRun`).
 
 Pause and stop have a thread of their own: neither planning nor the disk keeps them waiting. Their
 state goes out first; what the journal must remember is written afterwards.
@@ -16,14 +16,20 @@ state goes out first; what the journal must remember is written afterwards.
 
 from __future__ import annotations
 
+import contextlib
+import hashlib
+import os
 import threading
 import time
-from collections.abc import Callable, Collection, Mapping
+import uuid
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from geometry_msgs.msg import TransformStamped
+import numpy as np
+from geometry_msgs.msg import PoseStamped, TransformStamped
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.client import Client
 from rclpy.clock import Clock
@@ -31,34 +37,422 @@ from rclpy.node import Node
 from rclpy.subscription import Subscription
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from remaster_ros.collection import events
 from remaster_ros.collection.announcements import Announcements
 from remaster_ros.collection.collection_run import CollectionRun
-from remaster_ros.collection.events import OptimizerState
-from remaster_ros.collection.message_fields import JointOrder, wanted_of
+from remaster_ros.collection.events import OptimizerState, PoseAnnounced
+from remaster_ros.collection.message_fields import JointOrder, stamp_key, wanted_of
 from remaster_ros.collection.pace import Pace, progress_text
 from remaster_ros.collection.peer_models import PeerModels
 from remaster_ros.collection.plan_confirmation import service_name
 from remaster_ros.collection.preflight_facts import PreflightFacts
 from remaster_ros.collection.tour_progress import TourProgress
 from remaster_ros.errors import InputError, RemasterError
+from remaster_ros.kinematics import transforms
+from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.motion.preflight import preflight
-from remaster_ros.nodes.further_measuring import FurtherMeasuring
-from remaster_ros.nodes.messages import transform_array
-from remaster_ros.nodes.parameters import declare
+from remaster_ros.nodes.locking import runtime_folder
+from remaster_ros.nodes.messages import duration_of, transform_array
+from remaster_ros.nodes.parameters import declare, parameter
 from remaster_ros.nodes.plan_preview import PlanPreview
-from remaster_ros.nodes.planner_parameters import Parameters
 from remaster_ros.nodes.planning_thread import PlanningThread
-from remaster_ros.nodes.pose_publisher import PosePublisher
-from remaster_ros.nodes.run_token import LivingRun, new_token, silence_s
 from remaster_ros.nodes.running import RemasterNode, run
-from remaster_ros.nodes.status import JOINT_STATES, LATCHED, RELIABLE, NodeStatus, Summary, listen
+from remaster_ros.nodes.status import (
+    JOINT_STATES,
+    LATCHED,
+    LEASED,
+    RELIABLE,
+    NodeStatus,
+    Summary,
+    listen,
+)
+from remaster_ros.nodes.waypoints import waypoints_message
 from remaster_ros.planning.collection_plan import session_time_s
-from remaster_ros.planning.tour_order import REGISTRATION, PoseVisit
+from remaster_ros.planning.rival_causes import FoundCause
+from remaster_ros.planning.separating_design import MOST_FURTHER
+from remaster_ros.planning.tour_order import FITTED, REGISTRATION, PoseVisit, Tour
+from remaster_ros.planning.tour_planner import REGISTRATION_CANDIDATES, TourPlanner
+from remaster_ros.planning.travel_time import SPEED_SHARE, TravelTime
+from remaster_ros.session.files import read_limited
 from remaster_ros.session.plan_journal import NO_FREE_PATH, PlanJournal
+from remaster_ros.session.reader import OBSERVATIONS_LIMIT, ROWS, read_session
 from remaster_ros.session.workcell import Workcell, read_cell
 from remaster_ros.types import FloatArray
+
+# What is measured behind a complete collection: what separates causes from their look-alikes.
+#
+# /remaster/discover looks for causes; where it leaves look-alikes, the next /remaster/collect
+# measures the configurations that tell them apart, at most `MOST_FURTHER` of them in a session.
+
+
+DISCOVER = '/remaster/discover'
+
+
+class FurtherMeasuring:
+    """Decides whether and what is measured further.
+
+    Parameters
+    ----------
+    discovery
+        Folder of the optimizer's discovery; '' where nothing is measured further.
+    session
+        The recorder's folder.
+    journal, tours
+        The plan so far; plans the tours.
+    """
+
+    def __init__(
+        self, discovery: str, session: Path, journal: PlanJournal, tours: TourPlanner
+    ) -> None:
+        self._discovery, self._session = discovery, session
+        self._journal, self._tours = journal, tours
+
+    def ask(self, state: str, *, under_way: bool) -> tuple[str | None, partial[Tour] | None]:
+        """Return why nothing is measured further, '' where it is, and what plans it if it is new.
+
+        Parameters
+        ----------
+        state
+            The planner's: behind a collection that is not complete nothing is measured, None.
+        under_way
+            Whether something is being measured further already.
+
+        Returns
+        -------
+        str or None, callable or None
+            The latter of registrations.
+        """
+        if state != 'complete':
+            return '' if under_way else None, None
+        # Imported when it is needed, as it takes a while.
+        from remaster_ros.reports.fit_json import DISCOVERY_FILE
+        from remaster_ros.reports.found_causes import read_causes
+
+        path = Path(self._discovery) / DISCOVERY_FILE
+        if not self._discovery or not path.exists():
+            return f'{DISCOVER} looks for causes, and collect measures what they leave open', None
+        try:
+            causes = read_causes(path, observations_sha256=self._digest())
+        except InputError as error:
+            return str(error), None
+        left = MOST_FURTHER - self._measured()
+        if left <= 0:
+            return f'{MOST_FURTHER} configurations were measured to separate causes already', None
+        return '', partial(self._plan, causes, left)
+
+    def _digest(self) -> str:
+        rows = read_limited(self._session / ROWS, OBSERVATIONS_LIMIT, 'it is part of a session')
+        return hashlib.sha256(rows).hexdigest()
+
+    def _measured(self) -> int:
+        """Return how many configurations were planned for this so far."""
+        tour, count = self._journal.tour, self._journal.earlier['further']
+        if tour is not None and tour.begin_at:
+            count += sum(len(pose.solutions) for pose in tour.plans[FITTED].poses)
+        return count
+
+    def _plan(
+        self, causes: tuple[FoundCause, ...], most: int, T_R_N: Mapping[str, FloatArray]
+    ) -> Tour:
+        before = self._journal.tour
+        assert before is not None
+        rows = read_session(self._session).measurements
+        return self._tours.further(T_R_N, causes, rows, before, most)
+
+    def planned(self, tour: Tour) -> str:
+        """Return a tour of the collection with what is expected of it, in a line."""
+        designed = self._tours.designed
+        expected = '' if designed is None else designed.describe()
+        if tour.begin_at:
+            expected = self.describe()
+        return '; '.join(filter(None, (tour.describe(), expected)))
+
+    def describe(self) -> str:
+        """Return what is measured further and what is not, in a line; '' before it is planned."""
+        design = self._tours.separated
+        if design is None:
+            return ''
+        words = [
+            f'{pair.cause} and {pair.look_alike}: {pair.before:.1f} standard deviations apart, '
+            f'{pair.after:.1f} expected'
+            for pair in design.pairs
+        ]
+        words += [f'no poses of this cell separate {sentence}' for sentence in design.otherwise]
+        return ('' if design.order else 'nothing to measure: ') + '; '.join(words)
+
+
+# Parameters of the planner.
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """Parameters of the planner."""
+
+    cell: str = parameter('demo', 'cell file: a path, or the name of a shipped one')
+    optimization_candidates: int = parameter(
+        60, 'candidate poses that the offsets are fitted on', low=1, high=10000
+    )
+    validation_candidates: int = parameter(
+        60, 'candidate poses that the gain is proved on', low=0, high=10000
+    )
+    registration_candidates: int = parameter(
+        REGISTRATION_CANDIDATES,
+        'candidate poses for the three-point registration',
+        low=3,
+        high=1000,
+    )
+    seed: int = parameter(0, 'seed of the Latin hypercube', low=0)
+    reference_every: int = parameter(
+        25,
+        'how many configurations lie between two visits to the reference configurations, by which '
+        'a moved sensor or base, a slipped marker or encoder and drift are seen; 0 for none',
+        low=0,
+        high=100000,
+    )
+    session: str = parameter(
+        'session', "folder of the recorder's session, where the plan is kept (plan.jsonl)"
+    )
+    separate: str = parameter(
+        '',
+        'discovery.json: configurations that separate its causes from their look-alikes are '
+        'added; empty for none',
+    )
+    discovery: str = parameter(
+        'discovery',
+        "folder of the optimizer's discovery: after a complete collection remaster/collect "
+        'measures further what separates its causes from their look-alikes; empty for nothing',
+    )
+    resume_within_s: float = parameter(
+        30.0,
+        'a planner killed while collecting that is started again within this time goes on by '
+        'itself; later it waits for /remaster/collect',
+        unit='s',
+        low=0.0,
+        high=3600.0,
+    )
+    limit_margin_deg: float = parameter(
+        1.0, 'distance kept from the joint limits', unit='deg', low=0.0, high=45.0
+    )
+    speed_share: float = parameter(
+        SPEED_SHARE,
+        'as of robot_bridge: what `poses.design: optimal` and `poses.order: fastest` of a cell '
+        'file reckon with; commands nothing',
+        low=0.01,
+        high=1.0,
+    )
+    cartesian_speed_limit_m_s: float = parameter(
+        0.25, 'as of robot_bridge, likewise; 0 means no such limit', unit='m/s', low=0.0, high=10.0
+    )
+
+    def tour_planner(
+        self, cell: Workcell, chain: SerialChain, causes: Sequence[FoundCause]
+    ) -> TourPlanner:
+        """Return what plans the tours of a cell with this arm; causes as of `causes`."""
+        scene = cell.planning_scene(chain, np.deg2rad(self.limit_margin_deg))
+        counts = {
+            'optimization': self.optimization_candidates,
+            'validation': self.validation_candidates,
+            REGISTRATION: self.registration_candidates,
+        }
+        travel = TravelTime.of(
+            scene.model,
+            self.speed_share,
+            self.cartesian_speed_limit_m_s or np.inf,
+            cell.acceleration_limits(chain),
+        )
+        design = cell.design_settings()
+        return TourPlanner(scene, counts, self.seed, self.reference_every, design, travel, causes)
+
+    def causes(self, joint_names: Sequence[str]) -> tuple[FoundCause, ...]:
+        """Return the causes that the plan is to separate; errors as of `read_causes`."""
+        if not self.separate:
+            return ()
+        # Imported when it is needed, as it takes a while.
+        from remaster_ros.reports.found_causes import read_causes
+
+        return read_causes(self.separate, joint_names)
+
+    def plan_settings(self, cell: Workcell, causes: Sequence[FoundCause]) -> dict[str, Any]:
+        """Return what the plan depends on."""
+        design = cell.design_settings()
+        speeds = {
+            'speed_share': self.speed_share,
+            'cartesian_speed_limit_m_s': self.cartesian_speed_limit_m_s,
+        }
+        return {
+            'cell': cell.fingerprint(),
+            'optimization_candidates': self.optimization_candidates,
+            'validation_candidates': self.validation_candidates,
+            'registration_candidates': self.registration_candidates,
+            'seed': self.seed,
+            'reference_every': self.reference_every,
+            'limit_margin_deg': self.limit_margin_deg,
+            # Other plans do not depend on them.
+            **(speeds if design.optimal or design.fastest else {}),
+            **({'separate': repr(causes)} if causes else {}),
+        }
+
+
+# Publish a pose with all its joint solutions to bridge and recorder.
+
+
+LISTENERS = ('robot_bridge', 'recorder')
+"""Nodes that a pose is announced to. A viewer or `ros2 topic echo` stands for none of them."""
+
+
+class PosePublisher:
+    """Publishes poses, and the stop that takes them back.
+
+    Parameters
+    ----------
+    node
+        The planner.
+    chain
+        Its arm.
+    """
+
+    def __init__(self, node: RemasterNode, chain: SerialChain) -> None:
+        self._node, self._chain = node, chain
+        self._poses = node.create_publisher(PoseStamped, 'remaster/target_pose', LEASED)
+        self._waypoints = node.create_publisher(
+            JointTrajectory, 'remaster/joint_waypoints', LEASED
+        )
+        self._solutions = node.create_publisher(
+            JointTrajectory, 'remaster/joint_solutions', LEASED
+        )
+
+    @property
+    def subscribers(self) -> int:
+        """How many nodes subscribe to the solutions, without those that only look on."""
+        found = self._node.get_subscriptions_info_by_topic(self._solutions.topic_name)
+        others = sum(info.node_name not in LISTENERS for info in found)
+        return int(self._solutions.get_subscription_count()) - others
+
+    def stop(self) -> None:
+        """Take the pose back, on which the bridge stops the arm."""
+        self._solutions.publish(JointTrajectory(joint_names=list(self._chain.joint_names)))
+
+    def announce(self, stop: PoseVisit, plan: str, status: NodeStatus, *, last: bool) -> str:
+        """Publish a pose with what is left of its solutions; return the announcement's stamp.
+
+        Parameters
+        ----------
+        plan
+            The plan that poses and solutions are numbered by.
+        last
+            Whether it is the last reference of a round.
+        """
+        pose = PoseStamped()
+        pose.header.stamp = self._node.get_clock().now().to_msg()
+        pose.header.frame_id = self._chain.base_link
+        key = stamp_key(pose.header.stamp)
+        # The event goes first: the recorder must have the pose before the arm gets there.
+        status.event(
+            PoseAnnounced(
+                stamp=key, pose=stop.pose, split=stop.split, ids=stop.ids, plan=plan, last=last
+            )
+        )
+        position, orientation = pose.pose.position, pose.pose.orientation
+        position.x, position.y, position.z = map(float, stop.T_R_T[:3, 3])
+        quaternion = transforms.quaternion_xyzw(stop.T_R_T[:3, :3])
+        orientation.x, orientation.y, orientation.z, orientation.w = map(float, quaternion)
+        self._poses.publish(pose)
+        # Before the solutions: with those the bridge begins to move.
+        self._waypoints.publish(waypoints_message(stop, self._chain.joint_names, pose.header))
+        message = JointTrajectory(joint_names=list(self._chain.joint_names))
+        message.header = pose.header
+        message.points = [
+            JointTrajectoryPoint(positions=q.tolist(), time_from_start=duration_of(i + 1.0))
+            for i, q in enumerate(stop.solutions)
+        ]
+        self._solutions.publish(message)
+        return key
+
+
+# The token of a collection under way, and the sign of life of the planner that runs it.
+#
+# A planner that was killed may go on by itself only where it is certain that the same collection
+# is still under way: the same boot of this computer, a short time by a clock that cannot be set,
+# and recorder and bridge that hold the token in memory. Dates of files prove nothing of that.
+
+
+ALIVE_S = 1.0
+"""How often a planner renews its sign of life, s."""
+
+
+def boot_id() -> str:
+    """Return what this boot of this computer is called by its kernel."""
+    return Path('/proc/sys/kernel/random/boot_id').read_text().strip()
+
+
+def since_boot_s() -> float:
+    """Return the time since boot, s; it goes on while the computer is suspended."""
+    return time.clock_gettime(time.CLOCK_BOOTTIME)
+
+
+def new_token() -> str:
+    """Return a token for a run that begins now."""
+    return uuid.uuid4().hex[:12]
+
+
+class LivingRun:
+    """A run under way in this process; its sign of life is a file outside of every session.
+
+    Parameters
+    ----------
+    token
+        Names the run.
+
+    Attributes
+    ----------
+    token
+        The run's name.
+    """
+
+    def __init__(self, token: str) -> None:
+        self.token = token
+        self._renewed = float('-inf')
+        self.stay_alive()
+
+    def stay_alive(self) -> None:
+        """Renew the sign of life, at most once a second; where that fails, no planner goes on."""
+        now = since_boot_s()
+        if now - self._renewed < ALIVE_S:
+            return
+        self._renewed = now
+        path = _path(self.token)
+        with contextlib.suppress(OSError):
+            # It need not survive a power cut: another boot is another run.
+            new = path.with_suffix('.new')
+            new.write_text(f'{boot_id()} {now!r}\n')
+            os.replace(new, path)
+
+    def end(self) -> None:
+        """End the run: no planner goes on with it."""
+        with contextlib.suppress(OSError):
+            _path(self.token).unlink()
+
+
+def silence_s(token: str) -> float | None:
+    """Return for how long the planner of a run has given no sign of life, s.
+
+    None where it gave none in this boot of this computer, or the run was ended.
+    """
+    if not token.isalnum():
+        return None
+    try:
+        boot, _, sign = _path(token).read_text().strip().partition(' ')
+        passed_s = since_boot_s() - float(sign)
+    except (OSError, ValueError):
+        return None
+    return passed_s if boot == boot_id() and passed_s >= 0.0 else None
+
+
+def _path(token: str) -> Path:
+    return runtime_folder() / f'run_{token}'
+
 
 MEASURE_EVERY_WALL_S = 5.0
 """How often a single-shot sensor measures until its marker was seen, wall time."""

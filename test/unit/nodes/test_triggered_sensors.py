@@ -8,7 +8,7 @@ import pytest
 pytest.importorskip('rclpy', reason='needs ROS 2 Jazzy or its wheels')
 
 from remaster_ros.collection.pairing import Pairing, SensorRules
-from remaster_ros.nodes import cell_sensors
+from remaster_ros.nodes import recorder
 from remaster_ros.types import MarkerReading
 
 pytestmark = pytest.mark.ros
@@ -45,7 +45,7 @@ def scene():
     client = Client()
     rules = SensorRules('tracker', 'smr', single_shot=True, timeout_s=60.0)
     pairing = Pairing(10.0, Q, (rules,))
-    asking = cell_sensors.TriggeredSensors({'tracker': client})
+    asking = recorder.TriggeredSensors({'tracker': client})
 
     def look(at, absent=()):
         clock.now = at

@@ -13,7 +13,7 @@ from played_collection import CHAIN
 
 from remaster_ros.errors import InputError
 from remaster_ros.nodes import watch
-from remaster_ros.nodes.pose_publisher import PosePublisher
+from remaster_ros.nodes.pose_planner import PosePublisher
 from remaster_ros.nodes.watch import fit_facts
 from remaster_ros.reports.live_view import FitFacts
 
