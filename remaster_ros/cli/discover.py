@@ -18,10 +18,10 @@ from remaster_ros.discovery.confirmation import (
     Confirmation,
     confirm,
     require_other_session,
+    rms_sigmas,
 )
 from remaster_ros.discovery.decision import Named, decisions
 from remaster_ros.discovery.discover import Discovery, discover_session
-from remaster_ros.discovery.side_by_side import rms_sigmas
 from remaster_ros.discovery.words import part_words, percent, sentence_case, shown
 from remaster_ros.errors import InsufficientDataError
 from remaster_ros.kinematics.serial_chain import SerialChain
@@ -88,7 +88,7 @@ def run(args: argparse.Namespace) -> int:
         if other is not None:
             progress('confirming', 0.0)
             try:
-                confirmation = confirm(found, other)
+                confirmation = confirm(found, other, np.random.default_rng(args.seed))
             except InsufficientDataError as error:
                 # What was found stays, whatever the other session is like.
                 refusal = InsufficientDataError(f'the other session: {error}')

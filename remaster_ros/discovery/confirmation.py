@@ -1,47 +1,92 @@
-"""Do the causes of one session hold in another of the same arm?
+"""Do the causes of one session hold in another of the same arm? One model of both sessions tells.
 
-Registrations, markers and zero-offsets are fitted to the other session three times: without the
-causes, with the causes as found here, frozen, and with the same causes fitted there. The last
-shows what the other session could gain from them, and the frozen ones their share of it. A cause
-counts where its driver has values that were seen here (`common_range`). Errors are those of the
-validation rows, or of the fitted ones where there are none.
+Registrations, markers, noise and errors of the measuring are each session's own. A cause is
+*shared* by both, has a size of its *own* in each, or is *absent* in the other one; a zero-offset
+is shared or each session's own; all other kinds of errors of the arm are shared. With D = X'WX and
+h = X'Wy of the columns X of each session and its errors y, a choice of these is a matrix A of
+zeros and ones from the parameters of both sessions to those of the choice, and::
+
+    log evidence = ½ log|Λ| − ½ log|H| + ½ h'H⁻¹h,   H = Σ A'DA + Λ,   h = Σ A'(h − D s)
+
+with Λ the precision of Gaussian priors and s the zero-offsets of this session less those that the
+other one is linearised at. The evidence decides, from all shared on, by the best change at a time;
+what another choice for a cause then loses is what is told of it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+from typing import Literal
 
 import numpy as np
+from scipy.linalg import block_diag, cho_factor, cho_solve, cholesky
 
-from remaster_ros.calibration.estimate import Estimate, Problem, estimate, hold_offsets
-from remaster_ros.discovery.common_range import Split, split
+from remaster_ros.calibration.estimate import Estimate, Problem, estimate
+from remaster_ros.calibration.identifiability import WEAK_ANGLE
+from remaster_ros.calibration.noise import Noise
+from remaster_ros.calibration.priors import STEP_STD
+from remaster_ros.discovery.causes import NAMED, NEEDED
 from remaster_ros.discovery.discover import Discovery
-from remaster_ros.discovery.effects.base import Cell
+from remaster_ros.discovery.effects.base import Cell, Design
+from remaster_ros.discovery.effects.context import Context
+from remaster_ros.discovery.effects.drivers import Driver, driver_named
+from remaster_ros.discovery.effects.registry import EFFECTS
+from remaster_ros.discovery.effects.splines import Curve
 from remaster_ros.discovery.evidence import solve
 from remaster_ros.discovery.gain import rms
+from remaster_ros.discovery.random_effects import Family, kinds
 from remaster_ros.discovery.residuals import Residuals
-from remaster_ros.discovery.side_by_side import (
-    Compared,
-    compare_cell,
-    compare_offsets,
-    rms_sigmas,
-)
-from remaster_ros.discovery.solution import Solution
+from remaster_ros.discovery.thinning import draw_rows
+from remaster_ros.discovery.words import joint_words, percent
 from remaster_ros.errors import InputError
 from remaster_ros.linear_algebra import one_thread
-from remaster_ros.types import BoolArray, Session
+from remaster_ros.types import BoolArray, FloatArray, IntArray, Session
 
-# Zero-offsets with which a session's error is so many times that with its own, and which differ
-# by so many standard deviations on the average, are not its own.
-OTHER_OFFSETS = 1.5
-OTHER_SIGMAS = 3.0
-# Causes that take less off the squared error of the other session have nothing to gain there.
+Choice = Literal['shared', 'own', 'absent']
+Answer = Literal['confirmed', 'changed', 'absent', 'open']
+CHOICES: tuple[Choice, ...] = ('shared', 'own', 'absent')
+# Of each zero-offset, then of each cause.
+Choices = tuple[Choice, ...]
+# A cell with the precision of the prior on its parameters.
+_Weighted = tuple[Cell, FloatArray]
+
+# A size of its own halves the evidence at least where the other session halves what it can be.
+HALVED = float(np.log(2.0))
+# What this session tells of a parameter: it leaves at most half of what can be. Frozen at less, a
+# curve through angles that it hardly took would make the other session worse.
+HALF = 0.5
+# The same row in both sessions is told as well, but for rounding.
+ROUNDING = 1e-6
+# Causes that take less off the squared error of the other session, 0.5 % of its error, have
+# nothing to gain there: no share of that is known.
 LEAST_GAIN = 0.01
-# Fewer poses of the other session in the common range do not determine anything.
-FEWEST_POSES = 6
-# Sessions with a larger share of equal measurements are one and the same.
+# Sessions of one arm have no reading in common; copies of one have most, even with some left out.
 SAME_ROWS = 0.1
+
+
+@dataclass(frozen=True)
+class Compared:
+    """One quantity in two sessions, in its unit: value and standard deviation here and there.
+
+    ``sigmas`` is the difference, other less this, over the standard deviation of both together;
+    NaN where that is zero.
+    """
+
+    name: str
+    unit: str
+    value: float
+    std: float
+    other_value: float
+    other_std: float
+    sigmas: float
+
+
+def rms_sigmas(rows: Sequence[Compared]) -> float:
+    """Return the root mean square of the differences in standard deviations; NaN of none."""
+    squares = [row.sigmas**2 for row in rows if not np.isnan(row.sigmas)]
+    return float(np.sqrt(np.mean(squares))) if squares else float('nan')
 
 
 @dataclass(frozen=True)
@@ -51,7 +96,8 @@ class ConfirmedCause:
     Attributes
     ----------
     rows_common
-        Rows of the other session in which what drives the cause was seen here.
+        Rows of the other session in which this one tells what the cause does as well as in its
+        own.
     carried_over
         Of what the other session could gain from this cause, beside the others fitted there, the
         share that it gains with the cause as found here: at most 1, negative where that makes it
@@ -59,7 +105,12 @@ class ConfirmedCause:
     rms_without_m, rms_frozen_m
         RMS of the 3-D error in these rows without it, and with it as found here.
     parameters
-        Both sessions side by side; empty where the other session does not determine them.
+        Both sessions side by side; of a curve, where both measured.
+    answer
+        'confirmed' (both sessions share it), 'changed' (of another size there), 'absent' (not
+        there) or 'open' (the other session cannot tell).
+    log_evidence
+        Of 'shared', 'own' and 'absent', less that of the best, everything else as it is best.
     """
 
     rows_common: int
@@ -67,6 +118,8 @@ class ConfirmedCause:
     rms_without_m: float
     rms_frozen_m: float
     parameters: tuple[Compared, ...]
+    answer: Answer = 'open'
+    log_evidence: Mapping[Choice, float] | None = None
 
 
 @dataclass(frozen=True)
@@ -76,11 +129,10 @@ class Confirmation:
     Attributes
     ----------
     rows, rows_common
-        Rows of the other session, and those in which what drives each of the causes was seen.
+        Rows of the other session, and those of them that are common to all causes.
     rms_before_m, rms_after_m, rms_own_m
-        RMS of the 3-D error without causes, with the causes as found here, and with the same
-        causes fitted there. Registrations, markers, zero-offsets, and what takes the place of
-        causes beyond the common range, are fitted to the other session.
+        RMS of the 3-D error without causes, with those as found here, and with the same fitted
+        there; all else, and what this session does not tell, is fitted to the other one.
     rms_frozen_offsets_m
         With the zero-offsets of this session too, with or without the causes, whichever is less.
     carried_over
@@ -91,12 +143,13 @@ class Confirmation:
     joint_offsets
         Zero-offsets that both sessions determine, side by side.
     confirmed
-        More than half carries over, and the zero-offsets agree.
+        More than half carries over, and the zero-offsets agree; not where nothing can be told.
     same_offsets
-        Whether the zero-offsets agree: within three standard deviations on the average, or with an
-        error that is nearly as small as with the other session's own.
+        Whether the evidence has both sessions share all zero-offsets.
     why
         Why nothing can be compared; '' where it can.
+    other_joints
+        1-based joints whose zero-offset is another one there, by the evidence.
     """
 
     rows: int
@@ -111,6 +164,12 @@ class Confirmation:
     confirmed: bool
     same_offsets: bool
     why: str = ''
+    other_joints: tuple[int, ...] = ()
+
+    @property
+    def gone(self) -> bool:
+        """Whether one of the causes is absent in the other session."""
+        return any(cause.answer == 'absent' for cause in self.effects)
 
     @property
     def offsets_rms_sigmas(self) -> float:
@@ -124,8 +183,15 @@ class Confirmation:
 
 
 @one_thread
-def confirm(discovery: Discovery, session: Session) -> Confirmation:
+def confirm(discovery: Discovery, session: Session, rng: np.random.Generator) -> Confirmation:
     """Compare a discovery with another session of the same arm.
+
+    Parameters
+    ----------
+    discovery, session
+        What was found, and the other session.
+    rng
+        Draws the rows of a session that is too large to use all; see `thinning.draw_rows`.
 
     Raises
     ------
@@ -135,58 +201,49 @@ def confirm(discovery: Discovery, session: Session) -> Confirmation:
         Data that do not allow a fit.
     """
     require_other_session(discovery.fit.session, session)
-    there = _OtherSession.of(discovery, estimate(Problem.of(session)))
-    context = there.data.context
-    seen = np.ones(len(context), dtype=bool)
-    for part in there.given:
-        seen &= part.inside(context)
-    if there.given and not there.parts:
-        why = (
-            f'Of the {len(context)} rows of the other session too few lie where the causes were '
-            'seen, or none shows them: nothing can be compared. Measure the arm where this '
-            'session did.'
-        )
-        return _nothing(len(context), int(seen.sum()), why)
-    every = [part.within for part in there.parts]
-    before, own = there.error((), ()), there.error((), every)
-    after = there.error(every, ())
-    offsets = compare_offsets(discovery.fit, there.found, there.data, there.own, there.parts)
+    both = _Both.of(discovery, estimate(Problem.of(session)), rng)
+    best = both.most_likely()
+    rows = len(both.there.data.context)
+    told = [both.told(group) for group in both.groups]
+    causes = tuple(both.judged(best, index, told[index]) for index in range(len(told)))
+    every = [i for group in both.groups for i in group]
+    before, after, own = both.error(absent=every), both.error(frozen=every), both.error()
     carried = share_of_gain(before, after, own)
-    frozen_offsets = there.error_with_offsets(discovery)
-    agree = not rms_sigmas(offsets) > OTHER_SIGMAS
-    same = agree or frozen_offsets < OTHER_OFFSETS * min(before, after, own)
+    common = int(np.all([np.ones(rows, dtype=bool), *told], axis=0).sum())
+    why = ''
+    if causes and all(cause.answer == 'open' for cause in causes):
+        why = (
+            f'In {common} of the {rows} rows of the other session this one tells what all causes '
+            'do, and it shows none of them either way: nothing is confirmed. Measure the arm '
+            'where this session did.'
+        )
+    with_causes = both.here.data.context.joint_offsets + both.alone.values[: both.joints]
+    others = tuple(j + 1 for j, c in enumerate(best[: both.joints]) if c == 'own')
     return Confirmation(
-        rows=len(context),
-        rows_common=int(seen.sum()),
+        rows=rows,
+        rows_common=common,
         rms_before_m=before,
         rms_after_m=after,
         rms_own_m=own,
-        rms_frozen_offsets_m=frozen_offsets,
+        rms_frozen_offsets_m=min(
+            both.error(absent=every, joint_offsets=discovery.offsets_before[0]),
+            both.error(frozen=every, joint_offsets=with_causes),
+        ),
         carried_over=carried,
-        effects=tuple(_confirmed(discovery, there, group) for group in discovery.groups),
-        joint_offsets=offsets,
-        confirmed=same and carried > 0.5,
-        same_offsets=same,
+        effects=causes,
+        joint_offsets=both.offsets_side_by_side(discovery, best),
+        confirmed=not others and carried > 0.5 and not why,
+        same_offsets=not others,
+        why=why,
+        other_joints=others,
     )
-
-
-def _nothing(rows: int, common: int, why: str) -> Confirmation:
-    nan = float('nan')
-    return Confirmation(rows, common, nan, nan, nan, nan, nan, (), (), False, False, why)
 
 
 def share_of_gain(before: float, frozen: float, own: float) -> float:
     """Return the share of what could be gained in mean square that frozen causes gain.
 
-    Parameters
-    ----------
-    before, frozen, own
-        RMS errors without causes, with frozen ones, and with those fitted to the session itself.
-
-    Returns
-    -------
-    float
-        At most 1: what frozen causes gain could be gained. NaN where that is next to nothing.
+    Of RMS errors without causes, with frozen ones and with those fitted to the session itself. At
+    most 1: what frozen causes gain could be gained. NaN where that is next to nothing.
     """
     could = before**2 - min(own, frozen) ** 2
     if could < LEAST_GAIN * before**2:
@@ -194,142 +251,404 @@ def share_of_gain(before: float, frozen: float, own: float) -> float:
     return (before**2 - frozen**2) / could
 
 
-@dataclass(frozen=True, eq=False)
-class _OtherSession:
-    """The other session, and the causes on its rows.
+def _with(choices: Choices, index: int, choice: Choice) -> Choices:
+    return (*choices[:index], choice, *choices[index + 1 :])
 
-    Attributes
-    ----------
-    found, data
-        Its fit without causes, and the residuals of the rows kept.
-    values
-        Name of each of the causes' parameters -> its value in the first session.
-    given, parts
-        The cells of the causes, and those that the other session shows.
-    beyond
-        What takes the causes' place in fitted rows where they were not seen.
-    known
-        Rows in which each cause was seen or has something in its place, (all rows,).
-    own
-        The fit with the causes and what lies beyond.
+
+@dataclass(frozen=True, eq=False)
+class _Measured:
+    """What one session knows of its natural parameters and of m parameters of the arm's errors.
+
+    Products X'WX of the columns of the former, the latter, and the errors; ``plain`` where errors
+    of the measuring are none.
     """
 
-    found: Estimate
     data: Residuals
-    values: Mapping[str, float]
-    given: tuple[Split, ...]
-    parts: tuple[Split, ...]
-    beyond: tuple[Cell, ...]
-    known: BoolArray
-    own: Solution
+    products: FloatArray
+    plain: FloatArray
 
     @classmethod
-    def of(cls, discovery: Discovery, found: Estimate) -> _OtherSession:
-        data = Residuals.of(found)
-        # What happened once is no property of the arm.
-        cells = [cell for group in discovery.groups for cell in group if np.isnan(cell.moment)]
-        given = tuple(split(cell, discovery.residuals.part, data.context) for cell in cells)
-        poses = data.context.measurements.pose[data.rows.source]
-        parts = [
-            part for part in given if len(np.unique(poses[part.inside(data.part)])) >= FEWEST_POSES
-        ]
-        beyond, known = [], np.ones(len(data.context), dtype=bool)
-        for part in given:
-            if part.beyond is not None and np.any(~part.inside(data.part)):
-                beyond.append(part.beyond)
-            else:
-                # Nothing can be fitted to held-out rows alone.
-                known &= part.inside(data.context)
-        own = solve(data, [*(part.within for part in parts), *beyond])
-        if own is None:
-            # Some of the causes this session cannot show: the rest.
-            own = solve(data, beyond)
-            shown: list[Split] = []
-            for part in parts:
-                within = [*(other.within for other in shown), part.within]
-                tried = solve(data, [*within, *beyond], own)
-                if tried is not None:
-                    own, shown = tried, [*shown, part]
-            parts = shown
-        assert own is not None
-        values = dict(zip(discovery.fit.theta_names, discovery.fit.theta, strict=True))
-        return cls(found, data, values, given, tuple(parts), tuple(beyond), known, own)
+    def of(
+        cls, data: Residuals, noise: Noise, cells: Sequence[Cell], alone: Sequence[_Weighted]
+    ) -> _Measured:
+        """Take what rows know of cells, where others settle."""
+        natural = data.full_jacobian[data.rows.source]
+        further = data.columns([cell for cell, _ in alone])
+        parts = natural, data.columns(cells), data.errors[:, :, None], further
+        columns = np.concatenate(parts, axis=2)
+        grams = data.noise_model.gram(lambda _, where: columns[where], columns.shape[2])
+        total = np.tensordot(1.0 / data.noise_model.variances(noise), grams, axes=1)
+        known = columns.shape[2] - further.shape[2]
+        plain, across = total[:known, :known], total[known:, :known]
+        if not alone:
+            return cls(data, plain, plain)
+        own = total[known:, known:] + block_diag(*(prior for _, prior in alone))
+        return cls(data, plain - across.T @ _solved(own, across), plain)
+
+    @property
+    def size(self) -> int:
+        """Number of natural parameters."""
+        return int(self.data.full_jacobian.shape[2])
+
+
+@dataclass(frozen=True, eq=False)
+class _Fitted:
+    """Log evidence of some choices up to a constant, and the posterior of all that is fitted.
+
+    That begins with all of this session; ``there`` is where the other's are, -1 what is absent.
+    """
+
+    log_evidence: float
+    values: FloatArray
+    root: FloatArray
+    there: IntArray
+
+    def covariance(self, where: IntArray) -> FloatArray:
+        """Return the covariance of some of what is fitted."""
+        unit = np.zeros((len(self.values), len(where)))
+        unit[where, np.arange(len(where))] = 1.0
+        found: FloatArray = cho_solve((self.root, False), unit)[where]
+        return found
+
+
+@dataclass(frozen=True, eq=False)
+class _Both:
+    """Both sessions with the cells of the arm's errors on their rows.
+
+    As found and as wide as both need them, and which make each cause; what each session knows;
+    precision of the prior on their m parameters, (m, m); the other session fitted without causes.
+    """
+
+    found: tuple[Cell, ...]
+    cells: tuple[Cell, ...]
+    groups: tuple[tuple[int, ...], ...]
+    here: _Measured
+    there: _Measured
+    precision: FloatArray
+    fit: Estimate
+
+    @classmethod
+    def of(cls, discovery: Discovery, fit: Estimate, rng: np.random.Generator) -> _Both:
+        mine, theirs = discovery.residuals, Residuals.of(fit)
+        theirs = theirs.only(draw_rows(fit.problem.measurements, fit.kept, rng))
+        named = [cell for group in discovery.groups for cell in group]
+        names = {name for cell in named for name in cell.parameters}
+        others = [c for c in discovery.solution.cells if not names & set(c.parameters)]
+        causes = [cell for cell in named if not cell.happened]
+        found = causes + [cell for cell in others if not cell.of_measurement]
+        once = [c for c in named if c.happened] + [c for c in others if c.of_measurement]
+        cells = [widened(cell, mine.part, theirs.part) for cell in found]
+        noise, alone = _by_itself(theirs, cells[: len(causes)])
+        priors = [_prior(discovery, *pair) for pair in zip(found, cells, strict=True)]
+        of_once = [(cell, _prior(discovery, cell, cell)) for cell in once]
+        return cls(
+            tuple(found),
+            tuple(cells),
+            tuple(
+                tuple(causes.index(cell) for cell in group if cell in causes)
+                for group in discovery.groups
+            ),
+            _Measured.of(mine, discovery.solution.noise, cells, of_once),
+            _Measured.of(theirs, noise, cells, alone),
+            np.reshape(block_diag(*priors), [sum(cell.size for cell in cells)] * 2),
+            fit,
+        )
+
+    @property
+    def joints(self) -> int:
+        """Number of joints k."""
+        return self.fit.model.joints
+
+    def where(self, group: Sequence[int]) -> IntArray:
+        """Return where the parameters of some cells are among the m."""
+        edges = np.cumsum([0, *(cell.size for cell in self.cells)])
+        parts = [np.arange(edges[i], edges[i + 1]) for i in group]
+        return np.concatenate([np.zeros(0, np.int64), *parts])
+
+    def fitted(self, choices: Choices) -> _Fitted:
+        """Fit both sessions with some choices."""
+        here, there, k, m = self.here, self.there, self.joints, len(self.precision)
+        first, second = here.size + m, there.size
+        prior = block_diag(np.diag(_natural(second, k)), self.precision)
+        to = np.concatenate((np.arange(k), np.full(second - k, -1), here.size + np.arange(m)))
+        own = [np.arange(k, second)]
+        wheres = [*np.arange(k)[:, None], *(second + self.where(group) for group in self.groups)]
+        for where, choice in zip(wheres, choices, strict=True):
+            to[where] = -1 if choice == 'absent' else to[where]
+            own += [where] if choice == 'own' else []
+        at = first
+        for where in own:
+            to[where] = at + np.arange(len(where))
+            at += len(where)
+        blocks = [prior[np.ix_(where, where)] for where in own]
+        H = block_diag(np.diag(_natural(here.size, k)), self.precision, *blocks)
+        h = np.zeros(at)
+        H[:first, :first] += here.products[:-1, :-1]
+        h[:first] += here.products[:-1, -1]
+        # Both sessions' zero-offsets count from those that this one is linearised at.
+        known = there.products[:-1, :-1]
+        steps = here.data.context.joint_offsets - there.data.context.joint_offsets
+        pull = there.products[:-1, -1] - known[:, :k] @ steps
+        kept = to >= 0
+        H[np.ix_(to[kept], to[kept])] += known[np.ix_(kept, kept)]
+        h[to[kept]] += pull[kept]
+        root = cholesky(H)
+        values = cho_solve((root, False), h)
+        evidence = 0.5 * (h @ values + sum(np.linalg.slogdet(block)[1] for block in blocks))
+        return _Fitted(float(evidence - np.sum(np.log(np.diag(root)))), values, root, to)
+
+    def most_likely(self) -> Choices:
+        """Return what single changes reach from all shared, each at odds of twenty to one."""
+        # What happened once is no matter of the other session.
+        possible = [CHOICES[:2]] * self.joints
+        possible += [CHOICES if group else ('shared',) for group in self.groups]
+        best: Choices = tuple(choices[0] for choices in possible)
+        value = self.fitted(best).log_evidence
+        while True:
+            tried = [
+                _with(best, i, choice)
+                for i, choices in enumerate(possible)
+                for choice in choices
+                if choice != best[i]
+            ]
+            values = [self.fitted(choices).log_evidence for choices in tried]
+            if max(values) < value + NEEDED:
+                return best
+            value, best = max(values), tried[int(np.argmax(values))]
+
+    def judged(self, best: Choices, index: int, rows: BoolArray) -> ConfirmedCause:
+        """Judge one cause, everything else as it is best; errors are those of some rows."""
+        group = self.groups[index]
+        if not group:
+            return ConfirmedCause(0, np.nan, np.nan, np.nan, ())
+        fits = {c: self.fitted(_with(best, self.joints + index, c)) for c in CHOICES}
+        largest = max(fit.log_evidence for fit in fits.values())
+        evidence = {choice: fit.log_evidence - largest for choice, fit in fits.items()}
+        without, frozen = self.error(rows=rows, absent=group), self.error(rows=rows, frozen=group)
+        return ConfirmedCause(
+            int(rows.sum()),
+            share_of_gain(without, frozen, self.error(rows=rows)),
+            without,
+            frozen,
+            self._side_by_side(group, fits['own']),
+            answer_of(evidence),
+            evidence,
+        )
+
+    @cached_property
+    def alone(self) -> _Fitted:
+        """Each session by itself."""
+        every: Choices = (CHOICES[1],) * (self.joints + len(self.groups))
+        return self.fitted(every)
+
+    @cached_property
+    def _spread(self) -> FloatArray:
+        """Covariance of the m parameters by this session, (m, m)."""
+        return self.alone.covariance(self.here.size + np.arange(len(self.precision)))
+
+    def told(self, group: Sequence[int]) -> BoolArray:
+        """Return in which rows of the other session this one tells what a cause does, (all rows,).
+
+        Where it leaves half of what could be, or no more than in one of its own rows.
+        """
+        chosen = np.ix_(*[self.where(group)] * 2)
+        spreads = self._spread[chosen], np.linalg.inv(self.precision)[chosen]
+
+        def left(context: Context) -> FloatArray:
+            parts = [self.cells[i].columns(context).displacement(context) for i in group]
+            columns = np.concatenate([np.zeros((len(context), 3, 0)), *parts], axis=2)
+            mine, all_ = (np.sum((columns @ one) * columns, axis=(1, 2)) for one in spreads)
+            return np.divide(mine, all_, out=np.zeros(len(context)), where=all_ > 0.0)
+
+        known = [left(block) for _, block in self.there.data.context.blocks()]
+        most = max(HALF**2, (1.0 + ROUNDING) * left(self.here.data.part).max())
+        return np.asarray(np.concatenate(known) <= most)
 
     def error(
         self,
-        frozen: Sequence[Cell],
-        fitted: Sequence[Cell],
         *,
+        absent: Sequence[int] = (),
+        frozen: Sequence[int] = (),
         rows: BoolArray | None = None,
-        data: Residuals | None = None,
+        joint_offsets: FloatArray | None = None,
     ) -> float:
-        """Return the RMS error with some cells as found in the first session, and some fitted.
+        """Return the RMS error of the other session with some cells absent, or as found here.
 
-        Of the validation rows, or the fitted ones without any; of those in ``rows`` (all rows,).
+        All else, and what this session does not tell, is fitted to it. Of its validation rows, or
+        the fitted ones without any; of those in ``rows`` (all rows,), where there are such.
         """
-        data = self.data if data is None else data
-        theta = np.array([self.values[name] for cell in frozen for name in cell.parameters])
-        data = data.less(data.displaced(frozen, theta))
-        fit = solve(data, (*fitted, *self.beyond), self.own)
-        if fit is None:
-            return float('nan')
-        judged = data.context.measurements.is_validation & self.known
+        there, k, size = self.there, self.joints, self.there.size
+        held = np.full(size + len(self.precision), np.nan)
+        if joint_offsets is not None:
+            held[:k] = joint_offsets - there.data.context.joint_offsets
+        found = self.alone.values[self.here.size :][: len(self.precision)]
+        told = np.diag(self._spread) < HALF**2 * np.diag(np.linalg.inv(self.precision))
+        for cells, values in ((absent, 0.0 * found), (frozen, found)):
+            where = self.where(cells)
+            where = where[told[where]]
+            held[size + where] = values[where]
+        free, fixed = np.isnan(held), ~np.isnan(held)
+        H = there.plain[:-1, :-1] + block_diag(np.diag(_natural(size, 0)), self.precision)
+        h = there.plain[:-1, -1][free] - H[np.ix_(free, fixed)] @ held[fixed]
+        held[free] = _solved(H[np.ix_(free, free)], h)
+        data = there.data
+        left = data.full_errors - data.full_jacobian @ held[:size]
+        left -= data.displaced(self.cells, held[size:])
+        judged = data.context.measurements.is_validation
         if not judged.any():
             judged = np.isin(np.arange(len(judged)), data.rows.source)
         if rows is not None and np.any(judged & rows):
             judged = judged & rows
-        return rms(data.unexplained(fit), judged)
+        return rms(left, judged)
 
-    def error_with_offsets(self, discovery: Discovery) -> float:
-        """Return the least RMS error with the first session's zero-offsets, causes or not."""
-        joints = np.arange(self.found.model.joints)
-        within = [part.within for part in self.parts]
-        errors = []
-        for offsets, frozen in (
-            (discovery.offsets_before[0], ()),
-            (discovery.fit.joint_offsets, within),
-            (discovery.fit.joint_offsets, ()),
-        ):
-            data = Residuals.at(self.found, hold_offsets(self.found.mode, offsets))
-            errors.append(self.error(frozen, (), data=data.holding(joints)))
-        return min(errors)
+    def offsets_side_by_side(self, discovery: Discovery, best: Choices) -> tuple[Compared, ...]:
+        """Compare the zero-offsets that both sessions determine, the causes as they are best."""
+        rows: list[Compared] = []
+        offsets = self.here.data.context.joint_offsets
+        for joint, name in enumerate(discovery.fit.joint_names):
+            fit = self.fitted(_with(best, joint, 'own'))
+            where = np.array([joint, fit.there[joint]])
+            covariance = fit.covariance(where)
+            known = np.sqrt(np.diag(covariance).max()) < WEAK_ANGLE
+            if known and discovery.fit.identifiable[joint] and not self.fit.gauge.why[joint]:
+                pair = np.degrees(offsets[joint] + fit.values[where])
+                rows += _compared([name], 'deg', pair, np.degrees(np.degrees(covariance)))
+        return tuple(rows)
+
+    def _side_by_side(self, group: Sequence[int], own: _Fitted) -> tuple[Compared, ...]:
+        """Compare the parameters of a cause: as they are, or a curve at its places."""
+        rows: list[Compared] = []
+        for i in group:
+            cell, wide, where = self.found[i], self.cells[i], self.where([i])
+            names, heights = list(cell.parameters), np.eye(wide.size)
+            if cell.curve is not None and wide.curve is not None:
+                there = _driver(cell).value(self.there.data.part)
+                places = cell.curve.places
+                seen = cell.curve.seen(places, 0.5) & cell.curve.among(there).seen(places, 0.5)
+                axes = cell.size // len(places)
+                names = [n for n, both in zip(names, np.repeat(seen, axes), strict=True) if both]
+                if len(names) < 2 * axes:
+                    # Of one place nothing is left less the mean.
+                    continue
+                heights = wide.curve.columns(places[seen])
+                heights = np.kron(heights - heights.mean(axis=0), np.eye(axes))
+            both = np.append(self.here.size + where, own.there[self.there.size + where])
+            twice = block_diag(heights, heights)
+            covariance = twice @ own.covariance(both) @ twice.T
+            rows += _compared(names, cell.unit, twice @ own.values[both], covariance)
+        return tuple(rows)
 
 
-def _confirmed(
-    discovery: Discovery, there: _OtherSession, group: tuple[Cell, ...]
-) -> ConfirmedCause:
-    """Judge one cause where it was seen, the others fitted to the other session."""
-    mine = [part for part in there.parts if part.cell in group]
-    context = there.data.context
-    rows = np.zeros(len(context), dtype=bool)
-    for part in mine:
-        rows |= part.inside(context)
-    within = [part.within for part in mine]
-    rest = [part.within for part in there.parts if part not in mine]
-    without = there.error((), rest, rows=rows)
-    frozen = there.error(within, rest, rows=rows) if mine else float('nan')
-    own = there.error((), [*rest, *within], rows=rows)
-    return ConfirmedCause(
-        int(rows.sum()),
-        share_of_gain(without, frozen, own) if mine else float('nan'),
-        without,
-        frozen,
-        tuple(
-            row
-            for part in mine
-            for row in compare_cell(discovery.fit, part, there.data.part, there.own)
-        ),
-    )
+def _compared(
+    names: Sequence[str], unit: str, values: FloatArray, covariance: FloatArray
+) -> list[Compared]:
+    """Compare values of this session, then of the other, (2 n,), by their covariance."""
+    found, n = [], len(names)
+    variance = np.diag(covariance)
+    for i, name in enumerate(names):
+        mine, other = float(values[i]), float(values[n + i])
+        std = float(np.sqrt(variance[i] + variance[n + i] - 2.0 * covariance[i, n + i]))
+        sigmas = (other - mine) / std if std > 0.0 else float('nan')
+        stds = np.sqrt(variance[[i, n + i]]).tolist()
+        found.append(Compared(str(name), unit, mine, stds[0], other, stds[1], sigmas))
+    return found
+
+
+def answer_of(evidence: Mapping[Choice, float]) -> Answer:
+    """Return what the log evidence of the choices for a cause says of it.
+
+    'open' where it could be there or not, or is there, but maybe not of that size.
+    """
+    shared, own, absent = evidence['shared'], evidence['own'], evidence['absent']
+    if max(own, absent) > shared + NEEDED:
+        return 'changed' if own > absent + NEEDED else 'absent'
+    if shared < absent + NEEDED or shared < own + HALVED:
+        return 'open'
+    return 'confirmed'
+
+
+def _by_itself(data: Residuals, causes: Sequence[Cell]) -> tuple[Noise, list[_Weighted]]:
+    """Return a session's noise beside causes and all kinds of errors, and those of its measuring.
+
+    Each of these with the precision of its weights.
+    """
+    others = [
+        cell
+        for effect in EFFECTS.values()
+        if not effect.moves_the_fit and not effect.needs(data.context)
+        for cell in effect.cells(data.context)
+    ]
+    each = [Family.of(data, f'cause {i}', [cell]) for i, cell in enumerate(causes)]
+    every = kinds(data, others, causes)
+    found = solve(data, [one.cell for one in each if one is not None])
+    if found is None:
+        return data.noise, []
+    # Of few rows all kinds together would explain the noise as well.
+    whole = solve(data, [*found.cells, *(one.cell for one in every)], found)
+    if whole is None or whole.log_evidence < found.log_evidence + NAMED:
+        return found.noise, []
+    weights = dict(zip(whole.cells, whole.smoothness, strict=True))
+    return whole.noise, [
+        (family.cell, weights[family.cell] * np.eye(family.cell.size))
+        for family in every
+        if family.members[0].of_measurement
+    ]
+
+
+def _natural(size: int, k: int) -> FloatArray:
+    """Return the prior precision of natural parameters: of zero-offsets, then of all others.
+
+    Registrations and markers are known to a metre and a radian: to nothing that counts.
+    """
+    return np.where(np.arange(size) < k, STEP_STD**-2.0, 1.0)
+
+
+def _solved(matrix: FloatArray, right: FloatArray) -> FloatArray:
+    """Solve with a positive definite matrix of parameters in units far apart."""
+    unit = np.diag(matrix) ** -0.5
+    factor = cho_factor(matrix * np.outer(unit, unit), check_finite=False)
+    return (unit * cho_solve(factor, (unit * right.T).T, check_finite=False).T).T
+
+
+def _prior(discovery: Discovery, cell: Cell, wide: Cell) -> FloatArray:
+    """Return the precision of a cell's parameters, (m, m): of their size here, or smoothness."""
+    solution, fit = discovery.solution, discovery.fit
+    is_cause = any(cell in group for group in discovery.groups)
+    if cell in solution.cells and (cell.penalty is not None or not is_cause):
+        index = solution.cells.index(cell)
+        ridge = solution.ridge[solution.slices()[index]]
+        if wide.penalty is None:
+            return np.diag(ridge)
+        return solution.smoothness[index] * wide.penalty + ridge[0] * np.eye(wide.size)
+    chosen = [fit.theta_names.index(name) for name in cell.parameters]
+    return np.eye(cell.size) / float(np.mean(fit.theta[chosen] ** 2 + fit.theta_std[chosen] ** 2))
+
+
+def _driver(cell: Cell) -> Driver:
+    driver = driver_named(cell.driver, cell.joints[-1] if cell.joints else 0)
+    assert driver is not None
+    return driver
+
+
+def widened(cell: Cell, mine: Context, theirs: Context) -> Cell:
+    """Return a cell whose free form reaches over both sessions, with its mean zero over this."""
+    if cell.curve is None or cell.place != 'joint_angle':
+        return cell
+    driver = _driver(cell)
+    values = np.concatenate([driver.value(mine), driver.value(theirs)])
+    curve = Curve.of(values, 0.0, cell.curve.step, not np.isnan(cell.curve.start))
+    curve = replace(curve, weights=curve.splines(driver.value(mine)).mean(axis=0))
+    names = tuple(f'{cell.parameters[0]} {place:+.4f}' for place in curve.places)
+    columns = partial(_free, joint=cell.joints[0], driver=driver, curve=curve)
+    return replace(cell, columns=columns, parameters=names, penalty=curve.penalty, curve=curve)
+
+
+def _free(context: Context, joint: int, driver: Driver, curve: Curve) -> Design:
+    return Design(joint - 1, curve.columns(driver.value(context)))
 
 
 def require_other_session(session: Session, other: Session) -> None:
-    """Refuse to compare sessions of different robots, sensors or markers, or one with itself.
-
-    Raises
-    ------
-    InputError
-        Says what differs, or how many measurements are in both.
-    """
+    """Refuse, by InputError, other robots, sensors or markers, or a session with itself."""
     mine, theirs = Problem.of(session), Problem.of(other)
     if mine.chain.joint_names != theirs.chain.joint_names:
         raise InputError(
@@ -363,3 +682,67 @@ def _readings(session: Session) -> set[bytes]:
     m = session.measurements
     rounded = np.round(np.concatenate((m.q, m.position), axis=1), 9) + 0.0
     return {row.tobytes() for row in rounded}
+
+
+def in_words(discovery: Discovery, confirmation: Confirmation) -> list[str]:
+    """Return sentences: whose zero-offsets these are, and how far each cause holds there."""
+    found = confirmation
+    if found.why:
+        return [found.why]
+    carried = (
+        'the causes could gain next to nothing there'
+        if np.isnan(found.carried_over)
+        else f'{percent(found.carried_over)} of what they could gain there'
+    )
+    lines = [
+        f'{1e3 * found.rms_before_m:.3f} mm RMS without the causes, {1e3 * found.rms_after_m:.3f} '
+        f'mm with them as found here, {1e3 * found.rms_own_m:.3f} mm with them fitted there: '
+        f'{carried}. In {found.rows_common} of its {found.rows} rows this session tells what all '
+        'of them do; what it does not tell is fitted to the other one.'
+    ] * bool(found.effects)
+    offsets = (
+        f'they are {found.offsets_rms_sigmas:.1f} standard deviations apart on the average, and '
+        f'the error is {1e3 * found.rms_frozen_offsets_m:.3f} mm RMS with those found here'
+    )
+    own = f'{1e3 * min(found.rms_own_m, found.rms_before_m):.3f} mm with its own'
+    holds = any(cause.answer == 'confirmed' for cause in found.effects)
+    if not found.same_offsets and not holds and not found.carried_over > 0.5:
+        return [
+            f'The zero-offsets found here are not those of the other session: {offsets}, {own}. '
+            'That is another arm, or it was mastered anew in between: nothing is confirmed.'
+        ]
+    if not found.same_offsets:
+        lines.append(
+            f'Of {joint_words(found.other_joints)} the zero-offset is another one there: '
+            f'{offsets}, {own}. That is another arm of this kind, or it was mastered anew in '
+            'between, or what imitates an offset has changed.'
+        )
+    elif found.joint_offsets:
+        lines.append(f'The zero-offsets are the same, {offsets}: it is the same arm.')
+    lines += [
+        f'{effect.title}{_said(cause)}'
+        for effect, cause in zip(discovery.effects, found.effects, strict=False)
+    ]
+    return lines
+
+
+def _said(cause: ConfirmedCause) -> str:
+    """Return what the other session says of a cause, behind its title."""
+    change = f'{1e3 * cause.rms_without_m:.3f} to {1e3 * cause.rms_frozen_m:.3f} mm RMS'
+    share = (
+        f'as found here it goes from {change}'
+        if np.isnan(cause.carried_over) or cause.carried_over < 0.0
+        else f'{percent(cause.carried_over)} of what it could gain from it, {change}'
+    )
+    evidence = cause.log_evidence
+    if evidence is None:
+        return ': it happened once, and is no matter of the other session.'
+    if cause.answer == 'confirmed':
+        return f'. Confirmed: both sessions share it ({share}).'
+    if cause.answer == 'changed':
+        return f'. Changed: there, but not as it was found here ({share}).'
+    if cause.answer == 'absent':
+        return f'. Not there any more: the other session does not show it ({share}).'
+    if evidence['shared'] > evidence['absent'] + NEEDED:
+        return f'. There too; whether it is the same cannot be told ({share}).'
+    return ': the other session cannot tell; measure the arm where this session did.'

@@ -7,8 +7,7 @@ import numpy as np
 
 from remaster_ros.calibration.measured_again import MeasuredAgain
 from remaster_ros.calibration.noise_check import SPOILT
-from remaster_ros.discovery.confirmation import Confirmation
-from remaster_ros.discovery.confirmation_words import in_words
+from remaster_ros.discovery.confirmation import Confirmation, in_words
 from remaster_ros.discovery.discover import Discovery
 from remaster_ros.discovery.explain import UNCERTAIN
 from remaster_ros.discovery.gain import held_out_words
@@ -84,6 +83,8 @@ def _is_proven(discovery: Discovery, confirmation: Confirmation | None) -> bool:
         return False
     if any(effect.moment_s is not None for effect in discovery.effects):
         # What was measured before and after it does not agree.
+        return False
+    if confirmation is not None and (confirmation.other_joints or confirmation.gone):
         return False
     if confirmation is not None and not confirmation.same_offsets:
         return False
@@ -189,4 +190,6 @@ def _result(discovery: Discovery, confirmation: Confirmation | None, *, left: bo
             else f': its error is {1e3 * confirmation.rms_after_m:.3f} mm RMS with and '
             f'{1e3 * confirmation.rms_before_m:.3f} mm without.'
         )
+    elif confirmation is not None and confirmation.gone:
+        change += ' Not all of it is there in the other session.'
     return f'Beyond the zero-offsets there {"is" if count == 1 else "are"} {causes}.{change}'

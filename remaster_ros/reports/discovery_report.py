@@ -6,8 +6,7 @@ from pathlib import Path
 
 import msgspec
 
-from remaster_ros.discovery.confirmation import Confirmation
-from remaster_ros.discovery.confirmation_words import in_words
+from remaster_ros.discovery.confirmation import Confirmation, in_words
 from remaster_ros.discovery.discover import Discovery
 from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.reports.discovery_apply import load_words

@@ -161,7 +161,9 @@ class ConfirmedEffect(Struct):
     """How an effect does in the other session.
 
     ``rows_common`` of its rows have its driver where it was seen; ``carried_over`` is the share of
-    what it could gain there; None where that is nothing.
+    what it could gain there; None where that is nothing. ``answer`` is what the evidence says, and
+    ``log_evidence`` that of the cause shared by both sessions, of a size of its own there, and
+    absent there, less the best.
     """
 
     name: str
@@ -171,6 +173,8 @@ class ConfirmedEffect(Struct):
     rms_without_m: float | UnsetType | None = UNSET
     rms_frozen_m: float | UnsetType | None = UNSET
     parameters: list[Compared] | UnsetType = UNSET
+    answer: Literal['confirmed', 'changed', 'absent', 'open'] | UnsetType = UNSET
+    log_evidence: dict[str, float] | UnsetType | None = UNSET
 
 
 class Confirmed(Struct):
@@ -190,6 +194,7 @@ class Confirmed(Struct):
     offsets_rms_sigmas: float | UnsetType | None = UNSET
     parameters_rms_sigmas: float | UnsetType | None = UNSET
     why: str | UnsetType = UNSET
+    other_joints: list[int] | UnsetType = UNSET
 
 
 class Coverage(Struct):

@@ -117,8 +117,10 @@ def test_causes_carry_over_to_a_session_of_the_same_arm_until_they_are_removed()
     found, first = discovered(recipe)
     assert found.effects
     other = Recipe(SEED + 1)
-    same = confirm(found, another_session(first, other, first.truth.effects).session)
-    repaired = confirm(found, another_session(first, other, ()).session)
+    same = confirm(
+        found, another_session(first, other, first.truth.effects).session, np.random.default_rng(0)
+    )
+    repaired = confirm(found, another_session(first, other, ()).session, np.random.default_rng(0))
     print(same, repaired, sep='\n')
     assert same.confirmed
     assert same.rms_after_m < same.rms_before_m

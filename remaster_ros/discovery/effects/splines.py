@@ -166,7 +166,7 @@ def start_of_turn(values: FloatArray) -> float:
     widest = int(np.argmax(gaps))
     start = float(at[widest] + 0.5 * gaps[widest])
     moved = in_turn(values, start) - values
-    return start - float(np.median(np.round(moved / TURN))) * TURN
+    return start - round(float(np.median(np.round(moved / TURN)))) * TURN
 
 
 def in_turn(values: FloatArray, start: float) -> FloatArray:

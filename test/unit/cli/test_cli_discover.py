@@ -7,11 +7,9 @@ from dataclasses import replace
 
 from remaster_ros.cli.discover import summary as summary_of
 from remaster_ros.cli.main import main
-from remaster_ros.discovery.confirmation import Confirmation, ConfirmedCause
-from remaster_ros.discovery.confirmation_words import in_words
+from remaster_ros.discovery.confirmation import Compared, Confirmation, ConfirmedCause, in_words
 from remaster_ros.discovery.explain import FoundEffect, LookAlike
 from remaster_ros.discovery.gain import Gain
-from remaster_ros.discovery.side_by_side import Compared
 from remaster_ros.discovery.thinning import Thinning
 from remaster_ros.reports.discovery_schema import Loadable
 from remaster_ros.reports.schemas import Judgement
@@ -97,7 +95,9 @@ def compared(name, value, other, sigmas, unit='rad/(N m)'):
 
 
 def confirmation(share, frozen, parameters, **more):
-    cause = ConfirmedCause(180, share, 0.9e-3, frozen, tuple(parameters))
+    answer = 'absent' if share != share else 'confirmed'
+    evidence = {'shared': 0.0, 'own': -3.0, 'absent': -9.0}
+    cause = ConfirmedCause(180, share, 0.9e-3, frozen, tuple(parameters), answer, evidence)
     given = {
         'rows': 200,
         'rows_common': 150,
@@ -121,7 +121,7 @@ def test_the_other_session_is_shown_side_by_side():
     assert 'other session: 0.900 mm RMS without the causes, 0.350 mm with them as found' in text
     assert '93 % of what they could gain there' in text
     assert '150 of its 200 rows' in text
-    assert 'Confirmed: 93 % of what the other session could gain from it' in text
+    assert 'Confirmed: both sessions share it (93 % of what it could gain from it' in text
     assert re.search(
         r'compliance_2 +\+0\.069 ± 0\.003 +\+0\.072 ± 0\.003 ′/\(N m\) +\+0\.7 σ', text
     )
@@ -138,7 +138,7 @@ def test_a_cause_that_was_cured_is_not_confirmed():
     session = found((EFFECT,), Gain(1e-3, 0.3e-3, 0.28e-3, {}), {})
     text = summary(session, confirmation(float('nan'), 3.3e-3, [], confirmed=False))
     assert 'the causes could gain next to nothing there' in text
-    assert 'Not there any more: as found here it goes from 0.900 to 3.300 mm RMS' in text
+    assert 'does not show it (as found here it goes from 0.900 to 3.300 mm RMS)' in text
     assert 'nan' not in text
 
 

@@ -40,7 +40,9 @@ def saved(tmp_path_factory):
     again = session_with(41, bent, poses=25, validation=15, pose_sigma_m=0.3e-3)
     pair = (Named('joint_compliance', (2,)), Named('encoder_eccentricity', (2,)))
     decided = decisions(found, [pair])
-    report = save_discovery(found, folder, confirm(found, again), decided=decided)
+    report = save_discovery(
+        found, folder, confirm(found, again, np.random.default_rng(0)), decided=decided
+    )
     assert report == folder / 'report.html'
     return found, folder
 
@@ -64,6 +66,9 @@ def test_discovery_json_keeps_its_contract(saved):
     assert content['gain']['held_out_rms_after_m'] < content['gain']['held_out_rms_before_m']
     assert content['joint_offsets_after'][1].keys() >= {'joint', 'mean_deg', 'std_deg'}
     assert content['confirmation']['confirmed'] is True
+    (confirmed,) = content['confirmation']['effects']
+    assert confirmed['answer'] == 'confirmed'
+    assert confirmed['log_evidence'].keys() == {'shared', 'own', 'absent'}
     (decided,) = content['decided']
     assert decided['answer'] == 'look_alike'
     assert decided['cause'] == {'name': 'joint_compliance', 'joints': [2]}
