@@ -53,6 +53,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         'the tool), and look for it; `random` draws one; may be repeated',
     )
     parser.add_argument(
+        '--apply',
+        action='store_true',
+        help='let the bridge correct by what was found, visit other poses, and see whether the '
+        'tool comes to where it is wanted; a minute more',
+    )
+    parser.add_argument(
         '--rate',
         type=number(1.0, 20.0),
         default=10.0,
@@ -76,6 +82,7 @@ def run(args: argparse.Namespace) -> NoReturn:
             'figures': not args.no_figures,
             'quiet': args.quiet,
             'hide': ','.join(args.hide),
+            'apply': args.apply,
             'watch': args.watch,
         },
     )

@@ -30,6 +30,8 @@ KNOWN_OFFSET_RAD = float(np.deg2rad(0.1))
 """What may still be wrong with a joint whose offset is in use, for the clearance of paths."""
 OFFSET_STDS = 3.0
 """Or so many standard deviations of the offset that is known least."""
+NOTED = 1e-5
+"""What of a pose is not corrected is said where it is more, m or rad: sensors see no less."""
 SAMPLED = 2000
 """Configurations in which largest changes are looked for: they are smooth in the angles, and of
 seven joints some hundreds come near each extreme."""
@@ -204,11 +206,12 @@ class CorrectionInUse:
         refused |= self.too_large(change)
         notes = []
         for row in map(int, np.flatnonzero(finite)):
-            if done.faded[row]:
+            left = done.residual_m[row], done.residual_rad[row]
+            if done.faded[row] and max(left) > NOTED:
                 notes.append(
                     f'solution {row} is near a singularity: of its pose '
-                    f'{1e3 * done.residual_m[row]:.3f} mm and '
-                    f'{np.degrees(done.residual_rad[row]):.4f} degrees are not corrected'
+                    f'{1e3 * left[0]:.3f} mm and {np.degrees(left[1]):.4f} degrees are not '
+                    'corrected'
                 )
             if done.outside_range[row]:
                 notes.append(

@@ -18,7 +18,7 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -46,23 +46,28 @@ from remaster_ros.collection.events import (
     State,
     TourPlanned,
 )
+from remaster_ros.compensation.compensator import Compensator
+from remaster_ros.compensation.file import COMPENSATION_FILE, read_compensation
+from remaster_ros.compensation.verification import Visits, verify
 from remaster_ros.errors import DeviceError, InputError, RemasterError
-from remaster_ros.nodes.launching import ALL_NODES, CORE, SENSORS
+from remaster_ros.nodes.launching import CORE, SENSORS
 from remaster_ros.nodes.page_address import opening_path, page_name
 from remaster_ros.nodes.parameters import declare, parameter
 from remaster_ros.nodes.running import report
 from remaster_ros.nodes.status import listen
 from remaster_ros.reports.discovery_json import read_discovery
-from remaster_ros.reports.fit_json import read_fit
+from remaster_ros.reports.fit_json import APPLY_FOLDER, read_fit
 from remaster_ros.session.files import cannot_write, make_folder, undone_on_failure
-from remaster_ros.session.reader import HEADER
+from remaster_ros.session.reader import HEADER, read_session
 from remaster_ros.session.session_journal import is_complete
 from remaster_ros.session.workcell import config_path, read_cell
 from remaster_ros.simulation.effect_sampling import EffectSpec
 from remaster_ros.simulation.expected_findings import causes, describe, named_cause
+from remaster_ros.simulation.hidden_arm import tool_points
 from remaster_ros.simulation.hidden_effects import true_parameters
 from remaster_ros.simulation.setup import make_world
 from remaster_ros.simulation.truth import SessionTruth, to_plain
+from remaster_ros.types import Session
 
 _PR_SET_PDEATHSIG = 1
 
@@ -148,21 +153,22 @@ class NodeProcesses:
         """Return the process that runs a node now."""
         return self._running[name].pid
 
-    def stop(self, grace_s: float = 3.5) -> list[str]:
-        """End every process within about `grace_s` seconds; return those that were killed."""
-        for process in self._running.values():
+    def stop(self, names: Sequence[str] = (), grace_s: float = 3.5) -> list[str]:
+        """End processes within about `grace_s`, all by default; return those that were killed."""
+        ended = {name: self._running[name] for name in names or self._running}
+        for process in ended.values():
             if process.poll() is None:
                 process.send_signal(signal.SIGINT)
         deadline = time.monotonic() + grace_s
         killed = []
-        for name, process in self._running.items():
+        for name, process in ended.items():
             try:
                 process.wait(max(0.0, deadline - time.monotonic()))
             except subprocess.TimeoutExpired:
                 process.kill()
                 process.wait()
                 killed.append(name)
-        self._running.clear()
+            del self._running[name]
         return killed
 
 
@@ -308,14 +314,11 @@ def print_hidden(console: Console, discovery: dict[str, Any], truth: SessionTrut
         )
 
 
-HAVE_CELL = (
-    'pose_planner',
-    'robot_bridge',
-    'recorder',
-    'optitrack_markers',
-    'laser_tracker_markers',
-)
-"""Nodes with the parameter ``cell``."""
+AFTERWARDS = 5
+"""Candidate poses, each, that are visited with the correction on: with all their solutions a dozen
+or two of configurations, and `remaster verify` asks for ten."""
+LAST_MESSAGES = 50
+"""So many messages of nodes that have ended may still be on their way to this one."""
 BEFORE_SESSION = {'log', 'ros_home', 'session'}
 """What a demo that was interrupted leaves in its folder; while there is no session yet, all."""
 
@@ -345,8 +348,41 @@ class Parameters:
         '', 'what else is wrong with the hidden arm: NAME[@JOINT][:SIZE_MM],…, or random'
     )
     figures: bool = parameter(True, 'write figures and the report')
+    apply: bool = parameter(
+        False, 'correct the arm by what was found, and measure poses that no fit has seen'
+    )
     watch: bool = parameter(False, 'serve the live page, and end with a signal')
     quiet: bool = parameter(False, 'print nothing but errors')
+
+
+def true_errors(
+    session: Session, compensator: Compensator, truth: SessionTruth
+) -> tuple[float, float]:
+    """Return the mean true error of the tool without and with a correction, mm.
+
+    At the configurations of a session that was measured with it on; against the nominal arm, base
+    and marker fitted to each.
+    """
+    m = session.measurements
+    assert m.wanted is not None
+    first = np.unique(m.configuration, return_index=True)[1]
+    tours = m.wanted[np.sort(first)], m.q[np.sort(first)]
+    n, marker = len(first), next(iter(compensator.model.markers))
+    found = verify(
+        compensator,
+        Visits(
+            np.tile(tours[0], (2, 1)),
+            np.repeat([False, True], n),
+            np.tile(np.arange(n), 2),
+            2 * n * ('truth',),
+            2 * n * (marker,),
+            np.concatenate(
+                [tool_points(compensator.model.chain, truth, q, marker) for q in tours]
+            ),
+        ),
+    )
+    assert found.error_off is not None
+    return found.error_off.mean_mm, found.error_on.mean_mm
 
 
 class Conductor(Node):
@@ -409,7 +445,7 @@ class Demo:
             shutil.rmtree(self.hidden, ignore_errors=True)
             raise
         self.session, self.fit = self.out / 'session', self.out / 'fit'
-        self.discovery = self.out / 'discovery'
+        self.discovery, self.corrected = self.out / 'discovery', self.out / 'corrected'
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(node)
         self.processes = NodeProcesses(
@@ -440,19 +476,63 @@ class Demo:
             self.console.print('looking for causes')
             self._trigger('remaster/discover', 'optimizer', timeout_s=300.0)
             results.append(('causes', self.discovery, 'discovery.json'))
+        times, file = self.node.times, None
+        if self.p.apply:
+            file = self._apply()
         if self.p.watch:
             self._stay()
         self.processes.stop()
-        print_times(self.console, self.node.times)
+        print_times(self.console, times)
         # Only here, after everything that estimates has ended, is the truth opened.
         print_offsets(self.console, read_fit(self.fit / 'fit.json'), self.world.truth)
         if self.requests:
             discovery = read_discovery(self.discovery / 'discovery.json')
             print_hidden(self.console, discovery, self.world.truth)
+        if file is not None:
+            self._print_applied(file)
         (self.out / 'truth.yaml').write_text(yaml.safe_dump(to_plain(self.world.truth)))
         self.console.print(f'session: {self.session}')
         for label, folder, data in results:
             self.console.print(f'{label}: {folder / ("report.html" if self.p.figures else data)}')
+
+    def _apply(self) -> Path:
+        """Give the bridge the correction, and collect once more; return its file."""
+        file = self.discovery / APPLY_FOLDER / COMPENSATION_FILE
+        if not (self.requests and file.exists()):
+            file = self.fit / APPLY_FOLDER / COMPENSATION_FILE
+        self.console.print(f'correcting by {file}, and visiting other poses')
+        self.processes.stop(CORE)
+        # What they sent last has arrived; it holds no more.
+        for _ in range(LAST_MESSAGES):
+            self._executor.spin_once(timeout_sec=0.01)
+        for name in CORE:
+            self.node.summaries.pop(name, None)
+        self.node.times = ConfigurationTimes(self.p.rate)
+        self._start_core(self.corrected, self.p.seed + 1, AFTERWARDS, AFTERWARDS, str(file))
+        self._wait(self._ready, 60.0, 'the nodes to come up')
+        self._trigger('remaster/collect', 'pose_planner')
+        self._collect()
+        return file
+
+    def _print_applied(self, file: Path) -> None:
+        """Print what `remaster verify` says of the corrected poses, and the truth of them."""
+        command = ['verify', str(self.corrected), '--compensation', str(file)]
+        self.console.print(f'remaster {" ".join(command)}', soft_wrap=True)
+        done = subprocess.run(
+            [sys.executable, '-m', 'remaster_ros.cli.main', *command],
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        self.console.print((done.stdout or done.stderr).strip())
+        before, after = true_errors(
+            read_session(self.corrected), read_compensation(file).compensator, self.world.truth
+        )
+        self.console.print(
+            f'opened truth: on these poses the tool was {after:.3f} mm from where it was wanted, '
+            f'and would have been {before:.3f} mm without the correction (mean, without noise; '
+            'base and marker fitted to each)'
+        )
 
     def _start(self) -> None:
         common = config_path('fake.yaml')
@@ -460,40 +540,54 @@ class Demo:
             socket.SOCK_DGRAM, socket.SOCK_DGRAM, socket.SOCK_STREAM
         )
         ports = {'command_port': command_port, 'data_port': data_port}
-        size, world, session = self.p.candidates, str(self.hidden), str(self.session)
+        world = str(self.hidden)
         own: dict[str, dict[str, Any]] = {
             'fake_robot': {'world': world},
             'fake_optitrack': {'world': world, **ports},
             'fake_laser_tracker': {'world': world, 'port': tracker_port},
-            'pose_planner': {
-                'seed': self.p.seed,
-                'session': session,
-                'discovery': str(self.discovery),
-                'optimization_candidates': size,
-                'validation_candidates': self.p.held_out_candidates or size,
-                'reference_every': self.p.reference_every,
-            },
-            'robot_bridge': {'simulated_clock_rate': self.p.rate},
-            'recorder': {'session': session, 'simulated_clock_rate': self.p.rate},
-            'optimizer': {
-                'session': session,
-                'out': str(self.fit),
-                'discovery': str(self.discovery),
-                'seed': self.p.seed,
-                'figures': self.p.figures,
-            },
-            'optitrack_markers': ports,
-            'laser_tracker_markers': {'port': tracker_port},
+            'optitrack_markers': {**ports, 'cell': self.p.cell},
+            'laser_tracker_markers': {'port': tracker_port, 'cell': self.p.cell},
         }
-        for name in ALL_NODES:
-            values = own.get(name, {})
-            if name in HAVE_CELL:
-                values['cell'] = self.p.cell
+        for name, values in own.items():
             self.processes.start(name, common, values)
+        size = self.p.candidates
+        held_out = self.p.held_out_candidates or size
+        self._start_core(self.session, self.p.seed, size, held_out)
         if self.p.watch:
             self.processes.start('watch', common, {'cell': self.p.cell, 'fit': str(self.fit)})
             name = page_name(self.node.context.get_domain_id(), '/watch')
             self.console.print(f'live page: open {opening_path(name)}', soft_wrap=True)
+
+    def _start_core(
+        self, session: Path, seed: int, size: int, held_out: int, compensation: str = ''
+    ) -> None:
+        """Start the nodes of a collection: the planner's seed, and how many candidates it has."""
+        rate, cell = {'simulated_clock_rate': self.p.rate}, {'cell': self.p.cell}
+        # What is fitted of corrected poses, by hand, takes the place of nothing.
+        beside = f'_of_{session.name}' if compensation else ''
+        discovery = f'{self.discovery}{beside}'
+        own: dict[str, dict[str, Any]] = {
+            'pose_planner': {
+                **cell,
+                'seed': seed,
+                'session': str(session),
+                'discovery': discovery,
+                'optimization_candidates': size,
+                'validation_candidates': held_out,
+                'reference_every': self.p.reference_every,
+            },
+            'robot_bridge': {**cell, **rate, 'compensation': compensation},
+            'recorder': {**cell, **rate, 'session': str(session)},
+            'optimizer': {
+                'session': str(session),
+                'out': f'{self.fit}{beside}',
+                'discovery': discovery,
+                'seed': self.p.seed,
+                'figures': self.p.figures,
+            },
+        }
+        for name in CORE:
+            self.processes.start(name, config_path('fake.yaml'), own[name])
 
     def _spin(self) -> None:
         self._executor.spin_once(timeout_sec=0.1)

@@ -15,6 +15,7 @@ from remaster_ros.simulation.world_model import (
     circumstances,
     deviation,
     measured,
+    placed,
 )
 from remaster_ros.types import FloatArray
 
@@ -139,6 +140,32 @@ class ChainArm:
     def segments(self) -> FloatArray:
         """From each joint to the next one, the last to the tool, m, (k + 1, 3)."""
         return self._chain.T_fixed[:, :3, 3]
+
+
+def tool_points(chain: SerialChain, truth: SessionTruth, q: FloatArray, marker: str) -> FloatArray:
+    """Return where a marker truly is at the stops of a tour, whatever a sensor makes of it.
+
+    Parameters
+    ----------
+    chain
+        The arm as drawn.
+    truth
+        What is wrong with it.
+    q
+        Reported joint angles, in the order of the tour, rad, (m, k).
+    marker
+        Its name.
+
+    Returns
+    -------
+    ndarray
+        In the base's frame R, m, (m, 3).
+    """
+    tour = model_of_tour(chain, truth, q)
+    names = tuple(truth.sensors), tuple(truth.markers)
+    wrong = deviation(truth.effects, tour.circumstances, *names)
+    state = tour.arm.state(q + truth.joint_offsets + wrong.angle)
+    return placed(state, truth.markers[marker], wrong)
 
 
 def model_of_tour(chain: SerialChain, truth: SessionTruth, q: FloatArray) -> WorldModel:

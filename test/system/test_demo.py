@@ -1,7 +1,9 @@
 """The main job, once, with everything real but the devices; then many looks at what it left."""
 
 import csv
+import hashlib
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -12,11 +14,13 @@ import yaml
 from command_line import remaster
 from ros_rig import ROOT, call, node_arguments, wait_until
 
+from remaster_ros.compensation.file import read_compensation
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.motion.settling import SettleRules
 from remaster_ros.session.bag import BagReader
 from remaster_ros.session.reader import read_session
 from remaster_ros.simulation.truth import SessionTruth, from_plain
+from remaster_ros.types import Correction
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(900)]
 
@@ -41,6 +45,7 @@ def demo(ros_environment, tmp_path_factory):
             str(SEED),
             '--candidates',
             '5',
+            '--apply',
         ],
         env={**ros_environment, 'COLUMNS': '200'},
         capture_output=True,
@@ -89,7 +94,9 @@ def test_no_configuration_is_lost(demo):
     assert session.exit_status == 'complete'
     planned = [
         int(words[i - 1])
-        for words in [printed.replace(',', ' ').replace(';', ' ').split()]
+        for words in [
+            printed.split('correcting by')[0].replace(',', ' ').replace(';', ' ').split()
+        ]
         for i, word in enumerate(words)
         if word == 'configurations' and words[i - 1].isdigit()
     ]
@@ -132,6 +139,30 @@ def test_the_offsets_are_the_hidden_ones(demo, truth):
             assert row['interval95_deg'][1] - row['interval95_deg'][0] > 0.5
     validation = fit['accuracy']['validation']['post_registration']
     assert validation['after']['mean_mm'] < 0.1 * validation['before']['mean_mm']
+
+
+def test_the_corrected_arm_comes_to_where_it_is_wanted(demo):
+    """Poses that no fit has seen, by the bridge with the fit's own compensation.json."""
+    out, printed = demo
+    file = out / 'fit' / 'apply' / 'compensation.json'
+    compensator = read_compensation(file).compensator
+    session = read_session(out / 'corrected')
+    assert session.correction == Correction(
+        'robot_bridge', hashlib.sha256(file.read_bytes()).hexdigest()
+    )
+    m = session.measurements
+    assert m.correction.tolist() == [1] * len(m)
+    assert len(np.unique(m.configuration)) >= 10
+    # What was commanded is what the file makes of what was wanted, to the arm's repeatability.
+    np.testing.assert_allclose(m.q, compensator.command(m.wanted), atol=1e-4)
+    assert np.max(np.abs(m.q - m.wanted)) > np.deg2rad(0.2)
+    assert 'halted' not in (out / 'log' / 'robot_bridge.log').read_text()
+
+    assert 'in_use: The correction is in use, once.' in printed
+    (line,) = [line for line in printed.splitlines() if line.startswith('opened truth:')]
+    after, before = (float(word) for word in re.findall(r'([0-9.]+) mm', line))
+    assert before > 1.0
+    assert after < 0.1
 
 
 def test_the_arm_had_settled_before_every_reading(demo):
