@@ -2,10 +2,10 @@
 
 Smooth structure over the place in a sensor's volume and over time competes in the search itself
 (the effects without a cause), against all that is tried there; what is too weak to win may still
-be more than chance where the place alone is asked for (`errors_by_place`). Then follow readings of
-another configuration, held-out poses with larger errors than poses left out of the fit in turn,
-and errors beyond the accuracy that a sensor states. Single gross errors are no structure: they are
-listed.
+be more than chance where the place alone is asked for. Then follow readings of another
+configuration, a sensor that is far off in held-out rows, held-out poses with larger errors than
+poses left out of the fit in turn, and errors beyond the accuracy that a sensor states. Single
+gross errors are no structure: they are listed.
 """
 
 from __future__ import annotations
@@ -16,15 +16,18 @@ from functools import cached_property
 
 import numpy as np
 import scipy
+from scipy.linalg import block_diag, cholesky, solve_triangular
 
 from remaster_ros.calibration.gauge_words import the
+from remaster_ros.calibration.moved_since import moved_since
+from remaster_ros.calibration.outliers import LARGEST_SHARE
+from remaster_ros.calibration.residual_structure import LEAST_NOISE_M, explained_of_poses
 from remaster_ros.calibration.result import FitResult
-from remaster_ros.discovery.errors_by_place import errors_by_place
+from remaster_ros.calibration.smooth_functions import of_position
+from remaster_ros.discovery.effects.sensor_field import EFFECT as SENSOR_FIELD
 from remaster_ros.discovery.explain import FoundEffect
 from remaster_ros.discovery.gain import GROSS, rms
 from remaster_ros.discovery.guard import Unexplained
-from remaster_ros.discovery.held_out_poses import compare_held_out
-from remaster_ros.discovery.moved_meanwhile import far_off, moved_text
 from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.discovery.solution import Solution
 from remaster_ros.types import BoolArray, FloatArray, IntArray
@@ -37,6 +40,15 @@ FEWEST_MISPAIRED = 2
 MOST_COMPARED = 200
 # Observations that a sentence lists.
 LISTED = 5
+# Share of gross errors among careful measurements; for the p-value.
+USUAL_GROSS = 0.01
+# Poses are left out of the fit in so many parts; fewer poses of either kind are not compared.
+FOLDS = 10
+FEWEST_POSES = 8
+# Held-out rows that are predicted; of more, every second pose, every third, …
+MOST_ROWS = 3_000
+# Poses that alone determine a direction leave nothing of it but this, in units of its square.
+ROUNDING = 1e-10
 
 
 def structure_left(
@@ -71,7 +83,7 @@ def structure_left(
         ),
         *errors_by_place(data, solution, SIGNIFICANCE),
         *checks.pairing(),
-        *far_off(data.context, checks.errors, checks.gross & ~checks.mispaired),
+        *checks.far_off(),
         *checks.held_out(),
         *checks.beyond_stated(),
     )
@@ -175,6 +187,50 @@ class _Checks:
             length = float(np.linalg.norm(self.errors[row]))
             yield int(measurements.observation[row]), f'held out, off by {1e3 * length:.1f} mm'
 
+    def far_off(self) -> Iterator[Unexplained]:
+        """Each sensor of whose held-out rows more than a tenth are gross, but for mispaired ones.
+
+        Steps among the fitted rows are found by the search. Where held-out poses were measured
+        last, as in many protocols, what was bumped between the two shows in held-out rows alone.
+        """
+        context, gross = self.data.context, self.gross & ~self.mispaired
+        for index, sensor in enumerate(context.sensor_names):
+            rows = context.measurements.is_validation & (context.sensor == index)
+            count, total = int(gross[rows].sum()), int(rows.sum())
+            if count <= LARGEST_SHARE * total:
+                continue
+            size = rms(self.errors, rows & gross)
+            moved = self._moved(index)
+            yield Unexplained(
+                where='held_out_poses',
+                driver='time' if moved else 'unknown',
+                size_m=size,
+                p_value=float(scipy.stats.binom.sf(count - 1, total, USUAL_GROSS)),
+                next=moved
+                or (
+                    f'{count} of the {total} held-out readings of {sensor} are off by '
+                    f'{1e3 * size:.1f} mm (RMS): too many to be single gross errors. Compare '
+                    'where and how they were measured with the others.'
+                ),
+            )
+
+    def _moved(self, sensor: int) -> str:
+        """Return from when on a sensor's errors are others than before; '' if they are not."""
+        context = self.data.context
+        rows = np.flatnonzero(context.sensor == sensor)
+        moved = None
+        if context.has_time:
+            moved = moved_since(context.measurements, rows, self.errors[rows])
+        if moved is None:
+            return ''
+        x, y, z = 1e3 * moved.shift
+        return (
+            f'From about observation {moved.observation} on, the readings of '
+            f'{context.sensor_names[sensor]} are off by ({x:+.2f}, {y:+.2f}, {z:+.2f}) mm in its '
+            'frame: the sensor or its marker was moved then. Fasten both, and measure the session '
+            'again, or remove what was measured from there on.'
+        )
+
     def held_out(self) -> Iterator[Unexplained]:
         """Held-out poses with larger errors than poses that were left out of the fit in turn."""
         data = self.data
@@ -182,11 +238,8 @@ class _Checks:
         compared = compare_held_out(data, self.solution, np.flatnonzero(held_out))
         if compared is None or compared.p_value > SIGNIFICANCE:
             return
-        moved = [
-            text
-            for sensor in range(len(data.context.sensor_names))
-            if (text := moved_text(data.context, self.errors, sensor))
-        ]
+        sensors = range(len(data.context.sensor_names))
+        moved = [text for sensor in sensors if (text := self._moved(sensor))]
         yield Unexplained(
             where='held_out_poses',
             driver='time' if moved else 'unknown',
@@ -222,3 +275,137 @@ class _Checks:
                     'each time.'
                 ),
             )
+
+
+def errors_by_place(
+    data: Residuals, solution: Solution, significance: float
+) -> Iterator[Unexplained]:
+    """Give an entry for each sensor whose errors follow the place, with no field of its own.
+
+    In the search a field over a sensor's volume has to beat the best of all that is tried. Here
+    the place alone is asked for, one F test a sensor: do polynomials of it up to the second degree
+    explain more of the means of the poses than noise would, beside all that was found? Half a lens
+    that is bent, too little for a cause of its own, shows so.
+    """
+    rows, cells = data.rows, solution.cells
+    parts = [data.base, data.columns(cells), data.errors[:, :, None], of_position(rows)]
+    white = data.noise_model.whitened(np.concatenate(parts, axis=2), solution.noise)
+    fitted = parts[0].shape[2] + parts[1].shape[2]
+    model, errors, places = np.split(white, [fitted, fitted + 1], axis=2)
+    left = rows.group_sum(data.left(solution)) / rows.group_size[:, None]
+    noise_m = data.noise_model.sensor_noise(solution.noise).total
+    located = {cell.subject for cell in cells if cell.name == SENSOR_FIELD.name}
+    families = np.split(places, len(rows.spans), axis=2)
+    for (sensor, _), family in zip(rows.spans, families, strict=True):
+        name = data.context.sensor_names[sensor]
+        if name in located or noise_m[sensor] < LEAST_NOISE_M:
+            continue
+        found = explained_of_poses(rows, model, family, errors[:, :, 0])
+        if found is None or found.p_value > significance:
+            continue
+        mean_square = np.mean(np.sum(left[rows.group_sensor == sensor] ** 2, axis=1))
+        size_m = float(np.sqrt(found.share * mean_square))
+        yield Unexplained(
+            where='sensor_frame',
+            driver='position',
+            size_m=size_m,
+            p_value=found.p_value,
+            next=(
+                f'From pose to pose the errors follow the place in front of {the("sensor", name)} '
+                f'more than chance would ({1e3 * size_m:.3f} mm RMS), but no cause stands out '
+                'from all that were tried. Measure the same poses with the sensor moved and '
+                'turned: what follows its volume is its own; or measure more poses.'
+            ),
+        )
+
+
+@dataclass(frozen=True)
+class HeldOutPoses:
+    """How held-out poses compare with poses left out of the fit.
+
+    Ratio of the typical errors, each in units of what is uncertain of its prediction, and the
+    probability that they are as large by chance.
+    """
+
+    ratio: float
+    p_value: float
+
+
+def compare_held_out(data: Residuals, solution: Solution, source: IntArray) -> HeldOutPoses | None:
+    """Compare held-out rows (m,) with poses left out of the fit; None where there are too few.
+
+    Both in units of what is uncertain of their prediction, the parameters included, and by a noise
+    that was estimated without them: one fitted to the rows that it judges is too small.
+    """
+    pose = np.unique(data.context.measurements.pose[source], return_inverse=True)[1]
+    source = source[pose % (1 + len(source) // MOST_ROWS) == 0]
+    if min(data.poses, len(np.unique(pose))) < FEWEST_POSES:
+        return None
+    found = predicted_squares(data.only(source), solution)
+    fold = np.arange(data.poses) % min(FOLDS, data.poses)
+    left_out = left_out_squares(data, solution, fold)
+    if np.any(np.isnan(left_out)):
+        return None
+    return HeldOutPoses(
+        float(np.sqrt(np.median(found) / np.median(left_out))),
+        float(scipy.stats.mannwhitneyu(found, left_out, alternative='greater').pvalue),
+    )
+
+
+def predicted_squares(data: Residuals, solution: Solution) -> FloatArray:
+    """Return how well a fit predicts each pose of rows that it has not seen, (poses,).
+
+    Mean squared error in units of what is uncertain of the prediction: chi-square over its degrees
+    of freedom. Each pose by itself: what a sensor that was moved has in common in all of them must
+    count in all.
+    """
+    columns = np.concatenate((data.base, data.columns(solution.cells)), axis=2)
+    white = data.noise_model.whitened(columns, solution.noise)
+    left = data.noise_model.whitened(data.left(solution), solution.noise)
+    squares = np.empty(data.poses)
+    for pose in range(data.poses):
+        mine = data.pose_of_row == pose
+        X = white[mine].reshape(-1, columns.shape[2])
+        squares[pose] = _mean_square(left[mine].ravel(), X @ solution.full_covariance @ X.T)
+    return squares
+
+
+def left_out_squares(data: Residuals, solution: Solution, fold_of_pose: IntArray) -> FloatArray:
+    """Return the same of poses that are left out in turn, those of a fold together, (poses,).
+
+    With the smoothness of the solution, and its noise but for the scale, which is that of the
+    others; NaN where these leave none.
+    """
+    parts = data.base, data.columns(solution.cells), data.errors[:, :, None]
+    white = data.noise_model.whitened(np.concatenate(parts, axis=2), solution.noise)
+    scale = np.linalg.norm(white, axis=(0, 1))
+    scale[-1] = 1.0
+    white /= np.where(scale > 0.0, scale, 1.0)
+    prior = block_diag(data.base_precision, solution.prior_precision(), 0.0)
+    prior /= np.outer(*[np.where(scale > 0.0, scale, 1.0)] * 2)
+    flat = white.reshape(-1, len(scale))
+    every = flat.T @ flat + prior + ROUNDING * np.eye(len(scale))
+    free = sum(cell.size for cell in solution.cells if cell.penalty is None)
+    squares = np.full(data.poses, np.nan)
+    fold = fold_of_pose[data.pose_of_row]
+    for index in range(int(fold.max()) + 1):
+        own = white[fold == index].reshape(-1, len(scale))
+        freedom = len(flat) - len(own) - data.base.shape[2] - free
+        if freedom <= 0:
+            continue
+        # The last pivot of the factor is the root of what the fit leaves of the errors.
+        root = cholesky(every - own.T @ own)
+        noise = root[-1, -1] ** 2 / freedom
+        half = solve_triangular(root[:-1, :-1], own[:, :-1].T, trans='T', check_finite=False)
+        errors = own[:, -1] - root[:-1, -1] @ half
+        pose = np.repeat(data.pose_of_row[fold == index], 3)
+        for number in np.unique(pose):
+            mine = half[:, pose == number]
+            squares[number] = _mean_square(errors[pose == number], mine.T @ mine) / noise
+    return squares
+
+
+def _mean_square(errors: FloatArray, covariance: FloatArray) -> float:
+    """Return the mean square of errors beside noise of one and what else is uncertain of them."""
+    variance = np.eye(len(errors)) + covariance
+    return float(errors @ np.linalg.solve(variance, errors) / len(errors))

@@ -7,9 +7,9 @@ import pytest
 from discovery_scenes import residuals_of, session_with
 from scipy.stats import binom
 
-from remaster_ros.discovery.errors_by_place import errors_by_place
 from remaster_ros.discovery.evidence import solve
 from remaster_ros.discovery.guard import Unexplained
+from remaster_ros.discovery.omnibus import errors_by_place
 from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.types import FloatArray
 

@@ -6,7 +6,7 @@ from discovery_scenes import residuals_of, session_with
 from scipy.stats import multivariate_normal
 
 from remaster_ros.discovery.evidence import solve
-from remaster_ros.discovery.held_out_poses import LeftOut, compare_held_out, predicted_squares
+from remaster_ros.discovery.omnibus import compare_held_out, left_out_squares, predicted_squares
 from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.discovery.solution import Solution
 from remaster_ros.types import FloatArray, IntArray, Session
@@ -65,7 +65,7 @@ def test_poses_left_out_are_judged_as_by_a_fit_to_the_others():
     """By one factor of all rows, against least squares of the others alone."""
     data, solution, _ = fitted(session_with(3, poses=12))
     fold = np.arange(data.poses) % 5
-    squares = LeftOut.of(data, (), solution.noise, fold).squares(solution)
+    squares = left_out_squares(data, solution, fold)
     X = data.noise_model.whitened(data.base, solution.noise)
     y = data.noise_model.whitened(data.errors, solution.noise)
     for index in range(5):
@@ -87,7 +87,7 @@ def test_poses_left_out_are_judged_as_by_a_fit_to_the_others():
 def test_poses_that_leave_no_noise_to_judge_by_have_no_squares():
     data, solution, _ = fitted(session_with(3, poses=12))
     fold = np.zeros(data.poses, dtype=np.int64)
-    assert np.all(np.isnan(LeftOut.of(data, (), solution.noise, fold).squares(solution)))
+    assert np.all(np.isnan(left_out_squares(data, solution, fold)))
 
 
 def test_a_sensor_that_was_moved_before_the_held_out_poses_is_seen():
