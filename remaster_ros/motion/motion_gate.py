@@ -219,7 +219,7 @@ class MotionGate:
             piece = Cubic.between(before, after)
             if not piece.duration_s > 0.0 or not np.all(np.isfinite(piece.coefficients)):
                 raise MotionRefusedError('the times of the move do not increase')
-            _check_range(piece, low, high, limits)
+            _check_range(*piece.range(), low, high, limits)
             _check_rate('speed', piece.largest_speed(), limits.velocity, 'rad/s', limits)
             largest = piece.largest_acceleration()
             _check_rate('acceleration', largest, limits.acceleration, 'rad/s2', limits)
@@ -300,14 +300,24 @@ class ForeignGate:
             self._check_start(points[0], q, velocity)
         if not is_straight and np.any(points[-1].velocity != 0.0):
             raise MotionRefusedError('the trajectory does not end at rest')
-        for before, after in pairwise(points):
-            piece = Cubic.line(before, after) if is_straight else Cubic.between(before, after)
-            if not piece.duration_s > 0.0 or not np.all(np.isfinite(piece.coefficients)):
-                raise MotionRefusedError('the times of the trajectory do not increase')
-            _check_range(piece, low, high, limits)
-            _check_rate('speed', piece.largest_speed(), limits.velocity, 'rad/s', limits)
-            largest = piece.largest_acceleration()
-            _check_rate('acceleration', largest, limits.acceleration, 'rad/s2', limits)
+        # All pieces in one: a planner's trajectory has a hundred.
+        times = np.array([point.time_s for point in points])[:, None]
+        places, speeds = (np.array([getattr(p, one) for p in points]) for one in ('q', 'velocity'))
+        if is_straight:
+            with np.errstate(divide='ignore', invalid='ignore'):
+                # The lines that a controller draws without velocities.
+                first = last = np.diff(places, axis=0) / np.diff(times, axis=0)
+        else:
+            first, last = speeds[:-1], speeds[1:]
+        pieces = Cubic.hermite(np.diff(times, axis=0), places[:-1], first, places[1:], last)
+        if not np.all(pieces.duration_s > 0.0) or not np.all(np.isfinite(pieces.coefficients)):
+            raise MotionRefusedError('the times of the trajectory do not increase')
+        least, most = pieces.range()
+        _check_range(least.min(axis=0), most.max(axis=0), low, high, limits)
+        largest = pieces.largest_speed().max(axis=0)
+        _check_rate('speed', largest, limits.velocity, 'rad/s', limits)
+        largest = pieces.largest_acceleration().max(axis=0)
+        _check_rate('acceleration', largest, limits.acceleration, 'rad/s2', limits)
         return Admitted(tuple(waypoints), None, is_straight)
 
     def _check_start(self, first: Waypoint, q: FloatArray, velocity: FloatArray) -> None:
@@ -317,7 +327,7 @@ class ForeignGate:
             joint = int(np.argmax(off))
             name, deg = self.limits.names[joint], float(np.rad2deg(off[joint]))
             raise StartMovedError(f'it begins {deg:.2f} deg from where {name} is')
-        if np.any(np.abs(velocity) > SLOW_RAD_S):
+        if not np.all(np.abs(velocity) <= SLOW_RAD_S):
             raise StartMovedError('it begins at once while the arm moves')
 
 
@@ -329,8 +339,9 @@ def _way_out_limits(limits: MotionLimits) -> MotionLimits:
     )
 
 
-def _check_range(piece: Cubic, low: FloatArray, high: FloatArray, limits: MotionLimits) -> None:
-    least, most = piece.range()
+def _check_range(
+    least: FloatArray, most: FloatArray, low: FloatArray, high: FloatArray, limits: MotionLimits
+) -> None:
     # To rounding: an arm that stands outside may stay there, and go inwards.
     bad = (least < low - 1e-9) | (most > high + 1e-9)
     if np.any(bad):
@@ -356,37 +367,40 @@ def _check_rate(
 
 @dataclass(frozen=True)
 class Cubic:
-    """What a controller makes of two waypoints.
+    """What a controller makes of two waypoints, or n cubics, each of two.
 
     Attributes
     ----------
     duration_s
-        s.
+        s; of n cubics (n, 1).
     coefficients
-        Of the powers of time since its start, lowest first, (4, k).
+        Of the powers of time since its start, lowest first, (4, k); of n cubics (4, n, k).
     """
 
-    duration_s: float
+    duration_s: float | FloatArray
     coefficients: FloatArray
 
     @classmethod
     def between(cls, before: Waypoint, after: Waypoint) -> Cubic:
         """Return the cubic that meets positions and velocities of both (Hermite)."""
-        duration = after.time_s - before.time_s
-        gap = after.q - before.q
-        with np.errstate(divide='ignore', invalid='ignore'):
-            second = (3 * gap / duration - 2 * before.velocity - after.velocity) / duration
-            third = (before.velocity + after.velocity - 2 * gap / duration) / duration**2
-        return cls(duration, np.array([before.q, before.velocity, second, third]))
+        duration_s = after.time_s - before.time_s
+        return cls.hermite(duration_s, before.q, before.velocity, after.q, after.velocity)
 
     @classmethod
-    def line(cls, before: Waypoint, after: Waypoint) -> Cubic:
-        """Return the line that a controller draws without velocities."""
-        duration = after.time_s - before.time_s
+    def hermite(
+        cls,
+        duration_s: float | FloatArray,
+        q: FloatArray,
+        velocity: FloatArray,
+        end_q: FloatArray,
+        end_velocity: FloatArray,
+    ) -> Cubic:
+        """Return the same of arrays: durations (n, 1), the others (n, k)."""
+        gap = end_q - q
         with np.errstate(divide='ignore', invalid='ignore'):
-            slope = (after.q - before.q) / duration
-        none = np.zeros_like(slope)
-        return cls(duration, np.array([before.q, slope, none, none]))
+            second = (3 * gap / duration_s - 2 * velocity - end_velocity) / duration_s
+            third = (velocity + end_velocity - 2 * gap / duration_s) / duration_s**2
+        return cls(duration_s, np.array([q, velocity, second, third]))
 
     def at(self, time_s: float | FloatArray) -> FloatArray:
         """Return positions, rad, (k,) or (n, k) for times (n,)."""
@@ -399,7 +413,7 @@ class Cubic:
         return powers @ (self.coefficients[1:] * np.array([[1.0], [2.0], [3.0]]))
 
     def range(self) -> tuple[FloatArray, FloatArray]:
-        """Return the smallest and the largest position of each joint, rad, (k,) each."""
+        """Return the smallest and the largest position of each joint, rad, (k,) or (n, k) each."""
         _, velocity, second, third = self.coefficients
         # Where the velocity v + 2 c t + 3 d t^2 is zero, and at both ends.
         root = np.sqrt(np.maximum(second**2 - 3 * third * velocity, 0.0))
@@ -415,16 +429,16 @@ class Cubic:
         return np.min(values, axis=0), np.max(values, axis=0)
 
     def largest_speed(self) -> FloatArray:
-        """Return the largest absolute velocity of each joint, rad/s, (k,)."""
+        """Return the largest absolute velocity of each joint, rad/s, (k,) or (n, k)."""
         _, velocity, second, third = self.coefficients
         with np.errstate(divide='ignore', invalid='ignore'):
             middle = np.nan_to_num(-second / (3 * third))
         times = np.array([np.zeros_like(middle), np.clip(middle, 0.0, self.duration_s)])
-        times = np.vstack([times, np.full_like(middle, self.duration_s)])
+        times = np.concatenate([times, np.broadcast_to(self.duration_s, (1, *middle.shape))])
         return np.max(np.abs(velocity + 2 * second * times + 3 * third * times**2), axis=0)
 
     def largest_acceleration(self) -> FloatArray:
-        """Return the largest absolute acceleration of each joint, rad/s², (k,)."""
+        """Return the largest absolute acceleration of each joint, rad/s², (k,) or (n, k)."""
         _, _, second, third = self.coefficients
         ends = np.array([2 * second, 2 * second + 6 * third * self.duration_s])
         return np.max(np.abs(ends), axis=0)

@@ -433,6 +433,24 @@ def test_a_goal_is_corrected_and_its_feedback_and_result_translated_back(by_acti
     assert done.result.error_string == 'too far'
 
 
+def test_a_node_that_ends_lets_the_controller_hold_the_arm(by_action):
+    """Nobody could cancel the goal any more."""
+    a, r = by_action, by_action.r
+    a.send(r.plan(r.told[-1], TARGET))
+    assert r.run(10.0, lambda: a.controller._active is not None)
+    r.run(0.1)
+    awaited = r.own.spin_once
+
+    def both(**options):
+        r.executor.spin_once(timeout_sec=0.005)
+        awaited(**options)
+
+    r.own.spin_once = both
+    r.node.close()
+    r.own.spin_once = awaited
+    assert a.controller.cancelled == 1
+
+
 def test_a_goal_is_cancelled_at_the_controller(by_action):
     from action_msgs.msg import GoalStatus
 
