@@ -313,7 +313,7 @@ def plan(
     Raises
     ------
     InputError
-        No such workcell, no closed form for its robot, or no pose that it can take.
+        No such workcell, no way to solve for the joints of its robot, or no pose that it can take.
 
     Examples
     --------

@@ -354,4 +354,30 @@ def xarm7() -> Description:
     return Description(urdf, 'link_base', 'link_eef')
 
 
+def xarm6() -> Description:
+    """UFACTORY xArm6: six joints whose last three do not meet, by 76 mm; no closed form is near."""
+    quarter = PI / 2
+    rows = (
+        ((0, 0, 0.267), 0.0, -2 * PI, 2 * PI),
+        ((0, 0, 0), -quarter, -2.059, 2.0944),
+        ((0.0535, -0.2845, 0), 0.0, -3.927, 0.19198),
+        ((0.0775, 0.3425, 0), -quarter, -2 * PI, 2 * PI),
+        ((0, 0, 0), quarter, -1.69297, PI),
+        ((0.076, 0.097, 0), -quarter, -2 * PI, 2 * PI),
+    )
+    joints = [
+        Joint(f'joint{i}', xyz, (roll, 0, 0), (0, 0, 1), lower, upper)
+        for i, (xyz, roll, lower, upper) in enumerate(rows, start=1)
+    ]
+    links = ['link_base', *(f'link{i}' for i in range(1, 7))]
+    urdf = document(
+        'xarm6',
+        *(link(name) for name in links),
+        arm(joints, links),
+        link('link_eef', None),
+        fixed('link6', 'link_eef'),
+    )
+    return Description(urdf, 'link_base', 'link_eef')
+
+
 ROBOTS = {'ur5e': ur5e, 'irb120': irb120, 'panda': panda, 'iiwa14': iiwa14}

@@ -15,6 +15,7 @@ from remaster_ros.cli.console import progress_bar, show
 from remaster_ros.cli.options import CANDIDATES, add_description, names, number, xacro_arguments
 from remaster_ros.errors import InputError, InsufficientDataError, did_you_mean
 from remaster_ros.kinematics.arm_ends import likely_base, likely_tips
+from remaster_ros.kinematics.inverse_kinematics import InverseKinematics
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.urdf import parse_urdf
 from remaster_ros.kinematics.urdf_geometry import chain_bodies, mesh_names
@@ -242,7 +243,7 @@ def _as_text(p: CellProposal) -> str:
             f'{chain.joint_names[held.joint]} is held at {angles} degrees, which gives the most '
             f'joint solutions of a pose: {held.solutions:.1f} on average'
         )
-    lines.append(p.kept)
+    lines += [held.kinematics.in_words(), p.kept]
     if p.missing_meshes:
         lines.append(
             f'warning: {len(p.missing_meshes)} meshes were not found, such as '
@@ -261,5 +262,16 @@ def _as_json(out: Path, p: CellProposal) -> dict[str, Any]:
         'other_tips': [tip for tip in p.tips if tip != p.chain.tip_link],
         'held_joint': None if held.joint is None else p.chain.joint_names[held.joint],
         'solutions': held.solutions,
+        'inverse_kinematics': _kinematics_as_json(held.kinematics),
         'missing_meshes': list(p.missing_meshes),
+    }
+
+
+def _kinematics_as_json(kinematics: InverseKinematics) -> dict[str, Any]:
+    off = kinematics.difference
+    return {
+        'way': kinematics.way,
+        'closed_form_off_mm': None if off is None else 1e3 * off[0],
+        'closed_form_off_deg': None if off is None else float(np.degrees(off[1])),
+        'in_words': kinematics.in_words(),
     }

@@ -1,10 +1,16 @@
-"""All analytical inverse-kinematics solutions of a pose, certified by forward kinematics.
+"""All inverse-kinematics solutions of a pose, certified by forward kinematics.
 
 EAIK [1]_ decomposes arms of six free joints into closed-form subproblems. It needs exact geometry
 (axes that meet or are parallel to 1e-13), and at singular or unreachable poses it returns
 least-squares angles, some of them wrong, or zero for an angle that is not determined. So it gets
-a cleaned model of the arm; its results are corrected on the true model by Newton's method and
+the nearest arm that is exact; its results are corrected on the true model by Newton's method and
 kept only where forward kinematics confirms them.
+
+An arm of which that one is a little off (each delivered arm, by its own calibration) has other
+solutions where those of the exact arm are about to meet. They are found from the solutions of the
+exact arm at a few poses around the one that is asked for.
+
+Where no exact arm is near, Newton's method starts from joint angles all over their turns.
 
 References
 ----------
@@ -16,15 +22,26 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import product
+from typing import Literal
 
 import numpy as np
 from eaik.IK_HP import HPRobot
 from numpy.typing import ArrayLike
 
 from remaster_ros.errors import InputError
+from remaster_ros.kinematics.newton_solutions import (
+    CERTIFIED,
+    MissedSolutions,
+    distinct,
+    reach_from,
+    screws_and_tool,
+    spread_angles,
+    wrapped,
+)
 from remaster_ros.kinematics.serial_chain import SerialChain
-from remaster_ros.kinematics.transforms import inverse, twist_logarithm
+from remaster_ros.kinematics.transforms import rotation_vector_to_matrix, transform
 from remaster_ros.types import FloatArray
 
 FREE_JOINTS = 6
@@ -33,39 +50,94 @@ OWN_CONFIGURATIONS = (
     'poses cannot be planned for it; measure configurations of your own choice, and make a '
     'session of their table: remaster import TABLE --urdf FILE --out SESSION'
 )
-"""What can be done with an arm that has no closed form."""
+"""What can be done with an arm whose solutions are not sought."""
 
-# Entries of the arm's fixed rotations and translations below this count as a zero that was
-# rounded (rpy="1.5708 0 0", a 0.4 mm CAD artefact). Newton's method takes the difference back.
-SNAP = 1e-3
-# As calibrated, axes that are drawn parallel are so no longer.
-_OF_ONE_ARM = (
-    " (that is so of a description with one arm's own calibration in it, as kinematics_params of "
-    'a UR)'
-)
-# What forward kinematics may leave of a solution: 10 nm and 10 nrad.
-CERTIFIED = 1e-8
-# Solutions whose joints all agree within this, rad, are one.
-DISTINCT = 1e-4
-NEWTON_STEPS = 12
-# Singular values below this share of the largest are left alone: no long steps at singularities.
-SINGULAR = 1e-6
+# An arm is near one with a closed form where no axis is turned by more than this against it, rad,
+# or shifted by more, m. Manufacture and wear leave a tenth of it. With three times as much, 3 of
+# 1,000 solutions would be missed (see `_Exact.around`).
+NEAR_RAD = 0.02
+NEAR_M = 0.01
+# Nearer than this, m and rad at the tool, both are one arm, written with other digits.
+EXACT = 1e-9
+# How many of these differences at the tool the poses around the one that is asked for are off. The
+# true arm's solutions are those of the exact one at some pose that is one of it off.
+AROUND = 2.0
+# Solutions of the exact arm as near to one another as this, rad, give one start of Newton's.
+ONE_START_RAD = 0.05
+# Starts where no exact arm is near.
+STARTS = 160
+# Poses by which it is judged what they miss.
+TRIAL_POSES = 20
+# The tool cannot be moved in six ways where the smallest singular value of the Jacobian (m, rad)
+# stays below. Errors of axes of some mrad lend a held elbow no more.
+IMMOBILE = 5e-3
 
 
 @dataclass(frozen=True)
-class _Decomposition:
-    """EAIK's model of the arm with the held joints at one combination of values.
+class _Exact:
+    """The nearest arm with a closed form, with the held joints at one combination of values.
 
-    ``rotation`` is the tool's rotation at zero, which EAIK does not carry.
+    Attributes
+    ----------
+    chain
+        Its six free joints.
+    robot
+        EAIK's model of it, which has no rotation of the tool at zero.
+    difference_m, difference_rad
+        How far its tool is from that of the true arm at the same angles, at most.
     """
 
-    held_values: tuple[float, ...]
+    chain: SerialChain
     robot: HPRobot
-    rotation: FloatArray
+    difference_m: float
+    difference_rad: float
+
+    @property
+    def is_the_arm(self) -> bool:
+        """Whether the arm itself has the closed form."""
+        return max(self.difference_m, self.difference_rad) < EXACT
+
+    @cached_property
+    def around(self) -> tuple[FloatArray, FloatArray]:
+        """The pose itself and twelve around it: turns (n, 3, 3) and shifts, m, (n, 3).
+
+        Six orthogonal directions and their opposites, so that one of them leads to where the
+        exact arm has solutions which the true arm has at the pose itself.
+        """
+        if self.is_the_arm:
+            return np.eye(3)[None], np.zeros((1, 3))
+        directions = np.linalg.qr(np.sin(np.arange(1.0, 37.0)).reshape(6, 6))[0]
+        twists = AROUND * np.vstack((np.zeros(6), directions, -directions))
+        turns = rotation_vector_to_matrix(self.difference_rad * np.sqrt(2.0) * twists[:, 3:])
+        return turns, self.difference_m * np.sqrt(2.0) * twists[:, :3]
+
+    def starts(self, T: FloatArray) -> FloatArray:
+        """Return angles near all solutions of the true arm at T (4, 4), and others, (m, 6)."""
+        turns, shifts = self.around
+        poses = np.broadcast_to(np.eye(4), (len(turns), 4, 4)).copy()
+        poses[:, :3, :3] = turns @ T[:3, :3] @ self.chain.T_fixed[-1, :3, :3].T
+        poses[:, :3, 3] = T[:3, 3] + shifts
+        solved = [np.reshape(self.robot.IK(pose).Q, (-1, FREE_JOINTS)) for pose in poses]
+        q = np.concatenate(solved)
+        q = q[np.all(np.isfinite(q), axis=1)]
+        if self.is_the_arm or not len(q):
+            return q
+        # Least-squares angles lie far from the pose.
+        _, rotation, position = screws_and_tool(self.chain, q)
+        off_m = np.linalg.norm(position - T[:3, 3], axis=1)
+        # The Frobenius norm of a difference of rotations is 2 sqrt(2) sin(angle / 2).
+        off_rad = np.linalg.norm(rotation - T[:3, :3], axis=(1, 2)) / np.sqrt(2.0)
+        near = 2.0 * AROUND
+        q = q[
+            (off_m <= near * self.difference_m + EXACT)
+            & (off_rad <= near * self.difference_rad + EXACT)
+        ]
+        gaps = np.max(np.abs(wrapped(q[:, None] - q[None])), axis=-1)
+        return q[~np.any(np.tril(gaps < ONE_START_RAD, -1), axis=1)]
 
 
 class InverseKinematics:
-    """All joint solutions of a tool pose in closed form.
+    """All joint solutions of a tool pose.
 
     A regular pose has up to eight solutions (sixteen for some arms) per value of the held joint.
     At a singular pose, where two joint axes line up or the shoulder's axis meets the wrist, a
@@ -86,7 +158,7 @@ class InverseKinematics:
     ------
     InputError
         The arm has not six free joints, a held value lies outside the joint's limits, or the arm
-        has no closed form.
+        is singular wherever it is.
     """
 
     def __init__(
@@ -95,25 +167,74 @@ class InverseKinematics:
         if held is None:
             held = {2: (0.0,)} if len(chain) == FREE_JOINTS + 1 else {}
         _check_held(chain, held)
-        try:
-            self._prepare(chain, held)
-        except InputError as error:
-            if len(chain) == FREE_JOINTS + 1:
-                raise InputError(f'{error}; {_what_may_be_held(chain)}') from None
-            if len(chain) == FREE_JOINTS:
-                raise InputError(f'{error}{_OF_ONE_ARM}; {OWN_CONFIGURATIONS}') from None
-            raise
-
-    def _prepare(self, chain: SerialChain, held: Mapping[int, Sequence[float]]) -> None:
-        """Set up the closed forms; an `InputError` where these held joints leave none."""
         self.chain = chain
         self.held = {joint: tuple(map(float, held[joint])) for joint in sorted(held)}
         self._free = [i for i in range(len(chain)) if i not in held]
         self._require_mobility()
-        clean = _cleaned(chain)
-        self._decompositions = [
-            self._decompose(clean, values) for values in product(*self.held.values())
+        self._parts: list[tuple[tuple[float, ...], _Exact | None]] = [
+            (values, self._nearest_exact(values)) for values in product(*self.held.values())
         ]
+
+    @property
+    def way(self) -> Literal['closed form', 'near closed form', 'many starts']:
+        """How solutions are found, for the held values for which that is hardest."""
+        exact = [part for _, part in self._parts]
+        if None in exact:
+            return 'many starts'
+        alike = all(part is not None and part.is_the_arm for part in exact)
+        return 'closed form' if alike else 'near closed form'
+
+    @property
+    def difference(self) -> tuple[float, float] | None:
+        """How far the nearest arm with a closed form is off at the tool, m and rad, at most.
+
+        None where there is none for some held values.
+        """
+        found = [part for _, part in self._parts if part is not None]
+        if len(found) < len(self._parts):
+            return None
+        return max(p.difference_m for p in found), max(p.difference_rad for p in found)
+
+    def in_words(self) -> str:
+        """Return in one sentence how solutions are found, and what they may lack."""
+        within = 'each is kept where forward kinematics reaches the pose to 1e-8 m and 1e-8 rad'
+        if self.difference is not None:
+            off_m, off_rad = self.difference
+            if self.way == 'closed form':
+                return f'All joint solutions of a pose are computed in closed form; {within}.'
+            return (
+                "All joint solutions of a pose are found by Newton's method from those of the "
+                'nearest arm that has a closed form, whose tool is up to '
+                f'{1e3 * off_m:.2g} mm and {np.degrees(off_rad):.2g} degrees elsewhere; {within}.'
+            )
+        trial = self.missed_solutions()
+        share = trial.missed / max(trial.found + trial.missed, 1.0)
+        return (
+            f'No arm with a closed form is near this one, so joint solutions are sought by '
+            f"Newton's method from {STARTS} starts a pose; {within}. Of {TRIAL_POSES} poses "
+            f'{trial.arrived} starts arrived at {trial.found} solutions, {trial.once} of which '
+            f'were found once: {100.0 * share:.1f} % are missed (by Chao), and the chance that '
+            f'one more start finds a further one is below {100.0 * trial.chance_of_new:.1g} % '
+            '(by Good, at 95 % confidence).'
+        )
+
+    def missed_solutions(self) -> MissedSolutions:
+        """Return what many starts find of poses whose joint angles are spread evenly."""
+        seeds = spread_angles(TRIAL_POSES, len(self.chain))
+        counts = []
+        for q in seeds:
+            values, _ = self._parts[0]
+            q[list(self.held)] = values
+            pose = self.chain.forward(q)
+            starts = self._with_held(spread_angles(STARTS, FREE_JOINTS), values)
+            found, left = reach_from(
+                self.chain, self._free, starts, np.broadcast_to(pose, (STARTS, 4, 4))
+            )
+            counts.append(distinct(found[left < CERTIFIED])[1])
+        times = np.concatenate(counts)
+        return MissedSolutions(
+            len(times), int(times.sum()), int(np.sum(times == 1)), int(np.sum(times == 2))
+        )
 
     def solutions(self, T: ArrayLike, within_limits: bool = True) -> FloatArray:
         """Return the joint solutions of one tool pose.
@@ -132,11 +253,48 @@ class InverseKinematics:
             rad, (m, k); m is 0 where no solution exists.
         """
         T = np.asarray(T, dtype=float)
-        q = self._certified(T)
-        if not within_limits:
-            return q
+        if T.shape != (4, 4) or not np.all(np.isfinite(T)):
+            raise ValueError(f'a pose is a finite matrix of shape (4, 4), not {T.shape}')
+        (q,) = self.solutions_of_each(T[None])
+        return self.usable(q) if within_limits else q
+
+    def solutions_of_each(self, T: FloatArray) -> list[FloatArray]:
+        """Return the joint solutions in [-pi, pi] of many tool poses (n, 4, 4), limits aside.
+
+        Much faster than pose by pose.
+        """
+        starts = [
+            np.concatenate([self._starts(values, exact, pose) for values, exact in self._parts])
+            for pose in T
+        ]
+        owner = np.repeat(np.arange(len(T)), [len(q) for q in starts])
+        q, left = reach_from(
+            self.chain,
+            self._free,
+            np.concatenate([np.empty((0, len(self.chain))), *starts]),
+            T[owner],
+        )
+        reached = left < CERTIFIED
+        ends = np.cumsum(np.bincount(owner[reached], minlength=len(T)))[:-1]
+        return [distinct(mine)[0] for mine in np.split(q[reached], ends)]
+
+    def usable(self, q: FloatArray) -> FloatArray:
+        """Return those of joint solutions (m, k) that a turn brings within the limits, (n, k)."""
         q = self._towards_middle(q)
         return q[self.chain.within_limits(q, tolerance=1e-9)]
+
+    def _starts(
+        self, values: tuple[float, ...], exact: _Exact | None, T: FloatArray
+    ) -> FloatArray:
+        """Return where Newton's method starts for one combination of held values, (m, k)."""
+        free = spread_angles(STARTS, FREE_JOINTS) if exact is None else exact.starts(T)
+        return self._with_held(free, values)
+
+    def _with_held(self, free: FloatArray, values: tuple[float, ...]) -> FloatArray:
+        q = np.empty((len(free), len(self.chain)))
+        q[:, self._free] = free
+        q[:, list(self.held)] = values
+        return q
 
     def _require_mobility(self) -> None:
         """Refuse held joints that leave the tool fewer than six ways to move, wherever it is.
@@ -144,76 +302,61 @@ class InverseKinematics:
         Holding the elbow of an S-R-S arm does: the wrist stays at its distance to the shoulder,
         and the arm still swings about the line between them.
         """
-        spread = np.sin(np.arange(8.0 * len(self.chain))).reshape(8, -1)
-        spread[:, list(self.held)] = [values[0] for values in self.held.values()]
-        singular_values = np.linalg.svd(self._jacobian(spread)[..., self._free], compute_uv=False)
-        if np.max(singular_values[:, -1]) < SINGULAR:
-            names = ', '.join(self.chain.joint_names[joint] for joint in self.held)
-            raise InputError(
-                f"inverse kinematics: with {names or 'no joint'} held, robot '{self.chain.name}' "
-                'is singular everywhere'
-            )
+        chain = self.chain
+        if _is_mobile(chain, {joint: values[0] for joint, values in self.held.items()}):
+            return
+        names = ', '.join(chain.joint_names[joint] for joint in self.held)
+        others = [
+            f'{name} (at {np.degrees(value):.0f} degrees, say)'
+            for joint, name in enumerate(chain.joint_names)
+            for value in (_middle(chain, joint),)
+            if len(self.held) == 1 and _is_mobile(chain, {joint: value})
+        ]
+        remedy = (
+            f'held_joint in the cell file may be {" or ".join(others)}'
+            if others
+            else OWN_CONFIGURATIONS
+        )
+        raise InputError(
+            f"inverse kinematics: with {names or 'no joint'} held, robot '{chain.name}' is "
+            f'singular everywhere; {remedy}'
+        )
 
-    def _decompose(self, clean: SerialChain, values: tuple[float, ...]) -> _Decomposition:
-        """Prepare EAIK for the cleaned arm with the held joints at the given values."""
-        q = np.zeros(len(clean))
+    def _nearest_exact(self, values: tuple[float, ...]) -> _Exact | None:
+        """Return the nearest arm with a closed form; None where none is near."""
+        chain, free = self.chain, self._free
+        q = np.zeros(len(chain))
         q[list(self.held)] = values
-        frames, tip = clean.frames(q), clean.forward(q)
-        axes = clean.axes_in_base(frames)[self._free]
-        origins = frames[self._free, :3, 3]
-        if not _may_have_closed_form(axes, origins):
-            raise InputError(_no_closed_form(self.chain, self.held))
-        steps = np.diff(np.vstack((np.zeros(3), origins, tip[:3, 3])), axis=0)
+        frames, tip = chain.frames(q), chain.forward(q)
+        axes, points = _nearest_lines(chain.axes_in_base(frames)[free], frames[free, :3, 3])
+        if not _may_have_closed_form(axes, points):
+            return None
+        steps = np.diff(np.vstack((np.zeros(3), points, tip[:3, 3])), axis=0)
         robot = HPRobot(axes, steps)
         if not robot.hasKnownDecomposition():
-            raise InputError(_no_closed_form(self.chain, self.held))
-        return _Decomposition(values, robot, tip[:3, :3])
-
-    def _certified(self, T: FloatArray) -> FloatArray:
-        """Return all distinct solutions, regardless of limits, angles in [-pi, pi], (m, k)."""
-        if T.shape != (4, 4) or not np.all(np.isfinite(T)):
-            raise ValueError(f'a pose is a finite matrix of shape (4, 4), not {T.shape}')
-        candidates = [self._closed_form(part, T) for part in self._decompositions]
-        q = self._corrected(np.concatenate(candidates), T)
-        return _distinct(q)
-
-    def _closed_form(self, part: _Decomposition, T: FloatArray) -> FloatArray:
-        """Return EAIK's results for one combination of held values, also wrong ones, (m, k)."""
-        without_tool_rotation = T.copy()
-        without_tool_rotation[:3, :3] = T[:3, :3] @ part.rotation.T
-        free = np.reshape(part.robot.IK(without_tool_rotation).Q, (-1, FREE_JOINTS))
-        q = np.empty((len(free), len(self.chain)))
-        q[:, self._free] = free
-        q[:, list(self.held)] = part.held_values
-        return q[np.all(np.isfinite(q), axis=1)]
-
-    def _corrected(self, q: FloatArray, T: FloatArray) -> FloatArray:
-        """Correct candidates (m, k) on the true model; return those that reach T."""
-        missing = self._missing(q, T)
-        for _ in range(NEWTON_STEPS):
-            wrong = np.flatnonzero(_size(missing) > 0.01 * CERTIFIED)
-            if not len(wrong):
-                break
-            jacobian = self._jacobian(q[wrong])[..., self._free]
-            step = np.linalg.pinv(jacobian, rcond=SINGULAR) @ missing[wrong, :, None]
-            q[wrong[:, None], self._free] += step[..., 0]
-            missing[wrong] = self._missing(q[wrong], T)
-        return _wrapped(q[_size(missing) < CERTIFIED])
-
-    def _missing(self, q: FloatArray, T: FloatArray) -> FloatArray:
-        """Return the screw motions in R that bring the tool at q (m, k) to T, (m, 6).
-
-        Where two axes line up EAIK leaves out a turn about them, of any size: a screw motion
-        holds it exactly, and one Newton step makes up for it.
-        """
-        return twist_logarithm(T @ inverse(self.chain.forward(q)))
-
-    def _jacobian(self, q: FloatArray) -> FloatArray:
-        """Return the joints' screws in R, o × a and a, (m, 6, k)."""
-        frames = self.chain.frames(q)
-        axes = self.chain.axes_in_base(frames)
-        screws = np.concatenate((np.cross(frames[..., :3, 3], axes), axes), axis=-1)
-        return np.swapaxes(screws, -1, -2)
+            return None
+        T_fixed = transform(np.eye(3), steps)
+        T_fixed[-1, :3, :3] = tip[:3, :3]
+        exact = replace(
+            chain,
+            joint_names=tuple(chain.joint_names[i] for i in free),
+            T_fixed=T_fixed,
+            axes=axes,
+            **{
+                name: getattr(chain, name)[free]
+                for name in ('lower', 'upper', 'velocity_limits', 'masses', 'centers_of_mass')
+            },
+        )
+        turned = spread_angles(200, FREE_JOINTS)
+        ours = chain.forward(self._with_held(turned, values))
+        off = exact.forward(turned) - ours
+        # At most 2 sin(angle / 2) of sqrt(2) times it, see `_Exact.starts`.
+        return _Exact(
+            exact,
+            robot,
+            float(np.max(np.linalg.norm(off[:, :3, 3], axis=1))),
+            float(np.max(np.linalg.norm(off[:, :3, :3], axis=(1, 2))) / np.sqrt(2.0)),
+        )
 
     def _towards_middle(self, q: FloatArray) -> FloatArray:
         """Turn joints by whole turns as near the middle of their ranges as they come."""
@@ -223,12 +366,21 @@ class InverseKinematics:
         return q + 2 * np.pi * np.round((middle - q) / (2 * np.pi))
 
 
+def _is_mobile(chain: SerialChain, held: Mapping[int, float]) -> bool:
+    """Return whether the free joints move the tool in six ways at any of a few places."""
+    spread = np.sin(np.arange(8.0 * len(chain))).reshape(8, -1)
+    spread[:, list(held)] = list(held.values())
+    free = [i for i in range(len(chain)) if i not in held]
+    screws = screws_and_tool(chain, spread)[0][..., free]
+    return bool(np.max(np.linalg.svd(screws, compute_uv=False)[:, -1]) >= IMMOBILE)
+
+
 def _check_held(chain: SerialChain, held: Mapping[int, Sequence[float]]) -> None:
     free = len(chain) - len(held)
     if free != FREE_JOINTS:
         raise InputError(
             f'inverse kinematics: {len(chain)} joints with {len(held)} held leave {free} free; '
-            f'closed forms need {FREE_JOINTS} free joints: hold none of six, one of seven'
+            f'poses need {FREE_JOINTS} free joints: hold none of six, one of seven'
         )
     for joint, values in held.items():
         if not 0 <= joint < len(chain):
@@ -247,13 +399,59 @@ def _check_held(chain: SerialChain, held: Mapping[int, Sequence[float]]) -> None
                 )
 
 
-def _cleaned(chain: SerialChain) -> SerialChain:
-    """Return the arm with rounded zeros made exact."""
-    T = np.where(np.abs(chain.T_fixed_z) < SNAP, 0.0, chain.T_fixed_z)
-    left, _, right = np.linalg.svd(T[:, :3, :3])
-    T[:, :3, :3] = left @ right
-    axes = np.broadcast_to((0.0, 0.0, 1.0), (len(chain), 3))
-    return replace(chain, T_fixed=T, axes=axes)
+def _nearest_lines(axes: FloatArray, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Make axes exactly parallel, and let them meet exactly, where they nearly do.
+
+    Parameters
+    ----------
+    axes, points
+        Direction and a point of each of six axes at zero, (6, 3).
+
+    Returns
+    -------
+    axes, points
+        Those of the exact arm.
+    """
+    axes, points = axes.copy(), points.copy()
+    count = len(axes)
+    # Turned about points near the arm: the origin of a joint may be metres along its axis.
+    before = np.zeros(3)
+    for i in range(count):
+        before = points[i] = points[i] + axes[i] * (axes[i] @ (before - points[i]))
+    first = 0
+    for i in range(1, count + 1):
+        if i < count and np.linalg.norm(np.cross(axes[i - 1], axes[i])) < NEAR_RAD:
+            continue
+        signs = np.sign(axes[first:i] @ axes[first])
+        mean = signs @ axes[first:i]
+        axes[first:i] = signs[:, None] * (mean / np.linalg.norm(mean))
+        first = i
+    parallel = np.linalg.norm(np.cross(axes[:-1], axes[1:]), axis=1) < EXACT
+    meeting = np.zeros(count - 1, dtype=bool)
+    for three in (slice(0, 3), slice(3, 6)):
+        pairs = slice(three.start, three.stop - 1)
+        point, gap = _meeting_point(axes[three], points[three])
+        if gap < NEAR_M and not np.any(parallel[pairs]):
+            points[three], meeting[pairs] = point, True
+    for i in range(count - 1):
+        if parallel[i] or meeting[i]:
+            continue
+        normal = np.cross(axes[i], axes[i + 1])
+        normal /= np.linalg.norm(normal)
+        gap = normal @ (points[i + 1] - points[i])
+        if abs(gap) < NEAR_M:
+            # What follows is carried along, with what meets there.
+            points[i + 1 :] -= gap * normal
+    return axes, points
+
+
+def _meeting_point(axes: FloatArray, points: FloatArray) -> tuple[FloatArray, float]:
+    """Return the point nearest to three lines, m, (3,), and how far the farthest is from it, m."""
+    # Sum of (I - a a^T)(x - o) = 0.
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    to_lines = np.einsum('nij,nj->ni', across, points)
+    point = np.linalg.lstsq(across.sum(axis=0), to_lines.sum(axis=0), rcond=None)[0]
+    return point, float(np.max(np.linalg.norm(across @ point - to_lines, axis=1)))
 
 
 def _may_have_closed_form(axes: FloatArray, origins: FloatArray) -> bool:
@@ -264,63 +462,13 @@ def _may_have_closed_form(axes: FloatArray, origins: FloatArray) -> bool:
     neighbours = np.linalg.norm(np.cross(axes[:-1], axes[1:]), axis=1) < 1e-9
     if np.any(neighbours[:-1] & neighbours[1:]):
         return True
-    for three in (slice(0, 3), slice(3, 6)):
-        # The point nearest to three lines: sum of (I - a a^T)(x - o) = 0.
-        across = np.eye(3) - axes[three, :, None] * axes[three, None, :]
-        to_lines = np.einsum('nij,nj->ni', across, origins[three])
-        point = np.linalg.lstsq(across.sum(axis=0), to_lines.sum(axis=0), rcond=None)[0]
-        if np.max(np.abs(across @ point - to_lines)) < 1e-9:
-            return True
-    return False
-
-
-def _no_closed_form(chain: SerialChain, held: Mapping[int, Sequence[float]]) -> str:
-    free = ', '.join(name for i, name in enumerate(chain.joint_names) if i not in held)
-    return (
-        f"inverse kinematics: robot '{chain.name}' has no closed form in {free}: no three "
-        'successive axes are parallel, nor do the first or last three meet in a point'
+    return any(
+        _meeting_point(axes[three], origins[three])[1] < EXACT
+        for three in (slice(0, 3), slice(3, 6))
     )
 
 
-def _what_may_be_held(chain: SerialChain) -> str:
-    """Return which joints of seven leave a closed form, found by trying each."""
-    good = []
-    for joint, name in enumerate(chain.joint_names):
-        for value in _trial_values(chain, joint):
-            solver = InverseKinematics.__new__(InverseKinematics)
-            try:
-                solver._prepare(chain, {joint: (value,)})
-            except InputError:
-                continue
-            good.append(f'{name} (at {np.degrees(value):.0f} degrees, say)')
-            break
-    if good:
-        return f'held_joint in the cell file may be {" or ".join(good)}'
-    return f'no joint of this arm may be held instead: {OWN_CONFIGURATIONS}'
-
-
-def _trial_values(chain: SerialChain, joint: int) -> list[float]:
-    """Return angles to try to hold a joint at: zero or mid-range, and off it, rad."""
+def _middle(chain: SerialChain, joint: int) -> float:
+    """Return zero, or mid-range where the limits exclude it, rad."""
     low, high = max(chain.lower[joint], -np.pi), min(chain.upper[joint], np.pi)
-    middle = 0.0 if low < 0.0 < high else (low + high) / 2
-    return [middle, *(v for v in (middle + np.pi / 6, middle - np.pi / 6) if low <= v <= high)]
-
-
-def _size(twists: FloatArray) -> FloatArray:
-    """Return the larger of translation, m, and rotation, rad, of twists (m, 6), (m,)."""
-    return np.max(np.linalg.norm(twists.reshape(-1, 2, 3), axis=-1), axis=-1)
-
-
-def _wrapped(angles: FloatArray) -> FloatArray:
-    """Bring angles into [-pi, pi]."""
-    return angles - 2 * np.pi * np.round(angles / (2 * np.pi))
-
-
-def _distinct(q: FloatArray) -> FloatArray:
-    """Return the rows of q (m, k) without repetitions modulo whole turns, in order."""
-    apart = np.max(np.abs(_wrapped(q[:, None] - q[None])), axis=-1) > DISTINCT
-    kept: list[int] = []
-    for i in range(len(q)):
-        if apart[i, kept].all():
-            kept.append(i)
-    return q[kept]
+    return 0.0 if low < 0.0 < high else float(low + high) / 2

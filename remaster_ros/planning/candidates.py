@@ -237,7 +237,7 @@ def plan_poses(
     Parameters
     ----------
     inverse_kinematics
-        The arm's closed form; its held values decide how many solutions there are.
+        Of the arm; its held values decide how many solutions there are.
     arm
         The same arm with everything it can hit.
     candidates
@@ -253,8 +253,8 @@ def plan_poses(
         With `dropped` and `len(poses)` adding up to n.
     """
     chain = inverse_kinematics.chain
-    reachable = [inverse_kinematics.solutions(T, within_limits=False) for T in candidates]
-    within = [inverse_kinematics.solutions(T) for T in candidates]
+    reachable = inverse_kinematics.solutions_of_each(candidates)
+    within = [inverse_kinematics.usable(q) for q in reachable]
     within = [q[chain.within_limits(q, -limit_margin_rad)] for q in within]
     owner = np.repeat(np.arange(len(within)), [len(q) for q in within])
     q = np.concatenate([np.empty((0, len(chain))), *within])

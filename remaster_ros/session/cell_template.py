@@ -169,16 +169,17 @@ def _held_lines(p: CellProposal) -> list[str]:
     held, chain = p.held, p.chain
     if held.joint is None:
         text = f'no joint is held. A pose has {held.solutions:.1f} joint solutions on average.'
-        return [*_comment(f'Six joints: {text}'), "held_joint: ''"]
+        how = held.kinematics.in_words()
+        return [*_comment(f'Six joints: {text} {how}'), "held_joint: ''"]
     tried = ', '.join(
-        f'{name} {count:.1f}' if isinstance(count, float) else f'{name} none (no closed form)'
+        f'{name} {count:.1f}' if isinstance(count, float) else f'{name} none ({count})'
         for name, count in held.tried.items()
     )
     return [
         *_comment(
             'Seven joints leave one free: this one is held, which gives poses the most joint '
             f'solutions. Tried, solutions of a pose on average: {tried}. Several values give more '
-            'poses, and determine the offset of this joint better.'
+            'poses, and determine the offset of this joint better. ' + held.kinematics.in_words()
         ),
         f'held_joint: {_value(chain.joint_names[held.joint])}',
         f'held_values_deg: [{", ".join(f"{np.degrees(value):.1f}" for value in held.values_rad)}]',

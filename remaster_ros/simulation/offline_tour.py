@@ -43,7 +43,7 @@ def plan_tour(
     Raises
     ------
     InputError
-        No closed form for this robot, or no pose to fit that it can take.
+        No way to solve for the joints of this robot, or no pose to fit that it can take.
     """
     scene = cell.planning_scene(chain, without_meshes=without_meshes)
     sensors_R = scene.rough_R

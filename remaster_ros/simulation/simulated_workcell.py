@@ -221,7 +221,7 @@ def simulate_workcell(
     Raises
     ------
     InputError
-        No closed form for this robot, or no pose that it can take.
+        No way to solve for the joints of this robot, or no pose that it can take.
     """
     # One stream each: other noise, for instance, leaves the poses and the offsets as they were.
     placement, planning, drawing, hiding = rng.spawn(4)
