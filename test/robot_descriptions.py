@@ -355,7 +355,7 @@ def xarm7() -> Description:
 
 
 def xarm6() -> Description:
-    """UFACTORY xArm6: six joints whose last three do not meet, by 76 mm; no closed form is near."""
+    """UFACTORY xArm6: its last three joints do not meet, by 76 mm; no closed form is near."""
     quarter = PI / 2
     rows = (
         ((0, 0, 0.267), 0.0, -2 * PI, 2 * PI),
