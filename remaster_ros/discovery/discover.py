@@ -406,15 +406,10 @@ def _beside(search: Search, named: Solution) -> tuple[list[Family], Solution | N
 
 
 def by_names(found: Estimate, search: Search, named: Solution) -> tuple[Solution, FloatArray]:
-    """Return the model of the causes alone, and how errors of all other kinds would move it.
+    """Return the model of the causes alone, by members, and how all other kinds would move it.
 
-    Returns
-    -------
-    solution
-        The fit, by members.
-    moves
-        Of all natural parameters of the fit and those of the solution, one standard deviation of
-        each weight of a kind that is not in it, (size + m, c).
+    That of all its natural parameters and those of the solution, one standard deviation of each
+    weight of a kind that is not in it, (size + m, c).
     """
     data = search.data
     members = by_members(named, search.families)

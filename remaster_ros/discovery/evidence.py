@@ -57,24 +57,11 @@ def log_prior_one_by_one(cells: Sequence[Cell]) -> float:
 
 
 def solve(
-    data: Residuals,
-    cells: Sequence[Cell],
-    start: Solution | None = None,
-    *,
-    prior: float | None = None,
+    data: Residuals, cells: Sequence[Cell], start: Solution | None = None
 ) -> Solution | None:
     """Fit a set of cells; None where one of them adds nothing to the others.
 
-    Parameters
-    ----------
-    data
-        The residuals.
-    cells
-        The set, maybe empty.
-    start
-        A fit whose noise and smoothness are near.
-    prior
-        Log prior probability of the set; by default that of its cells one by one.
+    It may be empty. The search for noise and smoothness begins at those of another fit, if given.
     """
     # Penalised ones last: one Cholesky factor holds all determinants.
     cells = tuple(sorted(cells, key=lambda cell: cell.penalty is not None))
@@ -102,9 +89,7 @@ def solve(
     if not system.visible():
         return None
     try:
-        if prior is None:
-            prior = log_prior_one_by_one(cells)
-        return system.solution(start, prior)
+        return system.solution(start, log_prior_one_by_one(cells))
     except np.linalg.LinAlgError:
         # The columns agree up to rounding: they cannot be distinguished.
         return None

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.linalg import cho_factor, cho_solve
 
 from remaster_ros.calibration.gauge_words import the
 from remaster_ros.calibration.result import FitResult
@@ -15,7 +16,6 @@ from remaster_ros.discovery.effects.context import Context
 from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.discovery.random_effects import by_members
 from remaster_ros.discovery.residuals import Residuals
-from remaster_ros.discovery.shares import shares
 from remaster_ros.discovery.solution import Solution
 from remaster_ros.discovery.words import (
     KIND_OF_SUBJECT,
@@ -24,6 +24,7 @@ from remaster_ros.discovery.words import (
     sentence_case,
     titled,
 )
+from remaster_ros.types import BoolArray, FloatArray, IntArray
 
 # Look-alikes within this of the evidence are named; within the other, the leaders tie.
 CONFUSABLE = 5.0
@@ -33,6 +34,8 @@ SHORTLIST = 10
 UNCERTAIN = 2.0
 # Columns that agree to this in every pose are the same change under two names.
 SAME = 1.0 - 1e-6
+# Of a matrix with ones on its diagonal.
+ROUNDING = 1e-12
 
 
 @dataclass(frozen=True)
@@ -192,17 +195,7 @@ def with_sizes(cause: str, sizes: Sequence[str]) -> str:
 def describe(
     search: Search, solution: Solution, progress: Callable[[float], None]
 ) -> tuple[tuple[tuple[Cell, ...], ...], tuple[FoundEffect, ...]]:
-    """Return the cells of a solution grouped to causes, and the causes, the largest first.
-
-    Parameters
-    ----------
-    search
-        What found them.
-    solution
-        With the cells of families as one.
-    progress
-        Called with the share that is done.
-    """
+    """Return the cells of a solution grouped to causes, and the causes, the largest first."""
     data = search.data
     members = by_members(solution, search.families)
     if not members.cells:
@@ -417,3 +410,81 @@ def _when(cell: Cell, context: Context) -> str:
         f'{clock}{cell.moment / 60.0:.1f} min after the first reading, '
         f'between configurations {before} and {behind},'
     )
+
+
+def shares(data: Residuals, groups: Sequence[tuple[Cell, ...]], solution: Solution) -> list[float]:
+    """Return the share of the gain in mean square that is lost without each cause.
+
+    Everything else is fitted again, with noise and variances as they are. Two causes that imitate
+    each other lose little each: together the shares need not make 1. On held-out rows where there
+    are any; negative where they are predicted better without it. All 0 where nothing is gained.
+    """
+    rows = data.context.measurements.is_validation
+    if not rows.any():
+        rows = np.isin(np.arange(len(rows)), data.rows.source)
+    parts = _Parts.of(data, groups, solution, rows)
+    every = set(range(len(groups)))
+    with_all = parts.left(every)
+    gain = parts.left(set()) - with_all
+    if gain <= 0.0:
+        return [0.0] * len(groups)
+    return [(parts.left(every - {index}) - with_all) / gain for index in every]
+
+
+@dataclass(frozen=True, eq=False)
+class _Parts:
+    """What fits of some of the causes leave of some rows.
+
+    The equations of base and cells; products of what they displace in the rows to judge, and of
+    the errors there, m²; places of the base columns, and those of each cause.
+    """
+
+    H: FloatArray
+    pull: FloatArray
+    gram: FloatArray
+    base: IntArray
+    where: list[IntArray]
+
+    @classmethod
+    def of(
+        cls,
+        data: Residuals,
+        groups: Sequence[tuple[Cell, ...]],
+        solution: Solution,
+        rows: BoolArray,
+    ) -> _Parts:
+        """Assemble; rows are those to judge by, (all rows,)."""
+        p, cells = data.base.shape[2], solution.cells
+        joined = (data.base, data.columns(cells), data.errors[:, :, None])
+        white = data.noise_model.whitened(np.concatenate(joined, axis=2), solution.noise)
+        flat = white.reshape(3 * len(data), -1)
+        H = flat.T @ flat
+        pull = H[:-1, -1]
+        H = H[:-1, :-1].copy()
+        H[:p, :p] += data.base_precision
+        H[p:, p:] += solution.prior_precision()
+        gram = np.zeros((len(pull) + 1, len(pull) + 1))
+        for block, context in data.context.blocks():
+            mine = rows[block]
+            columns = [cell.columns(context).displacement(context) for cell in cells]
+            seen = (data.full_base[block], *columns, data.full_errors[block][:, :, None])
+            flat = np.concatenate(seen, axis=2)[mine].reshape(-1, len(gram))
+            gram += flat.T @ flat
+        places = {
+            cell: p + np.arange(where.start, where.stop)
+            for cell, where in zip(cells, solution.slices(), strict=True)
+        }
+        where = [np.concatenate([places[cell] for cell in group]) for group in groups]
+        return cls(H, pull, gram, np.arange(p), where)
+
+    def left(self, causes: set[int]) -> float:
+        """Return the sum of squares that the fit of some causes leaves, m²."""
+        chosen = np.concatenate((self.base, *(self.where[index] for index in sorted(causes))))
+        H, pull = self.H[np.ix_(chosen, chosen)], self.pull[chosen]
+        # In units of each parameter's own: those of rad and of m/s differ by ten decades.
+        unit = np.diag(H) ** -0.5
+        scaled = H * np.outer(unit, unit) + ROUNDING * np.eye(len(H))
+        step = unit * cho_solve(cho_factor(scaled), unit * pull)
+        fit = np.append(-step, 1.0)
+        chosen = np.append(chosen, len(self.gram) - 1)
+        return float(fit @ self.gram[np.ix_(chosen, chosen)] @ fit)

@@ -181,15 +181,8 @@ def better_of_two(
     """Return the model with lengths and tilts as fitted beside all causes, where that is better.
 
     By themselves they take over a part of curves and compliances, which helps where poses are like
-    those fitted; fitted beside these they are the arm's own. Held-out poses decide.
-
-    Parameters
-    ----------
-    geometry, found, causes
-        The model, and what it was made of.
-    cells, theta
-        Of the model with all causes, and their parameters (m,). Those of no robot model count
-        nothing.
+    those fitted; fitted beside these they are the arm's own. Held-out poses decide. Cells with
+    their parameters (m,) are those of the model with all causes.
     """
     loaded = _loaded(_without_open_offsets(found), cells, theta, causes)
     if loaded is None:

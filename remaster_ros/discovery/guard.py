@@ -71,17 +71,7 @@ def is_harmful(gain: Gain) -> bool:
 def harm_of(
     found: Estimate, fit: FitResult, gain: Gain, effects: Sequence[FoundEffect]
 ) -> Unexplained:
-    """Return what is left unexplained where causes are discarded because they do harm.
-
-    Parameters
-    ----------
-    found
-        The fit without causes.
-    fit, gain
-        The sampled fit with the causes, and what it does on held-out rows.
-    effects
-        The causes.
-    """
+    """Return what is left unexplained where causes are discarded because they do harm."""
     measurements = found.problem.measurements
     rows = measurements.is_validation
     pose = np.unique(measurements.pose[rows], return_inverse=True)[1]
@@ -117,17 +107,7 @@ def harm_of(
 def unfitted(
     errors: FloatArray, effects: Sequence[FoundEffect], reason: InsufficientDataError
 ) -> Unexplained:
-    """Return what is left unexplained where the model does not end with the causes in it.
-
-    Parameters
-    ----------
-    errors
-        What the offsets alone leave, m, (n, 3).
-    effects
-        The causes.
-    reason
-        Why they cannot be fitted together with offsets, registrations and markers.
-    """
+    """Return what is left of errors (n, 3), m, where causes cannot be fitted with all else."""
     names = suggested(effects)
     return Unexplained(
         where='residuals',
@@ -145,12 +125,7 @@ def unfitted(
 def nameless(data: Residuals, solution: Solution, p_value: float) -> Unexplained:
     """Return what is left unexplained where errors are there and no cause stands out of them.
 
-    Parameters
-    ----------
-    data, solution
-        What was searched, and the model of all kinds of errors, by members.
-    p_value
-        Of gaining as much evidence where nothing is there.
+    Of the model of all kinds of errors, by members; a p-value of gaining as much by chance.
     """
     kinds: dict[str, list[Cell]] = {}
     for cell in solution.cells:

@@ -35,15 +35,7 @@ HIDDEN = 0.1
 
 
 def moved_markers(found: Estimate, data: Residuals, solution: Solution) -> tuple[FoundEffect, ...]:
-    """Return an effect for every marker that the fit moved beyond its stated accuracy.
-
-    Parameters
-    ----------
-    found
-        The fit.
-    data, solution
-        What it leaves, and the causes beside.
-    """
+    """Return an effect for every marker that the fit moved beyond its stated accuracy."""
     model, problem = found.model, found.problem
     x = model.natural(found.mode.z)
     jacobian = model.natural_jacobian(x, data.rows)
@@ -83,15 +75,7 @@ def moved_markers(found: Estimate, data: Residuals, solution: Solution) -> tuple
 
 
 def loosened(session: Session, moved: Sequence[FoundEffect]) -> Priors | None:
-    """Return priors that let markers go as far as they were found to be; None if none has moved.
-
-    Parameters
-    ----------
-    session
-        With their stated places.
-    moved
-        As `moved_markers` returns them; other effects count for nothing.
-    """
+    """Return priors that let markers go as far as they were found to be; None if none moved."""
     places = {}
     for effect in moved:
         if effect.name == MARKER_OFFSET.name:

@@ -57,23 +57,9 @@ def structure_left(
     fit: FitResult,
     located: Sequence[FoundEffect],
 ) -> tuple[tuple[Unexplained, ...], tuple[tuple[int, str], ...]]:
-    """Return all structure that no cause explains, and the gross errors among held-out rows.
+    """Return all structure that no cause explains, with that located by the search.
 
-    Parameters
-    ----------
-    data, solution
-        What the search worked on, and what is in the model.
-    fit
-        The sampled fit with it.
-    located
-        Structure without a cause that the search found.
-
-    Returns
-    -------
-    unexplained
-        The structure.
-    gross
-        (observation, what is wrong) of every held-out row.
+    And (observation, what is wrong) of every held-out row with a gross error.
     """
     checks = _Checks(data, solution, fit)
     unexplained = (

@@ -25,30 +25,14 @@ def diagonal(size: int) -> IntArray:
 
 
 def of_rows(rows: FloatArray, first: int) -> FloatArray:
-    """Return the rows from the first on of symmetric matrices, packed.
-
-    Parameters
-    ----------
-    rows
-        (..., size - first, size).
-    first
-        The rows before are left out, as they are packed already.
-    """
+    """Return the rows from the first on of symmetric matrices, (…, size − first, size), packed."""
     size = rows.shape[-1]
     up_to_diagonal = np.arange(size) <= np.arange(first, size)[:, None]
     return rows[..., up_to_diagonal]
 
 
 def picked(matrices: FloatArray, order: IntArray) -> FloatArray:
-    """Return the rows and columns of packed matrices in some order.
-
-    Parameters
-    ----------
-    matrices
-        (m, length).
-    order
-        Row of each row of the result, (size,).
-    """
+    """Return packed matrices (m, length) with rows and columns in some order, (size,)."""
     if np.array_equal(order, np.arange(len(order))):
         return matrices[:, : length(len(order))].copy()
     i, j = _half(len(order))

@@ -72,16 +72,7 @@ class Family:
     ) -> Family | None:
         """Make the family of some cells; None where none of them displaces a marker.
 
-        Parameters
-        ----------
-        data
-            The rows worked on.
-        name
-            Of its cell.
-        members
-            Cells of any effects.
-        least
-            Standard deviation of the weights that the family does not go below, m.
+        Its weights have a standard deviation of no less than ``least``, m.
         """
         seen, maps, scales = [], [], []
         for member in members:
@@ -132,17 +123,9 @@ def _columns(context: Context, members: Sequence[Cell], maps: Sequence[FloatArra
 def kinds(data: Residuals, cells: Sequence[Cell], apart: Sequence[Cell] = ()) -> list[Family]:
     """Return a family for each effect of some cells, without members that are found by themselves.
 
-    Parameters
-    ----------
-    data
-        The rows worked on.
-    cells
-        All that are tried. Of a joint with several variants those of `Effect.in_family` are
-        members, and of two with a parameter in common the larger. What is drawn from thousands
-        (orders of a gear, moments of a step, what has no name) is no family: with one variance
-        each would be lost among the others.
-    apart
-        Cells that have parameters of their own.
+    Of a joint with several variants those of `Effect.in_family` are members, and of two with a
+    parameter in common the larger. What is drawn from thousands (orders of a gear, moments of a
+    step, what has no name) is no family: with one variance each would be lost among the others.
     """
     taken = {name for cell in apart for name in cell.parameters}
     taken_places = {(cell.name, cell.joints, cell.subject) for cell in apart}

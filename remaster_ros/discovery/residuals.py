@@ -236,13 +236,8 @@ class Residuals:
     def gram_matrices(self, cells: Sequence[Cell]) -> tuple[FloatArray, FloatArray]:
         """Return norms and Gram matrices of the base columns, of cells, and of the errors.
 
-        Returns
-        -------
-        norms
-            Of the columns over all rows, (p + c + 1,).
-        grams
-            In each error group of the noise model, of the columns of cells in their units
-            (`units`), `packed`, (groups, length of p + c + 1); a copy.
+        Norms over all rows, (p + c + 1,); `packed` matrices of each error group of the noise
+        model, with the columns of cells in their units (`units`), (groups, length); a copy.
         """
         wanted = set(cells)
         known, norms, grams = max(

@@ -88,13 +88,6 @@ class Solution:
         Exact, from the covariance C alone: the square that is left rises by b_i' C_ii⁻¹ b_i, the
         determinant of what is estimated falls by that of C_ii. Log evidence of the columns: the
         prior probability of the cells is that of the larger set.
-
-        Parameters
-        ----------
-        index
-            Of the cell.
-        rows
-            Number of rows n that were fitted.
         """
         cell, p, where = self.cells[index], len(self.base), self.slices()[index]
         own = self.covariance[where, where]
@@ -111,15 +104,7 @@ class Solution:
         return float(self.log_evidence - worth - price)
 
     def less(self, index: int, log_evidence: float) -> Solution:
-        """Return the fit without one cell, with noise and smoothness as they are.
-
-        Parameters
-        ----------
-        index
-            Of the cell.
-        log_evidence
-            Of the fit without it, see `evidence_without`.
-        """
+        """Return the fit without one cell, with noise and smoothness as they are."""
         p, where = len(self.base), self.slices()[index]
         out = slice(p + where.start, p + where.stop)
         pull = _regression(self.full_covariance, out)

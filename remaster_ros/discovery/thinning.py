@@ -56,20 +56,6 @@ def draw_rows(
 
     Whole poses are drawn, one of every few consecutive ones that the same sensors measured. Where
     that would leave few poses, `FEWEST_POSES` are, with fewer rows of each.
-
-    Parameters
-    ----------
-    measurements
-        The session's.
-    rows
-        Indices to choose from, (n,).
-    rng
-        Source of randomness; not used where all are returned.
-
-    Returns
-    -------
-    ndarray
-        Indices in rising order, (m,).
     """
     if len(rows) <= most:
         return rows
@@ -98,17 +84,7 @@ def draw_rows(
 def judge_by_others(
     data: Residuals, rows: IntArray, searched: IntArray, empty: Solution, solution: Solution
 ) -> Thinning:
-    """Hold the causes, frozen, against the rows that the search has not seen.
-
-    Parameters
-    ----------
-    data
-        The residuals that were searched; ``context`` has all rows.
-    rows, searched
-        Indices of the rows that could have been searched, and of those that were.
-    empty, solution
-        Fit of the offsets alone, and with the causes.
-    """
+    """Hold the causes, frozen, against the rows that could have been searched, and were not."""
     others = np.setdiff1d(rows, searched)
 
     def left(fit: Solution) -> float:

@@ -18,15 +18,7 @@ NOTICEABLE = 0.1
 
 
 def extension_of(residuals: Residuals, solution: Solution, found: Estimate) -> Extension:
-    """Return the cells of a solution as further parameters, linearised where it has them.
-
-    Parameters
-    ----------
-    residuals, solution
-        What was searched, and found.
-    found
-        The fit that the search began with.
-    """
+    """Return the cells of a solution as further parameters, linearised where it has them."""
     terms = []
     displacement0 = np.zeros((len(residuals.context), 3))
     for cell, where in zip(solution.cells, solution.slices(), strict=True):
@@ -35,8 +27,13 @@ def extension_of(residuals: Residuals, solution: Solution, found: Estimate) -> E
             displacement0 += term.values @ solution.parameters[where]
         terms.append(term)
     model = found.model
-    step = natural_parameters(found, residuals, solution, solution)[: model.size]
-    x = model.natural(found.mode.z) + step
+    # Steps of the natural parameters, zeros where the gauge holds.
+    x, free = model.natural(found.mode.z), found.posterior.free
+    columns = residuals.full_jacobian[residuals.rows.source][:, :, free].reshape(-1, len(free))
+    scale = np.linalg.norm(columns, axis=0)
+    scale[scale == 0.0] = 1.0
+    step = (residuals.base @ solution.base).ravel()
+    x[free] += np.linalg.lstsq(columns / scale, step, rcond=None)[0] / scale
     names = tuple(name for cell in solution.cells for name in cell.parameters)
     units = tuple(cell.unit for cell in solution.cells for _ in cell.parameters)
     return Extension(
@@ -56,19 +53,7 @@ def moved_by_open_offsets(found: Estimate, data: Residuals, solution: Solution) 
     """Return how the parameters move with offsets that the prior on steps holds, one std of each.
 
     It is no knowledge of the arm: an offset is known no better than by the data and by what is
-    known of any mastering.
-
-    Parameters
-    ----------
-    found
-        The fit that the search began with.
-    data, solution
-        What it worked on and found.
-
-    Returns
-    -------
-    ndarray
-        (size + m, c) for all natural parameters of the fit and the m of the solution's cells.
+    known of any mastering. Of all natural parameters and the m of the cells, (size + m, c).
     """
     _, root, where = _solved(found, data, solution)
     names = found.problem.chain.joint_names
@@ -97,28 +82,23 @@ def _solved(
     found: Estimate, data: Residuals, solution: Solution
 ) -> tuple[FloatArray, FloatArray, IntArray]:
     """Return the whitened columns of all that is fitted, a root of its covariance, and where."""
-    columns, precision, where = fitted_columns(found, data, solution)
+    free, size = found.posterior.free, found.model.size
+    own = data.columns(solution.cells)
+    columns = np.concatenate((data.full_jacobian[data.rows.source][:, :, free], own), axis=2)
+    x = found.model.natural(found.mode.z)
+    rows = prior_rows(found.model, found.posterior.priors, x, natural=True)[1][:, free]
+    precision = np.zeros((columns.shape[2],) * 2)
+    precision[: len(free), : len(free)] = rows.T @ rows
+    precision[len(free) :, len(free) :] = solution.prior_precision()
     white = data.noise_model.whitened(columns, solution.noise).reshape(3 * len(data), -1)
-    return white, root_of_inverse(white.T @ white + precision), where
+    root = root_of_inverse(white.T @ white + precision)
+    return white, root, np.concatenate((free, size + np.arange(own.shape[2])))
 
 
 def moved_by(
     found: Estimate, data: Residuals, solution: Solution, displacements: FloatArray
 ) -> FloatArray:
-    """Return how displacements that the model does not have move what is fitted to them.
-
-    Parameters
-    ----------
-    found, data, solution
-        The fit that the search began with, what it worked on and found.
-    displacements
-        Of the rows worked on, m, (n, 3, c).
-
-    Returns
-    -------
-    ndarray
-        (size + m, c), as in `moved_by_open_offsets`.
-    """
+    """Return how displacements (n, 3, c), m, beside the model move all fitted, (size + m, c)."""
     white, root, where = _solved(found, data, solution)
     others = data.noise_model.whitened(displacements, solution.noise).reshape(3 * len(data), -1)
     moves = np.zeros((found.model.size + len(solution.parameters), others.shape[1]))
@@ -148,67 +128,3 @@ def _columns(cell: Cell, context: Context) -> tuple[int | None, FloatArray]:
     """Return joint and values of a cell's columns in every row of a session."""
     blocks = [cell.columns(block) for _, block in context.blocks()]
     return blocks[0].at, np.concatenate([block.values for block in blocks])
-
-
-def fitted_columns(
-    found: Estimate, data: Residuals, solution: Solution
-) -> tuple[FloatArray, FloatArray, IntArray]:
-    """Return what all parameters of the extended model do, and what is known of them beforehand.
-
-    Parameters
-    ----------
-    found, data, solution
-        The fit that the search began with, what it worked on and found.
-
-    Returns
-    -------
-    columns
-        What a unit of each free parameter of the fit and of the m of the cells displaces in the
-        rows worked on, (n, 3, f + m).
-    precision
-        Of their priors, (f + m, f + m).
-    where
-        Their indices among all the natural parameters and the m, (f + m,).
-    """
-    free, size = found.posterior.free, found.model.size
-    own = data.columns(solution.cells)
-    columns = np.concatenate((data.full_jacobian[data.rows.source][:, :, free], own), axis=2)
-    x = found.model.natural(found.mode.z)
-    rows = prior_rows(found.model, found.posterior.priors, x, natural=True)[1][:, free]
-    precision = np.zeros((columns.shape[2],) * 2)
-    precision[: len(free), : len(free)] = rows.T @ rows
-    precision[len(free) :, len(free) :] = solution.prior_precision()
-    return columns, precision, np.concatenate((free, size + np.arange(own.shape[2])))
-
-
-def natural_parameters(
-    found: Estimate, data: Residuals, solution: Solution, other: Solution
-) -> FloatArray:
-    """Return the parameters of another set of cells, as those of a solution, (size + m,).
-
-    Parameters
-    ----------
-    found, data, solution
-        The fit that the search began with, what it worked on and found.
-    other
-        The other set, fitted to the same rows.
-
-    Returns
-    -------
-    ndarray
-        Steps of the natural parameters of the fit from where the search began, zeros where the
-        gauge holds; and the parameters of the solution's m cells, 0 of those that the other set
-        does not have.
-    """
-    free, size = found.posterior.free, found.model.size
-    values = np.zeros(size + len(solution.parameters))
-    columns = data.full_jacobian[data.rows.source][:, :, free].reshape(-1, len(free))
-    scale = np.linalg.norm(columns, axis=0)
-    scale[scale == 0.0] = 1.0
-    step = (data.base @ other.base).ravel()
-    values[free] = np.linalg.lstsq(columns / scale, step, rcond=None)[0] / scale
-    found_again = dict(zip(other.cells, other.slices(), strict=True))
-    for cell, where in zip(solution.cells, solution.slices(), strict=True):
-        if cell in found_again:
-            values[size:][where] = other.parameters[found_again[cell]]
-    return values

@@ -12,12 +12,11 @@ from remaster_ros.calibration.fit import fit_session
 from remaster_ros.calibration.noise import NoiseModel
 from remaster_ros.calibration.outliers import robust_noise
 from remaster_ros.discovery import discover, packed
-from remaster_ros.discovery.catalogue import Catalogue
 from remaster_ros.discovery.discover import discover_session
 from remaster_ros.discovery.effects.base import Design
 from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.discovery.evidence import _System, solve
-from remaster_ros.discovery.screening import screen
+from remaster_ros.discovery.screening import Catalogue, screen
 from remaster_ros.errors import InsufficientDataError
 from remaster_ros.simulation.simulated_workcell import simulate_session
 from remaster_ros.types import Session

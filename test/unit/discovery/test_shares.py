@@ -12,9 +12,9 @@ from remaster_ros.discovery import evidence
 from remaster_ros.discovery.effects.base import Cell
 from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.discovery.evidence import Solution, solve
+from remaster_ros.discovery.explain import shares
 from remaster_ros.discovery.gain import rms
 from remaster_ros.discovery.residuals import Residuals
-from remaster_ros.discovery.shares import shares
 from remaster_ros.types import FloatArray, Session
 
 ARC_MINUTE = np.radians(1.0 / 60.0)
