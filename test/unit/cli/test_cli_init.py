@@ -11,6 +11,8 @@ from robot_descriptions import ROBOTS, Description, xarm7
 from remaster_ros.cli import init
 from remaster_ros.cli.main import main
 from remaster_ros.cli.plan import free_start
+from remaster_ros.compensation.arm_model import Geometry
+from remaster_ros.compensation.export import calibrated_urdf
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.planning import planned_design, pose_design
 from remaster_ros.session.workcell import read_cell
@@ -247,6 +249,24 @@ def test_an_arm_that_lies_on_the_floor_at_zero_is_planned_from_elsewhere(do, tmp
     few = ('--poses', '4', '--validation', '0', '--reference-every', '0', '--json')
     assert main(['plan', str(tmp_path / 'cell.yaml'), *few]) == 0
     assert json.loads(capsys.readouterr().out)['configurations'] > 0
+
+
+def test_a_description_that_was_corrected_is_planned(do, tmp_path):
+    """By zero-offsets and by changes of the joints' origins, as `remaster export` writes it."""
+    description = ROBOTS['irb120']()
+    chain = SerialChain.from_urdf(description.urdf, description.base_link, description.tip_link)
+    seed = 8
+    print('seed', seed)
+    rng = np.random.default_rng(seed)
+    geometry = Geometry(rng.normal(0, 2e-4, (6, 3)), rng.normal(0, 1e-3, (6, 3)))
+    corrected = calibrated_urdf(description.urdf, chain, rng.normal(0, 5e-3, 6), geometry=geometry)
+    path = tmp_path / 'corrected.urdf'
+    path.write_text(corrected)
+    status, printed, _ = do(path, '--json')
+    assert status == 0
+    found = json.loads(printed)
+    assert found['inverse_kinematics']['way'] == 'near closed form'
+    assert found['plan']['splits']['optimization']['poses'] >= 10
 
 
 def test_an_arm_with_its_makers_calibration_is_planned_and_its_table_is_imported(
