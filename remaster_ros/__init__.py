@@ -158,7 +158,7 @@ def import_table(
     )
     return in_python.of_files(
         files,
-        in_python.robot_of(urdf, base_link, tip_link),
+        in_python.robot_of(urdf, base_link, tip_link, files),
         TableOptions(told=Told(tuple(joints), tuple(points)), join=join),
         SessionOptions(
             couple=tuple((name, (other, -1 if minus else 1)) for name, (other, minus) in added),

@@ -259,6 +259,7 @@ def run(args: argparse.Namespace) -> int:
             xacro_arguments(args.xacro_argument),
             args.package_path,
             trusted=args.trust,
+            tables=args.files,
         )
     else:
         urdf, base = cell.urdf_text, args.base_link or cell.robot.base_link

@@ -14,7 +14,7 @@ import numpy as np
 from remaster_ros.cli.console import progress_bar, show
 from remaster_ros.cli.options import CANDIDATES, add_description, names, number, xacro_arguments
 from remaster_ros.errors import InputError, InsufficientDataError, did_you_mean
-from remaster_ros.kinematics.arm_ends import likely_base, likely_tips
+from remaster_ros.kinematics.arm_ends import likely_base, likely_tip, likely_tips, moving_before
 from remaster_ros.kinematics.inverse_kinematics import InverseKinematics
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.urdf import parse_urdf
@@ -27,7 +27,7 @@ from remaster_ros.planning.cell_proposal import (
     reach_of,
     widest_ranges,
 )
-from remaster_ros.planning.collection_plan import outlook
+from remaster_ros.planning.collection_plan import FITTED, outlook
 from remaster_ros.planning.tour_planner import TourPlanner
 from remaster_ros.reports.plan_json import outlook_text, outlook_to_dict
 from remaster_ros.session.cell_template import (
@@ -35,6 +35,7 @@ from remaster_ros.session.cell_template import (
     SENSORS,
     CellProposal,
     cell_text,
+    left_alone,
 )
 from remaster_ros.session.files import make_folder, undone_on_failure, write_atomically
 from remaster_ros.session.meshes import find_mesh, mesh_reader
@@ -47,6 +48,9 @@ COMPARED = 80
 TRIED = 200
 # Fewer that can be visited do not show ranges.
 FEWEST = 12
+# Poses to fit: places of sensor and marker and six offsets are 15 unknowns, for which five poses
+# give as many readings; ten leave as many to tell how well they agree.
+FEWEST_FITTED = 10
 # How far the sensor stands behind what the arm reaches, m.
 SENSOR_BEHIND_M = 1.2
 REMEDY = 'give another name with --out'
@@ -106,19 +110,31 @@ def run(args: argparse.Namespace) -> int:
         progress('trying', 0.1)
         widest = _propose(args, description, urdf, rng)
         progress('planning', 0.4)
-        proposal = _narrowed(widest, _cell(widest, args.out), rng)
+        proposal, planned_poses = _narrowed(widest, _cell(widest, args.out), rng)
         write_atomically(args.out, cell_text(proposal))
         progress('planning', 0.7)
         cell, missing = _cell(proposal, args.out), bool(proposal.missing_meshes)
-        planned, text = ({}, '') if args.no_plan else _plan(cell, missing, args.seed)
+        planned: dict[str, Any] = {}
+        text = ''
+        if not args.no_plan:
+            planned, text, planned_poses = _plan(cell, missing, args.seed)
     if args.json:
         print(json.dumps(_as_json(args.out, proposal) | planned))
-        return 0
-    show(args.quiet, _as_text(proposal))
-    if text:
-        show(args.quiet, text)
-    show(args.quiet, f'written: {args.out}; look at its lines marked CHECK')
-    show(args.quiet, f'every way, in 3-D: remaster plan {args.out} --out plan.html')
+    else:
+        show(args.quiet, _as_text(proposal))
+        if text:
+            show(args.quiet, text)
+        show(args.quiet, f'written: {args.out}; look at its lines marked CHECK')
+    if planned_poses < FEWEST_FITTED:
+        # The file stays: what it states may be what is wrong.
+        raise InsufficientDataError(
+            f'{args.out}: {planned_poses} poses can be planned in this cell, and a calibration '
+            f'needs {FEWEST_FITTED}; correct its lines marked CHECK (the place of the sensor, the '
+            'markers, the floor), and see whether they suffice: remaster plan '
+            f'{args.out}'
+        )
+    if not args.json:
+        show(args.quiet, f'every way, in 3-D: remaster plan {args.out} --out plan.html')
     return 0
 
 
@@ -143,7 +159,8 @@ def _propose(
         model = parse_urdf(text)
         base = likely_base(model) if args.base_link is None else args.base_link
         tips = likely_tips(model, base)
-        tip = tips[0] if args.tip_link is None else args.tip_link
+        tip = likely_tip(model, base) if args.tip_link is None else args.tip_link
+        before = moving_before(model, base)
         chain = SerialChain.from_urdf(text, base, tip)
         reach = reach_of(chain, rng)
         place = args.sensor_at or [
@@ -165,6 +182,7 @@ def _propose(
         urdf=os.path.relpath(urdf, args.out.parent),
         chain=chain,
         tips=tips,
+        before=before,
         held=held,
         reach=reach,
         ranges=ranges,
@@ -205,28 +223,38 @@ def _cell(proposal: CellProposal, out: Path) -> Workcell:
     return parse_cell(cell_text(proposal).encode(), out)
 
 
-def _narrowed(p: CellProposal, cell: Workcell, rng: np.random.Generator) -> CellProposal:
-    """Return the proposal with ranges around the poses that can be visited."""
+def _narrowed(
+    p: CellProposal, cell: Workcell, rng: np.random.Generator
+) -> tuple[CellProposal, int]:
+    """Return the proposal with ranges around the poses that can be visited, and their number."""
     scene = cell.planning_scene(p.chain, without_meshes=bool(p.missing_meshes))
     plan = scene.plan(TRIED, scene.rough_R, rng)
     lost = ', '.join(f'{count} {why}' for why, count in plan.dropped.items())
     found = f'Of {TRIED} poses everywhere around the arm {len(plan.poses)} can be visited ({lost})'
     if len(plan.poses) < FEWEST:
-        return replace(p, kept=f'{found}: too few to propose ranges.')
+        kept = f'{found}: too few to propose ranges.'
+        return replace(p, kept=kept), len(plan.poses)
     places = np.array([pose.T_R_T[:3, 3] for pose in plan.poses])
-    return replace(p, ranges=ranges_around(places), kept=f'{found}; these ranges are around them.')
+    kept = f'{found}; these ranges are around them.'
+    return replace(p, ranges=ranges_around(places), kept=kept), len(plan.poses)
 
 
-def _plan(cell: Workcell, without_meshes: bool, seed: int) -> tuple[dict[str, Any], str]:
-    """Plan in the new cell as the nodes do, without the ways; return it for JSON and as text."""
+def _plan(cell: Workcell, without_meshes: bool, seed: int) -> tuple[dict[str, Any], str, int]:
+    """Plan in the new cell as the nodes do, without the ways.
+
+    Returns
+    -------
+    plan, text, poses
+        For JSON; for people; how many poses there are to fit.
+    """
     scene = cell.planning_scene(cell.chain(), without_meshes=without_meshes)
     counts = {'optimization': CANDIDATES, 'validation': CANDIDATES}
     try:
         tour, expected = outlook(TourPlanner(scene, counts, seed, design=cell.design_settings()))
     except InsufficientDataError as error:
-        return {'plan': None, 'why': str(error)}, f'nothing can be measured like this: {error}'
+        return {'plan': None, 'why': str(error)}, f'nothing can be measured like this: {error}', 0
     text = f'planned from {sum(counts.values())} candidate poses:\n{outlook_text(tour, expected)}'
-    return {'plan': outlook_to_dict(tour, expected)}, text
+    return {'plan': outlook_to_dict(tour, expected)}, text, tour.poses[FITTED]
 
 
 def _as_text(p: CellProposal) -> str:
@@ -234,6 +262,7 @@ def _as_text(p: CellProposal) -> str:
     lines = [
         f'{chain.name}: {len(chain)} joints between {chain.base_link} and {chain.tip_link}'
         + (f' (or {", ".join(p.tips[1:4])})' if len(p.tips) > 1 else ''),
+        *([left_alone(p.before, chain.base_link)] if p.before else []),
         f'reach {p.reach.reach_m:.2f} m; the sensor is taken to be at '
         f'{", ".join(f"{value:.1f}" for value in p.sensor_R)} m',
     ]
@@ -259,6 +288,7 @@ def _as_json(out: Path, p: CellProposal) -> dict[str, Any]:
         'cell': str(out),
         'base_link': p.chain.base_link,
         'tip_link': p.chain.tip_link,
+        'not_of_the_arm': list(p.before),
         'other_tips': [tip for tip in p.tips if tip != p.chain.tip_link],
         'held_joint': None if held.joint is None else p.chain.joint_names[held.joint],
         'solutions': held.solutions,

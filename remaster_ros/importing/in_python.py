@@ -67,9 +67,14 @@ def of_files(
     return _made(rows, urdf, chain, corrections, seed, notes)
 
 
-def robot_of(urdf: str | os.PathLike[str], base_link: str | None, tip_link: str | None) -> Robot:
-    """Return the text of a robot's description, and the arm in it."""
-    return read_robot(Path(urdf), base_link, tip_link)
+def robot_of(
+    urdf: str | os.PathLike[str],
+    base_link: str | None,
+    tip_link: str | None,
+    tables: Sequence[str | os.PathLike[str]] = (),
+) -> Robot:
+    """Return the text of a robot's description, and the arm in it, by `tables` of several."""
+    return read_robot(Path(urdf), base_link, tip_link, tables=[Path(file) for file in tables])
 
 
 def _made(

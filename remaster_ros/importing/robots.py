@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from remaster_ros.errors import InputError
-from remaster_ros.kinematics.arm_ends import likely_base, likely_tips
+from remaster_ros.kinematics.arm_ends import likely_base, likely_tip
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.urdf import parse_urdf
 from remaster_ros.session.robot_description import read_description
+
+# Headers of hundreds of columns are shorter, bytes.
+_HEAD = 16_384
 
 
 def read_robot(
@@ -20,6 +24,7 @@ def read_robot(
     package_path: Sequence[Path] = (),
     *,
     trusted: bool = False,
+    tables: Sequence[Path] = (),
 ) -> tuple[str, SerialChain]:
     """Read a URDF, or expand a xacro, and find the arm in it.
 
@@ -30,6 +35,9 @@ def read_robot(
     arguments, package_path, trusted
         As of `read_description`.
 
+    tables
+        Whose joints are the arm's: of several arms it is the one that they name.
+
     Raises
     ------
     InputError
@@ -38,8 +46,20 @@ def read_robot(
     urdf = read_description(path, arguments, package_path, trusted=trusted)
     try:
         model = parse_urdf(urdf)
-        base = likely_base(model) if base_link is None else base_link
-        tip = likely_tips(model, base)[0] if tip_link is None else tip_link
+        names = _words(tables)
+        base = likely_base(model, names) if base_link is None else base_link
+        tip = likely_tip(model, base, names) if tip_link is None else tip_link
         return urdf, SerialChain.from_urdf(urdf, base, tip)
     except InputError as error:
         raise InputError(f'{path}: {error}') from None
+
+
+def _words(tables: Sequence[Path]) -> set[str]:
+    """Return the words at the beginning of text files, where their columns are named."""
+    words: set[str] = set()
+    for path in tables:
+        if path.is_file():
+            with path.open('rb') as file:
+                head = file.read(_HEAD)
+            words.update(re.findall(r'\w[\w-]*', head.decode('utf-8', 'replace')))
+    return words

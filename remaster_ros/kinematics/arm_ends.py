@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Container
+
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.urdf import UrdfJoint, UrdfModel
 
@@ -11,10 +13,39 @@ TOOL_NAMES = (
     *('link_ee', 'ee_link', 'link_eef', 'eef', 'ee', 'end_effector', 'flange', 'hand'),
 )
 _WORLD = ('world', 'map', 'odom')
+# Parts of a gripper that move against each other, in the names of joints and of what they carry.
+_JAWS = ('finger', 'jaw', 'knuckle', 'thumb', 'claw')
+# What else is in the name of a joint that turns the gripper as a whole.
+_WHOLE = ('roll', 'rot', 'pitch', 'yaw', 'wrist', 'turn', 'spin', 'flex')
+# What branches behind so many joints that turn is a hand: two arms have no more of them in common.
+_HAND_BEHIND = 5
 
 
-def likely_base(model: UrdfModel) -> str:
-    """Return the root, or what is fixed to it where the root is the world."""
+def likely_base(model: UrdfModel, names: Container[str] = ()) -> str:
+    """Return the root, or what is fixed to it where the root is the world.
+
+    Where a joint that slides (a rail, a lift) carries the arm, it is the base of what it carries.
+
+    Parameters
+    ----------
+    names
+        As of `likely_tips`.
+    """
+    arms = {link: arm for link in model.links if (arm := _arm(model, link)) is not None}
+    # From the root where both are as good.
+    best = max(
+        arms.values(),
+        key=lambda arm: (_named(arm[1], names), len(arm[1]), arm[0] == model.root),
+        default=None,
+    )
+    if best is not None and best[0] != model.root and best[1]:
+        start, joints = best
+        between, link = [start], joints[0].parent
+        while link != start:
+            between.append(link)
+            link = model.parent_joint[link].parent
+        based = [link for link in between if 'base' in link.lower()]
+        return min(based, key=len) if based else start
     if model.root not in _WORLD:
         return model.root
     children = [
@@ -25,29 +56,34 @@ def likely_base(model: UrdfModel) -> str:
     return children[0] if len(children) == 1 else model.root
 
 
-def likely_tips(model: UrdfModel, base_link: str) -> list[str]:
+def likely_tips(model: UrdfModel, base_link: str, names: Container[str] = ()) -> list[str]:
     """Return the links behind the last joint of the arm, the likeliest tool frame first.
 
-    The arm is the way from the base with the most joints that turn and none that slides.
+    The arm is the way from the base with the most joints that turn and none that slides; a
+    gripper's jaws and fingers are no joints of it.
+
+    Parameters
+    ----------
+    names
+        Joints that are known to be the arm's, such as those of a table: the arm is the way with
+        the most of them.
 
     Raises
     ------
     InputError
-        No joint turns behind the base.
+        No joint turns behind the base, or there are several arms.
     """
     if base_link not in model.links:
         raise InputError(f"URDF: there is no link '{base_link}'; it has {', '.join(model.links)}")
-    turning = {link: _turning(model, base_link, link) for link in model.links}
-    most = max((len(joints) for joints in turning.values() if joints is not None), default=0)
-    if not most:
+    arms = {
+        link: arm[1]
+        for link in model.links
+        if (arm := _arm(model, link, base_link)) is not None and arm[0] == base_link
+    }
+    most = max(((_named(arm, names), len(arm)) for arm in arms.values()), default=(0, 0))
+    if not most[1]:
         raise InputError(f"URDF: no joint turns behind link '{base_link}'; name another base link")
-    ends = [link for link, joints in turning.items() if joints is not None and len(joints) == most]
-    last = {turning[link][-1].name for link in ends}  # type: ignore[index]
-    if len(last) > 1:
-        raise InputError(
-            f'URDF: there are several arms of {most} joints ({", ".join(sorted(last))} are their '
-            'last ones); name the tip link'
-        )
+    ends = [link for link, arm in arms.items() if (_named(arm, names), len(arm)) == most]
     parents = {joint.parent for joint in model.parent_joint.values()}
 
     def rank(link: str) -> tuple[int, bool, int]:
@@ -58,17 +94,83 @@ def likely_tips(model: UrdfModel, base_link: str) -> list[str]:
         # Else a frame that carries nothing, the last one in the file.
         return len(TOOL_NAMES), link in parents, -ends.index(link)
 
-    return sorted(ends, key=rank)
+    ordered = sorted(ends, key=rank)
+    first = {arms[link][-1].name: link for link in reversed(ordered)}
+    if len(first) > 1:
+        tips = ' or '.join(sorted(first.values()))
+        raise InputError(
+            f'URDF: there are several arms of {most[1]} joints ({", ".join(sorted(first))} are '
+            f'their last ones); name the tip link, --tip-link {tips}'
+        )
+    return ordered
 
 
-def _turning(model: UrdfModel, base_link: str, link: str) -> list[UrdfJoint] | None:
-    """Return the joints that turn between two links; None where a way has others, or is none."""
+def likely_tip(model: UrdfModel, base_link: str, names: Container[str] = ()) -> str:
+    """Return the first of `likely_tips`.
+
+    Raises
+    ------
+    InputError
+        As `likely_tips`, or the arm goes on behind a joint that slides.
+    """
+    tip = likely_tips(model, base_link, names)[0]
+    last = _arm(model, tip, base_link)
+    for joint in _moved_from(model, last[1][-1].child if last else tip):
+        beyond = [j for j in _moved_from(model, joint.child) if not _is_jaw(j)]
+        if joint.kind == 'prismatic' and not joint.mimic and not _is_jaw(joint) and beyond:
+            raise InputError(
+                f"URDF: joint '{joint.name}' of the arm slides, and the arm goes on behind it "
+                f"with '{beyond[0].name}'; arms with such a joint cannot be calibrated"
+            )
+    return tip
+
+
+def moving_before(model: UrdfModel, base_link: str) -> list[str]:
+    """Return the joints between the root and a link that move, from the root on."""
+    joints = []
+    while (joint := model.parent_joint.get(base_link)) is not None:
+        if joint.kind != 'fixed':
+            joints.append(joint.name)
+        base_link = joint.parent
+    return joints[::-1]
+
+
+def _arm(
+    model: UrdfModel, link: str, base_link: str | None = None
+) -> tuple[str, list[UrdfJoint]] | None:
+    """Return where the arm that carries a link starts, and its joints; None behind its tool.
+
+    It starts at `base_link`, or at the root, or at what a joint carries that does not turn.
+    """
     joints: list[UrdfJoint] = []
-    while link != base_link:
-        joint = model.parent_joint.get(link)
-        if joint is None or joint.mimic or joint.kind not in ('fixed', 'revolute', 'continuous'):
+    while link != base_link and (joint := model.parent_joint.get(link)) is not None:
+        if joint.kind not in ('fixed', 'revolute', 'continuous') and not joint.mimic:
+            break
+        if joint.mimic:
             return None
         if joint.kind != 'fixed':
             joints.append(joint)
         link = joint.parent
-    return joints[::-1]
+    joints.reverse()
+    hand = any(len(_moved_from(model, joint.parent)) > 1 for joint in joints[_HAND_BEHIND:])
+    return None if hand or any(map(_is_jaw, joints)) else (link, joints)
+
+
+def _moved_from(model: UrdfModel, link: str) -> list[UrdfJoint]:
+    """Return the next joints that move behind a link."""
+    found = []
+    for joint in model.parent_joint.values():
+        if joint.parent == link:
+            found += [joint] if joint.kind != 'fixed' else _moved_from(model, joint.child)
+    return found
+
+
+def _is_jaw(joint: UrdfJoint) -> bool:
+    name = joint.name.lower()
+    if any(word in part for word in _JAWS for part in (name, joint.child.lower())):
+        return True
+    return 'grip' in name and not any(word in name for word in _WHOLE)
+
+
+def _named(joints: list[UrdfJoint], names: Container[str]) -> int:
+    return sum(joint.name in names for joint in joints)

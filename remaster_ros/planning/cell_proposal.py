@@ -85,7 +85,9 @@ def propose_held_joint(chain: SerialChain, facing: FloatArray) -> HeldJoint:
     if len(chain) != FREE_JOINTS + 1:
         raise InputError(
             f"robot '{chain.name}' has {len(chain)} joints between '{chain.base_link}' and "
-            f"'{chain.tip_link}'; poses are planned for six, or for seven with one held"
+            f"'{chain.tip_link}'; poses are planned for six, or for seven with one held. "
+            'Other links are named by --base-link and --tip-link. As it is, '
+            f'{OWN_CONFIGURATIONS}'
         )
     tried: dict[str, float | str] = {}
     able: dict[int, InverseKinematics] = {}

@@ -23,6 +23,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from remaster_ros.discovery.screening import FEWEST_POSES
+from remaster_ros.errors import InsufficientDataError
 from remaster_ros.planning.design_information import DesignInformation
 from remaster_ros.planning.travel_time import TravelTime
 from remaster_ros.types import BoolArray, FloatArray, IntArray
@@ -96,10 +97,18 @@ class Goal:
     tool_share: float = 0.0
 
     def weights(self, information: DesignInformation) -> FloatArray:
-        """Return L with criterion = trace(L' M^-1 L), (f, r), 1 or less at the goal."""
+        """Return L with criterion = trace(L' M^-1 L), (f, r), 1 or less at the goal.
+
+        Raises
+        ------
+        InsufficientDataError
+            No joint is identifiable.
+        """
         parts = []
         if self.tool_share < 1.0:
             places = sorted(information.identifiable.values())
+            if not places:
+                raise InsufficientDataError('the poses determine the zero-offset of no joint')
             joints = np.zeros((len(information.scale), len(places)))
             joints[places, np.arange(len(places))] = information.scale[places]
             share = (1.0 - self.tool_share) / len(places)

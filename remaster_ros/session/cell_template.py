@@ -52,6 +52,8 @@ class CellProposal:
         As the cell file is to name it.
     tips
         Links that may be the tool frame, the proposed one first.
+    before
+        Joints that carry the whole arm, such as a rail's.
     sensor_R
         Rough place of the sensors in the base, m, (3,).
     sensors
@@ -70,6 +72,7 @@ class CellProposal:
     urdf: str
     chain: SerialChain
     tips: Sequence[str]
+    before: Sequence[str]
     held: HeldJoint
     reach: Reach
     ranges: PoseRanges
@@ -80,6 +83,14 @@ class CellProposal:
     mesh_path: Sequence[str]
     missing_meshes: Sequence[str]
     floor_z: float | None
+
+
+def left_alone(before: Sequence[str], base_link: str) -> str:
+    """Return what is to be done with joints that carry the whole arm."""
+    return (
+        f'{", ".join(before)} carries the whole arm, and is no joint of it here: leave it where '
+        f'it is until everything is measured; the result is of the arm from {base_link} on'
+    )
 
 
 def cell_text(p: CellProposal) -> str:
@@ -103,6 +114,7 @@ def cell_text(p: CellProposal) -> str:
             + (f' Other links behind the last joint: {others}.' if others else '')
         ),
         *_comment(f'Joints between base_link and tip_link, limits in degrees: {limits}.'),
+        *(_comment(left_alone(p.before, chain.base_link) + '.') if p.before else []),
         'robot:',
         f'  urdf: {_value(p.urdf)}   # relative to this file',
         f'  base_link: {_value(chain.base_link)}',

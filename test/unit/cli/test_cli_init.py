@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -249,6 +250,38 @@ def test_an_arm_that_lies_on_the_floor_at_zero_is_planned_from_elsewhere(do, tmp
     few = ('--poses', '4', '--validation', '0', '--reference-every', '0', '--json')
     assert main(['plan', str(tmp_path / 'cell.yaml'), *few]) == 0
     assert json.loads(capsys.readouterr().out)['configurations'] > 0
+
+
+@pytest.mark.parametrize('options', [(), ('--no-plan',)])
+def test_a_cell_in_which_fewer_than_ten_poses_can_be_planned_ends_with_status_1(
+    options, do, tmp_path
+):
+    """An arm whose joints hardly turn."""
+    text = re.sub('upper="[^"]*"', 'upper="0.2"', ROBOTS['irb120']().urdf)
+    robot = tmp_path / 'stiff.urdf'
+    robot.write_text(re.sub('lower="[^"]*"', 'lower="-0.2"', text))
+    status, _, error = do(robot, *options)
+    assert status == 1
+    assert error.count('\n') == 1
+    assert 'poses can be planned in this cell, and a calibration needs 10; correct' in error
+    assert (tmp_path / 'cell.yaml').exists()
+
+
+def test_a_rail_that_carries_the_arm_is_left_alone_and_said_so(do, tmp_path):
+    text = ROBOTS['irb120']().urdf.replace(
+        '</robot>',
+        '<link name="hall"/><joint name="rail" type="prismatic"><parent link="hall"/>'
+        '<child link="base_link"/><axis xyz="1 0 0"/>'
+        '<limit lower="-1" upper="1" effort="1" velocity="1"/></joint></robot>',
+    )
+    path = tmp_path / 'on_rail.urdf'
+    path.write_text(text)
+    status, printed, _ = do(path)
+    assert status == 0
+    assert '6 joints between base_link and tool0' in printed
+    sentence = 'rail carries the whole arm, and is no joint of it here: leave it where it is'
+    assert sentence in printed
+    assert sentence in (tmp_path / 'cell.yaml').read_text().replace('\n# ', ' ')
 
 
 def test_a_description_that_was_corrected_is_planned(do, tmp_path):

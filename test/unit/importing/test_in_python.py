@@ -8,12 +8,29 @@ from foreign_tables import measured, text, write
 
 import remaster_ros
 from remaster_ros.errors import InputError, InsufficientDataError
+from remaster_ros.importing.in_python import robot_of
 
 
 @pytest.fixture
 def arm(tmp_path):
     (tmp_path / 'robot.urdf').write_text(measured().urdf)
     return measured()
+
+
+@pytest.mark.parametrize('side', ['left', 'right'])
+def test_of_two_arms_it_is_the_one_that_the_table_names(side, tmp_path):
+    sides, parts = ('left', 'right'), ['<link name="base"/>']
+    for name in sides:
+        parts.append(
+            f'<link name="{name}_arm"/><joint name="{name}_j" type="continuous">'
+            f'<parent link="base"/><child link="{name}_arm"/><axis xyz="0 0 1"/></joint>'
+        )
+    urdf, table = tmp_path / 'two.urdf', tmp_path / 'table.csv'
+    urdf.write_text(f'<robot name="two">{"".join(parts)}</robot>')
+    table.write_text(f'{side}_j.pos,x,y,z\n')
+    assert robot_of(urdf, None, None, [table])[1].tip_link == f'{side}_arm'
+    with pytest.raises(InputError, match='several arms of 1 joints'):
+        robot_of(urdf, None, None)
 
 
 def test_arrays_and_columns_by_name_are_a_session(arm, tmp_path):

@@ -6,7 +6,12 @@ import pytest
 from robot_descriptions import ROBOTS, Joint, arm, document, link, xarm7
 
 from remaster_ros.errors import InputError
-from remaster_ros.kinematics.arm_ends import likely_base, likely_tips
+from remaster_ros.kinematics.arm_ends import (
+    likely_base,
+    likely_tip,
+    likely_tips,
+    moving_before,
+)
 from remaster_ros.kinematics.urdf import parse_urdf
 
 
@@ -35,7 +40,7 @@ def test_a_base_without_an_arm_is_refused():
         likely_tips(model, 'link_eef')
 
 
-def test_two_arms_are_asked_for():
+def two_arms():
     arms = []
     for side in ('left', 'right'):
         links = ['base_link', f'{side}_1', f'{side}_2']
@@ -43,6 +48,80 @@ def test_two_arms_are_asked_for():
             Joint(f'{name}_joint', (0, 0, 1), (0, 0, 0), (0, 1, 0), -1, 1) for name in links[1:]
         ]
         arms += [*map(link, links[1:]), arm(joints, links)]
-    model = parse_urdf(document('two_arms', link('base_link'), *arms))
-    with pytest.raises(InputError, match=r'several arms of 2 joints .*; name the tip link'):
-        likely_tips(model, 'base_link')
+    return parse_urdf(document('two_arms', link('base_link'), *arms))
+
+
+def test_two_arms_are_asked_for():
+    message = r'several arms of 2 joints .*; name the tip link, --tip-link left_2 or right_2$'
+    with pytest.raises(InputError, match=message):
+        likely_tips(two_arms(), 'base_link')
+
+
+@pytest.mark.parametrize('side', ['left', 'right'])
+def test_of_two_arms_it_is_the_one_whose_joints_are_named(side):
+    names = {'time', f'{side}_1_joint', f'{side}_2_joint'}
+    assert likely_tips(two_arms(), 'base_link', names) == [f'{side}_2']
+
+
+def moving(name, parent, child, kind='revolute'):
+    return (
+        f'<joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/>'
+        '<axis xyz="0 0 1"/><limit lower="-1" upper="1" effort="1" velocity="1"/></joint>'
+    )
+
+
+def tree(*joints):
+    """Return the model of (joint, parent, child, kind) each."""
+    links = dict.fromkeys(name for joint in joints for name in joint[1:3])
+    return parse_urdf(document('tree', *map(link, links), *(moving(*joint) for joint in joints)))
+
+
+FIVE = [(f'j{i}', f'l{i}', f'l{i + 1}') for i in range(5)]
+
+
+@pytest.mark.parametrize(
+    'gripper',
+    [
+        [('gripper', 'l5', 'moving_jaw')],
+        [('left_finger_joint', 'l5', 'a'), ('right_finger_joint', 'l5', 'b')],
+        # A hand whose joints are not named so: it branches.
+        [('x1', 'l5', 'a1'), ('x2', 'a1', 'a2'), ('y1', 'l5', 'b1'), ('y2', 'b1', 'b2')],
+        [('drive_joint', 'l5', 'outer_knuckle')],
+    ],
+)
+def test_the_jaws_of_a_gripper_are_no_joints_of_the_arm(gripper):
+    model = tree(*FIVE, *gripper, ('at', 'l5', 'tcp', 'fixed'))
+    assert likely_base(model) == 'l0'
+    assert set(likely_tips(model, 'l0')) == {'l5', 'tcp'}
+    assert likely_tip(model, 'l0') == 'tcp'
+
+
+def test_a_joint_that_turns_the_whole_gripper_is_one_of_the_arm():
+    model = tree(*FIVE, ('gripper_roll', 'l5', 'gripper_base'), ('jaw', 'gripper_base', 'jaw'))
+    assert likely_tips(model, 'l0') == ['gripper_base']
+
+
+def test_the_arm_on_a_lift_of_a_mobile_base_starts_behind_the_lift():
+    model = tree(
+        ('wheel_left', 'base_footprint', 'wl', 'continuous'),
+        ('wheel_right', 'base_footprint', 'wr', 'continuous'),
+        ('lift', 'base_footprint', 'torso', 'prismatic'),
+        ('pan', 'torso', 'head'),
+        ('mount', 'torso', 'l0', 'fixed'),
+        *FIVE,
+        ('finger', 'l5', 'f', 'prismatic'),
+    )
+    assert likely_base(model) == 'torso'
+    assert likely_tips(model, 'torso') == ['l5']
+    assert moving_before(model, 'torso') == ['lift']
+
+
+def test_an_arm_that_slides_in_its_midst_is_refused_by_the_joints_name():
+    model = tree(
+        ('j1', 'base', 'l1'),
+        ('j2', 'l1', 'l2'),
+        ('j3', 'l2', 'l3', 'prismatic'),
+        ('j4', 'l3', 'tool0'),
+    )
+    with pytest.raises(InputError, match=r"joint 'j3' of the arm slides, .* with 'j4'"):
+        likely_tip(model, likely_base(model))

@@ -384,8 +384,9 @@ def test_arms_without_a_closed_form_keep_all_solutions(make, errors, held, way, 
     )
     assert doubled == 0
     assert max(worst) < 2e-8
-    # Where two solutions are about to meet, one in 10,000 may be lost.
-    assert missed <= 1e-4 * total
+    # Where two solutions are about to meet, one in 10,000 may be lost. Many starts miss those to
+    # which few of them lead: of solutions with a chance of 1 in 30 a start, 0.4 %.
+    assert missed <= (1e-3 if way == 'many starts' else 1e-4) * total
 
 
 def test_what_many_starts_miss_is_estimated_by_how_often_each_was_found():
