@@ -18,12 +18,12 @@ def drawn(times, q, v, at):
     return q[i] + v[i] * s + c2 * s**2 + c3 * s**3
 
 
-def line(a, b, acceleration, chain, every_s=0.1):
-    """Return a planner's trajectory along a line, of least jerk, up to 0.95 of its limits."""
+def line(a, b, acceleration, chain, every_s=0.1, share=0.95):
+    """Return a planner's trajectory along a line, of least jerk, up to a share of its limits."""
     far = np.abs(b - a)
     # Of least jerk: largest speed 15/8, largest acceleration 10/sqrt(3).
     fast = np.max(1.875 * far / chain.velocity_limits)
-    seconds = max(fast, np.sqrt(np.max(5.7735 * far) / acceleration)) / 0.95
+    seconds = max(fast, np.sqrt(np.max(5.7735 * far) / acceleration)) / share
     n = int(np.ceil(seconds / every_s)) + 1
     t = np.linspace(0.0, seconds, n)
     s = t / seconds
