@@ -426,24 +426,6 @@ class NoiseModel:
             white -= np.repeat(less, rows.frame_size, axis=0)
         return white.reshape(values.shape)
 
-    def precisions(self, noise: Noise) -> tuple[FloatArray, FloatArray]:
-        """Return the precision of errors e of frames of one row each, without cross terms.
-
-        In the axes of `frames` it is W'W of `whitened`: Σ own e² − Σ shared (Σ e)², the inner sum
-        over the rows of a group.
-
-        Returns
-        -------
-        own
-            Of each row, 1/m², (n, 3).
-        shared
-            Of each group, 1/m², (groups, 3).
-        """
-        sigma, pose_sigma, _ = self._of_groups(noise)
-        count = self.rows.group_frames[:, None]
-        mean = 1.0 / (sigma**2 + count * pose_sigma**2)
-        return (sigma**-2.0)[self.rows.group_of_row], (sigma**-2.0 - mean) / count
-
     def _of_groups(self, noise: Noise) -> FloatArray:
         """Return sigma, pose_sigma and frame_sigma of each group and axis, m, (3, groups, 3)."""
         rows, parts = self.rows, np.ones((3, len(self.rows.group_size), 3))

@@ -95,21 +95,6 @@ def test_sums_grams_and_whitening_are_of_one_likelihood(given, split):
     assert model.freedom.sum() == 3 * len(rows)
 
 
-@pytest.mark.parametrize('split', SPLITS)
-def test_precisions_are_those_of_the_whitened_errors(split):
-    rows, reference = rows_of_two_sensors()
-    model = NoiseModel.of(rows, reference, split)
-    noise = a_noise(model)
-    vectors = np.random.default_rng(6).standard_normal((len(rows), 3))
-    white = model.whitened(vectors, noise)
-    if model.frames is not None:
-        vectors = np.einsum('nij,nj->ni', model.frames, vectors)
-    own, shared = model.precisions(noise)
-    assert shared.max() > 0.0
-    total = np.sum(own * vectors**2) - np.sum(shared * rows.group_sum(vectors) ** 2)
-    assert total == pytest.approx(np.sum(white**2), rel=1e-9)
-
-
 def test_gram_matrices_do_not_depend_on_the_blocks(monkeypatch):
     rows, reference = rows_of_two_sensors()
     model = NoiseModel.of(rows, reference, (1,))
