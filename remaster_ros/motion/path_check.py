@@ -12,6 +12,7 @@ from itertools import pairwise
 import numpy as np
 
 from remaster_ros.kinematics.serial_chain import SerialChain
+from remaster_ros.kinematics.transforms import with_z_along
 from remaster_ros.types import FloatArray
 
 PEAK_STEP_RAD = 0.02
@@ -38,7 +39,11 @@ class PointSpeeds:
     def __init__(self, chain: SerialChain, extents: Sequence[FloatArray]) -> None:
         if len(extents) != len(chain):
             raise ValueError(f'{len(extents)} bodies for {len(chain)} joints')
-        self._chain, self._extents = chain, extents
+        self._steps = [_carried(T) for T in chain.T_fixed_z[:-1]]
+        self._points = [
+            _velocities(points @ with_z_along(axis)) if len(points) else None
+            for axis, points in zip(chain.axes, extents, strict=True)
+        ]
         # The way from each joint along the links behind it to the farthest point, at full stretch.
         links = [0.0, *np.linalg.norm(chain.T_fixed[1:-1, :3, 3], axis=1)]
         origins = np.cumsum(links)
@@ -51,21 +56,22 @@ class PointSpeeds:
 
     def fastest(self, q: FloatArray, velocity: FloatArray) -> FloatArray:
         """Return the speed of the fastest point, m/s, (n,), at q and joint velocities (n, k)."""
-        frames = self._chain.frames(q)
-        axes, origins = self._chain.axes_in_base(frames), frames[..., :3, 3]
-        turn = np.cumsum(velocity[..., None] * axes, axis=-2)
-        # Each link's motion as a turn and the velocity of the point of it at the base's origin.
-        shift = np.cumsum(velocity[..., None] * np.cross(origins, axes), axis=-2)
+        # The turn and the velocity of its joint's point of each link, in its own frame with the
+        # joint's axis as Z (Featherstone, "Rigid Body Dynamics Algorithms", 2008, eq. 5.14): a
+        # fixed step is one product, a turn about Z mixes X and Y, and points stand still.
+        motion = np.zeros((len(q), 2, 3))
         fastest = np.zeros(len(q))
-        for joint, points in enumerate(self._extents):
-            if not len(points):
-                continue
-            places = points @ np.swapaxes(frames[..., joint, :3, :3], -1, -2)
-            places += origins[..., joint, None, :]
-            speeds = shift[..., joint, None, :] + np.cross(turn[..., joint, None, :], places)
-            squares = np.max(np.sum(speeds**2, axis=2), axis=1)
-            fastest = np.maximum(fastest, np.sqrt(squares))
-        return fastest
+        sines, cosines = np.sin(q), np.cos(q)
+        for joint, (step, points) in enumerate(zip(self._steps, self._points, strict=True)):
+            motion = (motion.reshape(-1, 6) @ step).reshape(-1, 2, 3)
+            s, c = sines[:, joint, None], cosines[:, joint, None]
+            x, y = motion[..., 0].copy(), motion[..., 1].copy()
+            motion[..., 0], motion[..., 1] = c * x + s * y, c * y - s * x
+            motion[:, 0, 2] += velocity[:, joint]
+            if points is not None:
+                squares = ((motion.reshape(-1, 6) @ points) ** 2).reshape(len(q), 3, -1)
+                fastest = np.maximum(fastest, np.max(np.sum(squares, axis=1), axis=1))
+        return np.sqrt(fastest)
 
     def peak_m(self, start: FloatArray, end: FloatArray) -> float:
         """Return the fastest point's peak speed where the line takes a second, m/s."""
@@ -77,6 +83,29 @@ class PointSpeeds:
     def peaks_m(self, points: FloatArray) -> tuple[float, ...]:
         """Return `peak_m` of each line of a polyline, m/s, for points (n, k), rad."""
         return tuple(self.peak_m(start, end) for start, end in pairwise(points))
+
+
+def _carried(T: FloatArray) -> FloatArray:
+    """Return what takes turn and velocity, as a row, from a frame to one fixed at T (4, 4) in it.
+
+    Its origin moves with v + w × p.
+    """
+    rotation = T[:3, :3]
+    across = np.cross(np.eye(3), T[:3, 3])
+    return np.block([[rotation, across @ rotation], [np.zeros((3, 3)), rotation]])
+
+
+def _velocities(points: FloatArray) -> FloatArray:
+    """Return what takes turn and velocity of a frame, as a row, to those of points (n, 3) in it.
+
+    Returns
+    -------
+    ndarray
+        (6, 3 n), the points' x, then y, then z.
+    """
+    across = np.cross(np.eye(3)[:, None], points)
+    by_turn = np.moveaxis(across, 1, 2).reshape(3, -1)
+    return np.vstack((by_turn, np.repeat(np.eye(3), len(points), axis=1)))
 
 
 @dataclass(frozen=True)

@@ -108,6 +108,10 @@ def _move(times: FloatArray, order: list[int]) -> bool:
 
 NOT_NEEDED = 'not needed by the design'
 NO_FREE_PATH = 'no free path'
+# Beyond the precision of the paper (Van Wyk et al., Table I: 95 % intervals of 0.005 degrees and
+# more) other errors of an arm are larger than those of its zero-offsets: a design does not spend
+# minutes on it unless told so.
+ENOUGH_RAD = float(np.radians(0.005))
 POOL_CANDIDATES = 400
 """Candidate poses that a design chooses from, besides those of the plan that it replaces."""
 MOST_CANDIDATES = 1500
@@ -138,7 +142,8 @@ class DesignSettings:
     tool_share
         See `Goal`.
     joint_std_rad, tool_std_m
-        What is to be reached; None for what the Latin hypercube's poses reach.
+        What is to be reached; None for what the Latin hypercube's poses reach, of the joints no
+        less than `ENOUGH_RAD`.
     box
         Where the tool is to be accurate; None for wherever the poses are.
     priors
@@ -238,7 +243,7 @@ def designed_plans(
     count = sum(len(pose.solutions) for pose in plan.poses)
     reference = range(count)
     goal = Goal(
-        settings.joint_std_rad or information.joint_rms(reference),
+        settings.joint_std_rad or max(information.joint_rms(reference), ENOUGH_RAD),
         settings.tool_std_m or information.tool_rms(reference),
         settings.tool_share,
     )

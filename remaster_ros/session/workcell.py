@@ -213,7 +213,8 @@ class CellPoses(msgspec.Struct, forbid_unknown_fields=True):
         0 for the joint offsets alone, 1 for the tool's error alone, between them for a mixture.
     joint_std_deg, tool_std_m
         What is to be reached: an optimal design is made for it (without, for what the Latin
-        hypercube reaches), and a collection ends where it is known to be.
+        hypercube reaches, of the joints no less than 0.005 degrees), and a collection ends where
+        it is known to be.
     tool_box
         Where the tool's error counts; without, at all candidate poses.
     """
