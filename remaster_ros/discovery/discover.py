@@ -33,7 +33,7 @@ from remaster_ros.discovery.gain import (
     pose_common_fraction,
     residuals_of,
 )
-from remaster_ros.discovery.geometry_model import GeometryModel, better_of_two, geometry_model
+from remaster_ros.discovery.geometry_model import GeometryModel, geometry_model
 from remaster_ros.discovery.guard import Unexplained, harm_of, is_harmful, nameless, unfitted
 from remaster_ros.discovery.marker_offsets import loosened, moved_markers
 from remaster_ros.discovery.omnibus import structure_left
@@ -245,8 +245,6 @@ def discover_session(
             extension=None if errors is None else extension_of(data, errors, found),
         )
     geometry = geometry_model(found, causes=measured)
-    if geometry is not None and any(effect.in_robot_model for effect in effects):
-        geometry = better_of_two(geometry, found, solution.cells, fit.theta, measured)
     thinning = None
     if len(pool) < len(found.problem.fitted):
         thinning = judge_by_others(data, found.kept, data.rows.source, empty, solution)

@@ -171,29 +171,6 @@ def geometry_model(found: Estimate, causes: Sequence[Cell] = ()) -> GeometryMode
     )
 
 
-def better_of_two(
-    geometry: GeometryModel,
-    found: Estimate,
-    cells: Sequence[Cell],
-    theta: FloatArray,
-    causes: Sequence[Cell],
-) -> GeometryModel:
-    """Return the model with lengths and tilts as fitted beside all causes, where that is better.
-
-    By themselves they take over a part of curves and compliances, which helps where poses are like
-    those fitted; fitted beside these they are the arm's own. Held-out poses decide. Cells with
-    their parameters (m,) are those of the model with all causes.
-    """
-    loaded = _loaded(_without_open_offsets(found), cells, theta, causes)
-    if loaded is None:
-        return geometry
-    shifts, turns, joint_offsets, errors = loaded
-    other = replace(
-        geometry, shifts=shifts, turns=turns, joint_offsets=joint_offsets, errors=errors
-    )
-    return other if other.held_out_m < geometry.held_out_m else geometry
-
-
 def _loaded(
     found: Estimate, cells: Sequence[Cell], theta: FloatArray, causes: Sequence[Cell]
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray] | None:
