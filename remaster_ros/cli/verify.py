@@ -56,7 +56,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Read, judge, print."""
     session, compensation = read_session(args.session), read_compensation(args.compensation)
-    _require_same_arm(session, compensation, args.session)
+    require_same_arm(session, compensation, args.session)
     found = verify(compensation.compensator, visits(session, args.session))
     warnings = _warnings(session, compensation)
     for warning in warnings:
@@ -115,7 +115,8 @@ def _wanted(session: Session, folder: Path, on: BoolArray) -> FloatArray:
     return wanted
 
 
-def _require_same_arm(session: Session, compensation: Compensation, folder: Path) -> None:
+def require_same_arm(session: Session, compensation: Compensation, folder: Path) -> None:
+    """Refuse a session of another arm, and the one that the correction was made of."""
     chain = SerialChain.from_urdf(session.urdf, session.base_link, session.tip_link)
     robot = compensation.content.robot
     for what, own, other in (

@@ -1,0 +1,248 @@
+"""Has an arm changed since its correction was measured?"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import logging
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from remaster_ros.cli.console import show
+from remaster_ros.cli.options import number
+from remaster_ros.cli.verify import require_same_arm
+from remaster_ros.compensation.checking import SMALLEST_M, Checked, Measured, judge
+from remaster_ros.compensation.file import Compensation, read_compensation
+from remaster_ros.errors import InputError
+from remaster_ros.reports.check_page import write_check_page
+from remaster_ros.session.journal import Journal
+from remaster_ros.session.reader import read_session
+from remaster_ros.types import Session
+
+FORMAT = 'remaster-check/1'
+HISTORY = 'remaster-check-history/1'
+
+log = logging.getLogger('remaster_ros')
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of ``remaster check``."""
+    parser.add_argument(
+        'session',
+        metavar='SESSION',
+        type=Path,
+        help='session folder of the check: the same eight poses each time, those that '
+        '`remaster plan --check` chooses',
+    )
+    parser.add_argument(
+        '--baseline',
+        metavar='COMPENSATION',
+        type=Path,
+        required=True,
+        help='apply/compensation.json, by which the arm was right',
+    )
+    parser.add_argument(
+        '--history',
+        metavar='FILE',
+        type=Path,
+        required=True,
+        help='all checks of this arm so far, such as arm7.jsonl; this one is added to it',
+    )
+    parser.add_argument(
+        '--smallest-mm',
+        type=number(0.001, 100.0, 'mm'),
+        default=1e3 * SMALLEST_M,
+        metavar='MM',
+        help=f'change at the tool that matters (default {1e3 * SMALLEST_M:g})',
+    )
+    parser.add_argument(
+        '--out', metavar='PAGE', type=Path, help='write a page with the trend, such as check.html'
+    )
+    parser.add_argument('--json', action='store_true', help='print what was found as JSON')
+
+
+def run(args: argparse.Namespace) -> int:
+    """Read, add to the history, judge, print."""
+    session, baseline = read_session(args.session), read_compensation(args.baseline)
+    require_same_arm(session, baseline, args.session)
+    measured = _measured(session)
+    history = Journal(args.history)
+    try:
+        if history.lost:
+            log.warning('%s', history.lost)
+        checks, names = _before(history, args.history, baseline)
+        known = [record.get('session_sha256') for record in history.records]
+        sha256 = session.observations_sha256
+        if sha256 in known:
+            if known.index(sha256) + 1 < len(known):
+                raise InputError(
+                    f'{args.session}: is in {args.history} already, as check '
+                    f'{known.index(sha256) + 1} of {len(known)}; give the newest check'
+                )
+        else:
+            try:
+                measured = measured.as_before(checks[0]) if checks else measured
+            except InputError as error:
+                raise InputError(f'{args.session}: {error}') from None
+            checks, names = [*checks, measured], [*names, args.session.name]
+            # Before it is written: what cannot be judged is no check.
+            judge(baseline.model, checks, 1e-3 * args.smallest_mm)
+            history.append(_record(measured, args.session.name, sha256, baseline))
+    finally:
+        history.close()
+    found = judge(baseline.model, checks, 1e-3 * args.smallest_mm)
+    content = content_of(found, baseline.model.chain.joint_names, names, args.smallest_mm)
+    if args.out is not None:
+        write_check_page(args.out, content, baseline.model, checks, names)
+    if args.json:
+        print(json.dumps(content))
+    else:
+        show(args.quiet, _text(content))
+        if args.out is not None:
+            show(args.quiet, f'written: {args.out}')
+    return 0
+
+
+def _measured(session: Session) -> Measured:
+    m = session.measurements
+    return Measured(
+        m.q,
+        tuple(session.sensor_names[i] for i in m.sensor.tolist()),
+        tuple(session.marker_names[i] for i in m.marker.tolist()),
+        m.position,
+    )
+
+
+def _record(one: Measured, name: str, sha256: str, baseline: Compensation) -> dict[str, Any]:
+    return {
+        'format': HISTORY,
+        'baseline_sha256': baseline.sha256,
+        'robot': baseline.content.robot.name,
+        'joints': list(baseline.model.chain.joint_names),
+        'session': name,
+        'session_sha256': sha256,
+        'q_rad': one.q.tolist(),
+        'sensor': list(one.sensor),
+        'marker': list(one.marker),
+        'position_m': one.position.tolist(),
+    }
+
+
+def _before(
+    history: Journal, path: Path, baseline: Compensation
+) -> tuple[list[Measured], list[str]]:
+    """Return the checks of a history and their names, oldest first."""
+    checks, names = [], []
+    for line, record in enumerate(history.records, 1):
+        where = f'{path}, line {line}'
+        if record.get('format') != HISTORY:
+            raise InputError(f'{where}: is no check of an arm; name another file for the history')
+        if record.get('joints') != list(baseline.model.chain.joint_names):
+            raise InputError(f'{where}: is of another arm; each arm has a history of its own')
+        if record.get('baseline_sha256') != baseline.sha256:
+            raise InputError(
+                f'{where}: was compared with another baseline; a new correction begins a new '
+                'history'
+            )
+        try:
+            q, position = np.array(record['q_rad'], float), np.array(record['position_m'], float)
+            sensor, marker = tuple(record['sensor']), tuple(record['marker'])
+            names.append(str(record['session']))
+        except (KeyError, TypeError, ValueError):
+            raise InputError(f'{where}: is not whole; take another copy of the file') from None
+        rows, k = len(sensor), len(baseline.model.chain)
+        sound = q.shape == (rows, k) and position.shape == (rows, 3) and len(marker) == rows
+        known = set(sensor) <= set(baseline.model.T_R_N) and set(marker) <= set(
+            baseline.model.markers
+        )
+        if not (sound and known and np.isfinite(q).all() and np.isfinite(position).all()):
+            raise InputError(f'{where}: is not whole; take another copy of the file')
+        checks.append(Measured(q, sensor, marker, position))
+    return checks, names
+
+
+def content_of(
+    found: Checked, joint_names: tuple[str, ...], names: list[str], smallest_mm: float
+) -> dict[str, Any]:
+    """Return what was found, as it is printed as JSON; null where a number is not known."""
+
+    def known(value: float, scale: float) -> float | None:
+        return scale * float(value) if np.isfinite(value) else None
+
+    degree = float(np.degrees(1.0))
+    return {
+        'format': FORMAT,
+        'verdict': found.verdict,
+        'evidence': found.evidence,
+        'joints': [
+            {
+                'joint': name,
+                'change_deg': known(one.change_rad, degree),
+                'std_deg': known(one.std_rad, degree),
+                'change_mm': known(one.change_rad * one.lever_m, 1e3),
+                'detectable_mm': known(one.detectable_m, 1e3),
+                'evidence': one.evidence,
+            }
+            for name, one in zip(joint_names, found.joints, strict=True)
+        ],
+        'changed': [joint_names[joint] for joint in found.changed],
+        'tool_moved': found.tool_moved,
+        'since': None if found.since is None else names[found.since],
+        'moved_mm': 1e3 * found.moved_m,
+        'check_again': found.again,
+        'checks': len(names),
+        'noise': 1e3 * found.noise_m,
+        'smallest_mm': smallest_mm,
+        'text': in_words(found, joint_names, names),
+    }
+
+
+def in_words(found: Checked, joint_names: tuple[str, ...], names: list[str]) -> str:
+    """Return what was found and what to do, in sentences."""
+    unseen = [n for n, one in zip(joint_names, found.joints) if np.isnan(one.detectable_m)]
+    same = f', or the zero of {" or ".join(unseen)}, which looks the same' if unseen else ''
+    if found.verdict == 'changed':
+        alike = [joint_names[joint] for joint in found.changed]
+        who = ' or '.join([*alike, *(['the marker on the tool'] if found.tool_moved else [])])
+        several = ': these look alike in the poses of the check' if len(alike) > 1 else ''
+        size = 1e3 * abs(found.joints[found.changed[0]].change_rad)
+        size *= found.joints[found.changed[0]].lever_m
+        return (
+            f'Changed since check {names[found.since or 0]}: {who}{several}; {size:.2f} mm at the '
+            'tool. Look at it (a collision, a loose bolt, a new zero), then measure and correct '
+            'the arm again.'
+        )
+    if found.verdict == 'setup_moved' and found.tool_moved:
+        return (
+            f'The marker on the tool moved since check {names[found.since or 0]}, not the arm: '
+            'fasten it, and begin a new history.'
+        )
+    if found.verdict == 'setup_moved':
+        return (
+            f'The sensor or the base moved by {1e3 * found.moved_m:.2f} mm{same}. No other joint '
+            'has changed: the check is good for them.'
+        )
+    if found.verdict == 'unclear':
+        return 'Something may have changed: check again at once.'
+    return 'No joint has changed by more than a check can see.'
+
+
+def _text(content: dict[str, Any]) -> str:
+    lines = [f'{content["verdict"]}: {content["text"]}']
+    for one in content['joints']:
+        if one['detectable_mm'] is None:
+            lines.append(f'  {one["joint"]}: looks like a sensor that was moved; not checked')
+            continue
+        change = f'{one["change_deg"]:+.4f}'
+        std = '' if one['std_deg'] is None else f' ± {one["std_deg"]:.4f}'
+        lines.append(
+            f'  {one["joint"]}: {change}{std} deg, {one["change_mm"]:+.3f} mm at the tool; '
+            f'{one["detectable_mm"]:.2f} mm would be seen'
+        )
+    lines.append(
+        f'check {content["checks"]}; evidence {content["evidence"]:.2g} (an alarm at 100); noise '
+        f'of a reading {content["noise"]:.3f} mm'
+    )
+    return '\n'.join(lines)

@@ -1,0 +1,567 @@
+"""Has an arm changed since its correction was measured? From the same few poses, day after day.
+
+A check measures some eight poses. Where base and sensor stand is fitted again each time, and what
+a change of one joint would do beside that is compared. The correction's own error is the same in
+all checks of the same poses, so that each is compared with the checks before it, never with the
+correction alone: that difference is significant without end.
+
+Whether the mean of a series has changed, at a check that is not known, with a mean and a noise
+that are not known, is told by an e-process: its mean is at most 1 as long as nothing has changed,
+and so it ever exceeds 100 in at most one of 100 arms, however often it is looked at [1]_. Noise
+that remembers, or a season, is a change too; so an alarm also takes a change that is certainly
+larger than what matters at the tool.
+
+References
+----------
+.. [1] G. Shafer, A. Shen, N. Vereshchagin, V. Vovk, "Test martingales, Bayes factors and
+   p-values", Statistical Science, 2011.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from scipy.special import chdtri, erfc, stdtrit
+
+from remaster_ros.calibration.registration import register_points
+from remaster_ros.compensation.arm_model import ArmModel
+from remaster_ros.errors import InputError, InsufficientDataError
+from remaster_ros.kinematics.transforms import apply
+from remaster_ros.types import BoolArray, FloatArray
+
+Verdict = Literal['unchanged', 'changed', 'setup_moved', 'unclear']
+ALARM = 100.0
+"""Evidence of an alarm: at most one arm in so many ever has one without a change."""
+DOUBT = 10.0
+"""Evidence, and `BEYOND` standard deviations of a single result, that ask for another check."""
+BEYOND = 5.0
+SMALLEST_M = 1e-4
+"""What matters at the tool."""
+POWER_STD = 3.09 + 1.645
+"""Standard deviations of a change found in 95 %, at 1 % of false alarms over five joints."""
+PRIOR_STD = 4.0
+"""Of a change, in standard deviations of a result: what can be found at all. With 2 a change of 4
+std is found a check later, with 5 no sooner."""
+SEEN = 1e-3
+"""A joint whose marker moves by less than this share beside a moved sensor is not seen."""
+SAME_RAD = float(np.radians(0.5))
+"""So near are the configurations of one pose: the correction's own error changes over some
+degrees."""
+TELLING = 20.0
+"""Odds by which one explanation beats another that is named beside it where they are less."""
+
+
+@dataclass(frozen=True, eq=False)
+class Measured:
+    """A check: n readings of k joints.
+
+    Attributes
+    ----------
+    q
+        Reported joints, rad, (n, k).
+    sensor, marker
+        Names, (n,).
+    position
+        In the sensor's frame, m, (n, 3).
+    """
+
+    q: FloatArray
+    sensor: tuple[str, ...]
+    marker: tuple[str, ...]
+    position: FloatArray
+
+    def as_before(self, first: Measured) -> Measured:
+        """Return the readings of the poses of the first check, in its order.
+
+        Raises
+        ------
+        InputError
+            One of them is missing.
+        """
+        rows = []
+        for i, (sensor, marker) in enumerate(zip(first.sensor, first.marker, strict=True)):
+            apart = np.abs(self.q - first.q[i]).max(axis=1)
+            same = [
+                row
+                for row in np.flatnonzero(apart <= SAME_RAD)
+                if (self.sensor[row], self.marker[row]) == (sensor, marker)
+            ]
+            if not same:
+                joints = ', '.join(f'{angle:.2f}' for angle in np.degrees(first.q[i]))
+                raise InputError(
+                    f'no reading of {marker} by {sensor} at the joints {joints} deg, where the '
+                    'first check has one: measure the same poses, or begin another history'
+                )
+            rows.append(same)
+        position = np.array([self.position[same].mean(axis=0) for same in rows])
+        q = np.array([self.q[same].mean(axis=0) for same in rows])
+        return Measured(q, first.sensor, first.marker, position)
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """What a check says beside where its sensors stand.
+
+    Attributes
+    ----------
+    rest
+        Errors that a moved sensor cannot explain, m, (3 n,).
+    joints, tool
+        What a radian of each joint, and a metre of each marker, adds, (3 n, k), (3 n, 3 m).
+    unsure
+        What one standard deviation of each thing not known of the correction adds, (3 n, r).
+    freedom
+        How many numbers of the rest are free.
+    lever_m
+        How far a radian of each joint moves the markers, RMS, m, (k,).
+    T_R_N
+        Where each sensor stands.
+    """
+
+    rest: FloatArray
+    joints: FloatArray
+    tool: FloatArray
+    unsure: FloatArray
+    freedom: int
+    lever_m: FloatArray
+    T_R_N: Mapping[str, FloatArray]
+
+
+def seen(model: ArmModel, measured: Measured) -> Seen:
+    """Compare a check with the correction's model.
+
+    Raises
+    ------
+    InsufficientDataError
+        Too few poses to fit where the sensors stand.
+    """
+    n, k = measured.q.shape
+    state = model.state(measured.q)
+    errors, points = np.zeros((n, 3)), np.zeros((n, 3))
+    derivative = np.zeros((n, 3, len(model.parameter_names)))
+    sensors, markers = list(dict.fromkeys(measured.sensor)), list(dict.fromkeys(measured.marker))
+    frames, T_R_N = [], {}
+    for marker in markers:
+        mine = np.array([one == marker for one in measured.marker])
+        points[mine] = apply(state.tool[mine], model.markers[marker])
+    for sensor in sensors:
+        mine = np.array([one == sensor for one in measured.sensor])
+        for marker in markers:
+            both = mine & [one == marker for one in measured.marker]
+            derivative[both] = model.derivative(state, sensor, marker)[both]
+        T_R_N[sensor], _ = register_points(points[mine], measured.position[mine])
+        errors[mine] = apply(T_R_N[sensor], measured.position[mine]) - points[mine]
+        frame = np.zeros((n, 3, 6))
+        frame[mine] = rigid_motions(points[mine])
+        frames.append(frame)
+    rigid = np.concatenate(frames, axis=2).reshape(3 * n, -1)
+    basis = np.linalg.svd(rigid, full_matrices=False)
+    taken = basis[0][:, basis[1] > 1e-9 * basis[1][0]]
+    freedom = 3 * n - taken.shape[1]
+    if freedom < k:
+        raise InsufficientDataError(
+            f'{n} readings do not tell where the sensors stand and what has changed; measure '
+            'eight poses'
+        )
+
+    def rest_of(columns: FloatArray) -> FloatArray:
+        return np.asarray(columns - taken @ (taken.T @ columns))
+
+    columns = rest_of(derivative.reshape(3 * n, -1))
+    return Seen(
+        rest_of(errors.ravel()),
+        columns[:, :k],
+        np.concatenate([columns[:, model.marker(marker)] for marker in markers], axis=1),
+        model.widening * (columns @ model.root.T),
+        freedom,
+        np.sqrt(np.mean(np.sum(derivative[:, :, :k] ** 2, axis=1), axis=0)),
+        T_R_N,
+    )
+
+
+def rigid_motions(points: FloatArray) -> FloatArray:
+    """Return what shifts and turns of a sensor do to points (n, 3), (n, 3, 6)."""
+    turns = np.cross(np.eye(3), points[:, None, :]).swapaxes(1, 2)
+    shifts = np.broadcast_to(np.eye(3), turns.shape)
+    return np.concatenate((shifts, turns), axis=2)
+
+
+def detectable_m(joints: FloatArray, lever_m: FloatArray, noise_m: float) -> FloatArray:
+    """Return the smallest change of each joint that one check finds, m at the tool, (k,).
+
+    NaN where a moved sensor looks the same.
+    """
+    information = np.sum(joints**2, axis=0)
+    is_seen = _is_seen(joints, lever_m)
+    sizes = np.full(len(lever_m), np.nan)
+    sizes[is_seen] = POWER_STD * noise_m * (lever_m / np.sqrt(information))[is_seen]
+    return sizes
+
+
+def _is_seen(joints: FloatArray, lever_m: FloatArray) -> BoolArray:
+    """Whether a joint does more than a moved sensor would, (k,)."""
+    found: BoolArray = np.sum(joints**2, axis=0) > SEEN**2 * lever_m**2 * (len(joints) / 3)
+    return found
+
+
+@dataclass(frozen=True)
+class Change:
+    """Whether the mean of a series of T results has changed.
+
+    Attributes
+    ----------
+    evidence
+        Of the e-process.
+    at
+        The first result after the change; 0 where there is none to name.
+    size, std, half
+        Of the change where it is most likely, its standard deviation and half of its 95 %
+        interval; infinite where two results do not tell.
+    """
+
+    evidence: float
+    at: int
+    size: float
+    std: float
+    half: float
+
+
+def bayes_factors(x: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return for each place of a change the odds for it, its size, and the scatter that it leaves.
+
+    Both means and the variance are integrated out under their invariant priors; the size of the
+    change has a normal prior of `PRIOR_STD` standard deviations of a result.
+
+    Parameters
+    ----------
+    x
+        Series, (…, T), T >= 2.
+
+    Returns
+    -------
+    odds, size, left
+        (…, T - 1) each, for a change before result 1, 2, …; `left` is a sum of squares.
+    """
+    T = x.shape[-1]
+    j = np.arange(1.0, T)
+    before = np.cumsum(x, axis=-1)[..., :-1] / j
+    mean = x.mean(axis=-1, keepdims=True)
+    size = (mean * T - before * j) / (T - j) - before
+    squares = np.sum((x - mean) ** 2, axis=-1, keepdims=True)
+    v = 1.0 / j + 1.0 / (T - j)
+    wide = v + PRIOR_STD**2
+    # Equal results to the last bit have no scatter, and no change.
+    share = np.divide(size**2, squares, out=np.zeros_like(size), where=squares > 0.0)
+    left = np.maximum(squares - size**2 / v, 0.0)
+    kept = np.maximum(1.0 - share * (1.0 / v - 1.0 / wide), 1e-300)
+    return np.sqrt(v / wide) * kept ** (-0.5 * (T - 1.0)), size, left
+
+
+def evidence(x: FloatArray) -> FloatArray:
+    """Return the e-process of series (…, T): the mean of the odds for a change at each place.
+
+    The place has the prior 1 / (j (j + 1)); 1 / T is left for a change that is still to come.
+    """
+    T = x.shape[-1]
+    if T < 2:
+        return np.ones(x.shape[:-1])
+    j = np.arange(1.0, T)
+    odds = bayes_factors(x)[0]
+    return np.asarray(1.0 / T + np.sum(odds / (j * (j + 1.0)), axis=-1))
+
+
+def change(x: FloatArray) -> Change:
+    """Return where a series (T,) has changed, and by how much."""
+    T = len(x)
+    if T < 2:
+        return Change(1.0, 0, float(x[-1]), np.inf, np.inf)
+    odds, sizes, left = bayes_factors(x)
+    j = np.arange(1.0, T)
+    best = int(np.argmax(odds / (j * (j + 1.0))))
+    if T < 3:
+        return Change(float(evidence(x)), best + 1, float(sizes[best]), np.inf, np.inf)
+    v = 1.0 / j[best] + 1.0 / (T - j[best])
+    std = float(np.sqrt(v * left[best] / (T - 2.0)))
+    half = float(stdtrit(T - 2.0, 0.975)) * std
+    return Change(float(evidence(x)), best + 1, float(sizes[best]), std, half)
+
+
+@dataclass(frozen=True)
+class JointCheck:
+    """What is known of one joint; angles in rad, of the tool in m.
+
+    All but the lever is NaN where a moved sensor looks the same, and the evidence 1.
+    """
+
+    change_rad: float
+    std_rad: float
+    detectable_m: float
+    lever_m: float
+    evidence: float
+
+
+@dataclass(frozen=True)
+class Checked:
+    """What all checks so far say.
+
+    Attributes
+    ----------
+    verdict
+        Of the newest check, with all before it.
+    evidence
+        Mean over joints and markers, of the e-process.
+    joints
+        One of each joint, base to tip.
+    changed
+        Indices of the joints that the change may be of; they look alike where there are several.
+    since
+        Index of the first check after the change; None where none is named.
+    tool_moved
+        A marker moved on the tool, rather than a joint.
+    moved_m
+        By how much the sensors see the markers elsewhere than in the check before (the session
+        of the correction, for the first), RMS.
+    again
+        Whether to check again at once.
+    noise_m
+        Of a reading, per axis.
+    """
+
+    verdict: Verdict
+    evidence: float
+    joints: tuple[JointCheck, ...]
+    changed: tuple[int, ...]
+    since: int | None
+    tool_moved: bool
+    moved_m: float
+    again: bool
+    noise_m: float
+
+
+def judge(model: ArmModel, checks: Sequence[Measured], smallest_m: float = SMALLEST_M) -> Checked:
+    """Judge the newest of an arm's checks.
+
+    Parameters
+    ----------
+    model
+        Of the correction.
+    checks
+        Of the same poses, oldest first; see `Measured.as_before`.
+    smallest_m
+        Changes of the tool that matter.
+    """
+    looks = [seen(model, one) for one in checks]
+    last, T = looks[-1], len(looks)
+    levers = last.lever_m
+    information = np.sum(last.joints**2, axis=0)
+    is_seen = _is_seen(last.joints, levers)
+    x_m = _series(looks)
+    counts = np.concatenate((is_seen, np.ones(last.tool.shape[1], bool)))
+    found = [change(x_m[:, i]) for i in range(x_m.shape[1])]
+    total = float(np.mean([one.evidence for one, counted in zip(found, counts) if counted]))
+    best = max(np.flatnonzero(counts), key=lambda i: found[i].evidence)
+    at = found[best].at
+    noise = _noise(looks, at if total > DOUBT else 0)
+    std = noise / np.sqrt(np.where(is_seen, information, np.inf))
+    smallest = detectable_m(last.joints, levers, noise)
+    before = looks[-2].T_R_N if T > 1 else model.T_R_N
+    moved, moved_is = _moved(before, last, checks[-1], noise, smallest_m)
+    clear = abs(found[best].size) - found[best].half > smallest_m
+    small = abs(found[best].size) + found[best].half < smallest_m
+    single = _single(looks, x_m, counts, is_seen)
+    verdict: Verdict = 'setup_moved' if moved_is else 'unchanged'
+    named: tuple[int, ...] = ()
+    tool = False
+    again = False
+    if total >= ALARM and clear:
+        named, tool = _named(looks, at, noise, is_seen)
+        verdict = 'setup_moved' if tool and not named else 'changed'
+    elif (total > DOUBT and not small) or single:
+        verdict, again = 'unclear', True
+    return Checked(
+        verdict,
+        total,
+        tuple(
+            JointCheck(
+                found[i].size / levers[i] if is_seen[i] else np.nan,
+                (found[i].std / levers[i] if T > 2 else float(std[i])) if is_seen[i] else np.nan,
+                float(smallest[i]),
+                float(levers[i]),
+                found[i].evidence if is_seen[i] else 1.0,
+            )
+            for i in range(len(levers))
+        ),
+        named,
+        at if verdict in ('changed', 'setup_moved') and (named or tool) else None,
+        tool,
+        moved,
+        again,
+        noise,
+    )
+
+
+def series_m(model: ArmModel, checks: Sequence[Measured]) -> FloatArray:
+    """Return what each check says of each joint, at the tool, m, (T, k)."""
+    return _series([seen(model, one) for one in checks])[:, : model.joints]
+
+
+def _series(looks: Sequence[Seen]) -> FloatArray:
+    """Return results of joints, where each alone has changed, and of markers, m, (T, k + 3 m)."""
+    rows = [
+        (*(_alone(one.joints, one.rest) * one.lever_m), *np.linalg.lstsq(one.tool, one.rest)[0])
+        for one in looks
+    ]
+    return np.array(rows)
+
+
+def _alone(columns: FloatArray, rest: FloatArray) -> FloatArray:
+    """Return the size of each column where it alone explains the rest; 0 of one that is 0."""
+    squares = np.sum(columns**2, axis=0)
+    return np.divide(columns.T @ rest, squares, out=np.zeros_like(squares), where=squares > 0.0)
+
+
+def _noise(looks: Sequence[Seen], at: int) -> float:
+    """Return the noise of a reading per axis, m: the scatter of checks without a change at one.
+
+    Of a single check it is what the correction leaves, its own error included.
+    """
+    rests, freedom = np.array([one.rest for one in looks]), looks[-1].freedom
+    parts = [part for part in (rests[:at], rests[at:]) if len(part)]
+    squares = sum(float(np.sum((part - part.mean(axis=0)) ** 2)) for part in parts)
+    if len(rests) == len(parts):
+        return float(np.sqrt(np.sum(rests**2) / len(rests) / freedom))
+    return float(np.sqrt(squares / (len(rests) - len(parts)) / freedom))
+
+
+def _moved(
+    before: Mapping[str, FloatArray],
+    last: Seen,
+    measured: Measured,
+    noise: float,
+    smallest_m: float,
+) -> tuple[float, bool]:
+    """Return by how much the sensors see the markers elsewhere, RMS, m, and whether they moved."""
+    shift = np.zeros_like(measured.position)
+    for sensor, T in last.T_R_N.items():
+        mine = np.array([one == sensor for one in measured.sensor])
+        place = measured.position[mine]
+        shift[mine] = apply(T, place) - apply(before.get(sensor, T), place)
+    squares, size = float(np.sum(shift**2)), float(np.sqrt(np.mean(np.sum(shift**2, axis=1))))
+    # Two fits of six numbers a sensor each, with the noise of the readings.
+    limit = float(chdtri(6.0 * len(last.T_R_N), erfc(BEYOND / np.sqrt(2.0))))
+    return size, size > smallest_m and squares > 2.0 * noise**2 * limit
+
+
+def _single(looks: Sequence[Seen], x_m: FloatArray, counts: BoolArray, is_seen: BoolArray) -> bool:
+    """Whether the newest result is far from those before it, or the first from the correction."""
+    last, T = looks[-1], len(looks)
+    if T > 3:
+        std = x_m[:-1].std(axis=0, ddof=1) * np.sqrt(1.0 + 1.0 / (T - 1.0))
+        off = np.abs(x_m[-1] - x_m[:-1].mean(axis=0)) / np.where(std > 0.0, std, np.inf)
+        return bool(np.any(off[counts] > BEYOND))
+    # Too few for a scatter: what one joint, or a marker, leaves of the difference is the noise.
+    step = last.rest - (np.mean([one.rest for one in looks[:-1]], axis=0) if T > 1 else 0.0)
+    squares = np.where(is_seen, np.sum(last.joints**2, axis=0), np.inf)
+    size = last.joints.T @ step / squares
+    left = np.maximum(step @ step - size**2 * squares, 0.0) / (last.freedom - 1)
+    variance = left / squares
+    if T < 2:
+        variance += np.sum((last.joints.T @ last.unsure / squares[:, None]) ** 2, axis=1)
+    if np.any(size[is_seen] ** 2 > BEYOND**2 * variance[is_seen]):
+        return True
+    moved = last.tool @ np.linalg.lstsq(last.tool, step)[0]
+    count = last.tool.shape[1]
+    left_of_all = float(np.sum((step - moved) ** 2)) / (last.freedom - count)
+    return T > 1 and float(moved @ moved) > BEYOND**2 * count * left_of_all
+
+
+def _named(
+    looks: Sequence[Seen], at: int, noise: float, is_seen: BoolArray
+) -> tuple[tuple[int, ...], bool]:
+    """Return the joints that a change may be of, and whether it may be a marker's."""
+    rests = np.array([one.rest for one in looks])
+    step = rests[at:].mean(axis=0) - rests[:at].mean(axis=0)
+    variance = noise**2 * (1.0 / at + 1.0 / (len(looks) - at))
+    last = looks[-1]
+    squares = np.where(is_seen, np.sum(last.joints**2, axis=0), np.inf)
+    gains = 0.5 * (last.joints.T @ step) ** 2 / squares / variance
+    shift = np.linalg.lstsq(last.tool, step)[0]
+    # Two more numbers explain more by chance: Schwarz's price of them.
+    tool = 0.5 * float(np.sum((last.tool @ shift) ** 2)) / variance - np.log(len(step))
+    top = max(float(gains.max()), tool)
+    named = np.flatnonzero(gains > top - np.log(TELLING))
+    return tuple(int(one) for one in named), bool(tool > top - np.log(TELLING))
+
+
+def chosen_poses(
+    model: ArmModel,
+    q: FloatArray,
+    sensor: str,
+    marker: str,
+    count: int,
+    rng: np.random.Generator,
+) -> tuple[FloatArray, FloatArray]:
+    """Choose the configurations in which the smallest change of any joint is seen best.
+
+    Configurations are exchanged one by one, as long as the least information on a joint, divided
+    by the square of its lever, grows.
+
+    Parameters
+    ----------
+    q
+        To choose from, rad, (c, k), c >= count.
+    sensor, marker
+        What is measured by what.
+    count
+        How many.
+    rng
+        Draws the first ones, of five tries.
+
+    Returns
+    -------
+    rows, sizes
+        Of `q`, (count,); the smallest change of each joint that is found with a noise of 1 m per
+        axis, m at the tool, (k,), NaN where a moved sensor looks the same.
+    """
+    k = q.shape[1]
+    state = model.state(q)
+    D = model.derivative(state, sensor, marker)[:, :, :k]
+    points = apply(state.tool, model.markers[marker])
+    F = rigid_motions(points)
+    levers = np.sqrt(np.mean(np.sum(D**2, axis=1), axis=0))
+    DD = np.sum(D**2, axis=1)
+    FD, FF = np.swapaxes(F, 1, 2) @ D, np.swapaxes(F, 1, 2) @ F
+
+    def information(dd: FloatArray, fd: FloatArray, ff: FloatArray) -> FloatArray:
+        taken = np.einsum('...ij,...ij->...j', fd, np.linalg.solve(ff, fd))
+        return np.asarray(np.maximum(dd - taken, 0.0) / levers**2)
+
+    everything = information(DD.sum(axis=0), FD.sum(axis=0), FF.sum(axis=0))
+    able = everything > SEEN**2 * 3 * len(q)
+    ridge = 1e-9 * np.eye(6)
+    best, score = np.arange(count), -1.0
+    for _ in range(5):
+        rows = rng.choice(len(q), count, replace=False)
+        value = -1.0
+        while True:
+            before = value
+            for slot in range(count):
+                others = np.delete(rows, slot)
+                least = information(
+                    DD[others].sum(axis=0) + DD,
+                    FD[others].sum(axis=0) + FD,
+                    FF[others].sum(axis=0) + FF + ridge,
+                )[:, able].min(axis=1)
+                least[others] = -1.0
+                rows[slot], value = int(np.argmax(least)), float(least.max())
+            if value <= before * (1.0 + 1e-6):
+                break
+        if value > score:
+            best, score = rows.copy(), value
+    ff = FF[best].sum(axis=0) + ridge
+    found = information(DD[best].sum(axis=0), FD[best].sum(axis=0), ff)
+    sizes = np.where(able, POWER_STD / np.sqrt(np.where(able, found, 1.0)), np.nan)
+    return np.sort(best), sizes

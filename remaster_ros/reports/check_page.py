@@ -1,0 +1,81 @@
+"""The checks of an arm on a page: what they say, and the trend of each joint."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from remaster_ros.compensation.checking import Measured, series_m
+from remaster_ros.reports.pages import inlined, page
+from remaster_ros.session.files import write_atomically
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from remaster_ros.compensation.arm_model import ArmModel
+
+Trend = tuple[dict[str, Any], Any, list[str]]
+
+
+def write_check_page(
+    path: Path,
+    content: dict[str, Any],
+    model: ArmModel,
+    checks: Sequence[Measured],
+    names: list[str],
+) -> None:
+    """Write the page.
+
+    Parameters
+    ----------
+    content
+        As of ``remaster check --json``.
+    model
+        Of the baseline.
+    checks, names
+        All so far, oldest first.
+
+    Raises
+    ------
+    InputError
+        It cannot be written.
+    """
+    from remaster_ros.reports.figures import as_svg
+
+    trend: Trend = content, series_m(model, checks), names
+    drawing = as_svg({'trend': _draw}, trend)['trend']
+    html = page('check.html.jinja', check=content, names=names, trend=inlined('trend', drawing))
+    write_atomically(path, html)
+
+
+def _draw(trend: Trend) -> Figure:
+    """Draw each joint's results over the checks, m at the tool, mm."""
+    from matplotlib.figure import Figure
+    from matplotlib.ticker import MaxNLocator
+
+    from remaster_ros.reports.figures import AFTER, BEFORE, GRID, WIDTH_IN
+
+    content, x_m, names = trend
+    shown = [i for i, one in enumerate(content['joints']) if one['detectable_mm'] is not None]
+    figure = Figure(figsize=(WIDTH_IN, 1.25 * len(shown) + 0.4), layout='constrained')
+    axes = figure.subplots(len(shown), 1, sharex=True, squeeze=False)[:, 0]
+    numbers = np.arange(1, len(names) + 1)
+    for ax, i in zip(axes, shown, strict=True):
+        one = content['joints'][i]
+        is_it = one['joint'] in content['changed']
+        values = 1e3 * x_m[:, i]
+        ax.axhspan(-content['smallest_mm'], content['smallest_mm'], color=GRID, alpha=0.5, lw=0)
+        ax.plot(numbers, values, 'o-', color=BEFORE if is_it else AFTER, ms=3.0, lw=0.8)
+        if content['since'] in names:
+            ax.axvline(names.index(content['since']) + 0.5, color=BEFORE, lw=0.9, ls='--')
+        ax.set_title(one['joint'] + (': changed' if is_it else ''))
+        ax.set_ylabel('mm')
+        ax.margins(x=0.02)
+    axes[-1].xaxis.set_major_locator(MaxNLocator(integer=True))
+    figure.supxlabel(
+        'check; change at the tool against the baseline, shaded: what does not matter', fontsize=8
+    )
+    return figure
