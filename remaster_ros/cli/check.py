@@ -95,7 +95,7 @@ def run(args: argparse.Namespace) -> int:
     found = judge(baseline.model, checks, 1e-3 * args.smallest_mm)
     content = content_of(found, baseline.model.chain.joint_names, names, args.smallest_mm)
     if args.out is not None:
-        write_check_page(args.out, content, baseline.model, checks, names)
+        write_check_page(args.out, content, found.series_m, names)
     if args.json:
         print(json.dumps(content))
     else:

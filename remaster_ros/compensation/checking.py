@@ -20,7 +20,7 @@ References
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -328,6 +328,9 @@ class Checked:
         Whether to check again at once.
     noise_m
         Of a reading, per axis.
+    series_m
+        What each check says of each joint, at the tool, m, (T, k): where it alone has changed, or
+        beside what is named.
     """
 
     verdict: Verdict
@@ -339,6 +342,7 @@ class Checked:
     moved_m: float
     again: bool
     noise_m: float
+    series_m: FloatArray
 
 
 def judge(model: ArmModel, checks: Sequence[Measured], smallest_m: float = SMALLEST_M) -> Checked:
@@ -381,6 +385,13 @@ def judge(model: ArmModel, checks: Sequence[Measured], smallest_m: float = SMALL
         verdict = 'setup_moved' if tool and not named else 'changed'
     elif (total > DOUBT and not small) or single:
         verdict, again = 'unclear', True
+    if named or tool:
+        # What has changed is taken out of the others, which would show a part of it.
+        taken = last.joints[:, list(named[:1])] if named else last.tool
+        others = _series([_without(one, taken) for one in looks])
+        kept = np.isin(np.arange(x_m.shape[1]), named[:1])
+        x_m = np.where(kept, x_m, others)
+        found = [change(x_m[:, i]) for i in range(x_m.shape[1])]
     return Checked(
         verdict,
         total,
@@ -400,12 +411,18 @@ def judge(model: ArmModel, checks: Sequence[Measured], smallest_m: float = SMALL
         moved,
         again,
         noise,
+        x_m[:, : len(levers)],
     )
 
 
-def series_m(model: ArmModel, checks: Sequence[Measured]) -> FloatArray:
-    """Return what each check says of each joint, at the tool, m, (T, k)."""
-    return _series([seen(model, one) for one in checks])[:, : model.joints]
+def _without(one: Seen, taken: FloatArray) -> Seen:
+    """Return a check in which what some columns explain is not seen."""
+    basis = np.linalg.qr(taken)[0]
+
+    def rest_of(columns: FloatArray) -> FloatArray:
+        return np.asarray(columns - basis @ (basis.T @ columns))
+
+    return replace(one, rest=rest_of(one.rest), joints=rest_of(one.joints), tool=rest_of(one.tool))
 
 
 def _series(looks: Sequence[Seen]) -> FloatArray:
@@ -418,9 +435,10 @@ def _series(looks: Sequence[Seen]) -> FloatArray:
 
 
 def _alone(columns: FloatArray, rest: FloatArray) -> FloatArray:
-    """Return the size of each column where it alone explains the rest; 0 of one that is 0."""
+    """Return the size of each column where it alone explains the rest; 0 where it is rounding."""
     squares = np.sum(columns**2, axis=0)
-    return np.divide(columns.T @ rest, squares, out=np.zeros_like(squares), where=squares > 0.0)
+    is_any = squares > 1e-18 * np.max(squares)
+    return np.divide(columns.T @ rest, squares, out=np.zeros_like(squares), where=is_any)
 
 
 def _noise(looks: Sequence[Seen], at: int) -> float:
@@ -459,18 +477,24 @@ def _single(looks: Sequence[Seen], x_m: FloatArray, counts: BoolArray, is_seen: 
     """Whether the newest result is far from those before it, or the first from the correction."""
     last, T = looks[-1], len(looks)
     if T > 3:
-        std = x_m[:-1].std(axis=0, ddof=1) * np.sqrt(1.0 + 1.0 / (T - 1.0))
-        off = np.abs(x_m[-1] - x_m[:-1].mean(axis=0)) / np.where(std > 0.0, std, np.inf)
-        return bool(np.any(off[counts] > BEYOND))
+        # Of few checks the scatter may be small by chance, but not below the noise of a reading.
+        scatter = x_m[:-1].std(axis=0, ddof=1)
+        squares = np.where(is_seen, np.sum(last.joints**2, axis=0), np.inf)
+        of_tool = np.sqrt(np.diag(np.linalg.inv(last.tool.T @ last.tool)))
+        floor = _noise(looks[:-1], 0) * np.concatenate((last.lever_m / np.sqrt(squares), of_tool))
+        std = np.maximum(scatter, floor) * np.sqrt(1.0 + 1.0 / (T - 1.0))
+        off = np.abs(x_m[-1] - x_m[:-1].mean(axis=0))
+        return bool(np.any(off[counts] > BEYOND * std[counts]))
     # Too few for a scatter: what one joint, or a marker, leaves of the difference is the noise.
     step = last.rest - (np.mean([one.rest for one in looks[:-1]], axis=0) if T > 1 else 0.0)
-    squares = np.where(is_seen, np.sum(last.joints**2, axis=0), np.inf)
-    size = last.joints.T @ step / squares
+    joints = last.joints[:, is_seen]
+    squares = np.sum(joints**2, axis=0)
+    size = joints.T @ step / squares
     left = np.maximum(step @ step - size**2 * squares, 0.0) / (last.freedom - 1)
     variance = left / squares
     if T < 2:
-        variance += np.sum((last.joints.T @ last.unsure / squares[:, None]) ** 2, axis=1)
-    if np.any(size[is_seen] ** 2 > BEYOND**2 * variance[is_seen]):
+        variance += np.sum((joints.T @ last.unsure / squares[:, None]) ** 2, axis=1)
+    if np.any(size**2 > BEYOND**2 * variance):
         return True
     moved = last.tool @ np.linalg.lstsq(last.tool, step)[0]
     count = last.tool.shape[1]

@@ -2,29 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from remaster_ros.compensation.checking import Measured, series_m
 from remaster_ros.reports.pages import inlined, page
 from remaster_ros.session.files import write_atomically
+from remaster_ros.types import FloatArray
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from remaster_ros.compensation.arm_model import ArmModel
-
-Trend = tuple[dict[str, Any], Any, list[str]]
+Trend = tuple[dict[str, Any], FloatArray, list[str]]
 
 
 def write_check_page(
     path: Path,
     content: dict[str, Any],
-    model: ArmModel,
-    checks: Sequence[Measured],
+    series_m: FloatArray,
     names: list[str],
 ) -> None:
     """Write the page.
@@ -33,10 +29,10 @@ def write_check_page(
     ----------
     content
         As of ``remaster check --json``.
-    model
-        Of the baseline.
-    checks, names
-        All so far, oldest first.
+    series_m
+        What each check says of each joint, at the tool, m, (T, k).
+    names
+        Of the checks, oldest first.
 
     Raises
     ------
@@ -45,7 +41,7 @@ def write_check_page(
     """
     from remaster_ros.reports.figures import as_svg
 
-    trend: Trend = content, series_m(model, checks), names
+    trend: Trend = content, series_m, names
     drawing = as_svg({'trend': _draw}, trend)['trend']
     html = page('check.html.jinja', check=content, names=names, trend=inlined('trend', drawing))
     write_atomically(path, html)
@@ -56,7 +52,7 @@ def _draw(trend: Trend) -> Figure:
     from matplotlib.figure import Figure
     from matplotlib.ticker import MaxNLocator
 
-    from remaster_ros.reports.figures import AFTER, BEFORE, GRID, WIDTH_IN
+    from remaster_ros.reports.figures import AFTER, BEFORE, WIDTH_IN
 
     content, x_m, names = trend
     shown = [i for i, one in enumerate(content['joints']) if one['detectable_mm'] is not None]
@@ -67,7 +63,7 @@ def _draw(trend: Trend) -> Figure:
         one = content['joints'][i]
         is_it = one['joint'] in content['changed']
         values = 1e3 * x_m[:, i]
-        ax.axhspan(-content['smallest_mm'], content['smallest_mm'], color=GRID, alpha=0.5, lw=0)
+        ax.axhspan(-content['smallest_mm'], content['smallest_mm'], color=AFTER, alpha=0.12, lw=0)
         ax.plot(numbers, values, 'o-', color=BEFORE if is_it else AFTER, ms=3.0, lw=0.8)
         if content['since'] in names:
             ax.axvline(names.index(content['since']) + 0.5, color=BEFORE, lw=0.9, ls='--')

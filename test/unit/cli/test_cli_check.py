@@ -1,0 +1,127 @@
+"""``remaster check``: the history, what it refuses, and what is printed."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from checked_arms import CheckedArm
+from compensation_files import save
+from hidden_tours import robot
+
+from remaster_ros.cli.main import main
+from remaster_ros.compensation.checking import Measured
+from remaster_ros.session.reader import write_session
+from remaster_ros.types import Measurements, Session
+
+
+def write(folder: Path, one: Measured) -> Path:
+    """Write a check as a session."""
+    rows = len(one.q)
+    m = replace(
+        Measurements.empty(one.q.shape[1]),
+        observation=np.arange(rows),
+        pose=np.arange(rows),
+        configuration=np.arange(rows),
+        is_validation=np.zeros(rows, bool),
+        stamp_s=np.arange(float(rows)),
+        sensor=np.zeros(rows, np.int64),
+        marker=np.zeros(rows, np.int64),
+        q=one.q,
+        from_q=np.full_like(one.q, np.nan),
+        position=one.position,
+        std=np.full((rows, 3), np.nan),
+        samples=np.full(rows, -1),
+        temperature_c=np.full(rows, np.nan),
+    )
+    markers = {'sir': np.array([0.1, 0.0, 0.02])}
+    write_session(
+        folder, Session(robot('iiwa7'), 'base_link', 'tool', markers, {'mocap': 'sir'}, m)
+    )
+    return folder
+
+
+@pytest.fixture
+def arm():
+    return CheckedArm(21)
+
+
+@pytest.fixture
+def run(tmp_path, arm, capsys):
+    """Return a function that checks a session, and what it prints as JSON."""
+    baseline = save(tmp_path, arm.found, robot('iiwa7'))
+
+    def check(folder, *more, status=0, history='arm.jsonl'):
+        given = ['--baseline', str(baseline), '--history', str(tmp_path / history), '--json']
+        assert main(['check', str(folder), *given, *more]) == status
+        done = capsys.readouterr()
+        return json.loads(done.out) if status == 0 else done.err
+
+    return check
+
+
+def test_day_by_day_until_a_joint_has_changed(run, arm, tmp_path, capsys):
+    for day in range(12):
+        found = run(write(tmp_path / f'day{day}', arm.check()))
+        assert found['format'] == 'remaster-check/1'
+        assert found['verdict'] == 'unchanged', found
+        assert found['checks'] == day + 1
+    assert [one['detectable_mm'] is None for one in found['joints']] == [True, *[False] * 6]
+    changed = arm.joint(3, 5e-4)
+    for day in range(12, 16):
+        found = run(write(tmp_path / f'day{day}', arm.check(changed)))
+    assert found['verdict'] == 'changed'
+    assert found['changed'] == ['joint_4']
+    assert found['since'] == 'day12'
+    assert abs(found['joints'][3]['change_mm']) == pytest.approx(0.5, abs=0.1)
+    page = tmp_path / 'check.html'
+    # The same session again is the same check: it is judged, not added.
+    again = run(tmp_path / 'day15', '--out', str(page))
+    assert again == found
+    assert 'joint_4: changed' in page.read_text(encoding='utf-8')
+    assert 'already, as check 1 of 16' in run(tmp_path / 'day0', status=2)
+    args = ['check', str(tmp_path / 'day15'), '--history', str(tmp_path / 'arm.jsonl')]
+    assert main([*args, '--baseline', str(tmp_path / 'compensation.json')]) == 0
+    text = capsys.readouterr().out
+    assert 'changed: Changed since check day12: joint_4' in text
+    assert 'joint_1: looks like a sensor that was moved' in text
+
+
+def test_a_torn_line_is_dropped_and_said(run, arm, tmp_path, caplog):
+    run(write(tmp_path / 'day0', arm.check()))
+    history = tmp_path / 'arm.jsonl'
+    history.write_bytes(history.read_bytes() + b'{"format": "remaster-ch')
+    assert run(write(tmp_path / 'day1', arm.check()))['checks'] == 2
+    assert 'cut off while being written are dropped' in caplog.text
+
+
+def test_what_is_refused_leaves_the_history_as_it_was(run, arm, tmp_path):
+    first = arm.check()
+    run(write(tmp_path / 'day0', first))
+    history = tmp_path / 'arm.jsonl'
+    before = history.read_bytes()
+    short = Measured(first.q[1:], first.sensor[1:], first.marker[1:], first.position[1:])
+    error = run(write(tmp_path / 'short', short), status=2)
+    assert 'day' not in error
+    assert 'where the first check has one: measure the same poses' in error
+    few = Measured(first.q[:2], first.sensor[:2], first.marker[:2], first.position[:2])
+    assert 'measure' in run(write(tmp_path / 'few', few), status=1, history='other.jsonl')
+    assert history.read_bytes() == before
+    (tmp_path / 'note.jsonl').write_text('no journal\n')
+    other = write(tmp_path / 'day1', arm.check())
+    assert run(other, history='note.jsonl')['checks'] == 1
+
+
+def test_another_arm_and_another_baseline_are_refused(run, arm, tmp_path, capsys):
+    folder = write(tmp_path / 'day0', arm.check())
+    run(folder)
+    other = tmp_path / 'other'
+    other.mkdir()
+    model = replace(arm.found, joint_offsets=arm.found.joint_offsets + 1e-3)
+    baseline = save(other, model, robot('iiwa7'))
+    args = ['check', str(folder), '--history', str(tmp_path / 'arm.jsonl'), '--baseline']
+    assert main([*args, str(baseline)]) == 2
+    assert 'was compared with another baseline' in capsys.readouterr().err
