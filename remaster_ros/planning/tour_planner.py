@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import combinations
@@ -84,6 +85,8 @@ def registration_tour(
 
 REGISTRATION_CANDIDATES = 12
 """Candidate poses for the three-point registration, where nothing else is stated."""
+MORE_CANDIDATES = 10 * REGISTRATION_CANDIDATES
+"""Further ones where fewer than three of these can be taken."""
 MOST_TRIES = 5
 """So often references are chosen anew where one has no free way to it."""
 
@@ -150,8 +153,20 @@ class TourPlanner:
         return REGISTRATION in self._counts
 
     def registration(self) -> Tour:
-        """Plan poses for the three-point registration, before sensors at their rough places."""
+        """Plan poses for the three-point registration, before sensors at their rough places.
+
+        Where the arm can take too few of the candidates, as one whose limits are narrow, more are
+        drawn.
+        """
         plan = self._plan(REGISTRATION, self.scene.rough_R)
+        if len(plan.poses) < 3:
+            rng = np.random.default_rng([self._seed, *b'register'])
+            more = self.scene.plan(MORE_CANDIDATES, self.scene.rough_R, rng)
+            plan = Plan(
+                (*plan.poses, *more.poses),
+                dict(Counter(plan.dropped) + Counter(more.dropped)),
+                dict(Counter(plan.dropped_solutions) + Counter(more.dropped_solutions)),
+            )
         markers = [sight.marker_T for sight in self.scene.sights]
         return registration_tour(self._chain, plan, markers, self.model)
 

@@ -119,6 +119,19 @@ def test_the_robot_time_is_that_of_the_whole_session():
     assert 'robot time of the whole session' in plan_text(plan, DesignSettings(optimal=True))
 
 
+def test_more_poses_are_drawn_where_too_few_can_be_taken_for_the_registration():
+    planner, _ = planner_of(CellPoses(), registration=1)
+    tour = planner.registration()
+    assert sum(tour.poses.values()) >= 3
+    again, _ = planner_of(CellPoses(), registration=1)
+    for one, other in zip(
+        tour.plans['registration'].poses,
+        again.registration().plans['registration'].poses,
+        strict=True,
+    ):
+        np.testing.assert_array_equal(one.T_R_T, other.T_R_T)
+
+
 @pytest.mark.qualify
 def test_the_time_without_looking_for_ways_is_that_of_the_plan():
     planner, start = planner_of(CellPoses(), every=25, registration=12)
