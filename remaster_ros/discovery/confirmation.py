@@ -15,7 +15,7 @@ what another choice for a cause then loses is what is told of it.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Literal
@@ -33,7 +33,7 @@ from remaster_ros.discovery.effects.base import Cell, Design
 from remaster_ros.discovery.effects.context import Context
 from remaster_ros.discovery.effects.drivers import Driver, driver_named
 from remaster_ros.discovery.effects.registry import EFFECTS
-from remaster_ros.discovery.effects.splines import Curve
+from remaster_ros.discovery.effects.splines import Curve, in_turn, start_of_turn
 from remaster_ros.discovery.evidence import solve
 from remaster_ros.discovery.gain import rms
 from remaster_ros.discovery.random_effects import Family, kinds
@@ -57,8 +57,6 @@ HALVED = float(np.log(2.0))
 # What this session tells of a parameter: it leaves at most half of what can be. Frozen at less, a
 # curve through angles that it hardly took would make the other session worse.
 HALF = 0.5
-# The same row in both sessions is told as well, but for rounding.
-ROUNDING = 1e-6
 # Causes that take less off the squared error of the other session, 0.5 % of its error, have
 # nothing to gain there: no share of that is known.
 LEAST_GAIN = 0.01
@@ -96,8 +94,7 @@ class ConfirmedCause:
     Attributes
     ----------
     rows_common
-        Rows of the other session in which this one tells what the cause does as well as in its
-        own.
+        Rows of the other session in which what drives the cause was seen here.
     carried_over
         Of what the other session could gain from this cause, beside the others fitted there, the
         share that it gains with the cause as found here: at most 1, negative where that makes it
@@ -213,9 +210,9 @@ def confirm(discovery: Discovery, session: Session, rng: np.random.Generator) ->
     why = ''
     if causes and all(cause.answer == 'open' for cause in causes):
         why = (
-            f'In {common} of the {rows} rows of the other session this one tells what all causes '
-            'do, and it shows none of them either way: nothing is confirmed. Measure the arm '
-            'where this session did.'
+            f'In {common} of the {rows} rows of the other session all that drives the causes is '
+            'in the range seen here, and it shows none of them either way: nothing is confirmed. '
+            'Measure the arm where this session did.'
         )
     with_causes = both.here.data.context.joint_offsets + both.alone.values[: both.joints]
     others = tuple(j + 1 for j, c in enumerate(best[: both.joints]) if c == 'own')
@@ -447,22 +444,10 @@ class _Both:
         return self.alone.covariance(self.here.size + np.arange(len(self.precision)))
 
     def told(self, group: Sequence[int]) -> BoolArray:
-        """Return in which rows of the other session this one tells what a cause does, (all rows,).
-
-        Where it leaves half of what could be, or no more than in one of its own rows.
-        """
-        chosen = np.ix_(*[self.where(group)] * 2)
-        spreads = self._spread[chosen], np.linalg.inv(self.precision)[chosen]
-
-        def left(context: Context) -> FloatArray:
-            parts = [self.cells[i].columns(context).displacement(context) for i in group]
-            columns = np.concatenate([np.zeros((len(context), 3, 0)), *parts], axis=2)
-            mine, all_ = (np.sum((columns @ one) * columns, axis=(1, 2)) for one in spreads)
-            return np.divide(mine, all_, out=np.zeros(len(context)), where=all_ > 0.0)
-
-        known = [left(block) for _, block in self.there.data.context.blocks()]
-        most = max(HALF**2, (1.0 + ROUNDING) * left(self.here.data.part).max())
-        return np.asarray(np.concatenate(known) <= most)
+        """Return the other session's rows with a cause's drivers as seen here, (all rows,)."""
+        context, mine = self.there.data.context, self.here.data.part
+        seen = [_seen(self.found[i], mine)(context) for i in group]
+        return np.any(seen, axis=0) if group else np.ones(len(context), dtype=bool)
 
     def error(
         self,
@@ -555,10 +540,7 @@ def _compared(
 
 
 def answer_of(evidence: Mapping[Choice, float]) -> Answer:
-    """Return what the log evidence of the choices for a cause says of it.
-
-    'open' where it could be there or not, or is there, but maybe not of that size.
-    """
+    """Return what the evidence says; 'open': there or not, or there but maybe of another size."""
     shared, own, absent = evidence['shared'], evidence['own'], evidence['absent']
     if max(own, absent) > shared + NEEDED:
         return 'changed' if own > absent + NEEDED else 'absent'
@@ -568,10 +550,7 @@ def answer_of(evidence: Mapping[Choice, float]) -> Answer:
 
 
 def _by_itself(data: Residuals, causes: Sequence[Cell]) -> tuple[Noise, list[_Weighted]]:
-    """Return a session's noise beside causes and all kinds of errors, and those of its measuring.
-
-    Each of these with the precision of its weights.
-    """
+    """Return a session's noise beside causes and all kinds of errors, and its measuring's."""
     others = [
         cell
         for effect in EFFECTS.values()
@@ -647,6 +626,34 @@ def _free(context: Context, joint: int, driver: Driver, curve: Curve) -> Design:
     return Design(joint - 1, curve.columns(driver.value(context)))
 
 
+def _seen(cell: Cell, mine: Context) -> Callable[[Context], BoolArray]:
+    """Return what tells in which rows of another session a cell's driver was seen here."""
+    driver = driver_named(cell.driver, cell.joints[-1] if cell.joints else 0)
+    if driver is not None:
+        if cell.curve is not None:
+            curve = cell.curve
+            return lambda context: curve.seen(driver.value(context))
+        values = driver.value(mine)
+        if driver.is_angle and mine.turns_over(driver.joint):
+            start = start_of_turn(values)
+            values = in_turn(values, start)
+            return lambda context: _between(in_turn(driver.value(context), start), values)
+        return lambda context: _between(driver.value(context), values)
+    if cell.driver == 'position' and cell.form != 'linear':
+        sensor = mine.sensor_names.index(cell.subject)
+        box = mine.in_sensor[mine.seen_by(sensor)]
+        return lambda context: (
+            np.all([_between(context.in_sensor[:, i], box[:, i]) for i in range(3)], axis=0)
+            | ~context.seen_by(sensor)
+        )
+    return lambda context: np.ones(len(context), dtype=bool)
+
+
+def _between(values: FloatArray, seen: FloatArray) -> BoolArray:
+    inside: BoolArray = (values >= seen.min()) & (values <= seen.max())
+    return inside
+
+
 def require_other_session(session: Session, other: Session) -> None:
     """Refuse, by InputError, other robots, sensors or markers, or a session with itself."""
     mine, theirs = Problem.of(session), Problem.of(other)
@@ -697,8 +704,8 @@ def in_words(discovery: Discovery, confirmation: Confirmation) -> list[str]:
     lines = [
         f'{1e3 * found.rms_before_m:.3f} mm RMS without the causes, {1e3 * found.rms_after_m:.3f} '
         f'mm with them as found here, {1e3 * found.rms_own_m:.3f} mm with them fitted there: '
-        f'{carried}. In {found.rows_common} of its {found.rows} rows this session tells what all '
-        'of them do; what it does not tell is fitted to the other one.'
+        f'{carried}. In {found.rows_common} of its {found.rows} rows all that drives '
+        'them was seen here; what this session does not tell is fitted to the other one.'
     ] * bool(found.effects)
     offsets = (
         f'they are {found.offsets_rms_sigmas:.1f} standard deviations apart on the average, and '
