@@ -17,7 +17,7 @@ from remaster_ros.compensation.checking import SMALLEST_M, Checked, Measured, ju
 from remaster_ros.compensation.file import Compensation, read_compensation
 from remaster_ros.errors import InputError
 from remaster_ros.reports.check_page import write_check_page
-from remaster_ros.session.journal import Journal
+from remaster_ros.session.journal import Journal, format_record
 from remaster_ros.session.reader import read_session
 from remaster_ros.types import Session
 
@@ -68,6 +68,7 @@ def run(args: argparse.Namespace) -> int:
     session, baseline = read_session(args.session), read_compensation(args.baseline)
     require_same_arm(session, baseline, args.session)
     measured = _measured(session)
+    _require_history(args.history)
     history = Journal(args.history)
     try:
         if history.lost:
@@ -128,6 +129,29 @@ def _record(one: Measured, name: str, sha256: str, baseline: Compensation) -> di
         'marker': list(one.marker),
         'position_m': one.position.tolist(),
     }
+
+
+def _require_history(path: Path) -> None:
+    """Refuse any other file before it is opened, which drops what is no whole line of a journal.
+
+    Raises
+    ------
+    InputError
+        It is neither empty nor begins as a history does.
+    """
+    start = format_record({'format': HISTORY})[: len(f'{{"format":"{HISTORY}"')]
+    try:
+        with path.open('rb') as file:
+            found = file.read(len(start))
+    except FileNotFoundError:
+        return
+    except OSError as error:
+        raise InputError(f'{path}: {error.strerror}; name a file for the history') from None
+    # The first line may itself be torn: cut off, or zeros that the file system had reserved.
+    if not start.startswith(found.rstrip(b'\0')):
+        raise InputError(
+            f'{path}, line 1: is no check of an arm; name another file for the history'
+        )
 
 
 def _before(

@@ -110,9 +110,20 @@ def test_what_is_refused_leaves_the_history_as_it_was(run, arm, tmp_path):
     few = Measured(first.q[:2], first.sensor[:2], first.marker[:2], first.position[:2])
     assert 'measure' in run(write(tmp_path / 'few', few), status=1, history='other.jsonl')
     assert history.read_bytes() == before
-    (tmp_path / 'note.jsonl').write_text('no journal\n')
-    other = write(tmp_path / 'day1', arm.check())
-    assert run(other, history='note.jsonl')['checks'] == 1
+
+
+def test_a_file_that_is_no_history_is_left_as_it_was(run, arm, tmp_path):
+    folder = write(tmp_path / 'day0', arm.check())
+    table = folder / 'observations.csv'
+    before = table.read_bytes()
+    error = run(folder, status=2, history='day0/observations.csv')
+    assert 'observations.csv, line 1: is no check of an arm' in error
+    assert table.read_bytes() == before
+    assert run(folder, status=2, history='day0').count('\n') == 1
+    # A history of which a crash has left a part of the first line alone is one.
+    for torn in (b'', b'{"form', bytes(40), b'{"format":"remaster-check-history/1","base'):
+        (tmp_path / 'torn.jsonl').write_bytes(torn)
+        assert run(folder, history='torn.jsonl')['checks'] == 1
 
 
 def test_another_arm_and_another_baseline_are_refused(run, arm, tmp_path, capsys):
