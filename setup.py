@@ -100,6 +100,8 @@ setup(
         'pdf': ['weasyprint>=62'],
         # What `make docs` builds the site with.
         'docs': ['sphinx>=8.1', 'myst-parser>=4', 'furo>=2024.8'],
+        # `remaster batch --scheduler`; on the scheduler's workers as well.
+        'cluster': ['distributed>=2024.1'],
         'natnetclient': ['NatNetClient==0.8.3'],
         # colcon, with which a test builds the package, runs pytest only where it is in this list.
         'test': [

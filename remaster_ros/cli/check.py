@@ -67,7 +67,7 @@ def run(args: argparse.Namespace) -> int:
     """Read, add to the history, judge, print."""
     session, baseline = read_session(args.session), read_compensation(args.baseline)
     require_same_arm(session, baseline, args.session)
-    measured = _measured(session)
+    measured = measured_of(session)
     _require_history(args.history)
     history = Journal(args.history)
     try:
@@ -106,7 +106,8 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _measured(session: Session) -> Measured:
+def measured_of(session: Session) -> Measured:
+    """Return the readings of a session as a check."""
     m = session.measurements
     return Measured(
         m.q,

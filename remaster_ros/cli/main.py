@@ -33,6 +33,7 @@ VERBS = {
     'export': 'Write compensation.json in the form that a controller or driver takes.',
     'verify': 'Is a correction in use, once, and what remains? From ten new poses.',
     'check': 'Has an arm changed since its correction was measured? From eight poses, day by day.',
+    'batch': 'Fit, discover and check many sessions: a row each, resumable, a page over all.',
     'recover': 'Finish the files of a session whose recorder was killed; print what was lost.',
     'watch': 'Show a collection under way on a local web page.',
     'replay': 'Make the rows of a session again from its bag, or publish the bag again (ROS).',

@@ -1,0 +1,397 @@
+"""Fit, discover and check many sessions: a row each, resumable, and a page over all.
+
+Sessions are handed out to workers that stay: processes of this computer, started anew and not
+forked, or those of a Dask scheduler. A row is known by what it was made of, so that a batch that
+was interrupted, by whatever, does the rest when it is called again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import ipaddress
+import json
+import logging
+import multiprocessing
+import os
+import urllib.parse
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from remaster_ros.cli.console import progress_bar, show
+from remaster_ros.cli.options import integer
+from remaster_ros.errors import InputError, InsufficientDataError, RemasterError
+from remaster_ros.session.files import make_folder
+from remaster_ros.session.journal import Journal
+from remaster_ros.version import __version__
+
+FORMAT = 'remaster-batch/1'
+ROWS = 'rows.jsonl'
+PAGE = 'batch.html'
+KILLED = 2
+"""A session whose worker died so often is given up: the first time another one may have done it,
+the second time it had the worker for itself."""
+AHEAD = 4
+"""Sessions that each worker of a scheduler has waiting, so that none is idle meanwhile."""
+
+log = logging.getLogger('remaster_ros')
+
+
+@dataclass(frozen=True)
+class Job:
+    """A session to work on; all of it can be sent to another process.
+
+    Attributes
+    ----------
+    key
+        Of its files, this version, the seed and the baseline.
+    session, out
+        Its folder, and where its results go.
+    baseline
+        A compensation.json to check against; '' for none.
+    """
+
+    key: str
+    session: str
+    out: str
+    seed: int
+    baseline: str = ''
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of ``remaster batch``."""
+    parser.add_argument(
+        'session', metavar='SESSION', type=Path, nargs='+', help='session folders, in this order'
+    )
+    parser.add_argument(
+        '--out', metavar='DIR', type=Path, required=True, help='folder of rows, results and page'
+    )
+    parser.add_argument(
+        '--baseline',
+        metavar='COMPENSATION',
+        type=Path,
+        help='apply/compensation.json: has each session changed against it, and which joint?',
+    )
+    where = parser.add_mutually_exclusive_group()
+    where.add_argument(
+        '--workers',
+        type=integer(1),
+        default=os.cpu_count() or 1,
+        metavar='N',
+        help='processes of this computer (default: one for each processor)',
+    )
+    where.add_argument(
+        '--scheduler',
+        metavar='ADDRESS',
+        help="a Dask scheduler's address, such as tcp://127.0.0.1:8786; its workers need this "
+        'version, and the sessions and DIR under the same paths',
+    )
+    parser.add_argument(
+        '--insecure',
+        action='store_true',
+        help="take a scheduler on another computer without TLS: whoever reaches it runs anybody's "
+        'code on its workers',
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Do what is not done yet, a row each; then write the page."""
+    baseline = '' if args.baseline is None else str(args.baseline.resolve())
+    folders = list(dict.fromkeys(folder.resolve() for folder in args.session))
+    make_folder(args.out)
+    jobs = [_job(folder, args.out.resolve(), args.seed, baseline) for folder in folders]
+    rows = Journal(args.out / ROWS)
+    try:
+        if rows.lost:
+            log.warning('%s', rows.lost)
+        done = _done(rows, args.out / ROWS)
+        left = [job for job in jobs if job.key not in done]
+        with progress_bar(args.quiet) as progress:
+
+            def finished(job: Job, row: dict[str, Any]) -> None:
+                row = {'format': FORMAT, 'key': job.key, 'session': job.session, **row}
+                done[job.key] = row
+                rows.append(row)
+                progress('sessions', len(done.keys() & {job.key for job in jobs}) / len(jobs))
+
+            if left and args.scheduler is not None:
+                with _scheduler(args.scheduler, insecure=args.insecure) as (executor, workers):
+                    work_off(left, worked, lambda: executor, AHEAD * workers, finished)
+            elif left:
+                count = min(args.workers, len(left))
+                work_off(left, worked, lambda: _pool(count), count, finished)
+    finally:
+        rows.close()
+    found = [done[job.key] for job in jobs]
+    from remaster_ros.reports.batch_page import summary_of, write_batch_page
+
+    over_all = summary_of(found)
+    write_batch_page(args.out / PAGE, found, over_all)
+    for line in over_all['lines']:
+        show(args.quiet, line)
+    show(args.quiet, f'written: {args.out / PAGE}')
+    return 0 if any(row['status'] == 'done' for row in found) else 1
+
+
+def _job(folder: Path, out: Path, seed: int, baseline: str) -> Job:
+    """Return the work on a session; what cannot be read becomes its row's error."""
+    made_of = hashlib.sha256(f'{__version__} {seed}'.encode())
+    files = sorted(path for path in folder.glob('*') if path.suffix in _READ)
+    for path in [*files, *([Path(baseline)] if baseline else [])]:
+        try:
+            content = path.read_bytes()
+        except OSError:
+            content = b''
+        made_of.update(f'\0{path.name}\0{len(content)}\0'.encode() + content)
+    key = made_of.hexdigest()
+    place = hashlib.sha256(str(folder).encode()).hexdigest()[:8]
+    return Job(key, str(folder), str(out / f'{folder.name}-{place}'), seed, baseline)
+
+
+_READ = ('.yaml', '.csv', '.urdf', '.xml')
+
+
+def _done(rows: Journal, path: Path) -> dict[str, dict[str, Any]]:
+    """Return the rows that stay; a session whose worker was killed is done again."""
+    found = {}
+    for line, row in enumerate(rows.records, 1):
+        if row.get('format') != FORMAT or not isinstance(row.get('key'), str):
+            raise InputError(f'{path}, line {line}: is no row of a batch; name another folder')
+        if row.get('status') != 'killed':
+            found[row['key']] = row
+        else:
+            found.pop(row['key'], None)
+    return found
+
+
+# What a worker does
+
+
+def worked(job: Job) -> dict[str, Any]:
+    """Fit, discover and check a session; return what its row says.
+
+    It is called in a worker. The results are those of the commands with this seed: nothing of them
+    depends on who works, or on what was done before.
+    """
+    try:
+        return {'status': 'done', **_results(job)}
+    except InsufficientDataError as error:
+        return {'status': 'no answer', 'error': str(error)}
+    except RemasterError as error:
+        return {'status': 'error', 'error': str(error)}
+    except MemoryError:
+        return {'status': 'error', 'error': 'the memory does not suffice; use fewer workers'}
+    except Exception as error:
+        # A worker must go on with the next session, and no traceback reaches a user.
+        return {'status': 'error', 'error': f'{type(error).__name__}: {error}'}
+
+
+def _results(job: Job) -> dict[str, Any]:
+    import numpy as np
+
+    from remaster_ros.calibration.fit import fit_session
+    from remaster_ros.cli.sessions import read_together
+    from remaster_ros.discovery.discover import discover_session
+    from remaster_ros.reports.discovery_json import DISCOVERY_FILE, save_discovery
+    from remaster_ros.reports.fit_json import FIT_FILE, save_fit
+
+    session, _ = read_together([Path(job.session)])
+    folder = Path(job.out)
+    fitted = fit_session(session, rng=np.random.default_rng(job.seed))
+    make_folder(folder / 'fit')
+    save_fit(fitted, folder / 'fit', figures=False)
+    row: dict[str, Any] = {'fit': _of_fit(folder / 'fit' / FIT_FILE)}
+    try:
+        found = discover_session(session, rng=np.random.default_rng(job.seed))
+        make_folder(folder / 'discovery')
+        save_discovery(found, folder / 'discovery', figures=False)
+        row['discovery'] = _of_discovery(folder / 'discovery' / DISCOVERY_FILE)
+    except InsufficientDataError as error:
+        row['discovery'] = {'error': str(error)}
+    if job.baseline:
+        try:
+            row['check'] = _of_check(job, session)
+        except RemasterError as error:
+            row['check'] = {'error': str(error)}
+    return row
+
+
+def _of_fit(path: Path) -> dict[str, Any]:
+    content = json.loads(path.read_bytes())
+    held_out = (content['accuracy']['validation'] or {}).get('post_registration') or {}
+    return {
+        'robot': content['robot']['name'],
+        'judgement': content['judgement']['mood'],
+        'headline': content['judgement']['headline'],
+        'held_out_mm': {
+            side: None if not held_out.get(side) else held_out[side]['mean_mm']
+            for side in ('before', 'after')
+        },
+        'joints': [
+            {
+                'joint': one['joint'],
+                'mean_deg': one['mean_deg'] if one['identifiable'] else None,
+                'std_deg': one['std_deg'] if one['identifiable'] else None,
+            }
+            for one in content['joint_offsets']
+        ],
+    }
+
+
+def _of_discovery(path: Path) -> dict[str, Any]:
+    content = json.loads(path.read_bytes())
+    return {
+        'verdict': content['verdict'],
+        'judgement': content['judgement']['mood'],
+        'headline': content['judgement']['headline'],
+        'effects': [
+            {key: one.get(key) for key in ('name', 'joints', 'title', 'size_mm')}
+            for one in content['effects']
+        ],
+    }
+
+
+def _of_check(job: Job, session: Any) -> dict[str, Any]:
+    from remaster_ros.cli.check import content_of, measured_of
+    from remaster_ros.cli.verify import require_same_arm
+    from remaster_ros.compensation.checking import SMALLEST_M, judge
+    from remaster_ros.compensation.file import read_compensation
+
+    baseline = read_compensation(job.baseline)
+    require_same_arm(session, baseline, Path(job.session))
+    found = judge(baseline.model, [measured_of(session)])
+    names = baseline.model.chain.joint_names
+    return content_of(found, names, [Path(job.session).name], 1e3 * SMALLEST_M)
+
+
+# Who works
+
+
+def work_off(
+    jobs: Sequence[Any],
+    work: Callable[[Any], dict[str, Any]],
+    make: Callable[[], Executor],
+    ahead: int,
+    finished: Callable[[Any, dict[str, Any]], None],
+) -> None:
+    """Hand jobs out until all have a row.
+
+    Where a worker dies, all that were under way are done again, one at a time: so it is known
+    which of them it dies of, and that one's row says so.
+
+    Parameters
+    ----------
+    jobs
+        What `work` takes.
+    work
+        A function of a module, which a worker can import.
+    make
+        Makes an executor, again after one has broken.
+    ahead
+        How many jobs are handed out at a time.
+    finished
+        Called with each job and what its row says, in the order in which they are done.
+    """
+    waiting, deaths = list(reversed(jobs)), dict.fromkeys(map(id, jobs), 0)
+    suspects: list[Any] = []
+    under_way: dict[Future[dict[str, Any]], Any] = {}
+    executor = make()
+    try:
+        while waiting or suspects or under_way:
+            broken: list[Any] = []
+            while (suspects and not under_way) or (
+                waiting and not suspects and len(under_way) < ahead
+            ):
+                job = (suspects or waiting).pop()
+                try:
+                    under_way[executor.submit(work, job)] = job
+                except BrokenProcessPool:
+                    # A worker has died while it had nothing to do, or just now.
+                    (suspects or waiting).append(job)
+                    broken = list(under_way.values())
+                    break
+            if broken or not under_way:
+                ended: set[Future[dict[str, Any]]] = set()
+            else:
+                ended, _ = wait(under_way, return_when=FIRST_COMPLETED)
+            for future in ended:
+                job = under_way.pop(future)
+                try:
+                    row = future.result()
+                except Exception as error:
+                    if not _died(error):
+                        raise
+                    broken.append(job)
+                    continue
+                finished(job, row)
+            if ended and not broken:
+                continue
+            if isinstance(executor, ProcessPoolExecutor):
+                # All of its workers have ended with it.
+                broken = [*broken, *(job for job in under_way.values() if job not in broken)]
+                under_way.clear()
+                executor.shutdown(wait=False, cancel_futures=True)
+                executor = make()
+            for job in broken:
+                deaths[id(job)] += 1
+                if deaths[id(job)] < KILLED:
+                    suspects.append(job)
+                else:
+                    why = 'its worker was killed twice: is there enough memory?'
+                    finished(job, {'status': 'killed', 'error': why})
+    finally:
+        executor.shutdown(wait=False, cancel_futures=True)
+
+
+def _died(error: Exception) -> bool:
+    """Whether a worker has ended instead of its work."""
+    return isinstance(error, BrokenProcessPool) or type(error).__name__ == 'KilledWorker'
+
+
+def _pool(workers: int) -> ProcessPoolExecutor:
+    # Forked, a worker would have the parent's locks and threads. What it starts is set before.
+    os.environ['OMP_NUM_THREADS'] = '1'
+    return ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context('spawn'))
+
+
+@contextmanager
+def _scheduler(address: str, *, insecure: bool) -> Iterator[tuple[Executor, int]]:
+    """Connect to a Dask scheduler; yields its executor and how many workers it has."""
+    _refuse_open(address, insecure=insecure)
+    try:
+        from distributed import Client
+    except ImportError:
+        raise InputError(
+            "--scheduler takes Dask: pip install 'remaster_ros[cluster]', or use --workers"
+        ) from None
+    try:
+        client = Client(address, timeout='10s')
+    except (OSError, ValueError, TimeoutError) as error:
+        raise InputError(f'{address}: no scheduler answers ({error}); is it started?') from None
+    try:
+        workers = sum(client.nthreads().values())
+        if not workers:
+            raise InputError(f'{address}: the scheduler has no workers; start some first')
+        yield client.get_executor(pure=False), workers
+    finally:
+        client.close()
+
+
+def _refuse_open(address: str, *, insecure: bool) -> None:
+    """Refuse plain TCP to another computer: whoever reads or answers it decides what is run."""
+    parts = urllib.parse.urlsplit(address if '://' in address else f'tcp://{address}')
+    host = parts.hostname or ''
+    try:
+        is_here = ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        is_here = host == 'localhost'
+    if parts.scheme != 'tls' and not is_here and not insecure:
+        raise InputError(
+            f"{address}: is another computer without TLS, and a scheduler runs anybody's code; "
+            'give tls://…, a tunnel to 127.0.0.1, or --insecure where the network is yours alone'
+        )

@@ -1,0 +1,164 @@
+"""``remaster batch``: rows that stay, workers that die, and what is said over all sessions."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+from concurrent.futures import Executor, ProcessPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from remaster_ros.cli import batch
+from remaster_ros.cli.main import main
+from remaster_ros.reports.batch_page import summary_of
+from remaster_ros.session.journal import read_journal
+
+
+def rows(folder: Path) -> dict[str, dict]:
+    """Return the rows by session, without what a line is sealed with."""
+    found = read_journal(folder / batch.ROWS).records
+    return {row['session']: {k: v for k, v in row.items() if k != 'crc32'} for row in found}
+
+
+@pytest.fixture(scope='module')
+def sessions(tmp_path_factory):
+    folder = tmp_path_factory.mktemp('sessions')
+    for seed in (1, 2):
+        given = ['--poses', '12', '--validation', '6', '--seed', str(seed), '--quiet']
+        assert main(['simulate', str(folder / f's{seed}'), *given]) == 0
+    return folder
+
+
+def test_rows_do_not_depend_on_the_workers_and_are_not_made_again(sessions, tmp_path, capsys):
+    """One worker, then two with a session more; a broken one has its error and stops nobody."""
+    (tmp_path / 'empty').mkdir()
+    one = [str(sessions / 's1'), str(tmp_path / 'empty')]
+    assert main(['batch', *one, '--out', str(tmp_path / 'one'), '--workers', '1']) == 0
+    out = capsys.readouterr().out
+    assert '1 done, 1 error' in out
+    assert 'session.yaml: no such file' in out
+    two = [str(sessions / 's2'), one[0]]
+    assert main(['batch', *two, '--out', str(tmp_path / 'two'), '--workers', '2', '--quiet']) == 0
+    first, second = rows(tmp_path / 'one'), rows(tmp_path / 'two')
+    assert first[one[0]]['status'] == 'done'
+    for session in one[:1]:
+        assert first[session] == second[session]
+        name = next((tmp_path / 'one').glob(f'{Path(session).name}-*')).name
+        for file in ('fit/fit.json', 'discovery/discovery.json', 'fit/apply/compensation.json'):
+            texts = [(tmp_path / o / name / file).read_bytes() for o in ('one', 'two')]
+            assert texts[0] == texts[1]
+    before = (tmp_path / 'one' / batch.ROWS).read_bytes()
+    (tmp_path / 'one' / batch.PAGE).unlink()
+    assert main(['batch', *one, '--out', str(tmp_path / 'one'), '--quiet']) == 0
+    assert (tmp_path / 'one' / batch.ROWS).read_bytes() == before, 'made again'
+    assert 's1' in (tmp_path / 'one' / batch.PAGE).read_text(encoding='utf-8')
+
+
+def test_a_row_is_of_the_files_the_seed_and_the_baseline(sessions, tmp_path):
+    shutil.copytree(sessions / 's1', tmp_path / 's1')
+
+    def key(seed=0, baseline=''):
+        return batch._job(tmp_path / 's1', tmp_path, seed, baseline).key
+
+    keys = [key(), key(seed=1), key(baseline=str(tmp_path / 's1' / 'robot.urdf'))]
+    table = tmp_path / 's1' / 'observations.csv'
+    table.write_text(table.read_text(encoding='utf-8') + '\n', encoding='utf-8')
+    keys.append(key())
+    assert len(set(keys)) == 4
+
+
+# Stand-ins for the work, which a worker can import.
+
+
+def square(job):
+    return {'status': 'done', 'square': job * job}
+
+
+def dies_once(job):
+    number, mark = job
+    if number == 3 and not Path(mark).exists():
+        Path(mark).touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return {'status': 'done', 'square': number**2}
+
+
+def always_dies(job):
+    if job == 5:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return square(job)
+
+
+def worked_off(jobs, work, workers=2):
+    done, made = {}, []
+
+    def make() -> Executor:
+        made.append(batch._pool(workers))
+        assert isinstance(made[-1], ProcessPoolExecutor)
+        return made[-1]
+
+    batch.work_off(jobs, work, make, workers, lambda job, row: done.update({job: row}))
+    return done, len(made)
+
+
+def test_what_was_under_way_when_a_worker_was_killed_is_done_again(tmp_path):
+    jobs = [(number, str(tmp_path / 'mark')) for number in range(8)]
+    done, pools = worked_off(jobs, dies_once)
+    assert {job[0]: row['square'] for job, row in done.items()} == {n: n * n for n in range(8)}
+    assert pools == 2
+
+
+def test_a_session_that_kills_its_worker_twice_has_that_in_its_row():
+    done, _ = worked_off(list(range(8)), always_dies)
+    assert done.pop(5)['status'] == 'killed'
+    assert {job: row['square'] for job, row in done.items()} == {
+        n: n * n for n in range(8) if n != 5
+    }
+
+
+@pytest.mark.parametrize(
+    ('address', 'insecure', 'refused'),
+    [
+        ('tcp://127.0.0.1:8786', False, False),
+        ('127.0.0.1:8786', False, False),
+        ('tcp://[::1]:8786', False, False),
+        ('localhost:8786', False, False),
+        ('tls://10.0.0.7:8786', False, False),
+        ('tcp://10.0.0.7:8786', False, True),
+        ('10.0.0.7:8786', False, True),
+        ('tcp://localhost.example.org:8786', False, True),
+        ('tcp://10.0.0.7:8786', True, False),
+    ],
+)
+def test_a_scheduler_on_another_computer_takes_tls(address, insecure, refused):
+    if not refused:
+        batch._refuse_open(address, insecure=insecure)
+        return
+    with pytest.raises(batch.InputError, match='without TLS'):
+        batch._refuse_open(address, insecure=insecure)
+
+
+def made_row(name, offsets):
+    joints = [
+        {'joint': f'j{i}', 'mean_deg': value, 'std_deg': 0.01} for i, value in enumerate(offsets)
+    ]
+    return {'status': 'done', 'session': name, 'fit': {'robot': 'arm', 'joints': joints}}
+
+
+def test_who_differs_and_which_joint_changes_along_the_sessions():
+    """Twelve sessions: one has another j0, j1 has another zero from the seventh on."""
+    seed = 3
+    print('seed', seed)
+    offsets = 0.02 * np.random.default_rng(seed).standard_normal((12, 3))
+    offsets[4, 0] += 0.5
+    offsets[6:, 1] += 0.3
+    found = summary_of([made_row(f's{i}', row) for i, row in enumerate(offsets.tolist())])
+    j0, j1, j2 = found['joints']
+    assert j0['differs'] == ['s4']
+    assert j1['since'] == 's6'
+    assert j1['change_deg'] == pytest.approx(0.3, abs=0.05)
+    assert (j0['since'], j2['since'], j2['differs']) == ('', '', [])
+    assert json.dumps(found)
