@@ -335,7 +335,7 @@ def work_off(
                 # All of its workers have ended with it.
                 broken = [*broken, *(job for job in under_way.values() if job not in broken)]
                 under_way.clear()
-                executor.shutdown(wait=False, cancel_futures=True)
+                executor.shutdown(wait=False)
                 executor = make()
             for job in broken:
                 deaths[id(job)] += 1
@@ -345,7 +345,9 @@ def work_off(
                     why = 'its worker was killed twice: is there enough memory?'
                     finished(job, {'status': 'killed', 'error': why})
     finally:
-        executor.shutdown(wait=False, cancel_futures=True)
+        for future in under_way:
+            future.cancel()
+        executor.shutdown(wait=False)
 
 
 def _died(error: Exception) -> bool:

@@ -84,7 +84,7 @@ def run(args: argparse.Namespace) -> int:
                 )
         else:
             try:
-                measured = measured.as_before(checks[0]) if checks else measured
+                measured = measured.as_before(checks[0]) if checks else measured.merged()
             except InputError as error:
                 raise InputError(f'{args.session}: {error}') from None
             checks, names = [*checks, measured], [*names, args.session.name]
@@ -215,6 +215,7 @@ def content_of(
         'changed': [joint_names[joint] for joint in found.changed],
         'tool_moved': found.tool_moved,
         'since': None if found.since is None else names[found.since],
+        'since_check': None if found.since is None else found.since + 1,
         'moved_mm': 1e3 * found.moved_m,
         'check_again': found.again,
         'checks': len(names),
@@ -235,13 +236,13 @@ def in_words(found: Checked, joint_names: tuple[str, ...], names: list[str]) -> 
         size = 1e3 * abs(found.joints[found.changed[0]].change_rad)
         size *= found.joints[found.changed[0]].lever_m
         return (
-            f'Changed since check {names[found.since or 0]}: {who}{several}; {size:.2f} mm at the '
+            f'Changed since check {_named(found, names)}: {who}{several}; {size:.2f} mm at the '
             'tool. Look at it (a collision, a loose bolt, a new zero), then measure and correct '
             'the arm again.'
         )
     if found.verdict == 'setup_moved' and found.tool_moved:
         return (
-            f'The marker on the tool moved since check {names[found.since or 0]}, not the arm: '
+            f'The marker on the tool moved since check {_named(found, names)}, not the arm: '
             'fasten it, and begin a new history.'
         )
     if found.verdict == 'setup_moved':
@@ -252,6 +253,11 @@ def in_words(found: Checked, joint_names: tuple[str, ...], names: list[str]) -> 
     if found.verdict == 'unclear':
         return 'Something may have changed: check again at once.'
     return 'No joint has changed by more than a check can see.'
+
+
+def _named(found: Checked, names: list[str]) -> str:
+    since = found.since or 0
+    return f'{since + 1} ({names[since]})'
 
 
 def _text(content: dict[str, Any]) -> str:

@@ -73,6 +73,19 @@ class Measured:
     marker: tuple[str, ...]
     position: FloatArray
 
+    def merged(self) -> Measured:
+        """Return the mean of the readings of each pose by each sensor of each marker."""
+        rows: list[int] = []
+        for row in range(len(self.q)):
+            apart = np.abs(self.q[rows] - self.q[row]).max(axis=1)
+            same = [rows[i] for i in np.flatnonzero(apart <= SAME_RAD)]
+            seen_by = self.sensor[row], self.marker[row]
+            if seen_by not in [(self.sensor[one], self.marker[one]) for one in same]:
+                rows.append(row)
+        sensor = tuple(self.sensor[row] for row in rows)
+        marker = tuple(self.marker[row] for row in rows)
+        return self.as_before(Measured(self.q[rows], sensor, marker, self.position[rows]))
+
     def as_before(self, first: Measured) -> Measured:
         """Return the readings of the poses of the first check, in its order.
 

@@ -65,8 +65,8 @@ def _draw(trend: Trend) -> Figure:
         values = 1e3 * x_m[:, i]
         ax.axhspan(-content['smallest_mm'], content['smallest_mm'], color=AFTER, alpha=0.12, lw=0)
         ax.plot(numbers, values, 'o-', color=BEFORE if is_it else AFTER, ms=3.0, lw=0.8)
-        if content['since'] in names:
-            ax.axvline(names.index(content['since']) + 0.5, color=BEFORE, lw=0.9, ls='--')
+        if content['since_check'] is not None:
+            ax.axvline(content['since_check'] - 0.5, color=BEFORE, lw=0.9, ls='--')
         ax.set_title(one['joint'] + (': changed' if is_it else ''))
         ax.set_ylabel('mm')
         ax.margins(x=0.02)

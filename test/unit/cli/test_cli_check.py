@@ -86,7 +86,7 @@ def test_day_by_day_until_a_joint_has_changed(run, arm, tmp_path, capsys):
     args = ['check', str(tmp_path / 'day15'), '--history', str(tmp_path / 'arm.jsonl')]
     assert main([*args, '--baseline', str(tmp_path / 'compensation.json')]) == 0
     text = capsys.readouterr().out
-    assert 'changed: Changed since check day12: joint_4' in text
+    assert 'changed: Changed since check 13 (day12): joint_4' in text
     assert 'joint_1: looks like a sensor that was moved' in text
 
 

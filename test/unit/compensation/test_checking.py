@@ -130,3 +130,16 @@ def test_nothing_is_found_where_nothing_is():
         again += sum(each.again for each in found)
     assert alarms <= 2
     assert again <= 14, 'one in twenty checks at most'
+
+
+def test_several_readings_of_a_pose_are_one():
+    arm = CheckedArm(11)
+    one, two = arm.check(), arm.check()
+    both = type(one)(
+        np.concatenate((one.q, two.q)),
+        one.sensor + two.sensor,
+        one.marker + two.marker,
+        np.concatenate((one.position, two.position)),
+    ).merged()
+    np.testing.assert_allclose(both.position, 0.5 * (one.position + two.position))
+    assert both.sensor == one.sensor
