@@ -97,6 +97,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="take a scheduler on another computer without TLS: whoever reaches it runs anybody's "
         'code on its workers',
     )
+    parser.add_argument(
+        '--json', action='store_true', help='print the rows, and what they say together, as JSON'
+    )
 
 
 def run(args: argparse.Namespace) -> int:
@@ -111,7 +114,7 @@ def run(args: argparse.Namespace) -> int:
             log.warning('%s', rows.lost)
         done = _done(rows, args.out / ROWS)
         left = [job for job in jobs if job.key not in done]
-        with progress_bar(args.quiet) as progress:
+        with progress_bar(args.quiet or args.json) as progress:
 
             def finished(job: Job, row: dict[str, Any]) -> None:
                 row = {'format': FORMAT, 'key': job.key, 'session': job.session, **row}
@@ -132,9 +135,12 @@ def run(args: argparse.Namespace) -> int:
 
     over_all = summary_of(found)
     write_batch_page(args.out / PAGE, found, over_all)
-    for line in over_all['lines']:
-        show(args.quiet, line)
-    show(args.quiet, f'written: {args.out / PAGE}')
+    if args.json:
+        print(json.dumps({'format': FORMAT, 'rows': found, **over_all}))
+    else:
+        for line in over_all['lines']:
+            show(args.quiet, line)
+        show(args.quiet, f'written: {args.out / PAGE}')
     return 0 if any(row['status'] == 'done' for row in found) else 1
 
 

@@ -122,7 +122,8 @@ def test_every_import_is_declared(setup_arguments: dict[str, Any]) -> None:
         for line in setup_arguments['extras_require']['jazzy']
     }
     extras = setup_arguments['extras_require']
-    optional = {normal(line) for line in extras['natnetclient'] + extras['pdf']}
+    further = (line for name in ('natnetclient', 'pdf', 'cluster') for line in extras[name])
+    optional = {normal(line) for line in further}
     root = ElementTree.parse(ROOT / 'package.xml').getroot()
     depends = {element.text for element in root.findall('exec_depend')}
     # The launch files alone need these, which come with ROS and not with pip.

@@ -53,7 +53,9 @@ def test_rows_do_not_depend_on_the_workers_and_are_not_made_again(sessions, tmp_
             assert texts[0] == texts[1]
     before = (tmp_path / 'one' / batch.ROWS).read_bytes()
     (tmp_path / 'one' / batch.PAGE).unlink()
-    assert main(['batch', *one, '--out', str(tmp_path / 'one'), '--quiet']) == 0
+    assert main(['batch', *one, '--out', str(tmp_path / 'one'), '--json']) == 0
+    printed = json.loads(capsys.readouterr().out)
+    assert [row['status'] for row in printed['rows']] == ['done', 'error']
     assert (tmp_path / 'one' / batch.ROWS).read_bytes() == before, 'made again'
     assert 's1' in (tmp_path / 'one' / batch.PAGE).read_text(encoding='utf-8')
 
