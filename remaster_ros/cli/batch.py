@@ -203,8 +203,9 @@ def _results(job: Job) -> dict[str, Any]:
     from remaster_ros.calibration.fit import fit_session
     from remaster_ros.cli.sessions import read_together
     from remaster_ros.discovery.discover import discover_session
-    from remaster_ros.reports.discovery_json import DISCOVERY_FILE, save_discovery
-    from remaster_ros.reports.fit_json import FIT_FILE, save_fit
+    from remaster_ros.reports.discovery_json import DISCOVERY_FILE
+    from remaster_ros.reports.fit_json import FIT_FILE
+    from remaster_ros.reports.result_folder import save_discovery, save_fit
 
     session, _ = read_together([Path(job.session)])
     folder = Path(job.out)

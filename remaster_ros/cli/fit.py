@@ -62,7 +62,8 @@ def run(args: argparse.Namespace) -> int:
 
     from remaster_ros.calibration.fit import fit_session
     from remaster_ros.cli.sessions import read_together
-    from remaster_ros.reports.fit_json import FIT_FILE, prepare_folder, save_fit
+    from remaster_ros.reports.fit_json import FIT_FILE
+    from remaster_ros.reports.result_folder import prepare_folder, save_fit
     from remaster_ros.session.files import undone_on_failure
     from remaster_ros.session.priors import read_priors
 

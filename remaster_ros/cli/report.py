@@ -17,7 +17,8 @@ from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.reports.answer import Answer
 from remaster_ros.reports.answer_inputs import parts, read_inputs
 from remaster_ros.reports.answer_plan import PlanFacts, plan_facts, plan_to_dict
-from remaster_ros.reports.fit_json import FIT_FILE, REPORT_FILE, prepare_folder, save_fit
+from remaster_ros.reports.fit_json import FIT_FILE, REPORT_FILE
+from remaster_ros.reports.result_folder import prepare_folder, save_fit
 from remaster_ros.session.files import undone_on_failure
 from remaster_ros.session.plan_journal import read_plan
 

@@ -33,13 +33,8 @@ from remaster_ros.nodes.parameters import declare, parameter
 from remaster_ros.nodes.precision_watch import PrecisionWatch
 from remaster_ros.nodes.running import RemasterNode, run
 from remaster_ros.nodes.status import LATCHED, NodeStatus, Summary
-from remaster_ros.reports.fit_json import (
-    DISCOVERY_FILE,
-    FIT_FILE,
-    prepare_folder,
-    read_fit,
-    save_fit,
-)
+from remaster_ros.reports.fit_json import DISCOVERY_FILE, FIT_FILE, read_fit
+from remaster_ros.reports.result_folder import prepare_folder, save_fit
 from remaster_ros.session.priors import read_priors
 from remaster_ros.session.reader import read_session
 from remaster_ros.session.workcell import read_cell
@@ -158,8 +153,8 @@ class Optimizer(RemasterNode):
         # Imported when it is needed, as it takes a second: the node is there at once.
         from remaster_ros.discovery.decision import decisions
         from remaster_ros.discovery.discover import discover_session
-        from remaster_ros.reports.discovery_json import save_discovery
         from remaster_ros.reports.found_causes import earlier_pairs
+        from remaster_ros.reports.result_folder import save_discovery
 
         out = Path(self.p.discovery)
         session = read_session(self.p.session)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,24 +10,19 @@ from typing import Any
 import numpy as np
 
 from remaster_ros.calibration.predictions import Coverage, Predictions, predict
-from remaster_ros.compensation.export import MODEL_FILE
 from remaster_ros.discovery.confirmation import Confirmation
 from remaster_ros.discovery.decision import Decision
 from remaster_ros.discovery.discover import Discovery
 from remaster_ros.reports import schemas
-from remaster_ros.reports.discovery_apply import applied, loadable
+from remaster_ros.reports.discovery_apply import loadable
 from remaster_ros.reports.discovery_judgement import judgement
 from remaster_ros.reports.discovery_schema import Discovered
 from remaster_ros.reports.fit_json import (
-    APPLY_FOLDER,
     DISCOVERY_FILE,
     estimates,
     read_result,
-    remove_report,
     table_rows,
 )
-from remaster_ros.reports.rows_csv import PREDICTIONS_FILE, predictions_text
-from remaster_ros.session.files import make_folder, write_atomically
 from remaster_ros.version import __version__
 
 
@@ -138,52 +132,6 @@ def _regions(discovery: Discovery, predictions: Predictions) -> dict[str, Any]:
         'held_out': held_out_coverage(discovery, predictions),
         'fitted': Coverage.of(predictions.inside[fitted]),
     }
-
-
-def save_discovery(
-    discovery: Discovery,
-    folder: str | os.PathLike[str],
-    confirmation: Confirmation | None = None,
-    figures: bool = True,
-    predictions: Predictions | None = None,
-    decided: Sequence[Decision] = (),
-) -> Path:
-    """Write discovery.json, predictions.csv, what to apply and, with figures, the report.
-
-    ``decided`` is what was decided between causes and look-alikes of an earlier search.
-
-    Returns
-    -------
-    Path
-        The report; discovery.json without figures.
-
-    Raises
-    ------
-    InputError
-        The folder cannot be written to.
-    """
-    folder = Path(folder)
-    make_folder(folder)
-    predictions = predictions_of(discovery) if predictions is None else predictions
-    content = discovery_content(discovery, confirmation, predictions, decided)
-    text = schemas.encode(content)
-    write_atomically(folder / DISCOVERY_FILE, text)
-    result_sha256 = hashlib.sha256(text).hexdigest()
-    gross = {observation for observation, _ in discovery.fit.left_out}
-    rows = predictions_text(discovery.fit.session, predictions, gross)
-    write_atomically(folder / PREDICTIONS_FILE, rows)
-    make_folder(folder / APPLY_FOLDER)
-    # That of an earlier run would contradict the rest.
-    (folder / APPLY_FOLDER / MODEL_FILE).unlink(missing_ok=True)
-    for name, file in applied(discovery, predictions.widening, result_sha256).items():
-        write_atomically(folder / APPLY_FOLDER / name, file)
-    if not figures:
-        remove_report(folder)
-        return folder / DISCOVERY_FILE
-    # Matplotlib and the templates take a second to import: only where a report is made.
-    from remaster_ros.reports.discovery_report import write_discovery_report
-
-    return write_discovery_report(discovery, confirmation, content, folder)
 
 
 def read_discovery(path: str | os.PathLike[str]) -> dict[str, Any]:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
-import tempfile
 from collections.abc import Iterable, Sequence
 from functools import lru_cache
 from pathlib import Path
@@ -20,9 +18,8 @@ from remaster_ros.compensation.export import (
     MODEL_FILE,
     URDF_FILE,
     calibrated_urdf,
-    exports,
 )
-from remaster_ros.compensation.file import COMPENSATION_FILE, Source, written
+from remaster_ros.compensation.file import Source, written
 from remaster_ros.compensation.of_result import Described, geometry_too, offsets_alone
 from remaster_ros.discovery.geometry_model import GeometryModel, geometry_model
 from remaster_ros.errors import InputError
@@ -30,13 +27,11 @@ from remaster_ros.kinematics.transforms import quaternion_xyzw
 from remaster_ros.reports import schemas
 from remaster_ros.reports.discovery_schema import Discovered
 from remaster_ros.reports.judgement import verdict
-from remaster_ros.reports.rows_csv import RESIDUALS_FILE, residuals_text
+from remaster_ros.reports.rows_csv import RESIDUALS_FILE
 from remaster_ros.session.files import (
-    cannot_write,
     make_folder,
     read_limited,
     write_atomically,
-    writing,
 )
 from remaster_ros.types import FloatArray, Measurements, Session
 from remaster_ros.version import __version__
@@ -332,20 +327,6 @@ def read_result(
     return content
 
 
-def remove_report(folder: Path) -> None:
-    """Remove the report of an earlier run, which would contradict the new result.
-
-    Raises
-    ------
-    InputError
-        It cannot be removed.
-    """
-    try:
-        (folder / REPORT_FILE).unlink(missing_ok=True)
-    except OSError as error:
-        raise cannot_write(folder / REPORT_FILE, error) from None
-
-
 def joint_offsets_rad(
     fit: dict[str, Any], joint_names: Sequence[str]
 ) -> tuple[FloatArray, FloatArray]:
@@ -378,43 +359,6 @@ def joint_offsets_rad(
     return np.radians([row['mean_deg'] for row in ordered]), np.radians(std)
 
 
-def prepare_folder(folder: str | os.PathLike[str], result: str) -> None:
-    """Create the folder for results and make sure that files can be written there.
-
-    Parameters
-    ----------
-    result
-        The file that the command writes there, `FIT_FILE` or `DISCOVERY_FILE`. With it in the
-        folder, and without that of the other, the folder is one of the command's own.
-
-    Raises
-    ------
-    InputError
-        They cannot, or would replace what this command has not written. This is checked before
-        the long work, not after it.
-    """
-    folder = Path(folder)
-    make_folder(folder)
-    with writing(folder):
-        there = sorted(path.name for path in folder.iterdir())
-    (other,) = {FIT_FILE, DISCOVERY_FILE} - {result}
-    foreign = [
-        name for name in there if name == other or (name in WRITTEN and result not in there)
-    ]
-    if result in there:
-        require_own(folder / result, FORMATS[result])
-    if foreign:
-        raise InputError(
-            f'{folder}: holds {", ".join(foreign)}, not written by this command, some of which it '
-            'would replace; name another folder'
-        )
-    try:
-        # A file without a name: an interrupt leaves nothing behind.
-        tempfile.TemporaryFile(dir=folder).close()
-    except OSError as error:
-        raise cannot_write(folder, error) from None
-
-
 def require_own(path: Path, format_: str) -> None:
     """Refuse to replace a file that is no JSON of this format, or not of this program."""
     try:
@@ -423,41 +367,3 @@ def require_own(path: Path, format_: str) -> None:
         content = None
     if not isinstance(content, dict) or content.get('format') != format_:
         raise InputError(f'{path}: is there and is no {format_}; it is not replaced, name another')
-
-
-def save_fit(result: FitResult, folder: str | os.PathLike[str], figures: bool = True) -> Path:
-    """Write fit.json, residuals.csv, the files to apply the offsets, and the report with figures.
-
-    Without figures there is no report; that of an earlier fit in the folder would contradict
-    fit.json and is removed.
-
-    Returns
-    -------
-    Path
-        The report; fit.json without figures.
-
-    Raises
-    ------
-    InputError
-        The folder cannot be written to.
-    """
-    folder = Path(folder)
-    write_fit(result, folder / FIT_FILE)
-    result_sha256 = hashlib.sha256((folder / FIT_FILE).read_bytes()).hexdigest()
-    write_atomically(folder / RESIDUALS_FILE, residuals_text(result))
-    make_folder(folder / APPLY_FOLDER)
-    # A model of an earlier fit would contradict the rest.
-    (folder / APPLY_FOLDER / MODEL_FILE).unlink(missing_ok=True)
-    files = exports(result)
-    if (geometry := geometry_of(result)) is not None and geometry.is_better:
-        files[MODEL_FILE] = model_text(result, geometry)
-    files[COMPENSATION_FILE] = compensation_text(result, result_sha256)
-    for name, text in files.items():
-        write_atomically(folder / APPLY_FOLDER / name, text)
-    if not figures:
-        remove_report(folder)
-        return folder / FIT_FILE
-    # Matplotlib and the templates take a second to import: only where a report is made.
-    from remaster_ros.reports.report import write_fit_report
-
-    return write_fit_report(result, folder)

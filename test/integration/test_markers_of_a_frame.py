@@ -10,7 +10,8 @@ from remaster_ros.calibration.estimate import Problem, estimate
 from remaster_ros.calibration.fit import fit_session
 from remaster_ros.discovery.discover import discover_session
 from remaster_ros.planning.expected_sensors import ExpectedSensor
-from remaster_ros.reports.fit_json import read_fit, save_fit
+from remaster_ros.reports.fit_json import read_fit
+from remaster_ros.reports.result_folder import save_fit
 from remaster_ros.session.reader import read_session, write_session
 from remaster_ros.session.workcell import read_cell
 

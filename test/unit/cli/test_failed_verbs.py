@@ -83,7 +83,7 @@ VERBS: dict[str, Callable[[Path, Path], list[object]]] = {
 def few_poses(monkeypatch: pytest.MonkeyPatch) -> None:
     """What `init` proposes is of no concern here."""
     monkeypatch.setattr(init, 'COMPARED', 4)
-    monkeypatch.setattr(init, 'TRIED', 8)
+    monkeypatch.setattr(init, 'TRIED', 40)
 
 
 @pytest.fixture

@@ -17,9 +17,10 @@ from remaster_ros.reports.answer_inputs import Inputs, errors_with_model_mm, par
 from remaster_ros.reports.answer_report import answer_html, checked_svg, require_ready, worst_rows
 from remaster_ros.reports.discovery_judgement import more_than_noise
 from remaster_ros.reports.discovery_schema import Discovered, PredictedRegions
-from remaster_ros.reports.fit_json import fit_content, save_fit
+from remaster_ros.reports.fit_json import fit_content
 from remaster_ros.reports.pages import law
 from remaster_ros.reports.remaining import NO_FILE
+from remaster_ros.reports.result_folder import save_fit
 from remaster_ros.reports.schemas import Fit, Judgement
 
 STEP = {'driver': 'time', 'form': 'step', 'name': 'unnamed', 'moment_s': 455.0}

@@ -22,15 +22,9 @@ from remaster_ros.compensation.export import (
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.transforms import matrix_from_quaternion_xyzw, matrix_from_rpy
-from remaster_ros.reports.fit_json import (
-    fit_content,
-    joint_offsets_rad,
-    prepare_folder,
-    read_fit,
-    save_fit,
-    write_fit,
-)
+from remaster_ros.reports.fit_json import fit_content, joint_offsets_rad, read_fit, write_fit
 from remaster_ros.reports.report import report_html
+from remaster_ros.reports.result_folder import prepare_folder, save_fit
 
 
 def test_fit_json_is_the_fit(fit_result, tmp_path):

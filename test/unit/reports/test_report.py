@@ -16,9 +16,9 @@ import pytest
 from remaster_ros.calibration.noise_estimate import NoiseEstimate
 from remaster_ros.kinematics import transforms
 from remaster_ros.kinematics.transforms import apply
-from remaster_ros.reports.fit_json import save_fit
 from remaster_ros.reports.judgement import verdict
 from remaster_ros.reports.report import _round_factor, draw_view, report_html
+from remaster_ros.reports.result_folder import save_fit
 
 VOID = {'meta', 'br', 'img', 'link', 'hr', 'input'}
 

@@ -15,7 +15,7 @@ from remaster_ros.cli.fit import summary
 from remaster_ros.discovery.effects import registration_drift, thermal_growth
 from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.errors import InputError
-from remaster_ros.reports.fit_json import save_fit
+from remaster_ros.reports.result_folder import save_fit
 from remaster_ros.session.reader import read_session, write_session
 
 PAGE = Path(__file__).parents[3] / 'docs/session-format.md'

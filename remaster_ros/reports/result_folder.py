@@ -1,0 +1,181 @@
+"""A folder of results: made ready before the long work, written after it."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from remaster_ros.compensation.export import MODEL_FILE, exports
+from remaster_ros.compensation.file import COMPENSATION_FILE
+from remaster_ros.errors import InputError
+from remaster_ros.reports import schemas
+from remaster_ros.reports.fit_json import (
+    APPLY_FOLDER,
+    DISCOVERY_FILE,
+    FIT_FILE,
+    FORMATS,
+    REPORT_FILE,
+    WRITTEN,
+    compensation_text,
+    geometry_of,
+    model_text,
+    require_own,
+    write_fit,
+)
+from remaster_ros.reports.rows_csv import (
+    PREDICTIONS_FILE,
+    RESIDUALS_FILE,
+    predictions_text,
+    residuals_text,
+)
+from remaster_ros.session.files import cannot_write, make_folder, write_atomically, writing
+
+if TYPE_CHECKING:
+    from remaster_ros.calibration.predictions import Predictions
+    from remaster_ros.calibration.result import FitResult
+    from remaster_ros.discovery.confirmation import Confirmation
+    from remaster_ros.discovery.decision import Decision
+    from remaster_ros.discovery.discover import Discovery
+
+
+def prepare_folder(folder: str | os.PathLike[str], result: str) -> None:
+    """Create the folder for results and make sure that files can be written there.
+
+    Parameters
+    ----------
+    result
+        The file that the command writes there, `FIT_FILE` or `DISCOVERY_FILE`. With it in the
+        folder, and without that of the other, the folder is one of the command's own.
+
+    Raises
+    ------
+    InputError
+        They cannot, or would replace what this command has not written. This is checked before
+        the long work, not after it.
+    """
+    folder = Path(folder)
+    make_folder(folder)
+    with writing(folder):
+        there = sorted(path.name for path in folder.iterdir())
+    (other,) = {FIT_FILE, DISCOVERY_FILE} - {result}
+    foreign = [
+        name for name in there if name == other or (name in WRITTEN and result not in there)
+    ]
+    if result in there:
+        require_own(folder / result, FORMATS[result])
+    if foreign:
+        raise InputError(
+            f'{folder}: holds {", ".join(foreign)}, not written by this command, some of which it '
+            'would replace; name another folder'
+        )
+    try:
+        # A file without a name: an interrupt leaves nothing behind.
+        tempfile.TemporaryFile(dir=folder).close()
+    except OSError as error:
+        raise cannot_write(folder, error) from None
+
+
+def remove_report(folder: Path) -> None:
+    """Remove the report of an earlier run, which would contradict the new result.
+
+    Raises
+    ------
+    InputError
+        It cannot be removed.
+    """
+    try:
+        (folder / REPORT_FILE).unlink(missing_ok=True)
+    except OSError as error:
+        raise cannot_write(folder / REPORT_FILE, error) from None
+
+
+def save_fit(result: FitResult, folder: str | os.PathLike[str], figures: bool = True) -> Path:
+    """Write fit.json, residuals.csv, the files to apply the offsets, and the report with figures.
+
+    Without figures there is no report; that of an earlier fit in the folder would contradict
+    fit.json and is removed.
+
+    Returns
+    -------
+    Path
+        The report; fit.json without figures.
+
+    Raises
+    ------
+    InputError
+        The folder cannot be written to.
+    """
+    folder = Path(folder)
+    write_fit(result, folder / FIT_FILE)
+    result_sha256 = hashlib.sha256((folder / FIT_FILE).read_bytes()).hexdigest()
+    write_atomically(folder / RESIDUALS_FILE, residuals_text(result))
+    make_folder(folder / APPLY_FOLDER)
+    # A model of an earlier fit would contradict the rest.
+    (folder / APPLY_FOLDER / MODEL_FILE).unlink(missing_ok=True)
+    files = exports(result)
+    if (geometry := geometry_of(result)) is not None and geometry.is_better:
+        files[MODEL_FILE] = model_text(result, geometry)
+    files[COMPENSATION_FILE] = compensation_text(result, result_sha256)
+    for name, text in files.items():
+        write_atomically(folder / APPLY_FOLDER / name, text)
+    if not figures:
+        remove_report(folder)
+        return folder / FIT_FILE
+    # Matplotlib and the templates take a second to import: only where a report is made.
+    from remaster_ros.reports.report import write_fit_report
+
+    return write_fit_report(result, folder)
+
+
+def save_discovery(
+    discovery: Discovery,
+    folder: str | os.PathLike[str],
+    confirmation: Confirmation | None = None,
+    figures: bool = True,
+    predictions: Predictions | None = None,
+    decided: Sequence[Decision] = (),
+) -> Path:
+    """Write discovery.json, predictions.csv, what to apply and, with figures, the report.
+
+    ``decided`` is what was decided between causes and look-alikes of an earlier search.
+
+    Returns
+    -------
+    Path
+        The report; discovery.json without figures.
+
+    Raises
+    ------
+    InputError
+        The folder cannot be written to.
+    """
+    # `fit` does not need what discovers.
+    from remaster_ros.reports.discovery_apply import applied
+    from remaster_ros.reports.discovery_json import discovery_content, predictions_of
+
+    folder = Path(folder)
+    make_folder(folder)
+    predictions = predictions_of(discovery) if predictions is None else predictions
+    content = discovery_content(discovery, confirmation, predictions, decided)
+    text = schemas.encode(content)
+    write_atomically(folder / DISCOVERY_FILE, text)
+    result_sha256 = hashlib.sha256(text).hexdigest()
+    gross = {observation for observation, _ in discovery.fit.left_out}
+    rows = predictions_text(discovery.fit.session, predictions, gross)
+    write_atomically(folder / PREDICTIONS_FILE, rows)
+    make_folder(folder / APPLY_FOLDER)
+    # That of an earlier run would contradict the rest.
+    (folder / APPLY_FOLDER / MODEL_FILE).unlink(missing_ok=True)
+    for name, file in applied(discovery, predictions.widening, result_sha256).items():
+        write_atomically(folder / APPLY_FOLDER / name, file)
+    if not figures:
+        remove_report(folder)
+        return folder / DISCOVERY_FILE
+    # Matplotlib and the templates take a second to import: only where a report is made.
+    from remaster_ros.reports.discovery_report import write_discovery_report
+
+    return write_discovery_report(discovery, confirmation, content, folder)
