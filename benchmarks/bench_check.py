@@ -9,7 +9,7 @@ import sys
 import numpy as np
 from scipy.special import stdtrit
 
-from remaster_ros.compensation.checking import ALARM, bayes_factors
+from remaster_ros.compensation.checking import ALARM, bayes_factors, change
 
 SMALLEST = 2.9
 JOINTS = 5
@@ -45,8 +45,11 @@ def alarms(x, days):
     at = weighted[arms, best].argmax(axis=-1)
     v = 1.0 / (at + 1.0) + 1.0 / (days - at - 1.0)
     half = stdtrit(days - 2.0, 0.975) * np.sqrt(v * left[arms, best, at] / (days - 2.0))
-    clear = np.abs(sizes[arms, best, at]) - half > SMALLEST
-    return (evidence.mean(axis=-1) >= ALARM) & clear
+    found = (evidence.mean(axis=-1) >= ALARM) & (np.abs(sizes[arms, best, at]) - half > SMALLEST)
+    for arm in np.flatnonzero(found):
+        one = change(part[arm, best[arm]])
+        found[arm] = abs(one.size) - one.half > SMALLEST
+    return found
 
 
 def main(arms=500, days=1000, seed=36):

@@ -45,6 +45,8 @@ POWER_STD = 3.09 + 1.645
 PRIOR_STD = 4.0
 """Of a change, in standard deviations of a result: what can be found at all. With 2 a change of 4
 std is found a check later, with 5 no sooner."""
+BATCHES = 6
+"""Batches that the wander of a series is told from: two of their numbers are the means."""
 SEEN = 1e-3
 """A joint whose marker moves by less than this share beside a moved sensor is not seen."""
 SAME_RAD = float(np.radians(0.5))
@@ -298,8 +300,26 @@ def change(x: FloatArray) -> Change:
         return Change(float(evidence(x)), best + 1, float(sizes[best]), np.inf, np.inf)
     v = 1.0 / j[best] + 1.0 / (T - j[best])
     std = float(np.sqrt(v * left[best] / (T - 2.0)))
-    half = float(stdtrit(T - 2.0, 0.975)) * std
+    half = max(float(stdtrit(T - 2.0, 0.975)) * std, wander(x, best + 1))
     return Change(float(evidence(x)), best + 1, float(sizes[best]), std, half)
+
+
+def wander(x: FloatArray, at: int) -> float:
+    """Return half of the 95 % interval of a change before result `at`, by how the series wanders.
+
+    Means of results that follow one another differ by more than their scatter says where days
+    resemble one another, or with a season: batch means, of a sixth of the series at most.
+    """
+    T = len(x)
+    left = np.concatenate((x[:at] - x[:at].mean(), x[at:] - x[at:].mean()))
+    size = max(1, min(at, T - at, T // BATCHES))
+    count = T // size
+    if count < BATCHES:
+        return 0.0
+    means = left[T - count * size :].reshape(count, size).mean(axis=1)
+    variance = np.sum(means**2) / (count - 2.0) * size
+    std = float(np.sqrt(variance * (1.0 / at + 1.0 / (T - at))))
+    return float(stdtrit(count - 2.0, 0.975)) * std
 
 
 @dataclass(frozen=True)

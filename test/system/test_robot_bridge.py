@@ -23,7 +23,8 @@ from remaster_ros.session.workcell import read_cell
 pytestmark = [pytest.mark.ros, pytest.mark.timeout(900)]
 
 CHAIN = read_cell('demo').chain()
-FAST = {'settle_s': 0.5, 'heartbeat_s': 1.0, 'reaction_s': 1.0, 'cartesian_speed_limit_m_s': 0.5}
+# Silence and lag are counted in real time, and a busy machine may stand still for a second.
+FAST = {'settle_s': 0.5, 'heartbeat_s': 4.0, 'reaction_s': 4.0, 'cartesian_speed_limit_m_s': 0.5}
 
 
 @pytest.fixture
@@ -145,9 +146,9 @@ def test_solutions_are_taken_by_the_names_of_the_joints(bridge):
     'silent', ['pose_planner', pytest.param('recorder', marks=pytest.mark.qualify)]
 )
 def test_silence_holds_the_arm_and_it_goes_on_by_itself(bridge, silent):
-    bench = bridge()
+    bench = bridge(heartbeat_s=2.5)
     bench.silent.add(silent)
-    settle(bench, 1.6)
+    settle(bench, 3.2)
     bench.send([HOME + 0.1])
     settle(bench, 1.0)
     assert not moves(bench)
