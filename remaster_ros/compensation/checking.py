@@ -304,6 +304,15 @@ def change(x: FloatArray) -> Change:
     return Change(float(evidence(x)), best + 1, float(sizes[best]), std, half)
 
 
+def step(x: FloatArray, at: int) -> tuple[float, float]:
+    """Return the change of the mean of a series (T,) before result `at`, and its std."""
+    T = len(x)
+    left = np.concatenate((x[:at] - x[:at].mean(), x[at:] - x[at:].mean()))
+    variance = float(left @ left) / (T - 2.0) if T > 2 else np.inf
+    std = float(np.sqrt(variance * (1.0 / at + 1.0 / (T - at))))
+    return float(x[at:].mean() - x[:at].mean()), std
+
+
 def wander(x: FloatArray, at: int) -> float:
     """Return half of the 95 % interval of a change before result `at`, by how the series wanders.
 
@@ -326,7 +335,8 @@ def wander(x: FloatArray, at: int) -> float:
 class JointCheck:
     """What is known of one joint; angles in rad, of the tool in m.
 
-    All but the lever is NaN where a moved sensor looks the same, and the evidence 1.
+    The change is that since the check that is named, or that of the newest check. All but the
+    lever is NaN where a moved sensor looks the same, and the evidence 1.
     """
 
     change_rad: float
@@ -425,13 +435,16 @@ def judge(model: ArmModel, checks: Sequence[Measured], smallest_m: float = SMALL
         kept = np.isin(np.arange(x_m.shape[1]), named[:1])
         x_m = np.where(kept, x_m, others)
         found = [change(x_m[:, i]) for i in range(x_m.shape[1])]
+    # Where nothing is named, the newest check against all before it: no place is chosen.
+    place = at if named or tool else T - 1
+    sizes = [step(x, place) if T > 1 else (float(x[0]), np.inf) for x in x_m.T]
     return Checked(
         verdict,
         total,
         tuple(
             JointCheck(
-                found[i].size / levers[i] if is_seen[i] else np.nan,
-                (found[i].std / levers[i] if T > 2 else float(std[i])) if is_seen[i] else np.nan,
+                sizes[i][0] / levers[i] if is_seen[i] else np.nan,
+                (sizes[i][1] / levers[i] if T > 2 else float(std[i])) if is_seen[i] else np.nan,
                 float(smallest[i]),
                 float(levers[i]),
                 found[i].evidence if is_seen[i] else 1.0,
