@@ -26,7 +26,7 @@ PATIENCE = 4.0
 tenth of a processor is no failure."""
 
 
-def free_domains() -> Iterator[int]:
+def free_domains(first: int = 1, last: int = LAST_DOMAIN) -> Iterator[int]:
     """Yield DDS domains that no other test run on this computer has.
 
     A domain is reserved by a socket of its name, which the kernel removes with the process. The
@@ -34,7 +34,8 @@ def free_domains() -> Iterator[int]:
     """
     held: deque[socket.socket] = deque()
     # Each run begins elsewhere: a domain that was given back a moment ago is not taken at once.
-    for domain in cycle(1 + (os.getpid() + i) % LAST_DOMAIN for i in range(LAST_DOMAIN)):
+    count = last - first + 1
+    for domain in cycle(first + (os.getpid() + i) % count for i in range(count)):
         reservation = socket.socket(socket.AF_UNIX)
         try:
             reservation.bind(f'\0remaster_test_domain_{domain}')
@@ -48,6 +49,11 @@ def free_domains() -> Iterator[int]:
 
 
 domains = free_domains()
+_of_this_process = free_domains(215, 231)
+OWN_DOMAIN = next(_of_this_process)
+"""Of nodes in this process, which no other one has at the same time. Never that of the user's
+shell, in which an arm may be: the ports of domains from 215 on are above those that Linux gives to
+any program, and few use them."""
 
 
 @pytest.fixture(scope='module')

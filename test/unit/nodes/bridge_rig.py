@@ -5,7 +5,6 @@ context of its own. Every message crosses DDS; both nodes are spun by hand. Of t
 is replaced but the wall clock of its modules.
 """
 
-import os
 import time
 from types import SimpleNamespace
 
@@ -16,6 +15,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from hostile_arm import HostileArm
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import QoSProfile
+from ros_rig import OWN_DOMAIN
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
@@ -53,8 +53,6 @@ FAST = {
     'cartesian_speed_limit_m_s': 0.5,
 }
 """Parameters of a bridge whose decisions come soon."""
-DOMAIN = int(os.environ.get('REMASTER_TEST_DOMAIN', 215 + os.getpid() % 15))
-"""Of ROS; never that of the user's shell, in which an arm may be."""
 PATIENCE_S = 30.0
 """So long a message or a path check may take on a busy machine, s."""
 STEP_S = 0.02
@@ -179,7 +177,7 @@ class Rig:
 
     def _open_peer(self, controller):
         self.context = rclpy.Context()
-        rclpy.init(context=self.context, domain_id=DOMAIN)
+        rclpy.init(context=self.context, domain_id=OWN_DOMAIN)
         self.peer = node = rclpy.create_node('peer', context=self.context)
         self._spinner = SingleThreadedExecutor(context=self.context)
         self._spinner.add_node(node)
@@ -214,7 +212,7 @@ class Rig:
         for name, value in {'cell': 'demo', **FAST, **parameters}.items():
             text = str(value).lower() if isinstance(value, bool) else str(value)
             args += ['-p', f'{name}:={text}'] if text else ['-p', f"{name}:=''"]
-        rclpy.init(args=args, domain_id=DOMAIN)
+        rclpy.init(args=args, domain_id=OWN_DOMAIN)
         try:
             self.bridge = CountedBridge()
         except BaseException:

@@ -4,11 +4,12 @@ import threading
 import time
 
 import pytest
+from ros_rig import OWN_DOMAIN
 
 pytest.importorskip('rclpy', reason='needs ROS 2 Jazzy or its wheels')
 
 import rclpy
-from bridge_rig import DOMAIN, PATIENCE_S
+from bridge_rig import PATIENCE_S
 from rclpy.executors import SingleThreadedExecutor
 
 from remaster_ros.nodes.background import Background
@@ -20,7 +21,7 @@ pytestmark = [pytest.mark.ros, pytest.mark.timeout(60)]
 def node(monkeypatch):
     monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
     context = rclpy.Context()
-    rclpy.init(context=context, domain_id=DOMAIN)
+    rclpy.init(context=context, domain_id=OWN_DOMAIN)
     made = rclpy.create_node('worker', context=context)
     executor = SingleThreadedExecutor(context=context)
     executor.add_node(made)

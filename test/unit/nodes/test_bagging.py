@@ -1,9 +1,9 @@
 """What comes fast does not wait behind what comes seldom."""
 
-import os
 import time
 
 import pytest
+from ros_rig import OWN_DOMAIN
 
 pytest.importorskip('rclpy', reason='needs ROS 2 Jazzy or its wheels')
 
@@ -19,7 +19,7 @@ MANY = 60
 
 
 def test_all_messages_of_a_topic_that_wait_are_taken_in_its_turn(tmp_path):
-    rclpy.init(args=[], domain_id=200 + os.getpid() % 15)
+    rclpy.init(args=[], domain_id=OWN_DOMAIN)
     node = rclpy.create_node('taker')
     try:
         executor = SingleThreadedExecutor()

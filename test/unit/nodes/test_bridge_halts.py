@@ -5,12 +5,13 @@ import time
 
 import numpy as np
 import pytest
+from ros_rig import OWN_DOMAIN
 
 pytest.importorskip('rclpy', reason='needs ROS 2 Jazzy or its wheels')
 
 import rclpy
 from bridge_places import AWAY
-from bridge_rig import DOMAIN, HOME, stamp
+from bridge_rig import HOME, stamp
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool
@@ -36,7 +37,7 @@ def intruder(monkeypatch):
     """Return a node in a process of its own, as far as DDS can tell."""
     monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
     context = rclpy.Context()
-    rclpy.init(context=context, domain_id=DOMAIN)
+    rclpy.init(context=context, domain_id=OWN_DOMAIN)
     node = rclpy.create_node('intruder', context=context)
     yield node
     node.destroy_node()

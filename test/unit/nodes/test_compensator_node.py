@@ -2,11 +2,11 @@
 
 import contextlib
 import json
-import os
 import time
 
 import numpy as np
 import pytest
+from ros_rig import OWN_DOMAIN
 
 pytest.importorskip('rclpy', reason='needs ROS 2 Jazzy or its wheels')
 
@@ -34,7 +34,6 @@ from remaster_ros.session.workcell import read_cell
 
 pytestmark = [pytest.mark.ros, pytest.mark.timeout(120)]
 
-DOMAIN = 184 + os.getpid() % 15
 CELL = read_cell('demo')
 CHAIN, URDF = CELL.chain(), CELL.urdf_text
 NAMES = list(CHAIN.joint_names)
@@ -75,8 +74,8 @@ class Rig:
         args = ['--ros-args', '--log-level', 'fatal', '-r', f'__node:={name}']
         for parameter, value in given.items():
             args += ['-p', f'{parameter}:={value}']
-        rclpy.init(args=args, domain_id=DOMAIN)
-        rclpy.init(context=self.context, domain_id=DOMAIN)
+        rclpy.init(args=args, domain_id=OWN_DOMAIN)
+        rclpy.init(context=self.context, domain_id=OWN_DOMAIN)
         self.peer = rclpy.create_node('controller', context=self.context)
         self.executor, self.own = SingleThreadedExecutor(context=self.context), None
         self.executor.add_node(self.peer)

@@ -3,11 +3,12 @@
 from types import SimpleNamespace
 
 import pytest
+from ros_rig import OWN_DOMAIN
 
 pytest.importorskip('rclpy', reason='needs ROS 2 Jazzy or its wheels')
 
 import rclpy
-from bridge_rig import DOMAIN, PATIENCE_S
+from bridge_rig import PATIENCE_S
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Bool
@@ -34,7 +35,7 @@ class Bench:
         self.now = 500.0
         monkeypatch.setattr(emergency_link, 'time', SimpleNamespace(monotonic=lambda: self.now))
         self.context = rclpy.Context()
-        rclpy.init(context=self.context, domain_id=DOMAIN)
+        rclpy.init(context=self.context, domain_id=OWN_DOMAIN)
         self.node = rclpy.create_node('listener', context=self.context)
         self.robot = rclpy.create_node('robot', context=self.context)
         self.executor = SingleThreadedExecutor(context=self.context)

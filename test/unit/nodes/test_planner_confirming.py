@@ -4,11 +4,11 @@ import time
 
 import numpy as np
 import pytest
+from ros_rig import OWN_DOMAIN
 
 pytest.importorskip('rclpy', reason='needs ROS 2 Jazzy or its wheels')
 
 import rclpy
-from bridge_rig import DOMAIN
 from simple_cells import write_cell
 from std_srvs.srv import Trigger
 
@@ -35,7 +35,7 @@ class Planner:
         args = ['--ros-args', '--log-level', 'fatal']
         for name, value in parameters.items():
             args += ['-p', f'{name}:={value}']
-        rclpy.init(args=args, domain_id=DOMAIN)
+        rclpy.init(args=args, domain_id=OWN_DOMAIN)
         self.node = node = PosePlanner()
         node._q = START
         node._announcements.recorder = RecorderState(waiting_for='', run='')

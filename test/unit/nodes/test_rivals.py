@@ -4,11 +4,12 @@ import time
 from types import SimpleNamespace
 
 import pytest
+from ros_rig import OWN_DOMAIN
 
 pytest.importorskip('rclpy', reason='needs ROS 2 Jazzy or its wheels')
 
 import rclpy
-from bridge_rig import DOMAIN, PATIENCE_S
+from bridge_rig import PATIENCE_S
 from rclpy.duration import Duration
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.logging import LoggingSeverity, set_logger_level
@@ -41,7 +42,7 @@ class Bench:
         self.now = 500.0
         monkeypatch.setattr(rivals, 'time', SimpleNamespace(monotonic=lambda: self.now))
         self.context = rclpy.Context()
-        rclpy.init(context=self.context, domain_id=DOMAIN)
+        rclpy.init(context=self.context, domain_id=OWN_DOMAIN)
         self.node = rclpy.create_node('bridge', context=self.context, namespace='/left')
         self.others = []
         self.executor = SingleThreadedExecutor(context=self.context)
@@ -51,7 +52,7 @@ class Bench:
     def other(self, name, qos=PLAIN, namespace='/left'):
         # In a context of its own, as a process has one: a DDS participant.
         context = rclpy.Context()
-        rclpy.init(context=context, domain_id=DOMAIN)
+        rclpy.init(context=context, domain_id=OWN_DOMAIN)
         node = rclpy.create_node(name, context=context, namespace=namespace)
         self.others.append(node)
         count = self.node.count_publishers(f'/left/{TOPIC}')

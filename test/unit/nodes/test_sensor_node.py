@@ -8,6 +8,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from ros_rig import OWN_DOMAIN
 
 pytest.importorskip('rclpy', reason='needs ROS 2 Jazzy or its wheels')
 
@@ -33,7 +34,6 @@ from remaster_ros.types import MarkerReading
 
 pytestmark = [pytest.mark.ros, pytest.mark.timeout(120)]
 
-DOMAIN = 200 + os.getpid() % 15
 PLACE = np.array([0.5, -0.25, 2.0])
 
 
@@ -153,9 +153,9 @@ def rig(monkeypatch, tmp_path):
         args = ['--ros-args', '--log-level', 'fatal', '-r', f'__node:={name}']
         for key, value in parameters.items():
             args += ['-p', f'{key}:={value}']
-        rclpy.init(args=args, domain_id=DOMAIN)
+        rclpy.init(args=args, domain_id=OWN_DOMAIN)
         context = rclpy.Context()
-        rclpy.init(context=context, domain_id=DOMAIN)
+        rclpy.init(context=context, domain_id=OWN_DOMAIN)
         peer = rclpy.create_node('peer', context=context)
         r = SimpleNamespace(peer=peer, context=context, points=[], temperatures=[], node=None)
         made.append(r)

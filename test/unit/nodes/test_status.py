@@ -3,11 +3,11 @@
 import time
 
 import pytest
+from ros_rig import OWN_DOMAIN
 
 pytest.importorskip('rclpy', reason='needs ROS 2 Jazzy or its wheels')
 
 import rclpy
-from bridge_rig import DOMAIN
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.executors import SingleThreadedExecutor
 from std_msgs.msg import String
@@ -33,7 +33,7 @@ class Bench:
 
     def __init__(self):
         self.context = rclpy.Context()
-        rclpy.init(context=self.context, domain_id=DOMAIN)
+        rclpy.init(context=self.context, domain_id=OWN_DOMAIN)
         self.node = rclpy.create_node('robot_bridge', context=self.context, namespace='left')
         self.summary = Summary('error', HALT, {'commanded': 3}, BridgeState(halted=HALT))
         self.status = NodeStatus(self.node, lambda: self.summary, 'lwr4plus')

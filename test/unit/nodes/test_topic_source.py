@@ -1,11 +1,11 @@
 """A topic of another package's node as a sensor, through real DDS: its publishers are fakes."""
 
-import os
 import time
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from ros_rig import OWN_DOMAIN
 
 pytest.importorskip('rclpy', reason='needs ROS 2 Jazzy or its wheels')
 
@@ -24,7 +24,6 @@ from remaster_ros.session.workcell import config_path
 
 pytestmark = [pytest.mark.ros, pytest.mark.timeout(120)]
 
-DOMAIN = 184 + os.getpid() % 15
 PLACE = np.array([0.5, -0.25, 2.0])
 SOURCE = '/vrpn_mocap/tool/pose'
 
@@ -60,9 +59,9 @@ def rig(monkeypatch, tmp_path):
         cell = cell_of(tmp_path, message_type)
         args = ['--ros-args', '--log-level', 'fatal', '-r', f'__node:={name}']
         args += ['-p', f'cell:={cell}', '-p', 'sensor:=mocap']
-        rclpy.init(args=args, domain_id=DOMAIN)
+        rclpy.init(args=args, domain_id=OWN_DOMAIN)
         context = rclpy.Context()
-        rclpy.init(context=context, domain_id=DOMAIN)
+        rclpy.init(context=context, domain_id=OWN_DOMAIN)
         peer = rclpy.create_node('vrpn', context=context)
         r = SimpleNamespace(peer=peer, context=context, points=[], node=None)
         made.append(r)
