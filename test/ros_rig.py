@@ -1,5 +1,6 @@
 """Tests of real processes: each has a DDS domain, a ROS_HOME and processes of its own."""
 
+import atexit
 import os
 import signal
 import socket
@@ -33,23 +34,28 @@ def free_domains(first: int = 1, last: int = LAST_DOMAIN) -> Iterator[int]:
     last few are held; those before them are free again.
     """
     held: deque[socket.socket] = deque()
-    # Each run begins elsewhere: a domain that was given back a moment ago is not taken at once.
     count = last - first + 1
-    for domain in cycle(first + (os.getpid() + i) % count for i in range(count)):
-        reservation = socket.socket(socket.AF_UNIX)
-        try:
-            reservation.bind(f'\0remaster_test_domain_{domain}')
-        except OSError:
+    try:
+        # Each run begins elsewhere: a domain given back a moment ago is not taken at once.
+        for domain in cycle(first + (os.getpid() + i) % count for i in range(count)):
+            reservation = socket.socket(socket.AF_UNIX)
+            try:
+                reservation.bind(f'\0remaster_test_domain_{domain}')
+            except OSError:
+                reservation.close()
+                continue
+            held.append(reservation)
+            if len(held) > DOMAINS_HELD:
+                held.popleft().close()
+            yield domain
+    finally:
+        for reservation in held:
             reservation.close()
-            continue
-        held.append(reservation)
-        if len(held) > DOMAINS_HELD:
-            held.popleft().close()
-        yield domain
 
 
 domains = free_domains()
 _of_this_process = free_domains(215, 231)
+atexit.register(_of_this_process.close)
 OWN_DOMAIN = next(_of_this_process)
 """Of nodes in this process, which no other one has at the same time. Never that of the user's
 shell, in which an arm may be: the ports of domains from 215 on are above those that Linux gives to
