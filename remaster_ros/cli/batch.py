@@ -14,9 +14,17 @@ import json
 import logging
 import multiprocessing
 import os
+import threading
 import urllib.parse
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
+from concurrent.futures import (
+    FIRST_COMPLETED,
+    CancelledError,
+    Executor,
+    Future,
+    ProcessPoolExecutor,
+    wait,
+)
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -28,6 +36,7 @@ from remaster_ros.cli.options import integer
 from remaster_ros.errors import InputError, InsufficientDataError, RemasterError
 from remaster_ros.session.files import make_folder
 from remaster_ros.session.journal import Journal
+from remaster_ros.session.manifest import MANIFEST
 from remaster_ros.version import __version__
 
 FORMAT = 'remaster-batch/1'
@@ -36,6 +45,9 @@ PAGE = 'batch.html'
 KILLED = 2
 """A session whose worker died so often is given up: the first time another one may have done it,
 the second time it had the worker for itself."""
+FINAL = ('done', 'no answer')
+"""What the data say. An error may be the disk's, and a killed worker the memory's: such sessions
+are tried again by the next call."""
 AHEAD = 4
 """Sessions that each worker of a scheduler has waiting, so that none is idle meanwhile."""
 
@@ -112,15 +124,21 @@ def run(args: argparse.Namespace) -> int:
     try:
         if rows.lost:
             log.warning('%s', rows.lost)
-        done = _done(rows, args.out / ROWS)
-        left = [job for job in jobs if job.key not in done]
+        said = _said(rows, args.out / ROWS)
+        done = {key: row for key, row in said.items() if row.get('status') in FINAL}
+        # Copies of a session are one.
+        left = list({job.key: job for job in jobs if job.key not in done}.values())
         with progress_bar(args.quiet or args.json) as progress:
+            worked_on = 0
 
             def finished(job: Job, row: dict[str, Any]) -> None:
+                nonlocal worked_on
                 row = {'format': FORMAT, 'key': job.key, 'session': job.session, **row}
                 done[job.key] = row
-                rows.append(row)
-                progress('sessions', len(done.keys() & {job.key for job in jobs}) / len(jobs))
+                if row != said.get(job.key):
+                    rows.append(row)
+                worked_on += 1
+                progress('sessions', worked_on / len(left))
 
             if left and args.scheduler is not None:
                 with _scheduler(args.scheduler, insecure=args.insecure) as (executor, workers):
@@ -130,7 +148,8 @@ def run(args: argparse.Namespace) -> int:
                 work_off(left, worked, lambda: _pool(count), count, finished)
     finally:
         rows.close()
-    found = [done[job.key] for job in jobs]
+    # A session may have been moved since, or be a copy.
+    found = [{**done[job.key], 'session': job.session} for job in jobs]
     from remaster_ros.reports.batch_page import summary_of, write_batch_page
 
     over_all = summary_of(found)
@@ -147,7 +166,9 @@ def run(args: argparse.Namespace) -> int:
 def _job(folder: Path, out: Path, seed: int, baseline: str) -> Job:
     """Return the work on a session; what cannot be read becomes its row's error."""
     made_of = hashlib.sha256(f'{__version__} {seed}'.encode())
-    files = sorted(path for path in folder.glob('*') if path.suffix in _READ)
+    files = sorted(
+        path for path in folder.glob('*') if path.suffix in _READ or path.name == MANIFEST
+    )
     for path in [*files, *([Path(baseline)] if baseline else [])]:
         try:
             content = path.read_bytes()
@@ -162,16 +183,13 @@ def _job(folder: Path, out: Path, seed: int, baseline: str) -> Job:
 _READ = ('.yaml', '.csv', '.urdf', '.xml')
 
 
-def _done(rows: Journal, path: Path) -> dict[str, dict[str, Any]]:
-    """Return the rows that stay; a session whose worker was killed is done again."""
+def _said(rows: Journal, path: Path) -> dict[str, dict[str, Any]]:
+    """Return the last row of each key."""
     found = {}
     for line, row in enumerate(rows.records, 1):
         if row.get('format') != FORMAT or not isinstance(row.get('key'), str):
             raise InputError(f'{path}, line {line}: is no row of a batch; name another folder')
-        if row.get('status') != 'killed':
-            found[row['key']] = row
-        else:
-            found.pop(row['key'], None)
+        found[row['key']] = {name: value for name, value in row.items() if name != 'crc32'}
     return found
 
 
@@ -363,9 +381,24 @@ def _died(error: Exception) -> bool:
 
 
 def _pool(workers: int) -> ProcessPoolExecutor:
-    # Forked, a worker would have the parent's locks and threads. What it starts is set before.
-    os.environ['OMP_NUM_THREADS'] = '1'
-    return ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context('spawn'))
+    # What a worker starts with is set before; the latter two would go before the first.
+    for name in ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS'):
+        os.environ[name] = '1'
+    # Forked, a worker would have the parent's locks and threads.
+    spawn = multiprocessing.get_context('spawn')
+    return ProcessPoolExecutor(workers, mp_context=spawn, initializer=_end_with_parent)
+
+
+def _end_with_parent() -> None:
+    """End this worker when the batch is killed: it would wait for work for ever."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+
+    def watch() -> None:
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
 
 
 @contextmanager
@@ -378,6 +411,8 @@ def _scheduler(address: str, *, insecure: bool) -> Iterator[tuple[Executor, int]
         raise InputError(
             "--scheduler takes Dask: pip install 'remaster_ros[cluster]', or use --workers"
         ) from None
+    # What it logs are tracebacks; what a person can do is said below.
+    logging.getLogger('distributed').setLevel(logging.CRITICAL + 1)
     try:
         client = Client(address, timeout='10s')
     except (OSError, ValueError, TimeoutError) as error:
@@ -386,9 +421,35 @@ def _scheduler(address: str, *, insecure: bool) -> Iterator[tuple[Executor, int]
         workers = sum(client.nthreads().values())
         if not workers:
             raise InputError(f'{address}: the scheduler has no workers; start some first')
+        _require_this_version(client, address)
         yield client.get_executor(pure=False), workers
+    except CancelledError:
+        raise InputError(
+            f'{address}: the scheduler has ended; start it again and call this again: the rows '
+            'that were done stay'
+        ) from None
     finally:
         client.close()
+
+
+def _require_this_version(client: Any, address: str) -> None:
+    """Refuse workers that would make rows of another version under the name of this one."""
+    try:
+        versions = client.run(_version)
+    except Exception as error:
+        raise InputError(
+            f'{address}: a worker cannot work with remaster_ros {__version__} ({error}); install '
+            'it there'
+        ) from None
+    for worker, version in versions.items():
+        if version != __version__:
+            raise InputError(
+                f'{worker}: has remaster_ros {version}, here is {__version__}; install the same'
+            )
+
+
+def _version() -> str:
+    return __version__
 
 
 def _refuse_open(address: str, *, insecure: bool) -> None:

@@ -8,18 +8,22 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.special import stdtrit
 
 from remaster_ros.compensation.checking import ALARM, change
 from remaster_ros.reports.pages import page
 from remaster_ros.session.files import write_atomically
+from remaster_ros.types import FloatArray
 
 MAD_STD = 1.4826
 """Standard deviations of a normal variable in a median of absolute deviations."""
-DIFFERS = 5.0
-"""So many standard deviations from the median of the sessions one differs: of ten joints in a
-thousand sessions, none does by chance."""
+OWN_STD = 5.0
+"""One differs only if it is so many of its own standard deviations from the median: of ten joints
+in a thousand sessions, none is by chance."""
+FALSE = 0.01
+"""How often any of a kind of arm is said to differ, where all are drawn alike."""
 FEW = 5
-"""Sessions that a median and its scatter take."""
+"""Sessions of which one can be told from the scatter of the others."""
 
 
 def summary_of(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
@@ -43,7 +47,7 @@ def summary_of(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
             names = tuple(one['joint'] for one in row['fit']['joints'])
             arms[row['fit']['robot'], names].append(row)
     joints = [
-        _joint(robot, name, index, mine)
+        _joint(robot, name, index, mine, FALSE / len(names))
         for (robot, names), mine in arms.items()
         for index, name in enumerate(names)
     ]
@@ -68,7 +72,41 @@ def summary_of(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     return {'counts': dict(counts), 'joints': joints, 'lines': lines}
 
 
-def _joint(robot: str, name: str, index: int, rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+def differing(values: FloatArray, level: float) -> list[int]:
+    """Return which of the values (n,) are none of the normal distribution of the others.
+
+    The generalised extreme Studentised deviate test: values are taken out one by one, up to a
+    third of them, so that several do not hide each other.
+
+    Parameters
+    ----------
+    level
+        How often any is named where none differs; simulated for 5 to 200 values.
+
+    Notes
+    -----
+    B. Rosner, "Percentage points for a generalized ESD many-outlier procedure", Technometrics 25,
+    1983, equation 2.5.
+    """
+    left = list(range(len(values)))
+    out: list[int] = []
+    differ = 0
+    for _ in range((len(values) - 1) // 3):
+        n = len(left)
+        off = np.abs(values[left] - np.mean(values[left]))
+        worst = int(np.argmax(off))
+        t = float(stdtrit(n - 2.0, 1.0 - level / (2.0 * n)))
+        limit = (n - 1.0) * t / np.sqrt((n - 2.0 + t**2) * n)
+        beyond = off[worst] > limit * np.std(values[left], ddof=1)
+        out.append(left.pop(worst))
+        if beyond:
+            differ = len(out)
+    return sorted(out[:differ])
+
+
+def _joint(
+    robot: str, name: str, index: int, rows: Sequence[Mapping[str, Any]], level: float
+) -> dict[str, Any]:
     known = [row for row in rows if row['fit']['joints'][index]['mean_deg'] is not None]
     mean = np.array([row['fit']['joints'][index]['mean_deg'] for row in known])
     std = np.array([row['fit']['joints'][index]['std_deg'] for row in known])
@@ -84,8 +122,8 @@ def _joint(robot: str, name: str, index: int, rows: Sequence[Mapping[str, Any]])
     found |= {'median_deg': median, 'spread_deg': spread}
     if len(mean) < FEW:
         return found
-    off = np.abs(mean - median) / np.hypot(spread, std)
-    found['differs'] = [names[i] for i in np.flatnonzero(off > DIFFERS)]
+    sure = np.abs(mean - median) > OWN_STD * std
+    found['differs'] = [names[i] for i in differing(mean, level) if sure[i]]
     # Along the sessions in the order given, as for checks; one that differs alone is no change.
     along = change(mean)
     if along.evidence >= ALARM and abs(along.size) > along.half:
