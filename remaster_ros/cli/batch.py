@@ -87,7 +87,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--baseline',
         metavar='COMPENSATION',
         type=Path,
-        help='apply/compensation.json: has each session changed against it, and which joint?',
+        help='apply/compensation.json: compare each session with it, as a first check does',
     )
     where = parser.add_mutually_exclusive_group()
     where.add_argument(
