@@ -28,25 +28,12 @@ SEED = 10
 """Of few configurations: 11 of four poses to fit, 8 of two to validate."""
 
 
-@pytest.fixture(scope='module')
-def demo(ros_environment, tmp_path_factory):
+def ended(ros_environment, out, *more):
     """Run a small demo to its end; returns its folder and what it printed."""
-    out = tmp_path_factory.mktemp('demo') / 'out'
     print(f'seed {SEED}')
+    command = [sys.executable, '-m', 'remaster_ros.cli.main', 'demo', '--out', str(out)]
     process = subprocess.run(
-        [
-            sys.executable,
-            '-m',
-            'remaster_ros.cli.main',
-            'demo',
-            '--out',
-            str(out),
-            '--seed',
-            str(SEED),
-            '--candidates',
-            '5',
-            '--apply',
-        ],
+        [*command, '--seed', str(SEED), '--candidates', '5', *more],
         env={**ros_environment, 'COLUMNS': '200'},
         capture_output=True,
         text=True,
@@ -56,6 +43,11 @@ def demo(ros_environment, tmp_path_factory):
     logs = ''.join(path.read_text() for path in (out / 'log').glob('*.log'))
     assert process.returncode == 0, process.stdout + process.stderr + logs
     return out, process.stdout
+
+
+@pytest.fixture(scope='module')
+def demo(ros_environment, tmp_path_factory):
+    return ended(ros_environment, tmp_path_factory.mktemp('demo') / 'out')
 
 
 @pytest.fixture(scope='module')
@@ -141,9 +133,10 @@ def test_the_offsets_are_the_hidden_ones(demo, truth):
     assert validation['after']['mean_mm'] < 0.1 * validation['before']['mean_mm']
 
 
-def test_the_corrected_arm_comes_to_where_it_is_wanted(demo):
+@pytest.mark.qualify
+def test_the_corrected_arm_comes_to_where_it_is_wanted(ros_environment, tmp_path):
     """Poses that no fit has seen, by the bridge with the fit's own compensation.json."""
-    out, printed = demo
+    out, printed = ended(ros_environment, tmp_path / 'out', '--apply')
     file = out / 'fit' / 'apply' / 'compensation.json'
     compensator = read_compensation(file).compensator
     session = read_session(out / 'corrected')
