@@ -19,7 +19,7 @@ FRESH_S = 0.25
 ASTRAY_S = 0.3
 """An arm that is off its path for so long (wall time) is halted, s."""
 LATENCY_S = 0.1
-"""What a busy machine may add to the lag of an arm, s of wall time."""
+"""What a busy machine may add to the lag of an arm, or to its lead, s of wall time."""
 JITTER_S = 0.02
 """By so much a command's way to the robot may differ from another's, s of wall time."""
 EARLY_S = 0.1
@@ -132,7 +132,7 @@ class Following:
         self._lag_s = 0.0
         # The last moments: time since it was sent (s), where the arm was (rad), its lag (s).
         self._trail: deque[tuple[float, FloatArray, float]] = deque()
-        self._allowed_s = rules.lag_s
+        self._allowed_s, self._early_s = rules.lag_s, EARLY_S + LATENCY_S
         self._astray = ''
         self._astray_wall: float | None = None
 
@@ -143,6 +143,9 @@ class Following:
     def update(self, seen: Seen, rate: float) -> str:
         """Process a report; return how the arm has been off its path for too long, ''."""
         self._allowed_s = allowed_lag_s(self._rules, rate)
+        # A clock that runs faster stands still, too, while a busy machine catches up: when a move
+        # was sent is then reckoned too late.
+        self._early_s = EARLY_S + LATENCY_S * max(rate, 1.0)
         elapsed = self.elapsed_s(seen.time)
         self._astray = self._look(seen, elapsed)
         self._trail.append((elapsed, seen.q, self._lag_s))
@@ -195,12 +198,17 @@ class Following:
             self.reacted = True
         lag, off, is_near = self._lag(elapsed, seen.q)
         self._lag_s = float(np.clip(lag, 0.0, self._allowed_s))
-        if off <= ON_PATH_RAD and (is_near or -EARLY_S - LATENCY_S <= lag <= self._allowed_s):
+        if off <= ON_PATH_RAD and (is_near or -self._early_s <= lag <= self._allowed_s):
             return ''
         if seen.time - seen.stands_since >= STANDING_S:
             return STOPPED_ON_ITS_WAY
         if off > ON_PATH_RAD:
             return f'the robot does not follow its path: {np.rad2deg(off):.1f} deg beside it'
+        if lag < 0.0:
+            return (
+                f'the robot does not follow its path: {-lag:.2f} s ahead of it; does something '
+                'else move it, or are joint_states stamped late?'
+            )
         return (
             f'the robot does not follow its path: {lag:.2f} s behind it; is its speed override '
             'below 100 %, or do joint_states come late?'

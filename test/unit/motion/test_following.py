@@ -135,7 +135,14 @@ def test_an_arm_that_runs_ahead_does_not_follow():
     arm = Arm()
     astray = arm.run(2.2, arm.lagging(-0.22))
     assert astray is not None
-    assert '-0.22 s behind it' in arm.said
+    assert '0.22 s ahead of it' in arm.said
+
+
+@pytest.mark.parametrize(('ahead', 'follows'), [(0.6, True), (1.15, False)])
+def test_a_clock_that_runs_ten_times_as_fast_stands_still_meanwhile(ahead, follows):
+    """A tenth of a second of a busy machine is a second of such a clock, ahead and behind."""
+    arm = Arm(Trajectory((Line(AT, np.add(AT, 4.0), 0.1),)), rate=10.0)
+    assert (arm.run(9.0, arm.lagging(-ahead)) is None) == follows
 
 
 def test_off_its_path_for_a_moment_is_no_reason_and_for_longer_is():
