@@ -672,6 +672,13 @@ class Demo:
                     self._trigger('remaster/collect', 'pose_planner')
                 if planner.get('state') == 'failed':
                     raise DeviceError(f'the planner gave up: {planner["message"]}')
+                halted = self.node.summaries.get('robot_bridge', {}).get('halted')
+                if halted and not self.p.watch:
+                    # Only a person ends a halt, and here is none; with the live page there may be.
+                    raise DeviceError(
+                        f'the arm was halted, which only a person ends: {halted}. What was '
+                        'measured is kept; start the demo again'
+                    )
                 closed = self.node.summaries.get('recorder', {}).get('exit_status')
                 return planner.get('state') == 'complete' and closed == 'complete'
 

@@ -92,6 +92,28 @@ def test_while_it_collects(start, tmp_path):
         assert 'Traceback' not in log.read_text(), log
 
 
+@pytest.mark.qualify
+def test_a_halted_demo_ends_and_says_why(start, tmp_path):
+    """The fake robot stands still: the bridge halts, and nobody is there who could end that."""
+    out = tmp_path / 'out'
+    process = start(
+        'remaster_ros.cli.main', 'demo', '--out', out, '--no-figures', '--candidates', '4'
+    )
+    wait_until(lambda: observations(out / 'session') >= 2, 300, 'two observations')
+    (robot,) = [
+        pid
+        for pid in children(process.pid)
+        if b'fake_robot' in Path(f'/proc/{pid}/cmdline').read_bytes().split(b'\0')
+    ]
+    os.kill(robot, signal.SIGSTOP)
+    process.wait(timeout=120)
+    assert process.returncode == 2, process.communicate()
+    error = process.stderr.read()
+    assert 'the arm was halted, which only a person ends' in error
+    assert 'Traceback' not in error
+    assert len(read_session(out / 'session').measurements) >= 2
+
+
 def test_a_killed_demo_leaves_no_process(start, tmp_path):
     """Even SIGKILL: the kernel signals the children that their parent has died."""
     out = tmp_path / 'out'
