@@ -231,7 +231,7 @@ def in_words(found: Checked, joint_names: tuple[str, ...], names: list[str]) -> 
     same = f', or the zero of {" or ".join(unseen)}, which looks the same' if unseen else ''
     if found.verdict == 'changed':
         alike = [joint_names[joint] for joint in found.changed]
-        who = ' or '.join([*alike, *(['the marker on the tool'] if found.tool_moved else [])])
+        who = ' or '.join(alike)
         several = ': these look alike in the poses of the check' if len(alike) > 1 else ''
         size = 1e3 * abs(found.joints[found.changed[0]].change_rad)
         size *= found.joints[found.changed[0]].lever_m
@@ -239,6 +239,13 @@ def in_words(found: Checked, joint_names: tuple[str, ...], names: list[str]) -> 
             f'Changed since check {_named(found, names)}: {who}{several}; {size:.2f} mm at the '
             'tool. Look at it (a collision, a loose bolt, a new zero), then measure and correct '
             'the arm again.'
+        )
+    if found.verdict == 'unclear' and found.tool_moved:
+        who = ' or '.join(joint_names[joint] for joint in found.changed)
+        return (
+            f'Something has changed since check {_named(found, names)}: {who} or the marker on '
+            'the tool, which look alike in the poses of the check. Look at the marker first: '
+            'where it sits as it did, the arm has changed.'
         )
     if found.verdict == 'setup_moved' and found.tool_moved:
         return (

@@ -35,6 +35,8 @@ from remaster_ros.types import FloatArray
 TRIED_STARTS = 200
 # Of a check: four see 0.26 mm where eight see 0.17, and sixteen take twice the time for 0.12.
 CHECK_POSES = 8
+# A check that takes longer is not made each day.
+CHECK_S = 90.0
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -179,6 +181,12 @@ def _check_text(check: dict[str, Any], path: Path) -> str:
         'smallest change that one check finds, at a noise of '
         f'{check["noise_mm"]:.2g} mm per axis:',
     ]
+    if check['seconds'] > CHECK_S:
+        lines.insert(
+            1,
+            f'that is more than the {CHECK_S:g} s of a check: raise the limits of speed, if the '
+            'cell allows it',
+        )
     for name, size in check['detectable_mm'].items():
         what = 'none: looks like a sensor that was moved' if size is None else f'{size:.2f} mm'
         lines.append(f'  {name}: {what}')

@@ -24,7 +24,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from scipy.special import chdtri, erfc, stdtrit
+from scipy.special import erfc, fdtri, stdtrit
 
 from remaster_ros.calibration.registration import register_points
 from remaster_ros.compensation.arm_model import ArmModel
@@ -415,7 +415,7 @@ def judge(model: ArmModel, checks: Sequence[Measured], smallest_m: float = SMALL
     std = noise / np.sqrt(np.where(is_seen, information, np.inf))
     smallest = detectable_m(last.joints, levers, noise)
     before = looks[-2].T_R_N if T > 1 else model.T_R_N
-    moved, moved_is = _moved(before, last, checks[-1], noise, smallest_m)
+    moved, moved_is = _moved(before, last, checks[-1], noise, max(T - 1, 1), smallest_m)
     clear = abs(found[best].size) - found[best].half > smallest_m
     small = abs(found[best].size) + found[best].half < smallest_m
     single = _single(looks, x_m, counts, is_seen)
@@ -425,7 +425,8 @@ def judge(model: ArmModel, checks: Sequence[Measured], smallest_m: float = SMALL
     again = False
     if total >= ALARM and clear:
         named, tool = _named(looks, at, noise, is_seen)
-        verdict = 'setup_moved' if tool and not named else 'changed'
+        # A joint and the marker that look alike: nobody is told to correct the arm for that.
+        verdict = 'unclear' if tool and named else 'setup_moved' if tool else 'changed'
     elif (total > DOUBT and not small) or single:
         verdict, again = 'unclear', True
     if named or tool:
@@ -452,7 +453,7 @@ def judge(model: ArmModel, checks: Sequence[Measured], smallest_m: float = SMALL
             for i in range(len(levers))
         ),
         named,
-        at if verdict in ('changed', 'setup_moved') and (named or tool) else None,
+        at if named or tool else None,
         tool,
         moved,
         again,
@@ -505,6 +506,7 @@ def _moved(
     last: Seen,
     measured: Measured,
     noise: float,
+    looks: int,
     smallest_m: float,
 ) -> tuple[float, bool]:
     """Return by how much the sensors see the markers elsewhere, RMS, m, and whether they moved."""
@@ -514,8 +516,11 @@ def _moved(
         place = measured.position[mine]
         shift[mine] = apply(T, place) - apply(before.get(sensor, T), place)
     squares, size = float(np.sum(shift**2)), float(np.sqrt(np.mean(np.sum(shift**2, axis=1))))
-    # Two fits of six numbers a sensor each, with the noise of the readings.
-    limit = float(chdtri(6.0 * len(last.T_R_N), erfc(BEYOND / np.sqrt(2.0))))
+    # Two fits of six numbers a sensor each, and a noise that is estimated from so many checks.
+    count = 6.0 * len(last.T_R_N)
+    limit = count * float(
+        fdtri(count, float(looks * last.freedom), 1.0 - erfc(BEYOND / np.sqrt(2.0)))
+    )
     return size, size > smallest_m and squares > 2.0 * noise**2 * limit
 
 

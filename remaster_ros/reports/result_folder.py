@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -113,15 +113,11 @@ def save_fit(result: FitResult, folder: str | os.PathLike[str], figures: bool = 
     write_fit(result, folder / FIT_FILE)
     result_sha256 = hashlib.sha256((folder / FIT_FILE).read_bytes()).hexdigest()
     write_atomically(folder / RESIDUALS_FILE, residuals_text(result))
-    make_folder(folder / APPLY_FOLDER)
-    # A model of an earlier fit would contradict the rest.
-    (folder / APPLY_FOLDER / MODEL_FILE).unlink(missing_ok=True)
     files = exports(result)
     if (geometry := geometry_of(result)) is not None and geometry.is_better:
         files[MODEL_FILE] = model_text(result, geometry)
     files[COMPENSATION_FILE] = compensation_text(result, result_sha256)
-    for name, text in files.items():
-        write_atomically(folder / APPLY_FOLDER / name, text)
+    _write_applied(folder, files)
     if not figures:
         remove_report(folder)
         return folder / FIT_FILE
@@ -167,11 +163,7 @@ def save_discovery(
     gross = {observation for observation, _ in discovery.fit.left_out}
     rows = predictions_text(discovery.fit.session, predictions, gross)
     write_atomically(folder / PREDICTIONS_FILE, rows)
-    make_folder(folder / APPLY_FOLDER)
-    # That of an earlier run would contradict the rest.
-    (folder / APPLY_FOLDER / MODEL_FILE).unlink(missing_ok=True)
-    for name, file in applied(discovery, predictions.widening, result_sha256).items():
-        write_atomically(folder / APPLY_FOLDER / name, file)
+    _write_applied(folder, applied(discovery, predictions.widening, result_sha256))
     if not figures:
         remove_report(folder)
         return folder / DISCOVERY_FILE
@@ -179,3 +171,11 @@ def save_discovery(
     from remaster_ros.reports.discovery_report import write_discovery_report
 
     return write_discovery_report(discovery, confirmation, content, folder)
+
+
+def _write_applied(folder: Path, files: Mapping[str, str | bytes]) -> None:
+    """Write what a robot can load; a model of an earlier run would contradict it."""
+    make_folder(folder / APPLY_FOLDER)
+    (folder / APPLY_FOLDER / MODEL_FILE).unlink(missing_ok=True)
+    for name, content in files.items():
+        write_atomically(folder / APPLY_FOLDER / name, content)

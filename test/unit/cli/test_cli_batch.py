@@ -18,8 +18,10 @@ import pytest
 
 from remaster_ros.cli import batch
 from remaster_ros.cli.main import main
+from remaster_ros.errors import InputError
 from remaster_ros.reports.batch_page import summary_of
 from remaster_ros.session.journal import read_journal
+from remaster_ros.session.reader import read_session
 
 
 def rows(folder: Path) -> dict[str, dict]:
@@ -89,6 +91,15 @@ def test_copies_are_worked_on_once_and_each_has_its_name(sessions, tmp_path, cap
     (moved,) = json.loads(capsys.readouterr().out)['rows']
     assert moved['session'] == str(tmp_path / 'moved')
     assert len(read_journal(tmp_path / 'out' / batch.ROWS).records) == 1
+    # Against the correction of one session, made of each: another arm's, and its own.
+    (baseline,) = (tmp_path / 'out').glob('*/fit/apply/compensation.json')
+    other, own = sessions / 's2', sessions / 's1'
+    job = batch.Job('', str(other), '', 0, str(baseline))
+    found = batch._of_check(job, read_session(other))
+    assert found['verdict'] == 'unclear', 'offsets of half a degree lie between the two arms'
+    assert [one['joint'] for one in found['joints']] == [f'joint_{i}' for i in range(1, 8)]
+    with pytest.raises(InputError, match='is the session that the correction was made of'):
+        batch._of_check(job, read_session(own))
 
 
 def test_an_error_that_is_none_of_the_session_is_tried_again(sessions, tmp_path, capsys):
