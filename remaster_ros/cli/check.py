@@ -257,6 +257,12 @@ def in_words(found: Checked, joint_names: tuple[str, ...], names: list[str]) -> 
             f'The sensor or the base moved by {1e3 * found.moved_m:.2f} mm{same}. No other joint '
             'has changed: the check is good for them.'
         )
+    if found.verdict == 'unclear' and len(names) == 1:
+        return (
+            'The first check is further from the correction than both are uncertain by: check '
+            'again at once. If it stays so: is it this arm, this marker, and is the correction '
+            'in use as it was when it was measured?'
+        )
     if found.verdict == 'unclear':
         return 'Something may have changed: check again at once.'
     return 'No joint has changed by more than a check can see.'
@@ -269,6 +275,8 @@ def _named(found: Checked, names: list[str]) -> str:
 
 def _text(content: dict[str, Any]) -> str:
     lines = [f'{content["verdict"]}: {content["text"]}']
+    if not content['changed']:
+        lines.append('each joint as if it alone had changed:')
     for one in content['joints']:
         if one['detectable_mm'] is None:
             lines.append(f'  {one["joint"]}: looks like a sensor that was moved; not checked')
