@@ -14,9 +14,8 @@ from remaster_ros.version import __version__
 
 # Each function imports what it needs: a node or a verb shall not wait for all of it.
 if TYPE_CHECKING:
-    from remaster_ros.calibration.result import FitResult
     from remaster_ros.compensation.file import Compensation
-    from remaster_ros.discovery.discover import Discovery
+    from remaster_ros.notebook import Fit, Found
     from remaster_ros.planning.tour_order import Tour
     from remaster_ros.simulation.simulated_workcell import SimulatedRun
     from remaster_ros.types import Priors, Session
@@ -169,7 +168,7 @@ def import_table(
     )
 
 
-def fit(session: Session, *, seed: int = 0, priors: Priors | None = None) -> FitResult:
+def fit(session: Session, *, seed: int = 0, priors: Priors | None = None) -> Fit:
     """Estimate the joint zero-offsets of a session, with their uncertainty.
 
     Parameters
@@ -202,11 +201,12 @@ def fit(session: Session, *, seed: int = 0, priors: Priors | None = None) -> Fit
     import numpy as np
 
     from remaster_ros.calibration.fit import fit_session
+    from remaster_ros.notebook import Fit
 
-    return fit_session(session, rng=np.random.default_rng(seed), priors=priors)
+    return Fit.of(fit_session(session, rng=np.random.default_rng(seed), priors=priors))
 
 
-def discover(session: Session, *, seed: int = 0) -> Discovery:
+def discover(session: Session, *, seed: int = 0) -> Found:
     """Find what the zero-offsets leave unexplained, and its physical cause.
 
     Parameters
@@ -227,7 +227,7 @@ def discover(session: Session, *, seed: int = 0) -> Discovery:
     --------
     >>> import remaster_ros
     >>> made = remaster_ros.simulate(
-    ...     poses=20, validation_poses=10, effects=['joint_compliance@2:1.0'], seed=1
+    ...     poses=14, validation_poses=8, effects=['joint_compliance@2:1.0'], seed=1
     ... )
     >>> found = remaster_ros.discover(made.session)
     >>> [(effect.name, effect.joints) for effect in found.effects]
@@ -236,8 +236,9 @@ def discover(session: Session, *, seed: int = 0) -> Discovery:
     import numpy as np
 
     from remaster_ros.discovery.discover import discover_session
+    from remaster_ros.notebook import Found
 
-    return discover_session(session, rng=np.random.default_rng(seed))
+    return Found.of(discover_session(session, rng=np.random.default_rng(seed)))
 
 
 def simulate(

@@ -312,7 +312,7 @@ class Correction:
         return self.form + (f', checksum {self.sha256[:8]}' if self.sha256 else '')
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Session:
     """A session: the robot, the markers and sensors, and what was measured.
 
@@ -386,6 +386,56 @@ class Session:
     def urdf_sha256(self) -> str:
         """SHA-256 of the URDF's text, which identifies the robot that a result belongs to."""
         return hashlib.sha256(self.urdf.encode()).hexdigest()
+
+    def __repr__(self) -> str:
+        m = self.measurements
+        sensors = ', '.join(f'{name} (marker {marker})' for name, marker in self.sensors.items())
+        held_out = int(m.is_validation.sum())
+        return (
+            f'Session of the arm from {self.base_link} to {self.tip_link}: {m.q.shape[1]} joints, '
+            f'{len(m) - held_out} rows to fit, {held_out} held out; sensors {sensors}'
+        )
+
+    def columns(self) -> dict[str, NDArray[Any]]:
+        """Return the rows as columns by their names in observations.csv, for a data frame.
+
+        What no row has is left out; an unknown number is NaN, an unknown count -1.
+
+        Returns
+        -------
+        dict of (n,) arrays
+            In s, rad, m, degrees Celsius and N m, as the names say.
+        """
+        m, joints = self.measurements, range(1, len(self.measurements.q[0]) + 1)
+        found: dict[str, NDArray[Any]] = {
+            'observation': m.observation,
+            'pose': m.pose,
+            'configuration': m.configuration,
+            'split': np.where(m.is_validation, 'validation', 'optimization'),
+            'stamp_s': m.stamp_s,
+            'sensor': np.array(self.sensor_names)[m.sensor],
+            'marker': np.array(self.marker_names)[m.marker],
+        }
+        for names, values in (
+            ([f'q{i}_rad' for i in joints], m.q),
+            ([f'from_q{i}_rad' for i in joints], m.from_q),
+            (['x_m', 'y_m', 'z_m'], m.position),
+            (['std_x_m', 'std_y_m', 'std_z_m'], m.std),
+            ([f'orientation_{axis}' for axis in 'xyzw'], m.orientation),
+            ([f'effort{i}_nm' for i in joints], m.effort),
+            ([f'wanted{i}_rad' for i in joints], m.wanted),
+        ):
+            if values is not None and not np.isnan(values).all():
+                found |= dict(zip(names, values.T, strict=True))
+        if (m.samples >= 0).any():
+            found['samples'] = m.samples
+        if not np.isnan(m.temperature_c).all():
+            found['temperature_c'] = m.temperature_c
+        if m.frame is not None:
+            found['frame'] = m.frame
+        if m.correction is not None:
+            found['correction'] = np.array(['', 'off', 'on'])[m.correction + 1]
+        return found
 
     @property
     def sensor_names(self) -> tuple[str, ...]:

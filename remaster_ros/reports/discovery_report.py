@@ -57,10 +57,15 @@ EMPTY = 1.0 / 8.0
 
 def draw_discovery(discovery: Discovery) -> dict[str, str]:
     """Return every figure as SVG text, by file name without ending."""
+    return as_svg(figures_of(discovery), discovery)
+
+
+def figures_of(discovery: Discovery) -> dict[str, Callable[[Discovery], Figure]]:
+    """Return what draws each figure of a discovery, by file name without ending."""
     figures: dict[str, Callable[[Discovery], Figure]] = {'gain': gain, 'drivers': drivers}
     if discovery.groups:
         figures['causes'] = causes
-    return as_svg(figures, discovery)
+    return figures
 
 
 def gain(discovery: Discovery) -> Figure:
@@ -381,7 +386,18 @@ def write_discovery_report(
         The folder cannot be written to.
     """
     drawings = draw_discovery(discovery)
-    html = page(
+    html = report_html(discovery, confirmation, content, drawings)
+    return write_report(folder, drawings, html)
+
+
+def report_html(
+    discovery: Discovery,
+    confirmation: Confirmation | None,
+    content: Discovered,
+    drawings: dict[str, str],
+) -> str:
+    """Return the page, with those drawings (of `draw_discovery`) that are given."""
+    return page(
         'discovery.html.jinja',
         found=msgspec.to_builtins(content),
         session=discovery.fit.session,
@@ -392,4 +408,3 @@ def write_discovery_report(
         to_load=[(row, *load_words(row)) for row in content.loadable or ()],
         drawings={name: inlined(name, text) for name, text in drawings.items()},
     )
-    return write_report(folder, drawings, html)

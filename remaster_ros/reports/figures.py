@@ -8,7 +8,7 @@ readable on both.
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from io import StringIO
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -77,7 +77,12 @@ STYLE: Any = {
 
 def draw_figures(result: FitResult) -> dict[str, str]:
     """Return every figure as SVG text, by file name without ending."""
-    figures: dict[str, Callable[[FitResult], Figure]] = {
+    return as_svg(figures_of(result), result)
+
+
+def figures_of(_: FitResult) -> dict[str, Callable[[FitResult], Figure]]:
+    """Return what draws each figure of a fit, by file name without ending."""
+    return {
         'posteriors': posteriors,
         'traces': traces,
         'errors': errors_by_configuration,
@@ -85,7 +90,14 @@ def draw_figures(result: FitResult) -> dict[str, str]:
         'tool_places': tool_places_of_one,
         'accuracy_map': accuracy_map,
     }
-    return as_svg(figures, result)
+
+
+def as_figures(
+    figures: Mapping[str, Callable[[Subject], Figure]], subject: Subject
+) -> dict[str, Figure]:
+    """Draw figures of a fit or a discovery, by the same names."""
+    with matplotlib.rc_context(STYLE):
+        return {name: draw(subject) for name, draw in figures.items()}
 
 
 def as_svg(figures: dict[str, Callable[[Subject], Figure]], subject: Subject) -> dict[str, str]:

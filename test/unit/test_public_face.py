@@ -2,12 +2,15 @@
 
 import ast
 import doctest
+import html
+import json
 import re
 from pathlib import Path
 
 import pytest
 
 import remaster_ros
+from remaster_ros.session.observations import ColumnNames
 
 ROOT = Path(__file__).parents[2]
 FUNCTIONS = [name for name in remaster_ros.__all__ if name != '__version__']
@@ -50,3 +53,60 @@ def test_pages_for_users_import_nothing_deeper(page):
     text = page.read_text(encoding='utf-8')
     deeper = re.findall(r'^\s*(?:from|import) remaster_ros\.\w+.*$', text, re.MULTILINE)
     assert not deeper
+
+
+@pytest.fixture(scope='module')
+def notebook():
+    """The names of the shipped notebook after its cells have run, and what each cell ends with."""
+    pytest.importorskip('matplotlib')
+    path = ROOT / 'docs' / 'examples' / 'remaster.ipynb'
+    cells = json.loads(path.read_text(encoding='utf-8'))['cells']
+    names, shown = {}, []
+    for cell in cells:
+        if cell['cell_type'] == 'code':
+            body = ast.parse(''.join(cell['source'])).body
+            last = body.pop() if isinstance(body[-1], ast.Expr) else None
+            exec(compile(ast.Module(body, []), str(path), 'exec'), names)
+            if last is not None:
+                shown.append(eval(compile(ast.Expression(last.value), str(path), 'eval'), names))
+    return names, shown
+
+
+def test_the_notebook_runs_and_finds_what_it_says(notebook):
+    names, shown = notebook
+    assert ('joint_compliance', (2,)) in [entry[:2] for entry in shown[-3]]
+    assert (abs(shown[-2]) < 4.0).all()
+    # The correction turns the joint by its offset and by what its compliance gives.
+    assert names['found'].verdict == 'effects'
+    assert (abs(shown[-1]) < 3.0).all()
+    assert abs(shown[-1]).max() > 0.1
+
+
+@pytest.mark.parametrize('name', ['session', 'result', 'found'])
+def test_what_is_printed_is_short(notebook, name):
+    assert len(repr(notebook[0][name])) < 6000
+
+
+@pytest.mark.parametrize(('name', 'words'), [('result', 'Zero-offsets'), ('found', 'gets wrong')])
+def test_a_notebook_shows_the_first_screen_of_the_report(notebook, name, words):
+    result = notebook[0][name]
+    (frame,) = re.findall(r'srcdoc="([^"]*)"', result._repr_html_())
+    screen = html.unescape(frame)
+    report = result.save(notebook[0]['folder'] + name).read_text(encoding='utf-8')
+    assert words in screen
+    assert '<style>' in screen
+    assert 'save(folder)' in screen
+    # The whole of the verdict, word for word.
+    verdict = re.search(r'<section class="verdict.*?</section>', report, re.DOTALL)
+    assert verdict
+    assert verdict[0] in screen
+    assert set(result.figures()) == {
+        path.stem for path in (Path(notebook[0]['folder'] + name) / 'figures').glob('*.svg')
+    } - {'stages'}
+
+
+def test_columns_are_those_of_the_file(notebook, tmp_path):
+    session = notebook[0]['session']
+    columns = session.columns()
+    assert {len(values) for values in columns.values()} == {len(session.measurements)}
+    assert set(columns) < set(ColumnNames(7).names())

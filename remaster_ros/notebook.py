@@ -1,0 +1,128 @@
+"""What results show of themselves in Python: a short table, a report's first screen, figures."""
+
+from __future__ import annotations
+
+import html
+import os
+from dataclasses import fields
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from remaster_ros.calibration.result import FitResult
+from remaster_ros.discovery.discover import Discovery
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from remaster_ros.reports.discovery_schema import Discovered
+
+# In px; what is longer is scrolled.
+SCREEN_HEIGHT = 620
+
+
+class Fit(FitResult):
+    """The result of `fit`: printed as a short table, in a notebook the report's first screen."""
+
+    @classmethod
+    def of(cls, result: FitResult) -> Fit:
+        """Return a result as one that shows itself."""
+        return cls(**{one.name: getattr(result, one.name) for one in fields(result)})
+
+    def __repr__(self) -> str:
+        from remaster_ros.cli.fit import summary
+
+        return summary(self)
+
+    def _repr_html_(self) -> str:
+        from remaster_ros.reports.report import report_html
+
+        return _first_screen(report_html(self, {}))
+
+    def figures(self) -> dict[str, Figure]:
+        """Return the report's figures by name."""
+        from remaster_ros.reports.figures import as_figures, figures_of
+
+        return as_figures(figures_of(self), self)
+
+    def save(self, folder: str | os.PathLike[str]) -> Path:
+        """Write what ``remaster fit --out`` writes, the files for the robot among it.
+
+        Returns
+        -------
+        Path
+            The report.
+
+        Raises
+        ------
+        InputError
+            The folder cannot be written to, or holds what this would replace.
+        """
+        from remaster_ros.reports.fit_json import FIT_FILE
+        from remaster_ros.reports.result_folder import prepare_folder, save_fit
+
+        prepare_folder(folder, FIT_FILE)
+        return save_fit(self, folder)
+
+
+class Found(Discovery):
+    """The result of `discover`, shown in the same ways as `Fit`."""
+
+    @classmethod
+    def of(cls, found: Discovery) -> Found:
+        """Return a result as one that shows itself."""
+        return cls(**{one.name: getattr(found, one.name) for one in fields(found)})
+
+    def __repr__(self) -> str:
+        from remaster_ros.cli.discover import summary
+        from remaster_ros.reports.schemas import Judgement
+
+        judged = self._content.judgement
+        assert isinstance(judged, Judgement)
+        return summary(self, judged, to_load=self._content.loadable or ())
+
+    def _repr_html_(self) -> str:
+        from remaster_ros.reports.discovery_report import report_html
+
+        return _first_screen(report_html(self, None, self._content, {}))
+
+    @cached_property
+    def _content(self) -> Discovered:
+        from remaster_ros.reports.discovery_json import discovery_content
+
+        return discovery_content(self)
+
+    def figures(self) -> dict[str, Figure]:
+        """Return the report's figures by name."""
+        from remaster_ros.reports.discovery_report import figures_of
+        from remaster_ros.reports.figures import as_figures
+
+        return as_figures(figures_of(self), self)
+
+    def save(self, folder: str | os.PathLike[str]) -> Path:
+        """Write what ``remaster discover --out`` writes, the files for the robot among it.
+
+        Returns
+        -------
+        Path
+            The report.
+
+        Raises
+        ------
+        InputError
+            The folder cannot be written to, or holds what this would replace.
+        """
+        from remaster_ros.reports.fit_json import DISCOVERY_FILE
+        from remaster_ros.reports.result_folder import prepare_folder, save_discovery
+
+        prepare_folder(folder, DISCOVERY_FILE)
+        return save_discovery(self, folder)
+
+
+def _first_screen(page: str) -> str:
+    """Return a page down to its contents list, in a frame that keeps its style to itself."""
+    screen = page.partition('<nav>')[0] + '<p class="soft">Files: save(folder).</p>'
+    return (
+        f'<iframe srcdoc="{html.escape(screen)}" title="first screen of the report" '
+        f'style="width:100%;height:{SCREEN_HEIGHT}px;border:0"></iframe>'
+    )
