@@ -268,7 +268,12 @@ def _noise(inputs: Inputs) -> tuple[SensorNoise, ...]:
     elif isinstance(inputs.fit.explained_by_noise, dict):
         for sensor, check in inputs.fit.explained_by_noise.items():
             if check.noise_m is not None:
-                rows.append(SensorNoise(sensor, 1e3 * check.noise_m, None))
+                # One of held-out rows alone is not fitted.
+                fitted = inputs.fit.noise.get(sensor)
+                both = None
+                if fitted is not None and fitted.pose_sigma_m is not None:
+                    both = 1e3 * float(np.hypot(check.noise_m, MEAN_LENGTH * fitted.pose_sigma_m))
+                rows.append(SensorNoise(sensor, 1e3 * check.noise_m, both))
     return tuple(rows)
 
 

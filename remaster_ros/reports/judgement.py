@@ -47,10 +47,15 @@ def verdict(result: FitResult) -> Judgement:
     displaced = [f'{line}.' for line in result.displaced_markers]
     findings = [_compared(check) for check in unexplained] + _structure(result)
     doubts = [_compared(check) for check in untold]
+    few = result.structure is not None and result.structure.too_few
+    if few:
+        doubts.append(
+            'So few poses do not show whether other errors than noise are left, which the offsets '
+            f'would take up: measure at least {FEWEST_POSES} and fit again.'
+        )
     disagreements = changes + spoilt + displaced
     points = findings + doubts + _widening(result) + disagreements
     doubtful = bool(unexplained or untold) or result.other_errors
-    few = result.structure is not None and result.structure.too_few
     unproven = disagreements or few or again.most or not validated
     mood: Literal['good', 'caution', 'bad'] = 'caution'
     if result.sampler.wandering and not result.sampler.converged:
@@ -75,9 +80,12 @@ def verdict(result: FitResult) -> Judgement:
             mood = 'good'
     elif gain > 1 / NOTICEABLE_GAIN:
         headline = (
-            f'The zero-offsets hardly matter here: the mean position error goes from {change}. '
-            + (_dominated(result, unexplained) if doubtful else 'That is what noise explains.')
+            f'The zero-offsets hardly matter here: the mean position error goes from {change}.'
         )
+        if doubtful:
+            headline += f' {_dominated(result, unexplained)}'
+        elif not few:
+            headline += ' That is what noise explains.'
     else:
         mood = 'bad'
         headline = f'The offsets make it worse: the mean position error goes from {change}.'
@@ -89,11 +97,6 @@ def verdict(result: FitResult) -> Judgement:
         points.append(again.words)
     if note := result.session.correction_note:
         points.append(note)
-    if few:
-        points.append(
-            'So few poses do not show whether other errors than noise are left, which the offsets '
-            f'would take up: measure at least {FEWEST_POSES} and fit again.'
-        )
     if not validated:
         points.append(
             'There are no validation poses, so the gain is not proven: measure some and fit again.'

@@ -47,7 +47,9 @@ def what_remains(inputs: Inputs, loads_model: bool, held_out: bool) -> list[Rema
                 'More than noise' if judgement.findings else 'Not shown to be noise',
                 lines[0],
                 'Search for its cause: remaster discover SESSION --out DIR, then give DIR to '
-                'remaster report.',
+                'remaster report.'
+                if judgement.findings
+                else '',
             )
         )
     elif found is not None and not rows:
@@ -76,9 +78,7 @@ def what_remains(inputs: Inputs, loads_model: bool, held_out: bool) -> list[Rema
             if found is not None
             else 'what is left is what noise explains'
         )
-        if judgement.doubts:
-            words += '; how large the noise is nothing shows but these errors themselves'
-        rows.append(Remaining('Noise', words, ''))
+        rows.append(Remaining('Noise', '. '.join([words, *judgement.doubts[:1]]), ''))
     return rows
 
 

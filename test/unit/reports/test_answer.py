@@ -256,6 +256,24 @@ def test_what_no_cause_explains_is_never_called_noise(inputs, fit):
     assert [row.what for row in answer_of(inputs([LENGTH], model=0.3)).remains] == ['Noise']
 
 
+def test_the_noise_of_a_sensor_has_what_the_readings_of_a_pose_share(inputs, fit):
+    sensors = {}
+    for sensor, noise in fit.noise.items():
+        sensors[sensor] = msgspec.structs.replace(noise, pose_sigma_m=2e-4)
+    shown = answer_of(replace(inputs(), fit=msgspec.structs.replace(fit, noise=sensors))).noise
+    assert shown
+    for row in shown:
+        # The mean length of a Gaussian error in three dimensions: sqrt(8 / pi) times its std.
+        shared = np.sqrt(8.0 / np.pi) * 0.2
+        assert row.shared_mm == pytest.approx(np.hypot(row.reading_mm, shared), rel=1e-6)
+
+
+def test_the_first_screen_says_how_to_see_whether_it_is_in_use(inputs, fit_result):
+    html = answer_html(Subject(inputs(), answer_of(inputs()), fit_result.chain), {})
+    assert 'run <code>remaster verify</code>' in html
+    assert 'href="apply/compensation.json"' in html
+
+
 def test_a_doubt_is_no_finding(inputs, fit):
     """Where nothing shows how large the noise is, nobody is told that it is exceeded."""
     fit.judgement.doubts = ['tracker: nothing shows how much of the 0.500 mm is noise.']

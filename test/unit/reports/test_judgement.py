@@ -89,7 +89,16 @@ def test_too_few_poses_to_show_other_errors_are_never_green(fit_result):
     assert verdict(proven).mood == 'good'
     judged = verdict(replace(proven, structure=ResidualStructure((), too_few=True)))
     assert judged.mood == 'caution'
-    assert any('measure at least 12 and fit again' in point for point in judged.points)
+    (doubt,) = judged.doubts
+    assert 'measure at least 12 and fit again' in doubt
+    assert doubt in judged.points
+    # Where nothing is gained either noise is no explanation.
+    same = with_accuracy(proven, 'validation', 0.5, 0.5)
+    assert 'noise explains' in verdict(same).headline
+    assert (
+        'noise explains'
+        not in verdict(replace(same, structure=ResidualStructure((), too_few=True))).headline
+    )
 
 
 MOVED = NoiseCheck('tracker', 2.337e-3, None, 0.11e-3, poses=12)
