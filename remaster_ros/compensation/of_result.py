@@ -170,6 +170,27 @@ def everything(
     return _described(fit, cells, fit.theta, data, widening)
 
 
+def corrected_residuals(fit: FitResult, cells: Sequence[Cell]) -> FloatArray:
+    """Return the residuals of every row where `everything` is corrected that can be, m, (n, 3).
+
+    Those of the fit lack what no command corrects as well (backlash, say): that is put back.
+    Errors of the measurement stay taken out.
+    """
+    core, start = fit.predictive.model.core, 0
+    z = fit.predictive.after.copy()
+    for cell in cells:
+        if not cell.of_measurement and not list(placed(cell, fit.chain)):
+            z[core + start : core + start + cell.size] = 0.0
+        start += cell.size
+    if fit.found is None or np.array_equal(z, fit.predictive.after):
+        return fit.residuals_after
+    whole, less = (
+        predicted_rows(fit.found.problem, fit.predictive.model, at)
+        for at in (fit.predictive.after, z)
+    )
+    return fit.residuals_after + whole - less
+
+
 def _described(
     fit: FitResult,
     cells: Sequence[Cell],

@@ -20,6 +20,7 @@ from remaster_ros.compensation.file import COMPENSATION_FILE
 from remaster_ros.compensation.of_result import (
     Described,
     NotCorrected,
+    corrected_residuals,
     everything,
     offsets_alone,
 )
@@ -81,11 +82,15 @@ def compensation_of(discovery: Discovery, widening: float) -> Described:
 
 def holds_everything(discovery: Discovery) -> bool:
     """Whether compensation.json holds everything in the model, and not the offsets alone."""
-    alone, every = (
-        _held_out_mean(discovery, fit.residuals_after) for fit in (discovery.alone, discovery.fit)
-    )
+    alone = _held_out_mean(discovery, discovery.alone.residuals_after)
+    every = _held_out_mean(discovery, _corrected(discovery))
     better = bool(np.isnan(alone)) or round(every, 3) < round(alone, 3)
     return better and bool(discovery.solution.cells)
+
+
+def _corrected(discovery: Discovery) -> FloatArray:
+    """Return the residuals with what compensation.json corrects, where it holds everything."""
+    return corrected_residuals(discovery.fit, discovery.solution.cells)
 
 
 def _held_out_mean(discovery: Discovery, errors: FloatArray) -> float:
@@ -104,7 +109,7 @@ def loadable(discovery: Discovery) -> list[Loadable]:
         file = f'{APPLY_FOLDER}/{MODEL_FILE}' if discovery.loads_geometry else ''
         results.append(('geometry', discovery.geometry.errors, file))
     file = f'{APPLY_FOLDER}/{COMPENSATION_FILE}' if holds_everything(discovery) else ''
-    results.append(('everything', discovery.fit.residuals_after, file))
+    results.append(('everything', _corrected(discovery), file))
     rows: list[Loadable] = []
     # To what is shown: a difference in the fourth figure is no reason to load anything else.
     least = np.inf
@@ -130,7 +135,7 @@ def load_words(row: Loadable) -> tuple[str, str]:
 _RESULTS = {
     'offsets': 'zero-offsets alone',
     'geometry': 'all lengths, tilts and zero-offsets together',
-    'everything': 'everything in the model',
+    'everything': 'everything that a command can correct',
 }
 _MORE = {
     'offsets': f', {REMASTER_FILE} or {LAYER_FILE}',

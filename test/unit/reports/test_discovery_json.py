@@ -303,8 +303,12 @@ def test_what_is_no_better_in_the_figures_shown_is_not_to_be_loaded():
         outliers=(),
         alone=SimpleNamespace(residuals_after=2.0 * errors),
         geometry=SimpleNamespace(errors=errors),
-        fit=SimpleNamespace(residuals_after=0.9999 * errors),
-        solution=SimpleNamespace(cells=(object(),)),
+        fit=SimpleNamespace(
+            residuals_after=0.9999 * errors,
+            predictive=SimpleNamespace(model=SimpleNamespace(core=0), after=np.zeros(1)),
+            found=None,
+        ),
+        solution=SimpleNamespace(cells=(SimpleNamespace(of_measurement=True, size=1),)),
         loads_geometry=True,
     )
     results = loadable(found)
