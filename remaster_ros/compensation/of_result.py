@@ -469,9 +469,12 @@ def _left(
         key = (cell.name, cell.joints, cell.of_measurement or cell.place == 'marker')
         moved = data.columns([cell]) @ theta[where]
         together[key] = together[key] + moved if key in together else moved
-        remedies[key] = EFFECTS[cell.name].remedy
+        remedies[key] = EFFECTS[cell.name].remedy.format(driver=cell.driver.replace('_', ' '))
     for (name, joints, of_measurement), moved in together.items():
         size = float(np.sqrt(np.mean(np.sum(moved**2, axis=-1))))
+        if round(1e3 * size, 3) == 0.0:
+            # It shows as nothing wherever it is listed.
+            continue
         why = _OF_MEASUREMENT if of_measurement else _NOT_TOLD
         reported = EFFECTS[name].reported_as or name
         yield NotCorrected(reported, joints, size, why, remedies[name, joints, of_measurement])

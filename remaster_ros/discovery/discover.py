@@ -8,7 +8,6 @@ gain, and refuse a model that predicts them worse than the offsets do.
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -214,11 +213,15 @@ def discover_session(
     structure = tuple(e for e, cause in zip(described, is_cause, strict=True) if not cause)
     left, gross = structure_left(data, solution, fit, structure)
     unexplained += left
-    groups = tuple(itertools.compress(groups, is_cause))
-    effects = tuple(
-        effect.sampled(fit, group, data.part)
-        for effect, group in zip(itertools.compress(described, is_cause), groups, strict=True)
-    )
+    causes = [
+        (effect.sampled(fit, group, data), group)
+        for effect, group, so in zip(described, groups, is_cause, strict=True)
+        if so
+    ]
+    # Where another kind of errors has all of a cause in the model that is told, it is not in it.
+    causes = [cause for cause in causes if round(1e3 * cause[0].size_m, 3) > 0.0]
+    causes.sort(key=lambda cause: -cause[0].size_m)
+    effects, groups = zip(*causes, strict=True) if causes else ((), ())
     effects += tuple(effect.sampled(fit) for effect in moved_markers(found, data, named))
     empty = search.fit(())
     assert empty is not None

@@ -125,12 +125,13 @@ class FoundEffect:
     moment_s: float | None = None
 
     def sampled(
-        self, result: FitResult, group: Sequence[Cell] = (), context: Context | None = None
+        self, result: FitResult, group: Sequence[Cell] = (), data: Residuals | None = None
     ) -> FoundEffect:
         """Return the effect with its parameters as the extended model's posterior has them.
 
         With its cells and the rows that they were fitted to, its sizes as well.
         """
+        found = self
         index = {name: i for i, name in enumerate(result.theta_names)}
         parameters = tuple(
             replace(
@@ -142,16 +143,16 @@ class FoundEffect:
             else parameter
             for parameter in self.parameters
         )
-        sizes = self.sizes
-        if context is not None and group:
+        if data is not None and group:
             draws = result.theta_draws.reshape(-1, len(index))
+            wheres = [[index[name] for name in cell.parameters] for cell in group]
             sizes = tuple(
-                EFFECTS[cell.name].size(
-                    context, cell, draws[:, [index[name] for name in cell.parameters]]
-                )
-                for cell in group
+                EFFECTS[cell.name].size(data.part, cell, draws[:, where])
+                for cell, where in zip(group, wheres, strict=True)
             )
-        found = replace(self, parameters=parameters, sizes=sizes)
+            size_m = _size(data, group, [result.theta[where] for where in wheres])
+            found = replace(found, sizes=sizes, size_m=size_m)
+        found = replace(found, parameters=parameters)
         found = replace(found, cause=with_sizes(self.cause, found._clear_sizes(group)))
         if found.sigmas >= UNCERTAIN:
             return found
@@ -160,7 +161,8 @@ class FoundEffect:
             'from nothing, and may be chance or another cause: measure more poses before it is '
             'acted on.'
         )
-        return replace(found, cause=f'{found.cause} {doubt}')
+        remedy = f'Measure more poses first. If it stays: {found.remedy}' if found.remedy else ''
+        return replace(found, cause=f'{found.cause} {doubt}', remedy=remedy)
 
     def _clear_sizes(self, group: Sequence[Cell]) -> tuple[str, ...]:
         """Return the sizes that are more than their uncertainty, and how many others there are."""
@@ -339,16 +341,16 @@ def _same(data: Residuals, solution: Solution, cell: Cell, other: Cell) -> bool:
     return bool(cosines.min() > SAME)
 
 
-def size_of(
-    data: Residuals,
-    solution: Solution,
-    group: Sequence[Cell],
-) -> float:
+def size_of(data: Residuals, solution: Solution, group: Sequence[Cell]) -> float:
     """Return the RMS of a cause's displacement after absorption by the offsets model, m."""
     wheres = dict(zip(solution.cells, solution.slices(), strict=True))
+    return _size(data, group, [solution.parameters[wheres[cell]] for cell in group])
+
+
+def _size(data: Residuals, group: Sequence[Cell], parameters: Sequence[FloatArray]) -> float:
     shift = np.zeros((len(data), 3))
-    for cell in group:
-        shift += data.columns([cell]) @ solution.parameters[wheres[cell]]
+    for cell, values in zip(group, parameters, strict=True):
+        shift += data.columns([cell]) @ values
     flat, base = shift.ravel(), data.base.reshape(3 * len(data), -1)
     left = flat - base @ (base.T @ flat)
     return float(np.sqrt(np.sum(left**2) / len(data)))

@@ -223,13 +223,19 @@ def _sizes(ax: Axes, discovery: Discovery, effects: Sequence[FoundEffect]) -> No
     ax.set_title('Causes without a curve')
 
 
+def _estimate(discovery: Discovery, cell: Cell) -> FloatArray:
+    """Return a cause's parameters in the whole model, where they may be some of a larger cell."""
+    solution = discovery.solution
+    names = [name for one in solution.cells for name in one.parameters]
+    return solution.parameters[[names.index(name) for name in cell.parameters]]
+
+
 def _step(ax: Axes, discovery: Discovery, cell: Cell) -> None:
     """Draw a jump of a sensor, marker or base over time, along its own direction, mm."""
     data, solution = discovery.residuals, discovery.solution
     context = data.part
     columns = cell.columns(context).displacement(context)
-    where = dict(zip(solution.cells, solution.slices(), strict=True))[cell]
-    jump = columns @ solution.parameters[where]
+    jump = columns @ _estimate(discovery, cell)
     moved = np.linalg.norm(jump, axis=1) > 0.0
     # Before the moment every column is zero: what moved later tells which rows it is about.
     own = np.isin(context.sensor, context.sensor[moved]) & np.isin(
@@ -278,8 +284,7 @@ def _cause(ax: Axes, discovery: Discovery, cell: Cell) -> None:
     fitted = np.ones(len(context), dtype=bool)
     if whole:
         fitted = np.isin(np.arange(len(context)), data.rows.source)
-    where = dict(zip(solution.cells, solution.slices(), strict=True))[cell]
-    parameters = solution.parameters[where] / ARC_MINUTE
+    parameters = _estimate(discovery, cell) / ARC_MINUTE
     index = {name: i for i, name in enumerate(discovery.fit.theta_names)}
     chosen = [index[name] for name in cell.parameters]
     draws = discovery.fit.theta_draws[..., chosen].reshape(-1, len(chosen)) / ARC_MINUTE

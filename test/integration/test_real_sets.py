@@ -100,3 +100,12 @@ def test_what_can_be_loaded_of_a_panda(tmp_path: Path) -> None:
     offsets, geometry, everything = (row['held_out_mean_mm'] for row in loadable)
     assert offsets > 1.0
     assert everything < geometry < 0.33
+
+
+def test_no_cause_is_told_that_is_nothing_in_the_model(tmp_path: Path) -> None:
+    """The search names an eccentricity, which a curve of its joint has all of in the model."""
+    found = discover_session(real('irb120_three_points'), rng=np.random.default_rng(0))
+    assert found.effects
+    assert all(effect.size_m >= 0.5e-6 for effect in found.effects)
+    assert len(found.groups) == len(found.effects)
+    assert save_discovery(found, tmp_path).stat().st_size > 10_000

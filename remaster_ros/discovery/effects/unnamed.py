@@ -306,7 +306,7 @@ EFFECT = Effect(
     sentence='No named cause: {place} follows {driver}.',
     separate_by='poses in which {driver} changes and all else is held',
     remedy='Find the cause: measure poses in which {driver} changes and all else is held, and see '
-    'what it comes with. Until then nothing that can be loaded into a controller corrects it.',
+    'what it comes with.',
     size=_size,
     cells=cells,
     cause_per='variant',

@@ -208,10 +208,13 @@ def test_a_cause_that_may_be_chance_by_its_own_deviation_is_said_and_not_green(f
     (effect,), group = bent.effects, bent.groups[0]
     most = max(abs(parameter.value) for parameter in effect.parameters)
     wide = replace(bent.fit, theta_std=np.full_like(bent.fit.theta_std, most / 1.5))
-    doubtful = effect.sampled(wide, group, bent.residuals.part)
+    doubtful = effect.sampled(wide, group, bent.residuals)
     assert doubtful.sigmas == pytest.approx(1.5)
     assert 'is 1.5 standard deviations from nothing' in doubtful.cause
     assert 'from nothing' not in effect.cause
+    # Nobody is sent to the gearbox before it is sure.
+    assert doubtful.remedy == f'Measure more poses first. If it stays: {effect.remedy}'
+    assert doubtful.size_m == pytest.approx(effect.size_m)
     page, mood, _ = saved(replace(bent, effects=(doubtful,)), tmp_path)
     assert mood == 'caution'
     assert 'Not certain by its own standard deviation: encoder eccentricity of joint 2.' in page
