@@ -86,6 +86,7 @@ class Cell:
             own['robot_bridge']['command_interface'] = 'action'
         if compensation:
             own['robot_bridge']['compensation'] = compensation
+            own['pose_planner']['compensation'] = compensation
         if 'mocap' in sensors:
             ports = {'command_port': command, 'data_port': data}
             own['fake_optitrack'] = {'world': folder / 'world', 'rate': 20.0, **ports}

@@ -16,8 +16,9 @@ from remaster_ros.compensation.file import Compensation, read_compensation
 from remaster_ros.compensation.verification import Estimate, Verdict, Verified, Visits, verify
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.serial_chain import SerialChain
+from remaster_ros.planning.tour_order import nearest_solution
 from remaster_ros.session.reader import HEADER, ROWS, read_session
-from remaster_ros.types import BoolArray, Correction, FloatArray, Session
+from remaster_ros.types import BoolArray, Correction, FloatArray, IntArray, Session
 
 FORMAT = 'remaster-verify/1'
 WORDS: dict[Verdict, str] = {
@@ -72,14 +73,27 @@ def visits(session: Session, folder: Path) -> Visits:
     """Return the rows with what was wanted there; `folder` is for messages."""
     m = session.measurements
     on = _on(session, folder)
+    wanted = _wanted(session, folder, on)
     return Visits(
-        _wanted(session, folder, on),
+        wanted,
         on,
-        m.configuration,
+        _together(m.configuration, wanted),
         tuple(session.sensor_names[i] for i in m.sensor.tolist()),
         tuple(session.marker_names[i] for i in m.marker.tolist()),
         m.position,
     )
+
+
+def _together(configuration: IntArray, wanted: FloatArray) -> IntArray:
+    """Return the configurations, (n,), those that were visited again as the first time."""
+    found, firsts = configuration.copy(), dict[int, FloatArray]()
+    for one in dict.fromkeys(configuration.tolist()):
+        mine = configuration == one
+        q = wanted[mine][0]
+        near = nearest_solution(np.array(list(firsts.values())), q) if firsts else None
+        same = one if near is None else list(firsts)[near]
+        found[mine], firsts[same] = same, firsts.get(same, q)
+    return found
 
 
 def _on(session: Session, folder: Path) -> BoolArray:
@@ -175,6 +189,7 @@ def _content(found: Verified, warnings: list[str]) -> dict[str, Any]:
     return {
         'format': FORMAT,
         'verdict': found.verdict,
+        'text': _in_words(found),
         'toggle': found.toggle and asdict(found.toggle),
         'absolute': asdict(found.absolute),
         'joints': [{'joint': name, **asdict(one)} for name, one in found.joints.items()],
@@ -189,15 +204,20 @@ def _content(found: Verified, warnings: list[str]) -> dict[str, Any]:
     }
 
 
+def _in_words(found: Verified) -> str:
+    words = WORDS[found.verdict]
+    if found.verdict != 'unclear':
+        return words
+    if found.poses:
+        return f'{words} Some {found.poses} poses would do.'
+    return (
+        f'{words} No number of poses would do: the correction is about as small as what is not '
+        'known of it.'
+    )
+
+
 def _text(found: Verified) -> str:
-    lines = [f'{found.verdict}: {WORDS[found.verdict]}']
-    if found.verdict == 'unclear':
-        lines.append(
-            f'Some {found.poses} poses would do.'
-            if found.poses
-            else 'No number of poses would do: the correction is about as small as what is not '
-            'known of it.'
-        )
+    lines = [f'{found.verdict}: {_in_words(found)}']
     lines.append(f'share that acts, of the rows with it on: {_share(found.absolute)}')
     if found.toggle is not None:
         lines.append(f'share that is switched, of on - off: {_share(found.toggle)}')

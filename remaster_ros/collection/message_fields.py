@@ -103,6 +103,19 @@ def refuse_repeated(wanted: Sequence[str], given: Sequence[str], topic: str) -> 
         )
 
 
+CORRECTED = {'on': 'corrected/', 'off': 'uncorrected/'}
+"""Before the names of all joints in remaster/joint_solutions: whether what is commanded has to be
+corrected. In the names, so that a bridge that does not heed it finds none of its joints."""
+
+
+def correction_asked(message: Any) -> str:
+    """Return whether joint solutions are asked for with a correction ``on`` or ``off``; ''."""
+    for state, prefix in CORRECTED.items():
+        if message.joint_names and all(name.startswith(prefix) for name in message.joint_names):
+            return state
+    return ''
+
+
 def solutions_of(message: Any, joint_names: Sequence[str]) -> FloatArray:
     """Return the joint solutions in remaster/joint_solutions, rad, (m, k); m = 0 for a stop.
 
@@ -117,7 +130,8 @@ def solutions_of(message: Any, joint_names: Sequence[str]) -> FloatArray:
         The solutions are for other joints or name one twice, or a point has not one position
         for each.
     """
-    given = list(message.joint_names)
+    prefix = CORRECTED.get(correction_asked(message), '')
+    given = [name.removeprefix(prefix) for name in message.joint_names]
     if not message.points:
         # A stop, whatever joints it names.
         return np.empty((0, len(joint_names)))

@@ -22,7 +22,7 @@ def fingerprint(tour: Tour) -> str:
     for split, plan in sorted(tour.plans.items()):
         found.update(f'{split} {len(plan.poses)} '.encode())
         for pose in plan.poses:
-            found.update(f'{pose.solutions.shape} '.encode())
+            found.update(f'{pose.solutions.shape} {pose.correction}'.encode())
             found.update(np.ascontiguousarray(pose.solutions).tobytes())
     return found.hexdigest()[:8]
 

@@ -78,6 +78,9 @@ class TourProgress:
         Why the next pose cannot be planned from where the arm stands; ''.
     further
         Plans what is measured further, once the collection is complete; None for nothing.
+    judging
+        Plans, in place of registration and collection, poses by which an arm is judged; None for
+        nothing.
     """
 
     def __init__(self, memory: PlanMemory, tours: TourPlanner, planning: Planning) -> None:
@@ -93,6 +96,7 @@ class TourProgress:
         self.enough = False
         self.standing = ''
         self.further: Callable[[dict[str, FloatArray]], Tour] | None = None
+        self.judging: Callable[[], Tour] | None = None
 
     def describe(self) -> str:
         """Return how far the collection is, as text."""
@@ -183,6 +187,12 @@ class TourProgress:
             No registration after all poses for it, or no pose is left to fit on.
         """
         self.standing = ''
+        if self.judging is not None:
+            judged = self._planning.ask('judging', q, self.judging)
+            if judged is None:
+                return None
+            self.phase, self.judging = 'collection', None
+            self._memory.begin(judged[0])
         if self.phase == REGISTRATION and not sensors.are_among(self.T_R_N):
             return self._next_registration(q, sensors.names, words)
         self.phase = 'collection'

@@ -1,6 +1,7 @@
 """Plan poses in front of the sensors; publish them one by one, each with all its joint solutions.
 
 ``/remaster/collect`` starts or resumes; ``/remaster/pause`` and ``/remaster/stop`` hold the arm.
+``/remaster/verify`` begins visits by which a correction is judged, in place of a collection.
 Without a registration of every sensor the first poses serve the three-point registration.
 
 What the planner does and in which run is decided in `collection.collection_run`, which pose is
@@ -43,7 +44,7 @@ from remaster_ros.collection import events
 from remaster_ros.collection.announcements import Announcements
 from remaster_ros.collection.collection_run import CollectionRun
 from remaster_ros.collection.events import OptimizerState, PoseAnnounced
-from remaster_ros.collection.message_fields import JointOrder, stamp_key, wanted_of
+from remaster_ros.collection.message_fields import CORRECTED, JointOrder, stamp_key, wanted_of
 from remaster_ros.collection.pace import Pace, progress_text
 from remaster_ros.collection.peer_models import PeerModels
 from remaster_ros.collection.plan_confirmation import service_name
@@ -53,6 +54,7 @@ from remaster_ros.errors import InputError, RemasterError
 from remaster_ros.kinematics import transforms
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.motion.preflight import preflight
+from remaster_ros.nodes.judging import KINDS, Judging, Kind
 from remaster_ros.nodes.locking import runtime_folder
 from remaster_ros.nodes.messages import duration_of, transform_array
 from remaster_ros.nodes.parameters import declare, parameter
@@ -126,6 +128,8 @@ class FurtherMeasuring:
         """
         if state != 'complete':
             return '' if under_way else None, None
+        if self._journal.tour is not None and self._journal.tour.judges:
+            return 'it was no calibration; name a new session folder', None
         # Imported when it is needed, as it takes a while.
         from remaster_ros.reports.fit_json import DISCOVERY_FILE
         from remaster_ros.reports.found_causes import read_causes
@@ -223,6 +227,10 @@ class Parameters:
         'discovery',
         "folder of the optimizer's discovery: after a complete collection remaster/collect "
         'measures further what separates its causes from their look-alikes; empty for nothing',
+    )
+    compensation: str = parameter(
+        '',
+        'compensation.json that remaster/verify judges: the one of robot_bridge; empty for none',
     )
     resume_within_s: float = parameter(
         30.0,
@@ -361,7 +369,9 @@ class PosePublisher:
         self._poses.publish(pose)
         # Before the solutions: with those the bridge begins to move.
         self._waypoints.publish(waypoints_message(stop, self._chain.joint_names, pose.header))
-        message = JointTrajectory(joint_names=list(self._chain.joint_names))
+        prefix = CORRECTED.get(stop.correction, '')
+        names = [f'{prefix}{name}' for name in self._chain.joint_names]
+        message = JointTrajectory(joint_names=names)
         message.header = pose.header
         message.points = [
             JointTrajectoryPoint(positions=q.tolist(), time_from_start=duration_of(i + 1.0))
@@ -554,6 +564,7 @@ class PosePlanner(RemasterNode):
         self._further = FurtherMeasuring(self.p.discovery, folder, self.journal, self._tours)
         # Every pose passes its gate in `_announce`.
         self._preview = PlanPreview(self.cell, self._tours, self.journal, self.progress, folder)
+        self._judging = Judging(self, folder, self.p.compensation, self._tours)
         self._living: LivingRun | None = None
         self._tried_wall = 0.0
         self._resume()
@@ -567,6 +578,8 @@ class PosePlanner(RemasterNode):
         self._offered: set[str] = set()
         at_once = MutuallyExclusiveCallbackGroup()
         self.create_service(Trigger, 'remaster/collect', self._on_collect)
+        for kind in KINDS:
+            self.create_service(Trigger, f'remaster/{kind}', partial(self._on_judge, kind))
         self.create_service(Trigger, 'remaster/pause', self._on_pause, callback_group=at_once)
         self.create_service(Trigger, 'remaster/stop', self._on_stop, callback_group=at_once)
         model = self.cell.model()
@@ -627,13 +640,44 @@ class PosePlanner(RemasterNode):
     # Services
 
     def _on_collect(self, request: Trigger.Request, response: Trigger.Response) -> Any:
+        return self._collect(response)
+
+    def _on_judge(self, kind: Kind, request: Trigger.Request, response: Trigger.Response) -> Any:
+        """Begin, or go on with, visits by which the arm is judged; afterwards tell the verdict."""
+        tour, recorder = self.journal.tour, self._announcements.recorder
+        own = tour is not None and tour.judges == kind
+        if own and self.run.state == 'complete':
+            response.success, response.message = self._judging.told()
+        elif self.run.state == 'running':
+            response.message = 'something else is under way' if not own else 'under way'
+        elif (tour is not None and not own) or (
+            tour is None and recorder is not None and recorder.observations
+        ):
+            response.message = (
+                f'{self.p.session}: holds something else; start pose_planner and recorder with a '
+                'new session folder'
+            )
+        else:
+            response.message = self._judging.refusal(kind, self._announcements.bridge)
+            if not response.message:
+                plan, words = self._judging.tour(kind)
+                self._collect(response, None if own else plan)
+                response.message = words if response.success else response.message
+        return response
+
+    def _collect(
+        self, response: Trigger.Response, judging: Callable[[], Tour] | None = None
+    ) -> Any:
+        """Begin a run or go on; with `judging` that plans what is visited, once it is running."""
         bridge, recorder = self._announcements.bridge, self._announcements.recorder
         further, plan = self._further.ask(self.run.state, under_way=self.progress.goes_further)
         has_joints = self._q is not None
         refusal = self.run.refusal(bridge, recorder, has_joints=has_joints, further=further)
-        response.message = refusal or self._preview.asked()
+        # What is still to be planned cannot be shown; `_announce` has it confirmed.
+        response.message = refusal or (self._preview.asked() if judging is None else '')
         if response.message:
             return response
+        self.progress.judging = judging or self.progress.judging
         if plan is not None:
             # What was looked at before the first motion is looked at again.
             self.progress.further, self._described, self._cleared = plan, False, False
@@ -754,6 +798,11 @@ class PosePlanner(RemasterNode):
             self._end('paused', recorder.changed)
         if self.run.state not in ('complete', 'failed') and self.progress.catch_up(recorder):
             self._announcements.retract()
+        tour, closed = self.journal.tour, recorder.exit_status == 'complete'
+        if self.run.state == 'complete' and tour is not None and recorder.plan == self.journal.id:
+            for kind in KINDS:
+                if closed and tour.judges == kind:
+                    self._judging.judge(kind)
 
     # The tour
 
@@ -829,7 +878,7 @@ class PosePlanner(RemasterNode):
         if tour is not None and self.progress.phase != REGISTRATION and not self._described:
             self._described = True
             planned = self._further.planned(tour)
-            if self._q is not None and not tour.begin_at:
+            if self._q is not None and not tour.begin_at and not tour.judges:
                 self._session_s = session_time_s(self._tours, tour, self._q)
                 minutes = f'{self._session_s / 60.0:.1f} min'
                 planned += f'; about {minutes} of robot time for the whole session'
@@ -868,11 +917,12 @@ class PosePlanner(RemasterNode):
             'resuming': 'yes' if run.left else 'no',
             **self._preview.values(),
             **self.progress.counts(),
+            'verdict': self._judging.verdict,
             # Of the whole session; '' before its collection is planned.
             'robot_time_s': f'{self._session_s:.0f}' if self._session_s else '',
             'dropped_solutions_no free path': self.journal.outcomes[NO_FREE_PATH],
         }
-        why = full or run.why
+        why = full or run.why or self._judging.trouble
         level = 'error' if run.state == 'failed' else 'warn' if why else 'ok'
         shown = 'held' if full and run.state == 'running' else run.state
         return Summary(level, why or run.state, values, self.progress.state(shown, run.token))
@@ -881,6 +931,7 @@ class PosePlanner(RemasterNode):
         """Publish that the planner has stopped, on which the bridge stops the arm."""
         self._end('stopped')
         self._write_state()
+        self._judging.close()
         self.journal.close()
 
 

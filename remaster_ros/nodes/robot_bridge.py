@@ -22,7 +22,13 @@ from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from remaster_ros.collection import events
-from remaster_ros.collection.message_fields import WANTED, seconds, solutions_of, stamp_key
+from remaster_ros.collection.message_fields import (
+    WANTED,
+    correction_asked,
+    seconds,
+    solutions_of,
+    stamp_key,
+)
 from remaster_ros.collection.peer_models import PeerModels
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.same_arm import difference
@@ -63,6 +69,7 @@ from remaster_ros.nodes.waypoints import waypoints_by_solution
 from remaster_ros.session.halt_file import HaltFile
 from remaster_ros.session.last_command import LastCommandFile
 from remaster_ros.session.workcell import read_cell
+from remaster_ros.types import FloatArray
 
 SOLUTIONS = 'remaster/joint_solutions'
 WAYPOINTS = 'remaster/joint_waypoints'
@@ -106,8 +113,8 @@ class RobotBridge(RemasterNode):
             # Paths are checked where the arm is, not where its encoders put it.
             true_arm, self._shifts = correction.true_arm, correction.shifts
             unknown_rad = correction.unknown_rad(np.deg2rad(cell.unknown_offset_deg))
-        # What it has changed of each solution of the pose, rad, (m, k).
-        self._changes = np.zeros((0, len(self.chain)))
+        # What it has changed of each solution of the pose, rad, (m, k); None where it is off.
+        self._changes: FloatArray | None = None
         model = cell.collision_model(true_arm, unknown_rad)
         speeds = PointSpeeds(true_arm, model.extent_points)
         self._acceleration = cell.acceleration_limits(self.chain)
@@ -247,7 +254,13 @@ class RobotBridge(RemasterNode):
             self.get_logger().error(f'joint_solutions dropped: {error}')
             return
         refused: dict[int, str] = {}
-        if self._correction is not None:
+        asked, self._changes = correction_asked(message), None
+        if asked == 'on' and self._correction is None:
+            why = 'a correction is asked for, and robot_bridge has none: see its compensation'
+            refused = dict.fromkeys(range(len(targets)), why)
+        # Switched between two poses, when the arm stands: a move under way is stopped first. With
+        # it off the arm is where it is all the same, and so are its limits and its surroundings.
+        if self._correction is not None and asked != 'off':
             # Before all checks: they are of what is commanded.
             done = self._correction.commands(targets)
             targets, self._changes = done.command, done.change
@@ -450,7 +463,7 @@ class RobotBridge(RemasterNode):
         self._settled_wall = self.steady_s()
         self.counts['settled'] += 1
         names, q = list(self.chain.joint_names), settled.q
-        if self._correction is not None:
+        if self._changes is not None:
             names += [f'{WANTED}{name}' for name in names]
             q = np.concatenate((q, q - self._changes[settled.solution]))
         message = JointState(name=names, position=q.tolist())

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
+from typing import Literal
 
 import numpy as np
 import scipy
@@ -89,10 +90,15 @@ class LineOfSight:
 
 @dataclass(frozen=True)
 class PlannedPose:
-    """A tool pose T_R_T, (4, 4), and its usable joint solutions, rad, (m, k), m >= 1."""
+    """A tool pose T_R_T, (4, 4), and its usable joint solutions, rad, (m, k), m >= 1.
+
+    `correction`: whether the bridge's correction has to be on or off at it; '' where that is not
+    asked.
+    """
 
     T_R_T: FloatArray
     solutions: FloatArray
+    correction: Literal['', 'on', 'off'] = ''
 
 
 @dataclass(frozen=True)

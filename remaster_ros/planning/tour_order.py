@@ -7,7 +7,7 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from copy import copy, deepcopy
 from dataclasses import dataclass, replace
 from itertools import takewhile
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -20,6 +20,7 @@ from remaster_ros.types import FloatArray
 REGISTRATION = 'registration'
 REFERENCE = 'reference'
 FITTED = 'optimization'
+HELD_OUT = 'validation'
 FIRST_ROUNDS = 2
 """The references are measured so often at the beginning: their difference is the noise."""
 
@@ -62,6 +63,8 @@ class PoseVisit:
     ids, paths, unreached
         Which of that pose's planned solutions each of `solutions` is, and the way there: a
         `Route`.
+    correction
+        As of a `PlannedPose`.
     """
 
     pose: int
@@ -72,6 +75,7 @@ class PoseVisit:
     ids: tuple[int, ...]
     paths: tuple[FloatArray, ...] = ()
     unreached: tuple[int, ...] = ()
+    correction: str = ''
 
     def __post_init__(self) -> None:
         if not self.paths:
@@ -170,6 +174,14 @@ class Tour:
             self.dropped.update(plan.dropped)
             self.dropped_solutions.update(plan.dropped_solutions)
         self.visited = 0
+
+    @property
+    def judges(self) -> Literal['', 'verify', 'check']:
+        """What its poses are for, where that is not a calibration: they are all held out."""
+        if FITTED not in self.plans or self.plans[FITTED].poses:
+            return ''
+        held_out = self.plans.get(HELD_OUT, Plan(())).poses
+        return 'verify' if any(pose.correction for pose in held_out) else 'check'
 
     def fork(self) -> Tour:
         """Return a tour as far as this one, which can go on without it."""
@@ -341,7 +353,8 @@ class Tour:
         number = self._numbers.get((split, index), number)
         ids, paths, unreached = tuple(route.ids), tuple(route.paths), tuple(route.unreached)
         solutions = pose.solutions[list(ids)]
-        return PoseVisit(number, split, pose.T_R_T, solutions, index, ids, paths, unreached)
+        way = ids, paths, unreached
+        return PoseVisit(number, split, pose.T_R_T, solutions, index, *way, pose.correction)
 
     def _route(self, split: str, index: int, ids: Iterable[int], q: FloatArray) -> Route:
         """Order these solutions of a pose; see `free_order`."""

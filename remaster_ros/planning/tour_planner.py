@@ -30,7 +30,7 @@ from remaster_ros.planning.separating_design import (
     measured_so_far,
     separate,
 )
-from remaster_ros.planning.tour_order import FITTED, REFERENCE, REGISTRATION, Tour
+from remaster_ros.planning.tour_order import FITTED, HELD_OUT, REFERENCE, REGISTRATION, Tour
 from remaster_ros.planning.travel_time import TravelTime
 from remaster_ros.types import FloatArray, Measurements
 
@@ -88,7 +88,11 @@ REGISTRATION_CANDIDATES = 12
 MORE_CANDIDATES = 10 * REGISTRATION_CANDIDATES
 """Further ones where fewer than three of these can be taken."""
 MOST_TRIES = 5
-"""So often references are chosen anew where one has no free way to it."""
+"""So often poses are chosen anew where one has no free way to it."""
+VERIFIED_POSES = 10
+"""Of a verification: at 0.1 mm of noise they tell offsets of 0.1 degrees in 97 of 100 cases."""
+VERIFIED_CANDIDATES = 6 * VERIFIED_POSES
+"""As of a collection, of which arms reach a half to a sixth."""
 
 
 class TourPlanner:
@@ -268,6 +272,46 @@ class TourPlanner:
             order=[(FITTED, *visit) for visit in self.separated.order],
             begin_at=before.begin_at + before.visited,
         )
+
+    def verification(self) -> Tour:
+        """Plan poses that no collection has, each with the correction off and on.
+
+        Which of the two is first is random at each: what drifts is in neither alone. The sensors
+        are taken to be at their rough places; nothing has to be registered.
+
+        Raises
+        ------
+        InsufficientDataError
+            Too few of the candidates can be reached, each from the one before it.
+        """
+        rng = np.random.default_rng([self._seed, *b'verify'])
+        plan = self.scene.plan(VERIFIED_CANDIDATES, self.scene.rough_R, rng)
+        poses = [replace(p, solutions=rng.permutation(p.solutions)[:1]) for p in plan.poses]
+        chosen = self._reached(poses)
+        if len(chosen) < VERIFIED_POSES:
+            raise InsufficientDataError(
+                f'{len(chosen)} poses can be reached of {VERIFIED_CANDIDATES} candidates, and a '
+                f'verification takes {VERIFIED_POSES}; widen the ranges of poses in the cell file'
+            )
+        visits = [
+            replace(pose, correction=state)
+            for pose in chosen
+            for state in (('on', 'off') if rng.random() < 0.5 else ('off', 'on'))
+        ]
+        held_out = Plan(tuple(visits), plan.dropped, plan.dropped_solutions)
+        return Tour(
+            self._chain, {FITTED: Plan(()), HELD_OUT: held_out}, in_order=True, model=self.model
+        )
+
+    def _reached(self, poses: list[PlannedPose]) -> list[PlannedPose]:
+        """Return some of the poses in an order in which each is reached from the one before."""
+        while True:
+            q = np.array([pose.solutions[0] for pose in poses[:VERIFIED_POSES]])
+            chosen = [poses[i] for i in self._in_turn(q, list(range(len(q))))]
+            lost = self._without_way(chosen)
+            if not lost:
+                return chosen
+            poses = [pose for pose in poses if all(pose is not other for other in lost)]
 
     def _references(self, plans: Mapping[str, Plan]) -> Plan:
         """Choose references among the planned configurations, each with a way from the last."""

@@ -446,7 +446,8 @@ class SessionRecorder:
             if self.journal.closed or not self.journal.follow(pose.plan):
                 self.trouble = 'settled, but the session is closed, or was begun with another plan'
                 continue
-            if settled.change is not None and (self.another_correction or not self.correction):
+            untold = settled.change is not None and not self.correction
+            if self.another_correction or untold:
                 self.trouble = (
                     self.another_correction or 'the bridge does not tell what it corrects'
                 )
@@ -490,8 +491,8 @@ class SessionRecorder:
     def _write_down(self, ended: EndedReading) -> None:
         """Write what became of a configuration; publish it after that, and not before."""
         settled, pose = ended.settled, ended.settled.pose
-        if settled.change is not None and ended.accepted and pose.split != REGISTRATION:
-            # Before the first row: it decides which columns there are.
+        if self._read_with and ended.accepted and pose.split != REGISTRATION:
+            # Before the first row, also of one with it off: it decides which columns there are.
             self.journal.take_correction(Correction(BRIDGE, self._read_with))
         number = self.journal.write(
             pose=pose.pose,

@@ -1,12 +1,14 @@
 """A collection through a bridge that corrects what it commands, with real nodes."""
 
 import hashlib
+import json
 
 import numpy as np
 import pytest
 from collection_rig import SEED, Cell
 from command_line import remaster
 from compensation_files import save
+from ros_rig import call
 
 from remaster_ros.calibration.fit import fit_session
 from remaster_ros.cli.verify import visits
@@ -20,15 +22,15 @@ from remaster_ros.types import Correction
 pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(900)]
 
 
-def true_correction(folder):
-    """Write the compensation.json of the offsets that the world of the rig hides."""
+def true_correction(folder, share=1.0):
+    """Write the compensation.json of so much of the offsets that the world of the rig hides."""
     from dataclasses import replace
 
     cell = read_cell('demo')
     truth = make_world(folder / 'twin', cell, SEED, 1.0).truth
     model = replace(
         ArmModel.nominal(cell.chain()),
-        joint_offsets=truth.joint_offsets,
+        joint_offsets=share * truth.joint_offsets,
         T_R_N={'mocap': np.eye(4)},
         markers={name: np.array(at) for name, at in cell.markers.items()},
     )
@@ -68,3 +70,47 @@ def test_offsets_fitted_through_the_bridge_are_zero(start, client, tmp_path):
     done = remaster('replay', cell.session, '--out', tmp_path / 'again')
     assert done.returncode == 0, done.stderr
     assert 'all rows are those of' in done.stdout
+
+
+@pytest.mark.parametrize(('share', 'verdict'), [(1.0, 'in_use'), (-1.0, 'other')])
+def test_ten_poses_with_the_correction_off_and_on_tell_whether_it_is_in_use(
+    start, client, tmp_path, share, verdict
+):
+    """With the sign of each offset wrong, what acts is none of the correction's own states."""
+    from std_msgs.msg import String
+
+    from remaster_ros.nodes.status import LATCHED
+
+    file, _ = true_correction(tmp_path, share)
+    compensator = read_compensation(file).compensator
+    cell = Cell(start, client, tmp_path, 'mocap', ['mocap'], collect=False, compensation=file)
+    verdicts = []
+    client.create_subscription(String, 'remaster/verdict', verdicts.append, LATCHED)
+    cell.until(lambda: call(client, '/remaster/verify').success, 'the bridge to be known')
+    assert not call(client, '/remaster/verify').success
+    session = cell.complete()
+    m = session.measurements
+    on = m.correction == 1
+    # As they were visited: pairs of one pose, in either order.
+    pairs = m.correction.reshape(10, 2)
+    assert np.all(pairs.sum(axis=1) == 1)
+    assert 0 < pairs[:, 0].sum() < 10
+    assert m.is_validation.all()
+    np.testing.assert_allclose(m.q[on], compensator.command(m.wanted[on]), atol=1e-4)
+    np.testing.assert_array_equal(m.q[~on], m.wanted[~on])
+    wanted = m.wanted.reshape(10, 2, -1)
+    np.testing.assert_allclose(wanted[:, 0], wanted[:, 1], atol=1e-4)
+    assert not [e for e in cell.events if type(e).__name__ in ('ArmHalted', 'SolutionFailed')]
+
+    cell.until(lambda: verdicts, 'the verdict')
+    found = json.loads(verdicts[0].data)
+    assert found['verdict'] == verdict
+    if share == 1.0:
+        assert found['toggle']['verdict'] == 'in_use'
+        assert found['error_mm']['on']['mean_mm'] < 0.3 < found['error_mm']['off']['mean_mm']
+    done = remaster('verify', cell.session, '--compensation', file, '--json')
+    assert json.loads(done.stdout) == found
+    response = call(client, '/remaster/verify')
+    assert response.success
+    assert response.message.startswith(verdict)
+    assert 'it was no calibration' in call(client, '/remaster/collect').message

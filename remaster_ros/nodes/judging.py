@@ -1,0 +1,134 @@
+"""Visits by which an arm is judged, in place of a collection and in a session of their own.
+
+/remaster/verify: is the correction of the bridge in use? When the recorder has closed the session
+`remaster verify` judges it, in a process of its own: nothing that estimates runs beside what
+announces poses, and whoever judges the same session later gets the same.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Literal
+
+from rclpy.node import Node
+from std_msgs.msg import String
+
+from remaster_ros.collection.events import SHORT, BridgeState
+from remaster_ros.errors import InputError
+from remaster_ros.nodes.background import Background
+from remaster_ros.nodes.status import LATCHED
+from remaster_ros.planning.tour_order import Tour
+from remaster_ros.planning.tour_planner import TourPlanner
+
+Kind = Literal['verify']
+KINDS: tuple[Kind, ...] = ('verify',)
+VERDICT = 'remaster/verdict'
+LONGEST_WALL_S = 600.0
+"""A verdict takes seconds; a machine that takes longer does not give one."""
+
+
+class Judging:
+    """Plans the visits, and has them judged.
+
+    Parameters
+    ----------
+    node
+        The planner.
+    session
+        Its folder.
+    compensation
+        The file that the arm is judged by; '' for none.
+    tours
+        Plans the tours.
+
+    Attributes
+    ----------
+    verdict
+        In a line; '' before there is one.
+    trouble
+        Why there is none; ''.
+    """
+
+    def __init__(self, node: Node, session: Path, compensation: str, tours: TourPlanner) -> None:
+        self._log, self._session, self._tours = node.get_logger(), session, tours
+        self._compensation = compensation
+        self._publisher = node.create_publisher(String, VERDICT, LATCHED)
+        self._background = Background(node)
+        self._asked = False
+        self.verdict = self.trouble = ''
+
+    def refusal(self, kind: Kind, bridge: BridgeState | None) -> str:
+        """Return why these visits are not begun; ''."""
+        # Imported when it is needed, as it takes a while.
+        from remaster_ros.compensation.file import read_compensation
+
+        if not self._compensation:
+            return (
+                f'{kind} needs the parameter compensation of pose_planner: the compensation.json '
+                'that the arm is judged by'
+            )
+        try:
+            sha256 = read_compensation(self._compensation).sha256
+        except InputError as error:
+            return str(error)
+        if bridge is None:
+            return 'no sign of robot_bridge: is it running in this ROS domain?'
+        if bridge.correction != sha256:
+            has = f'checksum {bridge.correction[:SHORT]}' if bridge.correction else 'none'
+            return (
+                f'robot_bridge corrects by another file ({has}) than {self._compensation} '
+                f'({sha256[:SHORT]}): start it with the same parameter compensation'
+            )
+        return ''
+
+    def tour(self, kind: Kind) -> tuple[Callable[[], Tour], str]:
+        """Return what plans the visits, and what a person is told before the arm moves."""
+        return self._tours.verification, (
+            'ten poses follow, each with the correction off and on; the verdict comes on '
+            f'/{VERDICT}'
+        )
+
+    def judge(self, kind: Kind) -> None:
+        """Have the session judged that the recorder has closed, once."""
+        if not self._asked:
+            self._asked = True
+            command = [kind, str(self._session), '--compensation', self._compensation, '--json']
+            self._background.submit(lambda: _answer(command), self._on_answer)
+
+    def _on_answer(self, answer: str | Exception) -> None:
+        if isinstance(answer, Exception):
+            self.trouble = f'not judged: {answer}'
+            self._log.error(self.trouble)
+            return
+        content = json.loads(answer)
+        self.verdict = f'{content["verdict"]}: {content["text"]}'
+        self._log.info(self.verdict)
+        for warning in content.get('warnings', ()):
+            self._log.warning(warning)
+        self._publisher.publish(String(data=answer))
+
+    def told(self) -> tuple[bool, str]:
+        """Return whether there is a verdict of what was visited, and it or why there is none."""
+        return bool(self.verdict), self.verdict or self.trouble or 'it is being judged'
+
+    def close(self) -> None:
+        """Wait for no verdict."""
+        self._background.close(0.0)
+
+
+def _answer(command: list[str]) -> str:
+    """Return what a verb of the command line prints; `InputError` with its line where it fails."""
+    done = subprocess.run(
+        [sys.executable, '-m', 'remaster_ros.cli.main', *command],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=LONGEST_WALL_S,
+    )
+    if done.returncode:
+        raise InputError((done.stderr.strip() or f'status {done.returncode}').splitlines()[-1])
+    return done.stdout.strip()
