@@ -72,7 +72,9 @@ def test_offsets_fitted_through_the_bridge_are_zero(start, client, tmp_path):
     assert 'all rows are those of' in done.stdout
 
 
-@pytest.mark.parametrize(('share', 'verdict'), [(1.0, 'in_use'), (-1.0, 'other')])
+@pytest.mark.parametrize(
+    ('share', 'verdict'), [(1.0, 'in_use'), pytest.param(-1.0, 'other', marks=pytest.mark.qualify)]
+)
 def test_ten_poses_with_the_correction_off_and_on_tell_whether_it_is_in_use(
     start, client, tmp_path, share, verdict
 ):

@@ -12,6 +12,7 @@ from hidden_tours import robot
 from verified_arms import Case, found_arm, measured
 
 from remaster_ros.cli.main import main
+from remaster_ros.cli.verify import WORDS
 from remaster_ros.compensation.file import read_compensation
 from remaster_ros.session.reader import write_session
 from remaster_ros.types import Correction, Measurements, Session
@@ -70,6 +71,19 @@ def test_a_recorded_session_with_the_layer_on(tmp_path, file, capsys, state):
     assert found['error_mm']['on'].keys() == {'mean_mm', 'interval95_mm'}
     assert main(['verify', str(tmp_path / 's'), '--compensation', str(file)]) == 0
     assert capsys.readouterr().out.startswith(f'{state}: ')
+
+
+def test_visits_for_the_same_joints_belong_together_whatever_their_numbers(tmp_path, file, capsys):
+    """A recorder numbers each visit; the arm stands a little off what was wanted."""
+    session = session_of(CASE)
+    m, rng = session.measurements, np.random.default_rng(5)
+    order = rng.permutation(len(m))
+    off = rng.normal(0.0, 1e-5, m.wanted.shape)
+    apart = replace(m.select(order), configuration=np.arange(len(m)), pose=np.arange(len(m)))
+    apart = replace(apart, wanted=apart.wanted + off, q=apart.q + off)
+    found = verified(replace(session, measurements=apart), tmp_path / 's', file, capsys)
+    assert found['verdict'] == found['toggle']['verdict'] == 'in_use'
+    assert found['text'] == WORDS['in_use']
 
 
 def test_on_the_pad_what_is_reported_was_wanted(tmp_path, file, capsys):

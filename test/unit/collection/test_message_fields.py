@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from remaster_ros.collection.message_fields import JointOrder, solutions_of
+from remaster_ros.collection.message_fields import JointOrder, correction_asked, solutions_of
 from remaster_ros.errors import InputError
 
 ARM = ('a', 'b')
@@ -43,3 +43,26 @@ def test_a_joint_that_stands_twice_is_refused_by_name(names, repeated):
         solutions_of(solutions(names, range(len(names))), ARM)
     # And what comes right again is taken again.
     np.testing.assert_array_equal(order.positions(states('ab', [1.0, 2.0])), [1.0, 2.0])
+
+
+@pytest.mark.parametrize(
+    ('names', 'asked'),
+    [
+        (['a', 'b'], ''),
+        (['corrected/b', 'corrected/a'], 'on'),
+        (['uncorrected/a', 'uncorrected/b'], 'off'),
+    ],
+)
+def test_solutions_tell_whether_they_are_to_be_corrected(names, asked):
+    message = solutions(names, [1.0, 2.0])
+    assert correction_asked(message) == asked
+    first = 0 if names[0].endswith('a') else 1
+    assert solutions_of(message, ARM)[0, first] == 1.0
+
+
+@pytest.mark.parametrize('names', [['corrected/a', 'b'], ['corrected/a', 'uncorrected/b']])
+def test_solutions_of_which_some_are_to_be_corrected_are_refused(names):
+    message = solutions(names, [1.0, 2.0])
+    assert correction_asked(message) == ''
+    with pytest.raises(InputError, match='they are for corrected/a'):
+        solutions_of(message, ARM)

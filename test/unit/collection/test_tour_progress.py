@@ -1,5 +1,6 @@
 """Which pose is next, with the journal of a real session and tours of a few poses."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -337,3 +338,22 @@ def test_what_is_measured_further_follows_a_complete_collection_also_after_a_res
     assert (counts['poses_done'], counts['poses']) == (4, 4)
     assert b.journal.earlier['to_fit'] == planned
     assert b.journal.earlier['further'] == 0
+
+
+def test_poses_to_judge_by_need_no_registration_and_keep_their_state_over_a_restart(bench):
+    b = bench()
+    plan = plan_of(9, 2, 1)
+    visits = [replace(p, correction=state) for p in plan.poses for state in ('off', 'on')]
+    plans = {'optimization': Plan(()), 'validation': Plan(tuple(visits))}
+    b.progress.judging = lambda: Tour(CHAIN, plans, in_order=True)
+    seen = []
+    while (stop := b.next()) is not None:
+        seen.append((stop.pose, stop.split, stop.correction))
+        b.restart()
+        # What was announced before is announced as it was.
+        assert b.progress.rest(Q) is None
+        assert b.progress.rest(Q).correction == stop.correction
+        b.visit(stop)
+    assert seen == [(i, 'validation', state) for i, state in enumerate(('off', 'on') * 2)]
+    assert b.progress.is_complete
+    assert b.journal.tour.judges == 'verify'

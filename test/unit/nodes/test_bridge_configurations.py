@@ -67,6 +67,71 @@ def test_what_is_commanded_is_corrected_before_it_is_checked(rig, tmp_path):
     assert r.bridge.summarised.state.correction == sha256
 
 
+def asked(rig, prefix):
+    return [f'{prefix}{name}' for name in rig.names]
+
+
+def test_a_pose_has_the_correction_on_or_off_and_a_move_is_stopped_before_it_is_switched(
+    rig, tmp_path
+):
+    urdf = read_cell('demo').urdf_text
+    offsets = np.deg2rad([0.5, -0.7, 0.4, 0.9, -1.2, 0.3, 0.6])
+    model = arm(urdf, CHAIN.base_link, CHAIN.tip_link, joint_offsets=offsets)
+    r = rig(compensation=save(tmp_path, model, urdf))
+    command = Compensator(model).command(TARGET)
+    r.settle(TARGET, names=asked(r, 'uncorrected/'))
+    np.testing.assert_allclose(r.moves()[-1].q[-1], TARGET, atol=1e-12)
+    assert list(r.settled[-1].name) == r.names
+    r.settle(TARGET, names=asked(r, 'corrected/'))
+    np.testing.assert_allclose(r.moves()[-1].q[-1], command, atol=1e-9)
+    assert list(r.settled[-1].name) == [*r.names, *(f'wanted/{name}' for name in r.names)]
+
+    r.go(HOME, names=asked(r, 'uncorrected/'))
+    before = len(r.moves())
+    r.settle(TARGET, names=asked(r, 'corrected/'))
+    stop, *_, last = r.moves()[before:]
+    assert len(r.named(ArmStopped)) == 1
+    # It ends on the way home; what follows begins where the arm stands.
+    np.testing.assert_allclose(stop.q[-1], last.start_q, atol=1e-3)
+    np.testing.assert_allclose(last.q[-1], command, atol=1e-9)
+    assert not r.halted()
+
+
+@pytest.mark.parametrize(('degrees', 'refused'), [(1.9, True), (-1.9, False)])
+def test_with_the_correction_off_the_limits_are_still_those_of_the_true_arm(
+    rig, tmp_path, degrees, refused
+):
+    urdf = read_cell('demo').urdf_text
+    offsets = np.zeros(len(CHAIN))
+    offsets[1] = np.deg2rad(degrees)
+    model = arm(urdf, CHAIN.base_link, CHAIN.tip_link, joint_offsets=offsets)
+    r = rig(compensation=save(tmp_path, model, urdf), limit_margin_deg=0.0)
+    target = HOME.copy()
+    target[1] = CHAIN.upper[1] - np.deg2rad(1.0)
+    r.plan(target, names=asked(r, 'uncorrected/'))
+    r.run(30.0, lambda: r.named(SolutionFailed) or r.moves())
+    assert ['joint_2 at' in failed.reason for failed in r.named(SolutionFailed)] == [
+        True
+    ] * refused
+    assert bool(r.moves()) != refused
+
+
+def test_a_correction_that_a_bridge_does_not_have_is_refused_by_name(rig):
+    r = rig()
+    r.plan(TARGET, names=asked(r, 'corrected/'))
+    r.run(5.0, lambda: r.named(SolutionFailed))
+    (failed,) = r.named(SolutionFailed)
+    assert 'robot_bridge has none: see its compensation' in failed.reason
+    half = [*asked(r, 'corrected/')[:3], *asked(r, 'uncorrected/')[3:]]
+    r.plan(TARGET, names=half)
+    r.run(2.0)
+    assert 'joint_solutions dropped: they are for corrected/joint_1' in r.logged()[-1][1]
+    assert not r.moves()
+    # Off is what it does anyway.
+    r.settle(TARGET, names=asked(r, 'uncorrected/'))
+    np.testing.assert_allclose(r.moves()[-1].q[-1], TARGET, atol=1e-12)
+
+
 def test_a_configuration_that_the_correction_changes_too_much_is_given_up(
     rig, tmp_path, monkeypatch
 ):

@@ -6,6 +6,7 @@ from itertools import groupby
 import numpy as np
 import pytest
 
+from remaster_ros.collection.plan_confirmation import fingerprint
 from remaster_ros.kinematics.free_paths import is_straight_free
 from remaster_ros.planning import planned_design, pose_design
 from remaster_ros.planning.candidates import order_solutions, plan_poses
@@ -204,3 +205,36 @@ def test_looking_ahead_leaves_a_tour_as_it_is_and_begins_with_what_is_left_of_it
     assert tour.visited == 7
     # What the fit will state depends on all of it.
     assert left.joint_std == whole.joint_std
+
+
+def test_a_verification_has_ten_poses_off_and_on_in_random_order_that_no_collection_has():
+    planner, _ = planner_of(CellPoses(design=LATIN))
+    tour = planner.verification()
+    assert tour.judges == 'verify'
+    visits, q = [], np.zeros(len(planner.model.chain))
+    while (stop := tour.next(q)) is not None:
+        visits.append(stop)
+        q = stop.solutions[-1]
+    assert len(visits) == 20
+    assert {visit.split for visit in visits} == {'validation'}
+    pairs = list(zip(visits[::2], visits[1::2]))
+    first = [one.correction for one, _ in pairs]
+    assert {'on', 'off'} == set(first)
+    for one, other in pairs:
+        assert {one.correction, other.correction} == {'on', 'off'}
+        np.testing.assert_array_equal(one.solutions, other.solutions)
+        # The arm stands there already, as far as it is planned.
+        assert [len(way) for way in other.paths] == [0]
+    wanted = np.concatenate([one.solutions for one, _ in pairs])
+    assert len(np.unique(wanted, axis=0)) == 10
+    collected = planner.collection(planner.rough_places)
+    assert collected.judges == ''
+    used = [q for plan in collected.plans.values() for pose in plan.poses for q in pose.solutions]
+    away = np.max(np.abs(wanted[:, None] - np.array(used)), axis=2)
+    assert away.min() > 0.02
+    # Of a seed the same, of another one others.
+    again = planner.verification()
+    assert fingerprint(again) == fingerprint(planner.verification()) != fingerprint(collected)
+    other = TourPlanner(planner.scene, {}, 1, 0, planner.design).verification()
+    orders = [[p.correction for p in t.plans['validation'].poses] for t in (again, other)]
+    assert orders[0] != orders[1]
