@@ -79,7 +79,8 @@ def test_visits_for_the_same_joints_belong_together_whatever_their_numbers(tmp_p
     m, rng = session.measurements, np.random.default_rng(5)
     order = rng.permutation(len(m))
     off = rng.normal(0.0, 1e-5, m.wanted.shape)
-    apart = replace(m.select(order), configuration=np.arange(len(m)), pose=np.arange(len(m)))
+    apart, each = m.select(order), np.arange(len(m))
+    apart = replace(apart, observation=each, configuration=each, pose=each, stamp_s=1.0 * each)
     apart = replace(apart, wanted=apart.wanted + off, q=apart.q + off)
     found = verified(replace(session, measurements=apart), tmp_path / 's', file, capsys)
     assert found['verdict'] == found['toggle']['verdict'] == 'in_use'
