@@ -221,8 +221,9 @@ class ConfigurationTimes:
         needed = ('motion', 'settle', 'measuring', 'until_command')
         rows = [row for row in self.rows if all(name in row for name in needed)]
         table = {name: np.array([row[name] for row in rows]) for name in needed}
+        # A reading begins when the arm stands, a moment before the bridge's report of it.
         software = table.pop('until_command') - table['measuring'] / self._rate
-        return {**table, 'software': software}
+        return {**table, 'software': np.maximum(software, 0.0)}
 
 
 def _table(title: str, *headings: str, left: int = 1) -> Table:
