@@ -26,7 +26,8 @@ class Cell:
 
     `foreign` gives sensors that are read from the topic of a node of another package: sensor ->
     (message type, topic), as in the cell file. `by_action` gives the arm's controller the action
-    FollowJointTrajectory in place of the topic. `compensation` is that of the bridge.
+    FollowJointTrajectory in place of the topic. `compensation` is that of the bridge,
+    and `judged` what the planner has arms judged by.
     """
 
     def __init__(
@@ -47,6 +48,7 @@ class Cell:
         hidden=(),
         by_action=False,
         compensation='',
+        judged=None,
     ):
         from remaster_ros.nodes.controller_link import COMMANDS
         from remaster_ros.nodes.status import listen
@@ -87,6 +89,7 @@ class Cell:
         if compensation:
             own['robot_bridge']['compensation'] = compensation
             own['pose_planner']['compensation'] = compensation
+        own['pose_planner'] |= judged or {}
         if 'mocap' in sensors:
             ports = {'command_port': command, 'data_port': data}
             own['fake_optitrack'] = {'world': folder / 'world', 'rate': 20.0, **ports}

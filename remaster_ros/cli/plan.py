@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +12,7 @@ import numpy as np
 
 from remaster_ros.cli.console import progress_bar, show
 from remaster_ros.cli.options import add_poses, integer, number
-from remaster_ros.compensation.arm_model import ArmModel
-from remaster_ros.compensation.checking import chosen_poses
+from remaster_ros.compensation.check_visits import CHECK_POSES, chosen_visits
 from remaster_ros.errors import InsufficientDataError
 from remaster_ros.kinematics.body_pairs import RESERVE_M
 from remaster_ros.kinematics.collision import CollisionModel
@@ -33,10 +31,6 @@ from remaster_ros.types import FloatArray
 
 # Configurations at which the arm may begin that are tried, from zero outwards.
 TRIED_STARTS = 200
-# Of a check: four see 0.26 mm where eight see 0.17, and sixteen take twice the time for 0.12.
-CHECK_POSES = 8
-# A check that takes longer is not made each day.
-CHECK_S = 90.0
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -117,11 +111,11 @@ def run(args: argparse.Namespace) -> int:
     check = None if args.check is None else _check(cell, scene, plan, args)
     if args.json:
         content = plan_to_dict(plan)
-        print(json.dumps(content if check is None else {**content, 'check': check}, indent=2))
+        print(json.dumps(content if check is None else {**content, 'check': check[0]}, indent=2))
         return 0
     show(args.quiet, plan_text(plan, cell.design_settings()))
     if check is not None:
-        show(args.quiet, _check_text(check, args.check))
+        show(args.quiet, check[1])
     if args.out is not None:
         show(args.quiet, f'written: {args.out}; open it in a browser to see every way')
     return 0
@@ -140,57 +134,37 @@ def _travel(cell: Workcell, scene: PlanningScene, args: argparse.Namespace) -> T
 
 def _check(
     cell: Workcell, scene: PlanningScene, plan: CollectionPlan, args: argparse.Namespace
-) -> dict[str, Any]:
-    """Choose and write the configurations of a check; return what it is expected to see."""
-    chain, sensor = scene.model.chain, cell.sensors[cell.aim_at]
-    places = {name: np.array(place) for name, place in cell.markers.items()}
-    model = replace(ArmModel.nominal(chain), T_R_N={cell.aim_at: np.eye(4)}, markers=places)
+) -> tuple[dict[str, Any], str]:
+    """Choose and write the configurations of a check; return what is expected, and in words."""
+    chain = scene.model.chain
     q = np.unique([visit.q for visit in plan.visits], axis=0)
     if len(q) < CHECK_POSES:
         raise InsufficientDataError(
             f'{len(q)} configurations are planned, and a check takes {CHECK_POSES}; plan more'
         )
-    rng = np.random.default_rng(args.seed)
-    rows, sizes = chosen_poses(model, q, cell.aim_at, sensor.marker, CHECK_POSES, rng)
     travel = _travel(cell, scene, args)
-    between, order = travel.between(q[rows]), [0]
-    while len(order) < len(rows):
-        left = [i for i in range(len(rows)) if i not in order]
-        order.append(min(left, key=lambda i: float(between[order[-1], i])))
-    seconds = float(between[order[:-1], order[1:]].sum()) + CHECK_POSES * travel.measuring_s
-    noise = float(np.hypot(sensor.noise_m, sensor.pose_noise_m))
-    lines = [','.join(f'{name} [deg]' for name in chain.joint_names)]
-    lines += [','.join(f'{angle:.6f}' for angle in row) for row in np.degrees(q[rows][order])]
-    write_atomically(args.check, '\n'.join(lines) + '\n')
-    return {
-        'configurations': len(rows),
+    visits = chosen_visits(cell, chain, q, travel, np.random.default_rng(args.seed))
+    write_atomically(args.check, visits.table())
+    seconds = visits.seconds(travel)
+    found = {
+        'configurations': len(visits.q),
         'seconds': seconds,
-        'noise_mm': 1e3 * noise,
+        'noise_mm': 1e3 * visits.noise_m,
         'detectable_mm': {
-            name: None if np.isnan(size) else 1e3 * noise * float(size)
-            for name, size in zip(chain.joint_names, sizes, strict=True)
+            name: None if np.isnan(size) else 1e3 * float(size)
+            for name, size in zip(chain.joint_names, visits.detectable_m, strict=True)
         },
     }
-
-
-def _check_text(check: dict[str, Any], path: Path) -> str:
     lines = [
-        f'check: {check["configurations"]} configurations, some {check["seconds"]:.0f} s by '
-        f'straight lines; written: {path}. The ways between them are not planned: let your own '
+        f'check: {len(visits.q)} configurations, some {seconds:.0f} s by straight lines; written: '
+        f'{args.check}. The ways between them are not planned: let /remaster/check or your own '
         'planner find them, and measure these configurations in each check',
+        visits.too_long(seconds),
         'smallest change that one check finds, at a noise of '
-        f'{check["noise_mm"]:.2g} mm per axis:',
+        f'{1e3 * visits.noise_m:.2g} mm per axis:',
+        *(f'  {line}' for line in visits.expected()),
     ]
-    if check['seconds'] > CHECK_S:
-        lines.insert(
-            1,
-            f'that is more than the {CHECK_S:g} s of a check: raise the limits of speed, if the '
-            'cell allows it',
-        )
-    for name, size in check['detectable_mm'].items():
-        what = 'none: looks like a sensor that was moved' if size is None else f'{size:.2f} mm'
-        lines.append(f'  {name}: {what}')
-    return '\n'.join(lines)
+    return found, '\n'.join(filter(None, lines))
 
 
 def planned(

@@ -1,8 +1,9 @@
 """Visits by which an arm is judged, in place of a collection and in a session of their own.
 
-/remaster/verify: is the correction of the bridge in use? When the recorder has closed the session
-`remaster verify` judges it, in a process of its own: nothing that estimates runs beside what
-announces poses, and whoever judges the same session later gets the same.
+/remaster/verify: is the correction of the bridge in use? /remaster/check: has the arm changed?
+When the recorder has closed the session the verb of that name judges it, in a process of its own:
+nothing that estimates runs beside what announces poses, and whoever judges the same session later
+gets the same.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import json
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -18,17 +20,45 @@ from rclpy.node import Node
 from std_msgs.msg import String
 
 from remaster_ros.collection.events import SHORT, BridgeState
+from remaster_ros.compensation.checking import SMALLEST_M
 from remaster_ros.errors import InputError
 from remaster_ros.nodes.background import Background
+from remaster_ros.nodes.parameters import parameter
 from remaster_ros.nodes.status import LATCHED
 from remaster_ros.planning.tour_order import Tour
 from remaster_ros.planning.tour_planner import TourPlanner
+from remaster_ros.session.workcell import Workcell
 
-Kind = Literal['verify']
-KINDS: tuple[Kind, ...] = ('verify',)
+Kind = Literal['verify', 'check']
+KINDS: tuple[Kind, ...] = ('verify', 'check')
 VERDICT = 'remaster/verdict'
 LONGEST_WALL_S = 600.0
 """A verdict takes seconds; a machine that takes longer does not give one."""
+
+
+@dataclass(frozen=True)
+class JudgingParameters:
+    """What an arm is judged by."""
+
+    compensation: str = parameter(
+        '',
+        'compensation.json that remaster/verify is about (the one of robot_bridge), and by which '
+        'the arm was right for remaster/check; empty for neither',
+    )
+    check_poses: str = parameter(
+        'check.csv',
+        'configurations of remaster/check, as `remaster plan CELL --check FILE` writes them',
+    )
+    history: str = parameter(
+        'checks.jsonl', 'all checks of this arm so far; remaster/check adds to it'
+    )
+    smallest_mm: float = parameter(
+        1e3 * SMALLEST_M,
+        'change at the tool that matters to remaster/check',
+        unit='mm',
+        low=0.001,
+        high=100.0,
+    )
 
 
 class Judging:
@@ -40,10 +70,10 @@ class Judging:
         The planner.
     session
         Its folder.
-    compensation
-        The file that the arm is judged by; '' for none.
-    tours
-        Plans the tours.
+    p
+        What the arm is judged by.
+    cell, tours
+        The cell, and what plans its tours.
 
     Attributes
     ----------
@@ -53,40 +83,72 @@ class Judging:
         Why there is none; ''.
     """
 
-    def __init__(self, node: Node, session: Path, compensation: str, tours: TourPlanner) -> None:
-        self._log, self._session, self._tours = node.get_logger(), session, tours
-        self._compensation = compensation
+    def __init__(
+        self, node: Node, session: Path, p: JudgingParameters, cell: Workcell, tours: TourPlanner
+    ) -> None:
+        self._log, self._session, self._p = node.get_logger(), session, p
+        self._cell, self._tours = cell, tours
         self._publisher = node.create_publisher(String, VERDICT, LATCHED)
         self._background = Background(node)
         self._asked = False
         self.verdict = self.trouble = ''
+
+    @property
+    def page(self) -> Path:
+        """Where the trend of all checks is drawn, beside the session."""
+        session = self._session.absolute()
+        return session.with_name(f'{session.name}.check.html')
 
     def refusal(self, kind: Kind, bridge: BridgeState | None) -> str:
         """Return why these visits are not begun; ''."""
         # Imported when it is needed, as it takes a while.
         from remaster_ros.compensation.file import read_compensation
 
-        if not self._compensation:
+        file = self._p.compensation
+        if not file:
             return (
                 f'{kind} needs the parameter compensation of pose_planner: the compensation.json '
                 'that the arm is judged by'
             )
         try:
-            sha256 = read_compensation(self._compensation).sha256
+            sha256 = read_compensation(file).sha256
         except InputError as error:
             return str(error)
         if bridge is None:
             return 'no sign of robot_bridge: is it running in this ROS domain?'
-        if bridge.correction != sha256:
+        if kind == 'verify' and bridge.correction != sha256:
             has = f'checksum {bridge.correction[:SHORT]}' if bridge.correction else 'none'
             return (
-                f'robot_bridge corrects by another file ({has}) than {self._compensation} '
+                f'robot_bridge corrects by another file ({has}) than {file} '
                 f'({sha256[:SHORT]}): start it with the same parameter compensation'
             )
         return ''
 
     def tour(self, kind: Kind) -> tuple[Callable[[], Tour], str]:
-        """Return what plans the visits, and what a person is told before the arm moves."""
+        """Return what plans the visits, and what a person is told before the arm moves.
+
+        Raises
+        ------
+        InputError
+            The table of a check is none, or the arm cannot stand at one of its configurations.
+        """
+        if kind == 'check':
+            # Imported when it is needed, as it takes a while.
+            from remaster_ros.compensation.check_visits import read_visits
+
+            visits = read_visits(Path(self._p.check_poses), self._cell, self._tours.model.chain)
+            tour, seconds = self._tours.check(visits.q), visits.seconds(self._tours.travel)
+            too_long = visits.too_long(seconds)
+            return lambda: tour, '; '.join(
+                [
+                    f'{len(visits.q)} configurations follow, some {seconds:.0f} s by straight '
+                    'lines',
+                    *([too_long] if too_long else []),
+                    f'smallest change that is found, at a noise of {1e3 * visits.noise_m:.2g} mm '
+                    f'per axis: {", ".join(visits.expected())}',
+                    f'the verdict comes on /{VERDICT}',
+                ]
+            )
         return self._tours.verification, (
             'ten poses follow, each with the correction off and on; the verdict comes on '
             f'/{VERDICT}'
@@ -96,7 +158,12 @@ class Judging:
         """Have the session judged that the recorder has closed, once."""
         if not self._asked:
             self._asked = True
-            command = [kind, str(self._session), '--compensation', self._compensation, '--json']
+            command = [kind, str(self._session), '--json']
+            if kind == 'verify':
+                command += ['--compensation', self._p.compensation]
+            else:
+                command += ['--baseline', self._p.compensation, '--history', self._p.history]
+                command += ['--smallest-mm', repr(self._p.smallest_mm), '--out', str(self.page)]
             self._background.submit(lambda: _answer(command), self._on_answer)
 
     def _on_answer(self, answer: str | Exception) -> None:

@@ -1,7 +1,8 @@
 """Plan poses in front of the sensors; publish them one by one, each with all its joint solutions.
 
 ``/remaster/collect`` starts or resumes; ``/remaster/pause`` and ``/remaster/stop`` hold the arm.
-``/remaster/verify`` begins visits by which a correction is judged, in place of a collection.
+``/remaster/verify`` and ``/remaster/check`` begin visits by which the arm is judged, in place of a
+collection.
 Without a registration of every sensor the first poses serve the three-point registration.
 
 What the planner does and in which run is decided in `collection.collection_run`, which pose is
@@ -54,7 +55,7 @@ from remaster_ros.errors import InputError, RemasterError
 from remaster_ros.kinematics import transforms
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.motion.preflight import preflight
-from remaster_ros.nodes.judging import KINDS, Judging, Kind
+from remaster_ros.nodes.judging import KINDS, Judging, JudgingParameters, Kind
 from remaster_ros.nodes.locking import runtime_folder
 from remaster_ros.nodes.messages import duration_of, transform_array
 from remaster_ros.nodes.parameters import declare, parameter
@@ -191,7 +192,7 @@ class FurtherMeasuring:
 
 
 @dataclass(frozen=True)
-class Parameters:
+class Parameters(JudgingParameters):
     """Parameters of the planner."""
 
     cell: str = parameter('demo', 'cell file: a path, or the name of a shipped one')
@@ -227,10 +228,6 @@ class Parameters:
         'discovery',
         "folder of the optimizer's discovery: after a complete collection remaster/collect "
         'measures further what separates its causes from their look-alikes; empty for nothing',
-    )
-    compensation: str = parameter(
-        '',
-        'compensation.json that remaster/verify judges: the one of robot_bridge; empty for none',
     )
     resume_within_s: float = parameter(
         30.0,
@@ -564,7 +561,7 @@ class PosePlanner(RemasterNode):
         self._further = FurtherMeasuring(self.p.discovery, folder, self.journal, self._tours)
         # Every pose passes its gate in `_announce`.
         self._preview = PlanPreview(self.cell, self._tours, self.journal, self.progress, folder)
-        self._judging = Judging(self, folder, self.p.compensation, self._tours)
+        self._judging = Judging(self, folder, self.p, self.cell, self._tours)
         self._living: LivingRun | None = None
         self._tried_wall = 0.0
         self._resume()
@@ -659,8 +656,11 @@ class PosePlanner(RemasterNode):
             )
         else:
             response.message = self._judging.refusal(kind, self._announcements.bridge)
+            try:
+                plan, words = self._judging.tour(kind) if not response.message else (None, '')
+            except RemasterError as error:
+                response.message = str(error)
             if not response.message:
-                plan, words = self._judging.tour(kind)
                 self._collect(response, None if own else plan)
                 response.message = words if response.success else response.message
         return response

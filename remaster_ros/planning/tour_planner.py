@@ -9,7 +9,8 @@ from itertools import combinations
 
 import numpy as np
 
-from remaster_ros.errors import InsufficientDataError
+from remaster_ros.errors import InputError, InsufficientDataError
+from remaster_ros.kinematics.body_pairs import RESERVE_M
 from remaster_ros.kinematics.collision import CollisionModel
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.transforms import transform
@@ -302,6 +303,25 @@ class TourPlanner:
         return Tour(
             self._chain, {FITTED: Plan(()), HELD_OUT: held_out}, in_order=True, model=self.model
         )
+
+    def check(self, q: FloatArray) -> Tour:
+        """Plan a visit to each of these configurations, in their order, rad, (n, k).
+
+        Raises
+        ------
+        InputError
+            The arm cannot stand at one of them.
+        """
+        margin = self.scene.limit_margin_rad
+        for number, (one, why) in enumerate(zip(q, self.model.reasons(q, RESERVE_M)), 1):
+            if why or not self._chain.within_limits(one, -margin):
+                raise InputError(
+                    f'configuration {number} of the check: {why or "too near to a joint limit"}; '
+                    'choose others (remaster plan --check)'
+                )
+        poses = tuple(PlannedPose(self._chain.forward(one), one[None]) for one in q)
+        plans = {FITTED: Plan(()), HELD_OUT: Plan(poses)}
+        return Tour(self._chain, plans, in_order=True, model=self.model)
 
     def _reached(self, poses: list[PlannedPose]) -> list[PlannedPose]:
         """Return some of the poses in an order in which each is reached from the one before."""
