@@ -24,7 +24,7 @@ def baseline(folder):
     model = replace(
         ArmModel.nominal(cell.chain()),
         joint_offsets=truth.joint_offsets,
-        T_R_N={'mocap': np.eye(4)},
+        T_R_N={'mocap': truth.sensors['mocap'].T_R_N},
         markers=dict(truth.markers),
     )
     return save(folder, model, cell.urdf_text)
