@@ -356,8 +356,6 @@ def _read(args: argparse.Namespace, chain: SerialChain) -> RawRows:
         if len(args.files) > 1:
             raise InputError(f'{bags[0]}: a bag is imported alone; give one file')
         return read_bag(bags[0], chain, args.joints, args.points, args.length, args.clock_offset)
-    if len(args.files) > 2:
-        raise InputError(f'{len(args.files)} files; give one table, or two that are to be joined')
     return read_rows(
         args.files,
         chain,

@@ -13,9 +13,10 @@ import numpy as np
 
 from remaster_ros.errors import InputError
 from remaster_ros.importing.columns import AXES, Columns, Told, find_columns
+from remaster_ros.importing.makers import kuka
 from remaster_ros.importing.standstills import some
 from remaster_ros.importing.streams import stopped
-from remaster_ros.importing.text_table import TextTable, read_table
+from remaster_ros.importing.text_table import TABLE_LIMIT, TextTable, decode, read_table
 from remaster_ros.importing.units import ANGLES, LENGTHS
 from remaster_ros.importing.values import (
     angle_unit,
@@ -26,6 +27,7 @@ from remaster_ros.importing.values import (
     times,
 )
 from remaster_ros.kinematics.serial_chain import SerialChain
+from remaster_ros.session.files import read_limited
 from remaster_ros.types import AngleUnit, BoolArray, FloatArray, IntArray
 
 # Which row of the joints belongs to which row of the points: by name, by time or by order.
@@ -321,8 +323,22 @@ def read_rows(paths: Sequence[Path], chain: SerialChain, options: TableOptions) 
     InputError
         One line naming file, line, column and remedy.
     """
+    programs = {
+        data: path
+        for path in paths
+        for data in paths
+        if (path.suffix.lower(), data.suffix.lower()) == ('.src', '.dat')
+        and path.stem.lower() == data.stem.lower()
+    }
+    paths = [path for path in paths if path not in programs.values()]
+    if len(paths) > 2:
+        raise InputError(f'{len(paths)} files; give one table, or two that are to be joined')
     tables = [
         read_table(path, options.separator, options.decimal, options.encoding) for path in paths
+    ]
+    tables = [
+        _visited(table, programs[table.path]) if table.path in programs else table
+        for table in tables
     ]
     found = [
         (table, find_columns(table, chain.joint_names, _of_file(options.told, table.path, paths)))
@@ -371,6 +387,21 @@ def read_rows(paths: Sequence[Path], chain: SerialChain, options: TableOptions) 
         points = points[0].select(pairs.points), points[1]
         joints = joints[0].select(pairs.joints), joints[1]
     return _values(points, joints, chain, options, stamp, tuple(description), tuple(warnings))
+
+
+def _visited(data: TextTable, program: Path) -> TextTable:
+    """Return the positions of a KUKA program's data in the order of its moves."""
+    text, _ = decode(read_limited(program, TABLE_LIMIT, 'name the program'), program, '')
+    named = [row[0] for row in data.rows] if data.names[0] == 'name' else []
+    order = kuka.moves(text)
+    kept = [named.index(name) for name in order if name in named]
+    if not kept:
+        note = f'{program.name}: its moves name no point of {data.path.name}, whose order is kept'
+        return replace(data, notes=(*data.notes, note))
+    notes = data.notes
+    if left := sorted(set(order).difference(named)):
+        notes += (f'{program.name}: moves to {", ".join(left)} were left out: no axis positions',)
+    return replace(data.select(kept), notes=notes)
 
 
 def _values(

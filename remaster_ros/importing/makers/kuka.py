@@ -13,6 +13,7 @@ _PLACE = re.compile(r'\bE6POS\b|\bPOS\b|\bFRAME\b|[{:,]\s*X\s+[-+.\d]', re.IGNOR
 _ENTRY = re.compile(rf'\s*(?:(?:E6)?AXIS\s*:)?\s*([AE]\d)\s+({NUMBER.pattern})\s*', re.IGNORECASE)
 _AXIS = re.compile(r'\bA\d\s+[-+.\d]')
 _MOVE_TO = re.compile(r'\bS?PTP\s*\{', re.IGNORECASE)
+_MOVE = re.compile(r'\s*S?(?:PTP|LIN)\s+([A-Za-z]\w*)', re.IGNORECASE)
 _NAME = re.compile(r'([A-Za-z]\w*)\s*=\s*$')
 _PROGRAM = re.compile(r'\s*(?:&[A-Z]|;\s*FOLD|DEF(?:DAT)?\s+\w[^:\n]*(?:\n|$))', re.IGNORECASE)
 _EXPECTED = '{E6AXIS: A1 …, A2 …} with a number for each axis'
@@ -53,6 +54,17 @@ def read(text: str) -> Named | None:
     )
 
 
+def moves(text: str) -> tuple[str, ...]:
+    """Return the points that the moves of a program name, in their order; some more than once."""
+    codes = (line.partition(';')[0] for line in text.splitlines())
+    return tuple(_point(found[1]) for found in map(_MOVE.match, codes) if found)
+
+
+def _point(name: str) -> str:
+    """Return what a point is called whose data is called so: P1 of XP1."""
+    return name[1:] if name.upper().startswith('X') and len(name) > 1 else name
+
+
 def _position(
     number: int, line: str, code: str, aggregate: re.Match[str]
 ) -> tuple[str, dict[str, str]]:
@@ -65,5 +77,4 @@ def _position(
         values[entry[1].upper()] = entry[2]
     named = _NAME.search(code[: aggregate.start()])
     name = '' if named is None or named[1].upper() == 'AXIS_ACT' else named[1]
-    # The data of point P1 is called XP1.
-    return name[1:] if name.upper().startswith('X') and len(name) > 1 else name, values
+    return _point(name), values

@@ -278,3 +278,29 @@ def test_the_accuracy_option_of_a_kuka_is_asked_for_and_kept(tmp_path, capsys):
     told = ['--accuracy-option', 'inactive', '--unchecked', '--quiet']
     assert main(['import', str(tmp_path / 'b'), '--out', str(tmp_path / 'c'), *told]) == 0
     assert read_session(tmp_path / 'c').accuracy_option == 'inactive'
+
+
+def test_a_program_gives_the_order_and_its_data_the_positions(tmp_path):
+    """Both files of a KUKA program, as a controller exports them; HOME stands in a third one."""
+    arm = measured(rows=12)
+    data = write(
+        tmp_path, 'Calib.dat', KINDS['kuka_dat'].write(names_of('kuka_dat', 12), np.rad2deg(arm.q))
+    )
+    visited = [4, 0, 1, 2, 3, 11, 10, 9, 8, 7, 6, 5]
+    moves = [
+        f';FOLD PTP P{i + 1} Vel=100 % PDAT{i} Tool[1] Base[0]\nFDAT_ACT=FP{i}\nPTP XP{i + 1}\n'
+        f';ENDFOLD\nWAIT SEC 5'
+        for i in visited
+    ]
+    program = write(
+        tmp_path,
+        'calib.src',
+        '\n'.join(['DEF calib( )', 'PTP XHOME', *moves, 'SPTP XHOME', 'END']),
+    )
+    points = write(tmp_path, 'points.csv', text(['X', 'Y', 'Z'], arm.points[visited].T))
+    rows = read_rows([program, data, points], arm.chain, TableOptions(join='order'))
+    np.testing.assert_allclose(rows.q, arm.q[visited], atol=2e-6)
+    assert 'calib.src: moves to HOME were left out: no axis positions' in rows.warnings
+    other = write(tmp_path, 'other.src', 'DEF other( )\nPTP XP1\nEND')
+    with pytest.raises(InputError, match='3 files; give one table, or two'):
+        read_rows([other, data, points], arm.chain, TableOptions(join='order'))
