@@ -330,6 +330,9 @@ class Session:
         Sensor name -> further markers that it measures in the same frame, where it does.
     oriented
         Sensors that measure the orientation of a body, too.
+    on_tool
+        Those of them that are on the tool, and what they measure beside the robot: their readings
+        are those of the sensor itself, in the frame of what it measures.
     measurements
         What is fitted and what is held out: no row of them is a reference.
     references
@@ -377,6 +380,7 @@ class Session:
     references: Measurements | None = None
     further_markers: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     oriented: frozenset[str] = frozenset()
+    on_tool: frozenset[str] = frozenset()
     observations_sha256: str = ''
     controller: Controller | None = None
     correction: Correction | None = None
@@ -478,6 +482,11 @@ class Session:
             'zero-offsets found here are the whole ones again, take its place and never come on '
             'top of it; whether it is in use, and what remains, tells remaster verify.'
         )
+
+    def positions_alone(self) -> Session:
+        """Return the same without the measured orientations."""
+        without = replace(self.measurements, orientation=None)
+        return replace(self, measurements=without, oriented=frozenset(), on_tool=frozenset())
 
     def through_correction(self) -> Session:
         """Return the rows with the correction on as the nominal robot: at the angles wanted.

@@ -11,7 +11,7 @@ import numpy as np
 from remaster_ros.calibration.extension import Extension
 from remaster_ros.calibration.grouped_rows import Rows
 from remaster_ros.calibration.identifiability import WEAK_ANGLE, Gauge, find_gauge
-from remaster_ros.calibration.initial_guess import given_start, robust_start
+from remaster_ros.calibration.initial_guess import given_start, robust_start, with_bodies
 from remaster_ros.calibration.laplace import Mode, find_mode
 from remaster_ros.calibration.model import Model
 from remaster_ros.calibration.moved_since import moved_since
@@ -42,6 +42,11 @@ FEWEST_ROWS = 4
 FEWEST_POSES = 3
 # Limits of chi-squared with 1 to 3 degrees of freedom at an error rate of 1 in 1,000: so often a
 # sensor whose noise is the same in all directions gets one of its own along the line of sight.
+# Without its orientations a session is fitted as any other.
+NOT_FITTED = (
+    'the orientations are not fitted: {}; check that the quaternions are in the order x, y, z, w '
+    "and give the body's axes in the sensor's frame"
+)
 DIRECTION_LIMITS = {1: 10.828, 2: 13.816, 3: 16.266}
 
 
@@ -187,6 +192,11 @@ class Problem:
             np.tile(np.eye(4), (count, 1, 1)),
             np.zeros((count, 3)),
             extension,
+            on_tool=tuple(
+                index
+                for index, name in enumerate(self.sensor_names)
+                if name in self.session.on_tool
+            ),
         )
 
 
@@ -206,6 +216,9 @@ class Estimate:
         (row of the measurements, reason) of the gross errors.
     kept
         Indices of the optimization rows that were fitted.
+    without_turns
+        Why measured orientations are not fitted, a sentence; '' where they are, or none were
+        measured.
     """
 
     problem: Problem
@@ -214,6 +227,7 @@ class Estimate:
     mode: Mode
     left_out: tuple[tuple[int, str], ...]
     kept: IntArray
+    without_turns: str = ''
 
     @property
     def posterior(self) -> Posterior:
@@ -251,8 +265,23 @@ def estimate(problem: Problem, extension: Extension | None = None) -> Estimate:
             problem.marker_priors(empty)
             + problem.plausibility(empty, np.arange(len(problem.chain))),
         )
+    model, z, without_turns = with_bodies(model, z, measurements, problem.fitted)
+    try:
+        found = _estimated(problem, model, z)
+    except MisfitError as error:
+        if not model.bodies:
+            raise
+        # Where the positions are those of another robot, too, this is refused by them.
+        found = _estimated(problem, replace(model, bodies=()), z[: model.markers_end])
+        without_turns = NOT_FITTED.format(error.what)
+    return replace(found, without_turns=without_turns)
+
+
+def _estimated(problem: Problem, model: Model, z: FloatArray) -> Estimate:
+    """Find the mode from a solution near it; errors as of `estimate`."""
+    measurements = problem.measurements
     priors = problem.marker_priors(model) + problem.other_priors(model)
-    rows = Rows.of(measurements, problem.fitted, model.reference)
+    rows = model.rows(measurements, problem.fitted)
     gauge = find_gauge(model, model.natural(z), rows, priors)
     free = np.setdiff1d(np.arange(model.size), gauge.held)
     known = priors
@@ -264,7 +293,8 @@ def estimate(problem: Problem, extension: Extension | None = None) -> Estimate:
     def fitted(keep: BoolArray) -> Mode:
         # From the mode of the rows kept before: only the first search has far to go.
         nonlocal start
-        kept = Rows.of(measurements, np.sort(rows.source[keep]), model.reference)
+        # Of a reading, position and orientation are kept or neither.
+        kept = model.rows(measurements, np.setdiff1d(rows.source, rows.source[~keep]))
         mode = find_mode(Posterior.of(model, kept, priors, free, start))
         start = mode.z
         return mode
@@ -278,20 +308,31 @@ def estimate(problem: Problem, extension: Extension | None = None) -> Estimate:
     except MisfitError as error:
         remedy = f'{error.remedy}{_moved(problem, rows, errors)}'
         raise MisfitError(error.what, remedy) from None
-    _require_information(int(np.sum(~judgement.gross)), free, model)
+    _require_information(int(np.sum(~judgement.gross[: rows.points])), free, model)
     mode = with_directions(fitted(~judgement.gross))
     gauge = _judged_at(mode, gauge, known)
-    left_out = [
-        (int(rows.source[row]), judgement.why[row]) for row in np.flatnonzero(judgement.gross)
-    ]
+    why: dict[int, str] = {}
+    for row in np.flatnonzero(judgement.gross):
+        # Of a whole reading one half has the reason, or both.
+        source = int(rows.source[row])
+        why[source] = '; '.join(filter(None, (why.get(source), judgement.why[row])))
     return Estimate(
         problem,
         model,
         gauge,
         mode,
-        tuple(sorted(left_out)),
-        np.sort(rows.source[~judgement.gross]),
+        tuple(sorted(why.items())),
+        np.setdiff1d(rows.source, rows.source[judgement.gross]),
     )
+
+
+def of_positions_alone(found: Estimate) -> Estimate:
+    """Return the estimate by the positions alone, for models that say nothing of orientations."""
+    if not found.model.bodies:
+        return found
+    session = found.problem.session.positions_alone()
+    without = replace(found.problem.measurements, orientation=None)
+    return estimate(replace(found.problem, session=session, measurements=without))
 
 
 def with_directions(mode: Mode) -> Mode:
@@ -303,7 +344,7 @@ def with_directions(mode: Mode) -> Mode:
     """
     posterior = mode.linearisation.posterior
     split: list[int] = []
-    for sensor in range(len(posterior.model.sensor_names)):
+    for sensor in range(len(posterior.noise_names)):
         noise_model = NoiseModel.of(posterior.rows, posterior.model.reference, [*split, sensor])
         tried = replace(posterior, reference=mode.z, noise_model=noise_model)
         try:
@@ -370,7 +411,7 @@ def _require_information(count: int, free: IntArray, model: Model) -> None:
 def _moved(problem: Problem, rows: Rows, errors: FloatArray) -> str:
     """Return from when on sensors with too many gross errors are off; '' if nothing shows it."""
     text = ''
-    for sensor, span in rows.spans:
+    for sensor, span in rows.of_points.spans:
         moved = moved_since(problem.measurements, rows.source[span], errors[span])
         if moved is not None:
             text += (

@@ -46,6 +46,24 @@ def in_words(model: Model, direction: FloatArray) -> str:
                 f'{"s" if len(sensors) > 1 else ""} about the base axis; '
                 'a known base frame (base_prior) would separate them'
             )
+        bodies = [
+            model.body_names[index]
+            for index in range(len(model.bodies))
+            if np.any(direction[model.body(index)])
+        ]
+        if joints[0] == model.joints - 1 and not sensors and bodies:
+            per_degree = 1e3 * np.radians(1.0) / abs(amount)
+            far = [
+                f'{the("marker", model.marker_names[m])} moved '
+                f'{per_degree * np.linalg.norm(direction[model.marker(m)]):.3f} mm per degree'
+                for m in markers
+            ]
+            return (
+                f'{joint} offset = {listed(bodies)} turned on the tool about the axis of {joint}'
+                f'{" and " if far else ""}{listed(far)}; a known orientation of '
+                f'{listed(bodies)} on the tool'
+                f'{", or a measured marker," if far else ""} would separate them'
+            )
         if joints[0] == model.joints - 1 and not sensors:
             per_degree = 1e3 * np.radians(1.0) / abs(amount)
             moved = [

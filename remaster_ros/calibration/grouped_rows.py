@@ -1,16 +1,26 @@
-"""Observations sorted for the estimators: by sensor, then by pose, then by frame."""
+"""Observations sorted for the estimators: by sensor, then by pose, then by frame.
+
+Where a sensor measures how a body stands, too, its orientations are rows of their own behind those
+of all positions: three numbers each, rad, of a noise of its own (`model` has their prediction).
+"""
 
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from scipy.sparse import csr_array
+from scipy.spatial.transform import Rotation
 
 from remaster_ros.kinematics.transforms import apply
-from remaster_ros.types import FloatArray, IntArray, Measurements
+from remaster_ros.types import BoolArray, FloatArray, IntArray, Measurements
+
+Bodies = tuple[tuple[int, int], ...]
+"""(sensor, marker) of every body whose orientation is fitted."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,15 +36,31 @@ class Rows:
     marker
         Marker index, (n,).
     target
-        Measured positions in the base coordinates of the reference registrations, m, (n, 3).
+        Measured positions in the base coordinates of the reference registrations, m, (n, 3); 0 of
+        an orientation, whose prediction is the turn from the measured to the modelled one.
     spans
-        (sensor index, slice of its rows) of every sensor present.
+        (sensor index, slice of its rows) of every sensor present. The orientations of sensor
+        ``turning[i]`` have the index S + i, S being the number of sensors.
     group_start, group_size, group_sensor
         The rows of one sensor at one pose share an error: where each group starts, how many rows
         and which sensor it has, (groups,).
     frame
         Number of each row's frame, ascending from 0, (n,): the markers of one frame share an
         error, too. None where every row is a frame by itself.
+    turned
+        Measured orientations of the last r rows in the base coordinates of the reference
+        registrations, (r, 3, 3); None where none are fitted.
+    turning
+        Sensors whose orientations these are.
+    body
+        Index of each row's body, (n,); -1 where it has none. None as ``turned``.
+    lever
+        What a sensor on the tool measured, m, (n, 3): the point in its own frame, which is the
+        body's, and 0 in rows of other sensors; None where no sensor is on the tool. ``target`` is
+        then the origin of the measured thing, which is frame N.
+    place
+        Where the position of a row was measured, in the base coordinates of the reference, m,
+        (n, 3); None where that is ``target``.
     """
 
     source: IntArray
@@ -46,6 +72,11 @@ class Rows:
     group_size: IntArray
     group_sensor: IntArray
     frame: IntArray | None = None
+    turned: FloatArray | None = None
+    turning: tuple[int, ...] = ()
+    body: IntArray | None = None
+    lever: FloatArray | None = None
+    place: FloatArray | None = None
 
     @classmethod
     def of(cls, measurements: Measurements, rows: IntArray, reference: FloatArray) -> Rows:
@@ -80,9 +111,92 @@ class Rows:
             frame=frame,
         )
 
+    @classmethod
+    def with_turns(
+        cls,
+        measurements: Measurements,
+        rows: IntArray,
+        reference: FloatArray,
+        bodies: Bodies,
+        on_tool: Sequence[int] = (),
+    ) -> Rows:
+        """Sort as `of`, with the orientations of bodies behind the positions.
+
+        ``on_tool`` are sensors on the tool: see ``lever``.
+        """
+        points = cls.of(measurements, rows, reference)
+        if not bodies or measurements.orientation is None:
+            return points
+        number = np.full((len(reference), int(measurements.marker.max()) + 1), -1)
+        for index, (sensor, marker) in enumerate(bodies):
+            number[sensor, marker] = index
+
+        def body_of(rows: IntArray) -> IntArray:
+            return np.asarray(number[measurements.sensor[rows], measurements.marker[rows]])
+
+        seen = np.isfinite(measurements.orientation[rows]).all(axis=1) & (body_of(rows) >= 0)
+        turns = cls.of(replace(measurements, frame=None), rows[seen], reference)
+        turning = tuple(sorted({sensor for sensor, _ in bodies}))
+        n, sensors = len(points), len(reference)
+        source = np.concatenate((points.source, turns.source))
+        sensors_of = measurements.sensor[source]
+        R_N_B = Rotation.from_quat(measurements.orientation[turns.source]).as_matrix()
+        target, lever, place = points.target, None, np.concatenate((points.target, turns.target))
+        moving = np.isin(sensors_of[:n], on_tool)
+        if moving.any():
+            R_N_C = Rotation.from_quat(measurements.orientation[points.source[moving]])
+            lever = np.zeros((len(source), 3))
+            lever[:n][moving] = -R_N_C.inv().apply(measurements.position[points.source[moving]])
+            target = target.copy()
+            target[moving] = reference[sensors_of[:n][moving], :3, 3]
+        frame = points.frame
+        if frame is not None:
+            frame = np.concatenate((frame, frame[-1] + 1 + np.arange(len(turns))))
+        return cls(
+            source=source,
+            q=measurements.q[source],
+            marker=measurements.marker[source],
+            target=np.concatenate((target, np.zeros((len(turns), 3)))),
+            spans=points.spans
+            + tuple(
+                (sensors + turning.index(sensor), slice(n + span.start, n + span.stop))
+                for sensor, span in turns.spans
+            ),
+            group_start=np.concatenate((points.group_start, n + turns.group_start)),
+            group_size=np.concatenate((points.group_size, turns.group_size)),
+            group_sensor=np.concatenate(
+                (points.group_sensor, sensors + np.searchsorted(turning, turns.group_sensor))
+            ),
+            frame=frame,
+            turned=reference[sensors_of[n:], :3, :3] @ R_N_B,
+            turning=turning,
+            body=body_of(source),
+            lever=lever,
+            place=place,
+        )
+
     def __len__(self) -> int:
         """Return the number of rows."""
         return len(self.source)
+
+    @property
+    def points(self) -> int:
+        """Number of positions, which are the first of the rows."""
+        return len(self) - (0 if self.turned is None else len(self.turned))
+
+    def whole(self, rows: BoolArray) -> BoolArray:
+        """Return the same with the other half of each reading: its position or orientation."""
+        if self.turned is None:
+            return rows
+        return np.asarray(np.isin(self.source, self.source[rows]))
+
+    @property
+    def of_points(self) -> Rows:
+        """The positions alone."""
+        if self.turned is None:
+            return self
+        count = int(np.searchsorted(self.group_start, self.points))
+        return replace(self.of_groups(0, count), turning=())
 
     def group_sum(self, values: FloatArray) -> FloatArray:
         """Sum over the rows of each group, (groups, ...), of values (n, ...)."""
@@ -105,17 +219,26 @@ class Rows:
             (sensor, slice(max(span.start, start) - start, min(span.stop, stop) - start))
             for sensor, span in self.spans
         )
-        return Rows(
-            source=self.source[start:stop],
-            q=self.q[start:stop],
-            marker=self.marker[start:stop],
-            target=self.target[start:stop],
+        turned = self.turned
+        if turned is not None:
+            turned = turned[max(start - self.points, 0) : max(stop - self.points, 0)]
+        return replace(
+            self.picked(slice(start, stop)),
             spans=tuple((sensor, span) for sensor, span in spans if span.start < span.stop),
             group_start=self.group_start[first:last] - start,
             group_size=self.group_size[first:last],
             group_sensor=self.group_sensor[first:last],
             frame=None if self.frame is None else self.frame[start:stop] - self.frame[start],
+            turned=turned if turned is not None and len(turned) else None,
         )
+
+    def picked(self, rows: slice | IntArray) -> Rows:
+        """Return the columns of some rows; how they are grouped is left to the caller."""
+        names = ('source', 'q', 'marker', 'target', 'frame', 'body', 'lever', 'place')
+        columns: dict[str, Any] = {
+            name: value[rows] for name in names if (value := getattr(self, name)) is not None
+        }
+        return replace(self, **columns)
 
     @property
     def group_of_row(self) -> IntArray:

@@ -230,7 +230,7 @@ def _triangle(model: Model, x: FloatArray, rows: Rows) -> FloatArray:
     From blocks of rows, so that memory does not grow with their number.
     """
     errors = rows.target - model.predict(model.pinned(x), rows)
-    spread = np.ones(len(model.sensor_names))
+    spread = np.ones(len(model.sensor_names) + len(rows.turning))
     spread[[sensor for sensor, _ in rows.spans]] = robust_spread(errors, rows)
     triangle = np.zeros((0, model.size))
     for first, last in rows.blocks(BLOCK_ROWS):
@@ -280,11 +280,12 @@ def _angles(model: Model) -> BoolArray:
     angles = np.arange(model.size) < model.joints
     for sensor in range(len(model.sensor_names)):
         angles[model.registration(sensor)][3:] = True
+    angles[model.markers_end : model.core] = True
     return angles
 
 
 def _kinds(model: Model) -> tuple[IntArray, ...]:
-    """Return the indices of effects, joints, markers and registrations: the order of pivots."""
+    """Return the indices of effects, joints, tools and registrations: the order of pivots."""
     end = model.joints + 6 * len(model.sensor_names)
     return (
         np.arange(model.core, model.size),

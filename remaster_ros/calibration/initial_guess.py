@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from remaster_ros.calibration.extension import Start
 from remaster_ros.calibration.grouped_rows import Rows
@@ -34,6 +35,10 @@ LARGEST_RELATIVE_ERROR = 0.1
 # Errors of a mirrored sensor: beyond this share of the points' extent, and below this share of it
 # when its points are mirrored back.
 LEAST_MIRRORED, MIRRORED = 0.03, 0.3
+# Fewer orientations of a body do not determine how it stands and their noise. Half of them farther
+# from the robot than this, rad, are no measurement of this body: a mastering is off by less.
+FEWEST_TURNS = 4
+LARGEST_TURN = np.radians(10.0)
 
 
 def robust_start(
@@ -121,6 +126,73 @@ def closest_start(
         candidates.append((cost, start, z))
     _, start, z = min(candidates, key=lambda candidate: candidate[0])
     return start, z
+
+
+def with_bodies(
+    model: Model, z: FloatArray, measurements: Measurements, rows: IntArray
+) -> tuple[Model, FloatArray, str]:
+    """Return a model that fits the orientations measured, and z with how the bodies stand.
+
+    Parameters
+    ----------
+    model, z
+        Near the mode by the positions.
+    measurements, rows
+        The observations, and which of them to fit.
+
+    Returns
+    -------
+    model, z
+        As given where no orientations can be fitted.
+    why
+        A sentence where orientations were measured and cannot; else ''.
+    """
+    if measurements.orientation is None or model.extension is not None:
+        return model, z, ''
+    seen = rows[np.isfinite(measurements.orientation[rows]).all(axis=1)]
+    x = model.natural(z)
+    R_R_N = model.T_R_N(x)[measurements.sensor[seen], :3, :3]
+    R_R_B = R_R_N @ Rotation.from_quat(measurements.orientation[seen]).as_matrix()
+    R_R_T = model.chain.forward(measurements.q[seen], model.offsets(x))[:, :3, :3]
+    R_T_B = Rotation.from_matrix(np.swapaxes(R_R_T, 1, 2) @ R_R_B)
+    bodies, turns = [], []
+    which = np.stack((measurements.sensor[seen], measurements.marker[seen]), axis=1)
+    for sensor, marker in np.unique(which, axis=0).tolist():
+        mine = np.all(which == (sensor, marker), axis=1)
+        count = int(mine.sum())
+        if count < FEWEST_TURNS:
+            continue
+        middle, away = _middle(R_T_B[mine])
+        if away > LARGEST_TURN:
+            name = model.sensor_names[sensor]
+            why = (
+                f"the orientations are not fitted: half of those of '{name}' are more than "
+                f'{np.degrees(away):.0f} degrees from the robot model; check that the quaternions '
+                "are in the order x, y, z, w and give the body's axes in the sensor's frame"
+            )
+            return model, z, why
+        bodies.append((sensor, marker))
+        turns.append(middle)
+    if not bodies:
+        few = f'the orientations are not fitted: fewer than {FEWEST_TURNS} of each body'
+        return model, z, few if len(seen) else ''
+    turned = replace(model, bodies=tuple(bodies), body_reference=np.array(turns))
+    return turned, np.concatenate((z, np.zeros(3 * len(bodies)))), ''
+
+
+def _middle(turns: Rotation) -> tuple[FloatArray, float]:
+    """Return the median of rotations, (3, 3), and that of their angles from it, rad.
+
+    The mean with each weighted by the inverse of its angle, again and again (Weiszfeld 1937, on
+    rotations Hartley, Aftab and Trumpf 2011, doi:10.1109/CVPR.2011.5995745): some gross ones do
+    not move it.
+    """
+    weight = np.ones(len(turns))
+    for _ in range(30):
+        middle = turns.mean(weight)
+        angle = (middle.inv() * turns).magnitude()
+        weight = 1.0 / np.maximum(angle, RESOLUTION_M)
+    return np.asarray(middle.as_matrix()), float(np.median(angle))
 
 
 def _some_rows(measurements: Measurements, rows: IntArray) -> IntArray:

@@ -7,7 +7,7 @@ of its marginal density.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -59,6 +59,35 @@ class Mode:
     def eta_covariance(self) -> FloatArray:
         """Covariance of the noise's coordinates, (e, e)."""
         return _noise_covariance(self.linearisation, self.eta)
+
+    @cached_property
+    def of_points(self) -> Mode:
+        """The same mode with the positions alone as data.
+
+        What the orientations tell of the parameters is in the Gram matrix of the priors, at the
+        noise of the mode. For what looks at the errors of positions.
+        """
+        whole = self.linearisation.posterior
+        if not whole.rows.turning:
+            return self
+        noise_model = whole.noise_model.of_points
+        groups, channels = len(noise_model.error_groups), len(whole.noise_model.channels)
+        shares = [
+            part < len(noise_model.channels)
+            for parts in (whole.noise_model.separable, whole.noise_model.framed)
+            for part in parts
+        ]
+        kept = np.arange(len(self.eta)) < len(noise_model.channels)
+        kept[channels:] = shares
+        weights = 1.0 / whole.variances(self.eta)[groups:]
+        linearisation = replace(
+            self.linearisation,
+            posterior=replace(whole, noise_model=noise_model),
+            grams=self.linearisation.grams[:groups],
+            prior=self.linearisation.prior
+            + np.tensordot(weights, self.linearisation.grams[groups:], axes=1),
+        )
+        return Mode(self.z, self.eta[kept], linearisation)
 
     @property
     def log_evidence(self) -> float:

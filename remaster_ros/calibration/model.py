@@ -5,9 +5,10 @@ The model of one observation (eq. 8 of Van Wyk et al., with the marker's positio
     p_N = inverse(T_R_N) f(q + joint_offsets, marker)
 
 Parameters are one flat vector x, base units m and rad, in the order joint offsets (k),
-registration of each sensor (6), position of each marker (3), and theta (m) of an `Extension` where
-there is one. A registration is a correction C
-applied to the robot's points on their way to the sensor, along and about the axes of the base R::
+registration of each sensor (6), position of each marker (3), turn of each body (3) whose
+orientation is fitted, and theta (m) of an `Extension` where there is one. A registration
+is a correction C applied to the robot's points on their way to the sensor, along and about the
+axes of the base R::
 
     inverse(T_R_N) = inverse(T_R_N of the reference) C,    C(p) = c + exp(r) (p - c) + t
 
@@ -15,24 +16,37 @@ with t = (x, y, z) and r = (rx, ry, rz), about the centroid c of that sensor's d
 and r nearly uncorrelated. Everything is computed in the reference's base coordinates: distances
 there equal distances in N.
 
+*Orientations.* Where a sensor measures how a body stands, R_N_B, it should be::
+
+    R_N_B = R_R_N' R_R_T(q + joint_offsets) R_T_B,    R_T_B = exp(b) R_T_B of the reference
+
+How the body stands on the tool, b, is unknown like its place. The prediction of such a row is the
+rotation vector from the measured to the modelled orientation, along the axes of R, so that minus
+it is the error. A camera on the tool that measures a board is the same arm: the board is the
+sensor's frame N, the camera's frame C the body. What it measures is the board's origin l in C, at
+the place T_R_T (marker + R_T_C l) of the arm, which should be the origin of N; as its noise is in
+C, that is compared, not the camera's place in front of the board, in which noise of the
+orientation stands at the distance's lever.
+
 *Pinned coordinates.* Turning joint 1 is the same as turning the registrations about its axis, and
-turning joint k the same as turning the markers about its axis: no data can distinguish them. The
-samplers use coordinates in which this is exact at any size: C' = C Rot_1(offset of joint 1) and
-marker' = Rot_k(offset of joint k) marker. Predictions depend on C', marker' and the inner joints;
-the outer two joints move nothing but the priors. `pinned` and `natural` convert. Displacements of
+turning joint k the same as turning markers and bodies about its axis: no data can distinguish
+them, orientations no more than positions. The samplers use coordinates in which this is exact at
+any size: C' = C Rot_1(offset of joint 1), marker' = Rot_k(offset of joint k) marker and R_T_B' =
+Rot_k(offset of joint k) R_T_B. Predictions depend on C', marker', R_T_B' and the inner joints; the
+outer two joints move nothing but the priors. `pinned` and `natural` convert. Displacements of
 an extension turn with joint 1 like the arm they belong to, so this holds with an extension too.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 
 from remaster_ros.calibration.extension import Extension
-from remaster_ros.calibration.grouped_rows import Rows
+from remaster_ros.calibration.grouped_rows import Bodies, Rows
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.transforms import (
     apply,
@@ -41,7 +55,7 @@ from remaster_ros.kinematics.transforms import (
     rotation_vector_to_matrix,
     transform,
 )
-from remaster_ros.types import FloatArray, Measurements
+from remaster_ros.types import FloatArray, IntArray, Measurements
 
 REGISTRATION_AXES = ('x', 'y', 'z', 'rx', 'ry', 'rz')
 
@@ -92,7 +106,14 @@ class Model:
     centroid
         Point in R about which each sensor's correction turns, m, (sensors, 3).
     extension
-        Further parameters, given for every row of the `Measurements`; None without any.
+        Further parameters, given for every row of the `Measurements`; None without any. Its
+        displacements say nothing of turns: with one no orientation is fitted.
+    bodies
+        (sensor, marker) of every body whose orientation is fitted.
+    body_reference
+        R_T_B at b = 0 of each body, (bodies, 3, 3).
+    on_tool
+        Sensors on the tool, whose readings are those of the sensor in front of what it sees.
     """
 
     chain: SerialChain
@@ -101,6 +122,9 @@ class Model:
     reference: FloatArray
     centroid: FloatArray
     extension: Extension | None = None
+    bodies: Bodies = ()
+    body_reference: FloatArray = field(default_factory=lambda: np.zeros((0, 3, 3)))
+    on_tool: tuple[int, ...] = ()
 
     @property
     def joints(self) -> int:
@@ -109,7 +133,12 @@ class Model:
 
     @property
     def core(self) -> int:
-        """Number of parameters without the extension's: offsets, registrations, markers."""
+        """Number of parameters without the extension's: offsets, registrations, tools."""
+        return self.markers_end + 3 * len(self.bodies)
+
+    @property
+    def markers_end(self) -> int:
+        """Where the parameters of the bodies begin, behind those of the markers."""
         return self.joints + 6 * len(self.sensor_names) + 3 * len(self.marker_names)
 
     @property
@@ -125,9 +154,26 @@ class Model:
             names += [f'registration.{sensor}.{axis}' for axis in REGISTRATION_AXES]
         for marker in self.marker_names:
             names += [f'marker.{marker}.{axis}' for axis in 'xyz']
+        for body in self.body_names:
+            names += [f'body.{body}.{axis}' for axis in REGISTRATION_AXES[3:]]
         if self.extension is not None:
             names += [f'effect.{name}' for name in self.extension.names]
         return tuple(names)
+
+    @property
+    def body_names(self) -> tuple[str, ...]:
+        """Names of the bodies: of their markers, with the sensor where several measure it."""
+        markers = [marker for _, marker in self.bodies]
+        return tuple(
+            self.marker_names[marker]
+            if markers.count(marker) == 1
+            else f'{self.marker_names[marker]}.{self.sensor_names[sensor]}'
+            for sensor, marker in self.bodies
+        )
+
+    def rows(self, measurements: Measurements, rows: IntArray) -> Rows:
+        """Return given rows sorted, with the orientations that are fitted."""
+        return Rows.with_turns(measurements, rows, self.reference, self.bodies, self.on_tool)
 
     def registration(self, sensor: int) -> slice:
         """Return where the correction of a sensor lies in the vector."""
@@ -139,11 +185,17 @@ class Model:
         start = self.joints + 6 * len(self.sensor_names) + 3 * marker
         return slice(start, start + 3)
 
+    def body(self, body: int) -> slice:
+        """Return where the turn of a body lies in the vector."""
+        start = self.markers_end + 3 * body
+        return slice(start, start + 3)
+
     def vector(self, joint_offsets: FloatArray, markers: FloatArray) -> FloatArray:
         """Assemble the vector of these offsets and markers at the references, theta0 included."""
         corrections = np.zeros(6 * len(self.sensor_names))
         theta0 = self.extension.theta0 if self.extension is not None else np.zeros(0)
-        return np.concatenate((joint_offsets, corrections, np.ravel(markers), theta0))
+        turns = np.zeros(3 * len(self.bodies))
+        return np.concatenate((joint_offsets, corrections, np.ravel(markers), turns, theta0))
 
     def offsets(self, x: FloatArray) -> FloatArray:
         """Return the joint offsets, rad, (..., k)."""
@@ -152,8 +204,14 @@ class Model:
     def markers(self, x: FloatArray) -> FloatArray:
         """Return the marker positions in T, m, (..., markers, 3)."""
         start = self.joints + 6 * len(self.sensor_names)
-        part = x[..., start : self.core]
+        part = x[..., start : self.markers_end]
         return part.reshape(*x.shape[:-1], len(self.marker_names), 3)
+
+    def R_T_B(self, x: FloatArray) -> FloatArray:
+        """Return how the bodies stand on the tool, (..., bodies, 3, 3), of natural parameters."""
+        turns = x[..., self.markers_end : self.core]
+        turns = turns.reshape(*x.shape[:-1], len(self.bodies), 3)
+        return np.asarray(rotation_vector_to_matrix(turns) @ self.body_reference)
 
     def theta(self, x: FloatArray) -> FloatArray:
         """Return the extension's parameters, (..., m)."""
@@ -199,7 +257,11 @@ class Model:
         tool = _rotation_about(*self.tool_axis, sign * x[..., self.joints - 1])
         markers = apply(tool[..., None, :, :], self.markers(x))
         start = self.joints + 6 * len(self.sensor_names)
-        result[..., start : self.core] = markers.reshape(*x.shape[:-1], -1)
+        result[..., start : self.markers_end] = markers.reshape(*x.shape[:-1], -1)
+        if self.bodies:
+            turned = tool[..., None, :3, :3] @ self.R_T_B(x)
+            turns = matrix_to_rotation_vector(turned @ np.swapaxes(self.body_reference, -1, -2))
+            result[..., self.markers_end : self.core] = turns.reshape(*x.shape[:-1], -1)
         return result
 
     @cached_property
@@ -241,22 +303,61 @@ class Model:
         Returns
         -------
         ndarray
-            m, (..., n, 3).
+            m, (..., n, 3); of an orientation the turn from the measured one, rad.
         """
         turns, shifts = self._extended(z, rows)
+        count, offsets = rows.points, self._inner_offsets(z)
         points = self.chain.positions(
-            rows.q,
-            self.markers(z)[..., rows.marker, :],
-            self._inner_offsets(z)[..., None, :],
+            rows.q[:count],
+            self._places(z, rows)[..., :count, :],
+            offsets[..., None, :],
             turns,
         )
         points += shifts
         corrections = self.corrections(z)
         for sensor, span in rows.spans:
+            if sensor >= len(self.sensor_names):
+                continue
             turn = corrections[..., sensor, :3, :3]
             shift = corrections[..., sensor, None, :3, 3]
             points[..., span, :] = points[..., span, :] @ np.swapaxes(turn, -1, -2) + shift
-        return points
+        if rows.turned is None:
+            return points
+        return np.concatenate((points, self._turns(z, offsets, rows, corrections)), axis=-2)
+
+    def _places(self, z: FloatArray, rows: Rows) -> FloatArray:
+        """Return where on the tool the points of the rows are, m, (..., n, 3)."""
+        places = self.markers(z)[..., rows.marker, :]
+        if rows.lever is not None:
+            assert rows.body is not None
+            places = places + (self.R_T_B(z)[..., rows.body, :, :] @ rows.lever[..., None])[..., 0]
+        return places
+
+    def _turns(
+        self, x: FloatArray, offsets: FloatArray, rows: Rows, corrections: FloatArray
+    ) -> FloatArray:
+        """Return the rotation vectors from measured to modelled orientations, (..., r, 3)."""
+        assert rows.turned is not None
+        assert rows.body is not None
+        start = rows.points
+        R_T_B = self.R_T_B(x)[..., rows.body[start:], :, :]
+        # Two directions of the body, from its origin: as fast as points are.
+        first, second = R_T_B[..., 0], R_T_B[..., 1]
+        ends = np.stack((first, second, 0.0 * first))
+        ends = self.chain.positions(rows.q[start:], ends, offsets[..., None, :])
+        first, second = ends[0] - ends[2], ends[1] - ends[2]
+        R_R_B = np.stack((first, second, np.cross(first, second)), axis=-1)
+        for index, span in rows.spans:
+            if index >= len(self.sensor_names):
+                turn = corrections[..., self._sensor(rows, index), None, :3, :3]
+                part = slice(span.start - start, span.stop - start)
+                R_R_B[..., part, :, :] = turn @ R_R_B[..., part, :, :]
+        return _rotation_vector(R_R_B @ np.swapaxes(rows.turned, -1, -2))
+
+    def _sensor(self, rows: Rows, index: int) -> int:
+        """Return the sensor of a span of positions or orientations."""
+        count = len(self.sensor_names)
+        return index if index < count else rows.turning[index - count]
 
     def jacobian(self, z: FloatArray, rows: Rows) -> FloatArray:
         """Return the derivative of `predict` by the pinned parameters, (n, 3, size).
@@ -283,7 +384,7 @@ class Model:
             angles[..., joint] += turn
         frames = self.chain.frames(angles)
         tool = frames[..., -1, :, :] @ self.chain.T_fixed[-1]
-        points = apply(tool, self.markers(x)[rows.marker])
+        points = apply(tool, self._places(x, rows))
         by_joints = self.chain.velocities(frames, points)
         # Joint 1 carries the displacements along.
         by_joints[..., 0] += np.cross(self.base_axis[1], shifts)
@@ -303,7 +404,7 @@ class Model:
 
     def _derivative(self, offsets: FloatArray, x: FloatArray, rows: Rows) -> FloatArray:
         derivative = np.zeros((len(rows.q), 3, self.size))
-        tool, points, _, by_joints = self._pose(offsets, x, rows)
+        tool, points, axes, by_joints = self._pose(offsets, x, rows)
         by_theta = None
         if self.extension is not None:
             base = _rotation_about(*self.base_axis, offsets[0])[:3, :3]
@@ -312,24 +413,49 @@ class Model:
             turned[..., 0] -= np.cross(self.base_axis[1], self._extended(x, rows)[1] @ base.T)
             by_theta = self.extension.derivative(turned, base, rows.source)
         correction = self.corrections(x)
-        for sensor, span in rows.spans:
+        for index, span in rows.spans:
+            sensor = self._sensor(rows, index)
             turn = correction[sensor, :3, :3]
-            derivative[span, :, : self.joints] = turn @ by_joints[span]
             start = self.registration(sensor).start
-            derivative[span, :, start : start + 3] = np.eye(3)
-            vector = x[self.registration(sensor)][3:]
             # d(exp(r) v) = (J_l(r) dr) × exp(r) v: the arm after the turn, the left Jacobian of r.
+            by_turn = _left_jacobian(x[self.registration(sensor)][3:])
+            if index != sensor:
+                derivative[span, :, : self.joints] = turn @ np.swapaxes(axes[span], 1, 2)
+                derivative[span, :, start + 3 : start + 6] = by_turn
+                self._by_bodies(derivative, x, rows, span, turn @ tool[span, :3, :3])
+                continue
+            derivative[span, :, : self.joints] = turn @ by_joints[span]
+            derivative[span, :, start : start + 3] = np.eye(3)
             arms = (points[span] - self.centroid[sensor]) @ turn.T
-            derivative[span, :, start + 3 : start + 6] = -_cross_matrix(arms) @ _left_jacobian(
-                vector
-            )
+            derivative[span, :, start + 3 : start + 6] = -_cross_matrix(arms) @ by_turn
             by_marker = turn @ tool[span, :3, :3]
             for marker in range(len(self.marker_names)):
                 seen = rows.marker[span] == marker
                 derivative[span, :, self.marker(marker)] = by_marker * seen[:, None, None]
+            if rows.lever is not None and np.any(rows.lever[span]):
+                assert rows.body is not None
+                lever = self.R_T_B(x)[rows.body[span]] @ rows.lever[span][..., None]
+                arms = -by_marker @ _cross_matrix(lever[..., 0])
+                self._by_bodies(derivative, x, rows, span, arms)
             if by_theta is not None:
                 derivative[span, :, self.core :] = turn @ by_theta[span]
+        if rows.turned is not None:
+            # d log(exp(w) exp(v)) = J_l(v)⁻¹ w for a small turn w.
+            end = rows.points
+            away = self._turns(x, offsets, rows, correction)
+            derivative[end:] = _inverse_left_jacobian(away) @ derivative[end:]
         return derivative
+
+    def _by_bodies(
+        self, derivative: FloatArray, x: FloatArray, rows: Rows, span: slice, by_turn: FloatArray
+    ) -> None:
+        """Fill in how rows depend on b, ``by_turn`` being by a small turn of the body in T."""
+        assert rows.body is not None
+        for body in range(len(self.bodies)):
+            mine = (rows.body[span] == body)[:, None, None]
+            derivative[span, :, self.body(body)] = (
+                by_turn @ _left_jacobian(x[self.body(body)]) * mine
+            )
 
 
 class Pose(NamedTuple):
@@ -373,3 +499,34 @@ def _left_jacobian(vector: FloatArray) -> FloatArray:
     first = (1.0 - np.cos(angle)) / angle**2
     second = (angle - np.sin(angle)) / angle**3
     return np.eye(3) + first * K + second * K @ K
+
+
+def _rotation_vector(rotation: FloatArray) -> FloatArray:
+    """Return the rotation vectors (..., 3) of matrices (..., 3, 3), rad: small ones, fast.
+
+    Half a turn, where this has no axis, is left to the other way.
+    """
+    skew = rotation - np.swapaxes(rotation, -1, -2)
+    axis = 0.5 * np.stack((skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]), axis=-1)
+    sine = np.linalg.norm(axis, axis=-1)
+    cosine = 0.5 * (np.trace(rotation, axis1=-2, axis2=-1) - 1.0)
+    near = sine > 1e-9
+    vector: FloatArray = (
+        axis * np.where(near, np.arctan2(sine, cosine) / np.where(near, sine, 1.0), 1.0)[..., None]
+    )
+    opposite = (cosine < 0.0) & (sine < 1e-3)
+    if np.any(opposite):
+        vector[opposite] = matrix_to_rotation_vector(rotation[opposite])
+    return vector
+
+
+def _inverse_left_jacobian(vectors: FloatArray) -> FloatArray:
+    """Return the inverses (n, 3, 3) of `_left_jacobian` of rotation vectors (n, 3)."""
+    angle = np.linalg.norm(vectors, axis=-1)
+    K = _cross_matrix(vectors)
+    near = angle < 1e-4
+    half = 0.5 * np.where(near, 1.0, angle)
+    # (1 - x cot x) / (2 x)² with x half the angle; its series begins with 1/12.
+    weight = np.where(near, 1.0 / 12.0, (1.0 - half / np.tan(half)) / (4.0 * half**2))
+    inverted: FloatArray = np.eye(3) - 0.5 * K + weight[:, None, None] * (K @ K)
+    return inverted

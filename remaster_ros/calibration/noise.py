@@ -33,7 +33,7 @@ said of frame_sigma. Where every pose has one frame only, frame_sigma contains p
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Literal
 
@@ -175,7 +175,7 @@ class NoiseModel:
     sensors
         Number of sensors, those without rows included.
     channels
-        Those of sensor 0, of sensor 1, …
+        Those of sensor 0, of sensor 1, …, last those of orientations, whose noise is in rad.
     separable, framed
         Indices of the channels with a pose_sigma, and with a frame_sigma of their own, ascending.
     error_groups
@@ -207,7 +207,7 @@ class NoiseModel:
             Sensors with one noise along and another across their line of sight.
         """
         channels: list[Channel] = []
-        for sensor in range(len(reference)):
+        for sensor in range(len(reference) + len(rows.turning)):
             if sensor in split:
                 channels += [Channel(sensor, 'along', (0, 1)), Channel(sensor, 'across', (1, 3))]
             else:
@@ -226,8 +226,25 @@ class NoiseModel:
 
     @property
     def split(self) -> tuple[int, ...]:
-        """Sensors with a noise along their line of sight."""
+        """Sensors with a noise along their line of sight, orientations as `Rows.spans`."""
         return tuple(channel.sensor for channel in self.channels if channel.direction == 'along')
+
+    @property
+    def of_points(self) -> NoiseModel:
+        """That of the positions alone, whose channels and error groups are the first of these."""
+        if not self.rows.turning:
+            return self
+        channels = tuple(one for one in self.channels if one.sensor < self.sensors)
+        rows = self.rows.of_points
+        return replace(
+            self,
+            rows=rows,
+            channels=channels,
+            separable=tuple(index for index in self.separable if index < len(channels)),
+            framed=tuple(index for index in self.framed if index < len(channels)),
+            error_groups=tuple(one for one in self.error_groups if one.channel < len(channels)),
+            frames=None if self.frames is None else self.frames[: len(rows)],
+        )
 
     @cached_property
     def channel_of(self) -> IntArray:
@@ -280,8 +297,11 @@ class NoiseModel:
         return Noise(sigma[..., sensor], pose_sigma[..., sensor], np.zeros(len(sensor)))
 
     def sensor_noise(self, noise: Noise) -> Noise:
-        """Return the noise of each sensor, root mean square over the axes, m, (..., sensors)."""
-        share = np.zeros((len(self.channels), self.sensors))
+        """Return the noise of each sensor, root mean square over the axes, m, (..., sensors).
+
+        Behind those the noise of the orientations of each sensor that measures them, rad.
+        """
+        share = np.zeros((len(self.channels), self.sensors + len(self.rows.turning)))
         for index, channel in enumerate(self.channels):
             share[index, channel.sensor] = channel.dimension / 3.0
         parts = noise.sigma, noise.pose_sigma, noise.frame_sigma
@@ -295,6 +315,8 @@ class NoiseModel:
         total = noise.total
         result = np.empty((*total.shape[:-1], self.sensors, 2))
         for index, channel in enumerate(self.channels):
+            if channel.sensor >= self.sensors:
+                continue
             sides = {'along': [0], 'across': [1]}.get(channel.direction, [0, 1])
             result[..., channel.sensor, sides] = total[..., index, None]
         return result
@@ -440,8 +462,10 @@ class NoiseModel:
 
 def _frames(rows: Rows, reference: FloatArray) -> FloatArray:
     """Return the line of sight of each row's group, and two directions across it, (n, 3, 3)."""
-    middle = rows.group_sum(rows.target) / rows.group_size[:, None]
-    sight = middle - reference[rows.group_sensor, :3, 3]
+    measured = rows.target if rows.place is None else rows.place
+    middle = rows.group_sum(measured) / rows.group_size[:, None]
+    sensor = np.array([*range(len(reference)), *rows.turning])[rows.group_sensor]
+    sight = middle - reference[sensor, :3, 3]
     sight /= np.maximum(np.linalg.norm(sight, axis=1), np.finfo(float).tiny)[:, None]
     # The base axis least along the line of sight gives a first direction across it.
     helper = np.eye(3)[np.argmin(np.abs(sight), axis=1)]

@@ -1,4 +1,7 @@
-"""The noise of each sensor as a fit reports it: means and standard deviations over the draws."""
+"""The noise of each sensor as a fit reports it: means and standard deviations over the draws.
+
+That of orientations is reported alike, under the names of `Posterior.noise_names`, in rad.
+"""
 
 from __future__ import annotations
 
@@ -50,7 +53,7 @@ def noise_estimates(posterior: Posterior, by_channel: Noise) -> dict[str, NoiseE
         )
 
     result = {}
-    for sensor, name in enumerate(posterior.model.sensor_names):
+    for sensor, name in enumerate(posterior.noise_names):
         directions = {
             channel.direction: estimate(by_channel, index, sensor)
             for index, channel in enumerate(noise_model.channels)

@@ -1,25 +1,97 @@
-"""Errors of a measured body's orientation, beside the position errors of eq. 17 and 18.
+"""What measured orientations are good for: their errors, what they tell, and whether they agree.
 
 Where a sensor measures full poses. Eq. 17 of Van Wyk et al. compares the distances between
 joint solutions of a pose as measured and as modelled; here the angles between them are compared,
 which need neither registration nor the place of the body on the tool. Eq. 18 compares points after
 registration; here orientations are compared. How the body stands on the tool, R_T_B, is taken from
 the fitted rows, as its origin is: an offset of the last joint is taken up by it, one of the first
-by the registration. Orientations are not fitted: they test what positions have determined.
+by the registration.
+
+What they tell of the offsets is their part of the information at the mode. Two estimates of one
+truth, of the positions alone and of all, differ by no more than noise allows: their difference has
+the covariance of the one less that of the other (Hausman 1978, doi:10.2307/1913827).
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
+import scipy
 from scipy.spatial.transform import Rotation
 
+from remaster_ros.calibration.laplace import Mode
 from remaster_ros.calibration.model import Model
 from remaster_ros.kinematics.transforms import mean_quaternion_xyzw
 from remaster_ros.types import FloatArray, IntArray, Measurements
 
+# Directions in which the orientations add less than this share of what the positions leave open
+# cannot be compared.
+LEAST_ADDED = 0.01
+# Smallest information, of parameters scaled to 1, that is not rounding.
+ROUNDING = 1e-12
 METRICS = ('relative_orientation', 'post_registration_orientation')
+
+
+@dataclass(frozen=True, eq=False)
+class TurnsTell:
+    """What the orientations tell of the offsets of k joints.
+
+    Attributes
+    ----------
+    std_without
+        Of the offsets by the positions alone, rad, (k,); 0 where held, infinite where those do not
+        determine them.
+    shift
+        By how much the orientations move the offsets, rad, (k,); 0 where held or where the
+        positions alone determine nothing.
+    p_value
+        Of so large a shift, or a larger one, by noise.
+    """
+
+    std_without: FloatArray
+    shift: FloatArray
+    p_value: float
+
+
+def what_turns_tell(mode: Mode) -> TurnsTell | None:
+    """Compare a fit with that of the positions alone, linear about its mode.
+
+    None where no orientations are fitted.
+    """
+    posterior = mode.linearisation.posterior
+    if not posterior.rows.turning:
+        return None
+    f, points = len(posterior.free), mode.of_points.linearisation
+    groups = len(points.grams)
+    weights = 1.0 / posterior.variances(mode.eta)[:groups]
+    gram = np.tensordot(weights, points.grams, axes=1) + mode.linearisation.prior
+    std, shift = np.zeros(posterior.model.joints), np.zeros(posterior.model.joints)
+    joints = np.flatnonzero(posterior.free < posterior.model.joints)
+    where = posterior.free[joints]
+    # How bodies stand is a matter of orientations.
+    own = ~np.isin(posterior.free, np.arange(posterior.model.markers_end, posterior.model.core))
+    used = np.flatnonzero(own | (np.diag(gram)[:f] > 0.0))
+    scale = np.sqrt(np.diag(gram)[used])
+    scaled = gram[np.ix_(used, used)] / np.outer(scale, scale)
+    if not np.all(scale > 0.0) or np.linalg.eigvalsh(scaled)[0] < ROUNDING:
+        std[where] = np.inf
+        return TurnsTell(std, shift, 1.0)
+    covariance = np.zeros((f, f))
+    covariance[np.ix_(used, used)] = np.linalg.inv(scaled) / np.outer(scale, scale)
+    std[where] = np.sqrt(np.diag(covariance)[joints])
+    whole = mode.linearisation.gram(mode.eta)[:f, f]
+    away = covariance @ gram[:f, f] - mode.covariance @ whole
+    shift[where] = -away[joints]
+    left = covariance[np.ix_(joints, joints)]
+    root = np.linalg.cholesky(left)
+    inner = np.linalg.inv(root)
+    added = inner @ (left - mode.covariance[np.ix_(joints, joints)]) @ inner.T
+    values, vectors = np.linalg.eigh(added)
+    kept = values > LEAST_ADDED
+    square = np.sum((vectors.T @ (inner @ shift[where]))[kept] ** 2 / values[kept])
+    return TurnsTell(std, shift, float(scipy.stats.chi2.sf(square, max(int(kept.sum()), 1))))
 
 
 class ToolOrientations(NamedTuple):

@@ -133,8 +133,13 @@ def judge(rows: Rows, errors: FloatArray, gross: BoolArray) -> Judgement:
     np.maximum.at(worst, group, np.where(gross, 0.0, sigmas))
     gross_now = new & (gross | (sigmas == worst[group]))
     why = [
-        f'residual {_mm(d)} mm, {s:.0f} sigma; gross with probability {_percent(p)}' if g else ''
-        for d, s, p, g in zip(deviation, sigmas, probability, gross_now, strict=True)
+        f'residual {_size(d, i >= rows.points)}, {s:.0f} sigma; gross with probability '
+        f'{_percent(p)}'
+        if g
+        else ''
+        for i, (d, s, p, g) in enumerate(
+            zip(deviation, sigmas, probability, gross_now, strict=True)
+        )
     ]
 
     # A pose whose rows agree with each other, and with no other pose.
@@ -153,10 +158,12 @@ def judge(rows: Rows, errors: FloatArray, gross: BoolArray) -> Judgement:
         for row in range(start, start + rows.group_size[index]):
             gross_now[row] = True
             why[row] = (
-                f'residual {_mm(float(np.linalg.norm(errors[row])))} mm: the whole pose is off by '
-                f'{pose_sigmas[index]:.0f} sigma; gross with probability {_percent(off[index])}'
+                f'residual {_size(float(np.linalg.norm(errors[row])), row >= rows.points)}: the '
+                f'whole pose is off by {pose_sigmas[index]:.0f} sigma; gross with probability '
+                f'{_percent(off[index])}'
             )
-    return Judgement(gross_now, tuple(why))
+    # A reading whose orientation is gross has no position to be relied on, nor the reverse.
+    return Judgement(rows.whole(gross_now), tuple(why))
 
 
 def as_of_known_size(sigmas: FloatArray, freedom: int) -> FloatArray:
@@ -248,32 +255,41 @@ def robust_scale(lengths: FloatArray) -> float:
 
 def _require_majority(rows: Rows, errors: FloatArray, sensor_names: Sequence[str]) -> None:
     """Refuse data with so many gross errors that they cannot be identified."""
+    names = _names(rows, sensor_names)
     for sensor, span in rows.spans:
+        turned = span.start >= rows.points
         if span.stop - span.start < FEWEST_TO_JUDGE:
             continue
         half, most = np.quantile(np.linalg.norm(errors[span], axis=1), _QUANTILES)
         if most / _EXPECTED[1] > TAIL_LIMIT * (half / _EXPECTED[0] + RESOLUTION_M):
             raise MisfitError(
-                f"sensor '{sensor_names[sensor]}': half of the observations agree within "
-                f'{_mm(half)} mm, but a fifth is off by more than {_mm(most)} mm: too many gross '
-                'errors to name them',
+                f"sensor '{names[sensor]}': half of the observations agree within "
+                f'{_size(half, turned)}, but a fifth is off by more than {_size(most, turned)}: '
+                'too many gross errors to name them',
                 'look for mixed-up markers or a sensor that was moved',
             )
 
 
 def _guard(rows: Rows, gross: BoolArray, sensor_names: Sequence[str]) -> None:
+    names = _names(rows, sensor_names)
     for sensor, span in rows.spans:
         out, of = int(gross[span].sum()), span.stop - span.start
         if out > max(1.0, LARGEST_SHARE * of):
             raise MisfitError(
-                f"sensor '{sensor_names[sensor]}': {out} of {of} observations are gross errors, "
+                f"sensor '{names[sensor]}': {out} of {of} observations are gross errors, "
                 'too many to leave out',
                 'look for mixed-up markers or a sensor that was moved',
             )
 
 
-def _mm(length: float) -> str:
-    return f'{length * 1e3:.1f}'
+def _names(rows: Rows, sensor_names: Sequence[str]) -> list[str]:
+    """Return the names of the sensors, then those of their orientations."""
+    return [*sensor_names, *(f'{sensor_names[sensor]} (orientation)' for sensor in rows.turning)]
+
+
+def _size(error: float, turned: bool) -> str:
+    """Return an error in m, or one of an orientation in rad, as text."""
+    return f'{np.degrees(error):.2f} degrees' if turned else f'{error * 1e3:.1f} mm'
 
 
 def _percent(probability: float) -> str:

@@ -78,6 +78,12 @@ class Posterior:
         return self.noise_model.rows
 
     @property
+    def noise_names(self) -> tuple[str, ...]:
+        """What has a noise of its own: the sensors, then the orientations of those with any."""
+        names = self.model.sensor_names
+        return (*names, *(f'{names[sensor]}.orientation' for sensor in self.rows.turning))
+
+    @property
     def free_names(self) -> tuple[str, ...]:
         """Names of the free parameters, f."""
         return tuple(self.model.names[index] for index in self.free)

@@ -67,7 +67,8 @@ class StructureTest:
     driver
         What the residuals were held against: 'position', 'time', 'joint_angle', zero-offsets by
         'joint_time', displacements of a 'link' and tilts of an 'axis' that are constant in their
-        frames, 'reading_before'; 'held_out' where those on held-out poses were held against those
+        frames, 'reading_before'; 'orientation' where measured orientations ask for other
+        offsets; 'held_out' where those on held-out poses were held against those
         on poses left out.
     between_poses
         Whether in the means of the poses or in the deviations from them.
@@ -109,6 +110,7 @@ class StructureTest:
             'link': 'looks like that of links of other lengths',
             'axis': 'looks like that of tilted axes',
             'reading_before': 'resembles that of the reading before',
+            'orientation': 'differs between positions and orientations, which fit other offsets',
         }[self.driver]
         return f'the error{whose} {what} {where}'
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import Any
 
@@ -21,6 +21,7 @@ from remaster_ros.calibration.laplace import Mode
 from remaster_ros.calibration.metropolis import Chains
 from remaster_ros.calibration.noise_check import NoiseCheck, check_noise
 from remaster_ros.calibration.noise_estimate import NoiseEstimate, noise_estimates
+from remaster_ros.calibration.orientation_accuracy import TurnsTell, what_turns_tell
 from remaster_ros.calibration.posterior import Posterior
 from remaster_ros.calibration.predictive_accuracy import Predictive
 from remaster_ros.calibration.residual_structure import (
@@ -324,6 +325,53 @@ UNKNOWN_STD = np.pi / np.sqrt(3.0)
 
 
 @dataclass(frozen=True, eq=False)
+class Orientations:
+    """What came of the orientations that were measured.
+
+    Attributes
+    ----------
+    why_not
+        Why they are not fitted, a sentence; '' where they are, and the rest is empty otherwise.
+    count
+        How many were fitted.
+    noise
+        By sensor, rad where `NoiseEstimate` has m.
+    R_T_B, std_rad
+        How each body stands on the tool, (3, 3), and its standard deviation about the axes of T,
+        (3,); like the markers for offsets of 0 where they are not identifiable.
+    tell
+        What they tell of the offsets.
+    """
+
+    why_not: str
+    count: int = 0
+    noise: Mapping[str, NoiseEstimate] = field(default_factory=dict)
+    R_T_B: Mapping[str, FloatArray] = field(default_factory=dict)
+    std_rad: Mapping[str, FloatArray] = field(default_factory=dict)
+    tell: TurnsTell | None = None
+
+    def words(self, joint_names: Sequence[str], std: FloatArray) -> str:
+        """Return what orientations did to offsets with these std (k,), rad, a sentence."""
+        if self.why_not or self.tell is None:
+            return self.why_not
+        noises = ' and '.join(
+            f'{np.degrees(np.sqrt(one.sigma_m**2 + (one.pose_sigma_m or 0.0) ** 2)):.3f} deg '
+            f'({sensor})'
+            for sensor, one in self.noise.items()
+        )
+        text = f'{self.count} orientations are fitted, too; their noise is {noises} per axis'
+        held = std <= 0.0
+        gain = np.where(held, 0.0, self.tell.std_without / np.where(held, 1.0, std))
+        joint = int(np.argmax(gain))
+        if not np.isfinite(gain[joint]):
+            return f'{text}; the positions alone do not determine {joint_names[joint]}'
+        return (
+            f'{text}; {joint_names[joint]} is known to {np.degrees(std[joint]):.4f} deg with '
+            f'them, to {np.degrees(self.tell.std_without[joint]):.4f} by the positions alone'
+        )
+
+
+@dataclass(frozen=True, eq=False)
 class FitResult:
     """The posterior of a session and what follows from it; k joints, p sampled parameters.
 
@@ -386,6 +434,8 @@ class FitResult:
         The posterior as predictions take it.
     found
         The estimate whose posterior was sampled; None where the sampler is the paper's.
+    orientations
+        What came of measured orientations; None where none were measured.
     """
 
     session: Session
@@ -420,6 +470,7 @@ class FitResult:
     theta_draws: FloatArray
     predictive: Predictive
     found: Estimate | None = None
+    orientations: Orientations | None = None
 
     @property
     def comparison(self) -> Comparison:
@@ -440,6 +491,14 @@ class FitResult:
     def accuracy(self) -> Mapping[str, Any]:
         """The three metrics as fit.json has them."""
         return self.comparison.accuracy
+
+    @property
+    def orientations_in_words(self) -> str:
+        """What measured orientations did, a sentence; '' where there are none."""
+        if self.orientations is None:
+            return ''
+        std = np.where(self.identifiable, self.joint_offsets_std / self.widening, 0.0)
+        return self.orientations.words(self.joint_names, std)
 
     @property
     def other_errors(self) -> bool:
@@ -559,7 +618,7 @@ def _sampled_names(posterior: Posterior, moved: IntArray) -> tuple[str, ...]:
     """Return the names of `sampled_columns`."""
     model, noise_model = posterior.model, posterior.noise_model
     noises = [
-        '.'.join(filter(None, ('noise', model.sensor_names[channel.sensor], channel.direction)))
+        '.'.join(filter(None, ('noise', posterior.noise_names[channel.sensor], channel.direction)))
         for channel in noise_model.channels
     ]
     return (
@@ -601,19 +660,28 @@ def build_result(
         problem.sensor_names,
         residuals_after,
         left_out,
-        parameters=len(sampled.moved),
+        parameters=len(sampled.moved) - 3 * len(model.bodies),
     )
-    structure, widening = None, np.ones(model.joints)
+    structure, widening, tell = None, np.ones(model.joints), None
     if sampled.mode is not None and model.extension is None:
         gross = np.concatenate([np.zeros(0, np.int64), *(check.gross for check in noise_checks)])
-        held_out = held_out_tests(sampled.mode, measurements, gross)
-        structure = residual_structure(sampled.mode, measurements)
-        structure = replace(structure, tests=(*structure.tests, *held_out))
+        of_points = sampled.mode.of_points
+        held_out = held_out_tests(of_points, measurements, gross)
+        structure = residual_structure(of_points, measurements)
+        tests = (*structure.tests, *held_out)
+        tell = what_turns_tell(sampled.mode)
+        if tell is not None:
+            tests += (StructureTest('orientation', True, tell.p_value),)
+        structure = replace(structure, tests=tests)
         if errors_are_left(noise_checks, structure):
-            robust = robust_std(sampled.mode, measurements)
+            robust = robust_std(of_points, measurements)
+            if tell is not None and any(test.driver == 'orientation' for test in structure.found):
+                # One of the two is wrong, and nothing tells which.
+                robust = np.hypot(robust, tell.shift)
             widening = np.where(unfixed, 1.0, np.maximum(1.0, robust / std))
     identifiable, why = known_offsets(gauge.why, std_by_data, widening * std)
     noise = posterior.noise(sampled.eta)
+    noises = noise_estimates(posterior, noise)
     total_noise = posterior.noise_model.total_noise(noise)
     predictive = Predictive(
         model=model,
@@ -657,7 +725,8 @@ def build_result(
         T_R_N_std_rad=by_sensor(turns.std(axis=0, ddof=1)),
         marker_positions=by_marker(markers),
         marker_std_m=by_marker(model.markers(x_draws).std(axis=0, ddof=1)),
-        noise=noise_estimates(posterior, noise),
+        noise={name: noises[name] for name in problem.sensor_names},
+        orientations=_orientations(posterior, sampled, tell, x_after, x_draws),
         sampler=SamplerInfo.of(
             sampled.run,
             names,
@@ -678,6 +747,36 @@ def build_result(
         theta_draws=model.theta(sampled.z),
         predictive=predictive,
         found=sampled.found,
+    )
+
+
+def _orientations(
+    posterior: Posterior,
+    sampled: Sampled,
+    tell: TurnsTell | None,
+    x: FloatArray,
+    x_draws: FloatArray,
+) -> Orientations | None:
+    """Return what came of the orientations at natural x (size,) and of draws (n, size)."""
+    model = posterior.model
+    if not model.bodies:
+        why_not = '' if sampled.found is None else sampled.found.without_turns
+        return Orientations(why_not) if why_not else None
+    noises = noise_estimates(posterior, posterior.noise(sampled.eta))
+    count = len(model.sensor_names)
+    names = {
+        model.sensor_names[s]: name
+        for s, name in zip(posterior.rows.turning, posterior.noise_names[count:], strict=True)
+    }
+    middle = model.R_T_B(x)
+    turns = matrix_to_rotation_vector(model.R_T_B(x_draws) @ np.swapaxes(middle, -1, -2))
+    return Orientations(
+        '',
+        len(posterior.rows) - posterior.rows.points,
+        {sensor: noises[name] for sensor, name in names.items()},
+        dict(zip(model.body_names, middle, strict=True)),
+        dict(zip(model.body_names, turns.std(axis=0, ddof=1), strict=True)),
+        tell,
     )
 
 

@@ -7,6 +7,7 @@ zero-offset; and a displacement of each link and a tilt of each axis, constant i
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 from numpy.polynomial import legendre
@@ -34,16 +35,12 @@ def spread_poses(rows: Rows) -> Rows:
     cuts = [
         (sensor, *np.searchsorted(kept, (s.start, s.stop)).tolist()) for sensor, s in rows.spans
     ]
-    return Rows(
-        source=rows.source[kept],
-        q=rows.q[kept],
-        marker=rows.marker[kept],
-        target=rows.target[kept],
+    return replace(
+        rows.picked(kept),
         spans=tuple((sensor, slice(low, high)) for sensor, low, high in cuts),
         group_start=np.cumsum(size) - size,
         group_size=size,
         group_sensor=rows.group_sensor[first],
-        frame=None if rows.frame is None else rows.frame[kept],
     )
 
 
@@ -67,9 +64,10 @@ def of_position(rows: Rows, degree: int = POSITION_DEGREE) -> FloatArray:
 
     Without the constant: (n, 3, 9 sensors) or (n, 3, 27 sensors), as `by_sensor` splits them.
     """
-    place = np.empty_like(rows.target)
+    measured = rows.target if rows.place is None else rows.place
+    place = np.empty_like(measured)
     for _, span in rows.spans:
-        centred = rows.target[span] - rows.target[span].mean(axis=0)
+        centred = measured[span] - measured[span].mean(axis=0)
         place[span] = centred / max(float(np.std(centred)), 1e-9)
     if degree == 1:
         return _by_sensor(rows, place)

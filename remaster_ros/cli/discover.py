@@ -109,6 +109,12 @@ def run(args: argparse.Namespace) -> int:
         for line in named:
             show(args.quiet, line)
         show(args.quiet, summary(found, judged, confirmation, coverage, content.loadable or ()))
+        if session.measurements.orientation is not None:
+            show(
+                args.quiet,
+                'the measured orientations are not used: causes are searched in the '
+                'positions alone; "remaster fit" fits both',
+            )
         for one in decided:
             show(args.quiet, one.describe())
         show(args.quiet, f'written: {report}')

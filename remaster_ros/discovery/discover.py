@@ -169,6 +169,8 @@ def discover_session(
     """
     report = progress if progress is not None else silent
     report('offsets', 0.0)
+    # What causes do to orientations is not modelled.
+    session = session.positions_alone()
     before = sound_estimate(session)
     found, residuals, pool = _to_search(session, before, rng)
     untestable = {

@@ -21,7 +21,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from remaster_ros.calibration.comparison import predicted_rows
-from remaster_ros.calibration.estimate import Estimate, estimate
+from remaster_ros.calibration.estimate import Estimate, estimate, of_positions_alone
 from remaster_ros.calibration.identifiability import OPEN_ANGLE
 from remaster_ros.calibration.laplace import Mode
 from remaster_ros.calibration.priors import TIGHTEST_PRIOR, prior_rows
@@ -130,6 +130,7 @@ def geometry_model(found: Estimate, causes: Sequence[Cell] = ()) -> GeometryMode
     causes
         Errors of the measurement, fitted beside them: they are no errors of the arm.
     """
+    found = of_positions_alone(found)
     tolerance_m = found.problem.priors.geometry_tolerance_m
     drawing = _fitted(found, causes)
     found = _without_open_offsets(found)

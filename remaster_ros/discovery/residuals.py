@@ -134,7 +134,8 @@ class Residuals:
         step_precision = np.zeros(model.size)
         free = found.posterior.free
         step_precision[free[free < model.joints]] = STEP_STD**-2.0
-        noise_model = NoiseModel.of(rows, model.reference, found.posterior.noise_model.split)
+        split = found.posterior.noise_model.of_points.split
+        noise_model = NoiseModel.of(rows, model.reference, split)
         noise = robust_noise(rows, full_errors[rows.source], np.ones(len(rows), bool))
         return cls(
             context,

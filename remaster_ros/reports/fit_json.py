@@ -38,7 +38,7 @@ from remaster_ros.version import __version__
 
 if TYPE_CHECKING:
     from remaster_ros.calibration.noise_estimate import NoiseEstimate
-    from remaster_ros.calibration.result import FitResult
+    from remaster_ros.calibration.result import FitResult, Orientations
 
 FIT_FILE = 'fit.json'
 REPORT_FILE = 'report.html'
@@ -182,6 +182,42 @@ def _geometry(result: FitResult, geometry: GeometryModel) -> dict[str, Any]:
     }
 
 
+def _orientation(result: FitResult, found: Orientations) -> dict[str, Any]:
+    tell = found.tell
+    return {
+        'fitted': not found.why_not,
+        'count': found.count,
+        'why': found.why_not,
+        'noise': {
+            sensor: {
+                'sigma_deg': np.degrees(noise.sigma_m),
+                'std_deg': np.degrees(noise.std_m),
+                'pose_sigma_deg': (
+                    None if noise.pose_sigma_m is None else np.degrees(noise.pose_sigma_m)
+                ),
+            }
+            for sensor, noise in found.noise.items()
+        },
+        'bodies': {
+            name: {
+                'rotation_xyzw': quaternion_xyzw(R_T_B),
+                'std_deg': np.degrees(found.std_rad[name]),
+            }
+            for name, R_T_B in found.R_T_B.items()
+        },
+        'p_value': None if tell is None else tell.p_value,
+        'std_positions_deg': {}
+        if tell is None
+        else {
+            joint: float(np.degrees(std)) if np.isfinite(std) else None
+            for joint, std, known in zip(
+                result.joint_names, tell.std_without, result.identifiable, strict=True
+            )
+            if known
+        },
+    }
+
+
 def fit_content(result: FitResult) -> schemas.Fit:
     """Return a fit as fit.json has it."""
     draws, sampler = result.draws.reshape(-1, result.draws.shape[-1]), result.sampler
@@ -226,6 +262,8 @@ def fit_content(result: FitResult) -> schemas.Fit:
         for row, std, times in zip(content['joint_offsets'], model, result.widening, strict=True):
             if times > 1.0:
                 row['model_std_deg'] = std
+    if result.orientations is not None:
+        content['orientation'] = _orientation(result, result.orientations)
     if (geometry := geometry_of(result)) is not None:
         content['geometry'] = _geometry(result, geometry)
         wider = np.degrees(geometry.offsets_std(result.joint_offsets_std))

@@ -131,6 +131,9 @@ def verdict(result: FitResult) -> Judgement:
         )
     else:
         points.append(f'All {count} zero-offsets are measured.')
+    if result.orientations_in_words:
+        words = result.orientations_in_words
+        points.append(f'{words[0].upper()}{words[1:]}.')
     if result.left_out:
         plural = 's are' if len(result.left_out) > 1 else ' is'
         points.append(

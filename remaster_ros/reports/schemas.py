@@ -174,6 +174,38 @@ class LeftOut(Struct):
     why: str
 
 
+class TurnNoise(Struct):
+    """Noise of a sensor's orientations per axis, degrees: of one row, and common to a pose."""
+
+    sigma_deg: float
+    std_deg: float
+    pose_sigma_deg: float | None
+
+
+class Body(Struct):
+    """How a measured body stands on the tool, R_T_B; the std is about the axes of T."""
+
+    rotation_xyzw: list[float]
+    std_deg: Triple
+
+
+class Orientation(Struct):
+    """What came of measured orientations.
+
+    ``p_value`` is that positions and orientations agree on the offsets; ``std_positions_deg`` is
+    what the positions alone would know of each (None: nothing). Where they are not fitted ``why``
+    has the reason.
+    """
+
+    fitted: bool
+    count: int
+    why: str
+    noise: dict[str, TurnNoise]
+    bodies: dict[str, Body]
+    p_value: float | None = None
+    std_positions_deg: dict[str, float | None] = {}
+
+
 class NoiseCheck(Struct):
     """Does noise explain what is left of a sensor's errors?
 
@@ -277,6 +309,7 @@ class Fit(Struct):
     residual_structure: list[StructureTest] | UnsetType = UNSET
     intervals: Literal['model', 'robust'] | UnsetType = UNSET
     geometry: FittedGeometry | UnsetType = UNSET
+    orientation: Orientation | UnsetType = UNSET
     judgement: Judgement | UnsetType = UNSET
 
 
