@@ -121,16 +121,23 @@ def test_another_order_of_the_quaternion_is_named_and_the_positions_are_fitted()
 def test_orientations_that_ask_for_other_offsets_widen_the_intervals():
     made = make_session('tracker', np.random.default_rng(7), common=0.0)
     m = made.session.measurements
-    # A turn that follows joint 4: no offset of the positions has it.
-    error = np.zeros((len(m), 3))
-    error[:, 0] = np.radians(0.5) * np.sin(m.q[:, 3])
-    turned = (Rotation.from_rotvec(error) * Rotation.from_quat(m.orientation)).as_quat()
+    # As if joint 4 were off by 0.1 degrees more, which the positions do not show.
+    chain = estimate(Problem.of(made.session)).problem.chain
+    true = m.q + made.joint_offsets
+    here, there = (
+        Rotation.from_matrix(chain.forward(q)[:, :3, :3])
+        for q in (true, true + np.radians(0.1) * np.eye(7)[3])
+    )
+    body = Rotation.from_matrix(made.R_T_B)
+    moved = body.inv() * here.inv() * there * body
+    turned = (Rotation.from_quat(m.orientation) * moved).as_quat()
     fit = remaster_ros.fit(replace(made.session, measurements=replace(m, orientation=turned)))
-    tests = [test for test in fit.structure.tests if test.driver == 'orientation']
-    assert len(tests) == 1
-    if tests[0] in fit.structure.found:
-        assert np.all(fit.widening[fit.identifiable] >= 1.0)
-        assert fit.other_errors
+    (test,) = (test for test in fit.structure.tests if test.driver == 'orientation')
+    assert test in fit.structure.found
+    assert fit.other_errors
+    low, high = fit.joint_offsets_interval95[3]
+    assert low < made.joint_offsets[3] < high
+    assert not remaster_ros.fit(made.session).other_errors
 
 
 def test_report_and_file_tell_that_they_were_used_and_how_sure():
