@@ -210,10 +210,12 @@ def look_ahead(
         )
         for at, pose in enumerate(fitted)
     ]
-    expected, undetermined = NOTHING_EXPECTED, ''
+    reached = [pose for pose in reached if len(pose.solutions)]
+    judges = f'they are for /remaster/{tours[-1].judges}' if tours[-1].judges else 'none is left'
+    expected, undetermined = NOTHING_EXPECTED, '' if reached else f'none is fitted, {judges}'
     try:
-        reached = [pose for pose in reached if len(pose.solutions)]
-        expected = expected_precision(planner, T_R_N, reached)
+        if reached:
+            expected = expected_precision(planner, T_R_N, reached)
     except InsufficientDataError as error:
         # What the arm does is known all the same.
         undetermined = str(error)

@@ -209,3 +209,22 @@ def test_any_other_configuration_or_order_is_another_plan(bench):
         other = tour.fork()
         other.plans = {'registration': dataclasses.replace(plan, poses=poses)}
         assert not confirmation.allows(other)
+
+
+def test_poses_to_judge_by_are_shown_and_confirmed_like_any_other(bench):
+    """They are planned before they can be shown: nothing was announced by then."""
+    bench.draw()
+    bench.progress.judging = bench.tours.verification
+    until = time.monotonic() + 60.0
+    required = bench.facts.required()
+    while (stop := bench.progress.next(START, required, '')) is None:
+        assert time.monotonic() < until
+        time.sleep(0.01)
+    assert stop.correction in ('on', 'off')
+    assert not bench.preview.allows(bench.journal.tour)
+    bench.preview.withdraw()
+    name = fingerprint(bench.journal.tour)
+    assert name in bench.draw()
+    assert 'none is fitted, they are for /remaster/verify' in bench.page.read_text()
+    assert bench.preview.confirm(name)[0]
+    assert bench.preview.allows(bench.journal.tour)
