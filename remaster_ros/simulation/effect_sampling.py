@@ -110,7 +110,8 @@ def draw_effect(
     Raises
     ------
     InputError
-        Where all draws leave nothing, or none is about that joint.
+        Where all draws leave nothing, or none is about that joint, or those that are would have to
+        be larger than is plausible.
     """
     context = DrawContext(
         rng, stage.arm.joints, stage.circumstances, stage.distance_m, tuple(stage.markers)
@@ -130,6 +131,12 @@ def draw_effect(
     if best is None or best_size < 1e-6:
         where = '' if joint is None else f' at joint {joint}'
         raise InputError(f'{kind}{where} cannot be seen on these visits, whatever its size')
+    if joint is not None and best_size < size_m:
+        raise InputError(
+            f'{kind} at joint {joint}: one of a plausible size leaves {1e3 * best_size:.2g} mm on '
+            'these visits once offsets, registration and marker are fitted; ask for less, or for '
+            'another joint'
+        )
     return stage.of_size(best, size_m)
 
 

@@ -127,3 +127,8 @@ def test_a_world_keeps_what_is_hidden_in_it(tmp_path):
     np.testing.assert_allclose(opened.reported(110.0)[0], end, atol=1e-9)
     for world in (made, plain, opened):
         world.close()
+
+
+def test_no_effect_larger_than_is_plausible_is_hidden_at_a_joint(stage):
+    with pytest.raises(InputError, match='one of a plausible size leaves'):
+        hide(stage, [EffectSpec.parse('encoder_eccentricity@3:500')], np.random.default_rng(SEED))
