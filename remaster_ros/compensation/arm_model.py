@@ -309,12 +309,6 @@ class ArmModel:
         """Whether anything depends on the temperature."""
         return self.growth.is_any or 'temperature' in self._needs
 
-    @property
-    def is_joints_alone(self) -> bool:
-        """Whether all errors are those of joint angles."""
-        others = (self.geometry.is_any, self.growth.is_any, np.any(self.lateral_compliance))
-        return not (any(others) or self.base_terms)
-
     @cached_property
     def _needs(self) -> set[str]:
         drivers: set[str] = {term.function.driver for term in self.joint_terms}
