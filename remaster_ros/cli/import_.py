@@ -25,7 +25,7 @@ from remaster_ros.importing.assemble import (
 from remaster_ros.importing.bags import is_bag, read_bag
 from remaster_ros.importing.columns import Told
 from remaster_ros.importing.robots import read_robot
-from remaster_ros.importing.rows import RawRows, TableOptions, read_rows
+from remaster_ros.importing.rows import RawRows, TableOptions, from_tool, read_rows
 from remaster_ros.importing.sense import Sense, check_sense
 from remaster_ros.importing.sessions import Mending, Stretch, arrangement_of, mended
 from remaster_ros.importing.units import ANGLES, LENGTHS
@@ -169,6 +169,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="turn the markers' places about x, y or z of the tool frame, by a multiple of 90",
     )
     session = parser.add_argument_group('the session')
+    session.add_argument(
+        '--on-tool',
+        action='store_true',
+        help='the sensor, a camera, is on the tool: the points and quaternions are poses of what '
+        'stands (a board), in its frame',
+    )
     session.add_argument('--sensor', metavar='NAME', help='default: sensor')
     session.add_argument('--marker', metavar='NAME', help='default: marker')
     session.add_argument(
@@ -267,6 +273,8 @@ def run(args: argparse.Namespace) -> int:
     with progress_bar(args.quiet or args.json) as progress:
         progress('reading', 0.0)
         rows = _read(args, chain).in_order()
+        if args.on_tool:
+            rows = from_tool(rows)
         options, counted = as_counted(rows, chain, _session_options(args, cell))
         notes = f'imported from {", ".join(path.name for path in args.files)}'
         rng = np.random.default_rng(args.seed)
@@ -391,6 +399,7 @@ def _session_options(args: argparse.Namespace, cell: Workcell | None) -> Session
         marker_std_m=None if std is None else 1e-3 * std,
         hold_out=args.hold_out,
         visited_in_order=args.visited_in_order,
+        on_tool=args.on_tool,
     )
 
 

@@ -59,6 +59,8 @@ class SessionOptions:
         Share of the poses that is held out where the table names none.
     visited_in_order
         Whether each row's configuration was reached from that of the row before.
+    on_tool
+        Whether the sensor is on the tool, and measures the pose of what stands.
     """
 
     couple: tuple[tuple[str, tuple[str, Literal[1, -1]]], ...] = ()
@@ -70,6 +72,7 @@ class SessionOptions:
     marker_std_m: float | None = None
     hold_out: float = 1.0 / HOLD_OUT_ONE_OF
     visited_in_order: bool = False
+    on_tool: bool = False
 
 
 def controller_of(rows: RawRows, chain: SerialChain, options: SessionOptions) -> Controller | None:
@@ -188,6 +191,9 @@ def assemble(
         notes=notes,
         controller=controller,
     )
+    if options.on_tool:
+        every = frozenset(session.sensors)
+        session = replace(session, oriented=every, on_tool=every)
     return session, [how_pose, how_split]
 
 

@@ -27,6 +27,7 @@ from remaster_ros.importing.values import (
     times,
 )
 from remaster_ros.kinematics.serial_chain import SerialChain
+from remaster_ros.kinematics.transforms import inverse_poses
 from remaster_ros.session.files import read_limited
 from remaster_ros.types import AngleUnit, BoolArray, FloatArray, IntArray
 
@@ -639,3 +640,23 @@ def _refuse_untold(found: list[tuple[TextTable, Columns]], told: Told) -> None:
         if name not in ('', 'none') and not any('told' in c.why.values() for _, c in found):
             has = '; '.join(f'{table.path} has {", ".join(table.names)}' for table, _ in found)
             raise InputError(f'{option}: there is no column {name!r}; {has}')
+
+
+def from_tool(rows: RawRows) -> RawRows:
+    """Return rows of a sensor on the tool as those of the sensor, in the frame of what it sees.
+
+    Raises
+    ------
+    InputError
+        A row without an orientation.
+    """
+    orientation = np.full((1, 4), np.nan) if rows.orientation is None else rows.orientation
+    unknown = np.isnan(orientation).any(axis=1)
+    if unknown.any():
+        which = f'reading {int(np.argmax(unknown)) + 1} has no orientation'
+        raise InputError(
+            f'--on-tool: {which} (qx, qy, qz, qw), without which what a sensor on the tool '
+            'measures tells nothing; add the columns, or leave such rows out'
+        )
+    position, orientation = inverse_poses(rows.position, orientation)
+    return replace(rows, position=position, orientation=orientation)

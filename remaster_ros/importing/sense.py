@@ -129,7 +129,8 @@ def check_sense(session: Session, rows: RawRows, progress: Callable[[str, float]
             'known (--marker-std-mm)',
             error_m=as_given.error_m,
         )
-    return _nothing_found(as_given, without)
+    measured = session.measurements.orientation is not None and not session.on_tool
+    return _nothing_found(as_given, without, measured)
 
 
 def _too_few(session: Session, joints: int) -> str:
@@ -227,7 +228,10 @@ def _many_off(given: Fitted, beside: tuple[tuple[str, float], ...], rows: RawRow
     )
 
 
-def _nothing_found(given: Fitted, without: str) -> Sense:
+ON_TOOL = '; poses that a camera on the tool has of a board that stands need --on-tool'
+
+
+def _nothing_found(given: Fitted, without: str, oriented: bool) -> Sense:
     worst = int(np.argmax(np.abs(given.joint_offsets)))
     angle = given.joint_offsets[worst]
     if given.error_m < 5e-3 and abs(angle) > GROSS_OFFSET_RAD:
@@ -242,7 +246,8 @@ def _nothing_found(given: Fitted, without: str) -> Sense:
         False,
         f'the data fit to {without} only, and it is none of these, which were tried: {TRIED}; '
         'check that the URDF is that of this arm, that each point stands beside its own joints, '
-        'and that one marker was measured throughout',
+        'and that one marker was measured throughout'
+        f'{ON_TOOL if oriented else ""}',
         error_m=given.error_m,
     )
 

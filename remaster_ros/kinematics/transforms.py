@@ -97,6 +97,12 @@ def mean_quaternion_xyzw(quaternions: ArrayLike) -> FloatArray:
     return np.asarray(Rotation.from_quat(vector).as_quat(canonical=True))
 
 
+def inverse_poses(position: ArrayLike, xyzw: ArrayLike) -> tuple[FloatArray, FloatArray]:
+    """Return where a is in b, m, (n, 3), and how it stands, (n, 4), of poses of b in a."""
+    back = Rotation.from_quat(np.asarray(xyzw, dtype=float)).inv()
+    return np.asarray(-back.apply(np.asarray(position, dtype=float))), np.asarray(back.as_quat())
+
+
 def matrix_from_rpy(rpy: ArrayLike) -> FloatArray:
     """Turn roll, pitch, yaw (3,) in rad, URDF's Rz(yaw) Ry(pitch) Rx(roll), into a matrix."""
     return np.asarray(Rotation.from_euler('xyz', rpy).as_matrix())

@@ -8,6 +8,7 @@ import math
 import re
 from collections import ChainMap
 from collections.abc import Iterator, Mapping, MutableMapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -15,6 +16,7 @@ import numpy as np
 
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.serial_chain import LIMIT_TOLERANCE_RAD, SerialChain
+from remaster_ros.kinematics.transforms import inverse_poses
 from remaster_ros.session.files import decode_text, refuse_utf16
 from remaster_ros.types import (
     FARTHEST_M,
@@ -635,6 +637,32 @@ def _check_names(names: list[str], columns: ColumnNames, path: Path) -> None:
     unknown = [name for name in names if name not in columns.names(*[True] * 5)]
     if unknown:
         log.warning('%s: unknown columns are not used: %s', where, ', '.join(map(repr, unknown)))
+
+
+def turned_round(m: Measurements, sensors: Sequence[int], where: str) -> Measurements:
+    """Return rows with the readings of sensors on the tool the other way round.
+
+    Those of what stands, in the sensor's frame, become those of the sensor in the frame of what
+    stands, and back.
+
+    Raises
+    ------
+    InputError
+        One without an orientation; the message begins with ``where``.
+    """
+    mine = np.flatnonzero(np.isin(m.sensor, sensors))
+    if len(mine) == 0:
+        return m
+    if m.orientation is None or np.isnan(m.orientation[mine]).any():
+        unknown = [] if m.orientation is None else mine[np.isnan(m.orientation[mine, 0])]
+        row = int(m.observation[unknown[0] if len(unknown) else mine[0]])
+        raise InputError(
+            f'{where}: observation {row} has no orientation, without which a reading of a sensor '
+            'on the tool tells nothing; leave the row out'
+        )
+    position, orientation = m.position.copy(), m.orientation.copy()
+    position[mine], orientation[mine] = inverse_poses(position[mine], orientation[mine])
+    return replace(m, position=position, orientation=orientation)
 
 
 def _not_among(key: str, names: Sequence[str]) -> str:

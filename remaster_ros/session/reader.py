@@ -23,7 +23,7 @@ from remaster_ros.session.files import (
     write_atomically,
 )
 from remaster_ros.session.manifest import check_data, read_manifest
-from remaster_ros.session.observations import RowFormat, format_measurements
+from remaster_ros.session.observations import RowFormat, format_measurements, turned_round
 from remaster_ros.session.session_yaml import (
     SessionHeader,
     parse_header,
@@ -90,6 +90,8 @@ def _read(folder: Path, sums: dict[str, str], within_limits: bool) -> Session:
     check_data(sums, rows_path, data)
     names = tuple(header.sensors), tuple(header.markers)
     measurements = RowFormat(rows_path, chain, *names, within_limits=within_limits).parse(data)
+    on_tool = [i for i, name in enumerate(header.sensors) if name in header.on_tool]
+    measurements = turned_round(measurements, on_tool, str(rows_path))
     references = None
     if measurements.is_reference is not None:
         of_references = measurements.is_reference
@@ -135,7 +137,9 @@ def write_session(folder: str | os.PathLike[str], session: Session) -> None:
     parsed = parse_header(header.encode(), folder / HEADER)
     require_known_joints(parsed, chain.joint_names, folder / HEADER)
     names = session.sensor_names, session.marker_names
-    rows = format_measurements(all_rows(session), *names).encode()
+    on_tool = [i for i, name in enumerate(session.sensors) if name in session.on_tool]
+    measured = turned_round(all_rows(session), on_tool, 'session to be written')
+    rows = format_measurements(measured, *names).encode()
     RowFormat(folder / ROWS, chain, *names).parse(rows)
     with undone_on_failure():
         make_new_folder(folder)

@@ -51,6 +51,7 @@ class _Sensor(msgspec.Struct):
     marker: str
     further_markers: tuple[str, ...] = ()
     orientation: bool = False
+    mounted_on: Literal['', 'tool'] = ''
 
 
 class _PadJoint(msgspec.Struct):
@@ -98,6 +99,11 @@ class SessionHeader(msgspec.Struct):
     accuracy_option: AccuracyOption = ''
     extra: dict[str, Any] = {}
 
+    @property
+    def on_tool(self) -> frozenset[str]:
+        """Sensors on the tool."""
+        return frozenset(name for name, sensor in self.sensors.items() if sensor.mounted_on)
+
     def session(
         self, urdf: str, measurements: Measurements, references: Measurements | None = None
     ) -> Session:
@@ -114,8 +120,11 @@ class SessionHeader(msgspec.Struct):
                 if sensor.further_markers
             },
             oriented=frozenset(
-                name for name, sensor in self.sensors.items() if sensor.orientation
+                name
+                for name, sensor in self.sensors.items()
+                if sensor.orientation or sensor.mounted_on
             ),
+            on_tool=self.on_tool,
             measurements=measurements,
             marker_std_m=self.marker_std_m,
             settle_s=self.settle_s,
@@ -181,6 +190,7 @@ def write_header(session: Session, urdf_name: str, exit_status: str) -> str:
                 'marker': marker,
                 'further_markers': session.further_markers.get(name, ()),
                 'orientation': name in session.oriented,
+                'mounted_on': 'tool' if name in session.on_tool else '',
             }
             for name, marker in session.sensors.items()
         },
@@ -200,7 +210,7 @@ def write_header(session: Session, urdf_name: str, exit_status: str) -> str:
     header = _checked(to_plain(content), 'session to be written: ')
     given = {key: value for key, value in to_plain(header).items() if value not in ('', {}, None)}
     for sensor in given['sensors'].values():
-        for key in ('further_markers', 'orientation'):
+        for key in ('further_markers', 'orientation', 'mounted_on'):
             if not sensor[key]:
                 del sensor[key]
     if controller := given.get('controller'):
@@ -259,6 +269,18 @@ def _problem(header: SessionHeader) -> str:
                     f'sensors.{sensor}.{key}: {marker!r} is not among the markers '
                     f'({", ".join(header.markers)}); correct the name'
                 )
+    for sensor in header.on_tool:
+        entry = header.sensors[sensor]
+        others = [
+            other
+            for other, its in header.sensors.items()
+            if other != sensor and entry.marker in (its.marker, *its.further_markers)
+        ]
+        if entry.further_markers or others:
+            return (
+                f'sensors.{sensor}: of a sensor on the tool the marker is its own origin there; '
+                f'give it one of its own, which no other sensor has'
+            )
     for sensor, base in header.base_prior.items():
         if sensor not in header.sensors:
             known = ', '.join(header.sensors)

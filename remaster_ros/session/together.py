@@ -89,6 +89,7 @@ def together(sessions: Sequence[tuple[str, Session]]) -> tuple[Session, list[str
                 **joined.base_prior,
                 **{names[one]: prior for one, prior in session.base_prior.items()},
             },
+            on_tool=joined.on_tool | {names[one] for one in session.on_tool},
             oriented=joined.oriented | {names[one] for one in session.oriented},
             # The less is known of any marker, the less is said of each.
             marker_std_m=max(joined.marker_std_m, session.marker_std_m),
