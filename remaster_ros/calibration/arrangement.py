@@ -169,8 +169,9 @@ class Fitted:
     most_error_m
         The distance that nine of ten points keep within, as a median of Gaussian errors, m: larger
         than the median where a part of the points is off.
-    joint_offsets
-        rad, (k,); 0 where the data do not determine them, as of the outer two.
+    joint_offsets, per_radian
+        rad, or m of joints that slide, and how much of that counts as a radian, (k,); 0 where the
+        data do not determine them, as of the outer two.
     marker_shift_m
         Largest distance of a marker from where it was said to be, m.
     """
@@ -180,11 +181,12 @@ class Fitted:
     joint_offsets: FloatArray
     marker_shift_m: float
     most_error_m: float
+    per_radian: FloatArray
 
     @property
     def gross(self) -> bool:
         """Whether the table is hardly that of this robot."""
-        turned = np.abs(self.joint_offsets) > GROSS_OFFSET_RAD
+        turned = np.abs(self.joint_offsets) > GROSS_OFFSET_RAD * self.per_radian
         return bool(self.left_m > GROSS_M or turned.any())
 
     @property
@@ -325,6 +327,7 @@ def fit_arrangement(session: Session, arrangement: Arrangement) -> Fitted:
         determined_offsets(start, z, rows, problem.marker_priors(start), float(spread.max())),
         float(shift.max()),
         most * MEDIAN_CHI3 / _MOST_CHI3,
+        start.chain.per_radian,
     )
 
 
@@ -346,7 +349,8 @@ def determined_offsets(
     H = derivative.T @ derivative + by_z.T @ by_z + 1e-2 * np.eye(len(z))
     std = np.sqrt(np.diag(np.linalg.inv(H)))
     offsets = model.offsets(z)
-    return np.where(std[: len(offsets)] < GROSS_OFFSET_RAD, offsets, 0.0)
+    known = std[: len(offsets)] < GROSS_OFFSET_RAD * model.chain.per_radian
+    return np.where(known, offsets, 0.0)
 
 
 def linear_errors(

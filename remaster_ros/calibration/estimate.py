@@ -93,12 +93,20 @@ class Problem:
         InsufficientDataError
             Too few observations, of one sensor or of all.
         """
-        chain = SerialChain.from_urdf(session.urdf, session.base_link, session.tip_link)
+        chain = SerialChain.from_urdf(
+            session.urdf, session.base_link, session.tip_link, sliding=True
+        )
         given = session.measurements
         if given.q.shape[1:] != (len(chain),):
             raise InputError(
                 f'the session has {given.q.shape[-1]} joints, '
                 f'the URDF from {session.base_link} to {session.tip_link} has {len(chain)}'
+            )
+        if chain.slides.any() and given.orientation is not None:
+            raise InputError(
+                f"joint '{chain.joint_names[int(np.argmax(chain.slides))]}' slides, and "
+                'orientations are fitted for arms whose joints all turn; leave the columns of the '
+                'orientation out'
             )
         if len(chain) < 2:
             raise InsufficientDataError(
@@ -138,6 +146,11 @@ class Problem:
                         f"there is a prior on {kind} '{name}', but the session has "
                         f'{", ".join(names)}; correct the name or leave it out'
                     )
+        for name, slides in zip(chain.joint_names, chain.slides, strict=True):
+            if slides and name in priors.joint_offsets:
+                raise InputError(
+                    f"the prior on joint '{name}' is an angle, but that joint slides; leave it out"
+                )
         places = [
             priors.markers.get(name, (session.markers[name], session.marker_std_m))
             for name in marker_names
@@ -389,7 +402,7 @@ def _judged_at(mode: Mode, gauge: Gauge, priors: Sequence[Prior]) -> Gauge:
     posterior = mode.linearisation.posterior
     std = np.sqrt(np.diag(mode.covariance))
     if not any(
-        width > WEAK_ANGLE
+        width > WEAK_ANGLE * posterior.model.chain.per_radian[index]
         for index, width in zip(posterior.free, std, strict=True)
         if index < posterior.model.joints and not gauge.why[index]
     ):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import compress
 from typing import Literal
 
 import numpy as np
@@ -97,6 +98,13 @@ def fit_session(
     report = progress if progress is not None else silent
     started = clock() if clock is not None else np.nan
     problem = Problem.of(session, priors)
+    slides = list(compress(problem.chain.joint_names, problem.chain.slides))
+    if slides and (sampler == 'paper' or extension is not None):
+        raise InputError(
+            f"joint '{slides[0]}' slides, which {'the paper sampler' if extension is None else ''}"
+            f'{"a fit with further effects" if extension is not None else ""} does not take; fit '
+            'with the fast sampler, without effects'
+        )
     if sampler == 'paper':
         sampled = fit_paper(
             problem,

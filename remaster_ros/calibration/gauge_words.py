@@ -39,6 +39,22 @@ def in_words(model: Model, direction: FloatArray) -> str:
             )
         if not sensors and not markers:
             return f'{joint} moves no marker; a marker off its axis would show it'
+        slides = model.chain.slides[joints[0]]
+        shifted = not any(np.any(direction[model.registration(s)][3:]) for s in sensors)
+        if slides and not markers and shifted:
+            # A joint that no turning joint carries slides along the same line of R throughout.
+            return (
+                f'{joint} offset = a shift of the '
+                f'{listed([model.sensor_names[s] for s in sensors])} registration'
+                f'{"s" if len(sensors) > 1 else ""} along its axis; '
+                'a known base frame (base_prior) would separate them'
+            )
+        if slides and not sensors:
+            moved = [the('marker', model.marker_names[m]) for m in markers]
+            return (
+                f'{joint} offset = {listed(moved)} moved along its axis, as far; a measured '
+                'marker would separate them'
+            )
         if joints[0] == 0 and not markers:
             return (
                 f'{joint} offset = a rotation of the '

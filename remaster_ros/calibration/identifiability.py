@@ -24,12 +24,14 @@ from remaster_ros.calibration.initial_guess import robust_spread
 from remaster_ros.calibration.model import Model
 from remaster_ros.calibration.priors import Prior, prior_rows
 from remaster_ros.errors import InsufficientDataError
+from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.types import BoolArray, FloatArray, IntArray
 
 # Singular values (of unit columns, relative to the largest) that are rounding errors.
 ROUNDING = 1e-9
 # An angle with a larger standard deviation counts as unknown: over such a range neither the
-# prediction nor a prior is linear.
+# prediction nor a prior is linear. Of a joint that slides as much as such an angle does at
+# `LEVER_M`, here and in what follows.
 UNKNOWN_ANGLE = np.radians(5.0)
 # An offset with a standard deviation above this, and this many times that of the median one, is
 # reported as badly determined, with the parts of its direction above this share of the largest.
@@ -131,14 +133,14 @@ def find_gauge(
             why[joint] = f'{why[joint]}; {text}' if why[joint] else text
     for along, worst, std in weak:
         directions.append(_badly_determined(model, along, worst, std, scale))
-        if std > OPEN_ANGLE and not why[worst]:
-            known = f'the data determine it only to {np.degrees(std):.2f} deg'
+        if std > OPEN_ANGLE * model.chain.per_radian[worst] and not why[worst]:
+            known = f'the data determine it only to {model.chain.shown_offset(worst, std)}'
             why[worst] = f'{known}: {directions[-1].why}'
     return Gauge(tuple(directions), np.array(sorted(held), dtype=np.int64), tuple(why))
 
 
 def known_offsets(
-    why: tuple[str, ...], by_data: FloatArray, std: FloatArray
+    chain: SerialChain, why: tuple[str, ...], by_data: FloatArray, std: FloatArray
 ) -> tuple[BoolArray, tuple[str, ...]]:
     """Return which offsets are identifiable, (k,), and why the others are not.
 
@@ -147,22 +149,31 @@ def known_offsets(
 
     Parameters
     ----------
+    chain
+        The k joints.
     why
         Of each joint why the data do not determine its offset, '' where they do.
     by_data, std
-        Standard deviation by the model, and with what is known to be left out of it, rad, (k,).
+        Standard deviation by the model, and with what is known to be left out of it, rad or m,
+        (k,).
     """
+    by_data = by_data / chain.per_radian
     seen = np.array([not text for text in why])
     if not seen.any():
         return seen, why
     known: BoolArray = seen | (by_data <= AS_GOOD_AS_SEEN * np.median(by_data[seen]))
-    left_open = std > OPEN_ANGLE
+    left_open = std > OPEN_ANGLE * chain.per_radian
     reasons = tuple(
-        f'with what the model leaves out it is known only to {np.degrees(width):.1f} deg: poses '
+        f'with what the model leaves out it is known only to {shown}: poses '
         'that are spread further and turn the tool would tell more'
         if hardly and not text
         else text
-        for text, width, hardly in zip(why, std, left_open, strict=True)
+        for text, shown, hardly in zip(
+            why,
+            (chain.shown_offset(joint, width, 1) for joint, width in enumerate(std)),
+            left_open,
+            strict=True,
+        )
     )
     return known & ~left_open, reasons
 
@@ -178,7 +189,7 @@ def _entries(model: Model, combination: FloatArray) -> dict[str, float]:
 def _badly_determined(
     model: Model, direction: FloatArray, joint: int, std: float, scale: FloatArray
 ) -> GaugeDirection:
-    """Describe a direction along which a joint's offset has a large ``std``, rad."""
+    """Describe a direction along which a joint's offset has a large ``std``, rad or m."""
     size = np.abs(direction * scale)
     main = np.where(size > WEAK_SHARE * size.max(), direction, 0.0)
     main[joint] = direction[joint]
@@ -187,7 +198,7 @@ def _badly_determined(
         f'{together(model, combination)} hardly change the observations; poses that are spread '
         f'further and turn the tool, or a prior on {model.names[joint]}, would separate them'
     )
-    known = f'the data, though {model.names[joint]} only to {np.degrees(std):.2f} deg'
+    known = f'the data, though {model.names[joint]} only to {model.chain.shown_offset(joint, std)}'
     return GaugeDirection(_entries(model, combination), words, known)
 
 
@@ -196,7 +207,7 @@ def _null_space(
 ) -> tuple[FloatArray, FloatArray, list[int], list[tuple[FloatArray, int, float]]]:
     """Return the scale of each parameter, a basis of the null space, (size, d), and its pivots.
 
-    Last come the badly determined joints: direction, index and standard deviation, rad.
+    Last come the badly determined joints: direction, index and standard deviation, rad or m.
     """
     triangle = _triangle(model, x, rows)
     scale = np.linalg.norm(triangle, axis=0)
@@ -215,12 +226,14 @@ def _null_space(
     root[:, model.core :] = model.extension_root
     triangle = np.asarray(np.linalg.qr(np.concatenate((triangle, root / scale)), 'r'))
     for direction, pivot, _ in _nearly_null(
-        triangle, scale, pivots, _angles(model), UNKNOWN_ANGLE
+        triangle, scale, pivots, _angles(model), _per_radian(model), UNKNOWN_ANGLE
     ):
         basis = np.column_stack((basis, direction))
         pivots.append(pivot)
     joints = np.arange(model.size) < model.joints
-    weak = _nearly_null(triangle, scale, pivots, joints, WEAK_ANGLE, WEAK_FACTOR)
+    weak = _nearly_null(
+        triangle, scale, pivots, joints, _per_radian(model), WEAK_ANGLE, WEAK_FACTOR
+    )
     return scale, basis, pivots, weak
 
 
@@ -248,21 +261,24 @@ def _nearly_null(
     scale: FloatArray,
     pivots: list[int],
     angles: BoolArray,
+    per_radian: FloatArray,
     limit: float,
     factor: float = 0.0,
 ) -> list[tuple[FloatArray, int, float]]:
     """Return the directions along which an angle has a standard deviation above a limit, rad.
 
-    It is above a factor times the median of all angles as well, or above `OPEN_ANGLE`. With the
-    pivots of the null space held the rest has a covariance; its column of the worst angle is how
-    everything moves with that angle. Then that one is held too.
+    The zeros of joints that slide are among the angles, ``per_radian`` of the parameters' units,
+    (size,). It is above a factor times the median of all angles as well, or above `OPEN_ANGLE`.
+    With the pivots of the null space held the rest has a covariance; its column of the worst angle
+    is how everything moves with that angle. Then that one is held too.
     """
     found = []
     active = ~np.isin(np.arange(len(scale)), pivots)
     while np.any(active & angles):
         root = np.linalg.inv(np.linalg.qr(triangle[:, active], mode='r'))
         covariance = (root @ root.T) / np.outer(scale[active], scale[active])
-        std = np.where(angles[active], np.sqrt(np.diag(covariance)), 0.0)
+        own = np.sqrt(np.diag(covariance)) / per_radian[active]
+        std = np.where(angles[active], own, 0.0)
         worst = int(np.argmax(std))
         typical = float(np.median(std[angles[active]]))
         if std[worst] < limit or std[worst] < min(factor * typical, OPEN_ANGLE):
@@ -270,7 +286,7 @@ def _nearly_null(
         direction = np.zeros(len(scale))
         direction[active] = covariance[worst] / covariance[worst, worst]
         pivot = int(np.flatnonzero(active)[worst])
-        found.append((direction, pivot, float(std[worst])))
+        found.append((direction, pivot, float(std[worst] * per_radian[pivot])))
         active[pivot] = False
     return found
 
@@ -282,6 +298,11 @@ def _angles(model: Model) -> BoolArray:
         angles[model.registration(sensor)][3:] = True
     angles[model.markers_end : model.core] = True
     return angles
+
+
+def _per_radian(model: Model) -> FloatArray:
+    """Return how much of each parameter counts as a radian, (size,): 1 but of what slides."""
+    return np.append(model.chain.per_radian, np.ones(model.size - model.joints))
 
 
 def _kinds(model: Model) -> tuple[IntArray, ...]:
@@ -330,7 +351,7 @@ def _unresolved(
     A pivot counts as unknown from a certain standard deviation by the priors on. For an effect, of
     any unit, that is a million times what the data would leave it if it were alone.
     """
-    limit = np.where(_angles(model), UNKNOWN_ANGLE, 1e3)
+    limit = np.where(_angles(model), UNKNOWN_ANGLE * _per_radian(model), 1e3)
     limit[model.core :] = 1e6 / scale[model.core :]
     held: set[int] = set()
     while True:
@@ -347,7 +368,7 @@ def _unresolved(
                 f'the observations do not determine {", ".join(model.names[p] for p in loose)}; '
                 'measure poses that are spread further and turn the tool'
             )
-        held |= effects or {max(joints, key=joints.__getitem__)}
+        held |= effects or {max(joints, key=lambda j: joints[j] / model.chain.per_radian[j])}
 
 
 def _standard_deviations(by_direction: FloatArray) -> FloatArray:

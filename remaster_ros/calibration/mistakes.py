@@ -97,7 +97,9 @@ def find_mistakes(session: Session) -> Mistakes:
     # A marker that is firm at a wrong place would bend the fit.
     part = replace(session, marker_std_m=max(session.marker_std_m, UNKNOWN_MARKER_STD_M))
     given = fit_arrangement(part, Arrangement.given(joints))
-    if len(session.measurements) < FEWEST_ROWS:
+    # Nearly all that is tried is of angles.
+    slides = not np.all(given.per_radian == 1.0)
+    if len(session.measurements) < FEWEST_ROWS or slides:
         return Mistakes(given, ())
     found = [] if given.gross else _of_the_tool(session, given)
     if not found:
@@ -126,7 +128,8 @@ def is_gross(found: Estimate) -> bool:
     """Return whether an estimate has larger offsets or errors than a mastered robot leaves."""
     offsets = found.mode.z[: found.model.joints]
     sigma = found.posterior.noise(found.mode.eta).sigma
-    return bool(np.any(np.abs(offsets) > GROSS_OFFSET_RAD) or np.any(sigma > GROSS_M))
+    limit = GROSS_OFFSET_RAD * found.model.chain.per_radian
+    return bool(np.any(np.abs(offsets) > limit) or np.any(sigma > GROSS_M))
 
 
 @one_thread
@@ -157,8 +160,11 @@ def sound_estimate(session: Session, priors: Priors | None = None) -> Estimate:
         raise refused from None
     if not mistakes.fitting:
         few = len(session.measurements) < FEWEST_ROWS
+        slides = not np.all(mistakes.given.per_radian == 1.0)
         why = (
-            f'{len(session.measurements)} rows are too few to look for the reason'
+            'mistakes are not looked for where a joint slides'
+            if slides
+            else f'{len(session.measurements)} rows are too few to look for the reason'
             if few
             else f'tried, and it is none of these: {TRIED}'
         )
@@ -167,7 +173,7 @@ def sound_estimate(session: Session, priors: Priors | None = None) -> Estimate:
 
 
 def _named(session: Session, mistakes: Mistakes, what: str) -> MistakeFoundError:
-    chain = SerialChain.from_urdf(session.urdf, session.base_link, session.tip_link)
+    chain = SerialChain.from_urdf(session.urdf, session.base_link, session.tip_link, sliding=True)
     columns = Columns(chain.joint_names, chain.joint_names)
     sentence, options = in_a_sentence(mistakes, session, columns)
     return MistakeFoundError(f'{what}; {sentence}', options)

@@ -35,6 +35,7 @@ any size: C' = C Rot_1(offset of joint 1), marker' = Rot_k(offset of joint k) ma
 Rot_k(offset of joint k) R_T_B. Predictions depend on C', marker', R_T_B' and the inner joints; the
 outer two joints move nothing but the priors. `pinned` and `natural` convert. Displacements of
 an extension turn with joint 1 like the arm they belong to, so this holds with an extension too.
+Where an outer joint slides, Rot is the shift along it: the same holds, in metres.
 """
 
 from __future__ import annotations
@@ -252,9 +253,10 @@ class Model:
         if not np.any(x[..., [0, self.joints - 1]]):
             # Nothing turns, as where neither joint has a prior.
             return x.copy()
-        base = _rotation_about(*self.base_axis, sign * x[..., 0])
+        base = self._moved_by_first(sign * x[..., 0])
         result = self.with_corrections(x, self.corrections(x) @ base[..., None, :, :])
-        tool = _rotation_about(*self.tool_axis, sign * x[..., self.joints - 1])
+        last = sign * x[..., self.joints - 1]
+        tool = _moved_along(*self.tool_axis, last, bool(self.chain.slides[-1]))
         markers = apply(tool[..., None, :, :], self.markers(x))
         start = self.joints + 6 * len(self.sensor_names)
         result[..., start : self.markers_end] = markers.reshape(*x.shape[:-1], -1)
@@ -263,6 +265,10 @@ class Model:
             turns = matrix_to_rotation_vector(turned @ np.swapaxes(self.body_reference, -1, -2))
             result[..., self.markers_end : self.core] = turns.reshape(*x.shape[:-1], -1)
         return result
+
+    def _moved_by_first(self, amount: FloatArray) -> FloatArray:
+        """Return what joint 1 does in R when it moves by an amount (...), (..., 4, 4)."""
+        return _moved_along(*self.base_axis, amount, bool(self.chain.slides[0]))
 
     @cached_property
     def extension_root(self) -> FloatArray:
@@ -378,7 +384,7 @@ class Model:
 
     def _pose(self, offsets: FloatArray, x: FloatArray, rows: Rows) -> Pose:
         turns, shifts = self._extended(x, rows)
-        shifts = shifts @ _rotation_about(*self.base_axis, offsets[0])[:3, :3].T
+        shifts = shifts @ self._moved_by_first(offsets[0])[:3, :3].T
         angles = rows.q + offsets
         for joint, turn in turns.items():
             angles[..., joint] += turn
@@ -386,8 +392,9 @@ class Model:
         tool = frames[..., -1, :, :] @ self.chain.T_fixed[-1]
         points = apply(tool, self._places(x, rows))
         by_joints = self.chain.velocities(frames, points)
-        # Joint 1 carries the displacements along.
-        by_joints[..., 0] += np.cross(self.base_axis[1], shifts)
+        # Joint 1 carries the displacements along, turned where it turns.
+        if not self.chain.slides[0]:
+            by_joints[..., 0] += np.cross(self.base_axis[1], shifts)
         return Pose(tool, points + shifts, self.chain.axes_in_base(frames), by_joints)
 
     def _inner_offsets(self, z: FloatArray) -> FloatArray:
@@ -407,10 +414,11 @@ class Model:
         tool, points, axes, by_joints = self._pose(offsets, x, rows)
         by_theta = None
         if self.extension is not None:
-            base = _rotation_about(*self.base_axis, offsets[0])[:3, :3]
+            base = self._moved_by_first(offsets[0])[:3, :3]
             # The joints themselves turn under the displacements.
             turned = by_joints.copy()
-            turned[..., 0] -= np.cross(self.base_axis[1], self._extended(x, rows)[1] @ base.T)
+            if not self.chain.slides[0]:
+                turned[..., 0] -= np.cross(self.base_axis[1], self._extended(x, rows)[1] @ base.T)
             by_theta = self.extension.derivative(turned, base, rows.source)
         correction = self.corrections(x)
         for index, span in rows.spans:
@@ -470,7 +478,7 @@ class Pose(NamedTuple):
     axes
         Directions of the joints, (n, k, 3).
     by_joints
-        Derivative of the points by the joint angles, m/rad, (n, 3, k).
+        Derivative of the points by the joint angles, m/rad or m/m, (n, 3, k).
     """
 
     tool: FloatArray
@@ -479,9 +487,17 @@ class Pose(NamedTuple):
     by_joints: FloatArray
 
 
-def _rotation_about(point: FloatArray, axis: FloatArray, angle: FloatArray) -> FloatArray:
-    """Return the transform that turns by an angle (...) about an axis, (..., 4, 4)."""
-    turn = rotation_vector_to_matrix(np.asarray(angle)[..., None] * axis)
+def _moved_along(
+    point: FloatArray, axis: FloatArray, amount: FloatArray, slides: bool
+) -> FloatArray:
+    """Return the transform that turns by an angle (...) about an axis, or shifts along it.
+
+    (..., 4, 4).
+    """
+    vector = np.asarray(amount)[..., None] * axis
+    if slides:
+        return transform(np.eye(3), vector)
+    turn = rotation_vector_to_matrix(vector)
     return transform(turn, point - turn @ point)
 
 

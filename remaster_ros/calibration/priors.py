@@ -21,6 +21,8 @@ from remaster_ros.types import BasePrior, FloatArray
 TIGHTEST_PRIOR = 1e-6
 # A mastering is off by tenths of a degree. This prior keeps an offset that the data leave open
 # from running away; one that they determine to 0.05 degrees it moves by 1 in 10,000 of its size.
+# Of a joint that slides it is as much as that at `LEVER_M`, 22 mm: a switch or stop that sets such
+# a zero is rarely off by more than a turn of the motor, some millimetres.
 OFFSET_STD = np.radians(5.0)
 # Standard deviation of a zero-offset's step beside effects, rad: a marker 1 m from the axis is
 # then 0.15 mm off the tangent, on which the effects were searched.
@@ -54,10 +56,11 @@ def marker_prior(model: Model, marker: int, nominal: FloatArray, std_m: float) -
 
 
 def offset_prior(model: Model, joint: int, mean: float, std: float) -> Prior:
-    """Return what is known of a joint's offset before, rad."""
+    """Return what is known of a joint's offset before, rad or m."""
     width = max(std, TIGHTEST_PRIOR)
+    shown = f'{1e3 * std:g} mm' if model.chain.slides[joint] else f'{np.degrees(std):g} deg'
     return Prior(
-        f'the prior on {model.chain.joint_names[joint]}, {np.degrees(std):g} deg',
+        f'the prior on {model.chain.joint_names[joint]}, {shown}',
         lambda x: (x[..., joint : joint + 1] - mean) / width,
     )
 
@@ -68,13 +71,15 @@ def plausible_offsets(model: Model, joints: Sequence[int]) -> Prior:
     Beside effects it is near the one that they were searched with.
     """
     which = list(joints)
-    effects = model.extension
+    effects, per_radian = model.extension, model.chain.per_radian[which]
     if effects is None or effects.joint_offsets is None:
+        std = OFFSET_STD * per_radian
+        also = f' or {1e3 * std.min():.0f} mm' if model.chain.slides[which].any() else ''
         return Prior(
-            f'the size of a mastering error, {np.degrees(OFFSET_STD):g} deg',
-            lambda x: x[..., which] / OFFSET_STD,
+            f'the size of a mastering error, {np.degrees(OFFSET_STD):g} deg{also}',
+            lambda x: x[..., which] / std,
         )
-    searched, width = effects.joint_offsets[which], effects.step_std
+    searched, width = effects.joint_offsets[which], effects.step_std * per_radian
     return Prior(
         'the zero-offsets that the effects were searched with',
         lambda x: (x[..., which] - searched) / width,

@@ -320,7 +320,7 @@ LARGEST_OFFSET = np.radians(5.0)
 # A marker where it was stated to be is that many times the stated std off in one of a million
 # sessions (square root of chi squared with three degrees of freedom).
 DISPLACED = 5.5
-# Of an unknown angle, uniform over the turn.
+# Of an unknown angle, uniform over the turn; an unknown length is as much at `LEVER_M`.
 UNKNOWN_STD = np.pi / np.sqrt(3.0)
 
 
@@ -509,14 +509,22 @@ class FitResult:
     def implausible(self) -> tuple[str, ...]:
         """A line for each joint whose offset is identifiable and too large for a mastering."""
         return tuple(
-            f'{joint}: an offset of {np.degrees(offset):.2f} degrees is more than a mastering is '
-            f'off by ({np.degrees(LARGEST_OFFSET):.0f}); before it is used, check joint order, '
+            f'{joint}: an offset of {amount} is more than a mastering is off by ({largest}); '
+            'before it is used, check joint order, '
             'signs and units of the session, and that the URDF is that of this arm'
-            for joint, offset, known in zip(
-                self.joint_names, self.joint_offsets, self.identifiable, strict=True
-            )
-            if known and abs(offset) > LARGEST_OFFSET
+            for joint, amount, largest in self._too_large()
         )
+
+    def _too_large(self) -> list[tuple[str, str, str]]:
+        """Return the joints whose known offset is too large, with it and the limit as text."""
+        limit, found = LARGEST_OFFSET * self.chain.per_radian, []
+        for i in np.flatnonzero(self.identifiable & (np.abs(self.joint_offsets) > limit)):
+            amount = f'{np.degrees(self.joint_offsets[i]):.2f} degrees'
+            largest = f'{np.degrees(LARGEST_OFFSET):.0f}'
+            if self.chain.slides[i]:
+                amount, largest = f'{1e3 * self.joint_offsets[i]:.1f} mm', f'{1e3 * limit[i]:.0f}'
+            found.append((self.joint_names[i], amount, largest))
+        return found
 
     @property
     def displaced_markers(self) -> tuple[str, ...]:
@@ -644,9 +652,10 @@ def build_result(
     flat = z.reshape(-1, model.size)
     x_after = model.natural(sampled.z_mean)
     predicted_after = predicted_rows(problem, model, sampled.z_mean)
-    mean, std, interval = _offset_summary(flat[:, : model.joints], unfixed, sampled.taken_as_known)
+    held = np.where(unfixed, model.chain.per_radian, 0.0)
+    mean, std, interval = _offset_summary(flat[:, : model.joints], held, sampled.taken_as_known)
     std_by_data = _offset_summary(
-        by_data.z[..., : model.joints].reshape(-1, model.joints), unfixed, sampled.taken_as_known
+        by_data.z[..., : model.joints].reshape(-1, model.joints), held, sampled.taken_as_known
     )[1]
     T_R_N, markers = model.T_R_N(x_after), model.markers(x_after)
     x_draws = model.natural(flat)
@@ -679,7 +688,7 @@ def build_result(
                 # One of the two is wrong, and nothing tells which.
                 robust = np.hypot(robust, tell.shift)
             widening = np.where(unfixed, 1.0, np.maximum(1.0, robust / std))
-    identifiable, why = known_offsets(gauge.why, std_by_data, widening * std)
+    identifiable, why = known_offsets(problem.chain, gauge.why, std_by_data, widening * std)
     noise = posterior.noise(sampled.eta)
     noises = noise_estimates(posterior, noise)
     total_noise = posterior.noise_model.total_noise(noise)
@@ -781,12 +790,14 @@ def _orientations(
 
 
 def _offset_summary(
-    draws: FloatArray, unfixed: BoolArray, taken_as_known: FloatArray
+    draws: FloatArray, held: FloatArray, taken_as_known: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return mean (k,), std (k,) and 95 % interval (k, 2) of offsets (n, k), rad.
+    """Return mean (k,), std (k,) and 95 % interval (k, 2) of offsets (n, k), rad or m.
 
-    Of joints that are not identifiable, where ``unfixed`` is true, 0 and those of the whole turn.
+    Of joints that are not identifiable, where ``held`` is what counts as a radian and not 0, they
+    are 0 and those of the whole turn.
     """
+    unfixed = held > 0.0
     mean = draws.mean(axis=0)
     std = np.hypot(draws.std(axis=0, ddof=1), taken_as_known)
     interval = np.quantile(draws, (0.025, 0.975), axis=0).T
@@ -795,6 +806,6 @@ def _offset_summary(
     interval = mean[:, None] + half * (-1.0, 1.0)
     return (
         np.where(unfixed, 0.0, mean),
-        np.where(unfixed, UNKNOWN_STD, std),
-        np.where(unfixed[:, None], (-np.pi, np.pi), interval),
+        np.where(unfixed, UNKNOWN_STD * held, std),
+        np.where(unfixed[:, None], np.outer(held, (-np.pi, np.pi)), interval),
     )

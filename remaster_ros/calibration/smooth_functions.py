@@ -98,11 +98,19 @@ def _polynomials(seconds: FloatArray, degree: int) -> FloatArray:
 
 
 def of_joint_angles(mode: Mode, rows: Rows, harmonics: int = HARMONICS) -> FloatArray:
-    """Return what an error of each joint by its own angle does, (n, 3, 2 harmonics k)."""
-    by_joints = mode.linearisation.posterior.model.inner_pose(mode.z, rows).by_joints
+    """Return what an error of each joint by its own angle does, (n, 3, 2 harmonics k).
+
+    Of a joint that slides half a turn stands for the travel that was measured: a sine of its place
+    is then as smooth as one of an angle.
+    """
+    model = mode.linearisation.posterior.model
+    by_joints = model.inner_pose(mode.z, rows).by_joints
+    least, most = rows.q.min(axis=0), rows.q.max(axis=0)
+    travelled = np.pi * (rows.q - 0.5 * (least + most)) / np.maximum(most - least, 1e-9)
+    angles = np.where(model.chain.slides, travelled, rows.q)
     return np.concatenate(
         [
-            by_joints * wave(order * rows.q)[:, None, :]
+            by_joints * wave(order * angles)[:, None, :]
             for order in range(1, harmonics + 1)
             for wave in (np.sin, np.cos)
         ],

@@ -132,14 +132,20 @@ def summary(result: FitResult) -> str:
     from remaster_ros.reports.judgement import verdict
 
     lines = []
-    for joint, mean, std, seen, why in zip(
+    for joint, mean, std, slides, seen, why in zip(
         result.joint_names,
-        np.rad2deg(result.joint_offsets),
-        np.rad2deg(result.joint_offsets_std),
+        result.joint_offsets,
+        result.joint_offsets_std,
+        result.chain.slides,
         result.identifiable,
         result.why,
     ):
-        value = f'{mean:+9.4f} ± {std:.4f} deg' if seen else f'   not identifiable: {why}'
+        if not seen:
+            value = f'   not identifiable: {why}'
+        elif slides:
+            value = f'{1e3 * mean:+9.4f} ± {1e3 * std:.4f} mm'
+        else:
+            value = f'{np.rad2deg(mean):+9.4f} ± {np.rad2deg(std):.4f} deg'
         lines.append(f'{joint:12s} {value}')
     for split, metrics in result.accuracy.items():
         if metrics is None:
@@ -157,6 +163,11 @@ def summary(result: FitResult) -> str:
     judged = verdict(result)
     lines += [judged.headline, *judged.points]
     lines += geometry_lines(result)
+    if result.chain.slides.any():
+        lines.append(
+            'of an arm with a joint that slides neither lengths and tilts off their drawing nor '
+            'other causes are looked for, and there is no compensation.json'
+        )
     if not result.session.timed:
         lines.append('the session has no times: nothing that changes with time can be seen')
     if result.left_out:

@@ -323,7 +323,12 @@ def _mend(args: argparse.Namespace) -> int:
     if args.points and points not in ([*'xyz'], [*'yxz'], ['y_m', 'x_m', 'z_m']):
         raise InputError('--points: of a session X and Y can be exchanged; give y_m,x_m,z_m')
     session = read_session(folder, within_limits=False)
-    chain = SerialChain.from_urdf(session.urdf, session.base_link, session.tip_link)
+    chain = SerialChain.from_urdf(session.urdf, session.base_link, session.tip_link, sliding=True)
+    for joint in np.flatnonzero(chain.slides)[:1]:
+        raise InputError(
+            f"{folder}: joint '{chain.joint_names[joint]}' slides, and a session of such an arm "
+            'is not mended: correct its table and import that'
+        )
     told = Mending(
         order=args.joints,
         couple=args.couple,

@@ -52,7 +52,7 @@ class ZeroOffsets:
     urdf, chain
         The nominal robot, text and joints.
     joint_offsets, std
-        rad, (k,).
+        rad, m of joints that slide, (k,).
     identifiable
         Whether the data determine each, (k,); the others are not applied.
     why
@@ -88,7 +88,7 @@ class ZeroOffsets:
 
     @property
     def applied(self) -> FloatArray:
-        """What is applied, rad, (k,): 0 where the data determine nothing."""
+        """What is applied, rad or m, (k,): 0 where the data determine nothing."""
         return np.where(self.identifiable, self.joint_offsets, 0.0)
 
     @property
@@ -162,7 +162,11 @@ def remaster_text(
     left_out, checks = offsets.left_out, offsets.check_first
     notes = [f'  {joint}: {why}' for joint, why in left_out.items()]
     words = [] if offsets.controller is None else pad_in_words(offsets.controller)
-    way = _PLAIN if plain else _PAD
+    way: tuple[str, ...] = _PLAIN if plain else _PAD
+    slides = bool(offsets.chain.slides.any())
+    if slides:
+        way = tuple(line.replace('the angle', 'the value') for line in way)
+        way = tuple(line.replace('the same angle', 'the same amount') for line in way)
     where = 'Left out' if alone else 'Left out of all three'
     urdf_sha256 = hashlib.sha256(offsets.urdf.encode()).hexdigest()
     return '\n'.join(
@@ -172,6 +176,8 @@ def remaster_text(
             '',
             *checks,
             *(('',) if checks else ()),
+            *(('The true joint position is the reported one plus the offset; of joints that slide',
+               'all is in mm.', '') if slides else ()),
             *(('The true joint angle is the reported one plus the offset. Use no other form of',
                'this correction beside it.',
                '',
@@ -198,8 +204,11 @@ def remaster_text(
                'description.')
               if words else ()),
             '',
-            'Afterwards measure ten new poses and run "remaster verify": it shows whether the',
-            'offsets are in use, once.',
+            *(('Afterwards measure ten new poses, import and fit them with the robot model that',
+               'is then in use: the offsets must be zero within their intervals. "remaster',
+               'verify" does not take an arm with a joint that slides.') if slides else
+              ('Afterwards measure ten new poses and run "remaster verify": it shows whether the',
+               'offsets are in use, once.')),
             '',
         ]
     )  # fmt: skip
@@ -218,12 +227,19 @@ _PAD = (
 
 def _plain_rows(steps: Sequence[MasteringStep]) -> list[str]:
     """Return the table of joints that the pad has as the URDF has them."""
-    rows = [f'  {"joint":<20} {"offset, deg":>12} {"std, deg":>10} {"drive to, deg":>16}']
-    for step in steps:
+    rows = []
+    for unit in ('deg', 'mm'):
+        own = [step for step in steps if step.unit == unit]
+        if not own:
+            continue
         rows.append(
-            f'  {step.joint:<20} {step.offset_deg:>+12.4f} {step.std_deg:>10.4f} '
-            f'{step.drive_to:>+16.4f}'
+            f'  {"joint":<20} {f"offset, {unit}":>12} {f"std, {unit}":>10} '
+            f'{f"drive to, {unit}":>16}'
         )
+        rows += [
+            f'  {step.joint:<20} {step.offset:>+12.4f} {step.std:>10.4f} {step.drive_to:>+16.4f}'
+            for step in own
+        ]
     return rows
 
 
@@ -232,8 +248,11 @@ def _pad_rows(groups: Sequence[Sequence[MasteringStep]]) -> list[str]:
     steps = [step for group in groups for step in group]
     wide = max(len('on the pad'), *(len(step.pad_name) for step in steps))
     long = max(len('in the URDF'), *(len(step.joint) for step in steps))
+    # The units stand with the numbers where they are not all degrees.
+    mixed = any(step.slides for step in steps)
+    heads = ('offset', 'std') if mixed else ('offset, deg', 'std, deg')
     rows = [
-        f'  {"on the pad":<{wide}}  {"in the URDF":<{long}}  {"offset, deg":>11}  {"std, deg":>8}'
+        f'  {"on the pad":<{wide}}  {"in the URDF":<{long}}  {heads[0]:>11}  {heads[1]:>8}'
         f'  {"drive to":>16}  {"set to":>16}'
     ]
     for group in groups:
@@ -246,14 +265,15 @@ def _pad_rows(groups: Sequence[Sequence[MasteringStep]]) -> list[str]:
                 'shows of the next.',
             ]
         for step in group:
-            offset = f'{step.offset_deg:+.4f}' if step.determined else 'unknown'
-            std = f'{step.std_deg:.4f}' if step.determined else '-'
+            unit = '' if not mixed else ' mm' if step.slides else ' deg'
+            offset = f'{step.offset:+.4f}{unit}' if step.determined else 'unknown'
+            std = f'{step.std:.4f}{unit}' if step.determined else '-'
             places = [f'{step.shown(v)} {step.unit}' for v in (step.drive_to, step.set_to)]
             rows.append(
                 f'  {step.pad_name:<{wide}}  {step.joint:<{long}}  {offset:>11}  {std:>8}'
                 f'  {places[0]:>16}  {places[1]:>16}'
             )
-            if step.unit != 'deg':
+            if step.unit not in ('deg', 'mm'):
                 degrees = [f'{step.in_degrees(v):+.4f}' for v in (step.drive_to, step.set_to)]
                 rows.append(f'    ({step.pad_name} in degrees: {degrees[0]}, set to {degrees[1]})')
             if not step.determined:
@@ -261,19 +281,27 @@ def _pad_rows(groups: Sequence[Sequence[MasteringStep]]) -> list[str]:
                     f'    ({step.joint} keeps its zero in the URDF; what the pad shows goes with '
                     'the joint that it is coupled to)'
                 )
-    others = [step for step in steps if step.set_to != 0.0]
+    others = [step for step in steps if step.set_to != 0.0 and not step.slides]
     if others:
         rows += [
             '  Where the controller sets nothing but 0, drive instead to',
             *(f'    {step.pad_name}: {step.to_set_zero} {step.unit}' for step in others),
         ]
+    rows += [
+        f'  {step.pad_name}: its zero is beyond its limits; a controller that sets nothing but 0 '
+        'cannot take its offset: use way 2 or 3.'
+        for step in steps
+        if step.slides and step.set_to != 0.0
+    ]
     return rows
 
 
 def layer_text(offsets: ZeroOffsets, remarks: Sequence[str] = ()) -> str:
     """Return the offsets as a ROS 2 parameter file for an offset layer."""
+    slides = bool(offsets.chain.slides.any())
     head = (
-        '# Joint zero-offsets, rad. A layer between planner and controller:\n'
+        f'# Joint zero-offsets, rad{", m of joints that slide" if slides else ""}. '
+        'A layer between planner and controller:\n'
         '#   command to the controller = planned angle - offset\n'
         '#   angle to the planner      = reported angle + offset\n'
         "# Shift the joint limits as well: the controller's limits apply to its own angles.\n"
@@ -304,10 +332,11 @@ def calibrated_urdf(
 ) -> str:
     """Return the URDF whose kinematics at reported angles is that of the true ones.
 
-    Each joint's origin is turned by its offset about its axis, and its limits are shifted the
-    other way, so that they still stop the arm in the same places. A joint that mimics one of them
-    follows the true angle. What names the joints elsewhere (``<transmission>``,
-    ``<ros2_control>``, ``<gazebo>``) means reported angles and stays as it is.
+    Each joint's origin is turned by its offset about its axis, or shifted along it where the
+    joint slides, and its limits are shifted the other way, so that they still stop the arm in the
+    same places. A joint that mimics one of them follows the true angle. What names the joints
+    elsewhere (``<transmission>``, ``<ros2_control>``, ``<gazebo>``) means reported angles and
+    stays as it is.
 
     Parameters
     ----------
@@ -316,7 +345,7 @@ def calibrated_urdf(
     chain
         Its joints.
     joint_offsets
-        rad, (k,).
+        rad, m of joints that slide, (k,).
     notes
         Further comments in the file, such as the joints left out.
     geometry
@@ -341,13 +370,17 @@ def calibrated_urdf(
         rpy = [float(angle) for angle in origin.get('rpy', '0 0 0').split()]
         drawn = matrix_from_rpy(rpy)
         turned = drawn @ rotation_vector_to_matrix(turn)
-        turned = turned @ rotation_vector_to_matrix(offset * axis)
+        along = np.zeros(3)
+        if chain.slides[i]:
+            along = turned @ (offset * axis)
+        else:
+            turned = turned @ rotation_vector_to_matrix(offset * axis)
         origin.set('rpy', ' '.join(repr(angle) for angle in rpy_of(turned)))
-        if np.any(shift):
+        if np.any(shift) or np.any(along):
             # From the link that the joint before moves, through fixed joints, to the parent link.
             to_parent = drawn @ chain.T_fixed[i][:3, :3].T
             xyz = [float(value) for value in origin.get('xyz', '0 0 0').split()]
-            origin.set('xyz', ' '.join(repr(float(v)) for v in xyz + to_parent @ shift))
+            origin.set('xyz', ' '.join(repr(float(v)) for v in xyz + to_parent @ shift + along))
         for tag, keys in _LIMITS.items():
             for element in joint.findall(tag):
                 for key in keys.intersection(element.keys()):

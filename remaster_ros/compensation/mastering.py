@@ -11,18 +11,22 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
+from remaster_ros.errors import InputError
 from remaster_ros.kinematics.pad_angles import PadAngles
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.types import AngleUnit, BoolArray, Controller, FloatArray, PadJoint
 
 # As in `importing.units`; of digits so many that rounding is less than 0.0001 degrees.
 _PER_RAD = {'deg': 180.0 / np.pi, 'rad': 1.0, 'gon': 200.0 / np.pi}
-_DIGITS = {'deg': 4, 'rad': 6, 'gon': 4}
-# Where the URDF's zero is out of reach the place is one of whole so many degrees.
+_DIGITS = {'deg': 4, 'rad': 6, 'gon': 4, 'mm': 3}
+_MM_PER_M = 1e3
+# Where the URDF's zero is out of reach the place is one of whole so many degrees, or mm.
 _STEP_DEG = 10.0
+_STEP_MM = 10.0
 
 
 @dataclass(frozen=True)
@@ -34,23 +38,28 @@ class MasteringStep:
     joint, pad_name
         Its name in the URDF and on the pad.
     unit
-        Of what the pad shows.
+        Of what the pad shows; mm of a joint that slides.
     determined
         False where the joint's own zero stays, and what the pad shows changes with another joint.
-    offset_deg, std_deg
-        Of the URDF's joint.
+    offset, std
+        Of the URDF's joint, in degrees; in mm of a joint that slides.
     drive_to, set_to
         What the pad shows in the place in which it is set, before and after, in `unit`.
     """
 
     joint: str
     pad_name: str
-    unit: AngleUnit
+    unit: AngleUnit | Literal['mm']
     determined: bool
-    offset_deg: float
-    std_deg: float
+    offset: float
+    std: float
     drive_to: float
     set_to: float
+
+    @property
+    def slides(self) -> bool:
+        """Whether it is of a joint that slides."""
+        return self.unit == 'mm'
 
     @property
     def digits(self) -> int:
@@ -63,12 +72,14 @@ class MasteringStep:
 
     def in_degrees(self, value: float) -> float:
         """Return an angle of the pad's unit in degrees."""
+        if self.unit == 'mm':
+            raise ValueError(f'{self.joint} slides: {value} mm is no angle')
         return float(np.degrees(value / _PER_RAD[self.unit]))
 
     @property
     def is_plain(self) -> bool:
         """Whether the pad has the URDF's name and degrees, and it is set where it is to show 0."""
-        return self.pad_name == self.joint and self.unit == 'deg' and self.set_to == 0.0
+        return self.pad_name == self.joint and self.unit in ('deg', 'mm') and self.set_to == 0.0
 
     @property
     def to_set_zero(self) -> str:
@@ -92,7 +103,7 @@ def mastering(
     chain
         The k joints of the URDF.
     offsets, std
-        Zero-offsets of the URDF's joints, rad, (k,).
+        Zero-offsets of the URDF's joints, rad, m of joints that slide, (k,).
     known
         Whether the data determine them, (k,); the others stay as they are.
     """
@@ -106,16 +117,26 @@ def mastering(
     def step(i: int) -> MasteringStep:
         name = chain.joint_names[i]
         shown = joints.get(name, PadJoint(name))
-        per_rad, digits = _PER_RAD[shown.unit], _DIGITS[shown.unit]
+        # Of another one that is coupled to it as well.
+        told = shown.coupling or shown.sign != 1 or shown.zero_deg or change[i] != applied[i]
+        if chain.slides[i] and told:
+            raise InputError(
+                f"joint '{name}' slides, and the session's controller has a sign, a zero or a "
+                'coupling of it, which are of angles: take that joint out of controller'
+            )
+        unit: AngleUnit | Literal['mm'] = 'mm' if chain.slides[i] else shown.unit
+        per_rad = _MM_PER_M if unit == 'mm' else _PER_RAD[unit]
+        to_shown = _MM_PER_M if unit == 'mm' else 180.0 / np.pi
+        digits = _DIGITS[unit]
         # What is set is rounded first: the difference is what counts.
         set_to = round(per_rad * float(after[i]), digits)
         return MasteringStep(
             name,
             shown.name,
-            shown.unit,
+            unit,
             bool(known[i]),
-            float(np.degrees(offsets[i])),
-            float(np.degrees(std[i])),
+            float(to_shown * offsets[i]),
+            float(to_shown * std[i]),
             round(set_to + per_rad * float(before[i] - after[i]), digits) + 0.0,
             set_to + 0.0,
         )
@@ -126,9 +147,10 @@ def mastering(
 
 
 def _places(chain: SerialChain, offsets: FloatArray) -> FloatArray:
-    """Return true angles at which the joints are set, rad, (k,): 0 where they can be there."""
-    lower, upper = np.maximum(chain.lower, -np.pi), np.minimum(chain.upper, np.pi)
-    step = np.radians(_STEP_DEG)
+    """Return true places at which the joints are set, rad or m, (k,): 0 where they can be."""
+    turn = np.where(chain.slides, np.inf, np.pi)
+    lower, upper = np.maximum(chain.lower, -turn), np.minimum(chain.upper, turn)
+    step = np.where(chain.slides, _STEP_MM / _MM_PER_M, np.radians(_STEP_DEG))
     middle = step * np.round(0.5 * (lower + upper) / step)
     # There the joint reports 0 less its offset.
     reached = (lower <= -np.abs(offsets)) & (np.abs(offsets) <= upper)

@@ -16,7 +16,7 @@ from remaster_ros.errors import InputError
 from remaster_ros.importing.rows import RawRows
 from remaster_ros.importing.units import split_unit
 from remaster_ros.kinematics.pad_angles import PadAngles, coupled_in_circle
-from remaster_ros.kinematics.serial_chain import LIMIT_TOLERANCE_RAD, SerialChain
+from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.types import (
     AngleUnit,
     BoolArray,
@@ -85,7 +85,15 @@ def controller_of(rows: RawRows, chain: SerialChain, options: SessionOptions) ->
     InputError
         A joint that is not there, or one that is coupled to itself.
     """
-    if rows.angle_unit is None and not (options.couple or options.reverse or options.add_deg):
+    told = options.couple or options.reverse or options.add_deg
+    if chain.slides.any():
+        if told:
+            raise InputError(
+                '--couple, --reverse and --offset are for arms whose joints all turn; '
+                f"'{chain.joint_names[int(np.argmax(chain.slides))]}' slides: correct the table"
+            )
+        return None
+    if rows.angle_unit is None and not told:
         return None
     unit: AngleUnit = rows.angle_unit or 'rad'
     names = [split_unit(name)[0] or name for name in rows.joint_columns]
@@ -205,7 +213,7 @@ def as_counted(
     A description may have the coupling already: then the points fit without it.
     """
     coupling = tuple(rows.coupling.items())
-    if options.couple or not coupling:
+    if options.couple or not coupling or chain.slides.any():
         return options, []
     coupled = replace(options, couple=coupling)
     q = [
@@ -251,9 +259,18 @@ def refuse_outside_limits(rows: RawRows, chain: SerialChain, q: FloatArray) -> N
     InputError
         One line for the first such row.
     """
-    outside = (q < chain.lower - LIMIT_TOLERANCE_RAD) | (q > chain.upper + LIMIT_TOLERANCE_RAD)
+    allowed = chain.limit_tolerance
+    outside = (q < chain.lower - allowed) | (q > chain.upper + allowed)
     for row, joint in np.argwhere(outside)[:1]:
         count = int(outside[:, joint].sum())
+        if chain.slides[joint]:
+            raise InputError(
+                f'{rows.where[row]}, column {rows.joint_columns[joint]}: '
+                f'{1e3 * q[row, joint]:.2f} mm is outside the limits of '
+                f'{chain.joint_names[joint]} ({1e3 * chain.lower[joint]:.1f} to '
+                f'{1e3 * chain.upper[joint]:.1f} mm), as {count} of {len(q)} rows are; are its '
+                'unit (in the header, such as [mm]) and the URDF right?'
+            )
         raise InputError(
             f'{rows.where[row]}, column {rows.joint_columns[joint]}: '
             f'{np.degrees(q[row, joint]):.3f} degrees is outside the limits of '

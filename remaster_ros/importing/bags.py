@@ -23,6 +23,7 @@ from remaster_ros.importing.standstills import (
     match,
     point_standstills,
     reading_of,
+    refuse_sliding,
 )
 from remaster_ros.importing.units import LENGTHS
 from remaster_ros.kinematics.serial_chain import SerialChain
@@ -79,6 +80,7 @@ def read_bag(
     InputError
         No such topics, no standstill with a point in it, or a damaged bag.
     """
+    refuse_sliding(chain, path)
     joints: dict[str, _Topic] = defaultdict(_Topic)
     points: dict[str, _Topic] = defaultdict(_Topic)
     seen: dict[str, str] = {}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from itertools import chain as flat
 
@@ -141,13 +141,20 @@ class Told:
     names: str = ''
 
 
-def find_columns(table: TextTable, joint_names: Sequence[str], told: Told = Told()) -> Columns:
+def find_columns(
+    table: TextTable,
+    joint_names: Sequence[str],
+    told: Told = Told(),
+    sliding: Collection[int] = (),
+) -> Columns:
     """Find out what the columns of a table are.
 
     Parameters
     ----------
     joint_names
         Of the robot; a header that holds one of them is that joint's.
+    sliding
+        Indices of those whose columns hold lengths.
 
     Raises
     ------
@@ -166,7 +173,7 @@ def find_columns(table: TextTable, joint_names: Sequence[str], told: Told = Told
         return _by_place(table, found, len(joint_names))
     taken = set(found.why)
     if not found.joints:
-        found.joints = _joints(table, headers, joint_names, taken, found)
+        found.joints = _joints(table, headers, joint_names, sliding, taken, found)
     if not found.points:
         found.points = _points(table, headers, taken, found)
     _orientations(headers, taken, found)
@@ -240,6 +247,7 @@ def _joints(
     table: TextTable,
     headers: Sequence[_Header],
     joint_names: Sequence[str],
+    sliding: Collection[int],
     taken: set[int],
     found: Columns,
 ) -> tuple[int, ...]:
@@ -250,9 +258,12 @@ def _joints(
     for named in schemes:
         groups: dict[tuple[str, ...], dict[int, int]] = defaultdict(dict)
         for i, header in enumerate(headers):
-            if i in taken or (header.unit and header.unit not in ANGLES):
+            if i in taken:
                 continue
             number, stem = _joint_of(header.words, named)
+            slides = number is not None and number - 1 in sliding
+            if header.unit and header.unit not in (LENGTHS if slides else ANGLES):
+                continue
             # `x1 y1 z1 x2 …` are points.
             if number is not None and not set(stem) & {*AXES}:
                 groups[stem].setdefault(number, i)

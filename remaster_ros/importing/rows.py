@@ -19,7 +19,7 @@ from remaster_ros.importing.streams import stopped
 from remaster_ros.importing.text_table import TABLE_LIMIT, TextTable, decode, read_table
 from remaster_ros.importing.units import ANGLES, LENGTHS
 from remaster_ros.importing.values import (
-    angle_unit,
+    joint_values,
     labels,
     length_unit,
     numbers,
@@ -341,8 +341,14 @@ def read_rows(paths: Sequence[Path], chain: SerialChain, options: TableOptions) 
         _visited(table, programs[table.path]) if table.path in programs else table
         for table in tables
     ]
+    sliding = np.flatnonzero(chain.slides).tolist()
     found = [
-        (table, find_columns(table, chain.joint_names, _of_file(options.told, table.path, paths)))
+        (
+            table,
+            find_columns(
+                table, chain.joint_names, _of_file(options.told, table.path, paths), sliding
+            ),
+        )
         for table in tables
     ]
     _refuse_untold(found, options.told)
@@ -415,8 +421,8 @@ def _values(
     warnings: tuple[str, ...],
 ) -> RawRows:
     table, columns = points
-    angle, how_angle = angle_unit(*joints, options.angles)
-    q = numbers(joints[0], joints[1].joints) * ANGLES[angle]
+    q, units, scale = joint_values(*joints, chain, options.angles)
+    angle = next((unit for unit, _ in units if unit in ANGLES), None)
     several = len(columns.points) > 1
     raw = np.array([numbers(table, own, several) for own in columns.points.values()])
     _refuse_part_of_a_point(table, columns, raw)
@@ -435,7 +441,7 @@ def _values(
     n, k = q.shape
     from_q = np.full((n, k), np.nan)
     if len(joints[1].from_joints) == k:
-        from_q = numbers(joints[0], joints[1].from_joints, optional=True) * ANGLES[angle]
+        from_q = numbers(joints[0], joints[1].from_joints, optional=True) * scale
     std = np.full((len(names), n, 3), np.nan)
     turns = np.full((len(names), n, 4), np.nan)
     for i, name in enumerate(names):
@@ -468,7 +474,7 @@ def _values(
                 i,
                 found if is_joints else replace(found, joints=(), from_joints=()),
                 chain,
-                f'{angle} ({how_angle})',
+                tuple(f'{unit} ({how})' for unit, how in units),
                 f'{length} ({how_length})' if is_points else '',
             )
             meanings[f'{prefix}{name}'] = meaning
@@ -486,7 +492,7 @@ def _values(
         columns=meanings,
         description=description,
         warnings=warnings,
-        angle_unit=cast(AngleUnit, angle),
+        angle_unit=cast(AngleUnit | None, angle),
         reading=row if several else None,
         orientation=turns[marker, row] if columns.orientations else None,
         coupling=joints[0].coupling,
@@ -552,14 +558,17 @@ def _optional(points: tuple[TextTable, Columns], kind: str) -> FloatArray:
     return numbers(points[0], (column,), optional=True)[:, 0]
 
 
-def _meaning(i: int, columns: Columns, chain: SerialChain, angle: str, length: str) -> str:
+def _meaning(
+    i: int, columns: Columns, chain: SerialChain, units: Sequence[str], length: str
+) -> str:
     """Return what a column was taken for."""
     how = columns.why.get(i, '')
     by_place = ', by its place' if how == 'place' else ', as told' if how == 'told' else ''
     for kind, joints in (('', columns.joints), ('coming from, ', columns.from_joints)):
         if i in joints:
             joint = joints.index(i)
-            return f'{kind}joint {joint + 1} ({chain.joint_names[joint]}), {angle}{by_place}'
+            name, unit = chain.joint_names[joint], units[joint]
+            return f'{kind}joint {joint + 1} ({name}), {unit}{by_place}'
     for marker, own in columns.points.items():
         of = f'marker {marker}' if marker else 'the marker'
         spread, turned = columns.stds.get(marker, ()), columns.orientations.get(marker, ())

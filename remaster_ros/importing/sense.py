@@ -33,7 +33,7 @@ from remaster_ros.errors import InsufficientDataError
 from remaster_ros.importing.rows import RawRows
 from remaster_ros.importing.units import split_unit
 from remaster_ros.kinematics.serial_chain import SerialChain
-from remaster_ros.types import Session
+from remaster_ros.types import FloatArray, Session
 
 # Angles that agree so well are one configuration, measured again: a pendant's last digits.
 SAME_JOINTS_RAD = 1e-3
@@ -81,7 +81,7 @@ def check_sense(session: Session, rows: RawRows, progress: Callable[[str, float]
     """
     # The marker is left free: one that is firm at a wrong place would bend the fit.
     part = replace(session, marker_std_m=UNKNOWN_MARKER_STD_M)
-    chain = SerialChain.from_urdf(session.urdf, session.base_link, session.tip_link)
+    chain = SerialChain.from_urdf(session.urdf, session.base_link, session.tip_link, sliding=True)
     if too_few := _too_few(session, len(chain)):
         return Sense(False, too_few)
     progress('trying', 0.1)
@@ -97,7 +97,7 @@ def check_sense(session: Session, rows: RawRows, progress: Callable[[str, float]
         return Sense(
             True,
             f'the robot fits to {without} (median), with zero-offsets of up to '
-            f'{np.degrees(np.abs(as_given.joint_offsets).max()):.2f} degrees',
+            f'{_largest(as_given.joint_offsets, chain)}',
             error_m=as_given.error_m,
             rows_off=beside,
             warning=f'{_few_words(beside, rows)}; correct these rows or remove them'
@@ -130,7 +130,18 @@ def check_sense(session: Session, rows: RawRows, progress: Callable[[str, float]
             error_m=as_given.error_m,
         )
     measured = session.measurements.orientation is not None and not session.on_tool
-    return _nothing_found(as_given, without, measured)
+    return _nothing_found(as_given, without, chain, measured)
+
+
+def _largest(offsets: FloatArray, chain: SerialChain) -> str:
+    """Return the largest angle, and the largest length where a joint slides, of offsets (k,)."""
+    sizes, slides = np.abs(offsets), chain.slides
+    parts = []
+    if not slides.all():
+        parts.append(f'{np.degrees(sizes[~slides].max()):.2f} degrees')
+    if slides.any():
+        parts.append(f'{1e3 * sizes[slides].max():.1f} mm')
+    return ' and '.join(parts)
 
 
 def _too_few(session: Session, joints: int) -> str:
@@ -231,8 +242,18 @@ def _many_off(given: Fitted, beside: tuple[tuple[str, float], ...], rows: RawRow
 ON_TOOL = '; poses that a camera on the tool has of a board that stands need --on-tool'
 
 
-def _nothing_found(given: Fitted, without: str, oriented: bool) -> Sense:
-    worst = int(np.argmax(np.abs(given.joint_offsets)))
+def _nothing_found(given: Fitted, without: str, chain: SerialChain, oriented: bool) -> Sense:
+    equal = np.abs(given.joint_offsets) / given.per_radian
+    worst = int(np.argmax(equal))
+    if chain.slides.any():
+        off = f', joint {worst + 1} by {chain.shown_offset(worst, given.joint_offsets[worst], 1)}'
+        return Sense(
+            False,
+            f'the data fit to {without} only, with zero-offsets{off}; check units, signs and '
+            'order of the joints (where a joint slides other mistakes are not looked for), that '
+            'the URDF is that of this arm, and that each point stands beside its own joints',
+            error_m=given.error_m,
+        )
     angle = given.joint_offsets[worst]
     if given.error_m < 5e-3 and abs(angle) > GROSS_OFFSET_RAD:
         return Sense(

@@ -15,6 +15,7 @@ import numpy as np
 
 from remaster_ros.collection.pairing import SensorRules, are_too_many, of_the_marker
 from remaster_ros.errors import InputError
+from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.motion.settling import SettleRules
 from remaster_ros.types import BoolArray, FloatArray, IntArray
 
@@ -44,6 +45,22 @@ _FEWEST_FOR_ROBOT = 11
 _LARGEST_ERROR = 0.15
 # An offset that explains a tenth fewer standstills is as good: some are lost in either stream.
 _ALIKE = 0.9
+
+
+def refuse_sliding(chain: SerialChain, path: object) -> None:
+    """Refuse an arm with a joint that slides: its standstills are judged by angles.
+
+    Raises
+    ------
+    InputError
+        Naming the stream's file and the joint.
+    """
+    for joint in np.flatnonzero(chain.slides)[:1]:
+        raise InputError(
+            f"{path}: it is a stream, and joint '{chain.joint_names[joint]}' slides; standstills "
+            'are found for arms whose joints all turn: give a table with one row for each '
+            'configuration'
+        )
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,6 +20,7 @@ from remaster_ros.importing.standstills import (
     match,
     point_standstills,
     reading_of,
+    refuse_sliding,
     some,
 )
 from remaster_ros.importing.text_table import TextTable
@@ -76,6 +77,7 @@ def stopped(
     when = reported if same else times(*points)
     if when is None:
         return None
+    refuse_sliding(chain, joints[0].path)
     unit = ANGLES[angle_unit(*joints, angles)[0]]
     q = Stream.of(reported, unit * numbers(joints[0], joints[1].joints, optional=True))
     still = joint_standstills(q, FEWEST_REPORTS)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import warnings
+from dataclasses import replace
 from datetime import datetime
 
 import numpy as np
@@ -11,7 +12,8 @@ import numpy as np
 from remaster_ros.errors import InputError
 from remaster_ros.importing.columns import Columns
 from remaster_ros.importing.text_table import TextTable, parse_number
-from remaster_ros.importing.units import LENGTHS, TIMES, unit_of
+from remaster_ros.importing.units import ANGLES, LENGTHS, TIMES, unit_of
+from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.types import FARTHEST_M, FloatArray
 
 _UNIT_LINE = re.compile(
@@ -62,6 +64,62 @@ def angle_unit(table: TextTable, columns: Columns, told: str) -> tuple[str, str]
         return units.pop(), 'header'
     largest = np.abs(numbers(table, columns.joints)).max(initial=0.0)
     return ('rad', 'guessed') if largest < _LARGEST_RAD else ('deg', 'guessed')
+
+
+def joint_values(
+    table: TextTable, columns: Columns, chain: SerialChain, told: str
+) -> tuple[FloatArray, tuple[tuple[str, str], ...], FloatArray]:
+    """Return the joints' positions, (n, k), rad or m, with unit and source of each, k, and scale.
+
+    The unit of a joint that slides is in its header. Else it is m where all values are within
+    the joint's limits then, and mm where they are within them as that.
+
+    Parameters
+    ----------
+    told
+        The unit of the angles.
+
+    Raises
+    ------
+    InputError
+        Angles in several units, or a joint that slides of which neither header nor limits tell it.
+    """
+    values = numbers(table, columns.joints)
+    turning = tuple(i for i, slides in zip(columns.joints, chain.slides) if not slides)
+    angle = angle_unit(table, replace(columns, joints=turning), told)
+    units = []
+    for joint, column in enumerate(columns.joints):
+        if not chain.slides[joint]:
+            units.append(angle)
+            continue
+        if unit := columns.units.get(column, ''):
+            if unit not in LENGTHS:
+                raise InputError(
+                    f"{table.path}, column {table.names[column]}: joint '"
+                    f"{chain.joint_names[joint]}' slides, and the header has {unit}; write its "
+                    'unit of length, such as [mm]'
+                )
+            units.append((unit, 'header'))
+            continue
+        low, high = chain.lower[joint], chain.upper[joint]
+        allowed = chain.limit_tolerance[joint]
+        fitting = [
+            unit
+            for unit in ('m', 'mm')
+            if np.all(LENGTHS[unit] * values[:, joint] >= low - allowed)
+            and np.all(LENGTHS[unit] * values[:, joint] <= high + allowed)
+        ]
+        # What is within the limits in metres is so in mm as well, if the limits hold 0: all of it
+        # within a thousandth of them.
+        if not fitting:
+            raise InputError(
+                f"{table.path}, column {table.names[column]}: joint '{chain.joint_names[joint]}' "
+                f'slides from {low:g} to {high:g} m, and neither as m nor as mm are all values '
+                'there; write the unit into the header, such as [mm], or correct the limits'
+            )
+        units.append((fitting[0], 'by its limits'))
+    scale = np.array([{**ANGLES, **LENGTHS}[unit] for unit, _ in units])
+    return values * scale, tuple(units), scale
 
 
 def length_unit(

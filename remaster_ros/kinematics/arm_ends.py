@@ -21,17 +21,23 @@ _WHOLE = ('roll', 'rot', 'pitch', 'yaw', 'wrist', 'turn', 'spin', 'flex')
 _HAND_BEHIND = 5
 
 
-def likely_base(model: UrdfModel, names: Container[str] = ()) -> str:
+def likely_base(model: UrdfModel, names: Container[str] = (), *, sliding: bool = False) -> str:
     """Return the root, or what is fixed to it where the root is the world.
 
-    Where a joint that slides (a rail, a lift) carries the arm, it is the base of what it carries.
+    Where a joint that slides (a rail, a lift) carries the arm, it is the base of what it carries,
+    unless that joint is known to be the arm's and ``sliding`` ones are taken.
 
     Parameters
     ----------
     names
         As of `likely_tips`.
     """
-    arms = {link: arm for link in model.links if (arm := _arm(model, link)) is not None}
+    sliders = _sliders(model, names if sliding else ())
+    arms = {
+        link: arm
+        for link in model.links
+        if (arm := _arm(model, link, sliders=sliders)) is not None
+    }
     # From the root where both are as good.
     best = max(
         arms.values(),
@@ -56,11 +62,14 @@ def likely_base(model: UrdfModel, names: Container[str] = ()) -> str:
     return children[0] if len(children) == 1 else model.root
 
 
-def likely_tips(model: UrdfModel, base_link: str, names: Container[str] = ()) -> list[str]:
+def likely_tips(
+    model: UrdfModel, base_link: str, names: Container[str] = (), *, sliding: bool = False
+) -> list[str]:
     """Return the links behind the last joint of the arm, the likeliest tool frame first.
 
-    The arm is the way from the base with the most joints that turn and none that slides; a
-    gripper's jaws and fingers are no joints of it.
+    The arm is the way from the base with the most joints that turn and none that slides, but for
+    those in `names` where ``sliding`` ones are taken; a gripper's jaws and fingers are no joints
+    of it.
 
     Parameters
     ----------
@@ -75,10 +84,11 @@ def likely_tips(model: UrdfModel, base_link: str, names: Container[str] = ()) ->
     """
     if base_link not in model.links:
         raise InputError(f"URDF: there is no link '{base_link}'; it has {', '.join(model.links)}")
+    sliders = _sliders(model, names if sliding else ())
     arms = {
         link: arm[1]
         for link in model.links
-        if (arm := _arm(model, link, base_link)) is not None and arm[0] == base_link
+        if (arm := _arm(model, link, base_link, sliders)) is not None and arm[0] == base_link
     }
     most = max(((_named(arm, names), len(arm)) for arm in arms.values()), default=(0, 0))
     if not most[1]:
@@ -105,7 +115,9 @@ def likely_tips(model: UrdfModel, base_link: str, names: Container[str] = ()) ->
     return ordered
 
 
-def likely_tip(model: UrdfModel, base_link: str, names: Container[str] = ()) -> str:
+def likely_tip(
+    model: UrdfModel, base_link: str, names: Container[str] = (), *, sliding: bool = False
+) -> str:
     """Return the first of `likely_tips`.
 
     Raises
@@ -113,14 +125,15 @@ def likely_tip(model: UrdfModel, base_link: str, names: Container[str] = ()) -> 
     InputError
         As `likely_tips`, or the arm goes on behind a joint that slides.
     """
-    tip = likely_tips(model, base_link, names)[0]
-    last = _arm(model, tip, base_link)
+    tip = likely_tips(model, base_link, names, sliding=sliding)[0]
+    last = _arm(model, tip, base_link, _sliders(model, names if sliding else ()))
     for joint in _moved_from(model, last[1][-1].child if last else tip):
         beyond = [j for j in _moved_from(model, joint.child) if not _is_jaw(j)]
         if joint.kind == 'prismatic' and not joint.mimic and not _is_jaw(joint) and beyond:
             raise InputError(
                 f"URDF: joint '{joint.name}' of the arm slides, and the arm goes on behind it "
-                f"with '{beyond[0].name}'; arms with such a joint cannot be calibrated"
+                f"with '{beyond[0].name}'; such an arm can be imported, from a table that names "
+                'its joints, and fitted, no more'
             )
     return tip
 
@@ -135,16 +148,27 @@ def moving_before(model: UrdfModel, base_link: str) -> list[str]:
     return joints[::-1]
 
 
+def _sliders(model: UrdfModel, names: Container[str]) -> set[str]:
+    """Return the joints that slide among those known to be the arm's."""
+    joints = model.parent_joint.values()
+    return {joint.name for joint in joints if joint.kind == 'prismatic' and joint.name in names}
+
+
 def _arm(
-    model: UrdfModel, link: str, base_link: str | None = None
+    model: UrdfModel,
+    link: str,
+    base_link: str | None = None,
+    sliders: Container[str] = (),
 ) -> tuple[str, list[UrdfJoint]] | None:
     """Return where the arm that carries a link starts, and its joints; None behind its tool.
 
-    It starts at `base_link`, or at the root, or at what a joint carries that does not turn.
+    It starts at `base_link`, or at the root, or at what a joint carries that does not turn and is
+    none of the sliders.
     """
     joints: list[UrdfJoint] = []
     while link != base_link and (joint := model.parent_joint.get(link)) is not None:
-        if joint.kind not in ('fixed', 'revolute', 'continuous') and not joint.mimic:
+        moves = joint.kind in ('fixed', 'revolute', 'continuous') or joint.name in sliders
+        if not moves and not joint.mimic:
             break
         if joint.mimic:
             return None

@@ -1,7 +1,11 @@
-"""A serial chain of revolute joints from a URDF: kinematics with zero-offsets, gravity torques.
+"""A serial chain of joints from a URDF: kinematics with zero-offsets, gravity torques.
 
 The true joint angle is the reported one plus the zero-offset, everywhere. All methods take any
 number of leading dimensions in ``q``, ``points`` and ``joint_offsets``, and broadcast them.
+
+A joint that slides (prismatic) has metres where others have radians, in all of these arrays. Most
+of what takes a chain supposes angles (limits of motion, causes of errors, inverse kinematics), so
+`SerialChain.from_urdf` refuses such a joint unless its caller states that it takes them.
 """
 
 from __future__ import annotations
@@ -26,6 +30,10 @@ from remaster_ros.types import BoolArray, FloatArray
 
 # Reported angles may be beyond a joint's limits by so much: both are rounded.
 LIMIT_TOLERANCE_RAD = np.deg2rad(1.0)
+# An error of d at a joint that slides moves a marker by d, one of an angle a at distance r by a r.
+# Limits of angles, such as what is large for a zero-offset, so become lengths. The distance is on
+# the short side, a few tenths of an arm's reach: what counts as large is rather too small then.
+LEVER_M = 0.25
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,9 +49,9 @@ class SerialChain:
     base_link, tip_link
         Frame R and frame T.
     lower, upper
-        Joint limits, rad, (k,); infinite for continuous joints.
+        Joint limits, rad, m for joints that slide, (k,); infinite for continuous joints.
     velocity_limits
-        rad/s, (k,); infinite where the URDF gives none.
+        rad/s or m/s, (k,); infinite where the URDF gives none.
     T_fixed
         What lies before each joint and, last, from the last joint's link to the tip,
         (k + 1, 4, 4).
@@ -54,6 +62,8 @@ class SerialChain:
         its centre in the frame after the joint, m, (k, 3).
     has_inertials
         False where no moving link has a mass: gravity's effects cannot be computed.
+    slides
+        Which joints are prismatic, (k,).
     """
 
     name: str
@@ -68,10 +78,16 @@ class SerialChain:
     masses: FloatArray
     centers_of_mass: FloatArray
     has_inertials: bool
+    slides: BoolArray
 
     @classmethod
     def from_urdf(
-        cls, text: str, base_link: str | None = None, tip_link: str | None = None
+        cls,
+        text: str,
+        base_link: str | None = None,
+        tip_link: str | None = None,
+        *,
+        sliding: bool = False,
     ) -> SerialChain:
         """Read the chain from URDF text.
 
@@ -86,12 +102,14 @@ class SerialChain:
             Frame R; the root link where None.
         tip_link
             Frame T; where None, the only link that carries no other.
+        sliding
+            Whether the caller takes metres where a joint slides; else such an arm is refused.
 
         Raises
         ------
         InputError
             Text that is no URDF, missing links, no way from base to tip, a joint on the way that
-            is neither revolute, continuous nor fixed, or limits that are missing or reversed.
+            is not of a kind that is taken, or limits that are missing or reversed.
         """
         model = parse_urdf(text)
         base_link = model.root if base_link is None else base_link
@@ -109,7 +127,7 @@ class SerialChain:
         for joint in joints:
             T_fixed[-1] = T_fixed[-1] @ joint.origin
             if joint.kind != 'fixed':
-                _require_revolute(joint)
+                _require_kind(joint, sliding)
                 moving.append(joint)
                 T_fixed.append(np.eye(4))
         if not moving:
@@ -133,11 +151,36 @@ class SerialChain:
             masses=masses,
             centers_of_mass=first_moments / with_mass[:, None],
             has_inertials=bool(masses.any()),
+            slides=np.array([joint.kind == 'prismatic' for joint in moving]),
         )
 
     def __len__(self) -> int:
         """Return the number of joints k."""
         return len(self.joint_names)
+
+    @cached_property
+    def per_radian(self) -> FloatArray:
+        """How much of each joint's own unit counts as a radian, (k,): 1, or `LEVER_M` in m."""
+        return np.where(self.slides, LEVER_M, 1.0)
+
+    @property
+    def limit_tolerance(self) -> FloatArray:
+        """By how much reported positions may be beyond the limits, rad or m, (k,)."""
+        return LIMIT_TOLERANCE_RAD * self.per_radian
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """The unit of each joint's position, k names: rad or m."""
+        return tuple('m' if slides else 'rad' for slides in self.slides)
+
+    def shown_offset(self, joint: int, value: float, digits: int = 2) -> str:
+        """Return an offset of a joint (rad or m) as people read it: in degrees or mm.
+
+        A thousandth of a metre is about as much as a tenth of a degree: one digit less.
+        """
+        if self.slides[joint]:
+            return f'{1e3 * value:.{max(digits - 1, 0)}f} mm'
+        return f'{np.degrees(value):.{digits}f} deg'
 
     def with_offsets(self, joint_offsets: FloatArray) -> SerialChain:
         """Return the arm with zero-offsets (rad, (k,)) built in: it takes reported angles.
@@ -146,8 +189,7 @@ class SerialChain:
         the reported angles at its stops.
         """
         T_fixed = self.T_fixed.copy()
-        turns = rotation_vector_to_matrix(self.axes * np.asarray(joint_offsets)[:, None])
-        T_fixed[:-1, :3, :3] = T_fixed[:-1, :3, :3] @ turns
+        T_fixed[:-1] = T_fixed[:-1] @ self.motions(np.asarray(joint_offsets, dtype=float))
         return replace(
             self,
             T_fixed=T_fixed,
@@ -179,12 +221,20 @@ class SerialChain:
         angles = self._checked(q)
         if joint_offsets is not None:
             angles = angles + np.asarray(joint_offsets, dtype=float)
-        turns = rotation_vector_to_matrix(angles[..., None] * self.axes)
-        steps = self.T_fixed[:-1] @ transform(turns, np.zeros(3))
+        steps = self.T_fixed[:-1] @ self.motions(angles)
         frames, frame = np.empty_like(steps), np.eye(4)
         for i in range(len(self)):
             frame = frames[..., i, :, :] = frame @ steps[..., i, :, :]
         return frames
+
+    def motions(self, q: FloatArray) -> FloatArray:
+        """Return what each joint does at its position in q (..., k), (..., k, 4, 4)."""
+        vectors = q[..., None] * self.axes
+        if not self.slides.any():
+            return transform(rotation_vector_to_matrix(vectors), np.zeros(3))
+        slides = self.slides[:, None]
+        turns = rotation_vector_to_matrix(np.where(slides, 0.0, vectors))
+        return transform(turns, np.where(slides, vectors, 0.0))
 
     def forward(self, q: ArrayLike, joint_offsets: ArrayLike | None = None) -> FloatArray:
         """Return the tool pose T_R_T, (..., 4, 4), for joint angles (..., k); see `frames`."""
@@ -194,12 +244,12 @@ class SerialChain:
         """Return joint angles (n, k) with whole turns taken off where the limits ask for it.
 
         Angles that no turn brings within the limits stay as they are. A controller that counts on
-        is not more than two turns off.
+        is not more than two turns off. What slides has no turns.
         """
-        low, high = self.lower - LIMIT_TOLERANCE_RAD, self.upper + LIMIT_TOLERANCE_RAD
+        low, high = self.lower - self.limit_tolerance, self.upper + self.limit_tolerance
         turned = q.copy()
         for turns in (-1, 1, -2, 2):
-            other = q + turns * 2.0 * np.pi
+            other = q + np.where(self.slides, 0.0, turns * 2.0 * np.pi)
             outside = ~((turned >= low) & (turned <= high))
             turned = np.where(outside & (other >= low) & (other <= high), other, turned)
         return turned
@@ -226,7 +276,7 @@ class SerialChain:
         joint_offsets
             Zero-offsets, rad, (..., k).
         turns
-            What some joints turn further: index of the joint -> rad, (...).
+            What some joints turn or slide further: index of the joint -> rad or m, (...).
 
         Returns
         -------
@@ -243,6 +293,11 @@ class SerialChain:
             vectors += step[:3, 3].reshape(3, *(1,) * (vectors.ndim - 1))
             if i == 0:
                 break
+            if self.slides[i - 1]:
+                along = vectors[2] + q[..., i - 1] + offsets[..., i - 1] + further.get(i - 1, 0.0)
+                across = (np.broadcast_to(vectors[axis], along.shape) for axis in (0, 1))
+                vectors = np.stack((*across, along))
+                continue
             sine, cosine = np.sin(q[..., i - 1]), np.cos(q[..., i - 1])
             if joint_offsets is not None or i - 1 in further:
                 added = offsets[..., i - 1] + further.get(i - 1, 0.0)
@@ -261,12 +316,13 @@ class SerialChain:
     ) -> FloatArray:
         """Return the derivative of `positions` by q (or, the same, by the zero-offsets).
 
-        Column i is axis_i × (p − o_i), the velocity of the point about joint i.
+        Column i is axis_i × (p − o_i), the velocity of the point about joint i; axis_i of one that
+        slides.
 
         Returns
         -------
         ndarray
-            m/rad, (..., 3, k).
+            m/rad, or m/m, (..., 3, k).
         """
         frames = self.frames(q, joint_offsets)
         tip = frames[..., -1, :, :] @ self.T_fixed[-1]
@@ -274,8 +330,11 @@ class SerialChain:
 
     def velocities(self, frames: FloatArray, points: FloatArray) -> FloatArray:
         """Return the same, (..., 3, k), for points in R (..., 3) and `frames` (..., k, 4, 4)."""
-        arms = points[..., None, :] - frames[..., :3, 3]
-        return np.swapaxes(np.cross(self.axes_in_base(frames), arms), -1, -2)
+        arms, axes = points[..., None, :] - frames[..., :3, 3], self.axes_in_base(frames)
+        moved = np.cross(axes, arms)
+        if self.slides.any():
+            moved = np.where(self.slides[:, None], axes, moved)
+        return np.swapaxes(moved, -1, -2)
 
     def gravity_torque(
         self,
@@ -300,7 +359,8 @@ class SerialChain:
         Returns
         -------
         ndarray
-            N m, (..., k); zeros where the URDF has no masses (`has_inertials`).
+            N m, (..., k); zeros where the URDF has no masses (`has_inertials`). Of a joint that
+            slides gravity's force along it, N.
         """
         frames = self.frames(q, joint_offsets)
         centers = apply(frames, self.centers_of_mass)
@@ -310,6 +370,9 @@ class SerialChain:
         carried_mass = np.cumsum(self.masses[::-1])[::-1]
         arms = carried_moment - carried_mass[:, None] * frames[..., :3, 3]
         torque = np.cross(arms, np.asarray(gravity, dtype=float))
+        if self.slides.any():
+            force = carried_mass[:, None] * np.asarray(gravity, dtype=float)
+            torque = np.where(self.slides[:, None], force, torque)
         return np.sum(self.axes_in_base(frames) * torque, axis=-1)
 
     def axes_in_base(self, frames: FloatArray) -> FloatArray:
@@ -350,11 +413,18 @@ def _joints_between(model: UrdfModel, base_link: str, tip_link: str) -> list[Urd
     return joints[::-1]
 
 
-def _require_revolute(joint: UrdfJoint) -> None:
-    if joint.kind not in ('revolute', 'continuous'):
+def _require_kind(joint: UrdfJoint, sliding: bool) -> None:
+    if joint.kind == 'prismatic':
+        if not sliding:
+            raise InputError(
+                f"URDF: joint '{joint.name}' is prismatic; an arm with a joint that slides can be "
+                'imported and fitted, no more: this needs joints that turn, between other links'
+            )
+    elif joint.kind not in ('revolute', 'continuous'):
         raise InputError(
             f"URDF: joint '{joint.name}' is {joint.kind}; "
-            'only revolute, continuous and fixed joints are supported between base and tip'
+            'only revolute, continuous, prismatic and fixed joints are supported between base and '
+            'tip'
         )
     if joint.mimic:
         raise InputError(
@@ -375,7 +445,8 @@ def _limits(joint: UrdfJoint) -> tuple[float, float, float]:
         )
     if joint.lower >= joint.upper:
         raise InputError(
-            f"URDF: joint '{joint.name}' has limits {joint.lower} to {joint.upper} rad; "
+            f"URDF: joint '{joint.name}' has limits {joint.lower} to {joint.upper} "
+            f'{"m" if joint.kind == "prismatic" else "rad"}; '
             'the lower must be below the upper'
         )
     return joint.lower, joint.upper, velocity

@@ -130,6 +130,11 @@ class Answer:
         return all(len(group) == 1 and group[0].is_plain for group in self.on_the_pad)
 
     @property
+    def slides(self) -> bool:
+        """Whether the arm has a joint that slides."""
+        return any(row.unit == 'mm' for row in self.offsets)
+
+    @property
     def left_alone(self) -> list[str]:
         """The joints to leave as they are, by their names on the pad: their zeros are unknown."""
         told = {step.joint for group in self.on_the_pad for step in group}
@@ -197,9 +202,9 @@ def _on_the_pad(
 ) -> tuple[tuple[MasteringStep, ...], ...]:
     return mastering(
         session.controller,
-        SerialChain.from_urdf(session.urdf, session.base_link, session.tip_link),
-        np.radians([row.mean_deg for row in offsets]),
-        np.radians([row.std_deg for row in offsets]),
+        SerialChain.from_urdf(session.urdf, session.base_link, session.tip_link, sliding=True),
+        np.array([row.mean_and_std[0] for row in offsets]),
+        np.array([row.mean_and_std[1] for row in offsets]),
         np.array([row.identifiable for row in offsets]),
     )
 

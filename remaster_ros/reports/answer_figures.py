@@ -177,7 +177,7 @@ def workspace(subject: Subject) -> Figure:
     errors = subject.answer.final_mm[shown]
     order = np.argsort(errors)
     rows = inputs.fit.joint_offsets
-    offsets = np.radians([row.mean_deg if row.identifiable else 0.0 for row in rows])
+    offsets = np.array([row.mean_and_std[0] if row.identifiable else 0.0 for row in rows])
     chosen = m.q[np.linspace(0, len(m) - 1, min(len(m), ARMS)).round().astype(int)]
     joints = chain.frames(chosen, offsets)[..., :3, 3]
     tips = chain.forward(chosen, offsets)[:, None, :3, 3]

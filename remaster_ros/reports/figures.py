@@ -113,10 +113,16 @@ def as_svg(figures: dict[str, Callable[[Subject], Figure]], subject: Subject) ->
     return texts
 
 
+def shown_scale(result: FitResult) -> FloatArray:
+    """Return degrees per rad, or mm per m where a joint slides, (k,)."""
+    return np.where(result.chain.slides, 1e3, 180.0 / np.pi)
+
+
 def posteriors(result: FitResult) -> Figure:
     """Draw the marginal posterior of each joint's offset with mean and 95 % interval (Fig. 4)."""
     figure, axes = _joint_panels(result, height_in=1.55)
-    draws = np.degrees(result.joint_offset_draws)
+    scale = shown_scale(result)
+    draws = scale * result.joint_offset_draws
     for i, ax in enumerate(axes):
         sample = draws[..., i].ravel()
         if np.ptp(sample) == 0.0:
@@ -124,21 +130,23 @@ def posteriors(result: FitResult) -> Figure:
             continue
         color = AFTER if result.identifiable[i] else BEFORE
         ax.hist(sample, bins=60, density=True, histtype='stepfilled', color=color, alpha=0.55)
-        mean, std = np.degrees((result.joint_offsets[i], result.joint_offsets_std[i]))
-        low, high = np.degrees(result.joint_offsets_interval95[i])
+        mean, std = scale[i] * result.joint_offsets[i], scale[i] * result.joint_offsets_std[i]
+        low, high = scale[i] * result.joint_offsets_interval95[i]
+        unit = ' mm' if result.chain.slides[i] else '°'
         text = 'not identifiable: where the chains wandered to'
-        if high - low < WHOLE_TURN_DEG:
+        if high - low < WHOLE_TURN_DEG / (180.0 / np.pi) * scale[i] * result.chain.per_radian[i]:
             ax.axvspan(low, high, color=color, alpha=0.13, linewidth=0)
             ax.axvline(mean, color=color, linewidth=1.4)
             unseen = result.why[i].startswith('the data do not determine')
             source = 'prior alone: ' if unseen and not result.identifiable[i] else ''
-            text = f'{source}{mean:+.4f}° ± {std:.4f}°'.replace('-', '\N{MINUS SIGN}')
+            text = f'{source}{mean:+.4f}{unit} ± {std:.4f}{unit}'.replace('-', '\N{MINUS SIGN}')
         ax.set_title(text, loc='right', fontweight='normal')
         ax.set_yticks([])
         ax.spines['left'].set_visible(False)
         ax.grid(False)
         ax.xaxis.set_major_locator(MaxNLocator(5))
-    figure.supxlabel('zero-offset (degrees); line: mean, shaded: 95 % interval', fontsize=8)
+    units = 'degrees; mm of a joint that slides' if result.chain.slides.any() else 'degrees'
+    figure.supxlabel(f'zero-offset ({units}); line: mean, shaded: 95 % interval', fontsize=8)
     return figure
 
 
@@ -153,13 +161,13 @@ def traces(result: FitResult) -> Figure:
         if joint not in columns:
             _write_instead(ax, _short(result.why[i]))
             continue
-        values = np.degrees(result.trace[:, ::step, columns[joint]])
+        values = shown_scale(result)[i] * result.trace[:, ::step, columns[joint]]
         for chain in range(chains):
             color = CHAINS[chain % len(CHAINS)]
             ax.plot(x, values[chain], color=color, alpha=0.8, label=f'chain {chain + 1}')
         if not result.identifiable[i]:
             ax.set_title('not identifiable', loc='right', fontweight='normal')
-        ax.set_ylabel('degrees')
+        ax.set_ylabel('mm' if result.chain.slides[i] else 'degrees')
         ax.margins(x=0.01)
         ax.yaxis.set_major_locator(MaxNLocator(4))
     if sampled := [ax for ax in axes if ax.lines]:

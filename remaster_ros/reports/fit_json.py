@@ -66,14 +66,7 @@ def estimates(result: FitResult) -> dict[str, Any]:
             'tip_link': session.tip_link,
         },
         'session': _describe(session),
-        'joint_offsets': table_rows(
-            joint=result.joint_names,
-            mean_deg=np.degrees(result.joint_offsets),
-            std_deg=np.degrees(result.joint_offsets_std),
-            interval95_deg=np.degrees(result.joint_offsets_interval95),
-            identifiable=result.identifiable,
-            why=result.why,
-        ),
+        'joint_offsets': _offsets(result),
         'registration': {
             sensor: {
                 'translation_m': T_R_N[:3, 3],
@@ -97,10 +90,36 @@ def estimates(result: FitResult) -> dict[str, Any]:
     }
 
 
+def _offsets(result: FitResult) -> list[dict[str, Any]]:
+    """Return a row for each joint's offset, of one that slides in mm."""
+    rows = table_rows(
+        joint=result.joint_names,
+        mean_deg=np.degrees(result.joint_offsets),
+        std_deg=np.degrees(result.joint_offsets_std),
+        interval95_deg=np.degrees(result.joint_offsets_interval95),
+        identifiable=result.identifiable,
+        why=result.why,
+    )
+    for joint in np.flatnonzero(result.chain.slides):
+        rows[joint] |= {
+            **dict.fromkeys(('mean_deg', 'std_deg', 'interval95_deg')),
+            'unit': 'mm',
+            'mean_mm': 1e3 * result.joint_offsets[joint],
+            'std_mm': 1e3 * result.joint_offsets_std[joint],
+            'interval95_mm': 1e3 * result.joint_offsets_interval95[joint],
+        }
+    return rows
+
+
 @lru_cache(maxsize=2)
 def geometry_of(result: FitResult) -> GeometryModel | None:
-    """Return the lengths and tilts that the session of a fit shows; None without an estimate."""
-    return None if result.found is None else geometry_model(result.found)
+    """Return the lengths and tilts that the session of a fit shows; None without an estimate.
+
+    They are not looked for where a joint slides.
+    """
+    if result.found is None or result.chain.slides.any():
+        return None
+    return geometry_model(result.found)
 
 
 def model_text(result: FitResult, geometry: GeometryModel) -> str:
@@ -258,10 +277,12 @@ def fit_content(result: FitResult) -> schemas.Fit:
             for test in result.structure.tests
         ]
         content['intervals'] = 'robust' if result.other_errors else 'model'
-        model = np.degrees(result.joint_offsets_std / result.widening)
+        model = result.joint_offsets_std / result.widening
         for row, std, times in zip(content['joint_offsets'], model, result.widening, strict=True):
-            if times > 1.0:
-                row['model_std_deg'] = std
+            if times > 1.0 and row['mean_deg'] is None:
+                row['model_std_mm'] = 1e3 * std
+            elif times > 1.0:
+                row['model_std_deg'] = np.degrees(std)
     if result.orientations is not None:
         content['orientation'] = _orientation(result, result.orientations)
     if (geometry := geometry_of(result)) is not None:
@@ -388,6 +409,10 @@ def joint_offsets_rad(
         )
     ordered = [rows[name] for name in joint_names]
     for row in ordered:
+        if row['mean_deg'] is None or row['std_deg'] is None:
+            raise InputError(
+                f'{row["joint"]} slides, its offset is in mm; this takes angles alone'
+            )
         for key, low in (('mean_deg', -360.0), ('std_deg', 0.0)):
             if not low <= row[key] <= 360.0:
                 raise InputError(

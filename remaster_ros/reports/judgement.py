@@ -185,14 +185,14 @@ def _dominated(result: FitResult, unexplained: Sequence[NoiseCheck]) -> str:
     """Return why the error after is no success, and what to do."""
     if not result.other_errors:
         return 'Whether noise explains what is left, this session cannot show.'
+    deed = 'run "remaster discover".'
+    if result.chain.slides.any():
+        deed = '"remaster discover" does not take an arm with a joint that slides.'
     if not any(check.noise_m is not None for check in unexplained):
         return (
-            'But what is left has structure, which noise has not: other errors dominate; '
-            'run "remaster discover".'
+            'But what is left has structure, which noise has not: other errors dominate; ' + deed
         )
-    return (
-        'But noise does not explain what is left: other errors dominate; run "remaster discover".'
-    )
+    return f'But noise does not explain what is left: other errors dominate; {deed}'
 
 
 def _compared(check: NoiseCheck) -> str:

@@ -116,7 +116,9 @@ def save_fit(result: FitResult, folder: str | os.PathLike[str], figures: bool = 
     files = exports(result)
     if (geometry := geometry_of(result)) is not None and geometry.is_better:
         files[MODEL_FILE] = model_text(result, geometry)
-    files[COMPENSATION_FILE] = compensation_text(result, result_sha256)
+    # Its terms and limits are of angles.
+    if not result.chain.slides.any():
+        files[COMPENSATION_FILE] = compensation_text(result, result_sha256)
     _write_applied(folder, files)
     if not figures:
         remove_report(folder)
@@ -176,6 +178,7 @@ def save_discovery(
 def _write_applied(folder: Path, files: Mapping[str, str | bytes]) -> None:
     """Write what a robot can load; a model of an earlier run would contradict it."""
     make_folder(folder / APPLY_FOLDER)
-    (folder / APPLY_FOLDER / MODEL_FILE).unlink(missing_ok=True)
+    for name in (MODEL_FILE, COMPENSATION_FILE):
+        (folder / APPLY_FOLDER / name).unlink(missing_ok=True)
     for name, content in files.items():
         write_atomically(folder / APPLY_FOLDER / name, content)

@@ -7,6 +7,7 @@ Keys that are not here are kept as they are.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any, Literal, TypeVar
 
@@ -57,16 +58,33 @@ class JointOffset(Struct):
     ``model_std_deg`` stands where ``std_deg`` is wider than the model has it (``intervals``).
     ``std_deg`` is for an arm that is its drawing; ``std_with_geometry_deg`` holds what lengths and
     tilts off their drawing would do to the offset (``geometry``).
+
+    Of a joint that slides ``unit`` is mm, the values end in ``_mm``, and those in ``_deg`` are
+    null: there is no such angle.
     """
 
     joint: str
-    mean_deg: float
-    std_deg: float
-    interval95_deg: tuple[float, float]
+    mean_deg: float | None
+    std_deg: float | None
+    interval95_deg: tuple[float, float] | None
     identifiable: bool
     why: str
+    unit: Literal['deg', 'mm'] = 'deg'
+    mean_mm: float | UnsetType = UNSET
+    std_mm: float | UnsetType = UNSET
+    interval95_mm: tuple[float, float] | UnsetType = UNSET
+    model_std_mm: float | UnsetType = UNSET
     model_std_deg: float | UnsetType = UNSET
     std_with_geometry_deg: float | UnsetType = UNSET
+
+    @property
+    def mean_and_std(self) -> tuple[float, float]:
+        """Mean and standard deviation, rad; m of a joint that slides."""
+        if self.mean_deg is None or self.std_deg is None:
+            assert self.mean_mm is not UNSET
+            assert self.std_mm is not UNSET
+            return 1e-3 * self.mean_mm, 1e-3 * self.std_mm
+        return math.radians(self.mean_deg), math.radians(self.std_deg)
 
 
 class GaugeCombination(Struct):

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from remaster_ros.errors import InputError
-from remaster_ros.kinematics.serial_chain import LIMIT_TOLERANCE_RAD, SerialChain
+from remaster_ros.kinematics.serial_chain import LEVER_M, LIMIT_TOLERANCE_RAD, SerialChain
 from remaster_ros.kinematics.transforms import inverse_poses
 from remaster_ros.session.files import decode_text, refuse_utf16
 from remaster_ros.types import (
@@ -281,6 +281,8 @@ LENGTH_TOLERANCE = 1e-3
 class ColumnNames:
     """The column names of a session with k joints, in the order this package writes them.
 
+    ``slides`` tells which joints do, (k,): their positions are in m, their efforts in N.
+
     Attributes
     ----------
     q, from_q
@@ -294,12 +296,14 @@ class ColumnNames:
     position = ('x_m', 'y_m', 'z_m')
     std = ('std_x_m', 'std_y_m', 'std_z_m')
 
-    def __init__(self, joints: int) -> None:
+    def __init__(self, joints: int, slides: Sequence[bool] | BoolArray | None = None) -> None:
         self.joints = joints
+        lengths = [False] * joints if slides is None else list(slides)
         self.q, self.from_q, self.effort, self.wanted = (
-            [f'{prefix}{i}_{unit}' for i in range(1, joints + 1)]
-            for prefix, unit in (
-                *(('q', 'rad'), ('from_q', 'rad'), ('effort', 'nm'), ('wanted', 'rad')),
+            [f'{prefix}{i}_{units[int(length)]}' for i, length in enumerate(lengths, start=1)]
+            for prefix, units in (
+                *(('q', ('rad', 'm')), ('from_q', ('rad', 'm'))),
+                *(('effort', ('nm', 'n')), ('wanted', ('rad', 'm'))),
             )
         )
 
@@ -361,7 +365,7 @@ class RowFormat:
         self._sensors, self._markers = sensors, markers
         self._with = False, with_frame, with_orientation, with_correction, with_correction
         self._within_limits = within_limits
-        self._columns = ColumnNames(len(chain))
+        self._columns = ColumnNames(len(chain), chain.slides)
 
     def parse(self, data: bytes) -> Measurements:
         """Read the bytes of the file.
@@ -476,18 +480,24 @@ class RowFormat:
                 },
             )
         table.refuse(measurements.std < 0, dict.fromkeys(columns.std, 'is negative; correct it'))
+        words = {
+            'rad': ('1 degree', 'radians'),
+            'm': (f'{1e3 * LEVER_M * LIMIT_TOLERANCE_RAD:.1f} mm', 'metres'),
+        }
         problems = [
-            f'rad is more than 1 degree outside the limits of {joint} ({lower:.6g} to {upper:.6g} '
-            'rad); are the units radians, the joints base to tip, and the limits of the URDF '
-            'right?'
-            for joint, lower, upper in zip(chain.joint_names, chain.lower, chain.upper)
+            f'{unit} is more than {words[unit][0]} outside the limits of {joint} ({lower:.6g} to '
+            f'{upper:.6g} {unit}); are the units {words[unit][1]}, the joints base to tip, and '
+            'the limits of the URDF right?'
+            for joint, lower, upper, unit in zip(
+                chain.joint_names, chain.lower, chain.upper, chain.units
+            )
         ]
         given = [(columns.q, measurements.q), (columns.from_q, measurements.from_q)]
         if measurements.wanted is not None:
             given.append((columns.wanted, measurements.wanted))
         for names, q in given:
-            below = q < chain.lower - LIMIT_TOLERANCE_RAD
-            above = q > chain.upper + LIMIT_TOLERANCE_RAD
+            below = q < chain.lower - chain.limit_tolerance
+            above = q > chain.upper + chain.limit_tolerance
             if self._within_limits:
                 table.refuse(below | above, dict(zip(names, problems)))
         far = f'm is further than {FARTHEST_M:g} m away, beyond any sensor; are the units metres?'
@@ -526,9 +536,10 @@ def format_header(
     with_orientation: bool = False,
     with_wanted: bool = False,
     with_correction: bool = False,
+    slides: Sequence[bool] | BoolArray | None = None,
 ) -> str:
     """Return the header line of observations.csv."""
-    names = ColumnNames(joints).names(
+    names = ColumnNames(joints, slides).names(
         with_effort, with_frame, with_orientation, with_wanted, with_correction
     )
     return ','.join(names) + '\n'
@@ -562,8 +573,16 @@ def format_observation(
     return ','.join(cells)
 
 
-def format_measurements(m: Measurements, sensors: Sequence[str], markers: Sequence[str]) -> str:
-    """Return all observations as the text of the file, header included."""
+def format_measurements(
+    m: Measurements,
+    sensors: Sequence[str],
+    markers: Sequence[str],
+    slides: Sequence[bool] | BoolArray | None = None,
+) -> str:
+    """Return all observations as the text of the file, header included.
+
+    ``slides`` tells which joints do, (k,); None where all turn.
+    """
 
     def numbers(values: FloatArray) -> list[list[str]]:
         return [
@@ -602,6 +621,7 @@ def format_measurements(m: Measurements, sensors: Sequence[str], markers: Sequen
         m.orientation is not None,
         m.wanted is not None,
         m.correction is not None,
+        slides,
     )
     return header + ''.join(f'{row}\n' for row in lines)
 
@@ -620,8 +640,17 @@ def _check_names(names: list[str], columns: ColumnNames, path: Path) -> None:
         )
     for wanted in (columns.q, columns.from_q, columns.effort, columns.wanted):
         prefix, suffix = wanted[0].split('1')
-        pattern = re.compile(f'{prefix}[0-9]+{suffix}')
+        pattern = re.compile(f'{prefix}[0-9]+_(rad|m|nm|n)')
         found = [name for name in names if pattern.fullmatch(name)]
+        by_number = {name.rpartition('_')[0]: name for name in wanted}
+        for name in found:
+            right = by_number.get(name.rpartition('_')[0], name)
+            if name != right:
+                raise InputError(
+                    f'{where}: column {name}: joint {right[len(prefix) :].partition("_")[0]} of '
+                    f'the URDF {"slides" if right.endswith(("_m", "_n")) else "turns"}, so its '
+                    f'column is {right}; write it so, in that unit, or correct the URDF'
+                )
         if set(found) != set(wanted) and (found or wanted is columns.q):
             raise InputError(
                 f'{where}: {len(found)} columns {prefix}…{suffix} for the {columns.joints} joints '

@@ -120,7 +120,8 @@ def read_robot(
     data = read_limited(path, URDF_LIMIT, 'robot.urdf in session.yaml names the URDF')
     check_data(sums, path, data)
     urdf = decode_text(data, path)
-    return urdf, read_chain(urdf, path, header.robot.base_link, header.robot.tip_link)
+    robot = header.robot
+    return urdf, read_chain(urdf, path, robot.base_link, robot.tip_link, sliding=True)
 
 
 def write_session(folder: str | os.PathLike[str], session: Session) -> None:
@@ -132,14 +133,16 @@ def write_session(folder: str | os.PathLike[str], session: Session) -> None:
         The folder holds files or cannot be written to, or the session breaks the format.
     """
     folder = Path(folder)
-    chain = read_chain(session.urdf, folder / URDF, session.base_link, session.tip_link)
+    chain = read_chain(
+        session.urdf, folder / URDF, session.base_link, session.tip_link, sliding=True
+    )
     header = write_header(session, URDF, session.exit_status)
     parsed = parse_header(header.encode(), folder / HEADER)
     require_known_joints(parsed, chain.joint_names, folder / HEADER)
     names = session.sensor_names, session.marker_names
     on_tool = [i for i, name in enumerate(session.sensors) if name in session.on_tool]
     measured = turned_round(all_rows(session), on_tool, 'session to be written')
-    rows = format_measurements(measured, *names).encode()
+    rows = format_measurements(measured, *names, chain.slides).encode()
     RowFormat(folder / ROWS, chain, *names).parse(rows)
     with undone_on_failure():
         make_new_folder(folder)
@@ -165,9 +168,11 @@ def all_rows(session: Session) -> Measurements:
     return merged.select(np.argsort(merged.observation, kind='stable'))
 
 
-def read_chain(urdf: str, path: Path, base_link: str, tip_link: str) -> SerialChain:
+def read_chain(
+    urdf: str, path: Path, base_link: str, tip_link: str, *, sliding: bool = False
+) -> SerialChain:
     """Return the arm of a session; an `InputError` names the URDF file at `path`."""
     try:
-        return SerialChain.from_urdf(urdf, base_link, tip_link)
+        return SerialChain.from_urdf(urdf, base_link, tip_link, sliding=sliding)
     except InputError as error:
         raise InputError(f'{path}: {error}') from None

@@ -124,9 +124,9 @@ def test_a_prismatic_joint(session: Path) -> None:
     urdf = session / 'robot.urdf'
     edit(urdf, lambda text: text.replace('joint_4" type="revolute', 'joint_4" type="prismatic'))
     line = refusal(*fit(session))
-    assert 'robot.urdf' in line
-    assert 'joint_4' in line
-    assert 'prismatic' in line
+    assert 'observations.csv, line 1: column q4_rad' in line
+    assert 'slides' in line
+    assert 'q4_m' in line
 
 
 def test_a_urdf_that_is_none(session: Path) -> None:

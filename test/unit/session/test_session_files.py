@@ -171,11 +171,11 @@ def test_joints_that_do_not_match_the_urdf(folder):
     refused(folder, 'observations.csv', 'q1_rad', '1 joints')
 
 
-def test_a_prismatic_joint_is_refused(folder):
+def test_angles_of_a_prismatic_joint_are_refused(folder):
     edit(
         folder / 'robot.urdf', 'name="joint_2" type="revolute"', 'name="joint_2" type="prismatic"'
     )
-    refused(folder, 'robot.urdf', 'joint_2', 'prismatic')
+    refused(folder, 'observations.csv', 'q2_rad', 'slides', 'q2_m')
 
 
 def test_missing_parts_are_named(folder, tmp_path):
