@@ -11,6 +11,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from fault_bench import Bench
@@ -175,8 +176,10 @@ def _refused(bench: Bench, kind: str, began: float) -> int:
         for at, node, _, values in list(bench.observer.summaries)
         if node == 'robot_bridge'
     ]
-    before = [count for at, count in counts if at <= began]
-    return max(count for _, count in counts) - (before[-1] if before else 0)
+    before = [0, *(count for at, count in counts if at <= began)][-1]
+    since = [before, *(count for at, count in counts if at > began)]
+    # A bridge that was started again counts from zero.
+    return sum(max(later - earlier, 0) for earlier, later in pairwise(since))
 
 
 def wait_until(bench: Bench, until_s: float) -> None:
