@@ -428,7 +428,9 @@ class Model:
             # d(exp(r) v) = (J_l(r) dr) × exp(r) v: the arm after the turn, the left Jacobian of r.
             by_turn = _left_jacobian(x[self.registration(sensor)][3:])
             if index != sensor:
-                derivative[span, :, : self.joints] = turn @ np.swapaxes(axes[span], 1, 2)
+                # A joint that slides turns nothing.
+                turning = axes[span] * ~self.chain.slides[:, None]
+                derivative[span, :, : self.joints] = turn @ np.swapaxes(turning, 1, 2)
                 derivative[span, :, start + 3 : start + 6] = by_turn
                 self._by_bodies(derivative, x, rows, span, turn @ tool[span, :3, :3])
                 continue
