@@ -1,5 +1,7 @@
 """The exceptions a caller may expect; each carries what is wrong and the remedy."""
 
+from __future__ import annotations
+
 from collections.abc import Iterable
 from difflib import get_close_matches
 
@@ -52,6 +54,10 @@ class MisfitError(InsufficientDataError):
         super().__init__(f'{what}; {remedy}')
         self.what, self.remedy = what, remedy
 
+    def __reduce__(self) -> tuple[type[MisfitError], tuple[str, str]]:
+        # A worker hands its errors on: made again from the line alone it would wait for ever.
+        return type(self), (self.what, self.remedy)
+
 
 class MistakeFoundError(InsufficientDataError):
     """A misfit that a mistake in the session's tables explains.
@@ -67,6 +73,9 @@ class MistakeFoundError(InsufficientDataError):
     def __init__(self, sentence: str, options: str) -> None:
         super().__init__(sentence)
         self.options = options
+
+    def __reduce__(self) -> tuple[type[MistakeFoundError], tuple[str, str]]:
+        return type(self), (self.args[0], self.options)
 
 
 class DeviceError(RemasterError):

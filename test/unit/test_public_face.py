@@ -4,12 +4,14 @@ import ast
 import doctest
 import html
 import json
+import pickle
 import re
 from pathlib import Path
 
 import pytest
 
 import remaster_ros
+from remaster_ros.errors import MisfitError, MistakeFoundError
 from remaster_ros.session.observations import ColumnNames
 
 ROOT = Path(__file__).parents[2]
@@ -110,3 +112,9 @@ def test_columns_are_those_of_the_file(notebook, tmp_path):
     columns = session.columns()
     assert {len(values) for values in columns.values()} == {len(session.measurements)}
     assert set(columns) < set(ColumnNames(7).names())
+
+
+@pytest.mark.parametrize('made', [MisfitError('what', 'remedy'), MistakeFoundError('it', '--x')])
+def test_an_error_of_a_worker_arrives(made):
+    again = pickle.loads(pickle.dumps(made))
+    assert (type(again), str(again), vars(again)) == (type(made), str(made), vars(made))
