@@ -281,7 +281,7 @@ def _pad_rows(groups: Sequence[Sequence[MasteringStep]]) -> list[str]:
                     f'    ({step.joint} keeps its zero in the URDF; what the pad shows goes with '
                     'the joint that it is coupled to)'
                 )
-    others = [step for step in steps if step.set_to != 0.0 and not step.slides]
+    others = [step for step in steps if step.set_to != 0.0 and step.zero_in_reach]
     if others:
         rows += [
             '  Where the controller sets nothing but 0, drive instead to',
@@ -291,7 +291,7 @@ def _pad_rows(groups: Sequence[Sequence[MasteringStep]]) -> list[str]:
         f'  {step.pad_name}: its zero is beyond its limits; a controller that sets nothing but 0 '
         'cannot take its offset: use way 2 or 3.'
         for step in steps
-        if step.slides and step.set_to != 0.0
+        if step.set_to != 0.0 and not step.zero_in_reach
     ]
     return rows
 

@@ -45,6 +45,8 @@ class MasteringStep:
         Of the URDF's joint, in degrees; in mm of a joint that slides.
     drive_to, set_to
         What the pad shows in the place in which it is set, before and after, in `unit`.
+    zero_in_reach
+        Whether the joint can be driven to where the pad shows 0 afterwards.
     """
 
     joint: str
@@ -55,6 +57,7 @@ class MasteringStep:
     std: float
     drive_to: float
     set_to: float
+    zero_in_reach: bool
 
     @property
     def slides(self) -> bool:
@@ -114,6 +117,12 @@ def mastering(
     before = after - change
     joints = {} if controller is None else controller.joints
 
+    def zero_in_reach(i: int) -> bool:
+        place = after.copy()
+        place[i] = 0.0
+        at, off = pad.to_urdf(place)[i], abs(applied[i])
+        return bool(chain.lower[i] <= at - off and at + off <= chain.upper[i])
+
     def step(i: int) -> MasteringStep:
         name = chain.joint_names[i]
         shown = joints.get(name, PadJoint(name))
@@ -139,6 +148,7 @@ def mastering(
             float(to_shown * std[i]),
             round(set_to + per_rad * float(before[i] - after[i]), digits) + 0.0,
             set_to + 0.0,
+            zero_in_reach(i),
         )
 
     # Also a joint with a zero of its own that stays, where a coupled one's does not.

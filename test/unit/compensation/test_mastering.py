@@ -34,6 +34,22 @@ def test_a_joint_that_cannot_reach_zero_is_set_where_it_can_be(panda):
         low < -0.01 and high > 0.01 for low, high in zip(panda.lower, panda.upper)
     ]
     assert not all(step.set_to == 0.0 for step in steps)
+    # Nobody is told to drive such a joint to its zero.
+    assert [step.zero_in_reach for step in steps] == [step.set_to == 0.0 for step in steps]
+
+
+def test_a_zero_of_the_pad_that_is_within_the_limits_may_be_driven_to(panda):
+    pads = {name: PadJoint(name) for name in panda.joint_names}
+    pads[panda.joint_names[1]] = PadJoint('A2', zero_deg=90.0)
+    pads[panda.joint_names[4]] = PadJoint('A5', zero_deg=179.0)
+    k = len(panda)
+    groups = mastering(
+        Controller(pads), panda, np.full(k, 0.01), np.full(k, 1e-5), np.ones(k, bool)
+    )
+    steps = {step.pad_name: step for group in groups for step in group}
+    assert steps['A2'].set_to != 0.0
+    assert steps['A2'].zero_in_reach
+    assert not steps['A5'].zero_in_reach
 
 
 @pytest.mark.parametrize('seed', range(20))
