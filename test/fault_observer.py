@@ -146,7 +146,9 @@ class Observer:
 
         It came here at world time `came_s`, which may stand between two readings of a wall clock.
         """
-        lines = (self.world.folder / MOTION_FILE).read_text().splitlines()
+        while (text := (self.world.folder / MOTION_FILE).read_text())[-1:] not in ('', '\n'):
+            time.sleep(0.01)  # The arm is writing the last line.
+        lines = text.splitlines()
         motion = Motion(START_S, self.world.start_q)
         nearest_s, begun = SAME_WALL_S * self.world.rate, None
         for start_s, plain in map(json.loads, lines):

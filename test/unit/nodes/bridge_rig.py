@@ -224,12 +224,15 @@ class Rig:
         self.executor.add_node(self.bridge)
         if not parameters.get('use_sim_time'):
             self.bridge.now_s = lambda: self.wall + 0.25
+        ours = (self.states, self.said, self.solutions, self.ways)
+        topics = {publisher.topic_name for publisher in ours}
+        # Both sides of a match: what is sent before the other one has seen it may be lost.
+        heard = [one for one in self.bridge.subscriptions if one.topic_name in topics]
+        assert len(heard) >= len(ours)
         self.wait(
             lambda: (
-                all(
-                    publisher.get_subscription_count()
-                    for publisher in (self.states, self.said, self.solutions, self.ways)
-                )
+                all(publisher.get_subscription_count() for publisher in ours)
+                and all(subscription.get_publisher_count() for subscription in heard)
                 and self.bridge.status._publisher.get_subscription_count()
                 and self.bridge.status._events.get_subscription_count() > 2
                 and self.bridge._settled.get_subscription_count()
