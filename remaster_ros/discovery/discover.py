@@ -223,8 +223,6 @@ def discover_session(
         for effect, group, so in zip(described, groups, is_cause, strict=True)
         if so
     ]
-    # Where another kind of errors has all of a cause in the model that is told, it is not in it.
-    causes = [cause for cause in causes if round(1e3 * cause[0].size_m, 3) > 0.0]
     causes.sort(key=lambda cause: -cause[0].size_m)
     effects, groups = zip(*causes, strict=True) if causes else ((), ())
     effects += tuple(effect.sampled(fit) for effect in moved_markers(found, data, named))

@@ -151,6 +151,18 @@ class FoundEffect:
                 for cell, where in zip(group, wheres, strict=True)
             )
             size_m = _size(data, group, [result.theta[where] for where in wheres])
+            if round(1e3 * size_m, 3) == 0.0:
+                # Its own size is that of the search, where it stands alone.
+                elsewhere = (
+                    'In the model of all kinds of errors another kind has all of it: these poses '
+                    'do not tell which of them it is. Measure more poses before it is acted on.'
+                )
+                return replace(
+                    self,
+                    parameters=parameters,
+                    cause=f'{self.cause} {elsewhere}',
+                    remedy=_later(self.remedy),
+                )
             found = replace(found, sizes=sizes, size_m=size_m)
         found = replace(found, parameters=parameters)
         found = replace(found, cause=with_sizes(self.cause, found._clear_sizes(group)))
@@ -161,8 +173,7 @@ class FoundEffect:
             'from nothing, and may be chance or another cause: measure more poses before it is '
             'acted on.'
         )
-        remedy = f'Measure more poses first. If it stays: {found.remedy}' if found.remedy else ''
-        return replace(found, cause=f'{found.cause} {doubt}', remedy=remedy)
+        return replace(found, cause=f'{found.cause} {doubt}', remedy=_later(found.remedy))
 
     def _clear_sizes(self, group: Sequence[Cell]) -> tuple[str, ...]:
         """Return the sizes that are more than their uncertainty, and how many others there are."""
@@ -184,6 +195,10 @@ class FoundEffect:
         """Size of its clearest parameter in standard deviations."""
         known = [abs(one.value) / one.std for one in self.parameters if one.std > 0.0]
         return max(known, default=np.inf)
+
+
+def _later(remedy: str) -> str:
+    return f'Measure more poses first. If it stays: {remedy}' if remedy else ''
 
 
 def with_sizes(cause: str, sizes: Sequence[str]) -> str:
