@@ -124,8 +124,17 @@ import json, sys, time
 from natnet import NatNetClient, Version
 command_port, data_port, multicast, wanted = (json.loads(a) for a in sys.argv[1:])
 frames, models = [], []
-client = NatNetClient('127.0.0.1', '127.0.0.1', command_port=command_port, data_port=data_port,
-                      use_multicast=multicast)
+class Patient(NatNetClient):
+    # A frame that comes before the server's first answer ends its connect: it is tried again.
+    def connect(self, timeout=5.0):
+        for attempt in range(20):
+            try:
+                return super().connect(timeout)
+            except TypeError:
+                self.shutdown()
+        raise SystemExit('no answer came before a frame')
+client = Patient('127.0.0.1', '127.0.0.1', command_port=command_port, data_port=data_port,
+                 use_multicast=multicast)
 client.on_data_frame_received_event.handlers.append(frames.append)
 client.on_data_description_received_event.handlers.append(models.append)
 with client:
