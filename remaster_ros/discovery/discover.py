@@ -27,6 +27,7 @@ from remaster_ros.discovery.evidence import solve
 from remaster_ros.discovery.explain import FoundEffect, describe
 from remaster_ros.discovery.gain import (
     Gain,
+    fails_held_out,
     gain_of,
     noise_by_range,
     pose_common_fraction,
@@ -192,20 +193,22 @@ def discover_session(
     named, groups, described = _that_help(search, named, report)
     unexplained: tuple[Unexplained, ...] = ()
     sampled: _Sampled | None = None
-    # Kinds that nobody named may be what does harm, or what the poses do not determine.
+    # Kinds that nobody named may be what does harm, or what the poses do not determine. Where
+    # their model does not hold on held-out poses, these decide between it and the names alone.
     for every in (True, False):
         try:
-            sampled = _sampled(session, before, found, search, named, every, rng, report, clock)
+            tried = _sampled(session, before, found, search, named, every, rng, report, clock)
         except InsufficientDataError as error:
-            if described and not every:
+            if described and not every and sampled is None:
                 unexplained = (unfitted(residuals.errors, described, error),)
             continue
-        if not is_harmful(sampled.gain):
-            break
-        if described and sampled.by_name:
-            unexplained = (harm_of(before, sampled.fit, sampled.gain, described),)
-        by_name, sampled = sampled.by_name, None
-        if by_name:
+        if is_harmful(tried.gain):
+            if described and tried.by_name and sampled is None:
+                unexplained = (harm_of(before, tried.fit, tried.gain, described),)
+        elif sampled is None or tried.predicts_better_than(sampled):
+            sampled = tried
+        holds = sampled is tried and not fails_held_out(search.data, tried.solution, tried.fit)
+        if tried.by_name or holds:
             break
     if sampled is None:
         found, search = before, Search(Residuals.of(before), ())
@@ -334,6 +337,11 @@ class _Sampled:
     fit: FitResult
     gain: Gain
     by_name: bool
+
+    def predicts_better_than(self, other: _Sampled) -> bool:
+        """Return whether its errors on held-out poses are smaller."""
+        mine, others = self.gain.held_out_rms_after_m, other.gain.held_out_rms_after_m
+        return mine is not None and others is not None and mine < others
 
 
 def _sampled(

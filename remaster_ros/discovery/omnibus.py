@@ -166,10 +166,22 @@ class _Checks:
         away = np.linalg.norm(self.predicted[others] - measurements.position[row], axis=1)
         return float((1 + np.sum(away < self.limit[row])) / (1 + len(away)))
 
+    @cached_property
+    def too_many(self) -> BoolArray:
+        """Gross held-out rows, not mispaired, of sensors that have too many of them, (n,)."""
+        context, gross = self.data.context, self.gross & ~self.mispaired
+        found = np.zeros(len(gross), dtype=bool)
+        for index in range(len(context.sensor_names)):
+            rows = context.measurements.is_validation & (context.sensor == index)
+            if gross[rows].sum() > LARGEST_SHARE * rows.sum():
+                found |= rows & gross
+        return found
+
     def gross_held_out(self) -> Iterator[tuple[int, str]]:
-        """Give the gross errors among the held-out rows, which no fit leaves out."""
+        """Give the single gross errors among the held-out rows, which no fit leaves out."""
         measurements = self.data.context.measurements
-        for row in np.flatnonzero(self.gross & measurements.is_validation).tolist():
+        gross = self.gross & measurements.is_validation & ~self.too_many
+        for row in np.flatnonzero(gross).tolist():
             length = float(np.linalg.norm(self.errors[row]))
             yield int(measurements.observation[row]), f'held out, off by {1e3 * length:.1f} mm'
 
@@ -179,13 +191,13 @@ class _Checks:
         Steps among the fitted rows are found by the search. Where held-out poses were measured
         last, as in many protocols, what was bumped between the two shows in held-out rows alone.
         """
-        context, gross = self.data.context, self.gross & ~self.mispaired
+        context = self.data.context
         for index, sensor in enumerate(context.sensor_names):
             rows = context.measurements.is_validation & (context.sensor == index)
-            count, total = int(gross[rows].sum()), int(rows.sum())
-            if count <= LARGEST_SHARE * total:
+            count, total = int(self.too_many[rows].sum()), int(rows.sum())
+            if not count:
                 continue
-            size = rms(self.errors, rows & gross)
+            size = rms(self.errors, rows & self.too_many)
             moved = self._moved(index)
             yield Unexplained(
                 where='held_out_poses',
