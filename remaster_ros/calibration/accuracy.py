@@ -71,19 +71,9 @@ def relative_errors(
 ) -> FloatArray:
     """Return the difference of measured and modelled distances between solutions (eq. 17).
 
-    Parameters
-    ----------
-    measurements
-        n observations.
-    predicted
-        Where the model has the markers, in any one frame per sensor, m, (n, 3).
-    pairs
-        Of `solution_pairs`, (m, 2).
-
-    Returns
-    -------
-    ndarray
-        m, (m,).
+    ``measurements``: n observations; ``predicted``: where the model has the markers, in any one
+    frame per sensor, m, (n, 3); ``pairs``: of `solution_pairs`, (m, 2).
+    Returns m, (m,).
     """
     first, second = pairs.T
     measured = np.linalg.norm(measurements.position[first] - measurements.position[second], axis=1)

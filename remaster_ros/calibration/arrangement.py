@@ -69,52 +69,28 @@ _SCALES = (1.0, np.pi / 180.0, 180.0 / np.pi)
 
 @dataclass(frozen=True)
 class Arrangement:
-    """How the robot's joints come from the k columns of a table.
+    """How the robot's joints come from the k columns of a table."""
 
-    Attributes
-    ----------
-    order
-        Column of each joint, base to tip.
-    signs
-        1 or -1 for each joint.
-    quarters
-        What is added to each joint, in quarters of a turn.
-    angle_scale
-        What the angles are multiplied by.
-    coupled
-        What joint 3 takes of joint 2: 1 or -1 on arms that count it from the horizontal (FANUC,
-        and arms with a parallelogram), else 0.
-    mirrored
-        True where X and Y of the points are exchanged.
-    length_scale
-        What the points are multiplied by.
-    shift
-        A row's point belongs to the joints so many rows before, of those with its sensor and
-        marker.
-    exchanged
-        Indices of two markers whose labels are exchanged; () where none are.
-    since, until
-        Observations between which rows are shifted or labels exchanged, the latter excluded; None
-        where from the first, or to the last.
-    turned
-        Axis and quarters of a turn by which the markers' places are turned in the tool frame.
-    tip_link
-        Tool frame; '' where as given.
-    """
-
-    order: tuple[int, ...]
-    signs: tuple[int, ...]
-    quarters: tuple[int, ...]
-    angle_scale: float = 1.0
+    order: tuple[int, ...]  # Column of each joint, base to tip
+    signs: tuple[int, ...]  # 1 or -1 for each joint
+    quarters: tuple[int, ...]  # What is added to each joint, in quarters of a turn
+    angle_scale: float = 1.0  # What the angles are multiplied by
+    # What joint 3 takes of joint 2: 1 or -1 on arms that count it from the horizontal (FANUC, and
+    # arms with a parallelogram), else 0
     coupled: int = 0
-    mirrored: bool = False
-    length_scale: float = 1.0
+    mirrored: bool = False  # True where X and Y of the points are exchanged
+    length_scale: float = 1.0  # What the points are multiplied by
+    # A row's point belongs to the joints so many rows before, of those with its sensor and marker
     shift: int = 0
+    # Indices of two markers whose labels are exchanged; () where none are
     exchanged: tuple[int, ...] = ()
+    # Observations between which rows are shifted or labels exchanged, the latter excluded; None
+    # where from the first, or to the last
     since: int | None = None
     until: int | None = None
+    # Axis and quarters of a turn by which the markers' places are turned in the tool frame
     turned: tuple[int, int] = (0, 0)
-    tip_link: str = ''
+    tip_link: str = ''  # Tool frame; '' where as given
 
     @classmethod
     def given(cls, joints: int) -> Arrangement:
@@ -158,28 +134,16 @@ class Arrangement:
 
 @dataclass(frozen=True, eq=False)
 class Fitted:
-    """A robust fit of one arrangement.
+    """A robust fit of one arrangement."""
 
-    Attributes
-    ----------
-    arrangement
-        The arrangement.
-    error_m
-        Median distance of the points from the fit, m.
-    most_error_m
-        The distance that nine of ten points keep within, as a median of Gaussian errors, m: larger
-        than the median where a part of the points is off.
-    joint_offsets, per_radian
-        rad, or m of joints that slide, and how much of that counts as a radian, (k,); 0 where the
-        data do not determine them, as of the outer two.
-    marker_shift_m
-        Largest distance of a marker from where it was said to be, m.
-    """
-
-    arrangement: Arrangement
-    error_m: float
+    arrangement: Arrangement  # The arrangement
+    error_m: float  # Median distance of the points from the fit, m
+    # rad, or m of joints that slide, and how much of that counts as a radian, (k,); 0 where the
+    # data do not determine them, as of the outer two
     joint_offsets: FloatArray
-    marker_shift_m: float
+    marker_shift_m: float  # Largest distance of a marker from where it was said to be, m
+    # The distance that nine of ten points keep within, as a median of Gaussian errors, m: larger
+    # than the median where a part of the points is off
     most_error_m: float
     per_radian: FloatArray
 
@@ -288,10 +252,7 @@ def some_rows(session: Session) -> Session:
 def closest_fit(problem: Problem) -> tuple[Model, FloatArray, Rows]:
     """Return the model, its parameters (size,) and the rows of the best of a few starts.
 
-    Raises
-    ------
-    InsufficientDataError
-        Too few rows or poses to register a sensor.
+    Raises InsufficientDataError: too few rows or poses to register a sensor.
     """
     model = problem.empty_model()
     start, z = closest_start(
@@ -338,10 +299,7 @@ def determined_offsets(
 
     That of the joint before one that never moves, for instance, turns the marker about it.
 
-    Parameters
-    ----------
-    sigma
-        Standard deviation of the errors, per axis, m.
+    ``sigma``: standard deviation of the errors, per axis, m.
     """
     derivative = model.jacobian(z, rows).reshape(3 * len(rows), -1) / sigma
     _, by_z = prior_rows(model, priors, z)
@@ -360,12 +318,8 @@ def linear_errors(
 
     Only the sensor and marker with most rows are looked at.
 
-    Returns
-    -------
-    errors
-        Median distance over the extent of the points, (arrangements,).
-    scales
-        Signed: metres of the robot for one of the points, negative where G mirrors them.
+    Returns errors: Median distance over the extent of the points, (arrangements,); scales: Signed:
+    metres of the robot for one of the points, negative where G mirrors them.
     """
     m = session.measurements
     rows = max(streams(m), key=len)
@@ -434,14 +388,9 @@ def search(session: Session, given: Fitted, lengths: Sequence[float] = ()) -> li
     Tried are units, the order, zero positions by quarters of a turn, joint 3 coupled to joint 2,
     and rows shifted by one, all of them with any signs.
 
-    Parameters
-    ----------
-    session
-        With its markers open: one that is firm at a wrong place would bend the fit.
-    given
-        The fit of the table as it is.
-    lengths
-        Length scales that are likely: metres of other units over those of the given one.
+    ``session``: with its markers open: one that is firm at a wrong place would bend the fit;
+    ``given``: the fit of the table as it is; ``lengths``: length scales that are likely: metres of
+    other units over those of the given one.
     """
     if len(session.measurements) < FEWEST_ROWS:
         return []

@@ -20,21 +20,12 @@ from remaster_ros.types import FloatArray, IntArray
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """What the offsets change.
+    """What the offsets change."""
 
-    Attributes
-    ----------
-    T_R_N_before
-        Registrations with the offsets at zero, by sensor.
-    residuals_before
-        Measured minus modelled position in N for every row of the session, m, (n, 3).
-    accuracy
-        The three metrics as fit.json has them.
-    """
-
-    T_R_N_before: Mapping[str, FloatArray]
+    T_R_N_before: Mapping[str, FloatArray]  # Registrations with the offsets at zero, by sensor
+    # Measured minus modelled position in N for every row of the session, m, (n, 3)
     residuals_before: FloatArray
-    accuracy: Mapping[str, Any]
+    accuracy: Mapping[str, Any]  # The three metrics as fit.json has them
 
 
 def compared(
@@ -47,18 +38,9 @@ def compared(
 ) -> Comparison:
     """Compare.
 
-    Parameters
-    ----------
-    problem
-        What was fitted.
-    kept
-        Indices of the fitted rows that count.
-    before, after
-        Pinned parameters with offsets at zero and as estimated, (size,).
-    predictive
-        The posterior as predictions take it.
-    rng
-        For the theoretical metric.
+    ``problem``: what was fitted; ``kept``: indices of the fitted rows that count; ``before,
+    after``: pinned parameters with offsets at zero and as estimated, (size,); ``predictive``: the
+    posterior as predictions take it; ``rng``: for the theoretical metric.
     """
     model, measurements = predictive.model, problem.measurements
     predicted_before = predicted_rows(problem, model, before)

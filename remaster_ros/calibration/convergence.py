@@ -28,20 +28,9 @@ ESS_LIMIT = 400.0
 def r_hat(draws: FloatArray) -> FloatArray:
     """Return the rank-normalised split R-hat: the larger of the one of the bulk and of the tails.
 
-    Parameters
-    ----------
-    draws
-        Chains of draws, (chains, draws, ...).
-
-    Returns
-    -------
-    ndarray
-        (...); near 1 when the chains agree, 1.01 is the usual limit.
-
-    Raises
-    ------
-    InsufficientDataError
-        With fewer than 8 draws in a chain.
+    ``draws``: chains of draws, (chains, draws, ...).
+    Returns (...); near 1 when the chains agree, 1.01 is the usual limit.
+    Raises InsufficientDataError: with fewer than 8 draws in a chain.
     """
     return _figures('rhat', draws)
 
@@ -74,49 +63,31 @@ def _figures(statistic: str, draws: FloatArray, **options: Any) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class SamplerInfo:
-    """How the draws were made and whether they are reliable.
+    """How the draws were made and whether they are reliable."""
 
-    Attributes
-    ----------
-    name
-        Which sampler it was, for the report.
-    chains, draws
-        Number of chains, and of draws kept of each.
-    acceptance_rate
-        Share of proposals taken.
-    r_hat, ess_bulk, ess_tail
-        Per parameter of `FitResult.parameter_names`, (p,).
-    precision, precision_wanted
-        Largest Monte Carlo error of a mean over its parameter's standard deviation, reached and
-        asked for; None where a number of draws was asked for instead.
-    seconds
-        By the clock passed in; NaN without one.
-    converged
-        Every R-hat at most 1.01 and every effective sample size at least what the precision takes,
-        400 where none was asked for. A Gaussian about the mode counts where the parameters are too
-        many to be sampled; not where chains were given up.
-    message
-        The verdict with its figures, for the report.
-    method
-        'metropolis' or 'laplace', as `Chains` has it. The latter has no R-hat.
-    pareto_k
-        Where chains were given up: the shape of the tail of the proposals' importance weights.
-        Else NaN.
-    """
-
-    name: str
+    name: str  # Which sampler it was, for the report
+    # Number of chains, and of draws kept of each
     chains: int
     draws: int
-    acceptance_rate: float
+    acceptance_rate: float  # Share of proposals taken
+    # Per parameter of `FitResult.parameter_names`, (p,)
     r_hat: FloatArray
     ess_bulk: FloatArray
     ess_tail: FloatArray
+    # Largest Monte Carlo error of a mean over its parameter's standard deviation, reached and
+    # asked for; None where a number of draws was asked for instead
     precision: float
     precision_wanted: float | None
-    seconds: float
+    seconds: float  # By the clock passed in; NaN without one
+    # Every R-hat at most 1.01 and every effective sample size at least what the precision takes,
+    # 400 where none was asked for. A Gaussian about the mode counts where the parameters are too
+    # many to be sampled; not where chains were given up.
     converged: bool
-    message: str
+    message: str  # The verdict with its figures, for the report
+    # 'metropolis' or 'laplace', as `Chains` has it. The latter has no R-hat.
     method: Method = 'metropolis'
+    # Where chains were given up: the shape of the tail of the proposals' importance weights. Else
+    # NaN.
     pareto_k: float = float('nan')
 
     @property

@@ -52,35 +52,20 @@ DIRECTION_LIMITS = {1: 10.828, 2: 13.816, 3: 16.266}
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """What a session gives to fit, reduced to the sensors and markers that occur in it.
+    """What a session gives to fit, reduced to the sensors and markers that occur in it."""
 
-    Attributes
-    ----------
-    session
-        As it was given.
-    chain
-        The nominal robot.
-    sensor_names, marker_names
-        Those with at least one row.
-    measurements
-        All rows in file order, ``sensor`` and ``marker`` being indices into these names.
-    markers, marker_std_m
-        Nominal positions and how well they are known, m, (markers, 3) and (markers,).
-    fitted
-        Indices of the optimization rows.
-    priors
-        What is known beforehand of offsets and registrations.
-    """
-
-    session: Session
-    chain: SerialChain
+    session: Session  # As it was given
+    chain: SerialChain  # The nominal robot
+    # Those with at least one row
     sensor_names: tuple[str, ...]
     marker_names: tuple[str, ...]
+    # All rows in file order, ``sensor`` and ``marker`` being indices into these names
     measurements: Measurements
+    # Nominal positions and how well they are known, m, (markers, 3) and (markers,)
     markers: FloatArray
     marker_std_m: FloatArray
-    fitted: IntArray
-    priors: Priors
+    fitted: IntArray  # Indices of the optimization rows
+    priors: Priors  # What is known beforehand of offsets and registrations
 
     @classmethod
     def of(cls, session: Session, priors: Priors | None = None) -> Problem:
@@ -215,31 +200,17 @@ class Problem:
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """The mode with offsets and, for comparison, with offsets held at zero.
+    """The mode with offsets and, for comparison, with offsets held at zero."""
 
-    Attributes
-    ----------
-    problem, model
-        What was fitted.
-    gauge
-        What the data do not determine.
-    mode
-        With offsets.
-    left_out
-        (row of the measurements, reason) of the gross errors.
-    kept
-        Indices of the optimization rows that were fitted.
-    without_turns
-        Why measured orientations are not fitted, a sentence; '' where they are, or none were
-        measured.
-    """
-
+    # What was fitted
     problem: Problem
     model: Model
-    gauge: Gauge
-    mode: Mode
-    left_out: tuple[tuple[int, str], ...]
-    kept: IntArray
+    gauge: Gauge  # What the data do not determine
+    mode: Mode  # With offsets
+    left_out: tuple[tuple[int, str], ...]  # (row of the measurements, reason) of the gross errors
+    kept: IntArray  # Indices of the optimization rows that were fitted
+    # Why measured orientations are not fitted, a sentence; '' where they are, or none were
+    # measured
     without_turns: str = ''
 
     @property
@@ -375,12 +346,7 @@ def with_directions(mode: Mode) -> Mode:
 def hold_offsets(mode: Mode, joint_offsets: FloatArray) -> Mode:
     """Return the mode of the same posterior with the joint offsets held at given values.
 
-    Parameters
-    ----------
-    mode
-        Of the fit with free offsets.
-    joint_offsets
-        rad, (k,).
+    ``mode``: of the fit with free offsets; ``joint_offsets``: rad, (k,).
     """
     posterior = mode.linearisation.posterior
     joints = posterior.model.joints

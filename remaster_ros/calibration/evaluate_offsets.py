@@ -23,18 +23,11 @@ DRAWS = 2000
 
 @dataclass(frozen=True)
 class OffsetsJudgement:
-    """What the offsets do for a session.
+    """What the offsets do for a session."""
 
-    Attributes
-    ----------
-    accuracy
-        The three metrics before and after, as fit.json has them.
-    left_out
-        (observation, reason) of every gross error; neither fitted nor among the metrics of the
-        optimization rows.
-    """
-
-    accuracy: dict[str, Any]
+    accuracy: dict[str, Any]  # The three metrics before and after, as fit.json has them
+    # (observation, reason) of every gross error; neither fitted nor among the metrics of the
+    # optimization rows
     left_out: tuple[tuple[int, str], ...]
 
 

@@ -15,42 +15,24 @@ from remaster_ros.types import FloatArray, IntArray
 
 @dataclass(frozen=True, eq=False)
 class Term:
-    """What some of the parameters do, in one place.
+    """What some of the parameters do, in one place."""
 
-    Attributes
-    ----------
-    where
-        Which parameters, in order.
-    at
-        Index of the joint whose angle they add to; None where they displace the marker.
-    values
-        Added joint angle, rad per unit, (n, c), or displacement in base coordinates R, m per unit,
-        (n, 3, c): of all that does not enter through a joint angle (links, base, marker, sensor
-        frame), the derivative at ``theta0``.
-    """
-
-    where: slice
+    where: slice  # Which parameters, in order
+    # Index of the joint whose angle they add to; None where they displace the marker
     at: int | None
+    # Added joint angle, rad per unit, (n, c), or displacement in base coordinates R, m per unit,
+    # (n, 3, c): of all that does not enter through a joint angle (links, base, marker, sensor
+    # frame), the derivative at ``theta0``
     values: FloatArray
 
 
 @dataclass(frozen=True)
 class Start:
-    """Where the effects were found: a solution near the mode.
+    """Where the effects were found: a solution near the mode."""
 
-    Attributes
-    ----------
-    joint_offsets
-        rad, (k,).
-    T_R_N
-        Registration of each sensor, (sensors, 4, 4).
-    markers
-        In T, m, (markers, 3).
-    """
-
-    joint_offsets: FloatArray
-    T_R_N: FloatArray
-    markers: FloatArray
+    joint_offsets: FloatArray  # rad, (k,)
+    T_R_N: FloatArray  # Registration of each sensor, (sensors, 4, 4)
+    markers: FloatArray  # In T, m, (markers, 3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,38 +46,23 @@ class Extension:
 
     in base coordinates R, then registered as without an extension. Rows are those of the
     `Measurements` (``Rows.source``).
-
-    Attributes
-    ----------
-    names
-        'compliance_2', …, m names.
-    units
-        'rad/(N m)', …, m units.
-    terms
-        What they do. A curve of a joint has a hundred parameters, which concern this joint alone.
-    displacement0
-        Exact value at ``theta0`` of what the displacing terms are derivatives of, m, (n, 3).
-    theta0
-        Where it was linearised, (m,).
-    prior_precision
-        Gaussian prior about 0 (plausible size, smoothness); zeros where flat, (m, m).
-    joint_offsets
-        Zero-offsets that the effects were searched with, those that the gauge held at 0, rad,
-        (k,); None where nothing is known of them.
-    step_std
-        How far from there offsets beside the effects may be: a Gaussian prior, rad.
-    start
-        Where to begin the search for the mode; None where that is to be found, too.
     """
 
-    names: tuple[str, ...]
-    units: tuple[str, ...]
+    names: tuple[str, ...]  # 'compliance_2', …, m names
+    units: tuple[str, ...]  # 'rad/(N m)', …, m units
+    # What they do. A curve of a joint has a hundred parameters, which concern this joint alone.
     terms: tuple[Term, ...]
+    # Exact value at ``theta0`` of what the displacing terms are derivatives of, m, (n, 3)
     displacement0: FloatArray
-    theta0: FloatArray
+    theta0: FloatArray  # Where it was linearised, (m,)
+    # Gaussian prior about 0 (plausible size, smoothness); zeros where flat, (m, m)
     prior_precision: FloatArray
+    # Zero-offsets that the effects were searched with, those that the gauge held at 0, rad, (k,);
+    # None where nothing is known of them
     joint_offsets: FloatArray | None = None
+    # How far from there offsets beside the effects may be: a Gaussian prior, rad
     step_std: float = np.inf
+    # Where to begin the search for the mode; None where that is to be found, too
     start: Start | None = None
 
     def turns(self, theta: FloatArray, rows: IntArray) -> dict[int, FloatArray]:

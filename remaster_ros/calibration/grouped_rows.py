@@ -25,57 +25,37 @@ Bodies = tuple[tuple[int, int], ...]
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """Observations sorted by sensor, then by pose, then by frame.
+    """Observations sorted by sensor, then by pose, then by frame."""
 
-    Attributes
-    ----------
-    source
-        Index of each row in the `Measurements` it came from, (n,).
-    q
-        rad, (n, k).
-    marker
-        Marker index, (n,).
-    target
-        Measured positions in the base coordinates of the reference registrations, m, (n, 3); 0 of
-        an orientation, whose prediction is the turn from the measured to the modelled one.
-    spans
-        (sensor index, slice of its rows) of every sensor present. The orientations of sensor
-        ``turning[i]`` have the index S + i, S being the number of sensors.
-    group_start, group_size, group_sensor
-        The rows of one sensor at one pose share an error: where each group starts, how many rows
-        and which sensor it has, (groups,).
-    frame
-        Number of each row's frame, ascending from 0, (n,): the markers of one frame share an
-        error, too. None where every row is a frame by itself.
-    turned
-        Measured orientations of the last r rows in the base coordinates of the reference
-        registrations, (r, 3, 3); None where none are fitted.
-    turning
-        Sensors whose orientations these are.
-    body
-        Index of each row's body, (n,); -1 where it has none. None as ``turned``.
-    lever
-        What a sensor on the tool measured, m, (n, 3): the point in its own frame, which is the
-        body's, and 0 in rows of other sensors; None where no sensor is on the tool. ``target`` is
-        then the origin of the measured thing, which is frame N.
-    place
-        Where the position of a row was measured, in the base coordinates of the reference, m,
-        (n, 3); None where that is ``target``.
-    """
-
-    source: IntArray
-    q: FloatArray
-    marker: IntArray
+    source: IntArray  # Index of each row in the `Measurements` it came from, (n,)
+    q: FloatArray  # rad, (n, k)
+    marker: IntArray  # Marker index, (n,)
+    # Measured positions in the base coordinates of the reference registrations, m, (n, 3); 0 of an
+    # orientation, whose prediction is the turn from the measured to the modelled one
     target: FloatArray
+    # (sensor index, slice of its rows) of every sensor present. The orientations of sensor
+    # ``turning[i]`` have the index S + i, S being the number of sensors.
     spans: tuple[tuple[int, slice], ...]
+    # The rows of one sensor at one pose share an error: where each group starts, how many rows and
+    # which sensor it has, (groups,)
     group_start: IntArray
     group_size: IntArray
     group_sensor: IntArray
+    # Number of each row's frame, ascending from 0, (n,): the markers of one frame share an error,
+    # too. None where every row is a frame by itself.
     frame: IntArray | None = None
+    # Measured orientations of the last r rows in the base coordinates of the reference
+    # registrations, (r, 3, 3); None where none are fitted
     turned: FloatArray | None = None
-    turning: tuple[int, ...] = ()
+    turning: tuple[int, ...] = ()  # Sensors whose orientations these are
+    # Index of each row's body, (n,); -1 where it has none. None as ``turned``.
     body: IntArray | None = None
+    # What a sensor on the tool measured, m, (n, 3): the point in its own frame, which is the
+    # body's, and 0 in rows of other sensors; None where no sensor is on the tool. ``target`` is
+    # then the origin of the measured thing, which is frame N.
     lever: FloatArray | None = None
+    # Where the position of a row was measured, in the base coordinates of the reference, m, (n,
+    # 3); None where that is ``target``
     place: FloatArray | None = None
 
     @classmethod

@@ -51,43 +51,25 @@ BLOCK_ROWS = 5_000
 
 @dataclass(frozen=True)
 class GaugeDirection:
-    """A combination of parameters that can change without any change in the data.
+    """A combination of parameters that can change without any change in the data."""
 
-    Attributes
-    ----------
-    combination
-        How far each parameter moves, rad and m, the largest entry 1. Registrations are
-        corrections of the robot's points on their way to the sensor, along the axes of R and
-        about its origin (see `model`).
-    why
-        The same as a sentence for the report.
-    fixed_by
-        What decides where on the direction the result lies.
-    """
-
+    # How far each parameter moves, rad and m, the largest entry 1. Registrations are corrections
+    # of the robot's points on their way to the sensor, along the axes of R and about its origin
+    # (see `model`).
     combination: Mapping[str, float]
-    why: str
-    fixed_by: str
+    why: str  # The same as a sentence for the report
+    fixed_by: str  # What decides where on the direction the result lies
 
 
 @dataclass(frozen=True)
 class Gauge:
-    """All of the directions, and what follows for the joints.
+    """All of the directions, and what follows for the joints."""
 
-    Attributes
-    ----------
-    directions
-        One per dimension of the null space.
-    held
-        Indices of the joints held at zero and of the effects held where they were linearised,
-        (h,).
-    why
-        For each joint what the data do not distinguish its offset from; '' where it is determined,
-        k strings.
-    """
-
-    directions: tuple[GaugeDirection, ...]
+    directions: tuple[GaugeDirection, ...]  # One per dimension of the null space
+    # Indices of the joints held at zero and of the effects held where they were linearised, (h,)
     held: IntArray
+    # For each joint what the data do not distinguish its offset from; '' where it is determined, k
+    # strings
     why: tuple[str, ...]
 
 
@@ -147,15 +129,9 @@ def known_offsets(
     Those that the data determine, or a prior nearly as well; none that is known to no better than
     a degree once all is counted.
 
-    Parameters
-    ----------
-    chain
-        The k joints.
-    why
-        Of each joint why the data do not determine its offset, '' where they do.
-    by_data, std
-        Standard deviation by the model, and with what is known to be left out of it, rad or m,
-        (k,).
+    ``chain``: the k joints; ``why``: of each joint why the data do not determine its offset, ''
+    where they do; ``by_data, std``: standard deviation by the model, and with what is known to be
+    left out of it, rad or m, (k,).
     """
     by_data = by_data / chain.per_radian
     seen = np.array([not text for text in why])

@@ -51,30 +51,13 @@ def robust_start(
 ) -> tuple[Model, FloatArray]:
     """Find a solution near the mode.
 
-    Parameters
-    ----------
-    model
-        Only its chain and names are used.
-    measurements, rows
-        The observations, and which of them to fit.
-    nominal_markers, marker_std_m
-        Markers in the tool frame, m, (markers, 3), and how well they are known.
-    priors
-        Priors on the markers.
-
-    Returns
-    -------
-    model
-        With its reference registrations at the solution.
-    z
-        Pinned parameters there, the outer joints at 0, (size,).
-
-    Raises
-    ------
-    InsufficientDataError
-        When the points of a sensor do not fix a registration.
-    MisfitError
-        When they are not those of this robot.
+    ``model``: only its chain and names are used; ``measurements, rows``: the observations, and
+    which of them to fit; ``nominal_markers, marker_std_m``: markers in the tool frame, m,
+    (markers, 3), and how well they are known; ``priors``: priors on the markers.
+    Returns model: With its reference registrations at the solution; z: Pinned parameters there,
+    the outer joints at 0, (size,).
+    Raises InsufficientDataError: when the points of a sensor do not fix a registration;
+    MisfitError: when they are not those of this robot.
     """
     everything, rows = rows, _some_rows(measurements, rows)
     start, z = closest_start(model, measurements, rows, nominal_markers, marker_std_m, priors)
@@ -133,19 +116,10 @@ def with_bodies(
 ) -> tuple[Model, FloatArray, str]:
     """Return a model that fits the orientations measured, and z with how the bodies stand.
 
-    Parameters
-    ----------
-    model, z
-        Near the mode by the positions.
-    measurements, rows
-        The observations, and which of them to fit.
-
-    Returns
-    -------
-    model, z
-        As given where no orientations can be fitted.
-    why
-        A sentence where orientations were measured and cannot; else ''.
+    ``model, z``: near the mode by the positions; ``measurements, rows``: the observations, and
+    which of them to fit.
+    Returns model, z: As given where no orientations can be fitted; why: A sentence where
+    orientations were measured and cannot; else ''.
     """
     if measurements.orientation is None or model.extension is not None:
         return model, z, ''

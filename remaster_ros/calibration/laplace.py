@@ -39,21 +39,11 @@ DIFFERENCE = 0.02
 
 @dataclass(frozen=True, eq=False)
 class Mode:
-    """Where the linearised posterior peaks, and how wide it is.
+    """Where the linearised posterior peaks, and how wide it is."""
 
-    Attributes
-    ----------
-    z
-        Pinned parameters, (size,).
-    eta
-        (e,).
-    linearisation
-        About z.
-    """
-
-    z: FloatArray
-    eta: FloatArray
-    linearisation: Linearisation
+    z: FloatArray  # Pinned parameters, (size,)
+    eta: FloatArray  # (e,)
+    linearisation: Linearisation  # About z
 
     @cached_property
     def eta_covariance(self) -> FloatArray:
@@ -119,18 +109,10 @@ class Mode:
 def find_mode(posterior: Posterior, eta: FloatArray | None = None) -> Mode:
     """Find the mode by Gauss–Newton steps, the noise at the peak of its marginal density.
 
-    Parameters
-    ----------
-    posterior
-        With ``reference`` near the mode (see `initial_guess.robust_start`).
-    eta
-        Where to begin the search of the noise, (e,); from the errors at the reference where None.
-
-    Raises
-    ------
-    InsufficientDataError
-        When the steps do not settle: the rows do not determine the free parameters. The message
-        names those along which they go.
+    ``posterior``: with ``reference`` near the mode (see `initial_guess.robust_start`); ``eta``:
+    where to begin the search of the noise, (e,); from the errors at the reference where None.
+    Raises InsufficientDataError: when the steps do not settle: the rows do not determine the free
+    parameters. The message names those along which they go.
     """
     z = posterior.reference
     eta = _noise_guess(posterior) if eta is None else eta

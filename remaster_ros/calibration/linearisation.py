@@ -37,24 +37,13 @@ def linearise(posterior: Posterior, z: FloatArray) -> Linearisation:
 
 @dataclass(frozen=True, eq=False)
 class Linearisation:
-    """The posterior of a model that is linear about ``z``: Gaussian given the noise.
+    """The posterior of a model that is linear about ``z``: Gaussian given the noise."""
 
-    Attributes
-    ----------
-    posterior
-        The one it approximates.
-    z
-        Pinned parameters, (size,).
-    grams
-        Gram matrix of [derivative | error] in each error group, (error groups, f+1, f+1).
-    prior
-        Gram matrix of the priors, (f+1, f+1).
-    """
-
-    posterior: Posterior
-    z: FloatArray
+    posterior: Posterior  # The one it approximates
+    z: FloatArray  # Pinned parameters, (size,)
+    # Gram matrix of [derivative | error] in each error group, (error groups, f+1, f+1)
     grams: FloatArray
-    prior: FloatArray
+    prior: FloatArray  # Gram matrix of the priors, (f+1, f+1)
 
     def gram(self, eta: FloatArray) -> FloatArray:
         """Return the weighted Gram matrices (..., f+1, f+1) for noise coordinates (..., e)."""
@@ -63,19 +52,10 @@ class Linearisation:
     def conditional(self, eta: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return the Gaussian of the free parameters given the noise, and the noise's density.
 
-        Parameters
-        ----------
-        eta
-            (..., e).
-
-        Returns
-        -------
-        mean
-            Free pinned parameters, (..., f).
-        cholesky
-            Lower Cholesky factor of the precision, (..., f, f).
-        log_marginal
-            Log density of the noise coordinates with the parameters integrated out, (...).
+        ``eta``: (..., e).
+        Returns mean: Free pinned parameters, (..., f); cholesky: Lower Cholesky factor of the
+        precision, (..., f, f); log_marginal: Log density of the noise coordinates with the
+        parameters integrated out, (...).
         """
         factor, pull, log_marginal = self.whitened(eta)
         step = np.linalg.solve(np.swapaxes(factor, -1, -2), pull[..., None])[..., 0]
@@ -114,20 +94,10 @@ class Linearisation:
 
         All from one factor, where differences would take dozens.
 
-        Parameters
-        ----------
-        eta
-            (e,).
-
-        Returns
-        -------
-        log_marginal
-            As `conditional` gives it.
-        slope
-            Gradient without the prior of the noise, (error groups,).
-        information
-            Average of observed and expected information (Gilmour, Thompson & Cullis 1995,
-            Biometrics 51), (error groups, error groups).
+        ``eta``: (e,).
+        Returns log_marginal: As `conditional` gives it; slope: Gradient without the prior of the
+        noise, (error groups,); information: Average of observed and expected information (Gilmour,
+        Thompson & Cullis 1995, Biometrics 51), (error groups, error groups).
         """
         factor, pull, log_marginal = self.whitened(eta)
         root = np.asfortranarray(factor)

@@ -15,13 +15,7 @@ SAME_RAD = float(np.radians(0.05))
 
 @dataclass(frozen=True)
 class MeasuredAgain:
-    """How many of the held-out configurations were fitted as well.
-
-    Attributes
-    ----------
-    again, held_out
-        Counts.
-    """
+    """How many of the held-out configurations were fitted as well."""
 
     again: int
     held_out: int

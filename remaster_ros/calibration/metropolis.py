@@ -19,32 +19,20 @@ Method = Literal['metropolis', 'laplace']
 
 
 class Chains(NamedTuple):
-    """What a sampler returns.
+    """What a sampler returns."""
 
-    Attributes
-    ----------
-    draws
-        (chains, draws, d).
-    acceptance_rate
-        Share of proposals taken, over all chains.
-    trace
-        A thinned record from the first state on, warm-up included, (chains, records, d).
-    method
-        'metropolis', or 'laplace' for draws of the Gaussian about the mode, which are no chains.
-    pareto_k, effective
-        Where chains of an adapted proposal were given up: the shape of the tail of the importance
-        weights of its draws, and how many independent draws they are worth. NaN for chains.
-    figures
-        R-hat and effective draws of bulk and tails of the quantities that the length of chains was
-        judged by, (p,) each; None where it was not.
-    """
-
-    draws: FloatArray
-    acceptance_rate: float
+    draws: FloatArray  # (chains, draws, d)
+    acceptance_rate: float  # Share of proposals taken, over all chains
+    # A thinned record from the first state on, warm-up included, (chains, records, d)
     trace: FloatArray
+    # 'metropolis', or 'laplace' for draws of the Gaussian about the mode, which are no chains
     method: Method = 'metropolis'
+    # Where chains of an adapted proposal were given up: the shape of the tail of the importance
+    # weights of its draws, and how many independent draws they are worth. NaN for chains.
     pareto_k: float = float('nan')
     effective: float = float('nan')
+    # R-hat and effective draws of bulk and tails of the quantities that the length of chains was
+    # judged by, (p,) each; None where it was not
     figures: tuple[FloatArray, FloatArray, FloatArray] | None = None
 
 
@@ -75,20 +63,10 @@ def independence_sampler(
     All proposals are evaluated in batches beforehand; the chains then walk over their importance
     weights (Hastings 1970; Tierney 1994): take y from x with probability min(1, w(y) / w(x)).
 
-    Parameters
-    ----------
-    log_density
-        Points (n, d) to log density (n,), up to a constant; -inf where there is none.
-    proposal
-        Heavier in the tails than the target.
-    draws, warm_up
-        Draws kept per chain, after ``warm_up`` that are not.
-    rng
-        Source of all randomness.
-    start
-        First states of the chains, dispersed, (chains, d).
-    progress
-        Called with the share done.
+    ``log_density``: points (n, d) to log density (n,), up to a constant; -inf where there is none;
+    ``proposal``: heavier in the tails than the target; ``draws, warm_up``: draws kept per chain,
+    after ``warm_up`` that are not; ``start``: first states of the chains, dispersed, (chains, d);
+    ``progress``: called with the share done.
     """
     chains, length = len(start), warm_up + draws
     points, log_proposal = proposal.sample(chains * length, rng)
@@ -134,24 +112,12 @@ def random_walk_sampler(
 ) -> Chains:
     """Sample with Metropolis' random walk (Metropolis et al. 1953), all chains side by side.
 
-    Parameters
-    ----------
-    log_density
-        Points (chains, d) to log density (chains,), up to a constant; -inf where there is none.
-    step
-        Draws the proposed moves of all chains, (chains, d), from a symmetric distribution.
-    start
-        First states, (chains, d).
-    steps, burn_in
-        Steps of every chain in all, and how many of them are not kept.
-    rng
-        Source of all randomness.
-    thin
-        Every how many steps a draw is kept.
-    trace_every
-        Every how many steps a state is recorded in the trace, from the start.
-    progress
-        Called with the share done.
+    ``log_density``: points (chains, d) to log density (chains,), up to a constant; -inf where
+    there is none; ``step``: draws the proposed moves of all chains, (chains, d), from a symmetric
+    distribution; ``start``: first states, (chains, d); ``steps, burn_in``: steps of every chain in
+    all, and how many of them are not kept; ``thin``: every how many steps a draw is kept;
+    ``trace_every``: every how many steps a state is recorded in the trace, from the start;
+    ``progress``: called with the share done.
     """
     state, log_state = start.copy(), log_density(start)
     kept, trace = [], [state]

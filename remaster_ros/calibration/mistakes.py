@@ -66,17 +66,10 @@ TRIED = (
 
 @dataclass(frozen=True, eq=False)
 class Mistakes:
-    """What trying has shown.
+    """What trying has shown."""
 
-    Attributes
-    ----------
-    given
-        The fit of the session as it is, its markers' places left open.
-    fitting
-        The mistakes without which it fits, the simplest first; several where the data cannot tell.
-    """
-
-    given: Fitted
+    given: Fitted  # The fit of the session as it is, its markers' places left open
+    # The mistakes without which it fits, the simplest first; several where the data cannot tell
     fitting: tuple[Fitted, ...]
 
 
@@ -282,21 +275,13 @@ def _costs(
 
 @dataclass(frozen=True)
 class Columns:
-    """How a table names what it holds.
+    """How a table names what it holds."""
 
-    Attributes
-    ----------
-    joints, shown
-        Its columns of joints, and how they are called in a sentence.
-    points
-        Its columns of x, y and z.
-    length_unit, angle_unit
-        In which its numbers were taken to be.
-    """
-
+    # Its columns of joints, and how they are called in a sentence
     joints: tuple[str, ...]
     shown: tuple[str, ...]
-    points: tuple[str, ...] = ('x_m', 'y_m', 'z_m')
+    points: tuple[str, ...] = ('x_m', 'y_m', 'z_m')  # Its columns of x, y and z
+    # In which its numbers were taken to be
     length_unit: str = 'm'
     angle_unit: str = 'rad'
 

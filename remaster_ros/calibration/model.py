@@ -70,23 +70,10 @@ def predict_in_sensor(
 ) -> FloatArray:
     """Return where the sensors should measure the markers.
 
-    Parameters
-    ----------
-    chain
-        The nominal robot, k joints.
-    measurements
-        The observations to predict, n rows.
-    joint_offsets
-        Zero-offsets, rad, (k,).
-    T_R_N
-        Registration of each sensor, (sensors, 4, 4).
-    markers
-        Position of each marker in the tool frame, m, (markers, 3).
-
-    Returns
-    -------
-    ndarray
-        Marker positions in the frame N of the row's sensor, m, (n, 3).
+    ``chain``: the nominal robot, k joints; ``measurements``: the observations to predict, n rows;
+    ``joint_offsets``: zero-offsets, rad, (k,); ``T_R_N``: registration of each sensor, (sensors,
+    4, 4); ``markers``: position of each marker in the tool frame, m, (markers, 3).
+    Returns marker positions in the frame N of the row's sensor, m, (n, 3).
     """
     points = chain.positions(measurements.q, markers[measurements.marker], joint_offsets)
     return apply(inverse(T_R_N)[measurements.sensor], points)
@@ -94,37 +81,21 @@ def predict_in_sensor(
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """The parameters' layout and the prediction with its derivative.
+    """The parameters' layout and the prediction with its derivative."""
 
-    Attributes
-    ----------
-    chain
-        The nominal robot, k joints.
-    sensor_names, marker_names
-        In the order of the indices in `Measurements`.
-    reference
-        The registration T_R_N at (t, r) = 0 of each sensor, (sensors, 4, 4).
-    centroid
-        Point in R about which each sensor's correction turns, m, (sensors, 3).
-    extension
-        Further parameters, given for every row of the `Measurements`; None without any. Its
-        displacements say nothing of turns: with one no orientation is fitted.
-    bodies
-        (sensor, marker) of every body whose orientation is fitted.
-    body_reference
-        R_T_B at b = 0 of each body, (bodies, 3, 3).
-    on_tool
-        Sensors on the tool, whose readings are those of the sensor in front of what it sees.
-    """
-
-    chain: SerialChain
+    chain: SerialChain  # The nominal robot, k joints
+    # In the order of the indices in `Measurements`
     sensor_names: tuple[str, ...]
     marker_names: tuple[str, ...]
-    reference: FloatArray
-    centroid: FloatArray
+    reference: FloatArray  # The registration T_R_N at (t, r) = 0 of each sensor, (sensors, 4, 4)
+    centroid: FloatArray  # Point in R about which each sensor's correction turns, m, (sensors, 3)
+    # Further parameters, given for every row of the `Measurements`; None without any. Its
+    # displacements say nothing of turns: with one no orientation is fitted.
     extension: Extension | None = None
-    bodies: Bodies = ()
+    bodies: Bodies = ()  # (sensor, marker) of every body whose orientation is fitted
+    # R_T_B at b = 0 of each body, (bodies, 3, 3)
     body_reference: FloatArray = field(default_factory=lambda: np.zeros((0, 3, 3)))
+    # Sensors on the tool, whose readings are those of the sensor in front of what it sees
     on_tool: tuple[int, ...] = ()
 
     @property
@@ -469,24 +440,12 @@ class Model:
 
 
 class Pose(NamedTuple):
-    """Where an arm stands in n rows, in its base R.
+    """Where an arm stands in n rows, in its base R."""
 
-    Attributes
-    ----------
-    tool
-        T_R_T, (n, 4, 4).
-    points
-        Markers, displaced by an extension, m, (n, 3).
-    axes
-        Directions of the joints, (n, k, 3).
-    by_joints
-        Derivative of the points by the joint angles, m/rad or m/m, (n, 3, k).
-    """
-
-    tool: FloatArray
-    points: FloatArray
-    axes: FloatArray
-    by_joints: FloatArray
+    tool: FloatArray  # T_R_T, (n, 4, 4)
+    points: FloatArray  # Markers, displaced by an extension, m, (n, 3)
+    axes: FloatArray  # Directions of the joints, (n, k, 3)
+    by_joints: FloatArray  # Derivative of the points by the joint angles, m/rad or m/m, (n, 3, k)
 
 
 def _moved_along(

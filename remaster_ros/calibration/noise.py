@@ -48,21 +48,11 @@ from remaster_ros.types import FloatArray, IntArray
 
 @dataclass(frozen=True)
 class Channel:
-    """Errors of one sensor that have one noise.
+    """Errors of one sensor that have one noise."""
 
-    Attributes
-    ----------
-    sensor
-        Its index.
-    direction
-        'along' the line of sight, 'across' it, or '' for all axes alike.
-    axes
-        Which axes of the rows' frames these are: first and behind the last.
-    """
-
-    sensor: int
-    direction: str
-    axes: tuple[int, int]
+    sensor: int  # Its index
+    direction: str  # 'along' the line of sight, 'across' it, or '' for all axes alike
+    axes: tuple[int, int]  # Which axes of the rows' frames these are: first and behind the last
 
     @property
     def dimension(self) -> int:
@@ -75,31 +65,19 @@ class ErrorGroup:
     """Errors of one channel that have one variance.
 
     The variance is sigma² + frame_size frame_sigma² + size pose_sigma².
-
-    Attributes
-    ----------
-    channel
-        Its index.
-    kind
-        'rows' for the deviations from the means of the frames, 'frames' for those of the frames'
-        means from the mean of their pose, 'poses' for the poses' means.
-    frame_size
-        Harmonic mean M of the rows of a pose's frames; 0 of 'rows'.
-    size
-        m M for m frames in a pose, which is the number of its rows where the frames are of one
-        size; 0 but of 'poses'.
-    groups
-        The rows' groups that these errors belong to, (g,): of 'frames' those with several.
-    freedom
-        Number of independent errors.
     """
 
-    channel: int
+    channel: int  # Its index
+    # 'rows' for the deviations from the means of the frames, 'frames' for those of the frames'
+    # means from the mean of their pose, 'poses' for the poses' means
     kind: Literal['rows', 'frames', 'poses']
-    frame_size: float
+    frame_size: float  # Harmonic mean M of the rows of a pose's frames; 0 of 'rows'
+    # m M for m frames in a pose, which is the number of its rows where the frames are of one size;
+    # 0 but of 'poses'
     size: float
+    # The rows' groups that these errors belong to, (g,): of 'frames' those with several
     groups: IntArray
-    freedom: int
+    freedom: int  # Number of independent errors
 
 
 def error_groups(channels: Sequence[Channel], rows: Rows) -> tuple[ErrorGroup, ...]:
@@ -141,20 +119,12 @@ GRAM_ROWS = 2_000
 
 @dataclass(frozen=True, eq=False)
 class Noise:
-    """Standard deviations per axis of each channel, m, (..., channels).
+    """Standard deviations per axis of each channel, m, (..., channels)."""
 
-    Attributes
-    ----------
-    sigma
-        Of the part that is independent between rows.
-    pose_sigma
-        Of the part that the rows of one sensor at one pose share; 0 where the channel has none.
-    frame_sigma
-        Of the part that the markers of one frame share; 0 where the channel has none.
-    """
-
-    sigma: FloatArray
+    sigma: FloatArray  # Of the part that is independent between rows
+    # Of the part that the rows of one sensor at one pose share; 0 where the channel has none
     pose_sigma: FloatArray
+    # Of the part that the markers of one frame share; 0 where the channel has none
     frame_sigma: FloatArray
 
     @property
@@ -166,31 +136,18 @@ class Noise:
 
 @dataclass(frozen=True, eq=False)
 class NoiseModel:
-    """Which errors of some rows have which variance.
+    """Which errors of some rows have which variance."""
 
-    Attributes
-    ----------
-    rows
-        n rows, sorted by sensor and pose.
-    sensors
-        Number of sensors, those without rows included.
-    channels
-        Those of sensor 0, of sensor 1, …, last those of orientations, whose noise is in rad.
-    separable, framed
-        Indices of the channels with a pose_sigma, and with a frame_sigma of their own, ascending.
-    error_groups
-        What the data enter by.
-    frames
-        Rows of a matrix: the line of sight and two directions across it, in the coordinates of
-        `Rows.target`, one for all rows of a group, (n, 3, 3); None where no sensor needs them.
-    """
-
-    rows: Rows
-    sensors: int
+    rows: Rows  # n rows, sorted by sensor and pose
+    sensors: int  # Number of sensors, those without rows included
+    # Those of sensor 0, of sensor 1, …, last those of orientations, whose noise is in rad
     channels: tuple[Channel, ...]
+    # Indices of the channels with a pose_sigma, and with a frame_sigma of their own, ascending
     separable: tuple[int, ...]
     framed: tuple[int, ...]
-    error_groups: tuple[ErrorGroup, ...]
+    error_groups: tuple[ErrorGroup, ...]  # What the data enter by
+    # Rows of a matrix: the line of sight and two directions across it, in the coordinates of
+    # `Rows.target`, one for all rows of a group, (n, 3, 3); None where no sensor needs them
     frames: FloatArray | None
 
     @classmethod
@@ -372,12 +329,8 @@ class NoiseModel:
 
         Of 'frames' those of the means themselves, which contain the poses' means (`_contained`).
 
-        Parameters
-        ----------
-        rows
-            n of the rows, whole groups from the one with index ``first`` on.
-        values
-            Vectors in the axes of the channels, (n, 3, ...).
+        ``rows``: n of the rows, whole groups from the one with index ``first`` on; ``values``:
+        vectors in the axes of the channels, (n, 3, ...).
         """
         shape = (-1, *(1,) * (values.ndim - 1))
         means = frames = values

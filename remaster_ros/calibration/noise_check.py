@@ -42,40 +42,25 @@ MEDIAN_LENGTH = 1.5382
 
 @dataclass(frozen=True)
 class NoiseCheck:
-    """The error that a fit leaves at one sensor, and what noise explains of it.
+    """The error that a fit leaves at one sensor, and what noise explains of it."""
 
-    Attributes
-    ----------
-    sensor
-        Its name.
-    error_m
-        Mean 3-D error on the rows judged, without the worst twentieth and without gross errors, m.
-    stated_m
-        Standard deviation per axis of a reading (RMS) by the scatter of the samples that it is the
-        mean of, m; None where no reading has one.
-    within_m
-        Standard deviation per axis of the errors within poses, m; None where no pose has two.
-    poses
-        That were judged. The mean of few may lie far from that of many.
-    spread
-        How many times larger noise makes the error on held-out rows, as few poses determine the
-        parameters poorly; 1 on fitted rows.
-    gross
-        ``observation`` of every held-out row that is a single gross error: no fit leaves those
-        out. None where so many are that a fit would refuse them: something changed there, or the
-        model does not hold.
-    mean_m
-        Mean 3-D error on all rows judged, gross ones too, m.
-    """
-
-    sensor: str
+    sensor: str  # Its name
+    # Mean 3-D error on the rows judged, without the worst twentieth and without gross errors, m
     error_m: float
+    # Standard deviation per axis of a reading (RMS) by the scatter of the samples that it is the
+    # mean of, m; None where no reading has one
     stated_m: float | None
+    # Standard deviation per axis of the errors within poses, m; None where no pose has two
     within_m: float | None
-    poses: int
+    poses: int  # That were judged. The mean of few may lie far from that of many.
+    # How many times larger noise makes the error on held-out rows, as few poses determine the
+    # parameters poorly; 1 on fitted rows
     spread: float = 1.0
+    # ``observation`` of every held-out row that is a single gross error: no fit leaves those out.
+    # None where so many are that a fit would refuse them: something changed there, or the model
+    # does not hold.
     gross: tuple[int, ...] = ()
-    mean_m: float = 0.0
+    mean_m: float = 0.0  # Mean 3-D error on all rows judged, gross ones too, m
 
     @property
     def spoilt(self) -> str:
@@ -122,18 +107,10 @@ def check_noise(
 ) -> tuple[NoiseCheck, ...]:
     """Compare what a fit leaves with the noise, sensor by sensor.
 
-    Parameters
-    ----------
-    measurements
-        n observations. Those held out are judged where the sensor has any, else those fitted.
-    sensor_names
-        In index order.
-    residuals
-        Measured minus modelled positions, m, (n, 3).
-    left_out
-        ``observation`` of every row that was not fitted.
-    parameters
-        How many were fitted, without those of the noise.
+    ``measurements``: n observations. Those held out are judged where the sensor has any, else
+    those fitted; ``sensor_names``: in index order; ``residuals``: measured minus modelled
+    positions, m, (n, 3); ``left_out``: ``observation`` of every row that was not fitted;
+    ``parameters``: how many were fitted, without those of the noise.
     """
     kept = ~np.isin(measurements.observation, left_out)
     spread = _spread(measurements.select(kept & ~measurements.is_validation), parameters)

@@ -36,23 +36,15 @@ METRICS = ('relative_orientation', 'post_registration_orientation')
 
 @dataclass(frozen=True, eq=False)
 class TurnsTell:
-    """What the orientations tell of the offsets of k joints.
+    """What the orientations tell of the offsets of k joints."""
 
-    Attributes
-    ----------
-    std_without
-        Of the offsets by the positions alone, rad, (k,); 0 where held, infinite where those do not
-        determine them.
-    shift
-        By how much the orientations move the offsets, rad, (k,); 0 where held or where the
-        positions alone determine nothing.
-    p_value
-        Of so large a shift, or a larger one, by noise.
-    """
-
+    # Of the offsets by the positions alone, rad, (k,); 0 where held, infinite where those do not
+    # determine them
     std_without: FloatArray
+    # By how much the orientations move the offsets, rad, (k,); 0 where held or where the positions
+    # alone determine nothing
     shift: FloatArray
-    p_value: float
+    p_value: float  # Of so large a shift, or a larger one, by noise
 
 
 def what_turns_tell(mode: Mode) -> TurnsTell | None:
@@ -106,15 +98,9 @@ def tool_orientations(
 ) -> ToolOrientations | None:
     """Return how the sensors should see the tool; None where no orientation was measured.
 
-    Parameters
-    ----------
-    model
-        Without an extension, whose effects are known as displacements of points alone; with one
-        the answer is None.
-    measurements
-        n observations.
-    before, after
-        Pinned parameters with offsets at zero and as estimated, (size,).
+    ``model``: without an extension, whose effects are known as displacements of points alone; with
+    one the answer is None; ``measurements``: n observations; ``before, after``: pinned parameters
+    with offsets at zero and as estimated, (size,).
     """
     if measurements.orientation is None or model.extension is not None:
         return None
@@ -138,18 +124,9 @@ def orientation_accuracy(
 ) -> dict[str, Any]:
     """Return both errors before and after; {} where the chosen rows have no orientation.
 
-    Parameters
-    ----------
-    measurements
-        n observations.
-    modelled
-        Of the same rows.
-    fitted
-        Rows from which R_T_B of every sensor and marker is taken.
-    chosen
-        Rows that are judged.
-    pairs
-        Joint solutions of the same pose, (m, 2).
+    ``measurements``: n observations; ``modelled``: of the same rows; ``fitted``: rows from which
+    R_T_B of every sensor and marker is taken; ``chosen``: rows that are judged; ``pairs``: joint
+    solutions of the same pose, (m, 2).
     """
     assert measurements.orientation is not None
     seen = np.all(np.isfinite(measurements.orientation), axis=1)

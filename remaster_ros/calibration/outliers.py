@@ -50,18 +50,10 @@ FEWEST_TO_JUDGE = 60
 
 @dataclass(frozen=True, eq=False)
 class Judgement:
-    """What `judge` found, row by row in the order of `Rows`.
+    """What `judge` found, row by row in the order of `Rows`."""
 
-    Attributes
-    ----------
-    gross
-        True where the row is to be left out, (n,).
-    why
-        The reason with its numbers; '' where kept, n strings.
-    """
-
-    gross: BoolArray
-    why: tuple[str, ...]
+    gross: BoolArray  # True where the row is to be left out, (n,)
+    why: tuple[str, ...]  # The reason with its numbers; '' where kept, n strings
 
 
 def find_outliers(
@@ -172,17 +164,9 @@ def as_of_known_size(sigmas: FloatArray, freedom: int) -> FloatArray:
     The square of a length of three-dimensional errors in estimated standard deviations is three
     times F-distributed, in known ones chi-squared.
 
-    Parameters
-    ----------
-    sigmas
-        In estimated standard deviations, (n,).
-    freedom
-        Degrees of freedom of the estimate; with fewer than one it counts as one.
-
-    Returns
-    -------
-    ndarray
-        In known standard deviations, (n,).
+    ``sigmas``: in estimated standard deviations, (n,); ``freedom``: degrees of freedom of the
+    estimate; with fewer than one it counts as one.
+    Returns in known standard deviations, (n,).
     """
     rarity = fdtrc(3, max(freedom, 1), sigmas**2 / 3.0)
     known: FloatArray = np.sqrt(chdtri(3, np.maximum(rarity, np.finfo(float).tiny)))
@@ -192,15 +176,8 @@ def as_of_known_size(sigmas: FloatArray, freedom: int) -> FloatArray:
 def gross_probability(sigmas: FloatArray) -> FloatArray:
     """Return how probable it is that each of three-dimensional errors is gross.
 
-    Parameters
-    ----------
-    sigmas
-        Lengths of the errors in standard deviations of good ones, (n,).
-
-    Returns
-    -------
-    ndarray
-        (n,), under a mixture of two Gaussians whose share and width fit these errors.
+    ``sigmas``: lengths of the errors in standard deviations of good ones, (n,).
+    Returns (n,), under a mixture of two Gaussians whose share and width fit these errors.
     """
     square = sigmas**2
     share, excess = PRIOR_GROSS / PRIOR_ROWS, NARROWEST**2

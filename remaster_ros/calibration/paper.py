@@ -43,25 +43,14 @@ class PaperPosterior:
 
     A state is, per sensor, x, y, z in mm and alpha, beta, gamma in degrees (Theta_1); the offsets
     of all joints in degrees (Theta_2); and sigma per sensor in mm.
-
-    Attributes
-    ----------
-    chain
-        The nominal robot.
-    rows
-        The observations; `Rows.target` is not used.
-    measured
-        Measured positions in each sensor's frame N, in the order of ``rows``, m, (n, 3).
-    markers
-        Nominal markers in the tool frame, m, (markers, 3).
-    T_N_R
-        Three-point registration that each chain starts from, (chains, sensors, 4, 4).
     """
 
-    chain: SerialChain
-    rows: Rows
+    chain: SerialChain  # The nominal robot
+    rows: Rows  # The observations; `Rows.target` is not used
+    # Measured positions in each sensor's frame N, in the order of ``rows``, m, (n, 3)
     measured: FloatArray
-    markers: FloatArray
+    markers: FloatArray  # Nominal markers in the tool frame, m, (markers, 3)
+    # Three-point registration that each chain starts from, (chains, sensors, 4, 4)
     T_N_R: FloatArray
 
     @classmethod
@@ -132,16 +121,8 @@ def fit_paper(
 
     All parameters move at once by U(-0.0125, 0.0125) mm and degrees (eq. 16).
 
-    Parameters
-    ----------
-    problem
-        What to fit.
-    chains, steps
-        How many chains, and how many steps of each in all.
-    rng
-        Source of all randomness.
-    progress
-        Called with the share done.
+    ``problem``: what to fit; ``chains, steps``: how many chains, and how many steps of each in
+    all; ``progress``: called with the share done.
     """
     measurements, identity = problem.measurements, problem.empty_model()
     target = PaperPosterior.of(problem, chains, rng)

@@ -35,23 +35,14 @@ class Posterior:
     one, then asinh(frame_sigma / sigma) likewise. These are as good as linear near zero and as a
     logarithm far from it, so the posterior looks alike whether pose_sigma is nothing or nearly
     all; their prior is sech.
-
-    Attributes
-    ----------
-    model, priors
-        What is fitted, and what is known beforehand.
-    free
-        Indices of the parameters that are not held, (f,).
-    reference
-        Pinned parameters; those not in ``free`` keep these values, (size,).
-    noise_model
-        The rows it is fitted to, and which of their errors have which variance.
     """
 
+    # What is fitted, and what is known beforehand
     model: Model
     priors: tuple[Prior, ...]
-    free: IntArray
-    reference: FloatArray
+    free: IntArray  # Indices of the parameters that are not held, (f,)
+    reference: FloatArray  # Pinned parameters; those not in ``free`` keep these values, (size,)
+    # The rows it is fitted to, and which of their errors have which variance
     noise_model: NoiseModel
 
     @classmethod
@@ -132,15 +123,8 @@ class Posterior:
     def log_density(self, points: FloatArray) -> FloatArray:
         """Return the log posterior density up to a constant.
 
-        Parameters
-        ----------
-        points
-            (..., d).
-
-        Returns
-        -------
-        ndarray
-            (...).
+        ``points``: (..., d).
+        Returns (...).
         """
         flat = points.reshape(-1, points.shape[-1])
         block = max(1, BLOCK_ROWS // len(self.rows))

@@ -27,21 +27,11 @@ MOST_TIMES = 1e4
 
 @dataclass(frozen=True, eq=False)
 class NoiseMixture:
-    """The posterior of the f free parameters as a mixture of Gaussians over draws of the noise.
+    """The posterior of the f free parameters as a mixture of Gaussians over draws of the noise."""
 
-    Attributes
-    ----------
-    weight
-        Sum 1, (n,).
-    mean
-        Free pinned parameters, (n, f).
-    covariance
-        (n, f, f).
-    """
-
-    weight: FloatArray
-    mean: FloatArray
-    covariance: FloatArray
+    weight: FloatArray  # Sum 1, (n,)
+    mean: FloatArray  # Free pinned parameters, (n, f)
+    covariance: FloatArray  # (n, f, f)
 
     @classmethod
     def of(cls, mode: Mode, rng: np.random.Generator) -> NoiseMixture:
@@ -64,27 +54,15 @@ class NoiseMixture:
 
 @dataclass(frozen=True, eq=False)
 class Precision:
-    """What a fit knows of its f free parameters.
+    """What a fit knows of its f free parameters."""
 
-    Attributes
-    ----------
-    joints
-        For each joint its place among the free parameters; -1 where it is not identifiable, (k,).
-    covariance
-        The noise integrated out, (f, f).
-    tool
-        Mean of J'J over the predicted markers that count, m² per unit, (f, f); None for none.
-    prior
-        Information of the priors, (f, f).
-    freedom
-        Numbers measured, less the free parameters.
-    """
-
+    # For each joint its place among the free parameters; -1 where it is not identifiable, (k,)
     joints: tuple[int, ...]
-    covariance: FloatArray
+    covariance: FloatArray  # The noise integrated out, (f, f)
+    # Mean of J'J over the predicted markers that count, m² per unit, (f, f); None for none
     tool: FloatArray | None
-    prior: FloatArray
-    freedom: int
+    prior: FloatArray  # Information of the priors, (f, f)
+    freedom: int  # Numbers measured, less the free parameters
 
     @classmethod
     def of(cls, found: Estimate, counting: BoolArray, rng: np.random.Generator) -> Precision:
@@ -149,10 +127,8 @@ class Precision:
     def shortfall(self, joint_std: float | None, tool_std: float | None) -> float:
         """Return the largest ratio of a standard deviation to the one that is wanted; 0 for none.
 
-        Parameters
-        ----------
-        joint_std, tool_std
-            Wanted `joint_rms`, rad, and `tool_rms`, m; None where it does not matter.
+        ``joint_std, tool_std``: wanted `joint_rms`, rad, and `tool_rms`, m; None where it does not
+        matter.
         """
         return self._shortfall(self.covariance, joint_std, tool_std)
 

@@ -41,43 +41,22 @@ FEWEST_ROWS = 20
 
 @dataclass(frozen=True, eq=False)
 class Predictions:
-    """Of n rows, in the frame N of the row's sensor.
+    """Of n rows, in the frame N of the row's sensor."""
 
-    Attributes
-    ----------
-    position
-        m, (n, 3).
-    covariance
-        With the factor, m², (n, 3, 3).
-    inside
-        Whether the measured position lies in the 95 % region, (n,).
-    widening
-        The factor on standard deviations.
-    """
-
-    position: FloatArray
-    covariance: FloatArray
-    inside: BoolArray
-    widening: float
+    position: FloatArray  # m, (n, 3)
+    covariance: FloatArray  # With the factor, m², (n, 3, 3)
+    inside: BoolArray  # Whether the measured position lies in the 95 % region, (n,)
+    widening: float  # The factor on standard deviations
 
 
 @dataclass(frozen=True)
 class Coverage:
-    """How many measurements lie in their 95 % regions.
-
-    Attributes
-    ----------
-    rows, inside
-        Counts.
-    share
-        The latter of the former; None without rows.
-    interval95
-        Of the share, were all rows independent (Clopper & Pearson 1934); None without rows.
-    """
+    """How many measurements lie in their 95 % regions."""
 
     rows: int
     inside: int
-    share: float | None
+    share: float | None  # The latter of the former; None without rows
+    # Of the share, were all rows independent (Clopper & Pearson 1934); None without rows
     interval95: tuple[float, float] | None
 
     @classmethod
@@ -141,25 +120,15 @@ def squared_distances(errors: FloatArray, covariance: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class _Part:
-    """Some rows with what their covariance is made of, in the references' base coordinates.
+    """Some rows with what their covariance is made of, in the references' base coordinates."""
 
-    Attributes
-    ----------
-    rows, sensor
-        n rows, and the sensor of each, (n,).
-    place
-        Predicted, m, (n, 3).
-    spread
-        A root of the covariance by the parameters, m, (n, 3, size).
-    own_noise, pose_noise, frame_noise
-        Covariance of the noise of one row, of what rows of a pose share, and of what rows of a
-        frame share, m², (n, 3, 3).
-    """
-
+    # n rows, and the sensor of each, (n,)
     rows: Rows
     sensor: IntArray
-    place: FloatArray
-    spread: FloatArray
+    place: FloatArray  # Predicted, m, (n, 3)
+    spread: FloatArray  # A root of the covariance by the parameters, m, (n, 3, size)
+    # Covariance of the noise of one row, of what rows of a pose share, and of what rows of a frame
+    # share, m², (n, 3, 3)
     own_noise: FloatArray
     pose_noise: FloatArray
     frame_noise: FloatArray

@@ -46,24 +46,13 @@ class Distances(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Predictive:
-    """What the distances are computed from.
+    """What the distances are computed from."""
 
-    Attributes
-    ----------
-    model
-        Whose parameters were drawn.
-    after
-        Pinned parameters of the estimate, (size,).
-    draws
-        Pinned parameters of the posterior's draws, (draws, size).
-    sigma
-        Noise of each draw and sensor, all its parts together, m, (draws, sensors, 2): along the
-        line of sight, and per axis across it.
-    """
-
-    model: Model
-    after: FloatArray
-    draws: FloatArray
+    model: Model  # Whose parameters were drawn
+    after: FloatArray  # Pinned parameters of the estimate, (size,)
+    draws: FloatArray  # Pinned parameters of the posterior's draws, (draws, size)
+    # Noise of each draw and sensor, all its parts together, m, (draws, sensors, 2): along the line
+    # of sight, and per axis across it
     sigma: FloatArray
 
     @cached_property
@@ -106,18 +95,10 @@ def random_configurations(
 
 
 class PredictedAccuracy(NamedTuple):
-    """Where the marker is at n configurations, and how far it is from there, after.
+    """Where the marker is at n configurations, and how far it is from there, after."""
 
-    Attributes
-    ----------
-    place
-        By the estimate, in the robot base, m, (n, 3).
-    error
-        Mean distance over the draws, without the sensor's noise, m, (n,).
-    """
-
-    place: FloatArray
-    error: FloatArray
+    place: FloatArray  # By the estimate, in the robot base, m, (n, 3)
+    error: FloatArray  # Mean distance over the draws, without the sensor's noise, m, (n,)
 
 
 def predicted_accuracy(
@@ -138,18 +119,12 @@ def predicted_accuracy(
 
 
 class ToolPlaces(NamedTuple):
-    """Places of the marker at one configuration, in the robot base, m (Fig. 5 of the paper).
+    """Places of the marker at one configuration, in the robot base, m (Fig. 5 of the paper)."""
 
-    Attributes
-    ----------
-    before, after
-        With offsets at zero and as estimated, (3,).
-    drawn, noisy
-        With the offsets of draws, without and with the noise of a reading, (draws, 3).
-    """
-
+    # With offsets at zero and as estimated, (3,)
     before: FloatArray
     after: FloatArray
+    # With the offsets of draws, without and with the noise of a reading, (draws, 3)
     drawn: FloatArray
     noisy: FloatArray
 
@@ -189,23 +164,11 @@ def theoretical_distances(
 ) -> tuple[Distances, Distances]:
     """Return the distances of section V-C at rows of the measurements.
 
-    Parameters
-    ----------
-    predictive
-        The posterior.
-    before
-        Pinned parameters with offsets at zero, (size,); further ones are not looked at.
-    measurements
-        All rows of the session (those that an extension was made for).
-    chosen
-        Indices of the rows to take; of more than 10,000 as many at random.
-    rng
-        Source of randomness: which draw goes with which row, and the noise.
-
-    Returns
-    -------
-    invariant, paper
-        m.
+    ``predictive``: the posterior; ``before``: pinned parameters with offsets at zero, (size,);
+    further ones are not looked at; ``measurements``: all rows of the session (those that an
+    extension was made for); ``chosen``: indices of the rows to take; of more than 10,000 as many
+    at random.
+    Returns invariant, paper: m.
     """
     rows = rng.permutation(chosen)[:MOST_ROWS]
     draws, before = len(predictive.draws), before[: predictive.model.size]

@@ -31,17 +31,10 @@ STEP_STD = np.radians(1.0)
 
 @dataclass(frozen=True, eq=False)
 class Prior:
-    """A Gaussian prior as a function of the natural parameters.
+    """A Gaussian prior as a function of the natural parameters."""
 
-    Attributes
-    ----------
-    description
-        How the report names it: 'the prior on marker sir, 0.5 mm per axis'.
-    residual
-        Natural parameters (..., size) to whitened residuals (..., m), standard normal a priori.
-    """
-
-    description: str
+    description: str  # How the report names it: 'the prior on marker sir, 0.5 mm per axis'
+    # Natural parameters (..., size) to whitened residuals (..., m), standard normal a priori
     residual: Callable[[FloatArray], FloatArray]
 
 

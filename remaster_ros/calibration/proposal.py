@@ -46,21 +46,11 @@ POWERS = 0.7 ** np.arange(1.0, 25.0)
 
 @dataclass(frozen=True, eq=False)
 class StudentT:
-    """A multivariate Student t distribution.
+    """A multivariate Student t distribution."""
 
-    Attributes
-    ----------
-    mean
-        (d,).
-    factor
-        Lower Cholesky factor of the scale matrix, (d, d).
-    freedom
-        Degrees of freedom; small means heavy tails.
-    """
-
-    mean: FloatArray
-    factor: FloatArray
-    freedom: float
+    mean: FloatArray  # (d,)
+    factor: FloatArray  # Lower Cholesky factor of the scale matrix, (d, d)
+    freedom: float  # Degrees of freedom; small means heavy tails
 
     def sample(self, count: int, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
         """Return points (count, d) and their log density (count,)."""
@@ -86,17 +76,10 @@ class AdaptedProposal:
     It lies in coordinates in which the linearised posterior is standard: the noise as it is, the
     parameters p of a draw whitened by their Gaussian given its noise, w = L' (p - mean). Where
     poses are few the noise may be several times that of the mode, and the width of p with it.
-
-    Attributes
-    ----------
-    mode
-        About which it proposes.
-    centre
-        Of most draws: [w | noise], (d,).
     """
 
-    mode: Mode
-    centre: StudentT
+    mode: Mode  # About which it proposes
+    centre: StudentT  # Of most draws: [w | noise], (d,)
 
     @classmethod
     def about(cls, mode: Mode) -> AdaptedProposal:
@@ -212,24 +195,12 @@ class AdaptedProposal:
 
 
 class Weighted(NamedTuple):
-    """Draws of a proposal with their weights.
+    """Draws of a proposal with their weights."""
 
-    Attributes
-    ----------
-    points
-        (n, d).
-    log_weight
-        Log density over proposal, (n,).
-    weight
-        Smoothed, with sum 1, (n,).
-    pareto_k
-        Shape of their upper tail.
-    """
-
-    points: FloatArray
-    log_weight: FloatArray
-    weight: FloatArray
-    pareto_k: float
+    points: FloatArray  # (n, d)
+    log_weight: FloatArray  # Log density over proposal, (n,)
+    weight: FloatArray  # Smoothed, with sum 1, (n,)
+    pareto_k: float  # Shape of their upper tail
 
     @classmethod
     def of(cls, points: FloatArray, log_weight: FloatArray) -> Weighted:

@@ -60,30 +60,17 @@ LEAST_NOISE_M = 1e-6
 
 @dataclass(frozen=True)
 class StructureTest:
-    """One of the tests.
+    """One of the tests."""
 
-    Attributes
-    ----------
-    driver
-        What the residuals were held against: 'position', 'time', 'joint_angle', zero-offsets by
-        'joint_time', displacements of a 'link' and tilts of an 'axis' that are constant in their
-        frames, 'reading_before'; 'orientation' where measured orientations ask for other
-        offsets; 'held_out' where those on held-out poses were held against those
-        on poses left out.
-    between_poses
-        Whether in the means of the poses or in the deviations from them.
-    p_value
-        Of so much or more by chance.
-    sensor
-        Whose; '' where that of all.
-    ratio
-        Of 'held_out': of the typical errors, each in units of what is uncertain of it.
-    """
-
+    # What the residuals were held against: 'position', 'time', 'joint_angle', zero-offsets by
+    # 'joint_time', displacements of a 'link' and tilts of an 'axis' that are constant in their
+    # frames, 'reading_before'; 'orientation' where measured orientations ask for other offsets;
+    # 'held_out' where those on held-out poses were held against those on poses left out
     driver: str
-    between_poses: bool
-    p_value: float
-    sensor: str = ''
+    between_poses: bool  # Whether in the means of the poses or in the deviations from them
+    p_value: float  # Of so much or more by chance
+    sensor: str = ''  # Whose; '' where that of all
+    # Of 'held_out': of the typical errors, each in units of what is uncertain of it
     ratio: float | None = None
 
     @property
@@ -117,18 +104,10 @@ class StructureTest:
 
 @dataclass(frozen=True)
 class ResidualStructure:
-    """All of the tests; none where there are far too few poses, or readings without noise.
+    """All of the tests; none where there are far too few poses, or readings without noise."""
 
-    Attributes
-    ----------
-    tests
-        All that were made.
-    too_few
-        Whether there are too few poses to rely on them.
-    """
-
-    tests: tuple[StructureTest, ...]
-    too_few: bool = False
+    tests: tuple[StructureTest, ...]  # All that were made
+    too_few: bool = False  # Whether there are too few poses to rely on them
 
     @property
     def found(self) -> tuple[StructureTest, ...]:
@@ -264,18 +243,11 @@ def _explained(
 
 
 class Explained(NamedTuple):
-    """What a family of functions explains of the means of the poses.
+    """What a family of functions explains of the means of the poses."""
 
-    Attributes
-    ----------
-    p_value
-        Of so much or more by chance.
-    share
-        Of the sum of squares that the model leaves in the rows where the functions are not zero,
-        less what they explain of noise.
-    """
-
-    p_value: float
+    p_value: float  # Of so much or more by chance
+    # Of the sum of squares that the model leaves in the rows where the functions are not zero,
+    # less what they explain of noise
     share: float
 
 

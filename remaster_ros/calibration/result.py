@@ -66,12 +66,7 @@ def robust_std(mode: Mode, measurements: Measurements) -> FloatArray:
 
     0 for offsets that are held. Never below that of the model.
 
-    Parameters
-    ----------
-    mode
-        Of the posterior of the rows fitted.
-    measurements
-        That the rows were taken from.
+    ``mode``: of the posterior of the rows fitted; ``measurements``: that the rows were taken from.
     """
     posterior = mode.linearisation.posterior
     rows = spread_poses(posterior.rows)
@@ -172,20 +167,10 @@ def held_out_tests(
     The mean of a sensor's rows at a pose and their deviations from it are judged apart: the one
     shows a sensor or base that was moved, the other what differs between joint solutions.
 
-    Parameters
-    ----------
-    mode
-        Of the posterior of the rows fitted.
-    measurements
-        That the rows were taken from.
-    gross
-        ``observation`` of every held-out row that is a gross error.
-
-    Returns
-    -------
-    tuple of StructureTest
-        Of every sensor with enough poses of either kind: a rank test (Mann and Whitney 1947,
-        doi:10.1214/aoms/1177730491), which a few poses do not decide, however far out.
+    ``mode``: of the posterior of the rows fitted; ``measurements``: that the rows were taken from;
+    ``gross``: ``observation`` of every held-out row that is a gross error.
+    Returns of every sensor with enough poses of either kind: a rank test (Mann and Whitney 1947,
+    doi:10.1214/aoms/1177730491), which a few poses do not decide, however far out.
     """
     posterior = mode.linearisation.posterior
     kept = measurements.is_validation & ~np.isin(measurements.observation, gross)
@@ -220,21 +205,11 @@ def held_out_tests(
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """Means, or deviations from them, of the rows of one sensor at each of g poses.
+    """Means, or deviations from them, of the rows of one sensor at each of g poses."""
 
-    Attributes
-    ----------
-    pose
-        Of the session, (g,).
-    size
-        How many numbers each has, (g,).
-    gram
-        Gram matrices of [derivative | error] in units of the noise, (g, f+1, f+1).
-    """
-
-    pose: IntArray
-    size: IntArray
-    gram: FloatArray
+    pose: IntArray  # Of the session, (g,)
+    size: IntArray  # How many numbers each has, (g,)
+    gram: FloatArray  # Gram matrices of [derivative | error] in units of the noise, (g, f+1, f+1)
 
     def at(self, pose: int) -> Part:
         """Return the one at a pose, if any."""
@@ -326,29 +301,18 @@ UNKNOWN_STD = np.pi / np.sqrt(3.0)
 
 @dataclass(frozen=True, eq=False)
 class Orientations:
-    """What came of the orientations that were measured.
+    """What came of the orientations that were measured."""
 
-    Attributes
-    ----------
-    why_not
-        Why they are not fitted, a sentence; '' where they are, and the rest is empty otherwise.
-    count
-        How many were fitted.
-    noise
-        By sensor, rad where `NoiseEstimate` has m.
-    R_T_B, std_rad
-        How each body stands on the tool, (3, 3), and its standard deviation about the axes of T,
-        (3,); like the markers for offsets of 0 where they are not identifiable.
-    tell
-        What they tell of the offsets.
-    """
-
+    # Why they are not fitted, a sentence; '' where they are, and the rest is empty otherwise
     why_not: str
-    count: int = 0
+    count: int = 0  # How many were fitted
+    # By sensor, rad where `NoiseEstimate` has m
     noise: Mapping[str, NoiseEstimate] = field(default_factory=dict)
+    # How each body stands on the tool, (3, 3), and its standard deviation about the axes of T,
+    # (3,); like the markers for offsets of 0 where they are not identifiable
     R_T_B: Mapping[str, FloatArray] = field(default_factory=dict)
     std_rad: Mapping[str, FloatArray] = field(default_factory=dict)
-    tell: TurnsTell | None = None
+    tell: TurnsTell | None = None  # What they tell of the offsets
 
     def words(self, joint_names: Sequence[str], std: FloatArray) -> str:
         """Return what orientations did to offsets with these std (k,), rad, a sentence."""
@@ -549,56 +513,31 @@ class FitResult:
 
 @dataclass(frozen=True, eq=False)
 class Sampled:
-    """What a sampler hands over to `build_result`.
+    """What a sampler hands over to `build_result`."""
 
-    Attributes
-    ----------
-    posterior
-        Whose parameters and noise were sampled.
-    z, eta
-        Pinned parameters, (chains, draws, size), and noise coordinates, (chains, draws, e).
-    z_mean
-        Mean of z, joints that are not identifiable at 0, (size,).
-    moved
-        Indices of the sampled parameters, (m,).
-    run, name
-        The chains, in natural units and in the order of `FitResult.parameter_names`, and which
-        sampler it was.
-    precision
-        That was asked for; None where a number of draws was.
-    gauge
-        What the data do not determine.
-    taken_as_known
-        Standard deviation, rad, of what the sampler took as known exactly and the session does
-        not, in each joint's offset, (k,); it is added to that of the draws.
-    z_before
-        Returns the pinned parameters of the fit with offsets at zero, (size,).
-    left_out
-        (row of the measurements, reason) of the gross errors.
-    mode
-        Of the posterior; None where it was not sought.
-    unmodelled
-        How c causes outside the model move the natural parameters, one standard deviation of
-        each, (size, c); None where none are expected.
-    found
-        Whose posterior it is; None where it was not sought.
-    """
-
-    posterior: Posterior
+    posterior: Posterior  # Whose parameters and noise were sampled
+    # Pinned parameters, (chains, draws, size), and noise coordinates, (chains, draws, e)
     z: FloatArray
     eta: FloatArray
-    z_mean: FloatArray
-    moved: IntArray
+    z_mean: FloatArray  # Mean of z, joints that are not identifiable at 0, (size,)
+    moved: IntArray  # Indices of the sampled parameters, (m,)
+    # The chains, in natural units and in the order of `FitResult.parameter_names`, and which
+    # sampler it was
     run: Chains
     name: str
-    precision: float | None
-    gauge: Gauge
+    precision: float | None  # That was asked for; None where a number of draws was
+    gauge: Gauge  # What the data do not determine
+    # Standard deviation, rad, of what the sampler took as known exactly and the session does not,
+    # in each joint's offset, (k,); it is added to that of the draws
     taken_as_known: FloatArray
+    # Returns the pinned parameters of the fit with offsets at zero, (size,)
     z_before: Callable[[], FloatArray]
-    left_out: tuple[tuple[int, str], ...]
-    mode: Mode | None = None
+    left_out: tuple[tuple[int, str], ...]  # (row of the measurements, reason) of the gross errors
+    mode: Mode | None = None  # Of the posterior; None where it was not sought
+    # How c causes outside the model move the natural parameters, one standard deviation of each,
+    # (size, c); None where none are expected
     unmodelled: FloatArray | None = None
-    found: Estimate | None = None
+    found: Estimate | None = None  # Whose posterior it is; None where it was not sought
 
     def widened(self, rng: np.random.Generator) -> Sampled:
         """Return the same with the draws moved by causes outside the model."""

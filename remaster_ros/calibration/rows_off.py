@@ -25,21 +25,11 @@ from remaster_ros.types import BoolArray, FloatArray, Session
 
 @dataclass(frozen=True, eq=False)
 class RowsOff:
-    """How far each of the n rows of a session is from a robust fit.
+    """How far each of the n rows of a session is from a robust fit."""
 
-    Attributes
-    ----------
-    error_m
-        Distance of its point from the modelled one, m, (n,).
-    off
-        Whether it does not fit, (n,).
-    too_many
-        Whether these are more than a fit leaves out as gross errors.
-    """
-
-    error_m: FloatArray
-    off: BoolArray
-    too_many: bool
+    error_m: FloatArray  # Distance of its point from the modelled one, m, (n,)
+    off: BoolArray  # Whether it does not fit, (n,)
+    too_many: bool  # Whether these are more than a fit leaves out as gross errors
 
 
 def find_rows_off(session: Session, most: int) -> RowsOff:

@@ -63,18 +63,10 @@ EXACT = 'independence Metropolis-Hastings on the exact density, adapted Student 
 
 
 class Sampling(NamedTuple):
-    """What `sample_posterior` returns.
+    """What `sample_posterior` returns."""
 
-    Attributes
-    ----------
-    run
-        Points as `Posterior` defines them.
-    name
-        Which sampler it was, for the report.
-    """
-
-    run: Chains
-    name: str
+    run: Chains  # Points as `Posterior` defines them
+    name: str  # Which sampler it was, for the report
 
 
 def silent(stage: str, share: float) -> None:
@@ -98,23 +90,11 @@ def sample_posterior(
 ) -> Sampling:
     """Sample the exact posterior about its mode.
 
-    Parameters
-    ----------
-    mode
-        Of the posterior.
-    chains
-        Number of chains, from dispersed starts.
-    rng
-        Source of all randomness.
-    draws
-        Draws of each chain; None to sample in batches until R-hat is at most 1.01 and the
-        effective draws of every quantity reach the precision.
-    precision
-        Monte Carlo error of each mean over its standard deviation.
-    quantities
-        What the length is judged by: points (..., d) to quantities (..., p).
-    report
-        Called with the stage and the share of it that is done.
+    ``mode``: of the posterior; ``chains``: number of chains, from dispersed starts; ``draws``:
+    draws of each chain; None to sample in batches until R-hat is at most 1.01 and the effective
+    draws of every quantity reach the precision; ``precision``: Monte Carlo error of each mean over
+    its standard deviation; ``quantities``: what the length is judged by: points (..., d) to
+    quantities (..., p); ``report``: called with the stage and the share of it that is done.
     """
     posterior = mode.linearisation.posterior
     if len(posterior.free) > MANY_PARAMETERS:

@@ -56,14 +56,8 @@ FAMILIES: tuple[tuple[str, ...], ...] = tuple(
 class Search:
     """The search on one set of residuals.
 
-    Parameters
-    ----------
-    data
-        The residuals.
-    cells
-        All that are tried.
-    progress
-        Called with the share that is done.
+    ``data``: the residuals; ``cells``: all that are tried; ``progress``: called with the share
+    that is done.
     """
 
     def __init__(

@@ -89,78 +89,48 @@ def rms_sigmas(rows: Sequence[Compared]) -> float:
 
 @dataclass(frozen=True)
 class ConfirmedCause:
-    """How a cause does in the other session.
+    """How a cause does in the other session."""
 
-    Attributes
-    ----------
-    rows_common
-        Rows of the other session in which what drives the cause was seen here.
-    carried_over
-        Of what the other session could gain from this cause, beside the others fitted there, the
-        share that it gains with the cause as found here: at most 1, negative where that makes it
-        worse; NaN where there is nothing to gain.
-    rms_without_m, rms_frozen_m
-        RMS of the 3-D error in these rows without it, and with it as found here.
-    parameters
-        Both sessions side by side; of a curve, where both measured.
-    answer
-        'confirmed' (both sessions share it), 'changed' (of another size there), 'absent' (not
-        there) or 'open' (the other session cannot tell).
-    log_evidence
-        Of 'shared', 'own' and 'absent', less that of the best, everything else as it is best.
-    """
-
-    rows_common: int
+    rows_common: int  # Rows of the other session in which what drives the cause was seen here
+    # Of what the other session could gain from this cause, beside the others fitted there, the
+    # share that it gains with the cause as found here: at most 1, negative where that makes it
+    # worse; NaN where there is nothing to gain
     carried_over: float
+    # RMS of the 3-D error in these rows without it, and with it as found here
     rms_without_m: float
     rms_frozen_m: float
-    parameters: tuple[Compared, ...]
+    parameters: tuple[Compared, ...]  # Both sessions side by side; of a curve, where both measured
+    # 'confirmed' (both sessions share it), 'changed' (of another size there), 'absent' (not there)
+    # or 'open' (the other session cannot tell)
     answer: Answer = 'open'
+    # Of 'shared', 'own' and 'absent', less that of the best, everything else as it is best
     log_evidence: Mapping[Choice, float] | None = None
 
 
 @dataclass(frozen=True)
 class Confirmation:
-    """How causes found in one session do in another.
+    """How causes found in one session do in another."""
 
-    Attributes
-    ----------
-    rows, rows_common
-        Rows of the other session, and those of them that are common to all causes.
-    rms_before_m, rms_after_m, rms_own_m
-        RMS of the 3-D error without causes, with those as found here, and with the same fitted
-        there; all else, and what this session does not tell, is fitted to the other one.
-    rms_frozen_offsets_m
-        With the zero-offsets of this session too, with or without the causes, whichever is less.
-    carried_over
-        Of what the other session could gain from the causes, the share that it gains with them as
-        found here: at most 1, negative where they make it worse; NaN with nothing to gain.
-    effects
-        Each cause, in the order of the discovery.
-    joint_offsets
-        Zero-offsets that both sessions determine, side by side.
-    confirmed
-        More than half carries over, and the zero-offsets agree; not where nothing can be told.
-    same_offsets
-        Whether the evidence has both sessions share all zero-offsets.
-    why
-        Why nothing can be compared; '' where it can.
-    other_joints
-        1-based joints whose zero-offset is another one there, by the evidence.
-    """
-
+    # Rows of the other session, and those of them that are common to all causes
     rows: int
     rows_common: int
+    # RMS of the 3-D error without causes, with those as found here, and with the same fitted
+    # there; all else, and what this session does not tell, is fitted to the other one
     rms_before_m: float
     rms_after_m: float
     rms_own_m: float
+    # With the zero-offsets of this session too, with or without the causes, whichever is less
     rms_frozen_offsets_m: float
+    # Of what the other session could gain from the causes, the share that it gains with them as
+    # found here: at most 1, negative where they make it worse; NaN with nothing to gain
     carried_over: float
-    effects: tuple[ConfirmedCause, ...]
-    joint_offsets: tuple[Compared, ...]
+    effects: tuple[ConfirmedCause, ...]  # Each cause, in the order of the discovery
+    joint_offsets: tuple[Compared, ...]  # Zero-offsets that both sessions determine, side by side
+    # More than half carries over, and the zero-offsets agree; not where nothing can be told
     confirmed: bool
-    same_offsets: bool
-    why: str = ''
+    same_offsets: bool  # Whether the evidence has both sessions share all zero-offsets
+    why: str = ''  # Why nothing can be compared; '' where it can
+    # 1-based joints whose zero-offset is another one there, by the evidence
     other_joints: tuple[int, ...] = ()
 
     @property

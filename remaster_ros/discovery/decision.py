@@ -36,26 +36,17 @@ class Named(NamedTuple):
 
 @dataclass(frozen=True)
 class Decision:
-    """Which of two causes it is.
+    """Which of two causes it is."""
 
-    Attributes
-    ----------
-    cause, look_alike
-        As they were before.
-    answer
-        ``cause`` or ``look_alike``; ``open`` where odds of twenty to one are not reached;
-        ``neither`` where the search names none of the two.
-    log_evidence
-        Of the cause less that of its look-alike; NaN where they cannot be compared.
-    sigma
-        How sure the answer is, in standard deviations.
-    """
-
+    # As they were before
     cause: Named
     look_alike: Named
+    # ``cause`` or ``look_alike``; ``open`` where odds of twenty to one are not reached;
+    # ``neither`` where the search names none of the two
     answer: Literal['cause', 'look_alike', 'open', 'neither']
+    # Of the cause less that of its look-alike; NaN where they cannot be compared
     log_evidence: float
-    sigma: float
+    sigma: float  # How sure the answer is, in standard deviations
 
     def describe(self) -> str:
         """Return it in a line."""

@@ -50,59 +50,21 @@ class Parameter:
 
 @dataclass(frozen=True)
 class LookAlike:
-    """Another cause that explains the data nearly as well.
+    """Another cause that explains the data nearly as well."""
 
-    Attributes
-    ----------
-    name, joints
-        As of an effect.
-    log_evidence_gain
-        Of the look-alike in the effect's place.
-    separate_by
-        Which measurements would decide.
-    same
-        No measurement of these markers could: the two displace every pose alike.
-    general
-        It is a free form, and the effect one of the shapes that it can have.
-    title
-        A heading for people.
-    """
-
+    # As of an effect
     name: str
     joints: tuple[int, ...]
-    log_evidence_gain: float
-    separate_by: str
-    same: bool = False
-    general: bool = False
-    title: str = ''
+    log_evidence_gain: float  # Of the look-alike in the effect's place
+    separate_by: str  # Which measurements would decide
+    same: bool = False  # No measurement of these markers could: the two displace every pose alike
+    general: bool = False  # It is a free form, and the effect one of the shapes that it can have
+    title: str = ''  # A heading for people
 
 
 @dataclass(frozen=True)
 class FoundEffect:
-    """A cause; fields as in discovery.json.
-
-    Attributes
-    ----------
-    size_m
-        RMS of what it does to the marker after absorption, over the fitted rows, m.
-    share
-        Of the gain on held-out poses, see `shares`; None where the cause was found by how far the
-        fit moved a marker, not in the residuals.
-    title
-        A heading for people, such as 'Link length of joint 2'.
-    in_robot_model
-        A corrected robot model holds it.
-    of_measurement
-        It lies in how the arm was measured and not in the arm.
-    moment_s
-        When it happened, s since the first reading, where it came at one moment and stayed.
-    tied
-        A look-alike that measurements could distinguish explains the data as well.
-    sizes
-        What each of its cells amounts to, in arc minutes and millimetres with uncertainty.
-    remedy
-        What to do about it.
-    """
+    """A cause; fields as in discovery.json."""
 
     name: str
     joints: tuple[int, ...]
@@ -114,14 +76,19 @@ class FoundEffect:
     log_evidence_gain: float
     confusable_with: tuple[LookAlike, ...]
     cause: str
-    size_m: float
+    size_m: float  # RMS of what it does to the marker after absorption, over the fitted rows, m
+    # Of the gain on held-out poses, see `shares`; None where the cause was found by how far the
+    # fit moved a marker, not in the residuals
     share: float | None = None
+    # A look-alike that measurements could distinguish explains the data as well
     tied: bool = False
+    # What each of its cells amounts to, in arc minutes and millimetres with uncertainty
     sizes: tuple[str, ...] = ()
-    remedy: str = ''
-    title: str = ''
-    in_robot_model: bool = False
-    of_measurement: bool = False
+    remedy: str = ''  # What to do about it
+    title: str = ''  # A heading for people, such as 'Link length of joint 2'
+    in_robot_model: bool = False  # A corrected robot model holds it
+    of_measurement: bool = False  # It lies in how the arm was measured and not in the arm
+    # When it happened, s since the first reading, where it came at one moment and stayed
     moment_s: float | None = None
 
     def sampled(

@@ -24,29 +24,19 @@ GROSS = 7.0
 
 @dataclass(frozen=True)
 class Gain:
-    """RMS of the 3-D error over all validation rows, m; None where there are none.
+    """RMS of the 3-D error over all validation rows, m; None where there are none."""
 
-    Attributes
-    ----------
-    held_out_rms_before_m, held_out_rms_after_m
-        With offsets only, and with the effects.
-    noise_floor_m
-        What the estimated noise alone leaves.
-    held_out_gross
-        How many held-out rows are single gross errors: so far off with and without the effects
-        that neither is judged by them.
-    held_out_kept_before_m, held_out_kept_after_m
-        The same RMS without these.
-    metrics
-        'relative' and 'post_registration', each 'before' and 'after', as in fit.json; empty
-        without validation rows.
-    """
-
+    # With offsets only, and with the effects
     held_out_rms_before_m: float | None
     held_out_rms_after_m: float | None
-    noise_floor_m: float
+    noise_floor_m: float  # What the estimated noise alone leaves
+    # 'relative' and 'post_registration', each 'before' and 'after', as in fit.json; empty without
+    # validation rows
     metrics: Mapping[str, Any]
+    # How many held-out rows are single gross errors: so far off with and without the effects that
+    # neither is judged by them
     held_out_gross: int = 0
+    # The same RMS without these
     held_out_kept_before_m: float | None = None
     held_out_kept_after_m: float | None = None
 
@@ -136,12 +126,8 @@ def pose_common_fraction(data: Residuals, solution: Solution) -> float:
 def noise_by_range(data: Residuals, solution: Solution) -> dict[str, dict[str, float]]:
     """Compare errors near and far from each sensor.
 
-    Returns
-    -------
-    dict
-        Sensor -> ``near_m`` and ``far_m``, the quartiles of the range; ``far_over_near``, the
-        ratio of the RMS errors beyond them; ``p_value`` of the rank correlation of range and
-        error.
+    Returns sensor -> ``near_m`` and ``far_m``, the quartiles of the range; ``far_over_near``, the
+    ratio of the RMS errors beyond them; ``p_value`` of the rank correlation of range and error.
     """
     rows = data.rows
     length = np.linalg.norm(data.left(solution), axis=1)

@@ -41,44 +41,28 @@ from remaster_ros.types import BoolArray, FloatArray
 
 @dataclass(frozen=True, eq=False)
 class GeometryModel:
-    """The arm with the lengths and tilts that its session shows; k joints, m lengths and tilts.
+    """The arm with the lengths and tilts that its session shows; k joints, m lengths and tilts."""
 
-    Attributes
-    ----------
-    tolerance_m
-        Of the drawing: RMS displacement of the marker by each length and each tilt, m.
-    members
-        Their cells; ``variant`` is the axis.
-    std_m
-        Standard deviation of each before it is measured, as RMS displacement of the marker, m,
-        (m,).
-    offset_moves
-        What one such standard deviation of each does to each zero-offset of the fit that takes the
-        arm to be its drawing, rad, (k, m).
-    shifts, turns
-        Of each joint's origin, in the frame of the link before, m, and of its frame, a rotation
-        vector, rad, (k, 3) each.
-    joint_offsets
-        Zero-offsets fitted together with it, those that the gauge holds at 0, rad, (k,).
-    errors, drawing_errors
-        Measured minus predicted position of every row of the session, m, (n, 3), with this
-        geometry and on the drawing.
-    is_validation
-        Which of them were held out, (n,).
-    mode
-        Of the fit of the members beside the offsets: ``members`` are its first further parameters.
-    """
-
+    # Of the drawing: RMS displacement of the marker by each length and each tilt, m
     tolerance_m: float
-    members: tuple[Cell, ...]
+    members: tuple[Cell, ...]  # Their cells; ``variant`` is the axis
+    # Standard deviation of each before it is measured, as RMS displacement of the marker, m, (m,)
     std_m: FloatArray
+    # What one such standard deviation of each does to each zero-offset of the fit that takes the
+    # arm to be its drawing, rad, (k, m)
     offset_moves: FloatArray
+    # Of each joint's origin, in the frame of the link before, m, and of its frame, a rotation
+    # vector, rad, (k, 3) each
     shifts: FloatArray
     turns: FloatArray
+    # Zero-offsets fitted together with it, those that the gauge holds at 0, rad, (k,)
     joint_offsets: FloatArray
+    # Measured minus predicted position of every row of the session, m, (n, 3), with this geometry
+    # and on the drawing
     errors: FloatArray
     drawing_errors: FloatArray
-    is_validation: BoolArray
+    is_validation: BoolArray  # Which of them were held out, (n,)
+    # Of the fit of the members beside the offsets: ``members`` are its first further parameters
     mode: Mode
 
     @property

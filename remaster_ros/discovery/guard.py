@@ -29,25 +29,14 @@ MOST_HARM = 1.05
 
 @dataclass(frozen=True)
 class Unexplained:
-    """Structure that no cause explains; fields as in discovery.json.
+    """Structure that no cause explains; fields as in discovery.json."""
 
-    Attributes
-    ----------
-    where, driver
-        Where it shows, and what it follows as far as that is known.
-    size_m
-        RMS of the 3-D error, m.
-    p_value
-        Of seeing as much by chance; NaN where too few poses are held out.
-    next
-        What it means and what to do next, one or two sentences.
-    """
-
+    # Where it shows, and what it follows as far as that is known
     where: str
     driver: str
-    size_m: float
-    p_value: float
-    next: str
+    size_m: float  # RMS of the 3-D error, m
+    p_value: float  # Of seeing as much by chance; NaN where too few poses are held out
+    next: str  # What it means and what to do next, one or two sentences
 
 
 def suggested(effects: Sequence[FoundEffect]) -> str:

@@ -40,25 +40,15 @@ RANDOM = 'random'
 
 @dataclass(frozen=True, eq=False)
 class Family:
-    """All members of one kind of error.
+    """All members of one kind of error."""
 
-    Attributes
-    ----------
-    cell
-        Of the weights of all members, m, with a penalty of one.
-    members
-        The cells that displace a marker.
-    maps
-        Parameters of each member, in its unit, from its weights, (member's size, weights).
-    scales
-        Factor from the smoothness of the family to that of each penalised member, and from the
-        precision of the weights to that of the parameters of the others: RMS displacement per unit
-        squared, (member's size,) or (1,).
-    """
-
-    cell: Cell
-    members: tuple[Cell, ...]
+    cell: Cell  # Of the weights of all members, m, with a penalty of one
+    members: tuple[Cell, ...]  # The cells that displace a marker
+    # Parameters of each member, in its unit, from its weights, (member's size, weights)
     maps: tuple[FloatArray, ...]
+    # Factor from the smoothness of the family to that of each penalised member, and from the
+    # precision of the weights to that of the parameters of the others: RMS displacement per unit
+    # squared, (member's size,) or (1,)
     scales: tuple[FloatArray, ...]
 
     @property

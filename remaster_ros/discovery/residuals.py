@@ -56,48 +56,21 @@ class Fit(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Residuals:
-    """n rows, sorted by sensor and pose, with what the offsets model leaves of them.
+    """n rows, sorted by sensor and pose, with what the offsets model leaves of them."""
 
-    Attributes
-    ----------
-    context
-        All rows of the session at the solution of the offsets model.
-    rows
-        The rows worked on; ``source`` are their indices in the context.
-    errors
-        Measured minus modelled, in base coordinates, m, (n, 3).
-    base
-        What the offsets model can absorb, orthonormal columns, (n, 3, p).
-    base_precision
-        Of the prior on their coefficients, about 0, (p, p).
-    full_base
-        The same columns for every row of the session, (all rows, 3, p).
-    full_errors
-        Errors of every row of the session, m, (all rows, 3).
-    full_jacobian
-        Derivative of the prediction by the model's natural parameters, (all rows, 3, size).
-    step_precision
-        Of the prior on steps of these; 0 for a flat one, (size,).
-    reference
-        T_R_N of every sensor that `errors` are relative to, (sensors, 4, 4).
-    noise_model
-        Which errors of the rows have which variance.
-    noise
-        A robust first estimate.
-    """
-
-    context: Context
-    rows: Rows
-    errors: FloatArray
-    base: FloatArray
-    base_precision: FloatArray
-    full_base: FloatArray
-    full_errors: FloatArray
+    context: Context  # All rows of the session at the solution of the offsets model
+    rows: Rows  # The rows worked on; ``source`` are their indices in the context
+    errors: FloatArray  # Measured minus modelled, in base coordinates, m, (n, 3)
+    base: FloatArray  # What the offsets model can absorb, orthonormal columns, (n, 3, p)
+    base_precision: FloatArray  # Of the prior on their coefficients, about 0, (p, p)
+    full_base: FloatArray  # The same columns for every row of the session, (all rows, 3, p)
+    full_errors: FloatArray  # Errors of every row of the session, m, (all rows, 3)
+    # Derivative of the prediction by the model's natural parameters, (all rows, 3, size)
     full_jacobian: FloatArray
-    step_precision: FloatArray
-    reference: FloatArray
-    noise_model: NoiseModel
-    noise: Noise
+    step_precision: FloatArray  # Of the prior on steps of these; 0 for a flat one, (size,)
+    reference: FloatArray  # T_R_N of every sensor that `errors` are relative to, (sensors, 4, 4)
+    noise_model: NoiseModel  # Which errors of the rows have which variance
+    noise: Noise  # A robust first estimate
 
     @classmethod
     def of(cls, found: Estimate) -> Residuals:

@@ -39,30 +39,14 @@ CHUNK = 1024
 
 @dataclass(frozen=True, eq=False)
 class Catalogue:
-    """All cells that can be tried on these rows, with their columns at hand.
+    """All cells that can be tried on these rows, with their columns at hand."""
 
-    Attributes
-    ----------
-    cells
-        As the effects gave them.
-    starts
-        First column of each cell, and the number of columns, (cells + 1,).
-    at
-        Joint of each column, -1 where it displaces, (columns,).
-    features
-        Added angles of the columns at joints, (n, joint columns), in order.
-    shifts
-        Displacements of the other columns, (n, 3, others), in order.
-    position
-        Where each column is among the features or the shifts, (columns,).
-    """
-
-    cells: tuple[Cell, ...]
-    starts: IntArray
-    at: IntArray
-    features: FloatArray
-    shifts: FloatArray
-    position: IntArray
+    cells: tuple[Cell, ...]  # As the effects gave them
+    starts: IntArray  # First column of each cell, and the number of columns, (cells + 1,)
+    at: IntArray  # Joint of each column, -1 where it displaces, (columns,)
+    features: FloatArray  # Added angles of the columns at joints, (n, joint columns), in order
+    shifts: FloatArray  # Displacements of the other columns, (n, 3, others), in order
+    position: IntArray  # Where each column is among the features or the shifts, (columns,)
     jacobian: FloatArray
 
     @classmethod
@@ -177,20 +161,10 @@ def screen(
 ) -> FloatArray:
     """Score all cells beside the given ones, under their noise.
 
-    Parameters
-    ----------
-    data, catalogue
-        The residuals and the cells.
-    given
-        The set already found: projected out, with its penalties.
-    chosen
-        Which cells to score; all by default.
-
-    Returns
-    -------
-    ndarray
-        Log evidence gained, with the prior probability of each cell, (cells,); -inf where it adds
-        nothing to the set.
+    ``data, catalogue``: the residuals and the cells; ``given``: the set already found: projected
+    out, with its penalties; ``chosen``: which cells to score; all by default.
+    Returns log evidence gained, with the prior probability of each cell, (cells,); -inf where it
+    adds nothing to the set.
     """
     project = _Projection(data, given)
     white = data.noise_model.whitened(data.errors, given.noise).reshape(-1, 1)

@@ -16,16 +16,10 @@ from remaster_ros.types import FloatArray
 
 @dataclass(frozen=True, eq=False)
 class Covariances:
-    """Covariances of a fit, computed when asked for: most fits are compared by evidence alone.
+    """Covariances of a fit, computed when asked for: most fits are compared by evidence alone."""
 
-    Attributes
-    ----------
-    compute
-        Returns the covariance of everything together, (p + m, p + m), and that of the columns of
-        the offsets model and the unpenalised parameters, were the penalised ones known,
-        (p + u, p + u).
-    """
-
+    # Returns the covariance of everything together, (p + m, p + m), and that of the columns of the
+    # offsets model and the unpenalised parameters, were the penalised ones known, (p + u, p + u)
     compute: Callable[[], tuple[FloatArray, FloatArray]]
 
     @cached_property
@@ -36,36 +30,17 @@ class Covariances:
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """A set of cells fitted to the residuals.
+    """A set of cells fitted to the residuals."""
 
-    Attributes
-    ----------
-    cells
-        The set; of a fit those with a penalty are last.
-    parameters
-        Of all the cells in order, SI, (m,).
-    base
-        Of the offsets model's columns, (p,).
-    noise
-        Re-estimated.
-    smoothness
-        Precision factor of each penalised cell, in order of the cells (NaN for the others).
-    ridge
-        Prior precision of each unpenalised parameter (0 for the others), (m,).
-    covariances
-        Of base and parameters, in this order.
-    log_evidence
-        With the prior probability of the cells.
-    """
-
-    cells: tuple[Cell, ...]
-    parameters: FloatArray
-    base: FloatArray
-    noise: Noise
+    cells: tuple[Cell, ...]  # The set; of a fit those with a penalty are last
+    parameters: FloatArray  # Of all the cells in order, SI, (m,)
+    base: FloatArray  # Of the offsets model's columns, (p,)
+    noise: Noise  # Re-estimated
+    # Precision factor of each penalised cell, in order of the cells (NaN for the others)
     smoothness: FloatArray
-    ridge: FloatArray
-    covariances: Covariances
-    log_evidence: float
+    ridge: FloatArray  # Prior precision of each unpenalised parameter (0 for the others), (m,)
+    covariances: Covariances  # Of base and parameters, in this order
+    log_evidence: float  # With the prior probability of the cells
 
     @property
     def full_covariance(self) -> FloatArray:

@@ -29,19 +29,13 @@ FEWEST_ROWS = 2
 
 @dataclass(frozen=True)
 class Thinning:
-    """Which rows were searched, and how the causes hold on the others.
+    """Which rows were searched, and how the causes hold on the others."""
 
-    Attributes
-    ----------
-    searched, rows
-        Rows that were searched, and all that could have been.
-    others_rms_before_m, others_rms_after_m
-        RMS of the 3-D error over the rows that were not, m: what the offsets leave, and what is
-        left with the causes as the search fitted them, frozen.
-    """
-
+    # Rows that were searched, and all that could have been
     searched: int
     rows: int
+    # RMS of the 3-D error over the rows that were not, m: what the offsets leave, and what is left
+    # with the causes as the search fitted them, frozen
     others_rms_before_m: float
     others_rms_after_m: float
 

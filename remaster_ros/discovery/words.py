@@ -61,12 +61,7 @@ def clock_time(stamp_s: float) -> str:
 def titled(cell: Cell, joints: Sequence[int]) -> str:
     """Return a heading: 'Link length of joint 2', 'Joint 3 slipped', 'The sensor mocap moved'.
 
-    Parameters
-    ----------
-    cell
-        The first of a cause.
-    joints
-        Of the whole cause.
+    ``cell``: the first of a cause; ``joints``: of the whole cause.
     """
     kind = KIND_OF_SUBJECT.get(cell.place, '')
     joint = joint_words(joints[:1]) if joints else ''

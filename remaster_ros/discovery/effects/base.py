@@ -28,17 +28,10 @@ NO_TIMES = 'the session has no times (times: none), only the order of its rows'
 
 @dataclass(frozen=True, eq=False)
 class Design:
-    """What one unit of each of m parameters does to each of n rows.
+    """What one unit of each of m parameters does to each of n rows."""
 
-    Attributes
-    ----------
-    at
-        Index of the joint whose angle it adds to; None where it displaces the marker.
-    values
-        Added joint angle, rad per unit, (n, m), or displacement in R, m per unit, (n, 3, m).
-    """
-
-    at: int | None
+    at: int | None  # Index of the joint whose angle it adds to; None where it displaces the marker
+    # Added joint angle, rad per unit, (n, m), or displacement in R, m per unit, (n, 3, m)
     values: FloatArray
 
     @property
@@ -55,84 +48,50 @@ class Design:
 
 @dataclass(frozen=True, eq=False)
 class ModelChange:
-    """What a unit of each of m parameters changes for good in the robot model: a joint's origin.
+    """What a unit of each of m parameters changes for good in the model: a joint's origin."""
 
-    Attributes
-    ----------
-    joint
-        Index of the joint, from 0.
-    shifts
-        Of its origin, in the frame of the link before, m per unit, (m, 3).
-    turns
-        Of its frame, about axes of that frame, rad per unit, (m, 3).
-    """
-
-    joint: int
-    shifts: FloatArray
-    turns: FloatArray
+    joint: int  # Index of the joint, from 0
+    shifts: FloatArray  # Of its origin, in the frame of the link before, m per unit, (m, 3)
+    turns: FloatArray  # Of its frame, about axes of that frame, rad per unit, (m, 3)
 
 
 @dataclass(frozen=True, eq=False)
 class Cell:
-    """One candidate cause: a place, a driver and a form, with its parameters.
+    """One candidate cause: a place, a driver and a form, with its parameters."""
 
-    Attributes
-    ----------
-    name
-        Of the named effect; 'unnamed' for the rest.
-    joints
-        1-based; () where none.
-    place, driver, form
-        As discovery.json has them.
-    parameters, unit
-        Name of each of the m parameters, and their common unit.
-    columns
-        What a unit of each does.
-    drawn_from
-        How many cells like it are tried: its prior probability is that of its kind over this.
-    penalty
-        For free forms: precision of the parameters, (m, m), up to the smoothness; None else.
-    variant
-        Distinguishes cells of the same name and joints: the order of a harmonic, an axis.
-    subject
-        The sensor or marker it is about; '' where it is about joints or the whole arm.
-    largest
-        Standard deviation of the prior on each parameter about 0, in ``unit``: the largest that is
-        plausible. None: what displaces the marker by `LARGEST_M`.
-    sign
-        Of the parameters, where physics has only one: 1 or -1; 0 for both.
-    moment
-        When it happened, s since the first row; NaN for what does not happen at one moment.
-    moment_std
-        How far apart moments are that explain the rows nearly as well, s; 0 until that is judged.
-    curve
-        For free forms of one driver: their splines, one parameter each, or one for each of three
-        axes, those of a spline next to each other; None else.
-    model_change
-        The same as a change of the robot model, where it is one; None else.
-    least
-        Of a penalised cell: standard deviation of the weights at a penalty of 1 that its
-        smoothness does not go below, in ``unit``; 0 for none.
-    """
-
-    name: str
+    name: str  # Of the named effect; 'unnamed' for the rest
+    # As discovery.json has them
     place: Place
     driver: str
     form: str
+    # Name of each of the m parameters, and their common unit
     parameters: tuple[str, ...]
     unit: str
-    columns: Callable[[Context], Design]
-    joints: tuple[int, ...] = ()
+    columns: Callable[[Context], Design]  # What a unit of each does
+    joints: tuple[int, ...] = ()  # 1-based; () where none
+    # How many cells like it are tried: its prior probability is that of its kind over this
     drawn_from: int = 1
+    # For free forms: precision of the parameters, (m, m), up to the smoothness; None else
     penalty: FloatArray | None = None
+    # Distinguishes cells of the same name and joints: the order of a harmonic, an axis
     variant: str = ''
+    # The sensor or marker it is about; '' where it is about joints or the whole arm
     subject: str = ''
+    # Standard deviation of the prior on each parameter about 0, in ``unit``: the largest that is
+    # plausible. None: what displaces the marker by `LARGEST_M`.
     largest: float | None = None
-    sign: int = 0
+    sign: int = 0  # Of the parameters, where physics has only one: 1 or -1; 0 for both
+    # When it happened, s since the first row; NaN for what does not happen at one moment
     moment: float = np.nan
+    # How far apart moments are that explain the rows nearly as well, s; 0 until that is judged
     moment_std: float = 0.0
+    # For free forms of one driver: their splines, one parameter each, or one for each of three
+    # axes, those of a spline next to each other; None else
     curve: Curve | None = None
+    # The same as a change of the robot model, where it is one; None else
     model_change: ModelChange | None = None
+    # Of a penalised cell: standard deviation of the weights at a penalty of 1 that its smoothness
+    # does not go below, in ``unit``; 0 for none
     least: float = 0.0
 
     @property
@@ -174,87 +133,53 @@ class Cell:
 
 @dataclass(frozen=True, eq=False)
 class Effect:
-    """A physical cause with a name: everything that the program needs to find and explain it.
+    """A physical cause with a name: everything that the program needs to find and explain it."""
 
-    Attributes
-    ----------
-    name
-        As in discovery.json.
-    place, driver, form
-        Of its cells.
-    equation, source
-        What it does, and where that is written.
-    unit
-        Of its parameters.
-    plausible
-        Range of size that real machines have, in ``unit``; its upper end is the standard deviation
-        of the prior on each parameter. None where nothing is known.
-    sign
-        Of its parameters, as of `Cell`.
-    sentence
-        For a technician; ``{subject}`` (its joints or sensor), ``{other}`` (the joint that
-        drives) and ``{driver}`` are filled in.
-    separate_by
-        Which measurements distinguish it from others.
-    remedy
-        What to do about it: a sentence for whoever answers for the arm.
-    size
-        What a cell amounts to, for a sentence: of context, cell and draws of its parameters
-        (draws, m); see `sizes`.
-    cells
-        All of its cells for a context.
-    needs
-        Returns why a context cannot show it; '' where it can.
-    family
-        Effects of one family strike all joints or links alike: they are tried together, too, and
-        share their prior probability. '' for an effect that comes alone.
-    in_family
-        Which of its cells are tried with the family: one for each joint, not every variant.
-    cause_per
-        How cells make causes: all cells of an ``effect`` are one cause, those of the same
-        ``joints``, or those of the same joints and ``variant``.
-    costly
-        It has too many cells to be tried again and again.
-    many
-        Its cells are drawn from thousands: they are no family of one variance.
-    moves_the_fit
-        The offsets model absorbs it: it is judged by how far that fit moved the markers
-        (`marker_offsets`), not by the residuals.
-    reported_as
-        Name in discovery.json, where it is another: 'unnamed' for what has no name of its own.
-    is_cause
-        False for structure that is located without a cause: it is reported as unexplained.
-    between
-        For what happened at one moment: its cells in all gaps between rows that reach between two
-        moments, s since the first row.
-    driven_by_joint
-        Its cells' second joint is the one that drives; the sentence is about the first.
-    """
-
-    name: str
+    name: str  # As in discovery.json
+    # Of its cells
     place: Place
     driver: str
     form: str
+    # What it does, and where that is written
     equation: str
     source: str
-    unit: str
+    unit: str  # Of its parameters
+    # Range of size that real machines have, in ``unit``; its upper end is the standard deviation
+    # of the prior on each parameter. None where nothing is known.
     plausible: tuple[float, float] | None
+    # For a technician; ``{subject}`` (its joints or sensor), ``{other}`` (the joint that drives)
+    # and ``{driver}`` are filled in
     sentence: str
-    separate_by: str
-    remedy: str
+    separate_by: str  # Which measurements distinguish it from others
+    remedy: str  # What to do about it: a sentence for whoever answers for the arm
+    # What a cell amounts to, for a sentence: of context, cell and draws of its parameters (draws,
+    # m); see `sizes`
     size: Callable[[Context, Cell, FloatArray], str]
-    cells: Callable[[Context], Iterable[Cell]]
+    cells: Callable[[Context], Iterable[Cell]]  # All of its cells for a context
+    # Returns why a context cannot show it; '' where it can
     needs: Callable[[Context], str] = field(default=lambda context: '')
+    # Effects of one family strike all joints or links alike: they are tried together, too, and
+    # share their prior probability. '' for an effect that comes alone.
     family: str = ''
+    # Which of its cells are tried with the family: one for each joint, not every variant
     in_family: Callable[[Cell], bool] = field(default=lambda cell: True)
+    # How cells make causes: all cells of an ``effect`` are one cause, those of the same
+    # ``joints``, or those of the same joints and ``variant``
     cause_per: Literal['effect', 'joints', 'variant'] = 'effect'
-    costly: bool = False
-    many: bool = False
+    costly: bool = False  # It has too many cells to be tried again and again
+    many: bool = False  # Its cells are drawn from thousands: they are no family of one variance
+    # The offsets model absorbs it: it is judged by how far that fit moved the markers
+    # (`marker_offsets`), not by the residuals
     moves_the_fit: bool = False
+    # Its cells' second joint is the one that drives; the sentence is about the first
     driven_by_joint: bool = False
-    sign: int = 0
+    sign: int = 0  # Of its parameters, as of `Cell`
+    # Name in discovery.json, where it is another: 'unnamed' for what has no name of its own
     reported_as: str = ''
+    # False for structure that is located without a cause: it is reported as unexplained
     is_cause: bool = True
+    # For what happened at one moment: its cells in all gaps between rows that reach between two
+    # moments, s since the first row
     between: Callable[[Context, float, float], Iterable[Cell]] | None = None
 
     def cell(
@@ -275,16 +200,9 @@ class Effect:
     ) -> Iterator[Cell]:
         """Give a cell for each of some joints (1-based), which adds to that joint's angle.
 
-        Parameters
-        ----------
-        joints
-            Which.
-        features
-            Context and joint to m added angles, rad per unit, (n,) each.
-        parameters
-            Names of the m parameters, with ``{joint}`` for the joint.
-        more
-            Further arguments of `Cell`.
+        ``joints``: which; ``features``: context and joint to m added angles, rad per unit, (n,)
+        each; ``parameters``: names of the m parameters, with ``{joint}`` for the joint; ``more``:
+        further arguments of `Cell`.
         """
         for joint in joints:
             yield self.cell(

@@ -29,34 +29,18 @@ BLOCK_ROWS = 10_000
 
 @dataclass(frozen=True, eq=False)
 class Context:
-    """What effects may depend on: n rows, k joints.
+    """What effects may depend on: n rows, k joints."""
 
-    Attributes
-    ----------
-    chain
-        The nominal robot.
-    measurements
-        All rows; ``sensor`` and ``marker`` are indices into the names below.
-    sensor_names, marker_names
-        In the order of those indices.
-    joint_offsets
-        As fitted, rad, (k,).
-    markers
-        As fitted, in the tool frame, m, (markers, 3).
-    T_R_N
-        As fitted, (sensors, 4, 4).
-    timed
-        False where the rows' times only order them.
-    """
-
-    chain: SerialChain
+    chain: SerialChain  # The nominal robot
+    # All rows; ``sensor`` and ``marker`` are indices into the names below
     measurements: Measurements
+    # In the order of those indices
     sensor_names: tuple[str, ...]
     marker_names: tuple[str, ...]
-    joint_offsets: FloatArray
-    markers: FloatArray
-    T_R_N: FloatArray
-    timed: bool = field(default=True, kw_only=True)
+    joint_offsets: FloatArray  # As fitted, rad, (k,)
+    markers: FloatArray  # As fitted, in the tool frame, m, (markers, 3)
+    T_R_N: FloatArray  # As fitted, (sensors, 4, 4)
+    timed: bool = field(default=True, kw_only=True)  # False where the rows' times only order them
 
     def __len__(self) -> int:
         """Return the number of rows n."""
@@ -280,14 +264,9 @@ class Context:
 
 @dataclass(frozen=True, eq=False)
 class PartOfContext(Context):
-    """Some rows of a context; what depends on more than a row itself is that of the whole.
+    """Some rows of a context; what depends on more than a row itself is that of the whole."""
 
-    Attributes
-    ----------
-    whole, rows
-        The context, and which of its rows these are, (n,).
-    """
-
+    # The context, and which of its rows these are, (n,)
     whole: Context
     rows: IntArray
 

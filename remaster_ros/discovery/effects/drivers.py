@@ -14,30 +14,18 @@ from remaster_ros.types import BoolArray, FloatArray
 
 @dataclass(frozen=True, eq=False)
 class Driver:
-    """What may drive an error.
+    """What may drive an error."""
 
-    Attributes
-    ----------
-    name, unit
-        As the cells have them.
-    value
-        Its value in each row, (n,).
-    label, shown_unit, per_shown
-        For people: what it is, in which unit, and how much of ``unit`` makes one of that.
-    joint
-        The joint (1-based) that it belongs to; 0 where it belongs to none.
-    is_angle
-        It is that joint's angle.
-    """
-
+    # As the cells have them
     name: str
     unit: str
-    value: Callable[[Context], FloatArray]
+    value: Callable[[Context], FloatArray]  # Its value in each row, (n,)
+    # For people: what it is, in which unit, and how much of ``unit`` makes one of that
     label: str
     shown_unit: str = ''
     per_shown: float = 1.0
-    joint: int = 0
-    is_angle: bool = False
+    joint: int = 0  # The joint (1-based) that it belongs to; 0 where it belongs to none
+    is_angle: bool = False  # It is that joint's angle
 
     def curve(
         self, context: Context, share: float, finest: float = 0.0, rows: BoolArray | None = None

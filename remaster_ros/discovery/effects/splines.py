@@ -31,28 +31,15 @@ CLOSED_GAP = 3.0
 
 @dataclass(frozen=True, eq=False)
 class Curve:
-    """A free form of one driver, with zero mean over the values that it was made for.
+    """A free form of one driver, with zero mean over the values that it was made for."""
 
-    Attributes
-    ----------
-    knots
-        Uniform, in the unit of the driver, (m + 4,), or (m + 7,) where closed.
-    start
-        Where the turn begins that angles are brought to, rad; NaN where the driver is no angle of
-        a joint that turns over.
-    closed
-        The curve runs into itself after a turn.
-    visited
-        The values that it was made for, each once, sorted, in that turn, (v,).
-    weights
-        Mean of each spline over these values, as often as they occurred, (m,).
-    """
-
-    knots: FloatArray
+    knots: FloatArray  # Uniform, in the unit of the driver, (m + 4,), or (m + 7,) where closed
+    # Where the turn begins that angles are brought to, rad; NaN where the driver is no angle of a
+    # joint that turns over
     start: float
-    closed: bool
-    visited: FloatArray
-    weights: FloatArray
+    closed: bool  # The curve runs into itself after a turn
+    visited: FloatArray  # The values that it was made for, each once, sorted, in that turn, (v,)
+    weights: FloatArray  # Mean of each spline over these values, as often as they occurred, (m,)
 
     @classmethod
     def of(
