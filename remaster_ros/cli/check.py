@@ -15,6 +15,7 @@ from remaster_ros.cli.options import number
 from remaster_ros.cli.verify import require_same_arm
 from remaster_ros.compensation.checking import SMALLEST_M, Checked, Measured, judge
 from remaster_ros.compensation.file import Compensation, read_compensation
+from remaster_ros.compensation.iso9283 import Visited, visited
 from remaster_ros.errors import InputError
 from remaster_ros.reports.check_page import write_check_page
 from remaster_ros.session.journal import Journal, format_record
@@ -68,6 +69,7 @@ def run(args: argparse.Namespace) -> int:
     session, baseline = read_session(args.session), read_compensation(args.baseline)
     require_same_arm(session, baseline, args.session)
     measured = measured_of(session)
+    iso = visited(baseline.model, measured, session.measurements.wanted)
     _require_history(args.history)
     history = Journal(args.history)
     try:
@@ -94,7 +96,7 @@ def run(args: argparse.Namespace) -> int:
     finally:
         history.close()
     found = judge(baseline.model, checks, 1e-3 * args.smallest_mm)
-    content = content_of(found, baseline.model.chain.joint_names, names, args.smallest_mm)
+    content = content_of(found, baseline.model.chain.joint_names, names, args.smallest_mm, iso)
     if args.out is not None:
         write_check_page(args.out, content, found.series_m, names)
     if args.json:
@@ -189,7 +191,11 @@ def _before(
 
 
 def content_of(
-    found: Checked, joint_names: tuple[str, ...], names: list[str], smallest_mm: float
+    found: Checked,
+    joint_names: tuple[str, ...],
+    names: list[str],
+    smallest_mm: float,
+    iso: Visited,
 ) -> dict[str, Any]:
     """Return what was found, as it is printed as JSON; null where a number is not known."""
 
@@ -221,6 +227,11 @@ def content_of(
         'checks': len(names),
         'noise': 1e3 * found.noise_m,
         'smallest_mm': smallest_mm,
+        'iso9283': {
+            'accuracy_mm': (1e3 * iso.accuracy_m).tolist(),
+            'repeatability_mm': (1e3 * iso.repeatability_m).tolist(),
+            'text': iso.text(),
+        },
         'text': in_words(found, joint_names, names),
     }
 
@@ -291,4 +302,6 @@ def _text(content: dict[str, Any]) -> str:
         f'check {content["checks"]}; evidence {content["evidence"]:.2g} (an alarm at 100); noise '
         f'of a reading {content["noise"]:.3f} mm'
     )
+    if content['iso9283']['accuracy_mm']:
+        lines.append(content['iso9283']['text'])
     return '\n'.join(lines)

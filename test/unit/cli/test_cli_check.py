@@ -11,9 +11,11 @@ import pytest
 from checked_arms import CheckedArm
 from compensation_files import save
 from hidden_tours import robot
+from scipy.spatial.transform import Rotation
 
 from remaster_ros.cli.main import main
 from remaster_ros.compensation.checking import Measured
+from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.session.reader import write_session
 from remaster_ros.types import Measurements, Session
 
@@ -136,3 +138,33 @@ def test_another_arm_and_another_baseline_are_refused(run, arm, tmp_path, capsys
     args = ['check', str(folder), '--history', str(tmp_path / 'arm.jsonl'), '--baseline']
     assert main([*args, str(baseline)]) == 2
     assert 'was compared with another baseline' in capsys.readouterr().err
+
+
+def test_figures_of_iso_9283_need_its_visits(run, arm, tmp_path):
+    """Five poses, 30 visits each; AP and RP by the standard's formulas and SciPy's alignment."""
+    rng = np.random.default_rng(9283)
+    q, names = np.tile(arm.q[:5], (30, 1)), {'sensor': ('mocap',) * 150, 'marker': ('sir',) * 150}
+    at = arm.true.in_sensor(arm.true.state(q), 'mocap', 'sir')
+    at += 1e-4 * rng.standard_normal(at.shape)
+    iso = run(write(tmp_path / 'whole', Measured(q=q, position=at, **names)))['iso9283']
+    each = at.reshape(30, 5, 3)
+    distance = np.linalg.norm(each - each.mean(axis=0), axis=2)
+    repeatability = distance.mean(axis=0) + 3.0 * distance.std(axis=0, ddof=1)
+    assert iso['repeatability_mm'] == pytest.approx(1e3 * repeatability, rel=1e-9)
+    frames = SerialChain.from_urdf(robot('iiwa7'), 'base_link', 'tool').forward(arm.q[:5])
+    drawn = frames[:, :3, :3] @ arm.found.markers['sir'] + frames[:, :3, 3]
+    drawn, centres = drawn - drawn.mean(axis=0), each.mean(axis=0) - at.mean(axis=0)
+    turn, _ = Rotation.align_vectors(drawn, centres)
+    accuracy = np.linalg.norm(turn.apply(centres) - drawn, axis=1)
+    assert iso['accuracy_mm'] == pytest.approx(1e3 * accuracy, rel=1e-6)
+    # Readings one after the other are one visit.
+    order = np.argsort(np.arange(150) % 5, kind='stable')
+    standing = Measured(q=q[order], position=at[order], **names)
+    page = tmp_path / 'check.html'
+    none = run(
+        write(tmp_path / 'standing', standing), '--out', str(page), history='another.jsonl'
+    )['iso9283']
+    assert none['accuracy_mm'] == []
+    missing = 'it asks for 30 visits of each of 5 poses, and here 5 were visited, 1 times at most'
+    assert missing in none['text']
+    assert missing in page.read_text(encoding='utf-8')

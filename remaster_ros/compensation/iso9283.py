@@ -1,0 +1,109 @@
+"""Position accuracy and repeatability of a session whose visits are those that ISO 9283 asks for.
+
+References
+----------
+ISO 9283:1998, 7.2.1 (position accuracy AP) and 7.2.2 (position repeatability RP): 30 cycles of
+five poses, each reached from the same side.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from remaster_ros.calibration.registration import register_points
+from remaster_ros.compensation.arm_model import ArmModel
+from remaster_ros.compensation.checking import SAME_RAD, Measured
+from remaster_ros.kinematics.transforms import apply
+from remaster_ros.types import FloatArray
+
+POSES = 5
+CYCLES = 30
+
+
+@dataclass(frozen=True, eq=False)
+class Visited:
+    """What the sensor and the marker that saw most say of repeated visits.
+
+    Attributes
+    ----------
+    visits
+        Of each configuration, most first, (p,). Readings one after the other are one visit.
+    accuracy_m, repeatability_m
+        AP and RP of each of the configurations with `CYCLES` visits, m; empty where fewer than
+        `POSES` have so many.
+    """
+
+    visits: tuple[int, ...]
+    accuracy_m: FloatArray
+    repeatability_m: FloatArray
+
+    def text(self) -> str:
+        """Return the figures, or what is missing, in a sentence."""
+        if len(self.accuracy_m):
+            return (
+                f'ISO 9283, {len(self.accuracy_m)} poses of {CYCLES} visits and more: accuracy '
+                f'(AP) {1e3 * self.accuracy_m.max():.3f} mm, repeatability (RP) '
+                f"{1e3 * self.repeatability_m.max():.3f} mm at the worst pose, the sensor's noise "
+                "included; the sensor's frame is fitted to these poses, and load and speed are "
+                'those that you measured with: the standard asks for the rated ones.'
+            )
+        return (
+            f'No figures of ISO 9283: it asks for {CYCLES} visits of each of {POSES} poses, and '
+            f'here {len(self.visits)} were visited, {self.visits[0]} times at most, '
+            f'{sum(count >= CYCLES for count in self.visits)} of them {CYCLES} times.'
+        )
+
+
+def visited(model: ArmModel, measured: Measured, wanted: FloatArray | None) -> Visited:
+    """Return accuracy and repeatability of repeated visits.
+
+    Parameters
+    ----------
+    model
+        The marker on the tool is taken from it, the arm as it is drawn: what is asked is how far
+        from the pose that was commanded the tool came.
+    measured
+        Readings in the order in which they were taken.
+    wanted
+        Joints before any correction, rad, (n, k), NaN where nothing was corrected; or None.
+    """
+    pairs = list(zip(measured.sensor, measured.marker, strict=True))
+    most = max(dict.fromkeys(pairs), key=pairs.count)
+    mine = np.array([pair == most for pair in pairs])
+    q, position = measured.q[mine], measured.position[mine]
+    commanded = q if wanted is None else np.where(np.isnan(wanted[mine]), q, wanted[mine])
+    places: list[FloatArray] = []
+    visits: list[list[list[int]]] = []
+    last = -1
+    for row, angles in enumerate(q):
+        near = [at for at, place in enumerate(places) if np.abs(angles - place).max() <= SAME_RAD]
+        at = near[0] if near else len(places)
+        if not near:
+            places.append(angles)
+            visits.append([])
+        if at == last:
+            visits[at][-1].append(row)
+        else:
+            visits[at].append([row])
+        last = at
+    counts = tuple(sorted(map(len, visits), reverse=True))
+    enough = [each for each in visits if len(each) >= CYCLES]
+    if len(enough) < POSES:
+        return Visited(counts, np.empty(0), np.empty(0))
+    attained = [np.array([position[rows].mean(axis=0) for rows in each]) for each in enough]
+    centres = np.array([points.mean(axis=0) for points in attained])
+    rows = [np.concatenate(each) for each in enough]
+    tool = model.chain.forward(np.array([commanded[some].mean(axis=0) for some in rows]))
+    points = apply(tool, model.markers[most[1]])
+    T_R_N, _ = register_points(points, centres)
+    distances = [
+        np.linalg.norm(some - centre, axis=1)
+        for some, centre in zip(attained, centres, strict=True)
+    ]
+    return Visited(
+        counts,
+        np.linalg.norm(apply(T_R_N, centres) - points, axis=1),
+        np.array([each.mean() + 3.0 * each.std(ddof=1) for each in distances]),
+    )
