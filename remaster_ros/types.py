@@ -80,6 +80,8 @@ class Observation:
         The reported joint positions less what a correction changed, rad, (k,); None where unknown.
     correction
         Whether a correction was on; None where unknown.
+    effort
+        Measured joint torques, N m, (k,), NaN where unknown; None where none is known.
     """
 
     observation: int
@@ -99,6 +101,7 @@ class Observation:
     orientation: FloatArray | None = None
     wanted: FloatArray | None = None
     correction: bool | None = None
+    effort: FloatArray | None = None
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,7 @@
-"""observations.csv: text to checked columns and back, every fault named by line and column."""
+"""An observation as a line, and as one of columns: observations.csv, its rules, its faults.
+
+The journal keeps the same lines (see `session_writer`). Every fault is named by line and column.
+"""
 
 from __future__ import annotations
 
@@ -7,12 +10,14 @@ import logging
 import math
 import re
 from collections import ChainMap
-from collections.abc import Iterator, Mapping, MutableMapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, MutableMapping, Sequence
 from dataclasses import replace
+from itertools import repeat
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.serial_chain import LEVER_M, LIMIT_TOLERANCE_RAD, SerialChain
@@ -267,73 +272,47 @@ def row_keys(m: Measurements, first_line: int) -> Iterator[RowKeys]:
 
 log = logging.getLogger('remaster_ros')
 
-FRAME = 'frame'
-"""The column that names the rows of one sensor which come from one frame."""
-ORIENTATION = ('orientation_x', 'orientation_y', 'orientation_z', 'orientation_w')
-"""Columns of the orientation of the measured body, a unit quaternion."""
-CORRECTION = 'correction'
-"""The column that has whether a correction was on."""
+OPTIONAL = ('frame', 'orientation', 'effort', 'wanted', 'correction')
+"""Fields of an observation whose columns a file need not have."""
+LEFT_OUT = ('from_q', 'std', 'samples', 'temperature_c')
+"""Fields whose columns are written always, though a file of others may leave them out."""
 STATES = ('off', 'on')
 LENGTH_TOLERANCE = 1e-3
 """By so much the length of a quaternion may differ from 1."""
 
 
-class ColumnNames:
-    """The column names of a session with k joints, in the order this package writes them.
+def column_names(
+    joints: int, slides: Sequence[bool] | BoolArray | None = None
+) -> dict[str, list[str]]:
+    """Return the columns by the field of `Observation` that they hold, in the order written.
 
     ``slides`` tells which joints do, (k,): their positions are in m, their efforts in N.
-
-    Attributes
-    ----------
-    q, from_q
-        Reported joint positions, and those that the arm came from.
-    effort
-        Measured joint torques; these columns are optional, and so are `FRAME` and `ORIENTATION`.
-    wanted
-        Joint positions wanted before any correction; optional, and so is `CORRECTION`.
     """
+    lengths = [False] * joints if slides is None else list(slides)
 
-    position = ('x_m', 'y_m', 'z_m')
-    std = ('std_x_m', 'std_y_m', 'std_z_m')
-
-    def __init__(self, joints: int, slides: Sequence[bool] | BoolArray | None = None) -> None:
-        self.joints = joints
-        lengths = [False] * joints if slides is None else list(slides)
-        self.q, self.from_q, self.effort, self.wanted = (
-            [f'{prefix}{i}_{units[int(length)]}' for i, length in enumerate(lengths, start=1)]
-            for prefix, units in (
-                *(('q', ('rad', 'm')), ('from_q', ('rad', 'm'))),
-                *(('effort', ('nm', 'n')), ('wanted', ('rad', 'm'))),
-            )
-        )
-
-    @property
-    def optional(self) -> tuple[str, ...]:
-        """Columns that a file may leave out where every field of them would be empty."""
-        return (*self.from_q, *self.std, 'samples', 'temperature_c')
-
-    def names(
-        self,
-        with_effort: bool = False,
-        with_frame: bool = False,
-        with_orientation: bool = False,
-        with_wanted: bool = False,
-        with_correction: bool = False,
-    ) -> list[str]:
-        """Return every column's name."""
+    def of_joints(prefix: str, turning: str = 'rad', sliding: str = 'm') -> list[str]:
         return [
-            *('observation', 'pose', 'configuration', 'split', 'stamp_s', 'sensor', 'marker'),
-            *(*self.q, *self.from_q, *self.position, *self.std, 'samples', 'temperature_c'),
-            *([FRAME] if with_frame else ()),
-            *(ORIENTATION if with_orientation else ()),
-            *(self.effort if with_effort else ()),
-            *(self.wanted if with_wanted else ()),
-            *([CORRECTION] if with_correction else ()),
+            f'{prefix}{i}_{sliding if length else turning}'
+            for i, length in enumerate(lengths, start=1)
         ]
+
+    single = ('observation', 'pose', 'configuration', 'split', 'stamp_s', 'sensor', 'marker')
+    return {
+        **{name: [name] for name in single},
+        'q': of_joints('q'),
+        'from_q': of_joints('from_q'),
+        'position': ['x_m', 'y_m', 'z_m'],
+        'std': ['std_x_m', 'std_y_m', 'std_z_m'],
+        **{name: [name] for name in ('samples', 'temperature_c', 'frame')},
+        'orientation': [f'orientation_{axis}' for axis in 'xyzw'],
+        'effort': of_joints('effort', 'nm', 'n'),
+        'wanted': of_joints('wanted'),
+        'correction': ['correction'],
+    }
 
 
 class RowFormat:
-    """observations.csv of one session: reads it, and checks rows that are to be written.
+    """observations.csv of one session: observations to lines, and lines to checked columns.
 
     Parameters
     ----------
@@ -343,9 +322,8 @@ class RowFormat:
         The robot, for the number of joints and their limits.
     sensors, markers
         The names in session.yaml, in their order.
-    with_frame, with_orientation, with_correction
-        Whether the rows that are to be written have the columns `FRAME`, `ORIENTATION`, and those
-        of what was wanted before a correction.
+    optional
+        Which of the `OPTIONAL` fields the lines have that are to be written.
     within_limits
         Whether joint angles outside the robot's limits are refused.
     """
@@ -356,27 +334,63 @@ class RowFormat:
         chain: SerialChain,
         sensors: Sequence[str],
         markers: Sequence[str],
-        with_frame: bool = False,
-        with_orientation: bool = False,
-        with_correction: bool = False,
+        optional: Collection[str] = (),
         within_limits: bool = True,
     ) -> None:
         self._path, self._chain = path, chain
         self._sensors, self._markers = sensors, markers
-        self._with = False, with_frame, with_orientation, with_correction, with_correction
         self._within_limits = within_limits
-        self._columns = ColumnNames(len(chain), chain.slides)
+        self._columns = column_names(len(chain), chain.slides)
+        self._absent = [name for name in OPTIONAL if name not in optional]
+        self._written = [
+            name
+            for field, names in self._columns.items()
+            if field not in self._absent
+            for name in names
+        ]
+
+    @property
+    def header(self) -> str:
+        """The first line of what is written, with its end."""
+        return ','.join(self._written) + '\n'
+
+    def line(self, o: Observation) -> str:
+        """Return one observation without a line end; numbers survive the round trip exactly."""
+        joints = len(o.q)
+        cells: dict[str, list[str]] = {
+            'observation': [str(int(o.observation))],
+            'pose': [str(int(o.pose))],
+            'configuration': [str(int(o.configuration))],
+            'split': [o.split],
+            'stamp_s': _numbers([o.stamp_s], 1),
+            'sensor': [o.sensor],
+            'marker': [o.marker],
+            'q': _numbers(o.q, joints),
+            'from_q': _numbers(o.from_q, joints),
+            'position': _numbers(o.position, 3),
+            'std': _numbers(o.std, 3),
+            'samples': ['' if o.samples is None else str(int(o.samples))],
+            'temperature_c': _numbers(None if o.temperature_c is None else [o.temperature_c], 1),
+            'frame': ['' if o.frame is None else str(int(o.frame))],
+            'orientation': _numbers(o.orientation, 4),
+            'effort': _numbers(o.effort, joints),
+            'wanted': _numbers(o.wanted, joints),
+            'correction': ['' if o.correction is None else STATES[o.correction]],
+        }
+        for field in self._absent:
+            del cells[field]
+        return ','.join(cell for own in cells.values() for cell in own)
+
+    def text(self, m: Measurements) -> str:
+        """Return all observations as the text of the file."""
+        rows = observations_of(m, self._sensors, self._markers)
+        return self.header + ''.join(f'{self.line(row)}\n' for row in rows)
 
     def parse(self, data: bytes) -> Measurements:
-        """Read the bytes of the file.
+        """Read the bytes of the file; an `InputError` names file, line, column and remedy.
 
         What was cut off while it was written is dropped with a warning: a last line without its
         line end, and last lines with the zeros that a power cut leaves.
-
-        Raises
-        ------
-        InputError
-            One line naming file, line, column and remedy.
         """
         path = self._path
         # Before its zeros are taken for those that a power cut leaves.
@@ -396,33 +410,21 @@ class RowFormat:
         if len(lines) < 2:
             raise InputError(f'{path}: no observations below the header; measure before fitting')
         table = Table(path, names, lines[1:], first_line=2)
-        for name in self._columns.optional:
-            table.cells.setdefault(name, [''] * table.rows)
+        for field in LEFT_OUT:
+            for name in self._columns[field]:
+                table.cells.setdefault(name, [''] * table.rows)
         measurements = self._convert(table)
         self._accept(measurements, 2, SequenceRules())
         return measurements
 
     def check(self, rows: Sequence[str], first_line: int, rules: SequenceRules) -> list[RowKeys]:
-        """Check rows that are to be written as a reader would; return their keys.
+        """Check lines that are to be written as a reader would; return their keys.
 
-        Parameters
-        ----------
-        rows
-            Lines without their ends.
-        first_line
-            The line of the first one in the file.
-        rules
-            Accepts the rows.
-
-        Raises
-        ------
-        InputError
-            As `parse`.
+        The first one is on `first_line` of the file; `rules` accepts them. Errors as of `parse`.
         """
         if not rows:
             return []
-        names = self._columns.names(*self._with)
-        table = Table(self._path, names, list(rows), first_line)
+        table = Table(self._path, self._written, list(rows), first_line)
         return self._accept(self._convert(table), first_line, rules)
 
     def _accept(self, m: Measurements, first_line: int, rules: SequenceRules) -> list[RowKeys]:
@@ -436,9 +438,13 @@ class RowFormat:
     def _convert(self, table: Table) -> Measurements:
         """Convert and check every column by itself."""
         columns, chain = self._columns, self._chain
-        with_effort = columns.effort[0] in table.cells
+
+        def given(field: str) -> bool:
+            return columns[field][0] in table.cells
+
         split = table.choices('split', SPLITS, f'is none of {", ".join(SPLITS)}; correct it')
         is_reference = split == SPLITS.index('reference')
+        states = ('', *STATES)
         measurements = Measurements(
             observation=table.integers('observation'),
             pose=table.integers('pose'),
@@ -447,39 +453,33 @@ class RowFormat:
             stamp_s=table.numbers(['stamp_s'])[:, 0],
             sensor=table.choices('sensor', self._sensors, _not_among('sensors', self._sensors)),
             marker=table.choices('marker', self._markers, _not_among('markers', self._markers)),
-            q=table.numbers(columns.q),
-            from_q=table.whole_or_empty(columns.from_q),
-            position=table.numbers(columns.position),
-            std=table.whole_or_empty(columns.std),
+            q=table.numbers(columns['q']),
+            from_q=table.whole_or_empty(columns['from_q']),
+            position=table.numbers(columns['position']),
+            std=table.whole_or_empty(columns['std']),
             samples=table.integers('samples', least=1),
             temperature_c=table.numbers(['temperature_c'], optional=True)[:, 0],
-            effort=table.numbers(columns.effort, optional=True) if with_effort else None,
+            effort=table.numbers(columns['effort'], optional=True) if given('effort') else None,
             is_reference=is_reference if is_reference.any() else None,
-            frame=table.integers(FRAME, least=0) if FRAME in table.cells else None,
-            orientation=table.whole_or_empty(ORIENTATION)
-            if ORIENTATION[0] in table.cells
+            frame=table.integers('frame', least=0) if given('frame') else None,
+            orientation=table.whole_or_empty(columns['orientation'])
+            if given('orientation')
             else None,
-            wanted=table.whole_or_empty(columns.wanted)
-            if columns.wanted[0] in table.cells
-            else None,
+            wanted=table.whole_or_empty(columns['wanted']) if given('wanted') else None,
             correction=table.choices(
-                CORRECTION, ('', *STATES), 'is neither on nor off; leave it empty where unknown'
+                'correction', states, 'is neither on nor off; leave it empty where unknown'
             )
             - 1
-            if CORRECTION in table.cells
+            if given('correction')
             else None,
         )
         if measurements.orientation is not None:
             length = np.linalg.norm(measurements.orientation, axis=1, keepdims=True)
-            table.refuse(
-                np.abs(length - 1.0) > LENGTH_TOLERANCE,
-                {
-                    ORIENTATION[
-                        0
-                    ]: 'and the three beside it are no quaternion of length 1; correct them'
-                },
-            )
-        table.refuse(measurements.std < 0, dict.fromkeys(columns.std, 'is negative; correct it'))
+            problem = 'and the three beside it are no quaternion of length 1; correct them'
+            wrong = np.abs(length - 1.0) > LENGTH_TOLERANCE
+            table.refuse(wrong, {columns['orientation'][0]: problem})
+        negative = dict.fromkeys(columns['std'], 'is negative; correct it')
+        table.refuse(measurements.std < 0, negative)
         words = {
             'rad': ('1 degree', 'radians'),
             'm': (f'{1e3 * LEVER_M * LIMIT_TOLERANCE_RAD:.1f} mm', 'metres'),
@@ -492,17 +492,14 @@ class RowFormat:
                 chain.joint_names, chain.lower, chain.upper, chain.units
             )
         ]
-        given = [(columns.q, measurements.q), (columns.from_q, measurements.from_q)]
-        if measurements.wanted is not None:
-            given.append((columns.wanted, measurements.wanted))
-        for names, q in given:
-            below = q < chain.lower - chain.limit_tolerance
-            above = q > chain.upper + chain.limit_tolerance
-            if self._within_limits:
-                table.refuse(below | above, dict(zip(names, problems)))
+        for field in ('q', 'from_q', 'wanted') if self._within_limits else ():
+            if (q := getattr(measurements, field)) is not None:
+                below = q < chain.lower - chain.limit_tolerance
+                above = q > chain.upper + chain.limit_tolerance
+                table.refuse(below | above, dict(zip(columns[field], problems)))
         far = f'm is further than {FARTHEST_M:g} m away, beyond any sensor; are the units metres?'
         outside = np.abs(measurements.position) > FARTHEST_M
-        table.refuse(outside, dict.fromkeys(columns.position, far))
+        table.refuse(outside, dict.fromkeys(columns['position'], far))
         return measurements
 
 
@@ -529,116 +526,80 @@ def _whole_lines(data: bytes, most: int) -> int:
     return data.rfind(b'\n', 0, zero) + 1
 
 
-def format_header(
-    joints: int,
-    with_effort: bool = False,
-    with_frame: bool = False,
-    with_orientation: bool = False,
-    with_wanted: bool = False,
-    with_correction: bool = False,
-    slides: Sequence[bool] | BoolArray | None = None,
-) -> str:
-    """Return the header line of observations.csv."""
-    names = ColumnNames(joints, slides).names(
-        with_effort, with_frame, with_orientation, with_wanted, with_correction
+def observations_of(
+    m: Measurements, sensors: Sequence[str], markers: Sequence[str]
+) -> Iterator[Observation]:
+    """Yield the rows of columns; what is NaN or -1 there is None here."""
+
+    def rows(values: FloatArray | None) -> Iterator[FloatArray | None]:
+        if values is None:
+            return repeat(None, len(m))
+        return (None if np.isnan(row).all() else row for row in values)
+
+    def counts(values: IntArray | None) -> Iterator[int | None]:
+        if values is None:
+            return repeat(None, len(m))
+        return (value if value >= 0 else None for value in values.tolist())
+
+    corrections = (None if one is None else bool(one) for one in counts(m.correction))
+    return map(
+        Observation,
+        *(m.observation.tolist(), m.pose.tolist(), m.configuration.tolist()),
+        (SPLITS[split] for split in split_indices(m).tolist()),
+        m.stamp_s.tolist(),
+        (sensors[i] for i in m.sensor.tolist()),
+        (markers[i] for i in m.marker.tolist()),
+        *(m.q, m.position, rows(m.from_q), rows(m.std), counts(m.samples)),
+        (None if value != value else value for value in m.temperature_c.tolist()),
+        *(counts(m.frame), rows(m.orientation), rows(m.wanted), corrections, rows(m.effort)),
     )
-    return ','.join(names) + '\n'
 
 
-def format_observation(
-    observation: Observation,
-    with_frame: bool = False,
-    with_orientation: bool = False,
-    with_correction: bool = False,
-) -> str:
-    """Return one observation as a line without its end; numbers survive the round trip exactly."""
-    o = observation
-    unknown = [''] * len(o.q)
-    cells = [
-        *(str(int(o.observation)), str(int(o.pose)), str(int(o.configuration)), o.split),
-        *(_text(o.stamp_s), o.sensor, o.marker),
-        *map(_text, o.q),
-        *(unknown if o.from_q is None else map(_text, o.from_q)),
-        *map(_text, o.position),
-        *([''] * 3 if o.std is None else map(_text, o.std)),
-        '' if o.samples is None else str(int(o.samples)),
-        '' if o.temperature_c is None else _text(o.temperature_c),
-        *(['' if o.frame is None else str(int(o.frame))] if with_frame else ()),
-    ]
-    if with_orientation:
-        cells += [''] * 4 if o.orientation is None else map(_text, o.orientation)
-    if with_correction:
-        cells += unknown if o.wanted is None else map(_text, o.wanted)
-        cells.append('' if o.correction is None else STATES[o.correction])
-    return ','.join(cells)
+def optional_of(m: Measurements) -> list[str]:
+    """Return the `OPTIONAL` fields that columns have."""
+    return [name for name in OPTIONAL if getattr(m, name) is not None]
 
 
-def format_measurements(
-    m: Measurements,
-    sensors: Sequence[str],
-    markers: Sequence[str],
-    slides: Sequence[bool] | BoolArray | None = None,
-) -> str:
-    """Return all observations as the text of the file, header included.
-
-    ``slides`` tells which joints do, (k,); None where all turn.
-    """
-
-    def numbers(values: FloatArray) -> list[list[str]]:
-        return [
-            [repr(number) if number == number else '' for number in column]
-            for column in values.T.tolist()
-        ]
-
-    cells = [
-        *(list(map(str, ids.tolist())) for ids in (m.observation, m.pose, m.configuration)),
-        [SPLITS[split] for split in split_indices(m).tolist()],
-        *numbers(m.stamp_s[:, None]),
-        [sensors[sensor] for sensor in m.sensor.tolist()],
-        [markers[marker] for marker in m.marker.tolist()],
-        *(column for values in (m.q, m.from_q, m.position, m.std) for column in numbers(values)),
-        [str(samples) if samples >= 0 else '' for samples in m.samples.tolist()],
-        *numbers(m.temperature_c[:, None]),
-        *(
-            [[str(number) if number >= 0 else '' for number in m.frame.tolist()]]
-            if m.frame is not None
-            else ()
-        ),
-        *(numbers(m.orientation) if m.orientation is not None else ()),
-        *(numbers(m.effort) if m.effort is not None else ()),
-        *(numbers(m.wanted) if m.wanted is not None else ()),
-        *(
-            [['' if state < 0 else STATES[state] for state in m.correction.tolist()]]
-            if m.correction is not None
-            else ()
-        ),
-    ]
-    lines = map(','.join, zip(*cells, strict=True))
-    header = format_header(
-        m.q.shape[1],
-        m.effort is not None,
-        m.frame is not None,
-        m.orientation is not None,
-        m.wanted is not None,
-        m.correction is not None,
-        slides,
-    )
-    return header + ''.join(f'{row}\n' for row in lines)
+def stacked(parts: Sequence[Measurements]) -> Measurements:
+    """Return the rows of all parts; where only some have a field, it is unknown in the others."""
+    columns: dict[str, Any] = {}
+    for name in vars(parts[0]):
+        values = [getattr(part, name) for part in parts]
+        known = next((value for value in values if value is not None), None)
+        columns[name] = (
+            None
+            if known is None
+            else np.concatenate(
+                [
+                    _unknown(known, len(part)) if value is None else value
+                    for part, value in zip(parts, values, strict=True)
+                ]
+            )
+        )
+    return Measurements(**columns)
 
 
-def _check_names(names: list[str], columns: ColumnNames, path: Path) -> None:
+def _unknown(like: NDArray[Any], count: int) -> NDArray[Any]:
+    """Return a column in which nothing is known: NaN, -1 or False, (count, ...)."""
+    fill = {'f': np.nan, 'i': -1, 'b': False}[like.dtype.kind]
+    return np.full((count, *like.shape[1:]), fill, dtype=like.dtype)
+
+
+def _check_names(names: list[str], columns: Mapping[str, list[str]], path: Path) -> None:
     """Refuse a header that does not have the columns of the format."""
     where = f'{path}, line 1'
     for name in names:
         if names.count(name) > 1:
             raise InputError(f'{where}: column {name[:40]!r} is given twice; keep one')
-    turned = [name for name in ORIENTATION if name in names]
-    if turned and len(turned) < len(ORIENTATION):
+    axes = columns['orientation']
+    turned = [name for name in axes if name in names]
+    if turned and len(turned) < len(axes):
         raise InputError(
-            f'{where}: of the columns {", ".join(ORIENTATION)} only {", ".join(turned)} are '
+            f'{where}: of the columns {", ".join(axes)} only {", ".join(turned)} are '
             'there; give all or none'
         )
-    for wanted in (columns.q, columns.from_q, columns.effort, columns.wanted):
+    for field in ('q', 'from_q', 'effort', 'wanted'):
+        wanted = columns[field]
         prefix, suffix = wanted[0].split('1')
         pattern = re.compile(f'{prefix}[0-9]+_(rad|m|nm|n)')
         found = [name for name in names if pattern.fullmatch(name)]
@@ -651,19 +612,21 @@ def _check_names(names: list[str], columns: ColumnNames, path: Path) -> None:
                     f'the URDF {"slides" if right.endswith(("_m", "_n")) else "turns"}, so its '
                     f'column is {right}; write it so, in that unit, or correct the URDF'
                 )
-        if set(found) != set(wanted) and (found or wanted is columns.q):
+        if set(found) != set(wanted) and (found or field == 'q'):
             raise InputError(
-                f'{where}: {len(found)} columns {prefix}…{suffix} for the {columns.joints} joints '
+                f'{where}: {len(found)} columns {prefix}…{suffix} for the {len(wanted)} joints '
                 f'of the robot between its base_link and tip_link; give {wanted[0]} to '
                 f'{wanted[-1]}, or the right URDF and links in session.yaml'
             )
-    missing = [name for name in columns.names() if name not in (*names, *columns.optional)]
+    needed = [field for field in columns if field not in (*OPTIONAL, *LEFT_OUT)]
+    missing = [name for field in needed for name in columns[field] if name not in names]
     if missing:
         raise InputError(
             f'{where}: column {", ".join(missing)} is missing; add it (docs/session-format.md), '
             'or let "remaster import" make a session of this table'
         )
-    unknown = [name for name in names if name not in columns.names(*[True] * 5)]
+    known = set().union(*columns.values())
+    unknown = [name for name in names if name not in known]
     if unknown:
         log.warning('%s: unknown columns are not used: %s', where, ', '.join(map(repr, unknown)))
 
@@ -672,12 +635,7 @@ def turned_round(m: Measurements, sensors: Sequence[int], where: str) -> Measure
     """Return rows with the readings of sensors on the tool the other way round.
 
     Those of what stands, in the sensor's frame, become those of the sensor in the frame of what
-    stands, and back.
-
-    Raises
-    ------
-    InputError
-        One without an orientation; the message begins with ``where``.
+    stands, and back. An `InputError`, which begins with `where`, for one without an orientation.
     """
     mine = np.flatnonzero(np.isin(m.sensor, sensors))
     if len(mine) == 0:
@@ -698,5 +656,9 @@ def _not_among(key: str, names: Sequence[str]) -> str:
     return f'is not among the {key} of session.yaml ({", ".join(names)}); correct either'
 
 
-def _text(number: float) -> str:
-    return repr(float(number))
+def _numbers(values: FloatArray | Sequence[float] | None, count: int) -> list[str]:
+    """Return numbers as cells, empty where they are not known."""
+    if values is None:
+        return [''] * count
+    numbers = np.asarray(values, float).tolist()
+    return [repr(number) if number == number else '' for number in numbers]

@@ -32,7 +32,7 @@ from remaster_ros.planning.tour_order import (
 )
 from remaster_ros.session.files import make_folder
 from remaster_ros.session.journal import Journal, Record, read_journal
-from remaster_ros.session.session_opening import PLAN
+from remaster_ros.session.reader import PLAN
 from remaster_ros.session.yaml_records import from_plain, to_plain
 from remaster_ros.types import FloatArray
 

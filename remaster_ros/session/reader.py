@@ -8,7 +8,6 @@ from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
 
 import numpy as np
 
@@ -23,7 +22,7 @@ from remaster_ros.session.files import (
     write_atomically,
 )
 from remaster_ros.session.manifest import check_data, read_manifest
-from remaster_ros.session.observations import RowFormat, format_measurements, turned_round
+from remaster_ros.session.observations import RowFormat, optional_of, stacked, turned_round
 from remaster_ros.session.session_yaml import (
     SessionHeader,
     parse_header,
@@ -38,6 +37,8 @@ OBSERVATIONS_LIMIT = 1024**3
 HEADER = 'session.yaml'
 ROWS = 'observations.csv'
 URDF = 'robot.urdf'
+JOURNAL = 'journal.jsonl'
+PLAN = 'plan.jsonl'
 
 _ATTEMPTS = 10
 
@@ -142,8 +143,9 @@ def write_session(folder: str | os.PathLike[str], session: Session) -> None:
     names = session.sensor_names, session.marker_names
     on_tool = [i for i, name in enumerate(session.sensors) if name in session.on_tool]
     measured = turned_round(all_rows(session), on_tool, 'session to be written')
-    rows = format_measurements(measured, *names, chain.slides).encode()
-    RowFormat(folder / ROWS, chain, *names).parse(rows)
+    row_format = RowFormat(folder / ROWS, chain, *names, optional_of(measured))
+    rows = row_format.text(measured).encode()
+    row_format.parse(rows)
     with undone_on_failure():
         make_new_folder(folder)
         write_atomically(folder / URDF, session.urdf)
@@ -156,15 +158,7 @@ def all_rows(session: Session) -> Measurements:
     m, references = session.measurements, session.references
     if references is None:
         return m
-    of_references = np.repeat([False, True], [len(m), len(references)])
-    columns: dict[str, Any] = {
-        name: None
-        if value is None or getattr(references, name) is None
-        else np.concatenate((value, getattr(references, name)))
-        for name, value in vars(m).items()
-    }
-    columns['is_reference'] = of_references
-    merged = Measurements(**columns)
+    merged = stacked([m, replace(references, is_reference=np.ones(len(references), bool))])
     return merged.select(np.argsort(merged.observation, kind='stable'))
 
 

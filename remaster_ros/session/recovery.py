@@ -10,8 +10,7 @@ from remaster_ros.errors import InputError
 from remaster_ros.session.bag_writer import recover_bag
 from remaster_ros.session.journal import Journal
 from remaster_ros.session.manifest import check_file, read_manifest
-from remaster_ros.session.reader import read_header, read_robot
-from remaster_ros.session.session_opening import JOURNAL, PLAN
+from remaster_ros.session.reader import JOURNAL, PLAN, read_header, read_robot
 from remaster_ros.session.session_writer import SessionWriter
 from remaster_ros.session.session_yaml import SessionHeader
 from remaster_ros.types import Measurements

@@ -17,8 +17,7 @@ from remaster_ros.collection.pairing import PairedReading
 from remaster_ros.planning.tour_order import REFERENCE, REGISTRATION
 from remaster_ros.session.files import read_limited
 from remaster_ros.session.journal import Record, read_journal
-from remaster_ros.session.reader import HEADER, OBSERVATIONS_LIMIT, ROWS, read_header
-from remaster_ros.session.session_opening import JOURNAL
+from remaster_ros.session.reader import HEADER, JOURNAL, OBSERVATIONS_LIMIT, ROWS, read_header
 from remaster_ros.session.session_writer import SessionWriter
 from remaster_ros.session.session_yaml import ExitStatus
 from remaster_ros.session.yaml_records import from_plain, to_plain

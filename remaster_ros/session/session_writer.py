@@ -11,41 +11,39 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import os
-from collections.abc import Callable, Sequence
-from functools import partial
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 
 from remaster_ros.errors import DiskError, InputError, MovedError
 from remaster_ros.session.files import (
+    URDF_LIMIT,
     AppendFile,
     make_folder,
+    make_new_folder,
     read_limited,
     reason,
+    remove_leftovers,
+    sync_folder,
     write_atomically,
     writing,
 )
 from remaster_ros.session.journal import Journal, Record
-from remaster_ros.session.manifest import write_sums
-from remaster_ros.session.observations import (
-    RowFormat,
-    RowKeys,
-    SequenceRules,
-    format_header,
-    format_observation,
-)
-from remaster_ros.session.reader import HEADER, OBSERVATIONS_LIMIT, ROWS, URDF, read_chain
-from remaster_ros.session.session_opening import (
+from remaster_ros.session.manifest import check_file, read_manifest, remove_manifest, write_sums
+from remaster_ros.session.observations import RowFormat, RowKeys, SequenceRules
+from remaster_ros.session.reader import (
+    HEADER,
     JOURNAL,
-    ChangedError,
-    begin,
-    intact_size,
-    refuse_another,
-    remove_beginnings,
-    reopen,
+    OBSERVATIONS_LIMIT,
+    PLAN,
+    ROWS,
+    URDF,
+    read_chain,
+    read_header,
 )
 from remaster_ros.session.session_yaml import (
     ExitStatus,
+    parse_header,
     with_correction,
     with_exit_status,
     write_header,
@@ -64,13 +62,7 @@ Signature = tuple[int, int, int, int]
 
 
 def signature(path: Path) -> Signature | None:
-    """Return what identifies a file and its state; None where there is none.
-
-    Raises
-    ------
-    DiskError
-        It cannot be looked at.
-    """
+    """Return what identifies a file and its state; None where there is none."""
     with writing(path):
         try:
             found = path.stat()
@@ -82,14 +74,7 @@ def signature(path: Path) -> Signature | None:
 class SessionGuard:
     """Compare the files of a folder with what they were and with what they must hold.
 
-    Parameters
-    ----------
-    folder
-        The session's.
-    names
-        The files.
-    content
-        Name of a file -> the bytes that the writer put there.
+    `content` returns the bytes that the writer put into the file of a name.
     """
 
     def __init__(
@@ -132,10 +117,7 @@ class SessionGuard:
     def differing(self, *, content: bool) -> dict[str, str]:
         """Return the files that are not as the writer left them, and what is wrong with each.
 
-        Parameters
-        ----------
-        content
-            Read every file; else only those whose size or time of change is different.
+        With `content` every file is read, else only those of another size or time of change.
         """
         wrong = {}
         for name in self._names:
@@ -154,13 +136,7 @@ class SessionGuard:
 
 
 def set_aside(path: Path) -> str:
-    """Rename a file that is not the writer's; return its new name, '' where there is none.
-
-    Raises
-    ------
-    DiskError
-        It cannot be renamed.
-    """
+    """Rename a file that is not the writer's; return its new name, '' where there is none."""
     number, aside = 1, path.with_name(f'{path.name}.changed')
     while os.path.lexists(aside):
         number += 1
@@ -178,6 +154,113 @@ def _read(path: Path) -> bytes:
         return path.read_bytes()
     except OSError as error:
         raise DiskError(f'{path}: cannot be read ({reason(error)}); check the disk') from None
+
+
+# Begin a session folder, or take up one that its writer left unfinished, whatever stopped it.
+
+_COMPARED = ('robot', 'markers', 'sensors', 'settle_s', 'marker_std_m', 'base_prior')
+
+
+class ChangedError(InputError):
+    """observations.csv is not what the journal has, and no crash made it so."""
+
+
+def _begin(folder: Path, files: Mapping[str, bytes]) -> None:
+    """Write the files of a session without rows into a new folder, or one with only a plan."""
+    # The planner may have been there first.
+    if not (folder.is_dir() and os.listdir(folder) == [PLAN]):
+        make_new_folder(folder)
+    with writing(folder):
+        sync_folder(folder.parent)
+    # session.yaml last: with it the folder is a session.
+    for name in (URDF, ROWS, HEADER):
+        write_atomically(folder / name, files[name])
+
+
+def _remove_beginnings(folder: Path, empty_rows: bytes) -> None:
+    """Remove what a writer has left that was killed before the folder was a session.
+
+    A folder that holds a session, or anything else, is left as it is.
+    """
+    names = {path.name for path in folder.iterdir() if path.suffix != '.tmp'} - {PLAN}
+    if HEADER in names or names - {URDF, ROWS}:
+        return
+    if ROWS in names and _read_rows(folder) != empty_rows:
+        return
+    remove_leftovers(folder)
+    for name in names:
+        with writing(folder / name):
+            os.unlink(folder / name)
+
+
+def _refuse_another(folder: Path, files: Mapping[str, bytes], even_complete: bool) -> None:
+    """Refuse to go on with a session that is not the one to be recorded.
+
+    `files` are those of the session to be recorded, without rows. An `InputError` for another
+    robot, markers or sensors, a complete session, one without a journal, or files that changed
+    since the session was closed.
+    """
+    old, new = read_header(folder), parse_header(files[HEADER], folder / HEADER)
+    if old.exit_status == 'complete' and not even_complete:
+        raise InputError(f'{folder}: this session is complete; name a new folder')
+    urdf = read_limited(folder / old.robot.urdf, URDF_LIMIT, 'it is part of a session')
+    differing = [name for name in _COMPARED if getattr(old, name) != getattr(new, name)]
+    differing += ['URDF'] * (urdf != files[URDF])
+    if differing:
+        raise InputError(
+            f'{folder}: holds an unfinished session with another {" and ".join(differing)}; '
+            'to go on, start with what it was begun with; else name a new folder'
+        )
+    if not (folder / JOURNAL).exists() and _read_rows(folder) != files[ROWS]:
+        raise InputError(
+            f'{folder}: holds a session without {JOURNAL}, from which alone it could be resumed; '
+            'name a new folder'
+        )
+    sums = read_manifest(folder)
+    for name in sums:
+        check_file(sums, folder / name)
+
+
+def _reopen(folder: Path, *, keep_status: bool) -> str:
+    """Take back that a session was closed; return the text of its session.yaml.
+
+    Its exit status becomes ``aborted``, unless it is to be kept.
+    """
+    path = folder / HEADER
+    remove_leftovers(folder)
+    remove_manifest(folder)
+    old = path.read_text(encoding='utf-8-sig')
+    text = old if keep_status else with_exit_status(old, 'aborted')
+    if text != old:
+        write_atomically(path, text)
+    return text
+
+
+def _intact_size(path: Path, data: bytes, wanted: bytes, last_rows: Sequence[str]) -> int:
+    """Return how many bytes of observations.csv are whole lines as the journal has them.
+
+    `data` is what the file holds, `wanted` what it must hold by the journal, whose last record
+    with rows has `last_rows`: only these can be torn. A `ChangedError` where it differs before.
+    """
+    if wanted.startswith(data):
+        return len(data)
+    differing = (i for i, (a, b) in enumerate(zip(data, wanted)) if a != b)
+    good = next(differing, len(wanted))
+    start = wanted.rfind(b'\n', 0, good) + 1
+    torn_from = len(wanted) - sum(len(row.encode()) + 1 for row in last_rows)
+    # What a crash tore never reaches beyond what was being written.
+    if start < torn_from or len(data) > len(wanted):
+        line = data.count(b'\n', 0, start) + 1
+        raise ChangedError(
+            f'{path}, line {line}: not as {JOURNAL} has it; the session cannot be resumed from a '
+            'file that was changed: undo that, let `remaster recover` restore it, or name a new '
+            'folder'
+        )
+    return start
+
+
+def _read_rows(folder: Path) -> bytes:
+    return read_limited(folder / ROWS, OBSERVATIONS_LIMIT, f'a session folder holds {ROWS}')
 
 
 FILES = (HEADER, URDF, ROWS, JOURNAL)
@@ -242,15 +325,15 @@ class SessionWriter:
     ) -> None:
         self.folder = Path(folder)
         self._rows_path = self.folder / ROWS
-        chain = read_chain(header.urdf, self.folder / URDF, header.base_link, header.tip_link)
-        names = header.sensor_names, header.marker_names
-        # Columns for what may come: of frames with several markers, of bodies' orientations.
-        self._columns = bool(header.further_markers), bool(header.oriented), False
-        self._row_format, self._joints = (
-            partial(RowFormat, self._rows_path, chain, *names),
-            len(chain),
+        self._chain = read_chain(
+            header.urdf, self.folder / URDF, header.base_link, header.tip_link
         )
-        self._use_columns()
+        self._names = header.sensor_names, header.marker_names
+        # Columns for what may come: of frames with several markers, of bodies' orientations.
+        self._optional: tuple[str, ...] = ()
+        self._add_columns(
+            *['frame'] * bool(header.further_markers), *['orientation'] * bool(header.oriented)
+        )
         plain_rows = self._empty_rows
         self.correction: Correction | None = None
         # Files that are to be written again for it.
@@ -260,12 +343,12 @@ class SessionWriter:
         files = {URDF: self._urdf, ROWS: self._empty_rows, HEADER: self._text.encode()}
         if resume:
             make_folder(self.folder)
-            remove_beginnings(self.folder, self._empty_rows)
+            _remove_beginnings(self.folder, self._empty_rows)
         self.resumed = resume and (self.folder / HEADER).exists()
         if self.resumed:
-            refuse_another(self.folder, files, even_complete or go_further)
+            _refuse_another(self.folder, files, even_complete or go_further)
         else:
-            begin(self.folder, files)
+            _begin(self.folder, files)
         self._closed = False
         self._closed_as: ExitStatus = 'aborted'
         self.restored: list[str] = []
@@ -276,7 +359,7 @@ class SessionWriter:
             self._guard = SessionGuard(self.folder, FILES, self._content)
             undo.callback(self._guard.close)
             if self.resumed:
-                self._text = reopen(self.folder, keep_status=even_complete)
+                self._text = _reopen(self.folder, keep_status=even_complete)
                 self._take_up_correction(plain_rows)
             self._rows = AppendFile(self._rows_path)
             undo.callback(lambda: self._rows.close())
@@ -284,12 +367,10 @@ class SessionWriter:
             self._guard.note_all()
             undo.pop_all()
 
-    def _use_columns(self) -> None:
-        self._format = self._row_format(*self._columns)
-        frame, orientation, correction = self._columns
-        self._empty_rows = format_header(
-            self._joints, False, frame, orientation, correction, correction
-        ).encode()
+    def _add_columns(self, *fields: str) -> None:
+        self._optional = (*self._optional, *fields)
+        self._format = RowFormat(self._rows_path, self._chain, *self._names, self._optional)
+        self._empty_rows = self._format.header.encode()
 
     def _take_up_correction(self, plain_rows: bytes) -> None:
         """Write columns and key of a correction that was noted, if a crash came in between."""
@@ -297,16 +378,14 @@ class SessionWriter:
         if not noted:
             return
         self._use_correction(Correction(noted[-1]['form'], noted[-1]['sha256']))
-        found = read_limited(self._rows_path, OBSERVATIONS_LIMIT, f'a session folder holds {ROWS}')
-        if found == plain_rows:
+        if _read_rows(self.folder) == plain_rows:
             write_atomically(self._rows_path, self._empty_rows)
         if (self.folder / HEADER).read_bytes() != self._text.encode():
             write_atomically(self.folder / HEADER, self._text)
 
     def _use_correction(self, correction: Correction) -> None:
         self.correction = correction
-        self._columns = (*self._columns[:2], True)
-        self._use_columns()
+        self._add_columns('wanted', 'correction')
         self._text = with_correction(self._text, correction)
 
     def correct(self, correction: Correction) -> None:
@@ -359,9 +438,9 @@ class SessionWriter:
         self.lost = self._journal.lost
         wanted = self._content(ROWS)
         pieces = [record['rows'] for record in self.records if 'rows' in record]
-        data = read_limited(self._rows_path, OBSERVATIONS_LIMIT, f'a session folder holds {ROWS}')
+        data = _read_rows(self.folder)
         try:
-            size = intact_size(self._rows_path, data, wanted, pieces[-1] if pieces else ())
+            size = _intact_size(self._rows_path, data, wanted, pieces[-1] if pieces else ())
         except ChangedError:
             if not even_changed:
                 raise
@@ -404,7 +483,7 @@ class SessionWriter:
             raise InputError(f'{self.folder}: the session is closed; start a new one')
         self._write_due()
         self.check()
-        rows = [format_observation(row, *self._columns) for row in observations]
+        rows = [self._format.line(row) for row in observations]
         keys = self._format.check(rows, self._line, self._rules.branch())
         if rows:
             record = {**record, 'rows': rows}

@@ -9,11 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
 from remaster_ros.errors import InputError
+from remaster_ros.session.observations import stacked
 from remaster_ros.types import Measurements, Session
 
 
@@ -100,8 +100,8 @@ def together(sessions: Sequence[tuple[str, Session]]) -> tuple[Session, list[str
     whole = replace(
         joined,
         timed=timed,
-        measurements=_stacked(rows),
-        references=_stacked(given) if given else None,
+        measurements=stacked(rows),
+        references=stacked(given) if given else None,
         observations_sha256='',
     )
     return whole, lines
@@ -151,29 +151,6 @@ def _counted_on(part: Measurements, added: Mapping[str, float], frames: int) -> 
     if part.frame is not None:
         columns['frame'] = np.where(part.frame < 0, -1, part.frame + frames)
     return replace(part, **columns)
-
-
-def _stacked(parts: Sequence[Measurements]) -> Measurements:
-    columns: dict[str, Any] = {}
-    for name in vars(parts[0]):
-        values = [getattr(part, name) for part in parts]
-        if all(value is None for value in values):
-            columns[name] = None
-            continue
-        known = next(value for value in values if value is not None)
-        columns[name] = np.concatenate(
-            [
-                _unknown(known, len(part)) if value is None else value
-                for part, value in zip(parts, values, strict=True)
-            ]
-        )
-    return Measurements(**columns)
-
-
-def _unknown(like: Any, count: int) -> Any:
-    """Return a column in which nothing is known: NaN, -1 or False, (count, ...)."""
-    fill = {'f': np.nan, 'i': -1, 'b': False}[like.dtype.kind]
-    return np.full((count, *like.shape[1:]), fill, dtype=like.dtype)
 
 
 def _power_of_ten(largest: int) -> int:

@@ -12,7 +12,7 @@ import pytest
 
 import remaster_ros
 from remaster_ros.errors import MisfitError, MistakeFoundError
-from remaster_ros.session.observations import ColumnNames
+from remaster_ros.session.observations import column_names
 
 ROOT = Path(__file__).parents[2]
 FUNCTIONS = [name for name in remaster_ros.__all__ if name != '__version__']
@@ -111,7 +111,7 @@ def test_columns_are_those_of_the_file(notebook, tmp_path):
     session = notebook[0]['session']
     columns = session.columns()
     assert {len(values) for values in columns.values()} == {len(session.measurements)}
-    assert set(columns) < set(ColumnNames(7).names())
+    assert set(columns) < {name for names in column_names(7).values() for name in names}
 
 
 @pytest.mark.parametrize('made', [MisfitError('what', 'remedy'), MistakeFoundError('it', '--x')])

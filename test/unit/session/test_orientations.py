@@ -8,7 +8,6 @@ from calibration_scenes import scene
 
 from remaster_ros.collection.pairing import PairedReading
 from remaster_ros.errors import InputError
-from remaster_ros.session.observations import ORIENTATION
 from remaster_ros.session.reader import read_session, write_session
 from remaster_ros.session.session_journal import SessionJournal
 from remaster_ros.types import Measurements
@@ -45,7 +44,7 @@ def test_without_them_a_session_is_written_as_ever(made, tmp_path):
     [
         ('0.0,0.6,0.0,0.8', '0.0,0.6,0.0,0.9', 'line 2, column orientation_x'),
         ('0.0,0.6,0.0,0.8', '0.0,,0.0,0.8', 'line 2, column orientation_y'),
-        (ORIENTATION[3], 'w', 'only orientation_x, orientation_y, orientation_z are there'),
+        ('orientation_w', 'w', 'only orientation_x, orientation_y, orientation_z are there'),
     ],
 )
 def test_what_is_no_orientation_is_refused_by_its_place(made, tmp_path, old, new, message):
