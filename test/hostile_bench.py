@@ -55,7 +55,7 @@ from remaster_ros.collection.events import (
     decode,
     encode,
 )
-from remaster_ros.session.last_command import LastCommandFile
+from remaster_ros.session.bridge_files import LastCommandFile
 from remaster_ros.session.workcell import read_cell
 from remaster_ros.types import FloatArray
 

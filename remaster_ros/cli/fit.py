@@ -65,7 +65,7 @@ def run(args: argparse.Namespace) -> int:
     from remaster_ros.reports.fit_json import FIT_FILE
     from remaster_ros.reports.result_folder import prepare_folder, save_fit
     from remaster_ros.session.files import undone_on_failure
-    from remaster_ros.session.priors import read_priors
+    from remaster_ros.session.session_yaml import read_priors
 
     session, named = read_together(args.session)
     priors = read_priors(args.prior) if args.prior is not None else None

@@ -30,18 +30,12 @@ from remaster_ros.planning.cell_proposal import (
 from remaster_ros.planning.collection_plan import FITTED, outlook
 from remaster_ros.planning.tour_planner import TourPlanner
 from remaster_ros.reports.plan_json import outlook_text, outlook_to_dict
-from remaster_ros.session.cell_template import (
-    LINK_RADIUS_M,
-    SENSORS,
-    CellProposal,
-    cell_text,
-    left_alone,
-)
+from remaster_ros.session.cell_template import SENSORS, CellProposal, cell_text, left_alone
 from remaster_ros.session.files import make_folder, undone_on_failure, write_atomically
 from remaster_ros.session.meshes import find_mesh, mesh_reader
 from remaster_ros.session.packages import package_of
 from remaster_ros.session.robot_description import is_xacro, read_description
-from remaster_ros.session.workcell import Workcell, parse_cell
+from remaster_ros.session.workcell import LINK_RADIUS_M, Workcell, parse_cell
 
 # Tool poses by which the joints to hold are compared; poses that are planned to find the ranges.
 COMPARED = 80

@@ -66,8 +66,7 @@ from remaster_ros.nodes.running import RemasterNode, run
 from remaster_ros.nodes.simulated_clock import ReportsTaken, SteadyTime
 from remaster_ros.nodes.status import RELIABLE, NodeStatus, Summary, listen
 from remaster_ros.nodes.waypoints import waypoints_by_solution
-from remaster_ros.session.halt_file import HaltFile
-from remaster_ros.session.last_command import LastCommandFile
+from remaster_ros.session.bridge_files import HaltFile, LastCommandFile
 from remaster_ros.session.workcell import read_cell
 from remaster_ros.types import FloatArray
 

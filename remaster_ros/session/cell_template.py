@@ -13,33 +13,25 @@ import numpy as np
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.planning.candidates import PoseRanges
 from remaster_ros.planning.cell_proposal import HeldJoint, Reach
+from remaster_ros.session.workcell import LINK_RADIUS_M, CellSensor
 from remaster_ros.session.yaml_records import load_yaml
 
-# As of `session.workcell`: arms of some 7 to 20 kg.
-LINK_RADIUS_M = 0.075
 _PLAIN = re.compile(r'[A-Za-z/.][\w./+-]*')
 
 
-@dataclass(frozen=True)
-class NewSensor:
-    """A sensor of a new cell; see `session.workcell.CellSensor`."""
-
-    marker: str
-    topic: str
-    single_shot: bool
-    measure_service: str
-    max_angle_deg: float
-    why: str
-
-
+ANYWHERE = (0.0, 0.0, 0.0)
 SENSORS = {
-    'tracker': NewSensor(
-        'smr', 'laser_tracker/marker', True, 'laser_tracker/measure', 25.0, 'a retroreflector'
+    'tracker': CellSensor(
+        'smr',
+        'laser_tracker/marker',
+        ANYWHERE,
+        single_shot=True,
+        measure_service='laser_tracker/measure',
+        max_angle_deg=25.0,
     ),
-    'mocap': NewSensor(
-        'sir', 'optitrack/marker', False, '', 60.0, 'a sphere is seen from far round'
-    ),
+    'mocap': CellSensor('sir', 'optitrack/marker', ANYWHERE, max_angle_deg=60.0),
 }
+"""What a new cell may have; where it stands is proposed."""
 
 
 @dataclass(frozen=True)
@@ -200,6 +192,7 @@ def _held_lines(p: CellProposal) -> list[str]:
 
 def _sensor_lines(name: str, place: Sequence[float]) -> list[str]:
     sensor = SENSORS[name]
+    why = 'a retroreflector' if sensor.single_shot else 'a sphere is seen from far round'
     service = [f'    measure_service: {sensor.measure_service}'] if sensor.measure_service else []
     return [
         f'  {name}:',
@@ -208,7 +201,7 @@ def _sensor_lines(name: str, place: Sequence[float]) -> list[str]:
         f'    single_shot: {_value(sensor.single_shot)}',
         *service,
         f'    rough_position_m: [{", ".join(f"{value:.1f}" for value in place)}]',
-        f'    max_angle_deg: {sensor.max_angle_deg}   # {sensor.why}',
+        f'    max_angle_deg: {sensor.max_angle_deg}   # {why}',
     ]
 
 

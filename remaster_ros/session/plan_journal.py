@@ -53,12 +53,11 @@ class TourNoted(msgspec.Struct, tag_field='kind', tag='tour'):
     plans: dict[str, Plan]
     in_order: bool
     one_solution: bool
-    # Plans of older versions have no references, and go on without them.
-    reference_every: int = 0
+    reference_every: int
     # Empty where the nearest pose is next.
-    order: tuple[tuple[str, int, int], ...] = ()
+    order: tuple[tuple[str, int, int], ...]
     # Above 0 behind another tour of the collection.
-    begin_at: int = 0
+    begin_at: int
 
     def tour(self, chain: SerialChain, model: CollisionModel | None = None) -> Tour:
         """Return the tour of this arm, at its beginning; the model is what it must not hit."""
@@ -157,7 +156,7 @@ class RecordedPlan:
     page
         Where the planner draws it where a person has to confirm it (`confirm: true`).
     expected
-        What its fit was expected to state; None in sessions of older versions.
+        What its fit was expected to state; None where that was not known.
     outcomes
         What became of each configuration that was begun, references not among them: ``recorded``,
         ``partial``, ``rejected``, ``failed`` or ``no_free_path``.
@@ -331,9 +330,7 @@ class PlanJournal:
         return self._journal
 
     def _refuse_other_settings(self, made: Mapping[str, Any]) -> None:
-        # Plans of older versions have no references, and go on without them.
-        here = {k: v for k, v in self._settings.items() if k != 'reference_every' or k in made}
-        other = [name for name, value in here.items() if made.get(name) != value]
+        other = [name for name, value in self._settings.items() if made.get(name) != value]
         if other:
             name = other[0]
             was = '' if name == 'cell' else f' ({made.get(name)}, now {self._settings[name]})'

@@ -1,8 +1,13 @@
-"""session.yaml: what was measured, with what, on which robot (format ``remaster-session/1``)."""
+"""session.yaml: what was measured, with what, on which robot (format ``remaster-session/1``).
+
+And the file of priors, which has the same base frames.
+"""
 
 from __future__ import annotations
 
 import logging
+import math
+import os
 from collections.abc import Mapping, Sequence
 from datetime import datetime
 from pathlib import Path, PurePosixPath
@@ -13,30 +18,34 @@ import numpy as np
 
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.pad_angles import coupled_in_circle
-from remaster_ros.session.files import decode_text
+from remaster_ros.session.files import decode_text, read_limited
 from remaster_ros.session.yaml_records import (
-    BaseFrame,
+    YAML_LIMIT,
     Bounds,
     Triple,
     YamlError,
     dump_yaml,
     load_yaml,
     out_of_bounds,
+    read_yaml,
     to_plain,
 )
 from remaster_ros.types import (
     AccuracyOption,
-    AngleUnit,
+    BasePrior,
     Controller,
     Correction,
     Measurements,
     PadJoint,
+    Priors,
     Session,
 )
 
 FORMAT = 'remaster-session/1'
 ExitStatus = Literal['complete', 'stopped', 'aborted']
 MARKER_STD = Bounds(0.0, 0.4, 'm', remedy='; 0.3 where nothing is known of their places')
+ZERO = Bounds(-360.0, 360.0, 'degrees')
+PRIORS_HELP = '; see "Priors" in docs/statistics.md'
 
 log = logging.getLogger('remaster_ros')
 
@@ -54,25 +63,25 @@ class _Sensor(msgspec.Struct):
     mounted_on: Literal['', 'tool'] = ''
 
 
-class _PadJoint(msgspec.Struct):
-    name: str
-    unit: AngleUnit = 'deg'
-    sign: Literal[1, -1] = 1
-    zero_deg: Annotated[float, Bounds(-360.0, 360.0, 'degrees')] = 0.0
-    coupling: dict[str, Literal[1, -1]] = {}
+class BaseFrame(msgspec.Struct):
+    """A registration known beforehand, as files have it; see `BasePrior`."""
 
+    translation_m: Triple
+    rotation_xyzw: tuple[float, float, float, float]
+    std_m: float
+    std_rad: float
 
-class _Controller(msgspec.Struct):
-    joints: dict[str, _PadJoint]
-    maker: str = ''
+    def problem(self, key: str) -> str:
+        """Return what is wrong with the quaternion; '' where nothing is."""
+        norm = math.hypot(*self.rotation_xyzw)
+        if abs(norm - 1.0) < 1e-3:
+            return ''
+        return f'{key}.rotation_xyzw has norm {norm:.6g}, not 1; give a unit quaternion x, y, z, w'
 
-    def record(self) -> Controller:
-        """Return it as the session has it."""
-        joints = {
-            name: PadJoint(pad.name, pad.unit, pad.sign, pad.zero_deg, pad.coupling)
-            for name, pad in self.joints.items()
-        }
-        return Controller(joints, self.maker)
+    def prior(self) -> BasePrior:
+        """Return it for the fit, the quaternion normalised."""
+        rotation = np.array(self.rotation_xyzw) / np.linalg.norm(self.rotation_xyzw)
+        return BasePrior(np.array(self.translation_m), rotation, self.std_m, self.std_rad)
 
 
 class SessionHeader(msgspec.Struct):
@@ -94,7 +103,7 @@ class SessionHeader(msgspec.Struct):
     operator: str = ''
     serial_number: str = ''
     notes: str = ''
-    controller: _Controller | None = None
+    controller: Controller | None = None
     correction: Correction | None = None
     accuracy_option: AccuracyOption = ''
     extra: dict[str, Any] = {}
@@ -136,7 +145,7 @@ class SessionHeader(msgspec.Struct):
             operator=self.operator,
             serial_number=self.serial_number,
             extra=self.extra,
-            controller=None if self.controller is None else self.controller.record(),
+            controller=self.controller,
             correction=self.correction,
             accuracy_option=self.accuracy_option,
             references=references,
@@ -144,13 +153,7 @@ class SessionHeader(msgspec.Struct):
 
 
 def parse_header(data: bytes, path: Path) -> SessionHeader:
-    """Check the content of session.yaml; `path` is for messages.
-
-    Raises
-    ------
-    InputError
-        One line naming file, line or key, and the remedy.
-    """
+    """Check the content of session.yaml; `path` is for messages."""
     try:
         content = load_yaml(decode_text(data, path))
     except YamlError as error:
@@ -170,13 +173,7 @@ def parse_header(data: bytes, path: Path) -> SessionHeader:
 
 
 def write_header(session: Session, urdf_name: str, exit_status: str) -> str:
-    """Return the text of session.yaml for a session.
-
-    Raises
-    ------
-    InputError
-        The session has names or numbers that the format does not allow.
-    """
+    """Return the text of session.yaml; an `InputError` for what the format does not allow."""
     content: dict[str, Any] = {
         'format': FORMAT,
         'robot': {
@@ -214,7 +211,7 @@ def write_header(session: Session, urdf_name: str, exit_status: str) -> str:
             if not sensor[key]:
                 del sensor[key]
     if controller := given.get('controller'):
-        plain = msgspec.to_builtins(_PadJoint(''))
+        plain = msgspec.to_builtins(PadJoint(''))
         for name, joint in controller['joints'].items():
             controller['joints'][name] = {
                 key: value for key, value in joint.items() if value != plain[key]
@@ -297,7 +294,7 @@ def _problem(header: SessionHeader) -> str:
     return ''
 
 
-def _controller_problem(controller: _Controller) -> str:
+def _controller_problem(controller: Controller) -> str:
     """Return what is wrong with the pad's joints; '' where nothing is."""
     if not controller.joints:
         return 'controller.joints: none given; name the joints of the URDF, or leave it out'
@@ -308,6 +305,8 @@ def _controller_problem(controller: _Controller) -> str:
             return f'{key}.name: {pad.name!r} is no usable name; give that on the pad'
         if names.count(pad.name) > 1:
             return f'{key}.name: {pad.name!r} is given to two joints; correct one'
+        if problem := ZERO.problem(f'{key}.zero_deg', pad.zero_deg):
+            return problem
         for other in pad.coupling:
             if other not in controller.joints:
                 known = ', '.join(controller.joints)
@@ -353,3 +352,72 @@ def _merge(content: dict[str, Any], extra: Mapping[str, Any]) -> dict[str, Any]:
         elif isinstance(merged[key], dict) and isinstance(value, Mapping):
             merged[key] = _merge(merged[key], value)
     return merged
+
+
+# What is known before a fit: offsets, markers, base frames, the drawing.
+
+
+class _Strict(msgspec.Struct, forbid_unknown_fields=True):
+    """A key that is misspelt must not be a prior that is silently missing."""
+
+
+class _OffsetPrior(_Strict):
+    mean_deg: Annotated[float, Bounds(-180.0, 180.0, 'degrees')]
+    std_deg: Annotated[float, Bounds(0.0, 180.0, 'degrees', above=True)]
+
+
+class _MarkerPrior(_Strict):
+    position_m: Annotated[Triple, Bounds(-10.0, 10.0, 'm')]
+    std_m: Annotated[float, Bounds(0.0, 1.0, 'm', above=True)]
+
+
+class _StrictBase(BaseFrame, forbid_unknown_fields=True):
+    translation_m: Annotated[Triple, Bounds(-1000.0, 1000.0, 'm')]
+    std_m: Annotated[float, Bounds(0.0, 1000.0, 'm', above=True)]
+    std_rad: Annotated[float, Bounds(0.0, np.pi, 'rad', above=True)]
+
+
+class _Priors(_Strict):
+    """A file of priors; all keys are optional.
+
+    ::
+
+        joint_offsets: {joint_2: {mean_deg: 0.1, std_deg: 0.05}}
+        markers: {sir: {position_m: [0.1, 0.0, 0.02], std_m: 1.0e-4}}
+        base: {mocap: {translation_m: [2.0, 0.0, 1.0], rotation_xyzw: [0, 0, 0, 1],
+                       std_m: 1.0e-3, std_rad: 1.0e-3}}
+        geometry_tolerance_mm: 0.1
+    """
+
+    joint_offsets: dict[str, _OffsetPrior] = {}
+    markers: dict[str, _MarkerPrior] = {}
+    base: dict[str, _StrictBase] = {}
+    geometry_tolerance_mm: Annotated[float, Bounds(0.0, 100.0, 'mm', above=True)] = 0.1
+
+
+def read_priors(path: str | os.PathLike[str]) -> Priors:
+    """Read and check a file of priors; the fit checks that the session has these names.
+
+    Raises
+    ------
+    InputError
+        One line naming file, key and remedy.
+    """
+    path = Path(path)
+    data = read_limited(path, YAML_LIMIT, 'give a YAML file of priors')
+    content = read_yaml(data, path, _Priors, PRIORS_HELP)
+    for sensor, base in content.base.items():
+        if problem := base.problem(f'base.{sensor}'):
+            raise InputError(f'{path}: {problem}')
+    return Priors(
+        joint_offsets={
+            joint: (np.radians(prior.mean_deg), np.radians(prior.std_deg))
+            for joint, prior in content.joint_offsets.items()
+        },
+        markers={
+            marker: (np.array(prior.position_m), prior.std_m)
+            for marker, prior in content.markers.items()
+        },
+        base={sensor: base.prior() for sensor, base in content.base.items()},
+        geometry_tolerance_m=1e-3 * content.geometry_tolerance_mm,
+    )

@@ -326,6 +326,8 @@ class CellPoses(msgspec.Struct, forbid_unknown_fields=True):
 ON_TOOL = Bounds(-3.0, 3.0, 'm')
 # A marker is placed better than this; a session file may give more, where nothing is known.
 MARKER_STD = Bounds(0.0, 0.02, 'm', above=True)
+# Of arms of some 7 to 20 kg.
+LINK_RADIUS_M = 0.075
 NO_MOTION = (
     'urdf_text', 'file', 'mesh_path', 'confirm', 'poses', 'aim_at', 'held_joint',
     'held_values_deg', 'marker_std_m', 'sensors',
@@ -398,7 +400,7 @@ class Workcell(msgspec.Struct, forbid_unknown_fields=True):
     held_joint: str | None = ''
     held_values_deg: list[float] | None = []
     poses: CellPoses = msgspec.field(default_factory=CellPoses)
-    link_radius_m: Annotated[float, Bounds(0.0, 1.0, 'm', above=True)] = 0.075
+    link_radius_m: Annotated[float, Bounds(0.0, 1.0, 'm', above=True)] = LINK_RADIUS_M
     obstacles: dict[str, CellBox] = {}
     floor_z_m: float | None = 0.0
     tool: dict[str, CellToolBody] = {}
@@ -423,21 +425,6 @@ class Workcell(msgspec.Struct, forbid_unknown_fields=True):
         """Return a checksum of all that a plan depends on."""
         plain = msgspec.to_builtins(msgspec.structs.replace(self, file=''))
         del plain['confirm']
-        # Keys that files of older versions have not count where they are not as by default: plans
-        # of those versions go on.
-        given = self.poses.given()
-        plain['poses'] = {k: v for k, v in plain['poses'].items() if k in RANGES or k in given}
-        for sensor in plain['sensors'].values():
-            for key, usual in (
-                ('noise_m', SIGMA_M),
-                ('pose_noise_m', POSE_SIGMA_M),
-                ('message_type', ''),
-                ('source', ''),
-                ('frame_noise_m', 0.0),
-                ('further_markers', {}),
-            ):
-                if sensor[key] == usual:
-                    del sensor[key]
         return hashlib.sha256(msgspec.json.encode(plain)).hexdigest()
 
     def model(self) -> ArmModel:

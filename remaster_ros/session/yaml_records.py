@@ -22,7 +22,6 @@ import yaml
 
 from remaster_ros.errors import InputError, did_you_mean
 from remaster_ros.session.files import decode_text
-from remaster_ros.types import BasePrior
 
 # YAML of unknown origin: plain data only, YAML 1.2's numbers, no aliases, no tags.
 #
@@ -282,27 +281,6 @@ class Bounds:
         elif self.unit == 'degrees' and 0.0 < value < self.least:
             text += f'; if radians were meant, write {math.degrees(value):.4g}'
         return text + self.remedy
-
-
-class BaseFrame(msgspec.Struct):
-    """A registration known beforehand, as files have it; see `BasePrior`."""
-
-    translation_m: Triple
-    rotation_xyzw: tuple[float, float, float, float]
-    std_m: float
-    std_rad: float
-
-    def problem(self, key: str) -> str:
-        """Return what is wrong with the quaternion; '' where nothing is."""
-        norm = math.hypot(*self.rotation_xyzw)
-        if abs(norm - 1.0) < 1e-3:
-            return ''
-        return f'{key}.rotation_xyzw has norm {norm:.6g}, not 1; give a unit quaternion x, y, z, w'
-
-    def prior(self) -> BasePrior:
-        """Return it for the fit, the quaternion normalised."""
-        rotation = np.array(self.rotation_xyzw) / np.linalg.norm(self.rotation_xyzw)
-        return BasePrior(np.array(self.translation_m), rotation, self.std_m, self.std_rad)
 
 
 def read_yaml(data: bytes, path: Path, record: type[Record], remedy: str = '') -> Record:

@@ -20,7 +20,7 @@ from hostile_lines import RELIABLE
 from hostile_scene import demo_body
 
 from remaster_ros.nodes.demo import free_ports
-from remaster_ros.session.last_command import LastCommandFile
+from remaster_ros.session.bridge_files import LastCommandFile
 from remaster_ros.session.workcell import read_cell
 from remaster_ros.simulation.setup import make_world
 

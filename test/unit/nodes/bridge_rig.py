@@ -39,7 +39,7 @@ from remaster_ros.nodes import (
     simulated_clock,
     status,
 )
-from remaster_ros.session.last_command import LastCommandFile
+from remaster_ros.session.bridge_files import LastCommandFile
 from remaster_ros.session.workcell import read_cell
 
 CELL = read_cell('demo')

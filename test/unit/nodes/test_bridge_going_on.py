@@ -10,7 +10,7 @@ from bridge_rig import HOME
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_msgs.msg import Bool
 
-from remaster_ros.session.last_command import LastCommandFile
+from remaster_ros.session.bridge_files import LastCommandFile
 
 pytestmark = [pytest.mark.ros, pytest.mark.timeout(300)]
 

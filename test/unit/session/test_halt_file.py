@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from remaster_ros.errors import RemasterError
-from remaster_ros.session import halt_file
-from remaster_ros.session.halt_file import HaltFile
+from remaster_ros.session import bridge_files
+from remaster_ros.session.bridge_files import HaltFile
 
 
 @pytest.fixture
@@ -124,7 +124,7 @@ def test_a_halt_that_was_cleared_does_not_come_back_after_a_power_cut(file, monk
     file.write('x')
     synced = []
     monkeypatch.setattr(
-        halt_file, 'sync_folder', lambda folder: synced.append((folder, file.path.exists()))
+        bridge_files, 'sync_folder', lambda folder: synced.append((folder, file.path.exists()))
     )
     file.clear()
     assert synced == [(file.path.parent, False)]

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from remaster_ros.session.halt_file import HaltFile
-from remaster_ros.session.last_command import LastCommandFile
+from remaster_ros.session.bridge_files import HaltFile, LastCommandFile
 
 JOINTS = ['joint_1', 'joint_2']
 NOW_NS = 1_800_000_000_123_456_789

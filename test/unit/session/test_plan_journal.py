@@ -204,7 +204,7 @@ def test_the_counts_of_dropped_solutions_survive_a_restart(chain, tmp_path):
 
 
 def test_references_are_visited_as_in_one_run_whatever_is_killed(chain, tmp_path):
-    """Also a round that was asked for, and an old plan goes on without references."""
+    """Also a round that was asked for."""
     seed = 29
     print('seed', seed)
     rng = np.random.default_rng(seed)
@@ -236,16 +236,6 @@ def test_references_are_visited_as_in_one_run_whatever_is_killed(chain, tmp_path
     book.close()
     with pytest.raises(InputError, match='another reference_every'):
         PlanJournal(tmp_path / 'session', {**settings, 'reference_every': 8}, chain)
-
-
-def test_a_plan_of_a_version_without_references_goes_on_without(chain, tmp_path):
-    book = PlanJournal(tmp_path, SETTINGS, chain)
-    book.begin(Tour(chain, {'optimization': plan_of(chain, 7, 2, 2)}))
-    book.close()
-    again = PlanJournal(tmp_path, {**SETTINGS, 'reference_every': 25}, chain)
-    again.ask_round()
-    assert again.tour.next(np.zeros(len(chain))).split == 'optimization'
-    again.close()
 
 
 @pytest.mark.parametrize(
