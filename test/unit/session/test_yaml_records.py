@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from remaster_ros.errors import InputError
+from remaster_ros.session.session_yaml import BaseFrame
 from remaster_ros.session.workcell import config_path, read_cell
-from remaster_ros.session.yaml_records import BaseFrame, Bounds, Triple, read_yaml
+from remaster_ros.session.yaml_records import Bounds, Triple, read_yaml
 
 
 class Part(msgspec.Struct, forbid_unknown_fields=True):
