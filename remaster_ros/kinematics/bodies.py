@@ -36,24 +36,12 @@ _AROUND_A_BALL = np.concatenate(
 
 @dataclass(frozen=True, eq=False)
 class Shape:
-    """A convex set: the hull of `points`, grown by a disc across z and by a ball.
+    """A convex set: the hull of `points`, grown by a disc across z and by a ball."""
 
-    Attributes
-    ----------
-    kind
-        ``box``, ``cylinder``, ``sphere``, ``capsule`` or ``hull``.
-    points
-        m, (n, 3).
-    disc
-        Radius of the disc across z that is swept over the points (a cylinder), m.
-    ball
-        Radius of the ball that is swept over the points (sphere, capsule), m.
-    """
-
-    kind: str
-    points: FloatArray
-    disc: float = 0.0
-    ball: float = 0.0
+    kind: str  # ``box``, ``cylinder``, ``sphere``, ``capsule`` or ``hull``
+    points: FloatArray  # m, (n, 3)
+    disc: float = 0.0  # Radius of the disc across z that is swept over the points (a cylinder), m
+    ball: float = 0.0  # Radius of the ball that is swept over the points (sphere, capsule), m
 
     @cached_property
     def outline(self) -> FloatArray:
@@ -129,10 +117,8 @@ def capsule(start: ArrayLike, end: ArrayLike, radius_m: float) -> Shape:
 def hull(points: ArrayLike) -> Shape:
     """Return the convex hull of points (a mesh's vertices), m, (n, 3).
 
-    Raises
-    ------
-    InputError
-        Points that are not finite, or that all lie in one plane and so enclose nothing.
+    Raises InputError: points that are not finite, or that all lie in one plane and so enclose
+    nothing.
     """
     points = np.asarray(points, dtype=float)
     if points.ndim != 2 or points.shape[1:] != (3,) or not np.all(np.isfinite(points)):
@@ -158,27 +144,14 @@ def _positive(kind: str, values: ArrayLike, count: int) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class Body:
-    """A shape fastened to a link.
-
-    Attributes
-    ----------
-    name
-        For messages.
-    link
-        0 for the base, i for what moves with joint i (1-based).
-    shape
-        The shape.
-    T_link_body
-        Where it is in the frame after that joint (in the base for 0), (4, 4).
-    role
-        ``link``, ``tool`` (tool and markers) or ``obstacle``.
-    """
+    """A shape fastened to a link."""
 
     name: str
-    link: int
+    link: int  # 0 for the base, i for what moves with joint i (1-based)
     shape: Shape
+    # Where it is in the frame after that joint (in the base for 0), (4, 4)
     T_link_body: FloatArray = field(default_factory=lambda: np.eye(4))
-    role: str = 'link'
+    role: str = 'link'  # ``link``, ``tool`` (tool and markers) or ``obstacle``
 
     @cached_property
     def outline(self) -> FloatArray:

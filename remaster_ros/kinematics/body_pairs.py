@@ -23,10 +23,7 @@ from remaster_ros.types import BoolArray, FloatArray, IntArray
 class ConvexDistances:
     """Distances between shapes that are fastened to moving frames.
 
-    Parameters
-    ----------
-    shapes
-        Each with its place in the frame that carries it, (4, 4).
+    ``shapes``: each with its place in the frame that carries it, (4, 4).
     """
 
     def __init__(self, shapes: Sequence[tuple[Shape, FloatArray]]) -> None:
@@ -129,32 +126,14 @@ class Placed:
 class BodyPairs:
     """The pairs of an arm, its tool and markers, the obstacles and the floor.
 
-    Parameters
-    ----------
-    chain
-        The arm.
-    bodies
-        Everything, by link.
-    floor_z
-        Height of the floor in R, m; None where there is none to hit.
-    margin
-        Fixed part of the clearance, m.
-    unknown_offset
-        What a joint's zero-offset may be off by, rad.
-
-    Attributes
-    ----------
-    inner, outer
-        Indices of the two bodies of each pair, (P,); inner is -1 for the floor.
-    is_floor, contact_only
-        Pairs with the floor, and those that are kept from touching only, (P,).
-    levers
-        Bounds of how far the outer body moves relative to the inner one for a radian of each
-        joint, m, (P, k).
-    most_kept
-        The largest clearance of each pair, m, (P,).
-    left_out
-        The pairs that are not checked, or only for contact, and why.
+    ``bodies``: everything, by link; ``floor_z``: height of the floor in R, m; None where there is
+    none to hit; ``margin``: fixed part of the clearance, m; ``unknown_offset``: what a joint's
+    zero-offset may be off by, rad.
+    Attributes: ``inner, outer``: indices of the two bodies of each pair, (P,); inner is -1 for the
+    floor; ``is_floor, contact_only``: pairs with the floor, and those that are kept from touching
+    only, (P,); ``levers``: bounds of how far the outer body moves relative to the inner one for a
+    radian of each joint, m, (P, k); ``most_kept``: the largest clearance of each pair, m, (P,);
+    ``left_out``: the pairs that are not checked, or only for contact, and why.
     """
 
     def __init__(

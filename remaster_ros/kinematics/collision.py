@@ -183,10 +183,7 @@ class CollisionModel:
         check to the next), everything else stays as far as is kept, the end is free (with
         `ends_free`), and no joint leaves its limits.
 
-        Parameters
-        ----------
-        waypoints
-            rad, (n, k), n >= 1.
+        ``waypoints``: rad, (n, k), n >= 1.
         """
         q = np.asarray(waypoints, dtype=float)
         if not np.all(np.isfinite(q)):

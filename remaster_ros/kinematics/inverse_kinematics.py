@@ -75,20 +75,11 @@ IMMOBILE = 5e-3
 
 @dataclass(frozen=True)
 class _Exact:
-    """The nearest arm with a closed form, with the held joints at one combination of values.
+    """The nearest arm with a closed form, with the held joints at one combination of values."""
 
-    Attributes
-    ----------
-    chain
-        Its six free joints.
-    robot
-        EAIK's model of it, which has no rotation of the tool at zero.
-    difference_m, difference_rad
-        How far its tool is from that of the true arm at the same angles, at most.
-    """
-
-    chain: SerialChain
-    robot: HPRobot
+    chain: SerialChain  # Its six free joints
+    robot: HPRobot  # EAIK's model of it, which has no rotation of the tool at zero
+    # How far its tool is from that of the true arm at the same angles, at most
     difference_m: float
     difference_rad: float
 
@@ -402,15 +393,8 @@ def _check_held(chain: SerialChain, held: Mapping[int, Sequence[float]]) -> None
 def _nearest_lines(axes: FloatArray, points: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Make axes exactly parallel, and let them meet exactly, where they nearly do.
 
-    Parameters
-    ----------
-    axes, points
-        Direction and a point of each of six axes at zero, (6, 3).
-
-    Returns
-    -------
-    axes, points
-        Those of the exact arm.
+    ``axes, points``: direction and a point of each of six axes at zero, (6, 3).
+    Returns axes, points: Those of the exact arm.
     """
     axes, points = axes.copy(), points.copy()
     count = len(axes)

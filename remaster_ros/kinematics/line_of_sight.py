@@ -22,17 +22,11 @@ class LinkCapsules:
 
     The first one begins at the base frame. The link after the last joint carries the marker and is
     left out: which way the marker faces decides there.
-
-    Attributes
-    ----------
-    chain
-        The arm.
-    radius
-        Radius of the links, m. 75 mm encloses the links of arms of the LWR's and iiwa's size
-        about as their collision models do (70 mm in CentroEPiaggio's).
     """
 
     chain: SerialChain
+    # Radius of the links, m. 75 mm encloses the links of arms of the LWR's and iiwa's size about
+    # as their collision models do (70 mm in CentroEPiaggio's).
     radius: float = 0.075
 
     def __post_init__(self) -> None:
@@ -69,15 +63,8 @@ class LinkCapsules:
 def segment_distance(a: ArrayLike, b: ArrayLike, c: ArrayLike, d: ArrayLike) -> FloatArray:
     """Return the shortest distances between segments a–b and c–d, points among them.
 
-    Parameters
-    ----------
-    a, b, c, d
-        End points, (..., 3), broadcast against each other.
-
-    Returns
-    -------
-    ndarray
-        (...).
+    ``a, b, c, d``: end points, (..., 3), broadcast against each other.
+    Returns (...).
     """
     a, b, c, d = (np.asarray(point, dtype=float) for point in (a, b, c, d))
     along_1, along_2, gap = b - a, d - c, a - c

@@ -49,21 +49,9 @@ def reach_from(
 ) -> tuple[FloatArray, FloatArray]:
     """Bring starts to the poses that they are for.
 
-    Parameters
-    ----------
-    free
-        Joints that may turn, six.
-    starts
-        rad, (m, k).
-    T
-        T_R_T of each, (m, 4, 4).
-
-    Returns
-    -------
-    q
-        Where they arrive, in [-pi, pi] for the free joints, rad, (m, k).
-    left
-        The larger of the translation, m, and rotation, rad, between tool and pose, (m,).
+    ``free``: joints that may turn, six; ``starts``: rad, (m, k); ``T``: T_R_T of each, (m, 4, 4).
+    Returns q: Where they arrive, in [-pi, pi] for the free joints, rad, (m, k); left: The larger
+    of the translation, m, and rotation, rad, between tool and pose, (m,).
     """
     q, left = starts.copy(), np.empty(len(starts))
     for first in range(0, len(q), _ROWS):
@@ -108,10 +96,7 @@ def screws_and_tool(
     The same as from `SerialChain.frames`, several times as fast: joint frames have their axis
     as Z, and a turn about it costs no product of matrices.
 
-    Returns
-    -------
-    screws, rotation, position
-        (m, 6, k); (m, 3, 3); m, (m, 3).
+    Returns screws, rotation, position: (m, 6, k); (m, 3, 3); m, (m, 3).
     """
     m, k = q.shape
     fixed = chain.T_fixed_z[:, :3]
@@ -180,10 +165,7 @@ def wrapped(angles: FloatArray) -> FloatArray:
 def distinct(q: FloatArray, apart_rad: float = DISTINCT) -> tuple[FloatArray, IntArray]:
     """Return the rows of q (m, k) that differ modulo whole turns, in order, and how often each is.
 
-    Returns
-    -------
-    q, counts
-        rad, (n, k); (n,).
+    Returns q, counts: rad, (n, k); (n,).
     """
     one = np.max(np.abs(wrapped(q[:, None] - q[None])), axis=-1) <= apart_rad
     kept: list[int] = []
@@ -199,10 +181,7 @@ def spread_angles(count: int, joints: int) -> FloatArray:
     An additive recurrence with the powers of the root of x^(d+1) = x + 1, of low discrepancy in
     d dimensions (M. Roberts, "The unreasonable effectiveness of quasirandom sequences", 2018).
 
-    Returns
-    -------
-    ndarray
-        In [-pi, pi), (count, joints).
+    Returns in [-pi, pi), (count, joints).
     """
     root = 2.0
     for _ in range(40):
@@ -214,20 +193,11 @@ def spread_angles(count: int, joints: int) -> FloatArray:
 
 @dataclass(frozen=True)
 class MissedSolutions:
-    """What poses solved from many starts tell about solutions that none of these found.
+    """What poses solved from many starts tell about solutions that none of these found."""
 
-    Attributes
-    ----------
-    found
-        Solutions of all poses.
-    arrived
-        Starts that arrived at one.
-    once, twice
-        Solutions that were found so often.
-    """
-
-    found: int
-    arrived: int
+    found: int  # Solutions of all poses
+    arrived: int  # Starts that arrived at one
+    # Solutions that were found so often
     once: int
     twice: int
 

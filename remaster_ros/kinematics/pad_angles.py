@@ -23,21 +23,13 @@ from remaster_ros.types import Controller, FloatArray
 
 @dataclass(frozen=True, eq=False)
 class PadAngles:
-    """The map between k angles on the pad and those of the URDF, rad.
+    """The map between k angles on the pad and those of the URDF, rad."""
 
-    Attributes
-    ----------
-    matrix, from_urdf
-        S (I + K), (k, k), and its inverse, both of whole numbers.
-    zero
-        a, rad, (k,).
-    order
-        The joints in an order in which each stands behind those that are added to it.
-    """
-
+    # S (I + K), (k, k), and its inverse, both of whole numbers
     matrix: FloatArray
     from_urdf: FloatArray
-    zero: FloatArray
+    zero: FloatArray  # a, rad, (k,)
+    # The joints in an order in which each stands behind those that are added to it
     order: tuple[int, ...]
 
     @classmethod

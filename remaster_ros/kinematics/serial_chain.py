@@ -38,47 +38,27 @@ LEVER_M = 0.25
 
 @dataclass(frozen=True, eq=False)
 class SerialChain:
-    """The joints between two links of a robot, base to tip; fixed joints are merged.
+    """The joints between two links of a robot, base to tip; fixed joints are merged."""
 
-    Attributes
-    ----------
-    name
-        The robot's name in the URDF.
-    joint_names
-        Names of the k joints.
-    base_link, tip_link
-        Frame R and frame T.
-    lower, upper
-        Joint limits, rad, m for joints that slide, (k,); infinite for continuous joints.
-    velocity_limits
-        rad/s or m/s, (k,); infinite where the URDF gives none.
-    T_fixed
-        What lies before each joint and, last, from the last joint's link to the tip,
-        (k + 1, 4, 4).
-    axes
-        Unit joint axes in the joint frames, (k, 3).
-    masses, centers_of_mass
-        Mass that moves with each joint (its link and all that is fastened to it), kg, (k,), and
-        its centre in the frame after the joint, m, (k, 3).
-    has_inertials
-        False where no moving link has a mass: gravity's effects cannot be computed.
-    slides
-        Which joints are prismatic, (k,).
-    """
-
-    name: str
-    joint_names: tuple[str, ...]
+    name: str  # The robot's name in the URDF
+    joint_names: tuple[str, ...]  # Names of the k joints
+    # Frame R and frame T
     base_link: str
     tip_link: str
+    # Joint limits, rad, m for joints that slide, (k,); infinite for continuous joints
     lower: FloatArray
     upper: FloatArray
-    velocity_limits: FloatArray
+    velocity_limits: FloatArray  # rad/s or m/s, (k,); infinite where the URDF gives none
+    # What lies before each joint and, last, from the last joint's link to the tip, (k + 1, 4, 4)
     T_fixed: FloatArray
-    axes: FloatArray
+    axes: FloatArray  # Unit joint axes in the joint frames, (k, 3)
+    # Mass that moves with each joint (its link and all that is fastened to it), kg, (k,), and its
+    # centre in the frame after the joint, m, (k, 3)
     masses: FloatArray
     centers_of_mass: FloatArray
+    # False where no moving link has a mass: gravity's effects cannot be computed
     has_inertials: bool
-    slides: BoolArray
+    slides: BoolArray  # Which joints are prismatic, (k,)
 
     @classmethod
     def from_urdf(

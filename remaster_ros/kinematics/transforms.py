@@ -153,15 +153,8 @@ def twist_logarithm(T: ArrayLike) -> FloatArray:
     Turning by a twist's rotation while shifting by its translation, steadily, from identity,
     arrives at T. A turn about any line gives a twist along that line's screw, however large.
 
-    Parameters
-    ----------
-    T
-        Rigid transforms of angles below pi, (..., 4, 4).
-
-    Returns
-    -------
-    ndarray
-        Translation part, m, then rotation vector, rad, (..., 6).
+    ``T``: rigid transforms of angles below pi, (..., 4, 4).
+    Returns translation part, m, then rotation vector, rad, (..., 6).
     """
     T = np.asarray(T, dtype=float)
     rotation = matrix_to_rotation_vector(T[..., :3, :3])

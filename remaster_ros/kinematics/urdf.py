@@ -39,32 +39,19 @@ class UrdfLink:
 
 @dataclass(frozen=True, eq=False)
 class UrdfJoint:
-    """One joint as written.
-
-    Attributes
-    ----------
-    kind
-        ``type`` of the URDF: revolute, continuous, fixed, prismatic, floating, planar.
-    origin
-        T_parent_joint, (4, 4).
-    axis
-        Unit vector in the joint frame, (3,); X for a joint that is fixed.
-    lower, upper, velocity
-        Limits as written, rad and rad/s; None where absent.
-    mimic
-        True where the joint follows another one.
-    """
+    """One joint as written."""
 
     name: str
-    kind: str
+    kind: str  # ``type`` of the URDF: revolute, continuous, fixed, prismatic, floating, planar
     parent: str
     child: str
-    origin: FloatArray
-    axis: FloatArray
+    origin: FloatArray  # T_parent_joint, (4, 4)
+    axis: FloatArray  # Unit vector in the joint frame, (3,); X for a joint that is fixed
+    # Limits as written, rad and rad/s; None where absent
     lower: float | None
     upper: float | None
     velocity: float | None
-    mimic: bool
+    mimic: bool  # True where the joint follows another one
 
 
 @dataclass(frozen=True, eq=False)

@@ -37,50 +37,28 @@ class LinkShape:
 
 @dataclass(frozen=True, eq=False)
 class Visual:
-    """One ``<visual>`` element of a link of the arm.
+    """One ``<visual>`` element of a link of the arm."""
 
-    Attributes
-    ----------
-    link_name
-        The URDF's link.
-    link
-        0 for what stands still, i for what moves with joint i.
-    T_link_visual
-        Its place in the frame after that joint (in the base for 0), (4, 4).
-    shape
-        A box, cylinder or sphere; None for a mesh.
-    mesh
-        The mesh's file name as the URDF writes it; '' for none, with no shape either where the
-        element cannot be read.
-    scale
-        Of the mesh, (3,).
-    color
-        Red, green and blue, 0 to 1; None where the URDF gives none.
-    """
-
-    link_name: str
-    link: int
+    link_name: str  # The URDF's link
+    link: int  # 0 for what stands still, i for what moves with joint i
+    # Its place in the frame after that joint (in the base for 0), (4, 4)
     T_link_visual: FloatArray
-    shape: Shape | None
+    shape: Shape | None  # A box, cylinder or sphere; None for a mesh
+    # The mesh's file name as the URDF writes it; '' for none, with no shape either where the
+    # element cannot be read
     mesh: str
-    scale: FloatArray
+    scale: FloatArray  # Of the mesh, (3,)
+    # Red, green and blue, 0 to 1; None where the URDF gives none
     color: tuple[float, float, float] | None
 
 
 def link_shapes(text: str, read_mesh: MeshReader) -> list[LinkShape]:
     """Read all collision elements of URDF text (that `parse_urdf` accepts).
 
-    Parameters
-    ----------
-    text
-        Contents of the URDF file.
-    read_mesh
-        Called for each mesh; what it returns is taken as its convex hull, scaled.
-
-    Raises
-    ------
-    InputError
-        A geometry that is missing, unknown or has no volume, or what `read_mesh` raises.
+    ``text``: contents of the URDF file; ``read_mesh``: called for each mesh; what it returns is
+    taken as its convex hull, scaled.
+    Raises InputError: a geometry that is missing, unknown or has no volume, or what `read_mesh`
+    raises.
     """
     found = []
     for link in ElementTree.fromstring(text).findall('link'):

@@ -12,44 +12,23 @@ from remaster_ros.types import FloatArray
 
 @dataclass(frozen=True)
 class CheckPath:
-    """Find out whether the way to a target is free; answer with `ArmSupervisor.path_found`.
+    """Find out whether the way to a target is free; answer with `ArmSupervisor.path_found`."""
 
-    Attributes
-    ----------
-    number
-        Names the request.
-    start, target
-        rad, (k,).
-    waypoints
-        What the planner would go through, rad, (n, k).
-    """
-
-    number: int
+    number: int  # Names the request
+    # rad, (k,)
     start: FloatArray
     target: FloatArray
-    waypoints: FloatArray
+    waypoints: FloatArray  # What the planner would go through, rad, (n, k)
 
 
 @dataclass(frozen=True)
 class PathAnswer:
-    """The answer to a `CheckPath`.
+    """The answer to a `CheckPath`."""
 
-    Attributes
-    ----------
-    path
-        A free path; None where there is none.
-    why
-        What is in the way.
-    at_start
-        The arm stands in contact or within a margin already.
-    way_out
-        The slow way out of that; None where none is known.
-    """
-
-    path: FreePath | None
-    why: str = ''
-    at_start: bool = False
-    way_out: FreePath | None = None
+    path: FreePath | None  # A free path; None where there is none
+    why: str = ''  # What is in the way
+    at_start: bool = False  # The arm stands in contact or within a margin already
+    way_out: FreePath | None = None  # The slow way out of that; None where none is known
 
 
 @dataclass(frozen=True)
@@ -72,23 +51,12 @@ class Stop:
 
 @dataclass(frozen=True)
 class Settled:
-    """The arm stands still at a configuration.
-
-    Attributes
-    ----------
-    solution
-        Its number.
-    stamp_s
-        Stamp of the report that completed the settling, s.
-    q
-        Mean reported joint positions since it stands still, rad, (k,).
-    motion_s, settle_s
-        How long it moved and how long it stood, s.
-    """
+    """The arm stands still at a configuration."""
 
     solution: int
-    stamp_s: float
-    q: FloatArray
+    stamp_s: float  # Stamp of the report that completed the settling, s
+    q: FloatArray  # Mean reported joint positions since it stands still, rad, (k,)
+    # How long it moved and how long it stood, s
     motion_s: float
     settle_s: float
 
@@ -113,37 +81,21 @@ Action = CheckPath | Drive | Stop | Settled | Failed | Halted
 
 @dataclass(frozen=True)
 class SupervisorRules:
-    """When to wait, to give up and to halt. Times in s.
+    """When to wait, to give up and to halt. Times in s."""
 
-    Attributes
-    ----------
-    settle
-        What counts as arrived and still.
-    arrive_timeout_s
-        Beyond the expected motion and the settling: not arrived (robot time).
-    answer_timeout_s
-        Longest wait for the recorder's answer on a settled configuration (robot time).
-    heartbeat_s
-        Longest silence of planner, recorder or robot (wall time).
-    stall_s
-        An arm that stands for so long and not at its target will not get there (robot time).
-    reaction_s
-        A command may take so long to reach the robot and be seen in its reports (wall time).
-    lag_s
-        An arm may be so far behind its trajectory (robot time).
-    failures_in_a_row
-        So many configurations that the robot did not reach, and it is halted.
-    resume_alone_s
-        After a longer interruption only a person goes on, unless the robot's safety circuit was
-        known to be released all the time (wall time).
-    """
-
-    settle: SettleRules = field(default_factory=SettleRules)
+    settle: SettleRules = field(default_factory=SettleRules)  # What counts as arrived and still
+    # Beyond the expected motion and the settling: not arrived (robot time)
     arrive_timeout_s: float = 10.0
+    # Longest wait for the recorder's answer on a settled configuration (robot time)
     answer_timeout_s: float = 180.0
-    heartbeat_s: float = 3.0
+    heartbeat_s: float = 3.0  # Longest silence of planner, recorder or robot (wall time)
+    # An arm that stands for so long and not at its target will not get there (robot time)
     stall_s: float = 1.0
+    # A command may take so long to reach the robot and be seen in its reports (wall time)
     reaction_s: float = 0.5
-    lag_s: float = 0.35
+    lag_s: float = 0.35  # An arm may be so far behind its trajectory (robot time)
+    # So many configurations that the robot did not reach, and it is halted
     failures_in_a_row: int = 3
+    # After a longer interruption only a person goes on, unless the robot's safety circuit was
+    # known to be released all the time (wall time)
     resume_alone_s: float = 5.0

@@ -388,10 +388,7 @@ class ArmSupervisor:
     def _elsewhere(self, q: FloatArray) -> str:
         """Return that the arm is reported elsewhere than the last command led, and what to do; ''.
 
-        Parameters
-        ----------
-        q
-            Where it is reported, rad, (k,).
+        ``q``: where it is reported, rad, (k,).
         """
         end = self._motion.end
         if end is None or not self._differs(q, end):

@@ -42,33 +42,20 @@ STOPPED_ON_ITS_WAY = 'the robot stopped on its way: an emergency or protective s
 
 @dataclass(frozen=True)
 class Seen:
-    """The last report that was believed.
+    """The last report that was believed."""
 
-    Attributes
-    ----------
-    q
-        Joint positions, rad, (k,).
-    stamp, wall, time
-        Its stamp, wall time and robot time, s.
-    stands_at, stands_since
-        Where (rad, (k,)) and since when (robot time, s) the arm has been standing.
-    late_s
-        How much later than usual it came, s: the arm has gone on meanwhile.
-    changed
-        When each joint's position last differed from the report before (robot time, s, (k,)).
-    resumed
-        Of the first report after the last gap, robot time, s.
-    """
-
-    q: FloatArray
+    q: FloatArray  # Joint positions, rad, (k,)
+    # Its stamp, wall time and robot time, s
     stamp: float
     wall: float
     time: float
+    # Where (rad, (k,)) and since when (robot time, s) the arm has been standing
     stands_at: FloatArray
     stands_since: float
-    late_s: float
+    late_s: float  # How much later than usual it came, s: the arm has gone on meanwhile
+    # When each joint's position last differed from the report before (robot time, s, (k,))
     changed: FloatArray = field(default_factory=lambda: np.array(-np.inf))
-    resumed: float = -np.inf
+    resumed: float = -np.inf  # Of the first report after the last gap, robot time, s
 
     @classmethod
     def after(
@@ -108,19 +95,10 @@ class Seen:
 class Following:
     """Compare the arm with one trajectory, report by report.
 
-    Parameters
-    ----------
-    trajectory
-        Where it was sent.
-    sent, sent_wall
-        When, robot time and wall time, s.
-    rules
-        How far it may lag and how long a command may take to be seen.
-
-    Attributes
-    ----------
-    reacted
-        Whether the arm has left its start, or goes too short a way for that to be seen.
+    ``trajectory``: where it was sent; ``sent, sent_wall``: when, robot time and wall time, s;
+    ``rules``: how far it may lag and how long a command may take to be seen.
+    Attributes: ``reacted``: whether the arm has left its start, or goes too short a way for that
+    to be seen.
     """
 
     def __init__(

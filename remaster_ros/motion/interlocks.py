@@ -18,19 +18,10 @@ OWN_PAUSE_S = 0.5
 class Interlocks:
     """Reasons not to move, each by its origin, and when each origin last gave a sign of life.
 
-    Parameters
-    ----------
-    heartbeat_s
-        Longest silence of those in `NAMES`, s of wall time.
-    resume_alone_s
-        After a longer interruption of a run only a person goes on, s of wall time.
-
-    Attributes
-    ----------
-    must_collect
-        Why nothing moves before a person begins a collection (again); ''.
-    run
-        The run of a collection that was reported last; '' before the first.
+    ``heartbeat_s``: longest silence of those in `NAMES`, s of wall time; ``resume_alone_s``: after
+    a longer interruption of a run only a person goes on, s of wall time.
+    Attributes: ``must_collect``: why nothing moves before a person begins a collection (again);
+    ''; ``run``: the run of a collection that was reported last; '' before the first.
     """
 
     def __init__(self, heartbeat_s: float, resume_alone_s: float) -> None:
@@ -58,15 +49,9 @@ class Interlocks:
         What `must_collect` waits for is another run than the last one, not a pause: a summary from
         before may come late.
 
-        Parameters
-        ----------
-        reason
-            Why the arm must not move; '' while a collection runs.
-        run
-            Names the run, '' where none is under way; another one than before was begun by a
-            person since.
-        wall_s
-            Now, s.
+        ``reason``: why the arm must not move; '' while a collection runs; ``run``: names the run,
+        '' where none is under way; another one than before was begun by a person since;
+        ``wall_s``: now, s.
         """
         if self.silence_s('planner', wall_s) > self._heartbeat_s:
             self._planner_since_wall = wall_s

@@ -53,33 +53,18 @@ UNKNOWN_SPEED = 4.0
 
 @dataclass(frozen=True)
 class JointReport:
-    """The content of a message on joint_states, and its times.
+    """The content of a message on joint_states, and its times."""
 
-    Attributes
-    ----------
-    stamp_s
-        Its stamp, s.
-    q
-        Joint positions, rad, (k,).
-    clock_s
-        The node's time at its arrival, s.
-    wall_s
-        Wall time at its arrival, s.
-    """
-
-    stamp_s: float
-    q: FloatArray
-    clock_s: float
-    wall_s: float
+    stamp_s: float  # Its stamp, s
+    q: FloatArray  # Joint positions, rad, (k,)
+    clock_s: float  # The node's time at its arrival, s
+    wall_s: float  # Wall time at its arrival, s
 
 
 class ClockRate:
     """How fast the node's clock runs beside the wall's; 1 for the system's clock.
 
-    Attributes
-    ----------
-    rate
-        Seconds of the node's clock per second of wall time.
+    Attributes: ``rate``: seconds of the node's clock per second of wall time.
     """
 
     def __init__(self) -> None:

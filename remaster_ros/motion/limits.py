@@ -21,31 +21,18 @@ URDFs have none. Makers of arms of this size state 7.5 (joint 2 of the Franka Pa
 
 @dataclass(frozen=True)
 class MotionLimits:
-    """Limits of commanded joint positions, speeds and accelerations.
+    """Limits of commanded joint positions, speeds and accelerations."""
 
-    Attributes
-    ----------
-    names
-        Joint names, base to tip.
-    lower, upper
-        Position limits in reported angles, rad, (k,).
-    velocity
-        Largest commanded joint velocities (the share of the robot's limits), rad/s, (k,).
-    acceleration
-        Largest commanded joint accelerations, rad/s², (k,).
-    tool_speed
-        Largest speed of the fastest point of arm and tool, m/s; infinite for none.
-    margin
-        Distance kept from the position limits, rad.
-    """
-
-    names: Sequence[str]
+    names: Sequence[str]  # Joint names, base to tip
+    # Position limits in reported angles, rad, (k,)
     lower: FloatArray
     upper: FloatArray
+    # Largest commanded joint velocities (the share of the robot's limits), rad/s, (k,)
     velocity: FloatArray
-    acceleration: FloatArray
+    acceleration: FloatArray  # Largest commanded joint accelerations, rad/s², (k,)
+    # Largest speed of the fastest point of arm and tool, m/s; infinite for none
     tool_speed: float = np.inf
-    margin: float = 0.0
+    margin: float = 0.0  # Distance kept from the position limits, rad
 
     @classmethod
     def of(

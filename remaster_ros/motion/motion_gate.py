@@ -65,21 +65,13 @@ class StartMovedError(MotionRefusedError):
 
 @dataclass(frozen=True)
 class Admitted:
-    """What may be published.
+    """What may be published."""
 
-    Attributes
-    ----------
-    waypoints
-        For the controller, which begins at once.
-    trajectory
-        The lines that the arm will be on; None for a stop, which stays on those of its move, and
-        for the trajectory of another planner.
-    is_straight
-        Whether the controller is given no velocities, and draws straight lines.
-    """
-
-    waypoints: tuple[Waypoint, ...]
+    waypoints: tuple[Waypoint, ...]  # For the controller, which begins at once
+    # The lines that the arm will be on; None for a stop, which stays on those of its move, and for
+    # the trajectory of another planner
     trajectory: Trajectory | None = None
+    # Whether the controller is given no velocities, and draws straight lines
     is_straight: bool = False
 
 
@@ -142,19 +134,9 @@ class MotionGate:
         time that from anywhere within the limits of the doubtful joints no speed and no
         acceleration is above its limit.
 
-        Parameters
-        ----------
-        path
-            From `q` to a place next to it.
-        q
-            Where the arm is reported, rad, (k,).
-        doubtful
-            Which joints may be elsewhere, (k,).
-
-        Raises
-        ------
-        MotionRefusedError
-            As of `admit`.
+        ``path``: from `q` to a place next to it; ``q``: where the arm is reported, rad, (k,);
+        ``doubtful``: which joints may be elsewhere, (k,).
+        Raises MotionRefusedError: as of `admit`.
         """
         limits = self.limits
         farthest = np.maximum(q - limits.lower, limits.upper - q)
@@ -367,17 +349,10 @@ def _check_rate(
 
 @dataclass(frozen=True)
 class Cubic:
-    """What a controller makes of two waypoints, or n cubics, each of two.
+    """What a controller makes of two waypoints, or n cubics, each of two."""
 
-    Attributes
-    ----------
-    duration_s
-        s; of n cubics (n, 1).
-    coefficients
-        Of the powers of time since its start, lowest first, (4, k); of n cubics (4, n, k).
-    """
-
-    duration_s: float | FloatArray
+    duration_s: float | FloatArray  # s; of n cubics (n, 1)
+    # Of the powers of time since its start, lowest first, (4, k); of n cubics (4, n, k)
     coefficients: FloatArray
 
     @classmethod

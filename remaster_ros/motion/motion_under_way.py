@@ -23,24 +23,10 @@ gives way under the arm's weight does so by another amount in every configuratio
 class MotionUnderWay:
     """What the arm does by the last command.
 
-    Parameters
-    ----------
-    gate
-        Every command comes from it.
-    rules
-        See `SupervisorRules`.
-    end
-        Where the last command led that was sent before this process was started, rad, (k,); None
-        where that is not known.
-
-    Attributes
-    ----------
-    end
-        Where the last command led, rad, (k,).
-    visit
-        The configuration under way, to its end; None where none is.
-    braking
-        The stop under way, until the arm stands.
+    ``gate``: every command comes from it; ``end``: where the last command led that was sent before
+    this process was started, rad, (k,); None where that is not known.
+    Attributes: ``end``: where the last command led, rad, (k,); ``visit``: the configuration under
+    way, to its end; None where none is; ``braking``: the stop under way, until the arm stands.
     """
 
     def __init__(self, gate: MotionGate, rules: SupervisorRules, end: FloatArray | None) -> None:
@@ -90,25 +76,10 @@ class MotionUnderWay:
     ) -> Drive:
         """Return the move along a free path, which is under way from now on.
 
-        Parameters
-        ----------
-        solution
-            Its number.
-        path
-            From where the arm stands.
-        seen
-            The last report.
-        wall_s
-            Now, s.
-        rate
-            Seconds of the robot per second of wall time.
-        doubtful
-            For a probe, which joints may be elsewhere than reported, (k,).
-
-        Raises
-        ------
-        MotionRefusedError
-            As of `MotionGate.admit`; nothing is under way then.
+        ``solution``: its number; ``path``: from where the arm stands; ``seen``: the last report;
+        ``wall_s``: now, s; ``rate``: seconds of the robot per second of wall time; ``doubtful``:
+        for a probe, which joints may be elsewhere than reported, (k,).
+        Raises MotionRefusedError: as of `MotionGate.admit`; nothing is under way then.
         """
         if doubtful is None:
             admitted = self.gate.admit(path, seen.q)

@@ -27,18 +27,11 @@ NO_REFUSALS: Mapping[int, str] = {}
 class MoveQueue:
     """The configurations of a pose in the order of visiting, and the path that is asked for.
 
-    Attributes
-    ----------
-    next
-        The number of the next solution.
-    pending
-        The number of the path that is asked for, and of the solution that it leads to.
-    must_look
-        Whether it must be found out first that the arm stands where it may.
-    must_probe
-        Whether the probe must be commanded first: it shows that reports are measured.
-    way_out
-        The way out of a contact or a margin that a person has allowed by clearing the halt.
+    Attributes: ``next``: the number of the next solution; ``pending``: the number of the path that
+    is asked for, and of the solution that it leads to; ``must_look``: whether it must be found out
+    first that the arm stands where it may; ``must_probe``: whether the probe must be commanded
+    first: it shows that reports are measured; ``way_out``: the way out of a contact or a margin
+    that a person has allowed by clearing the halt.
     """
 
     def __init__(self) -> None:
@@ -98,12 +91,8 @@ class MoveQueue:
     def offer(self, answer: PathAnswer, names: Sequence[str]) -> str:
         """Keep a way out for the person who clears the halt; return what to tell that person.
 
-        Parameters
-        ----------
-        answer
-            That the arm stands where it must not, and the way out, if one is known.
-        names
-            Of the joints.
+        ``answer``: that the arm stands where it must not, and the way out, if one is known;
+        ``names``: of the joints.
         """
         self._offered = answer.way_out
         stands = f'the arm stands where it must not: {answer.why}'

@@ -98,10 +98,7 @@ def _carried(T: FloatArray) -> FloatArray:
 def _velocities(points: FloatArray) -> FloatArray:
     """Return what takes turn and velocity of a frame, as a row, to those of points (n, 3) in it.
 
-    Returns
-    -------
-    ndarray
-        (6, 3 n), the points' x, then y, then z.
+    Returns (6, 3 n), the points' x, then y, then z.
     """
     across = np.cross(np.eye(3)[:, None], points)
     by_turn = np.moveaxis(across, 1, 2).reshape(3, -1)
@@ -110,22 +107,13 @@ def _velocities(points: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class FreePath:
-    """A polyline in joint space that was found free.
+    """A polyline in joint space that was found free."""
 
-    Attributes
-    ----------
-    points
-        From where the arm stands to the target, rad, (n, k).
-    peaks_m
-        For each line the peak speed of the fastest point where it takes a second, m/s, (n - 1,);
-        none where no such limit is kept.
-    way_out
-        It leads out of a contact or a margin, and is gone slowly.
-    """
-
-    points: FloatArray
+    points: FloatArray  # From where the arm stands to the target, rad, (n, k)
+    # For each line the peak speed of the fastest point where it takes a second, m/s, (n - 1,);
+    # none where no such limit is kept
     peaks_m: tuple[float, ...] = ()
-    way_out: bool = False
+    way_out: bool = False  # It leads out of a contact or a margin, and is gone slowly
 
     def distance(self, q: FloatArray) -> float:
         """Return how far a configuration (rad, (k,)) lies off the polyline, rad."""

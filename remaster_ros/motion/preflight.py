@@ -11,53 +11,26 @@ FRESH_S = 3.0
 
 @dataclass(frozen=True)
 class SensorFacts:
-    """The present state of a sensor. Ages are wall time, s; infinite for what never came.
+    """The present state of a sensor. Ages are wall time, s; infinite for what never came."""
 
-    Attributes
-    ----------
-    name
-        As in the cell.
-    node_age_s
-        Since the last report of its node.
-    ready
-        Whether its node reports that the device can measure.
-    message
-        The node's own diagnosis.
-    read_age_s
-        Since the recorder's last reading of it.
-    """
-
-    name: str
-    node_age_s: float
-    ready: bool
-    message: str
-    read_age_s: float
+    name: str  # As in the cell
+    node_age_s: float  # Since the last report of its node
+    ready: bool  # Whether its node reports that the device can measure
+    message: str  # The node's own diagnosis
+    read_age_s: float  # Since the recorder's last reading of it
 
 
 @dataclass(frozen=True)
 class Facts:
-    """The present state of what the first motion needs.
+    """The present state of what the first motion needs."""
 
-    Attributes
-    ----------
-    joints_age_s
-        Since the last joint_states that name every joint, s.
-    joints_message
-        What is wrong with them; ''.
-    bridge_age_s, recorder_age_s
-        Since the last report of the bridge and of the recorder, s.
-    sensors
-        Those that the arm waits for.
-    any_sensor
-        Whether one of them is enough.
-    """
-
-    joints_age_s: float
-    joints_message: str
+    joints_age_s: float  # Since the last joint_states that name every joint, s
+    joints_message: str  # What is wrong with them; ''
+    # Since the last report of the bridge and of the recorder, s
     bridge_age_s: float
     recorder_age_s: float
-    sensors: Sequence[SensorFacts]
-    any_sensor: bool = False
+    sensors: Sequence[SensorFacts]  # Those that the arm waits for
+    any_sensor: bool = False  # Whether one of them is enough
 
 
 def preflight(facts: Facts) -> tuple[str, ...]:

@@ -14,23 +14,14 @@ SettleState = Literal['moving', 'elsewhere', 'settling', 'settled']
 
 @dataclass(frozen=True)
 class SettleRules:
-    """What counts as arrived and as still.
+    """What counts as arrived and as still."""
 
-    Attributes
-    ----------
-    settle_s
-        How long the arm must have stood still, s (3 s in Van Wyk et al., section III-A).
-    arrive_tolerance
-        Largest distance of any joint from its target, rad.
-    still_tolerance
-        Largest spread (maximum - minimum) of any reported joint position while still, rad.
-    max_gap_s
-        A longer gap in joint_states starts the waiting again: the arm was not observed then, s.
-    """
-
+    # How long the arm must have stood still, s (3 s in Van Wyk et al., section III-A)
     settle_s: float = 3.0
-    arrive_tolerance: float = 2e-3
+    arrive_tolerance: float = 2e-3  # Largest distance of any joint from its target, rad
+    # Largest spread (maximum - minimum) of any reported joint position while still, rad
     still_tolerance: float = 2e-4
+    # A longer gap in joint_states starts the waiting again: the arm was not observed then, s
     max_gap_s: float = 0.5
 
 
@@ -53,12 +44,7 @@ class SettleDetector:
     ``still_tolerance``; it has *settled* when that has lasted ``settle_s`` at the target.
     A slow drift breaks the spread and starts the waiting anew, unlike a velocity threshold.
 
-    Parameters
-    ----------
-    target
-        Commanded joint positions, rad, shape (k,).
-    rules
-        See `SettleRules`.
+    ``target``: commanded joint positions, rad, shape (k,).
     """
 
     def __init__(self, target: FloatArray, rules: SettleRules) -> None:
@@ -68,12 +54,8 @@ class SettleDetector:
     def update(self, stamp: float, q: FloatArray) -> SettleState:
         """Take one report and return the state.
 
-        Parameters
-        ----------
-        stamp
-            Time of the report, s.
-        q
-            Reported joint positions in the order of the target, rad, (k,).
+        ``stamp``: time of the report, s; ``q``: reported joint positions in the order of the
+        target, rad, (k,).
         """
         if not np.all(np.isfinite(q)):
             self._still = None

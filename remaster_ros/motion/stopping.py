@@ -39,14 +39,8 @@ ROUNDS = 32
 def stop_on_line(line: Line, low_s: float, high_s: float, limits: MotionLimits) -> Waypoint:
     """Return where and when an arm on a line comes to rest that is to stop now.
 
-    Parameters
-    ----------
-    line
-        The line.
-    low_s, high_s
-        The arm is where the line is at some time from `low_s` to `high_s`, s since its start.
-    limits
-        For the accelerations.
+    ``low_s, high_s``: the arm is where the line is at some time from `low_s` to `high_s`, s since
+    its start; ``limits``: for the accelerations.
     """
     stretch = _Stretch(line, low_s, high_s, limits)
     longest = max(LONGEST_S, LONGEST_SHARE * (high_s - low_s))

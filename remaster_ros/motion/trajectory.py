@@ -42,19 +42,12 @@ class Waypoint:
 
 @dataclass(frozen=True)
 class Line:
-    """A straight line in joint space: ramp up, cruise, ramp down; all joints arrive together.
+    """A straight line in joint space: ramp up, cruise, ramp down; all joints arrive together."""
 
-    Attributes
-    ----------
-    start, end
-        Joint positions at rest, rad, (k,).
-    rate
-        Share of the way per second while cruising, 1/s; at most 1/`RAMP_S`.
-    """
-
+    # Joint positions at rest, rad, (k,)
     start: FloatArray
     end: FloatArray
-    rate: float
+    rate: float  # Share of the way per second while cruising, 1/s; at most 1/`RAMP_S`
 
     @classmethod
     def within(
@@ -62,14 +55,8 @@ class Line:
     ) -> Line:
         """Return the fastest line within the speeds and accelerations.
 
-        Parameters
-        ----------
-        limits
-            The limits.
-        start, end
-            rad, (k,).
-        peak_m
-            Speed of the fastest point of arm and tool where the whole way takes a second, m/s.
+        ``start, end``: rad, (k,); ``peak_m``: speed of the fastest point of arm and tool where the
+        whole way takes a second, m/s.
         """
         way = np.maximum(np.abs(end - start), 1e-12)
         # The ramp is of a given length: what the joints may accelerate bounds the speed as well.

@@ -26,15 +26,9 @@ UNDER_WAY: Outcome = '', ''
 
 @dataclass
 class Visit:
-    """The configuration under way: when it was sent (stamp) and must have arrived (robot time).
+    """The configuration under way: when it was sent (stamp) and must have arrived (robot time)."""
 
-    Attributes
-    ----------
-    solution
-        Its number; negative where nothing is measured at the end.
-    """
-
-    solution: int
+    solution: int  # Its number; negative where nothing is measured at the end
     following: Following
     detector: SettleDetector
     rules: SupervisorRules
@@ -99,31 +93,16 @@ class Visit:
 
 @dataclass
 class Braking:
-    """A stop under way.
+    """A stop under way."""
 
-    Attributes
-    ----------
-    end
-        Where it leads, rad, (k,).
-    begins
-        Robot time at which the arm has begun it, however late it reacts, s. Before that an arm may
-        stand where its move ended.
-    over
-        Robot time at which it has come to its end, s.
-    deadline
-        Robot time until which it must stand there, s.
-    near
-        How far from the end it may stand: what this arm was seen to stand off, rad.
-    patience_s
-        `ASTRAY_S`, s of robot time.
-    """
-
-    end: FloatArray
+    end: FloatArray  # Where it leads, rad, (k,)
+    # Robot time at which the arm has begun it, however late it reacts, s. Before that an arm may
+    # stand where its move ended.
     begins: float
-    over: float
-    deadline: float
-    near: float
-    patience_s: float
+    over: float  # Robot time at which it has come to its end, s
+    deadline: float  # Robot time until which it must stand there, s
+    near: float  # How far from the end it may stand: what this arm was seen to stand off, rad
+    patience_s: float  # `ASTRAY_S`, s of robot time
 
     def judge(self, seen: Seen) -> Outcome:
         """Return whether the arm has come to rest where its stop ends, by a report."""

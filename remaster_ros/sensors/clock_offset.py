@@ -17,12 +17,8 @@ class ClockMapping:
     A simulated clock stands still between its ticks: by it an arrival may seem too early as well
     as too late, and the median is the estimate that neither error spoils.
 
-    Parameters
-    ----------
-    window
-        How many readings are looked back on; bounds how long a drift of the clocks lags.
-    simulated
-        Whether the receiver's clock is a simulated one.
+    ``window``: how many readings are looked back on; bounds how long a drift of the clocks lags;
+    ``simulated``: whether the receiver's clock is a simulated one.
     """
 
     def __init__(self, window: int = 240, *, simulated: bool = False) -> None:
@@ -33,14 +29,8 @@ class ClockMapping:
     def capture_time(self, device_s: float, age_s: float, received_s: float) -> float:
         """Return when a reading was captured, by the receiver's clock, s.
 
-        Parameters
-        ----------
-        device_s
-            Capture by the device's clock, s.
-        age_s
-            Delay that the device itself reports, s.
-        received_s
-            Arrival by the receiver's clock, s.
+        ``device_s``: capture by the device's clock, s; ``age_s``: delay that the device itself
+        reports, s; ``received_s``: arrival by the receiver's clock, s.
         """
         if self._last_device_s is not None and device_s < self._last_device_s:
             # The device's clock has started anew; what was learned of the old one is void.

@@ -37,56 +37,33 @@ class SensorParameters:
 
 @dataclass(frozen=True)
 class SensorClock:
-    """The clock by which readings are stamped.
+    """The clock by which readings are stamped."""
 
-    Attributes
-    ----------
-    now, sleep
-        Time and waiting, s.
-    simulated
-        Whether it runs at another speed than the wall clock and may stand still.
-    """
-
+    # Time and waiting, s
     now: Callable[[], float] = time.time
     sleep: Callable[[float], None] = time.sleep
+    # Whether it runs at another speed than the wall clock and may stand still
     simulated: bool = False
 
 
 @dataclass(frozen=True)
 class SensorState:
-    """How a sensor is now.
+    """How a sensor is now."""
 
-    Attributes
-    ----------
-    ready
-        It can measure a marker that is in view. A hidden marker does not make it unready: the
-        next configuration may show the marker again.
-    trouble
-        What is wrong, with the remedy; ''.
-    message
-        What to show a person where nothing is wrong.
-    level
-        ``ok``, ``warn`` or ``error``.
-    values
-        Counts and settings for the search of a cause.
-    """
-
+    # It can measure a marker that is in view. A hidden marker does not make it unready: the next
+    # configuration may show the marker again.
     ready: bool = True
-    trouble: str = ''
-    message: str = 'ok'
-    level: str = 'ok'
+    trouble: str = ''  # What is wrong, with the remedy; ''
+    message: str = 'ok'  # What to show a person where nothing is wrong
+    level: str = 'ok'  # ``ok``, ``warn`` or ``error``
+    # Counts and settings for the search of a cause
     values: Mapping[str, Any] = field(default_factory=dict)
 
 
 class Driver(ABC):
     """One device. The constructor refuses what waiting cannot mend; `open` connects.
 
-    Parameters
-    ----------
-    parameters
-        An instance of `parameters_type`.
-    clock
-        Gives the stamps of the readings.
+    ``parameters``: an instance of `parameters_type`; ``clock``: gives the stamps of the readings.
     """
 
     parameters_type: ClassVar[type[SensorParameters]]

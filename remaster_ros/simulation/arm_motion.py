@@ -103,12 +103,7 @@ class _Response:
 class Motion:
     """The arm's reported joint positions over time, as commanded trajectories make them.
 
-    Parameters
-    ----------
-    start_s
-        World time of the beginning, s.
-    q
-        Joint positions at rest then, rad, (k,).
+    ``start_s``: world time of the beginning, s; ``q``: joint positions at rest then, rad, (k,).
     """
 
     def __init__(self, start_s: float, q: FloatArray) -> None:

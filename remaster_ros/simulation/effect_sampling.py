@@ -22,21 +22,11 @@ TRIES = 30
 
 @dataclass(frozen=True)
 class EffectSpec:
-    """What is to be hidden.
+    """What is to be hidden."""
 
-    Attributes
-    ----------
-    kind
-        Of `KINDS`, or ``random`` for any of those that have a name.
-    joint
-        The joint that errs, 1-based; any where None.
-    size_m
-        What it leaves, see `WorldModel.size_m`; drawn where None.
-    """
-
-    kind: str
-    joint: int | None = None
-    size_m: float | None = None
+    kind: str  # Of `KINDS`, or ``random`` for any of those that have a name
+    joint: int | None = None  # The joint that errs, 1-based; any where None
+    size_m: float | None = None  # What it leaves, see `WorldModel.size_m`; drawn where None
 
     @classmethod
     def parse(cls, text: str) -> EffectSpec:
@@ -65,10 +55,8 @@ def hide(
 ) -> tuple[HiddenEffect, ...]:
     """Draw the requested effects.
 
-    Raises
-    ------
-    InputError
-        Something that this arm cannot show on these visits, or at a joint that it does not have.
+    Raises InputError: something that this arm cannot show on these visits, or at a joint that it
+    does not have.
     """
     effects = []
     for request in requests:
@@ -107,11 +95,8 @@ def draw_effect(
     Drawn again as long as it would have to be larger than is plausible: a joint that hardly moves
     shows no eccentricity. Where no draw gets there, the most visible of them is taken.
 
-    Raises
-    ------
-    InputError
-        Where all draws leave nothing, or none is about that joint, or those that are would have to
-        be larger than is plausible.
+    Raises InputError: where all draws leave nothing, or none is about that joint, or those that
+    are would have to be larger than is plausible.
     """
     context = DrawContext(
         rng, stage.arm.joints, stage.circumstances, stage.distance_m, tuple(stage.markers)

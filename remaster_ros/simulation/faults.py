@@ -87,13 +87,7 @@ def inject(folder: Path, faults: Mapping[str, Numbers]) -> None:
 
 
 class Faults:
-    """The faults of a World, as they are now.
-
-    Parameters
-    ----------
-    folder
-        The World's.
-    """
+    """The faults of a World, as they are now."""
 
     def __init__(self, folder: Path) -> None:
         self._path = folder / FILE

@@ -33,14 +33,8 @@ MOVES_KEPT = 16
 class WrongArm:
     """The true arm in front of the true sensors.
 
-    Parameters
-    ----------
-    chain
-        The arm as drawn.
-    truth
-        What is wrong with it.
-    start_s, q
-        When and where the arm stands at first, rad, (k,).
+    ``chain``: the arm as drawn; ``truth``: what is wrong with it; ``start_s, q``: when and where
+    the arm stands at first, rad, (k,).
     """
 
     def __init__(

@@ -20,71 +20,41 @@ SLACK_RAD = 2e-4
 
 @dataclass(frozen=True, eq=False)
 class Circumstances:
-    """What effects may depend on at n configurations of k joints.
+    """What effects may depend on at n configurations of k joints."""
 
-    Attributes
-    ----------
-    q, move
-        Reported joint angles, and how far each joint came by its last move, rad, (n, k).
-    approach
-        Direction of each joint's last move that was a move at all, -1, 0 or 1, (n, k).
-    time_s, warming_k
-        Since the first measurement, (n,); the arm's temperature above its first, K, (n,).
-    torque, base_moment
-        Gravity's torque about each joint, (n, k), and about the base, N m, (n, 3).
-    segments
-        From each joint to the next, in the frame between, m, (k + 1, 3).
-    axes
-        Axis of each joint in its own frame, (k, 3).
-    tool
-        Rotation of the tool, (n, 3, 3).
-    """
-
+    # Reported joint angles, and how far each joint came by its last move, rad, (n, k)
     q: FloatArray
     move: FloatArray
+    # Direction of each joint's last move that was a move at all, -1, 0 or 1, (n, k)
     approach: FloatArray
+    # Since the first measurement, (n,); the arm's temperature above its first, K, (n,)
     time_s: FloatArray
     warming_k: FloatArray
+    # Gravity's torque about each joint, (n, k), and about the base, N m, (n, 3)
     torque: FloatArray
     base_moment: FloatArray
-    segments: FloatArray
-    axes: FloatArray
-    tool: FloatArray
+    segments: FloatArray  # From each joint to the next, in the frame between, m, (k + 1, 3)
+    axes: FloatArray  # Axis of each joint in its own frame, (k, 3)
+    tool: FloatArray  # Rotation of the tool, (n, 3, 3)
 
 
 @dataclass(eq=False)
 class Deviation:
-    """How the true arm and sensors differ from their drawings at n configurations.
-
-    Attributes
-    ----------
-    sensors, markers
-        Their names.
-    angle
-        Added to the true joint angles, rad, (n, k).
-    shift
-        Added to each segment, in the frame after its joint (0: the base), m, (n, k + 1, 3).
-    tilt
-        Turns each joint's frame before its own turn, rad, (n, k, 3).
-    base
-        Turns the base about its origin, axes of R, rad, (n, 3).
-    marker
-        Added to each marker (c of them) in the tool frame, m, (n, c, 3).
-    beside, turn, scale, radial, along, half
-        What each sensor (s of them) adds to a point p = (x, y, z) that it measures, in its frame
-        N: beside, m, (n, s, 3); turn × p, rad, (n, s, 3); scale p, (n, s, 3); radial (x² + y²)
-        (x, y, 0), 1/m², (n, s, 1); along the line of sight a + b |p|² + c |p|³, in m, 1/m, 1/m²,
-        (n, s, 3); and z u² half where u = (x, y)/z along half is positive, (n, s, 2): the rays of
-        one half of its view bend.
-    """
+    """How the true arm and sensors differ from their drawings at n configurations."""
 
     sensors: tuple[str, ...]
     markers: tuple[str, ...]
-    angle: FloatArray
+    angle: FloatArray  # Added to the true joint angles, rad, (n, k)
+    # Added to each segment, in the frame after its joint (0: the base), m, (n, k + 1, 3)
     shift: FloatArray
-    tilt: FloatArray
-    base: FloatArray
-    marker: FloatArray
+    tilt: FloatArray  # Turns each joint's frame before its own turn, rad, (n, k, 3)
+    base: FloatArray  # Turns the base about its origin, axes of R, rad, (n, 3)
+    marker: FloatArray  # Added to each marker (c of them) in the tool frame, m, (n, c, 3)
+    # What each sensor (s of them) adds to a point p = (x, y, z) that it measures, in its frame N:
+    # beside, m, (n, s, 3); turn × p, rad, (n, s, 3); scale p, (n, s, 3); radial (x² + y²) (x, y,
+    # 0), 1/m², (n, s, 1); along the line of sight a + b |p|² + c |p|³, in m, 1/m, 1/m², (n, s, 3);
+    # and z u² half where u = (x, y)/z along half is positive, (n, s, 2): the rays of one half of
+    # its view bend
     beside: FloatArray
     turn: FloatArray
     scale: FloatArray
@@ -131,23 +101,12 @@ class Deviation:
 
 @dataclass(frozen=True, eq=False)
 class HiddenEffect:
-    """One effect of a certain size.
+    """One effect of a certain size."""
 
-    Attributes
-    ----------
-    kind
-        Its name, a key of `hidden_effects.NAMED` or `UNNAMED`.
-    joints
-        Numbers from 1: the joints whose angle, link or axis is wrong.
-    values
-        Its parameters in SI units, (m,); their meaning is in the rule's text.
-    detail
-        What else the rule needs: an order, a direction, another joint, a sensor.
-    """
-
-    kind: str
-    joints: tuple[int, ...]
-    values: FloatArray
+    kind: str  # Its name, a key of `hidden_effects.NAMED` or `UNNAMED`
+    joints: tuple[int, ...]  # Numbers from 1: the joints whose angle, link or axis is wrong
+    values: FloatArray  # Its parameters in SI units, (m,); their meaning is in the rule's text
+    # What else the rule needs: an order, a direction, another joint, a sensor
     detail: Mapping[str, Any] = field(default_factory=dict)
 
     def scaled(self, factor: float) -> HiddenEffect:
@@ -163,26 +122,12 @@ class HiddenEffect:
 
 @dataclass(frozen=True, eq=False)
 class DrawContext:
-    """What an effect is drawn from.
-
-    Attributes
-    ----------
-    rng
-        Source of all randomness.
-    joints
-        Number of joints.
-    circumstances
-        Of the visits.
-    distance_m
-        Sensor -> mean distance of what it measures, m.
-    markers
-        Their names.
-    """
+    """What an effect is drawn from."""
 
     rng: np.random.Generator
     joints: int
-    circumstances: Circumstances
-    distance_m: Mapping[str, float]
+    circumstances: Circumstances  # Of the visits
+    distance_m: Mapping[str, float]  # Sensor -> mean distance of what it measures, m
     markers: tuple[str, ...]
 
     @property
@@ -264,21 +209,14 @@ Rule = Callable[[HiddenEffect, Deviation, Circumstances], None]
 
 @dataclass(frozen=True)
 class Part:
-    """A parameter under the name that discovery gives it.
+    """A parameter under the name that discovery gives it."""
 
-    Attributes
-    ----------
-    name
-        With ``{j}`` for the joint, ``{by}`` for the one that drives it, ``{order}`` for the order
-        of a wave, ``{sensor}`` for the sensor.
-    values
-        The effect's values where this parameter is 1 and all others are 0.
-    detail
-        What the effect has to have in its detail.
-    """
-
+    # With ``{j}`` for the joint, ``{by}`` for the one that drives it, ``{order}`` for the order of
+    # a wave, ``{sensor}`` for the sensor
     name: str
+    # The effect's values where this parameter is 1 and all others are 0
     values: tuple[float, ...] = (1.0,)
+    # What the effect has to have in its detail
     detail: Mapping[str, str] = field(default_factory=dict)
 
     def of(self, effect: HiddenEffect) -> dict[str, float]:
@@ -297,28 +235,15 @@ class Part:
 
 @dataclass(frozen=True)
 class HiddenKind:
-    """A kind of effect.
+    """A kind of effect."""
 
-    Attributes
-    ----------
-    place, driver, form
-        Where it enters, what drives it, and its form.
-    rule
-        Its equation.
-    draw
-        Draws one of about the largest size that is plausible; `WorldModel.of_size` makes it
-        smaller.
-    parts
-        What discovery should find; none where it has no parameters that could be compared one by
-        one.
-    answers
-        Names of discovery.json that name it too, beside its own.
-    """
-
+    # Where it enters, what drives it, and its form
     place: str
     driver: str
     form: str
-    rule: Rule
+    rule: Rule  # Its equation
+    # Draws one of about the largest size that is plausible; `WorldModel.of_size` makes it smaller
     draw: Draw
+    # What discovery should find; none where it has no parameters that could be compared one by one
     parts: tuple[Part, ...] = ()
-    answers: tuple[str, ...] = ()
+    answers: tuple[str, ...] = ()  # Names of discovery.json that name it too, beside its own

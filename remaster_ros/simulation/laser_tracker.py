@@ -72,45 +72,28 @@ SETTINGS = {
 
 @dataclass(frozen=True)
 class TrackerBehaviour:
-    """What can be set on the fake. World time in s, lengths in m.
+    """What can be set on the fake. World time in s, lengths in m."""
 
-    Attributes
-    ----------
-    warm_up_s
-        From switching on until it can be initialised (two hours on a real one).
-    initialise_s
-        How long the initialisation takes.
-    slew_rad_s, slew_settle_s
-        Speed of turning to a position, and what each turn takes on top.
-    spiral_pitch_m, spiral_speed_m_s
-        Of the search, at the reflector.
-    acquire_s
-        From the first return of light to a lock with a valid absolute distance.
-    search_failure_share
-        Share of searches that find nothing for no visible reason.
-    tracking_speed_m_s
-        The beam loses a reflector that moves faster across it.
-    large_move_rad, large_move_break_share
-        Share of the moves in which a joint turns further than that which break the beam (gimbal
-        and reflector shake); the line of sight breaks others.
-    stability_limit_m
-        The ADM refuses a reflector that leaves a sphere of this radius while it integrates.
-    range_limit_m, range_limit_ppm, across_limit_m, across_limit_ppm
-        Accuracy limits (two standard deviations): a constant, and parts per million of distance.
-    """
-
+    # From switching on until it can be initialised (two hours on a real one)
     warm_up_s: float = 5.0
-    initialise_s: float = 2.0
+    initialise_s: float = 2.0  # How long the initialisation takes
+    # Speed of turning to a position, and what each turn takes on top
     slew_rad_s: float = 1.0
     slew_settle_s: float = 0.3
+    # Of the search, at the reflector
     spiral_pitch_m: float = 0.02
     spiral_speed_m_s: float = 3.0
+    # From the first return of light to a lock with a valid absolute distance
     acquire_s: float = 1.0
-    search_failure_share: float = 0.02
-    tracking_speed_m_s: float = 4.0
+    search_failure_share: float = 0.02  # Share of searches that find nothing for no visible reason
+    tracking_speed_m_s: float = 4.0  # The beam loses a reflector that moves faster across it
+    # Share of the moves in which a joint turns further than that which break the beam (gimbal and
+    # reflector shake); the line of sight breaks others
     large_move_rad: float = 1.5
     large_move_break_share: float = 0.25
+    # The ADM refuses a reflector that leaves a sphere of this radius while it integrates
     stability_limit_m: float = 50e-6
+    # Accuracy limits (two standard deviations): a constant, and parts per million of distance
     range_limit_m: float = 10e-6
     range_limit_ppm: float = 0.3
     across_limit_m: float = 15e-6
@@ -162,21 +145,10 @@ _SIGHT_EVERY_S = 0.5
 class Beam:
     """Where the instrument points, and whether it is locked on the reflector.
 
-    Parameters
-    ----------
-    world, sensor
-        Where the reflector truly is, and the tracker's name in the world.
-    rng
-        Source of all randomness.
-    behaviour
-        See `TrackerBehaviour`.
-    t
-        World time, s.
-    aim
-        Where it points at first, in its own frame, m, (3,); None: at the reflector.
-    further
-        Further reflectors of the tool by name, with the numbers of the fault ``hidden``; the
-        first has the name '' and the number 1.
+    ``world, sensor``: where the reflector truly is, and the tracker's name in the world; ``t``:
+    world time, s; ``aim``: where it points at first, in its own frame, m, (3,); None: at the
+    reflector; ``further``: further reflectors of the tool by name, with the numbers of the fault
+    ``hidden``; the first has the name '' and the number 1.
     """
 
     def __init__(
@@ -280,12 +252,8 @@ def adm_result(
 ) -> Measurement:
     """Return the packet of a measured position and its standard deviation (m, (3,) each).
 
-    Parameters
-    ----------
-    unit_m
-        The client's unit of length, m.
-    environment
-        Temperature (°C), pressure (mbar), relative humidity (%).
+    ``unit_m``: the client's unit of length, m; ``environment``: temperature (°C), pressure (mbar),
+    relative humidity (%).
     """
     x, y, z = (position / unit_m).tolist()
     std_x, std_y, std_z = (std / unit_m).tolist()
@@ -326,23 +294,10 @@ Operation = Iterator[None]
 class TrackerInstrument:
     """The instrument without sockets, threads and clocks.
 
-    Parameters
-    ----------
-    world
-        Where the reflector truly is.
-    sensor
-        The tracker's name in the world.
-    rng
-        Source of all randomness.
-    switched_on_s
-        World time at which it was switched on, s.
-    behaviour
-        See `TrackerBehaviour`.
-    aim
-        Where it points at first, in its own frame, m, (3,); None: where the reflector is, as
-        a person who sets up the instrument leaves it.
-    further
-        Further reflectors of the tool, as of `Beam`.
+    ``world``: where the reflector truly is; ``sensor``: the tracker's name in the world;
+    ``switched_on_s``: world time at which it was switched on, s; ``aim``: where it points at
+    first, in its own frame, m, (3,); None: where the reflector is, as a person who sets up the
+    instrument leaves it; ``further``: further reflectors of the tool, as of `Beam`.
     """
 
     def __init__(

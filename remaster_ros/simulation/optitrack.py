@@ -52,13 +52,7 @@ _GARBAGE_BYTES = 300
 
 
 class FrameFaults:
-    """Spoil frames on their way out.
-
-    Parameters
-    ----------
-    rng
-        Source of garbage.
-    """
+    """Spoil frames on their way out."""
 
     def __init__(self, rng: np.random.Generator) -> None:
         self._rng = rng
@@ -132,57 +126,36 @@ _HIDDEN = (
 
 @dataclass(frozen=True)
 class OptiTrackBehaviour:
-    """How the fake camera bar behaves; the defaults are an OptiTrack Trio.
+    """How the fake camera bar behaves; the defaults are an OptiTrack Trio."""
 
-    Attributes
-    ----------
-    rigid_body, body_id
-        The tool's rigid body. Its member 1 is the calibration marker.
-    further
-        Further markers of the world's sensor, by name, with their numbers in the body.
-    companions
-        Members 2, 3, … where there are no further markers: offsets from the calibration marker
-        along the sensor's axes, m. They move with it and do not turn with the tool: no program
-        here uses the body's rotation.
-    strays
-        Reflections at fixed places in the sensor frame, m.
-    noise_across_m, noise_along_m
-        Standard deviation of a position across the line of sight (sensor x, y) and along it (z).
-    mid_exposure_clock
-        Whether frames carry the time of exposure; USB cameras send 0.
-    occlusions_per_s, occlusion_s
-        How often one of the markers that are followed is hidden, and for how long on average
-        (exponential distributions), in world time.
-    guess_error_m
-        Standard deviation per axis of the model's guess at a hidden marker.
-    """
-
+    # The tool's rigid body. Its member 1 is the calibration marker.
     rigid_body: str = 'tool'
     body_id: int = 1
+    # Further markers of the world's sensor, by name, with their numbers in the body
     further: Mapping[str, int] = field(default_factory=dict)
+    # Members 2, 3, … where there are no further markers: offsets from the calibration marker along
+    # the sensor's axes, m. They move with it and do not turn with the tool: no program here uses
+    # the body's rotation.
     companions: tuple[Vec3, ...] = ((0.06, 0.0, 0.0), (0.0, 0.05, 0.0), (0.04, 0.03, 0.02))
+    # Reflections at fixed places in the sensor frame, m
     strays: tuple[Vec3, ...] = ((0.8, -0.5, 2.4), (-0.7, 0.4, 2.9))
+    # Standard deviation of a position across the line of sight (sensor x, y) and along it (z)
     noise_across_m: float = 25e-6
     noise_along_m: float = 100e-6
+    # Whether frames carry the time of exposure; USB cameras send 0
     mid_exposure_clock: bool = False
+    # How often one of the markers that are followed is hidden, and for how long on average
+    # (exponential distributions), in world time
     occlusions_per_s: float = 0.0
     occlusion_s: float = 0.3
+    # Standard deviation per axis of the model's guess at a hidden marker
     guess_error_m: float = 2e-3
 
 
 class OptiTrackScene:
     """Makes the frames of data of a fake camera bar.
 
-    Parameters
-    ----------
-    world
-        The hidden world.
-    sensor
-        The bar's name in the world.
-    rng
-        Source of noise and occlusion.
-    behaviour
-        See `OptiTrackBehaviour`.
+    ``sensor``: the bar's name in the world.
     """
 
     def __init__(
@@ -240,12 +213,7 @@ class OptiTrackScene:
     def frame(self, number: int, version: Version, t: float | None = None) -> Frame:
         """Look at the world now, or as it was at time t, s.
 
-        Parameters
-        ----------
-        number
-            Frame number.
-        version
-            Bitstream of the server: NatNet 2 has fewer flags and no residual.
+        ``version``: bitstream of the server: NatNet 2 has fewer flags and no residual.
         """
         behaviour, size = self._behaviour, len(self._offsets)
         t = self._world.now() if t is None else t

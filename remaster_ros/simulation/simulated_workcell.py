@@ -51,38 +51,18 @@ def simulate_session(
 ) -> tuple[Session, SessionTruth]:
     """Visit the poses with a robot whose truth is drawn, and measure with noise.
 
-    Parameters
-    ----------
-    chain, urdf
-        The nominal robot and the text it was read from; k joints.
-    rng
-        Source of all randomness but the effects'.
-    poses, validation_poses
-        For each pose its joint solutions in the order visited, rad, (m, k).
-    sensors
-        By name; at every configuration each gives an observation of each of its markers, from one
-        frame.
-    markers
-        Nominal positions in the tool frame, m, (3,); the true ones lie ``marker_std_m`` away.
-    joint_offsets
-        The true zero-offsets, rad, (k,); where None drawn from N(0, ``joint_offset_std``²).
-    outlier_share
-        Share of the observations moved by ``outlier_m`` in a random direction.
-    warming
-        Of the arm, measured as well; None where no temperature is measured.
-    effects, effect_rng
-        What else is wrong with the arm or the sensors, and the source of its randomness.
-
-    Returns
-    -------
-    session, truth
-        The session has no more in it than a recorded one.
-
-    Raises
-    ------
-    InputError
-        Solutions of the wrong shape, no poses, a sensor that follows no known marker, or an
-        effect that this arm cannot show.
+    ``chain, urdf``: the nominal robot and the text it was read from; k joints; ``poses,
+    validation_poses``: for each pose its joint solutions in the order visited, rad, (m, k);
+    ``sensors``: by name; at every configuration each gives an observation of each of its markers,
+    from one frame; ``markers``: nominal positions in the tool frame, m, (3,); the true ones lie
+    ``marker_std_m`` away; ``joint_offsets``: the true zero-offsets, rad, (k,); where None drawn
+    from N(0, ``joint_offset_std``²); ``outlier_share``: share of the observations moved by
+    ``outlier_m`` in a random direction; ``warming``: of the arm, measured as well; None where no
+    temperature is measured; ``effects, effect_rng``: what else is wrong with the arm or the
+    sensors, and the source of its randomness.
+    Returns session, truth: The session has no more in it than a recorded one.
+    Raises InputError: solutions of the wrong shape, no poses, a sensor that follows no known
+    marker, or an effect that this arm cannot show.
     """
     for name, sensor in sensors.items():
         for marker in sensor.markers:

@@ -40,34 +40,22 @@ class Warming:
 
 @dataclass(frozen=True, eq=False)
 class SimulatedSensor:
-    """A sensor as it truly stands and errs.
+    """A sensor as it truly stands and errs."""
 
-    Attributes
-    ----------
-    marker
-        Name of the marker that it measures.
-    further
-        Further markers that it measures, with their numbers in the rigid body.
-    T_R_N
-        Its true frame in the robot base, (4, 4).
-    sigma_m, pose_sigma_m, frame_sigma_m
-        Error of every point, error that all points at one pose share, and error that the markers
-        of one frame share, m per axis. They hold for the offline simulation; a fake device has
-        the errors of its own data sheet.
-    acceptance_rad
-        Largest angle between the tool's z axis and the line to the sensor at which a fake device
-        sees the marker (a retroreflector takes about 30 degrees, a sphere more).
-    single_shot
-        Whether it measures its markers one after another, in frames of their own.
-    """
-
-    marker: str
-    T_R_N: FloatArray
+    marker: str  # Name of the marker that it measures
+    T_R_N: FloatArray  # Its true frame in the robot base, (4, 4)
+    # Error of every point, error that all points at one pose share, and error that the markers of
+    # one frame share, m per axis. They hold for the offline simulation; a fake device has the
+    # errors of its own data sheet.
     sigma_m: float = 0.1e-3
     pose_sigma_m: float = 0.2e-3
+    # Largest angle between the tool's z axis and the line to the sensor at which a fake device
+    # sees the marker (a retroreflector takes about 30 degrees, a sphere more)
     acceptance_rad: float = np.pi
+    # Further markers that it measures, with their numbers in the rigid body
     further: Mapping[str, int] = field(default_factory=dict)
     frame_sigma_m: float = 0.0
+    # Whether it measures its markers one after another, in frames of their own
     single_shot: bool = False
 
     @property
@@ -82,50 +70,25 @@ class SimulatedSensor:
 
 @dataclass(frozen=True, eq=False)
 class SessionTruth:
-    """What a session was made from: everything that an estimate of it is to find.
+    """What a session was made from: everything that an estimate of it is to find."""
 
-    Attributes
-    ----------
-    joint_offsets
-        True joint angle minus reported one, rad, (k,).
-    markers
-        True positions in the tool frame, m, name -> (3,).
-    sensors
-        By name.
-    warming
-        How the arm, and the air around it, warms up.
-    effects
-        What else is wrong with the arm or the sensors.
-    effect_sizes_m
-        What each effect leaves after offsets, registration and marker are fitted: RMS of the 3-D
-        error over all rows.
-    outliers
-        ``observation`` of every gross error.
-    """
-
-    joint_offsets: FloatArray
-    markers: Mapping[str, FloatArray]
+    joint_offsets: FloatArray  # True joint angle minus reported one, rad, (k,)
+    markers: Mapping[str, FloatArray]  # True positions in the tool frame, m, name -> (3,)
     sensors: Mapping[str, SimulatedSensor]
-    warming: Warming = Warming()
-    effects: tuple[HiddenEffect, ...] = ()
+    warming: Warming = Warming()  # How the arm, and the air around it, warms up
+    effects: tuple[HiddenEffect, ...] = ()  # What else is wrong with the arm or the sensors
+    # What each effect leaves after offsets, registration and marker are fitted: RMS of the 3-D
+    # error over all rows
     effect_sizes_m: tuple[float, ...] = ()
-    outliers: tuple[int, ...] = ()
+    outliers: tuple[int, ...] = ()  # ``observation`` of every gross error
 
     def without_noise(
         self, chain: SerialChain, sensor: str, q: FloatArray, marker: str = ''
     ) -> FloatArray:
         """Where a sensor measures a marker without noise and effects, m, (..., 3).
 
-        Parameters
-        ----------
-        chain
-            The nominal arm.
-        sensor
-            Name of the sensor, in whose frame N the positions are.
-        q
-            Reported joint angles, rad, (..., k).
-        marker
-            One of its markers; '' for the first.
+        ``sensor``: name of the sensor, in whose frame N the positions are; ``q``: reported joint
+        angles, rad, (..., k); ``marker``: one of its markers; '' for the first.
         """
         placed = self.sensors[sensor]
         points_R = chain.positions(q, self.markers[marker or placed.marker], self.joint_offsets)

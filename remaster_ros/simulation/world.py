@@ -42,32 +42,17 @@ MOTION_FILE = 'motion.jsonl'
 
 @dataclass(frozen=True, eq=False)
 class WorldContent:
-    """What the file of a World holds.
+    """What the file of a World holds."""
 
-    Attributes
-    ----------
-    truth
-        The arm, the markers and the sensors as they are.
-    seed
-        Of everything drawn.
-    rate
-        World time over wall time.
-    urdf, base_link, tip_link
-        The nominal arm.
-    start_q
-        Reported joint positions at the beginning, rad, (k,).
-    link_radius_m
-        Of the links that can stand between sensor and marker.
-    """
-
-    truth: SessionTruth
-    seed: int
-    rate: float
+    truth: SessionTruth  # The arm, the markers and the sensors as they are
+    seed: int  # Of everything drawn
+    rate: float  # World time over wall time
+    # The nominal arm
     urdf: str
     base_link: str | None
     tip_link: str | None
-    start_q: FloatArray
-    link_radius_m: float
+    start_q: FloatArray  # Reported joint positions at the beginning, rad, (k,)
+    link_radius_m: float  # Of the links that can stand between sensor and marker
 
 
 class World:
@@ -108,10 +93,7 @@ class World:
     def open(cls, folder: Path) -> World:
         """Open the World that another process wrote.
 
-        Raises
-        ------
-        InputError
-            If there is none.
+        Raises InputError: if there is none.
         """
         try:
             text = (folder / WORLD_FILE).read_text()

@@ -131,12 +131,7 @@ _VERSION, _LINE, _SLOT = struct.Struct('=Q'), struct.Struct('=dddd'), struct.Str
 class WorldClock:
     """See the module's text.
 
-    Parameters
-    ----------
-    folder
-        Of the World; `create` has written the file.
-    rate
-        World time over wall time.
+    ``folder``: of the World; `create` has written the file; ``rate``: world time over wall time.
     """
 
     def __init__(self, folder: Path, rate: float) -> None:

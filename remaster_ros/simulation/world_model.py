@@ -23,24 +23,14 @@ from remaster_ros.types import FloatArray
 
 @dataclass(frozen=True, eq=False)
 class ArmState:
-    """The arm at n configurations, everything in the base frame R.
+    """The arm at n configurations, everything in the base frame R."""
 
-    Attributes
-    ----------
-    origin
-        Origin of every joint, m, (n, k, 3).
-    before, after
-        Rotation of each joint's frame before and after its own turn, (n, k, 3, 3).
-    axis
-        Unit axis of each joint, (n, k, 3).
-    tool_origin, tool
-        Of the tool frame, m, (n, 3) and (n, 3, 3).
-    """
-
-    origin: FloatArray
+    origin: FloatArray  # Origin of every joint, m, (n, k, 3)
+    # Rotation of each joint's frame before and after its own turn, (n, k, 3, 3)
     before: FloatArray
     after: FloatArray
-    axis: FloatArray
+    axis: FloatArray  # Unit axis of each joint, (n, k, 3)
+    # Of the tool frame, m, (n, 3) and (n, 3, 3)
     tool_origin: FloatArray
     tool: FloatArray
 
@@ -68,24 +58,12 @@ class Arm(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Round:
-    """The configurations visited, in that order.
+    """The configurations visited, in that order."""
 
-    Attributes
-    ----------
-    q
-        As the robot reported them, rad, (m, k).
-    home
-        Where it came from first, rad, (k,).
-    time_s
-        Since the beginning, (m,).
-    warming_k
-        Temperature of the arm above that of the beginning, K, (m,).
-    """
-
-    q: FloatArray
-    home: FloatArray
-    time_s: FloatArray
-    warming_k: FloatArray
+    q: FloatArray  # As the robot reported them, rad, (m, k)
+    home: FloatArray  # Where it came from first, rad, (k,)
+    time_s: FloatArray  # Since the beginning, (m,)
+    warming_k: FloatArray  # Temperature of the arm above that of the beginning, K, (m,)
 
     @cached_property
     def came_from(self) -> FloatArray:
@@ -169,27 +147,14 @@ def measured(
 
 @dataclass(eq=False)
 class WorldModel:
-    """The true arm and sensors on one round.
+    """The true arm and sensors on one round."""
 
-    Attributes
-    ----------
-    arm
-        As drawn.
-    visited
-        Where it goes.
-    sensors
-        By name.
-    markers
-        True positions in the tool frame where nothing is hidden, m, name -> (3,).
-    joint_offsets
-        True joint angle minus reported one, rad, (k,).
-    """
-
-    arm: Arm
+    arm: Arm  # As drawn
     visited: Round
     sensors: Mapping[str, SimulatedSensor]
+    # True positions in the tool frame where nothing is hidden, m, name -> (3,)
     markers: Mapping[str, FloatArray]
-    joint_offsets: FloatArray
+    joint_offsets: FloatArray  # True joint angle minus reported one, rad, (k,)
 
     @cached_property
     def circumstances(self) -> Circumstances:

@@ -60,11 +60,8 @@ _HANG_UP_S = 1.0
 class LaserTrackerError(DeviceError):
     """A laser tracker failed; the text names it, the command, the code in words, a remedy.
 
-    Attributes
-    ----------
-    status
-        Result status of the instrument (a `Status` or a number unknown to us); None where it
-        did not answer or the connection is at fault.
+    Attributes: ``status``: result status of the instrument (a `Status` or a number unknown to us);
+    None where it did not answer or the connection is at fault.
     """
 
     def __init__(self, text: str, status: int | None = None) -> None:
@@ -88,20 +85,11 @@ class TrackerLink:
     The protocol has no sequence numbers: a reply that comes too late cannot be distinguished
     from that to the next command. The connection is therefore closed where a reply is missing.
 
-    Parameters
-    ----------
-    host, port
-        Address of the instrument.
-    on_change
-        Called by the reading thread with the number of each status change.
-    now
-        Clock of the time-outs, s; may run faster than the wall clock.
-
-    Attributes
-    ----------
-    counts
-        How often each thing happened: ``connections``, ``bad_packets``, ``unknown_packets``,
-        ``unexpected_packets`` (no command was waiting for them).
+    ``host, port``: address of the instrument; ``on_change``: called by the reading thread with the
+    number of each status change; ``now``: clock of the time-outs, s; may run faster than the wall
+    clock.
+    Attributes: ``counts``: how often each thing happened: ``connections``, ``bad_packets``,
+    ``unknown_packets``, ``unexpected_packets`` (no command was waiting for them).
     """
 
     def __init__(
@@ -140,10 +128,7 @@ class TrackerLink:
     def open(self, timeout_s: float) -> None:
         """Connect, within `timeout_s` of wall time; nothing happens where already connected.
 
-        Raises
-        ------
-        LaserTrackerError
-            If the instrument cannot be reached.
+        Raises LaserTrackerError: if the instrument cannot be reached.
         """
         if self.connected:
             return
@@ -192,17 +177,10 @@ class TrackerLink:
     ) -> tuple[Value, ...]:
         """Send a command and return the values of its reply.
 
-        Parameters
-        ----------
-        timeout_s
-            On the injected clock, s, but never less than 2 s of wall time.
-        what
-            The command in words, for messages.
-
-        Raises
-        ------
-        LaserTrackerError
-            If the instrument refuses, is busy, does not answer or is not connected.
+        ``timeout_s``: on the injected clock, s, but never less than 2 s of wall time; ``what``:
+        the command in words, for messages.
+        Raises LaserTrackerError: if the instrument refuses, is busy, does not answer or is not
+        connected.
         """
         what = what or command.name.replace('_', ' ').lower()
         with self._exchange_of(command, what, timeout_s) as exchange:
@@ -211,10 +189,7 @@ class TrackerLink:
     def measure(self, timeout_s: float) -> tuple[Measurement, float]:
         """Measure once; return the result and the time in the middle of the integration, s.
 
-        Raises
-        ------
-        LaserTrackerError
-            As `ask` does.
+        Raises LaserTrackerError: as `ask` does.
         """
         with self._exchange_of(Command.START_MEASUREMENT, 'measurement', timeout_s) as exchange:
             self._reply(exchange, ())
@@ -384,15 +359,9 @@ class LaserTrackerClient:
     connection. One command is under way at a time: a second one, from another thread, is refused
     as busy. After a lost connection `connect` and `initialise` begin anew.
 
-    Parameters
-    ----------
-    host, port
-        Address of the instrument; emScon listens on 700.
-    settings
-        See `LaserTrackerSettings`.
-    now, sleep
-        Clock and waiting, s; give simulated ones where time runs faster. A time-out also needs two
-        seconds of wall time (or its own length, if shorter) to pass.
+    ``host, port``: address of the instrument; emScon listens on 700; ``now, sleep``: clock and
+    waiting, s; give simulated ones where time runs faster. A time-out also needs two seconds of
+    wall time (or its own length, if shorter) to pass.
     """
 
     def __init__(
@@ -513,11 +482,8 @@ class LaserTrackerClient:
     def find_reflector(self, distance_m: float | None = None) -> None:
         """Search a spiral about the place the tracker points to, and lock the reflector.
 
-        Parameters
-        ----------
-        distance_m
-            Approximate distance of the reflector; None takes that of the last reading or position,
-            or 3 m.
+        ``distance_m``: approximate distance of the reflector; None takes that of the last reading
+        or position, or 3 m.
         """
         distance = (self._distance_m or 3.0) if distance_m is None else distance_m
         if not 0 < distance < np.inf:
@@ -539,23 +505,11 @@ class LaserTrackerClient:
         one, searches about the place the tracker points to. The lock may hold any reflector within
         the search radius: compare the reading with what is expected.
 
-        Parameters
-        ----------
-        expected_position
-            Where the reflector should be, in the tracker's frame, m, (3,).
-        attempts
-            How many searches may be made.
-
-        Returns
-        -------
-        int
-            Searches made; 0 where the reflector was locked.
-
-        Raises
-        ------
-        LaserTrackerError
-            If the last attempt found nothing either (its status is that of the search), or the
-            connection is lost (at once; no status).
+        ``expected_position``: where the reflector should be, in the tracker's frame, m, (3,);
+        ``attempts``: how many searches may be made.
+        Returns searches made; 0 where the reflector was locked.
+        Raises LaserTrackerError: if the last attempt found nothing either (its status is that of
+        the search), or the connection is lost (at once; no status).
         """
         expected = None if expected_position is None else self._point(expected_position)
         failure: LaserTrackerError | None = None
@@ -575,16 +529,10 @@ class LaserTrackerClient:
     def measure(self, timeout_s: float | None = None) -> TrackerReading:
         """Measure the locked reflector once.
 
-        Parameters
-        ----------
-        timeout_s
-            None: the integration time and two reply time-outs.
-
-        Raises
-        ------
-        LaserTrackerError
-            `Status.MEASUREMENT_STATUS_NOT_READY` without a lock, `Status.SENSOR_NOT_STABLE` for a
-            moving target, `Status.SERVER_BUSY`; or the result is not usable.
+        ``timeout_s``: none: the integration time and two reply time-outs.
+        Raises LaserTrackerError: `Status.MEASUREMENT_STATUS_NOT_READY` without a lock,
+        `Status.SENSOR_NOT_STABLE` for a moving target, `Status.SERVER_BUSY`; or the result is not
+        usable.
         """
         if timeout_s is None:
             timeout_s = self.settings.integration_s + 2 * self.settings.reply_timeout_s
@@ -676,10 +624,7 @@ class LaserTrackerClient:
     def _check_settings(self) -> None:
         """Read back what a reading depends on.
 
-        Raises
-        ------
-        LaserTrackerError
-            If it is not as we set it.
+        Raises LaserTrackerError: if it is not as we set it.
         """
         # Set first: a change that is reported during the check makes it count for nothing.
         self._settings_checked = True

@@ -66,21 +66,9 @@ class LaserTrackerSettings:
     """What the client sets on the instrument, and how long it waits.
 
     Those made with `parameter` are parameters of the node as well.
-
-    Attributes
-    ----------
-    reflector_id
-        The instrument's number of the reflector mounted; None leaves the one it has set.
-    environment
-        None leaves the instrument's own weather station, or what is set there.
-    connect_timeout_s
-        Of the TCP connection, in wall time.
-    reply_timeout_s
-        Of a command that only sets or reads something.
-    initialise_timeout_s
-        Of the initialisation, waiting for the warm-up included.
     """
 
+    # The instrument's number of the reflector mounted; None leaves the one it has set
     reflector_id: int | None = None
     search_radius_m: float = parameter(
         0.05,
@@ -93,18 +81,16 @@ class LaserTrackerSettings:
     integration_s: float = parameter(
         1.0, 'averaging time of one measurement', unit='s', low=0.05, high=60.0
     )
+    # None leaves the instrument's own weather station, or what is set there
     environment: Environment | None = None
-    connect_timeout_s: float = 5.0
-    reply_timeout_s: float = 5.0
-    initialise_timeout_s: float = 300.0
+    connect_timeout_s: float = 5.0  # Of the TCP connection, in wall time
+    reply_timeout_s: float = 5.0  # Of a command that only sets or reads something
+    initialise_timeout_s: float = 300.0  # Of the initialisation, waiting for the warm-up included
 
     def __post_init__(self) -> None:
         """Refuse what no instrument can do.
 
-        Raises
-        ------
-        InputError
-            Naming the setting.
+        Raises InputError: naming the setting.
         """
         check_all('laser tracker', self)
         for name, value in vars(self).items():
@@ -116,14 +102,9 @@ class LaserTrackerSettings:
 class TrackerReading(MarkerReading):
     """One ADM measurement.
 
-    Attributes
-    ----------
-    stamp_s
-        Middle of the integration on the injected clock, s.
-    std
-        The instrument's own standard deviation per axis, m, (3,).
+    Attributes: ``stamp_s``: middle of the integration on the injected clock, s.
     """
 
-    std: FloatArray
+    std: FloatArray  # The instrument's own standard deviation per axis, m, (3,)
     pressure_hpa: float
     humidity_percent: float

@@ -58,19 +58,11 @@ _FRAME_ID = MessageId.FRAMEOFDATA.to_bytes(2, 'little')
 class NatNetClient(MarkerFollower):
     """Follows one marker of an OptiTrack server, NatNet 2.6 to 4.3, multicast or unicast.
 
-    Parameters
-    ----------
-    settings
-        How to reach the server, and which marker to follow.
-    on_sample
-        Called in the client's thread with every reading. What it raises is logged.
-    clock
-        Gives the time at which a datagram arrived, s.
-
-    Examples
-    --------
-    >>> client = NatNetClient(NatNetSettings(server='192.168.1.10'), print)  # doctest: +SKIP
-    >>> client.start(wait_s=5.0)  # doctest: +SKIP
+    ``settings``: how to reach the server, and which marker to follow; ``on_sample``: called in the
+    client's thread with every reading. What it raises is logged; ``clock``: gives the time at
+    which a datagram arrived, s; ``Examples``: ; ``--------``: ; ``>>> client =
+    NatNetClient(NatNetSettings(server='192.168.1.10'), print)  # doctest: +SKIP``: ; ``>>>
+    client.start(wait_s=5.0)  # doctest: +SKIP``: .
     """
 
     def __init__(

@@ -71,17 +71,9 @@ class SourceLock:
 
     Times are of one monotonic clock, s.
 
-    Parameters
-    ----------
-    silence_s
-        A source that sent no whole frame for longer counts as silent.
-
-    Attributes
-    ----------
-    source
-        The source with the lock; None while there is none.
-    taken
-        How often the lock was given to another source than before.
+    ``silence_s``: A source that sent no whole frame for longer counts as silent.
+    Attributes: ``source``: the source with the lock; None while there is none; ``taken``: how
+    often the lock was given to another source than before.
     """
 
     def __init__(self, silence_s: float) -> None:
@@ -233,28 +225,16 @@ class Dropped(StrEnum):
 
 @dataclass(frozen=True)
 class MarkerChoice:
-    """Which labelled marker is the calibration marker.
+    """Which labelled marker is the calibration marker."""
 
-    Attributes
-    ----------
-    rigid_body
-        Name of the rigid body in Motive; '' for the only one.
-    member
-        Number of the marker within that body, from 1.
-    marker_id
-        Id on the wire, ``asset id << 16 | member``; overrides the two above.
-    lone_marker
-        A single sphere that belongs to no rigid body: take the only marker in view, and nothing
-        while there are two. Overrides the three above.
-    max_speed_m_s
-        A reading that implies a faster move is dropped.
-    """
-
-    rigid_body: str = ''
-    member: int = 1
+    rigid_body: str = ''  # Name of the rigid body in Motive; '' for the only one
+    member: int = 1  # Number of the marker within that body, from 1
+    # Id on the wire, ``asset id << 16 | member``; overrides the two above
     marker_id: int | None = None
+    # A single sphere that belongs to no rigid body: take the only marker in view, and nothing
+    # while there are two. Overrides the three above.
     lone_marker: bool = False
-    max_speed_m_s: float = 5.0
+    max_speed_m_s: float = 5.0  # A reading that implies a faster move is dropped
 
     def __post_init__(self) -> None:
         """Refuse values that can never match."""
@@ -266,84 +246,43 @@ class MarkerChoice:
 
 @dataclass(frozen=True, eq=False)
 class MarkerSample:
-    """A measured position of the calibration marker.
-
-    Attributes
-    ----------
-    frame_number
-        Number of the frame.
-    timestamp_s
-        Time of the frame on the server, s since the stream started.
-    mid_exposure_s
-        Time of exposure by the server's fine clock, s; another zero than `timestamp_s`. None
-        where the cameras have no such clock (USB cameras, NatNet before 3.0).
-    age_s
-        Time from exposure (or, without such a clock, from the data's arrival at the server) to
-        transmission, s; before 3.0 the server's own estimate of its latency.
-    position
-        In the sensor's frame N, m, (3,).
-    residual_m
-        How well the cameras' rays meet, m per ray; NaN before NatNet 3.
-    received_s
-        When the datagram arrived here, by the clock given to the client, s.
-    marker
-        Name of a further marker; '' for the calibration marker itself.
-    """
+    """A measured position of the calibration marker."""
 
     frame_number: int
-    timestamp_s: float
+    timestamp_s: float  # Time of the frame on the server, s since the stream started
+    # Time of exposure by the server's fine clock, s; another zero than `timestamp_s`. None where
+    # the cameras have no such clock (USB cameras, NatNet before 3.0).
     mid_exposure_s: float | None
+    # Time from exposure (or, without such a clock, from the data's arrival at the server) to
+    # transmission, s; before 3.0 the server's own estimate of its latency
     age_s: float
-    position: FloatArray
-    residual_m: float
-    received_s: float
-    marker: str = ''
+    position: FloatArray  # In the sensor's frame N, m, (3,)
+    residual_m: float  # How well the cameras' rays meet, m per ray; NaN before NatNet 3
+    received_s: float  # When the datagram arrived here, by the clock given to the client, s
+    marker: str = ''  # Name of a further marker; '' for the calibration marker itself
 
 
 @dataclass(kw_only=True)
 class GateCounts:
-    """What a gate has let through and dropped.
+    """What a gate has let through and dropped."""
 
-    Attributes
-    ----------
-    dropped
-        Count by reason; every reason is a key from the start.
-    frames, accepted
-        Frames seen, readings let through.
-    lost
-        Frame numbers that never came.
-    restarts
-        How often the frame numbers began again.
-    last_reason
-        Why the latest frame was dropped; None if it was accepted.
-    marker_id
-        Id on the wire; None while unknown, and for a lone marker.
-    problem
-        Why the marker cannot be identified, with the remedy; '' if it can.
-    labels
-        The first labels of the last frame.
-    """
-
+    # Count by reason; every reason is a key from the start
     dropped: dict[Dropped, int] = field(default_factory=lambda: dict.fromkeys(Dropped, 0))
+    # Frames seen, readings let through
     frames: int = 0
     accepted: int = 0
-    lost: int = 0
-    restarts: int = 0
-    last_reason: Dropped | None = None
-    marker_id: int | None = None
-    problem: str = ''
-    labels: tuple[int, ...] = ()
+    lost: int = 0  # Frame numbers that never came
+    restarts: int = 0  # How often the frame numbers began again
+    last_reason: Dropped | None = None  # Why the latest frame was dropped; None if it was accepted
+    marker_id: int | None = None  # Id on the wire; None while unknown, and for a lone marker
+    problem: str = ''  # Why the marker cannot be identified, with the remedy; '' if it can
+    labels: tuple[int, ...] = ()  # The first labels of the last frame
 
 
 class MarkerGate:
     """Lets through the readings of one marker and counts everything else with its reason.
 
-    Parameters
-    ----------
-    choice
-        Which marker.
-    counts
-        Where to count.
+    ``choice``: which marker; ``counts``: where to count.
     """
 
     def __init__(self, choice: MarkerChoice, counts: GateCounts) -> None:
@@ -370,10 +309,7 @@ class MarkerGate:
     def name_assets(self, assets: Mapping[str, int]) -> None:
         """Find the marker's id among the rigid bodies that the server streams.
 
-        Parameters
-        ----------
-        assets
-            Asset id by name.
+        ``assets``: asset id by name.
         """
         self.forget_assets()
         if self.resolved:
@@ -414,14 +350,8 @@ class MarkerGate:
     def admit(self, frame: Frame, received_s: float, ticks_per_s: int) -> MarkerSample | None:
         """Return the reading in a frame, or None and count why.
 
-        Parameters
-        ----------
-        frame
-            As decoded.
-        received_s
-            When it arrived, s.
-        ticks_per_s
-            Frequency of the frame's stamps; 0 before NatNet 3.
+        ``frame``: as decoded; ``received_s``: when it arrived, s; ``ticks_per_s``: frequency of
+        the frame's stamps; 0 before NatNet 3.
         """
         self.counts.frames += 1
         found = self._order(frame) or self._find(frame)

@@ -54,51 +54,25 @@ Fault = Literal[
 
 @dataclass(kw_only=True)
 class StreamStatus(GateCounts):
-    """The state of a client; its gate counts in it.
+    """The state of a client; its gate counts in it."""
 
-    Attributes
-    ----------
-    server_ip, interface
-        Resolved addresses of the server and of this machine's card towards it.
-    server
-        Its answer to CONNECT; None while there is none.
-    version
-        Bitstream in use; None while unknown.
-    port_closed
-        The computer is there, but nothing listens on the command port.
-    send_error
-        Why the last request could not be sent; ''.
-    foreign
-        Addresses that sent something and are not the server (the first few).
-    last_malformed
-        What was wrong with the last datagram that could not be decoded; ''.
-    silent_s
-        Time since the last whole frame, s; None if there was none.
-    starved_s
-        Time since the last reading, s; None if there was none.
-    source
-        Address and port whose frames are believed; '' while there is none.
-    sources_taken
-        How often it was decided whose frames are believed.
-    rivals
-        Other ports of the server's address that sent lately, beside the believed one; refused.
-    contestants
-        Sources of which none is believed, as they send at the same time.
-    """
-
+    # Resolved addresses of the server and of this machine's card towards it
     server_ip: str = ''
     interface: str = ''
-    server: ServerInfo | None = None
-    version: Version | None = None
-    port_closed: bool = False
-    send_error: str = ''
+    server: ServerInfo | None = None  # Its answer to CONNECT; None while there is none
+    version: Version | None = None  # Bitstream in use; None while unknown
+    port_closed: bool = False  # The computer is there, but nothing listens on the command port
+    send_error: str = ''  # Why the last request could not be sent; ''
+    # Addresses that sent something and are not the server (the first few)
     foreign: tuple[str, ...] = ()
-    last_malformed: str = ''
-    silent_s: float | None = None
-    starved_s: float | None = None
-    source: str = ''
-    sources_taken: int = 0
+    last_malformed: str = ''  # What was wrong with the last datagram that could not be decoded; ''
+    silent_s: float | None = None  # Time since the last whole frame, s; None if there was none
+    starved_s: float | None = None  # Time since the last reading, s; None if there was none
+    source: str = ''  # Address and port whose frames are believed; '' while there is none
+    sources_taken: int = 0  # How often it was decided whose frames are believed
+    # Other ports of the server's address that sent lately, beside the believed one; refused
     rivals: tuple[str, ...] = ()
+    # Sources of which none is believed, as they send at the same time
     contestants: tuple[str, ...] = ()
 
 
@@ -291,15 +265,9 @@ class MarkerFollower(ABC):
     Each marker is judged by itself: one that is hidden, filled in by the model or jumps is NaN
     in a frame of which others are seen. Where none is, there is no reading at all.
 
-    Parameters
-    ----------
-    settings
-        How to reach the server, and which markers to follow.
-    on_sample
-        Called in the thread with every reading, those of a frame one after the other. What it
-        raises is logged.
-    clock
-        Gives the time at which a datagram arrived, s.
+    ``settings``: how to reach the server, and which markers to follow; ``on_sample``: called in
+    the thread with every reading, those of a frame one after the other. What it raises is logged;
+    ``clock``: gives the time at which a datagram arrived, s.
     """
 
     def __init__(
@@ -330,17 +298,10 @@ class MarkerFollower(ABC):
     def start(self, wait_s: float = 0.0) -> None:
         """Open the sockets and begin; the client keeps trying until `stop`.
 
-        Parameters
-        ----------
-        wait_s
-            How long to wait for the first frame and the marker's identity, s (wall clock); 0
-            returns at once.
-
-        Raises
-        ------
-        DeviceError
-            If a socket cannot be opened, or nothing useful came within `wait_s`; the message
-            is that of `diagnosis`. The client is stopped then.
+        ``wait_s``: how long to wait for the first frame and the marker's identity, s (wall clock);
+        0 returns at once.
+        Raises DeviceError: if a socket cannot be opened, or nothing useful came within `wait_s`;
+        the message is that of `diagnosis`. The client is stopped then.
         """
         settings = self._settings
         self._status.server_ip = resolve(settings.server)

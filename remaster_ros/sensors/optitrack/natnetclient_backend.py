@@ -42,17 +42,10 @@ FAILURES_IN_A_ROW = 3
 class NatNetClientBackend(MarkerFollower):
     """Follows one marker through PyPI ``natnetclient``; same interface as `NatNetClient`.
 
-    Parameters
-    ----------
-    settings
-        `transport` must be ``unicast``; frames are expected on `data_port` of this computer.
-    on_sample, clock
-        As for `NatNetClient`.
-
-    Raises
-    ------
-    InputError
-        If ``natnetclient`` is not installed, or the settings need what it cannot do.
+    ``settings``: `transport` must be ``unicast``; frames are expected on `data_port` of this
+    computer; ``on_sample, clock``: as for `NatNetClient`.
+    Raises InputError: if ``natnetclient`` is not installed, or the settings need what it cannot
+    do.
     """
 
     def __init__(

@@ -26,10 +26,7 @@ RECEIVE_BUFFER_BYTES = 1 << 22
 def resolve(host: str) -> str:
     """Return the IPv4 address of a host.
 
-    Raises
-    ------
-    DeviceError
-        If the name is unknown.
+    Raises DeviceError: if the name is unknown.
     """
     try:
         return socket.gethostbyname(host)
@@ -43,10 +40,7 @@ def resolve(host: str) -> str:
 def interface_towards(server_ip: str, port: int) -> str:
     """Return the address of this machine's interface from which packets reach the server.
 
-    Raises
-    ------
-    DeviceError
-        If there is no route.
+    Raises DeviceError: if there is no route.
     """
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
@@ -107,10 +101,7 @@ def open_multicast_socket(group: str, port: int, interface: str) -> socket.socke
     Linux delivers a group's packets to sockets bound to the group's address (or to any), and
     none to a socket bound to the interface's own address.
 
-    Raises
-    ------
-    DeviceError
-        If the port is in use, or the interface cannot join the group.
+    Raises DeviceError: if the port is in use, or the interface cannot join the group.
     """
     opened = open_socket(
         group, port, purpose='NatNet data', remedy='set data_port as in Motive', shared=True
@@ -152,19 +143,7 @@ class NatNetSettings:
     Group and data port matter for multicast only (the data port for ``client: natnetclient``
     too). A `bitstream` can be requested from servers of 4.0 or newer, in unicast.
 
-    Attributes
-    ----------
-    marker
-        Which marker to follow.
-    further_markers
-        Further markers of the same rigid body to follow: their numbers in it by name.
-    silence_s
-        Without a frame for this long the stream counts as stopped, s (wall clock).
-
-    Raises
-    ------
-    InputError
-        Naming the setting that cannot work.
+    Raises InputError: naming the setting that cannot work.
     """
 
     server: str = parameter('127.0.0.1', 'the computer that runs Motive')
@@ -180,8 +159,10 @@ class NatNetSettings:
     )
     data_port: int = parameter(natnet.DEFAULT_DATA_PORT, 'as set in Motive', low=1, high=65535)
     bitstream: str = parameter('', "NatNet version to ask for; empty takes the server's own")
-    marker: MarkerChoice = field(default_factory=MarkerChoice)
+    marker: MarkerChoice = field(default_factory=MarkerChoice)  # Which marker to follow
+    # Further markers of the same rigid body to follow: their numbers in it by name
     further_markers: Mapping[str, int] = field(default_factory=dict)
+    # Without a frame for this long the stream counts as stopped, s (wall clock)
     silence_s: float = 1.0
 
     def __post_init__(self) -> None:
@@ -203,10 +184,7 @@ class NatNetSettings:
     def choices(self) -> dict[str, MarkerChoice]:
         """Return which markers to follow: that of `marker` as '', and the further ones by name.
 
-        Raises
-        ------
-        InputError
-            Two of them are the same marker, or a lone marker has none beside it.
+        Raises InputError: two of them are the same marker, or a lone marker has none beside it.
         """
         first = self.marker
         found = {'': first}

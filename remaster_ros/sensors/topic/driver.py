@@ -24,24 +24,14 @@ from remaster_ros.types import FloatArray, MarkerReading
 
 
 class Sighting(NamedTuple):
-    """What a message holds of the marker.
+    """What a message holds of the marker."""
 
-    Attributes
-    ----------
-    stamp_s
-        Of its header, s; 0 where the node that sent it has set none.
-    frame
-        Of its header.
-    position
-        m, (3,); None where the message has the marker without a measured place, or not at all.
-    orientation
-        Unit quaternion x, y, z, w, (4,); None where the message has none, or one of another
-        length, as drivers send that do not measure it.
-    """
-
-    stamp_s: float
+    stamp_s: float  # Of its header, s; 0 where the node that sent it has set none
     frame: str
+    # m, (3,); None where the message has the marker without a measured place, or not at all
     position: FloatArray | None
+    # Unit quaternion x, y, z, w, (4,); None where the message has none, or one of another length,
+    # as drivers send that do not measure it
     orientation: FloatArray | None = None
 
 

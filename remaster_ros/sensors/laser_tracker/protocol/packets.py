@@ -319,21 +319,15 @@ class StatusChange:
 
 @dataclass(frozen=True)
 class Measurement:
-    """Result of one stationary measurement, in the units and coordinates set (156 bytes).
-
-    Attributes
-    ----------
-    values, std, pointing_error, a_priori_std
-        One number per coordinate each.
-    std_total, a_priori_std_total
-        Their root sums of squares.
-    """
+    """Result of one stationary measurement, in the units and coordinates set (156 bytes)."""
 
     status: int
     mode: int
     is_try: int
+    # One number per coordinate each
     values: Triple
     std: Triple
+    # Their root sums of squares
     std_total: float
     pointing_error: Triple
     a_priori_std: Triple

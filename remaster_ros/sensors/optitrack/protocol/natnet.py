@@ -59,10 +59,7 @@ def require_supported(version: Version) -> None:
 class Reader:
     """A cursor over the bytes of one datagram that refuses to run past the end.
 
-    Parameters
-    ----------
-    data
-        The datagram's payload.
+    ``data``: the datagram's payload.
     """
 
     __slots__ = ('_data', 'end', 'offset')
@@ -134,15 +131,9 @@ _COUNT_AND_SIZE = Struct('<2i')
 
 
 class Codec(ABC):
-    """Reads, writes and steps over one item.
+    """Reads, writes and steps over one item."""
 
-    Attributes
-    ----------
-    least
-        The fewest bytes that an item takes.
-    """
-
-    least: int
+    least: int  # The fewest bytes that an item takes
 
     @abstractmethod
     def read(self, reader: Reader) -> Any:
@@ -173,14 +164,8 @@ def _same(item: Any) -> Any:
 class Row(Codec):
     """Numbers of a fixed layout.
 
-    Parameters
-    ----------
-    layout
-        `struct` format, without the byte order.
-    build
-        Makes the items of rows of numbers.
-    flatten
-        Undoes it, for one item.
+    ``layout``: `struct` format, without the byte order; ``build``: makes the items of rows of
+    numbers; ``flatten``: undoes it, for one item.
     """
 
     def __init__(
@@ -249,14 +234,8 @@ QUATERNION = Row('4f')
 class Record(Codec):
     """Items of different kinds that follow one another.
 
-    Parameters
-    ----------
-    build
-        Makes the record of the items.
-    parts
-        Their codecs.
-    flatten
-        Undoes `build`; a named tuple is its own items.
+    ``build``: makes the record of the items; ``parts``: their codecs; ``flatten``: undoes `build`;
+    a named tuple is its own items.
     """
 
     def __init__(
@@ -392,27 +371,14 @@ BITSTREAM_CHANGED = 1 << 3
 
 
 class LabeledMarker(NamedTuple):
-    """One entry of the labelled list, which holds every marker, the strays too.
+    """One entry of the labelled list, which holds every marker, the strays too."""
 
-    Attributes
-    ----------
-    id
-        ``asset id << 16 | member`` (member from 1) for a marker of an asset; arbitrary otherwise.
-    position
-        m, (3,). Not measured where `params` has `OCCLUDED` or `MODEL_FILLED`.
-    size
-        Diameter, m.
-    params
-        The flags above; NatNet 2 has the first three only.
-    residual
-        Metres per ray; None before NatNet 3.
-    """
-
+    # ``asset id << 16 | member`` (member from 1) for a marker of an asset; arbitrary otherwise
     id: int
-    position: Vec3
-    size: float
-    params: int
-    residual: float | None = None
+    position: Vec3  # m, (3,). Not measured where `params` has `OCCLUDED` or `MODEL_FILLED`.
+    size: float  # Diameter, m
+    params: int  # The flags above; NatNet 2 has the first three only
+    residual: float | None = None  # Metres per ray; None before NatNet 3
 
 
 class BodyMarker(NamedTuple):
@@ -465,66 +431,41 @@ class AnalogDevice(NamedTuple):
 
 @dataclass(frozen=True)
 class Frame:
-    """One frame of data.
+    """One frame of data."""
 
-    Attributes
-    ----------
-    number
-        Frame number; starts again with the stream, loops in Edit mode.
-    timestamp
-        Seconds since Motive, or the recording, started.
-    other_markers
-        Unlabelled positions, m (deprecated by OptiTrack; also in `labeled_markers`).
-    mid_exposure, data_received, transmitted
-        Server clock ticks (3.0+); `mid_exposure` is 0 where the cameras have no such clock.
-    precision_seconds, precision_fraction
-        PTP time (4.1+), else 0.
-    software_latency
-        Seconds, before 3.0 only.
-    params
-        `RECORDING`, `MODEL_LIST_CHANGED`, `NOT_LIVE`, `BITSTREAM_CHANGED`.
-    """
-
-    number: int
-    timestamp: float
+    number: int  # Frame number; starts again with the stream, loops in Edit mode
+    timestamp: float  # Seconds since Motive, or the recording, started
     labeled_markers: tuple[LabeledMarker, ...] = ()
     rigid_bodies: tuple[RigidBody, ...] = ()
     marker_sets: tuple[MarkerSet, ...] = ()
+    # Unlabelled positions, m (deprecated by OptiTrack; also in `labeled_markers`)
     other_markers: tuple[Vec3, ...] = ()
     skeletons: tuple[Skeleton, ...] = ()
     assets: tuple[Asset, ...] = ()
     force_plates: tuple[AnalogDevice, ...] = ()
     devices: tuple[AnalogDevice, ...] = ()
-    software_latency: float = 0.0
+    software_latency: float = 0.0  # Seconds, before 3.0 only
     timecode: int = 0
     timecode_sub: int = 0
+    # Server clock ticks (3.0+); `mid_exposure` is 0 where the cameras have no such clock
     mid_exposure: int = 0
     data_received: int = 0
     transmitted: int = 0
+    # PTP time (4.1+), else 0
     precision_seconds: int = 0
     precision_fraction: int = 0
-    params: int = 0
+    params: int = 0  # `RECORDING`, `MODEL_LIST_CHANGED`, `NOT_LIVE`, `BITSTREAM_CHANGED`
 
 
 def decode_frame(payload: bytes, version: Version, *, markers_only: bool = False) -> Frame:
     """Decode the payload of a FRAMEOFDATA datagram, to its end tag.
 
-    Parameters
-    ----------
-    payload
-        The bytes behind the 4-byte header.
-    version
-        The server's bitstream version.
-    markers_only
-        Step over everything but the labelled markers and the times: every count is checked, but
-        what is stepped over is left out and its numbers are not looked at. Half the work.
-
-    Raises
-    ------
-    ProtocolError
-        If the version is unknown, the bytes end early or late, a count does not fit, or a number
-        that must be finite is not. Positions of occluded markers and untracked bodies claim
-        nothing and may be anything.
+    ``payload``: the bytes behind the 4-byte header; ``version``: the server's bitstream version;
+    ``markers_only``: step over everything but the labelled markers and the times: every count is
+    checked, but what is stepped over is left out and its numbers are not looked at. Half the work.
+    Raises ProtocolError: if the version is unknown, the bytes end early or late, a count does not
+    fit, or a number that must be finite is not. Positions of occluded markers and untracked bodies
+    claim nothing and may be anything.
     """
     require_supported(version)
     layout = _layout(min(version, NEWEST_VERSION))
@@ -549,12 +490,8 @@ def decode_frame(payload: bytes, version: Version, *, markers_only: bool = False
 def encode_frame(frame: Frame, version: Version) -> bytes:
     """Encode the payload of a FRAMEOFDATA message; what the version does not have is left out.
 
-    Raises
-    ------
-    ProtocolError
-        If the version is unknown.
-    ValueError, struct.error
-        If a value does not fit its field.
+    Raises ProtocolError: if the version is unknown; ValueError, struct.error: if a value does not
+    fit its field.
     """
     require_supported(version)
     layout = _layout(min(version, NEWEST_VERSION))
@@ -695,32 +632,18 @@ class MarkerSetDescription(NamedTuple):
 
 
 class RigidBodyDescription(NamedTuple):
-    """A rigid body.
-
-    Attributes
-    ----------
-    id
-        The id in the frames; its marker number m is the labelled marker ``id << 16 | m``.
-    parent_id
-        -1 for none.
-    offset, offset_rotation
-        Pose relative to the parent, m and x, y, z, w (the rotation is sent since 4.2).
-    marker_positions
-        In the body's own axes, m (since 3.0).
-    marker_labels
-        Required active label of each marker, 0 for passive ones (since 3.0).
-    marker_names
-        Since 4.0.
-    """
+    """A rigid body."""
 
     name: str
-    id: int
-    parent_id: int = -1
+    id: int  # The id in the frames; its marker number m is the labelled marker ``id << 16 | m``
+    parent_id: int = -1  # -1 for none
+    # Pose relative to the parent, m and x, y, z, w (the rotation is sent since 4.2)
     offset: Vec3 = (0.0, 0.0, 0.0)
     offset_rotation: Quaternion = _IDENTITY
-    marker_positions: tuple[Vec3, ...] = ()
+    marker_positions: tuple[Vec3, ...] = ()  # In the body's own axes, m (since 3.0)
+    # Required active label of each marker, 0 for passive ones (since 3.0)
     marker_labels: tuple[int, ...] = ()
-    marker_names: tuple[str, ...] = ()
+    marker_names: tuple[str, ...] = ()  # Since 4.0
 
 
 class SkeletonDescription(NamedTuple):
@@ -732,19 +655,11 @@ class SkeletonDescription(NamedTuple):
 
 
 class OtherDescription(NamedTuple):
-    """A force plate, device, camera or asset: only what names it is kept.
+    """A force plate, device, camera or asset: only what names it is kept."""
 
-    Attributes
-    ----------
-    kind
-        The wire's type number, `FORCE_PLATE` to `ASSET`, or one unknown here.
-    id
-        None for cameras, which have none, and for unknown kinds.
-    """
-
-    kind: int
+    kind: int  # The wire's type number, `FORCE_PLATE` to `ASSET`, or one unknown here
     name: str
-    id: int | None = None
+    id: int | None = None  # None for cameras, which have none, and for unknown kinds
 
 
 Description = MarkerSetDescription | RigidBodyDescription | SkeletonDescription | OtherDescription
@@ -778,10 +693,7 @@ def decode_model_definition(payload: bytes, version: Version) -> ModelDefinition
     Bytes behind the last description, and from 4.1 on behind each, are skipped: servers newer
     than this decoder put new fields there.
 
-    Raises
-    ------
-    ProtocolError
-        If the version is unknown, the bytes end early or a count does not fit.
+    Raises ProtocolError: if the version is unknown, the bytes end early or a count does not fit.
     """
     require_supported(version)
     reader = Reader(payload)
@@ -792,12 +704,8 @@ def decode_model_definition(payload: bytes, version: Version) -> ModelDefinition
 def encode_model_definition(definition: ModelDefinition, version: Version) -> bytes:
     """Encode the payload of a MODELDEF message.
 
-    Raises
-    ------
-    ProtocolError
-        If the version is unknown.
-    ValueError
-        If a name is too long, or a description is of a kind whose details are not kept.
+    Raises ProtocolError: if the version is unknown; ValueError: if a name is too long, or a
+    description is of a kind whose details are not kept.
     """
     require_supported(version)
     descriptions = [_write(description, version) for description in definition.descriptions]
@@ -924,15 +832,9 @@ class MessageId(IntEnum):
 
 @dataclass(frozen=True)
 class Connection:
-    """How a server of NatNet 3.0 or newer streams.
+    """How a server of NatNet 3.0 or newer streams."""
 
-    Attributes
-    ----------
-    clock_frequency
-        Ticks per second of the three stamps of a frame.
-    """
-
-    clock_frequency: int
+    clock_frequency: int  # Ticks per second of the three stamps of a frame
     data_port: int
     is_multicast: bool
     multicast_group: str
@@ -940,20 +842,12 @@ class Connection:
 
 @dataclass(frozen=True)
 class ServerInfo:
-    """The answer to CONNECT.
-
-    Attributes
-    ----------
-    natnet_version
-        The bitstream version that governs decoding.
-    connection
-        None before NatNet 3.0.
-    """
+    """The answer to CONNECT."""
 
     name: str
     app_version: tuple[int, int, int, int]
-    natnet_version: Version
-    connection: Connection | None = None
+    natnet_version: Version  # The bitstream version that governs decoding
+    connection: Connection | None = None  # None before NatNet 3.0
 
 
 @dataclass(frozen=True)
@@ -1005,33 +899,19 @@ Message = ServerInfo | Response | ModelDefinition | Frame | MessageString | Echo
 
 @dataclass(frozen=True)
 class ClientRequest:
-    """What a client sent.
+    """What a client sent."""
 
-    Attributes
-    ----------
-    id
-        A `MessageId`, or the number of one that is unknown here.
-    text
-        The command of a REQUEST.
-    wanted_version
-        The bitstream that a CONNECT requests; None for the server's own.
-    clock
-        The client's clock of an ECHOREQUEST.
-    """
-
-    id: int
-    text: str = ''
+    id: int  # A `MessageId`, or the number of one that is unknown here
+    text: str = ''  # The command of a REQUEST
+    # The bitstream that a CONNECT requests; None for the server's own
     wanted_version: Version | None = None
-    clock: int = 0
+    clock: int = 0  # The client's clock of an ECHOREQUEST
 
 
 def split_datagram(datagram: bytes) -> tuple[int, bytes]:
     """Return the message id and the payload; bytes behind the payload are ignored.
 
-    Raises
-    ------
-    ProtocolError
-        If the datagram is shorter than its header states.
+    Raises ProtocolError: if the datagram is shorter than its header states.
     """
     if len(datagram) < _HEADER.size:
         raise ProtocolError(f'a datagram of {len(datagram)} bytes has no header')
@@ -1046,10 +926,7 @@ def split_datagram(datagram: bytes) -> tuple[int, bytes]:
 def join_datagram(message_id: int, payload: bytes = b'') -> bytes:
     """Put the header in front of a payload.
 
-    Raises
-    ------
-    ValueError
-        If the payload is longer than a datagram can carry.
+    Raises ValueError: if the payload is longer than a datagram can carry.
     """
     if len(payload) > MAX_PAYLOAD_BYTES:
         raise ValueError(f'a payload of {len(payload)} bytes is over {MAX_PAYLOAD_BYTES}')
@@ -1061,20 +938,10 @@ def decode_message(
 ) -> Message:
     """Decode what a server sent.
 
-    Parameters
-    ----------
-    datagram
-        As received.
-    version
-        The server's bitstream version; None while it is unknown, when frames and model
-        definitions cannot be read.
-    markers_only
-        As for `decode_frame`.
-
-    Raises
-    ------
-    ProtocolError
-        For anything that is not a whole, valid message from a server.
+    ``datagram``: as received; ``version``: the server's bitstream version; None while it is
+    unknown, when frames and model definitions cannot be read; ``markers_only``: as for
+    `decode_frame`.
+    Raises ProtocolError: for anything that is not a whole, valid message from a server.
     """
     message_id, payload = split_datagram(datagram)
     match message_id:
@@ -1100,12 +967,8 @@ def decode_message(
 def encode_message(message: Message, version: Version) -> bytes:
     """Encode what a server sends, header included.
 
-    Raises
-    ------
-    ProtocolError
-        If a frame or model definition is to be encoded for an unknown version.
-    ValueError, struct.error
-        If a value does not fit its field.
+    Raises ProtocolError: if a frame or model definition is to be encoded for an unknown version;
+    ValueError, struct.error: if a value does not fit its field.
     """
     if isinstance(message, Frame):
         return join_datagram(MessageId.FRAMEOFDATA, encode_frame(message, version))
@@ -1126,10 +989,7 @@ def encode_message(message: Message, version: Version) -> bytes:
 def decode_request(datagram: bytes) -> ClientRequest:
     """Decode what a client sent; the length in its header is ignored, as clients get it wrong.
 
-    Raises
-    ------
-    ProtocolError
-        If there is no header, or an ECHOREQUEST without a clock.
+    Raises ProtocolError: if there is no header, or an ECHOREQUEST without a clock.
     """
     if len(datagram) < _HEADER.size:
         raise ProtocolError(f'a datagram of {len(datagram)} bytes has no header')
@@ -1146,13 +1006,8 @@ def decode_request(datagram: bytes) -> ClientRequest:
 def encode_connect_request(name: str, wanted_version: Version | None = None) -> bytes:
     """Encode CONNECT in its full form, which servers of every version accept.
 
-    Parameters
-    ----------
-    name
-        Of this program.
-    wanted_version
-        The bitstream to be streamed to this client (unicast, servers from 4.0); None for the
-        server's own.
+    ``name``: of this program; ``wanted_version``: the bitstream to be streamed to this client
+    (unicast, servers from 4.0); None for the server's own.
     """
     major, minor = wanted_version or (0, 0)
     sender = _SENDER.pack(name.encode()[:255], 1, 0, 0, 0, *NEWEST_VERSION, 0, 0)
@@ -1175,10 +1030,7 @@ def encode_echo_request(clock: int) -> bytes:
 def parse_version(text: str) -> Version:
     """Read ``4.1`` (or ``4.1.0.0``).
 
-    Raises
-    ------
-    ValueError
-        If it is not two or more whole numbers with dots between.
+    Raises ValueError: if it is not two or more whole numbers with dots between.
     """
     parts = text.split('.')
     if len(parts) < 2 or not all(part.isdecimal() and part.isascii() for part in parts):
