@@ -37,7 +37,7 @@ CORE = (
     'session',
     'simulation',
 )
-_PR_SET_NAME, _PR_SET_CHILD_SUBREAPER = 15, 36
+_PR_SET_PDEATHSIG, _PR_SET_NAME, _PR_SET_CHILD_SUBREAPER = 1, 15, 36
 _MOST_BYTES = 1 << 20
 _asking = threading.Lock()
 
@@ -116,6 +116,8 @@ def _serve(tests: socket.socket) -> list[str]:
         # Not before its parent has ended, whose death it may be told of.
         os.close(go)
         os.read(ready, 1)
+        # Tests that are killed leave no node behind.
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
         for number in (ready, born, bears):
             os.close(number)
         tests.close()
