@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from remaster_ros.version import __version__
@@ -100,8 +101,9 @@ def session_from(
     remaster_ros.errors.InputError: no_such.urdf: ...
     """
     from remaster_ros.importing import in_python
+    from remaster_ros.session.robot_description import read_arm
 
-    robot = in_python.robot_of(urdf, base_link, tip_link)
+    robot = read_arm(Path(urdf), base_link, tip_link)
     return in_python.of_arrays(joints, points, robot, seed)
 
 
@@ -151,13 +153,15 @@ def import_table(
     from remaster_ros.importing.assemble import SessionOptions
     from remaster_ros.importing.columns import Told
     from remaster_ros.importing.rows import TableOptions
+    from remaster_ros.session.robot_description import read_arm
 
+    paths = [Path(file) for file in files]
     added = (
         (name, (other.lstrip('+-'), other[:1] == '-')) for name, other in (couple or {}).items()
     )
     return in_python.of_files(
-        files,
-        in_python.robot_of(urdf, base_link, tip_link, files),
+        paths,
+        read_arm(Path(urdf), base_link, tip_link, tables=paths),
         TableOptions(told=Told(tuple(joints), tuple(points)), join=join),
         SessionOptions(
             couple=tuple((name, (other, -1 if minus else 1)) for name, (other, minus) in added),

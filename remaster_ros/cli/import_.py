@@ -24,14 +24,14 @@ from remaster_ros.importing.assemble import (
 )
 from remaster_ros.importing.bags import is_bag, read_bag
 from remaster_ros.importing.columns import Told
-from remaster_ros.importing.robots import read_robot
 from remaster_ros.importing.rows import RawRows, TableOptions, from_tool, read_rows
 from remaster_ros.importing.sense import Sense, check_sense
-from remaster_ros.importing.sessions import Mending, Stretch, arrangement_of, mended
+from remaster_ros.importing.sessions import Stretch, arrangement_of, mended
 from remaster_ros.importing.units import ANGLES, LENGTHS
 from remaster_ros.kinematics.pad_angles import pad_in_words
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.session.reader import HEADER, read_session, write_session
+from remaster_ros.session.robot_description import read_arm
 from remaster_ros.session.workcell import Workcell, read_cell
 from remaster_ros.types import Session
 
@@ -258,7 +258,7 @@ def run(args: argparse.Namespace) -> int:
         raise InputError('--xacro-argument is for a xacro file: give it with --urdf FILE')
     cell = None if args.cell is None else read_cell(args.cell)
     if cell is None:
-        urdf, chain = read_robot(
+        urdf, chain = read_arm(
             args.urdf,
             args.base_link,
             args.tip_link,
@@ -280,10 +280,14 @@ def run(args: argparse.Namespace) -> int:
         rng = np.random.default_rng(args.seed)
         session, how = assemble(rows, urdf, chain, options, rng, notes)
         # What is not of the columns is undone in the session that they make.
-        told = Mending(
-            shift=args.shift_points, exchange=args.exchange_markers, turn=args.turn_tool
+        arrangement = arrangement_of(
+            session,
+            chain.joint_names,
+            shift=args.shift_points,
+            exchange=args.exchange_markers,
+            turn=args.turn_tool,
         )
-        session = mended(session, arrangement_of(told, session, chain.joint_names))
+        session = mended(session, arrangement)
         session = replace(session, accuracy_option=args.accuracy_option)
         sense = check_sense(session, rows, progress)
     session, turned = without_whole_turns(session, chain)
@@ -329,7 +333,9 @@ def _mend(args: argparse.Namespace) -> int:
             f"{folder}: joint '{chain.joint_names[joint]}' slides, and a session of such an arm "
             'is not mended: correct its table and import that'
         )
-    told = Mending(
+    arrangement = arrangement_of(
+        session,
+        chain.joint_names,
         order=args.joints,
         couple=args.couple,
         reverse=tuple(args.reverse),
@@ -344,7 +350,7 @@ def _mend(args: argparse.Namespace) -> int:
     )
     with progress_bar(args.quiet or args.json) as progress:
         progress('trying', 0.0)
-        session = mended(session, arrangement_of(told, session, chain.joint_names))
+        session = mended(session, arrangement)
         if args.accuracy_option:
             session = replace(session, accuracy_option=args.accuracy_option)
         if not args.unchecked:

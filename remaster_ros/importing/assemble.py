@@ -79,11 +79,6 @@ def controller_of(rows: RawRows, chain: SerialChain, options: SessionOptions) ->
     """Return how the controller writes the joints, by the table's columns and what was told.
 
     None where that is known to be as the URDF has them, as in a bag without corrections.
-
-    Raises
-    ------
-    InputError
-        A joint that is not there, or one that is coupled to itself.
     """
     told = options.couple or options.reverse or options.add_deg
     if chain.slides.any():

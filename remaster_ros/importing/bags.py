@@ -10,25 +10,22 @@ from typing import Any
 
 import numpy as np
 
-from remaster_ros.calibration.arrangement import linear_fit
 from remaster_ros.errors import InputError
 from remaster_ros.importing.rows import RawRows
 from remaster_ros.importing.standstills import (
     SWING_S,
-    Standstills,
     Stream,
     between,
-    is_stream,
     joint_standstills,
     match,
-    point_standstills,
+    point_visits,
     reading_of,
     refuse_sliding,
 )
 from remaster_ros.importing.units import LENGTHS
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.session.bag import BagReader
-from remaster_ros.types import FARTHEST_M, FloatArray, IntArray
+from remaster_ros.types import FARTHEST_M, FloatArray
 
 JOINT_STATE = 'sensor_msgs/msg/JointState'
 POINT = 'geometry_msgs/msg/PointStamped'
@@ -165,15 +162,7 @@ def _joint_topic(
 
 
 class _Rows:
-    """Rows as they are found.
-
-    Parameters
-    ----------
-    joints
-        Stream of `joint_topic`, rad.
-    clock_offset_s
-        As of `read_bag`.
-    """
+    """Rows as they are found; `joints` are the stream of `joint_topic`, rad."""
 
     def __init__(
         self,
@@ -195,21 +184,11 @@ class _Rows:
         still = self._still
         if not len(still) or not len(stream.stamps):
             return
-        dense = is_stream(stream.stamps)
-        seen = (
-            point_standstills(stream)
-            if dense
-            else Standstills.of_shots(stream.stamps, stream.values)
-        )
+        seen = point_visits(stream)
         offset = self._clock_offset_s or 0.0
         if self._clock_offset_s is None and len(seen):
-
-            def error_of(i: IntArray, j: IntArray) -> float:
-                q = still.mean[j][None]
-                return float(linear_fit(self._chain, q, seen.mean[i])[0][0])
-
             names = f'{self._path}, {topic}', self._joint_topic
-            matching = match(seen, still, names, error_of)
+            matching = match(seen, still, names, self._chain)
             self._matched.append(matching.in_words(seen, still, (topic, self._joint_topic)))
             offset = matching.offset_s or 0.0
         for j in range(len(still)):

@@ -95,30 +95,21 @@ _KINDS = {word: kind for kind, words in _WORDS.items() for word in words}
 
 @dataclass
 class Columns:
-    """Which column of a table is what; indices from 0, None and empty where there is none.
+    """Which column of a table is what; indices from 0, None and empty where there is none."""
 
-    Attributes
-    ----------
-    joints, from_joints
-        Base to tip.
-    points, stds, orientations
-        Marker ('' where there is one without a name) -> X, Y and Z, their standard deviations, and
-        the quaternion x, y, z, w where it was measured.
-    others
-        Kind (``name``, ``time``, ``pose``, …) -> columns.
-    units
-        Column -> unit of its header.
-    why
-        Column -> how it was taken for what it is: ``header``, ``told`` or ``place``.
-    """
-
+    # Base to tip.
     joints: tuple[int, ...] = ()
     from_joints: tuple[int, ...] = ()
+    # Marker ('' where there is one without a name) -> X, Y and Z, their standard deviations, and
+    # the quaternion x, y, z, w where it was measured.
     points: dict[str, tuple[int, ...]] = field(default_factory=dict)
     stds: dict[str, tuple[int, ...]] = field(default_factory=dict)
     orientations: dict[str, tuple[int, ...]] = field(default_factory=dict)
+    # Kind (``name``, ``time``, ``pose``, …) -> columns.
     others: dict[str, list[int]] = field(default_factory=lambda: defaultdict(list))
+    # Column -> unit of its header.
     units: dict[int, str] = field(default_factory=dict)
+    # Column -> how it was taken for what it is: ``header``, ``told`` or ``place``.
     why: dict[int, str] = field(default_factory=dict)
 
     @property
@@ -129,6 +120,9 @@ class Columns:
     def one(self, kind: str) -> int | None:
         """Return the first column of a kind."""
         return next(iter(self.others.get(kind, ())), None)
+
+
+Table = tuple[TextTable, Columns]
 
 
 @dataclass(frozen=True)
@@ -293,13 +287,7 @@ def _joints(
 def _only_one(
     table: TextTable, sets: Sequence[tuple[int, ...]], what: str, remedy: str
 ) -> tuple[int, ...]:
-    """Return the only set of columns; () where there is none.
-
-    Raises
-    ------
-    InputError
-        Several sets could be what is looked for.
-    """
+    """Return the only set of columns; () where there is none, an `InputError` for several."""
     if len(sets) > 1:
         listed = '; '.join(', '.join(table.names[i] for i in columns) for columns in sets[:4])
         raise InputError(f'{table.path}: these could all be {what}: {listed}; {remedy}')

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -17,16 +16,13 @@ from remaster_ros.importing.assemble import (
     refuse_outside_limits,
     without_whole_turns,
 )
-from remaster_ros.importing.robots import read_robot
 from remaster_ros.importing.rows import RawRows, TableOptions, read_rows
 from remaster_ros.importing.sense import check_sense
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.types import FloatArray, Session
 
-Robot = tuple[str, SerialChain]
 
-
-def of_arrays(joints: Any, points: Any, robot: Robot, seed: int) -> Session:
+def of_arrays(joints: Any, points: Any, robot: tuple[str, SerialChain], seed: int) -> Session:
     """Return the session of joints, rad, and points, m, row by row; see `session_from`."""
     urdf, chain = robot
     q = _numbers(joints, 'joints', chain.joint_names)
@@ -53,28 +49,17 @@ def of_arrays(joints: Any, points: Any, robot: Robot, seed: int) -> Session:
 
 
 def of_files(
-    files: Sequence[str | os.PathLike[str]],
-    robot: Robot,
+    paths: Sequence[Path],
+    robot: tuple[str, SerialChain],
     options: TableOptions,
     corrections: SessionOptions,
     seed: int,
 ) -> Session:
     """Return the session of one table or of two that are joined; see `import_table`."""
     urdf, chain = robot
-    paths = [Path(file) for file in files]
     rows = read_rows(paths, chain, options).in_order()
     notes = f'imported from {", ".join(path.name for path in paths)}'
     return _made(rows, urdf, chain, corrections, seed, notes)
-
-
-def robot_of(
-    urdf: str | os.PathLike[str],
-    base_link: str | None,
-    tip_link: str | None,
-    tables: Sequence[str | os.PathLike[str]] = (),
-) -> Robot:
-    """Return the text of a robot's description, and the arm in it, by `tables` of several."""
-    return read_robot(Path(urdf), base_link, tip_link, tables=[Path(file) for file in tables])
 
 
 def _made(

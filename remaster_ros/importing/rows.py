@@ -12,15 +12,13 @@ from typing import Any, Literal, cast
 import numpy as np
 
 from remaster_ros.errors import InputError
-from remaster_ros.importing.columns import AXES, Columns, Told, find_columns
+from remaster_ros.importing.columns import AXES, Columns, Table, Told, find_columns
 from remaster_ros.importing.makers import kuka
-from remaster_ros.importing.standstills import some
-from remaster_ros.importing.streams import stopped
+from remaster_ros.importing.standstills import some, stopped
 from remaster_ros.importing.text_table import TABLE_LIMIT, TextTable, decode, read_table
 from remaster_ros.importing.units import ANGLES, LENGTHS
 from remaster_ros.importing.values import (
     joint_values,
-    labels,
     length_unit,
     numbers,
     refuse_far,
@@ -45,37 +43,24 @@ _BRACKETS = re.compile(r'[\[\](){}_\s-]')
 
 @dataclass(frozen=True, eq=False)
 class Pairs:
-    """The pairs found.
+    """The pairs found."""
 
-    Attributes
-    ----------
-    points, joints
-        Rows of the two tables, (n,) each.
-    how
-        By what they were paired, for people.
-    left_out
-        What was left out and why, a sentence each.
-    """
-
+    # Rows of the two tables, (n,) each.
     points: IntArray
     joints: IntArray
+    # By what they were paired, for people.
     how: str
+    # What was left out and why, a sentence each.
     left_out: tuple[str, ...] = ()
 
 
 def join(
-    points: tuple[TextTable, Columns],
-    joints: tuple[TextTable, Columns],
+    points: Table,
+    joints: Table,
     how: How = '',
     within_s: float = 1.0,
 ) -> Pairs:
-    """Pair the rows of two tables.
-
-    Raises
-    ------
-    InputError
-        Nothing tells which rows belong together; names given twice.
-    """
+    """Pair the rows of two tables, where something tells which belong together."""
     if how in ('', 'name'):
         pairs = _by_name(points, joints)
         if pairs is not None:
@@ -104,9 +89,7 @@ def join(
     raise InputError(f'{a.path} and {b.path} have {what} in common; {remedy}')
 
 
-def common_names(
-    points: tuple[TextTable, Columns], joints: tuple[TextTable, Columns]
-) -> tuple[int, int, list[str], list[str]] | None:
+def common_names(points: Table, joints: Table) -> tuple[int, int, list[str], list[str]] | None:
     """Return the columns by whose names most rows belong together, and the names as compared.
 
     `P01`, `p1` and `P1 ` are the same; where no names are, then the last parts (`A::KR6::P1` and
@@ -125,7 +108,7 @@ def common_names(
     return None
 
 
-def _by_name(points: tuple[TextTable, Columns], joints: tuple[TextTable, Columns]) -> Pairs | None:
+def _by_name(points: Table, joints: Table) -> Pairs | None:
     best = common_names(points, joints)
     if best is None:
         return None
@@ -157,7 +140,7 @@ def _by_name(points: tuple[TextTable, Columns], joints: tuple[TextTable, Columns
 
 def _keys(table: TextTable, column: int, level: int) -> list[str]:
     """Return names as they are compared: 0 whole, 1 their last parts, 2 those without brackets."""
-    names = labels(table, column) or []
+    names = [row[column] for row in table.rows]
     if level > 0:
         names = [_PATH.split(name.strip())[-1] for name in names]
     if level > 1:
@@ -168,9 +151,7 @@ def _keys(table: TextTable, column: int, level: int) -> list[str]:
     ]
 
 
-def _by_time(
-    points: tuple[TextTable, Columns], joints: tuple[TextTable, Columns], within_s: float
-) -> Pairs | None:
+def _by_time(points: Table, joints: Table, within_s: float) -> Pairs | None:
     """Pair each point with the joints reported next to it, where the arm stood still."""
     when, reported = times(*points), times(*joints)
     if when is None or reported is None:
@@ -313,9 +294,6 @@ class RawRows:
         )
 
 
-Table = tuple[TextTable, Columns]
-
-
 def read_rows(paths: Sequence[Path], chain: SerialChain, options: TableOptions) -> RawRows:
     """Read one table with joints and points, or one with each.
 
@@ -412,8 +390,8 @@ def _visited(data: TextTable, program: Path) -> TextTable:
 
 
 def _values(
-    points: tuple[TextTable, Columns],
-    joints: tuple[TextTable, Columns],
+    points: Table,
+    joints: Table,
     chain: SerialChain,
     options: TableOptions,
     stamp: FloatArray | None,
@@ -459,9 +437,9 @@ def _values(
     given = {}
     for kind in _OTHERS:
         for one, found in (points, joints):
-            words = labels(one, found.one(kind))
-            if words is not None and kind not in given:
-                given[kind] = [words[i] for i in row]
+            column = found.one(kind)
+            if column is not None and kind not in given:
+                given[kind] = [one.rows[i][column] for i in row]
     if several:
         given['marker'] = [names[i] for i in marker]
     meanings: dict[str, str] = {}
@@ -551,7 +529,7 @@ def _all_the_same(stamp: FloatArray, q: FloatArray) -> str:
     )
 
 
-def _optional(points: tuple[TextTable, Columns], kind: str) -> FloatArray:
+def _optional(points: Table, kind: str) -> FloatArray:
     column = points[1].one(kind)
     if column is None:
         return np.full(len(points[0].rows), np.nan)
@@ -615,9 +593,7 @@ def _told_first(found: list[Table], kind: str) -> list[Table]:
     return told or found
 
 
-def _only(
-    found: list[tuple[TextTable, Columns]], tables: Sequence[TextTable], what: str, option: str
-) -> tuple[TextTable, Columns]:
+def _only(found: list[Table], tables: Sequence[TextTable], what: str, option: str) -> Table:
     """Return the one table that has something."""
     if len(found) == 1:
         return found[0]
@@ -631,7 +607,7 @@ def _only(
     raise InputError(f'{names}: both have {what}; give one of them, or name columns with {option}')
 
 
-def _refuse_untold(found: list[tuple[TextTable, Columns]], told: Told) -> None:
+def _refuse_untold(found: list[Table], told: Told) -> None:
     """Refuse columns that were told and are in no table."""
     for option, names, attribute in (
         ('--joints', told.joints, 'joints'),

@@ -26,11 +26,25 @@ class Stretch:
     until: int | None = None
 
 
-@dataclass(frozen=True)
-class Mending:
-    """What was told of a session's tables.
+def arrangement_of(
+    session: Session,
+    joint_names: Sequence[str],
+    *,
+    order: Sequence[str] = (),
+    couple: Sequence[tuple[str, tuple[str, float]]] = (),
+    reverse: Sequence[str] = (),
+    add_deg: Sequence[tuple[str, float]] = (),
+    angle_scale: float = 1.0,
+    length_scale: float = 1.0,
+    mirrored: bool = False,
+    shift: Stretch | None = None,
+    exchange: Stretch | None = None,
+    turn: tuple[str, float] = ('', 0.0),
+    tip_link: str = '',
+) -> Arrangement:
+    """Return the arrangement of a session that was told.
 
-    Attributes
+    Parameters
     ----------
     order
         Joint whose column each joint, base to tip, is to take; () for as they are.
@@ -46,23 +60,6 @@ class Mending:
         Axis, and degrees by which the markers' places are turned about it; '' for not at all.
     tip_link
         Tool frame; '' for as it is.
-    """
-
-    order: Sequence[str] = ()
-    couple: Sequence[tuple[str, tuple[str, float]]] = ()
-    reverse: Sequence[str] = ()
-    add_deg: Sequence[tuple[str, float]] = ()
-    angle_scale: float = 1.0
-    length_scale: float = 1.0
-    mirrored: bool = False
-    shift: Stretch | None = None
-    exchange: Stretch | None = None
-    turn: tuple[str, float] = ('', 0.0)
-    tip_link: str = ''
-
-
-def arrangement_of(told: Mending, session: Session, joint_names: Sequence[str]) -> Arrangement:
-    """Return the arrangement of a session that was told.
 
     Raises
     ------
@@ -70,43 +67,42 @@ def arrangement_of(told: Mending, session: Session, joint_names: Sequence[str]) 
         Names that the session has not, or angles that are no quarters of a turn.
     """
     k = len(joint_names)
-    if told.order and len(told.order) != k:
-        raise InputError(f'--joints names {len(told.order)} joints; the session has {k}')
-    for stretch in (told.shift, told.exchange):
+    if order and len(order) != k:
+        raise InputError(f'--joints names {len(order)} joints; the session has {k}')
+    for stretch in (shift, exchange):
         for number in () if stretch is None else (stretch.since, stretch.until):
             if number is not None and number not in all_rows(session).observation:
                 raise InputError(f'there is no observation {number} in the session; correct it')
-    if told.shift is not None and told.exchange is not None:
+    if shift is not None and exchange is not None:
         raise InputError('--shift-points and --exchange-markers: give one at a time')
     signs, quarters, coupled = [1] * k, [0] * k, 0
-    for name in told.reverse:
+    for name in reverse:
         signs[_index(name, joint_names, '--reverse')] *= -1
-    for name, angle in told.add_deg:
+    for name, angle in add_deg:
         quarters[_index(name, joint_names, '--offset')] += _quarters(angle, '--offset')
-    for name, (other, sign) in told.couple:
+    for name, (other, sign) in couple:
         if (
             _index(name, joint_names, '--couple') != 2
             or _index(other, joint_names, '--couple') != 1
         ):
             raise InputError('--couple: in a session only joint 3 is coupled, to joint 2')
         coupled = int(sign)
-    stretch = told.shift or told.exchange or Stretch('')
-    axis, angle = told.turn
+    stretch = shift or exchange or Stretch('')
+    axis, angle = turn
     return Arrangement(
-        order=tuple(_index(name, joint_names, '--joints') for name in told.order)
-        or tuple(range(k)),
+        order=tuple(_index(name, joint_names, '--joints') for name in order) or tuple(range(k)),
         signs=tuple(signs),
         quarters=tuple(quarters),
-        angle_scale=told.angle_scale,
+        angle_scale=angle_scale,
         coupled=coupled,
-        mirrored=told.mirrored,
-        length_scale=told.length_scale,
-        shift=0 if told.shift is None else -_rows(told.shift.what),
-        exchanged=() if told.exchange is None else _markers(told.exchange.what, session),
+        mirrored=mirrored,
+        length_scale=length_scale,
+        shift=0 if shift is None else -_rows(shift.what),
+        exchanged=() if exchange is None else _markers(exchange.what, session),
         since=stretch.since,
         until=stretch.until,
         turned=('xyz'.index(axis) if axis else 0, _quarters(angle, '--turn-tool')),
-        tip_link=told.tip_link,
+        tip_link=tip_link,
     )
 
 

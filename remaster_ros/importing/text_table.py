@@ -5,15 +5,15 @@ from __future__ import annotations
 import csv
 import re
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
 from remaster_ros.errors import InputError
 from remaster_ros.importing.makers import READERS
+from remaster_ros.importing.makers.named import Named
 from remaster_ros.importing.units import bare, is_unit
 from remaster_ros.session.files import read_limited
 
@@ -32,56 +32,27 @@ _BLANKS = re.compile(r'\s+(?![\[(])')
 _FEWEST_NUMBERS = 2
 
 
-@dataclass(frozen=True, eq=False)
-class TextTable:
+@dataclass(frozen=True, eq=False, kw_only=True)
+class TextTable(Named):
     """A table as text.
 
     Attributes
     ----------
     path
         The file, for messages.
-    encoding, separator, decimal
+    encoding, separator
         What it was found, or told, to be written with.
-    names
-        Of the columns; numbers from 1 on where it has no header.
-    rows, lines
-        Cells as text, and the line of each row in the file.
     preamble
         Title and comment lines.
     has_header
         Whether the names stand in the file.
-    kind
-        What the file is, where it is no plain table; '' else.
-    groups
-        Marker -> columns X, Y and Z, where the file itself names its markers.
-    turns
-        Marker -> columns of its quaternion x, y, z, w.
-    points
-        Those that are taken where nothing is told; () for all of them.
-    coupling
-        Joint column -> (another one, 1 or -1) that the controller does not count with it.
-    maker
-        Of the controller; '' where it is not known.
-    notes
-        What was left out of the file, a sentence each.
     """
 
     path: Path
     encoding: str
-    separator: str
-    decimal: str
-    names: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
-    lines: tuple[int, ...]
-    preamble: str
-    has_header: bool
-    kind: str = ''
-    groups: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
-    turns: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
-    points: tuple[str, ...] = ()
-    coupling: Mapping[str, tuple[str, Literal[1, -1]]] = field(default_factory=dict)
-    maker: str = ''
-    notes: tuple[str, ...] = ()
+    separator: str = ''
+    preamble: str = ''
+    has_header: bool = True
 
     def describe(self) -> str:
         """Return how it is written, in a few words."""
@@ -103,13 +74,7 @@ class TextTable:
         )
 
     def number(self, row: int, column: int) -> float | None:
-        """Return a cell as a number; None where it is empty.
-
-        Raises
-        ------
-        InputError
-            It is neither.
-        """
+        """Return a cell as a number; None where it is empty."""
         cell = self.rows[row][column]
         if not cell:
             return None
@@ -157,10 +122,7 @@ def read_table(
         except InputError as error:
             raise InputError(f'{path}, {error}') from None
         if found is not None:
-            own = vars(found)
-            return TextTable(
-                path=path, encoding=encoding, separator='', preamble='', has_header=True, **own
-            )
+            return TextTable(path=path, encoding=encoding, **vars(found))
     lines = [
         (number, line)
         for number, line in enumerate(text.replace('\r\n', '\n').split('\n'), start=1)
@@ -201,6 +163,7 @@ def read_table(
         if name and names.count(name) > 1:
             raise InputError(f'{path}: two columns are named {name!r}; name them differently')
     return TextTable(
+        kind='',
         path=path,
         encoding=encoding,
         separator=separator,

@@ -27,13 +27,7 @@ _LARGEST_RAD = 2.1 * np.pi
 
 
 def numbers(table: TextTable, columns: tuple[int, ...], optional: bool = False) -> FloatArray:
-    """Return columns of numbers, (n, len(columns)); NaN where optional and empty.
-
-    Raises
-    ------
-    InputError
-        Naming line and column of the first cell that is none.
-    """
+    """Return columns of numbers, (n, len(columns)); NaN where optional and empty."""
     values = np.full((len(table.rows), len(columns)), np.nan)
     for row in range(len(table.rows)):
         for i, column in enumerate(columns):
@@ -43,11 +37,6 @@ def numbers(table: TextTable, columns: tuple[int, ...], optional: bool = False) 
             elif not optional:
                 raise table.fault(row, column, 'is empty; complete it or remove the row')
     return values
-
-
-def labels(table: TextTable, column: int | None) -> list[str] | None:
-    """Return a column of names; None where there is none."""
-    return None if column is None else [row[column] for row in table.rows]
 
 
 def angle_unit(table: TextTable, columns: Columns, told: str) -> tuple[str, str]:
@@ -71,18 +60,9 @@ def joint_values(
 ) -> tuple[FloatArray, tuple[tuple[str, str], ...], FloatArray]:
     """Return the joints' positions, (n, k), rad or m, with unit and source of each, k, and scale.
 
-    The unit of a joint that slides is in its header. Else it is m where all values are within
-    the joint's limits then, and mm where they are within them as that.
-
-    Parameters
-    ----------
-    told
-        The unit of the angles.
-
-    Raises
-    ------
-    InputError
-        Angles in several units, or a joint that slides of which neither header nor limits tell it.
+    The unit of the angles is `told` or found. That of a joint that slides is in its header. Else
+    it is m where all values are within the joint's limits then, and mm where they are within them
+    as that.
     """
     values = numbers(table, columns.joints)
     turning = tuple(i for i, slides in zip(columns.joints, chain.slides) if not slides)
@@ -127,13 +107,8 @@ def length_unit(
 ) -> tuple[str, str]:
     """Return the unit of the points, and how it is known.
 
-    Parameters
-    ----------
-    points
-        As written, (n, 3).
-    modelled
-        The points as the robot's model has them, m, (n, 3): where nothing states the unit, it is
-        the one in which the measured ones lie as far apart.
+    The points are as written, (n, 3). Where nothing states the unit, it is the one in which they
+    lie as far apart as those `modelled` of the robot, m, (n, 3).
     """
     units = {columns.units.get(i, '') for i in columns.point} - {''}
     if told:

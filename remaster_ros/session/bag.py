@@ -248,21 +248,14 @@ _LIVE = {recorded: live for live, recorded in RECORDED.items()}
 
 
 class BagMessage(NamedTuple):
-    """One recorded message.
+    """One recorded message."""
 
-    Attributes
-    ----------
-    topic, msgtype
-        Such as ``/joint_states`` and ``sensor_msgs/msg/JointState``.
-    cdr
-        The serialised message, as it came off the wire.
-    stamp_ns
-        When it was recorded, nanoseconds since the epoch.
-    """
-
+    # Such as ``/joint_states`` and ``sensor_msgs/msg/JointState``.
     topic: str
     msgtype: str
+    # As it came off the wire.
     cdr: bytes
+    # When it was recorded, nanoseconds since the epoch.
     stamp_ns: int
 
 

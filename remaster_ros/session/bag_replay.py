@@ -67,20 +67,13 @@ class _Log(Outlet):
 
 @dataclass(frozen=True)
 class Replayed:
-    """What came of a bag.
+    """What came of a bag."""
 
-    Attributes
-    ----------
-    observations
-        Rows that were written.
-    counts
-        What became of readings and configurations.
-    torn_bytes
-        At the end of the bag, of a message that is not whole.
-    """
-
+    # Rows that were written.
     observations: int
+    # What became of readings and configurations.
     counts: dict[str, int]
+    # At the end of the bag, of a message that is not whole.
     torn_bytes: int
 
 
@@ -233,14 +226,10 @@ def _parameters(bag: BagReader, began: events.RecorderBegan) -> Parameters:
 
 
 def differences(session: Path, other: Path) -> list[str]:
-    """Return how the rows of two sessions differ, a line for each row.
+    """Return how the rows of a session and of that of its bag differ, a line for each row.
 
-    Parameters
-    ----------
-    session, other
-        The session recorded, and the one of its bag. A row is found in the other by its pose,
-        split, sensor and marker and by where the arm came from, so that one which is missing is
-        named alone.
+    A row is found in the other by its pose, split, sensor and marker and by where the arm came
+    from, so that one which is missing is named alone.
     """
     ours, theirs = _rows(session), _rows(other)
     found = []

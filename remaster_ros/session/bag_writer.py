@@ -234,16 +234,8 @@ class BagWriter:
 def recover_bag(folder: str | os.PathLike[str]) -> str:
     """Finish the bag of a killed writer, so that every MCAP and rosbag2 reader opens it.
 
-    Returns
-    -------
-    str
-        What could not be kept; '' where nothing was lost. A bag that was closed is left
-        as it is.
-
-    Raises
-    ------
-    InputError
-        No such bag, damaged, or not writable.
+    Returns what could not be kept; '' where nothing was lost. A bag that was closed is left as it
+    is.
     """
     folder = Path(folder)
     remove_leftovers(folder)

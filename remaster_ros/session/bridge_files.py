@@ -94,17 +94,11 @@ class _Kept(msgspec.Struct):
 
 @dataclass(frozen=True)
 class LastCommand:
-    """What is known of the last command of a bridge.
+    """What is known of the last command of a bridge."""
 
-    Attributes
-    ----------
-    end
-        Where it led, rad, (k,); None where the file cannot be read, or is of other joints.
-    age_s
-        How long ago it was sent, s; infinite where that is not known.
-    """
-
+    # Where it led, rad, (k,); None where the file cannot be read, or is of other joints.
     end: FloatArray | None
+    # How long ago it was sent, s; infinite where that is not known.
     age_s: float
 
 

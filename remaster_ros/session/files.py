@@ -47,21 +47,9 @@ def made_if_new(path: Path) -> None:
 
 
 def read_limited(path: Path, limit: int, missing: str) -> bytes:
-    """Read a regular file of at most `limit` bytes.
+    """Read a regular file of at most `limit` bytes; an `InputError` where that is not possible.
 
-    Parameters
-    ----------
-    path
-        The file.
-    limit
-        Largest size accepted, bytes.
-    missing
-        The remedy in the message where there is no such file.
-
-    Raises
-    ------
-    InputError
-        No such file, not a regular file, not readable, or larger than `limit`.
+    Where there is no such file, the message ends with the remedy `missing`.
     """
     try:
         if not path.exists():
@@ -128,10 +116,7 @@ def make_new_folder(folder: Path) -> None:
 def write_atomically(path: Path, data: str | bytes | bytearray) -> None:
     """Replace a file in one step, durable on return: readers see the old text or the new.
 
-    Raises
-    ------
-    InputError
-        The folder cannot be written to, or the disk is full.
+    A `DiskError` where the folder cannot be written to, or the disk is full.
     """
     temporary = path.with_name(f'.{path.name}.{os.getpid()}.tmp')
     made_if_new(path)
@@ -162,15 +147,7 @@ def remove_leftovers(folder: Path) -> None:
 class AppendFile:
     """A file that grows by pieces, each durable when `append` returns, or not there at all.
 
-    Parameters
-    ----------
-    path
-        The file; made where there is none, its name durable.
-
-    Raises
-    ------
-    InputError
-        The folder or the file cannot be written to.
+    It is made where there is none, its name durable.
     """
 
     def __init__(self, path: Path) -> None:
@@ -196,11 +173,8 @@ class AppendFile:
     def append(self, data: bytes) -> None:
         """Write a piece; durable on return.
 
-        Raises
-        ------
-        DiskError
-            The disk does not take it; the file ends as before. Where it cannot be cut to that
-            either, the file is closed: how it ends is unknown until it is read again.
+        Where the disk does not take it (`DiskError`), the file ends as before. If it cannot be cut
+        to that either, it is closed: how it ends is unknown until it is read again.
         """
         descriptor = self.descriptor
         with writing(self.path):
@@ -235,16 +209,6 @@ class PatientFile:
     """A new file that holds in memory what a full disk does not take, and writes it later.
 
     What `write` returned from survives a kill of this process unless it is `waiting`.
-
-    Parameters
-    ----------
-    path
-        The file, which must not be there yet.
-
-    Raises
-    ------
-    DiskError
-        It cannot be made.
     """
 
     def __init__(self, path: Path) -> None:

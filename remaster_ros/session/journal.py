@@ -24,19 +24,11 @@ Record = dict[str, Any]
 
 
 class JournalText(NamedTuple):
-    """A journal as read.
+    """A journal as read."""
 
-    Attributes
-    ----------
-    records
-        One for each whole line.
-    whole
-        The bytes of these lines.
-    torn
-        How many bytes behind them are no whole line.
-    """
-
+    # One for each whole line.
     records: list[Record]
+    # The bytes of these lines, and how many bytes behind them are no whole line.
     whole: bytes
     torn: int
 
@@ -45,24 +37,8 @@ class Journal:
     """Write a journal, or go on with one; what `append` returned from is on the disk.
 
     Opening cuts off what a crash has left of a line. While it is open, no other process can open
-    it for writing; the lock ends with the process, however that ends.
-
-    Parameters
-    ----------
-    path
-        The file; made where there is none, its name durable.
-
-    Attributes
-    ----------
-    records, content
-        Every record so far, and the bytes of all their lines.
-    lost
-        What was cut off when opening, in a line; '' where nothing was.
-
-    Raises
-    ------
-    InputError
-        Another process writes it, it is damaged, or it cannot be written.
+    it for writing; the lock ends with the process, however that ends. The file is made where there
+    is none, its name durable. An `InputError` where another process writes it, or it is damaged.
     """
 
     def __init__(self, path: Path) -> None:
@@ -70,8 +46,10 @@ class Journal:
         self._file = AppendFile(path)
         try:
             self._lock()
+            # Every record so far, and the bytes of all their lines.
             self.records, whole, torn = read_journal(path)
             self.content = bytearray(whole)
+            # What was cut off, in a line; '' where nothing was.
             self.lost = ''
             if torn:
                 self._file.truncate(len(whole))
@@ -91,12 +69,7 @@ class Journal:
     def restore(self) -> None:
         """Write every record again, where the file is no longer the one that was opened.
 
-        Raises
-        ------
-        DiskError
-            The disk does not take it.
-        InputError
-            Another process writes the file that is there.
+        An `InputError` where another process writes the file that is there.
         """
         write_atomically(self.path, self.content)
         self._file.close()
@@ -114,13 +87,7 @@ class Journal:
                 ) from None
 
     def append(self, record: Record) -> None:
-        """Write one record; durable on return.
-
-        Raises
-        ------
-        DiskError
-            The disk does not take it; the file is as it was before.
-        """
+        """Write one record; durable on return, and with a `DiskError` the file is as before."""
         line = format_record(record)
         self._file.append(line)
         self.content += line
@@ -141,10 +108,7 @@ class Journal:
 def read_journal(path: Path) -> JournalText:
     """Read a journal that is perhaps just being written, or was when the power failed.
 
-    Raises
-    ------
-    InputError
-        It cannot be read, or a line that others follow is damaged.
+    An `InputError` where it cannot be read, or a line that others follow is damaged.
     """
     data = read_limited(path, JOURNAL_LIMIT, 'without its journal a session cannot be resumed')
     records: list[Record] = []

@@ -25,13 +25,7 @@ _LINE = re.compile(r'([0-9a-f]{64}) [ *]([^\0]+)')
 
 
 def read_manifest(folder: Path) -> dict[str, str]:
-    """Return the checksum of every closed file by its name; nothing where there is no manifest.
-
-    Raises
-    ------
-    InputError
-        It cannot be read, or is none; names the line.
-    """
+    """Return the checksum of every closed file by its name; nothing where there is no manifest."""
     path = folder / MANIFEST
     if not path.exists():
         return {}
@@ -48,13 +42,7 @@ def read_manifest(folder: Path) -> dict[str, str]:
 
 
 def write_sums(folder: Path, sums: Mapping[str, str]) -> None:
-    """Write down checksums by name of the file, of what the caller put there.
-
-    Raises
-    ------
-    InputError
-        The folder cannot be written to.
-    """
+    """Write down checksums by name of the file, of what the caller put there."""
     lines = [f'{checksum}  {name}\n' for name, checksum in sorted(sums.items())]
     write_atomically(folder / MANIFEST, ''.join(lines))
 
@@ -74,13 +62,7 @@ def remove_manifest(folder: Path) -> None:
 
 
 def check_data(sums: Mapping[str, str], path: Path, data: bytes) -> None:
-    """Refuse the content of a file that is not what was closed; unlisted files pass.
-
-    Raises
-    ------
-    InputError
-        Naming the file.
-    """
+    """Refuse the content of a file that is not what was closed; unlisted files pass."""
     _compare(sums, path, hashlib.sha256(data).hexdigest())
 
 
@@ -91,13 +73,7 @@ def check_file(sums: Mapping[str, str], path: Path) -> None:
 
 
 def sha256_of(path: Path) -> str:
-    """Return a file's checksum in hexadecimal.
-
-    Raises
-    ------
-    InputError
-        It cannot be read.
-    """
+    """Return a file's checksum in hexadecimal."""
     try:
         with path.open('rb') as file:
             return hashlib.file_digest(file, 'sha256').hexdigest()

@@ -314,18 +314,9 @@ def column_names(
 class RowFormat:
     """observations.csv of one session: observations to lines, and lines to checked columns.
 
-    Parameters
-    ----------
-    path
-        The file, for messages.
-    chain
-        The robot, for the number of joints and their limits.
-    sensors, markers
-        The names in session.yaml, in their order.
-    optional
-        Which of the `OPTIONAL` fields the lines have that are to be written.
-    within_limits
-        Whether joint angles outside the robot's limits are refused.
+    Sensors and markers are in their order in session.yaml; `optional` are the `OPTIONAL` fields of
+    the lines that are to be written. With `within_limits` joint angles outside the robot's limits
+    are refused.
     """
 
     def __init__(

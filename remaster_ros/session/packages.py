@@ -14,18 +14,11 @@ _PACKAGE = re.compile(r'[A-Za-z][\w-]*')
 
 
 def find_package(name: str, beside: Path, package_path: Sequence[Path] = ()) -> Path | None:
-    """Return the folder of a ROS package; None where it is not found.
+    """Return the folder of a ROS package that the file `beside` names; None where it is not found.
 
     It is looked for in the given folders (which may be the package itself), in the share folders
     of AMENT_PREFIX_PATH, and above and beside the file that names it: by the name of the folder,
     then by the name in its package.xml, which a clone's folder need not have.
-
-    Parameters
-    ----------
-    beside
-        The file that names the package.
-    package_path
-        Further folders to look in.
     """
     if not _PACKAGE.fullmatch(name):
         return None
@@ -59,13 +52,6 @@ class Confinement:
     and below the folders that the user gives. Links are followed before that is judged, but for
     what a sourced workspace has: who builds a workspace runs its code, and links of its files lead
     to their sources.
-
-    Parameters
-    ----------
-    path
-        The description.
-    package_path
-        Folders that the user gives.
     """
 
     def __init__(self, path: Path, package_path: Sequence[Path] = ()) -> None:

@@ -18,17 +18,11 @@ from remaster_ros.types import Measurements
 
 @dataclass
 class Recovery:
-    """What a recovery found, a line each.
+    """What a recovery found."""
 
-    Attributes
-    ----------
-    finished
-        Whether anything was to be finished; False where the folder was complete.
-    lost
-        What could not be kept: what was being written, and never acknowledged.
-    """
-
+    # Whether anything was to be finished; False where the folder was complete.
     finished: bool = False
+    # What could not be kept, a line each: what was being written, and never acknowledged.
     lost: list[str] = field(default_factory=list)
 
 

@@ -141,17 +141,10 @@ def session_header(cell: Workcell, settle_s: float) -> Session:
 
 
 class Keeper(Protocol):
-    """Writes the session; what the disk does not take is written later.
-
-    Attributes
-    ----------
-    journal
-        What is written.
-    full
-        Why nothing can be written now; ''.
-    """
+    """Writes the session; what the disk does not take is written later."""
 
     journal: SessionJournal
+    # Why nothing can be written now; ''.
     full: str
 
     def write(self, write: Callable[[], object]) -> None:

@@ -273,45 +273,13 @@ class SessionWriter:
     line cut off by a crash is the only thing a reader may find incomplete. A writer is also a
     context manager: it closes as ``complete``, or as ``aborted`` where an exception passes.
 
-    Parameters
-    ----------
-    folder
-        New or empty; with `resume` also that of an unfinished session of the same robot, markers
-        and sensors.
-    header
-        Everything but the observations; its measurements and exit status are not used.
-    resume
-        Go on with what the folder holds.
-    even_complete
-        Open a complete session too, which remains complete until it is closed (recovery).
-    go_further
-        Go on with a complete session, which is unfinished until it is closed again.
+    The folder is new or empty; with `resume` also that of an unfinished session of the same robot,
+    markers and sensors, which goes on. With `even_complete` a complete session is opened too, and
+    remains complete until it is closed (recovery); with `go_further` it is unfinished until it is
+    closed again. Of the header, measurements and exit status are not used.
 
-    Attributes
-    ----------
-    records
-        The journal: every record so far, also those of the runs before.
-    resumed
-        Whether the folder held a session.
-    lost
-        What a crash has left incomplete, and was dropped; '' where nothing was.
-    observations, configurations
-        The next free numbers.
-    last_stamp_s
-        Time of the last observation, s; None before the first.
-    restored
-        What `check` found changed by others and restored, a line each.
-    beyond_repair
-        What others destroyed and the journal has not; '' where nothing is. Such a session is not
-        closed as complete.
-    correction
-        That `correct` was told of; None for none.
-
-    Raises
-    ------
-    InputError
-        The folder holds something else, a complete session, or one of another robot; another
-        process writes it; it cannot be written to; or the header breaks the format.
+    An `InputError` where the folder holds something else, a complete session, or one of another
+    robot; another process writes it; it cannot be written to; or the header breaks the format.
     """
 
     def __init__(
@@ -335,6 +303,7 @@ class SessionWriter:
             *['frame'] * bool(header.further_markers), *['orientation'] * bool(header.oriented)
         )
         plain_rows = self._empty_rows
+        # That `correct` was told of.
         self.correction: Correction | None = None
         # Files that are to be written again for it.
         self._due: list[str] = []
@@ -344,6 +313,7 @@ class SessionWriter:
         if resume:
             make_folder(self.folder)
             _remove_beginnings(self.folder, self._empty_rows)
+        # Whether the folder held a session.
         self.resumed = resume and (self.folder / HEADER).exists()
         if self.resumed:
             _refuse_another(self.folder, files, even_complete or go_further)
@@ -351,7 +321,9 @@ class SessionWriter:
             _begin(self.folder, files)
         self._closed = False
         self._closed_as: ExitStatus = 'aborted'
+        # What `check` found changed by others and restored, a line each.
         self.restored: list[str] = []
+        # What others destroyed and the journal has not; such a session is not closed as complete.
         self.beyond_repair = ''
         with contextlib.ExitStack() as undo:
             self._journal = Journal(self.folder / JOURNAL)
@@ -391,12 +363,7 @@ class SessionWriter:
     def correct(self, correction: Correction) -> None:
         """Note the correction that is on, before the first row: what was wanted gets columns.
 
-        Raises
-        ------
-        InputError
-            There are rows already, or the writer is closed.
-        DiskError
-            The disk does not take it; try again when there is room.
+        After a `DiskError` try again when there is room.
         """
         if self.correction is None:
             if self._closed or self.observations:
@@ -421,7 +388,7 @@ class SessionWriter:
 
     @property
     def records(self) -> list[Record]:
-        """Every record of the journal."""
+        """Every record of the journal, also those of the runs before."""
         return self._journal.records
 
     def _content(self, name: str) -> bytes:
@@ -435,6 +402,7 @@ class SessionWriter:
 
     def _take_up_rows(self, even_changed: bool) -> None:
         """Bring observations.csv up to the journal, and find the numbers to go on with."""
+        # What a crash has left incomplete, and was dropped; '' where nothing was.
         self.lost = self._journal.lost
         wanted = self._content(ROWS)
         pieces = [record['rows'] for record in self.records if 'rows' in record]
@@ -453,7 +421,9 @@ class SessionWriter:
             self._rows.append(wanted[size:])
         self._rules = SequenceRules()
         self._line = 2
+        # The next free numbers.
         self.observations = self.configurations = 0
+        # Time of the last observation, s; None before the first.
         self.last_stamp_s: float | None = None
         rows = [row for piece in pieces for row in piece]
         self._accept(self._format.check(rows, self._line, self._rules.branch()))
@@ -465,19 +435,9 @@ class SessionWriter:
     def record(self, record: Record, observations: Sequence[Observation] = ()) -> None:
         """Write one record and its observations; durable on return, or not there at all.
 
-        Parameters
-        ----------
-        record
-            What the journal keeps beside the rows: plain data with a ``kind``.
-        observations
-            In the order measured.
-
-        Raises
-        ------
-        InputError
-            An observation breaks the format (and nothing is written), or the writer is closed.
-        DiskError
-            The disk does not take it; try again when there is room.
+        The record is plain data with a ``kind``; the observations are in the order measured. An
+        `InputError` where one breaks the format (and nothing is written), or the writer is closed;
+        a `DiskError` where the disk does not take it: try again when there is room.
         """
         if self._closed:
             raise InputError(f'{self.folder}: the session is closed; start a new one')
@@ -509,18 +469,11 @@ class SessionWriter:
 
         A file that was replaced, removed or changed is written again from what is in memory: all
         that was acknowledged. What is found in its place is renamed to ``NAME.changed``. A folder
-        that was removed is made again, though the bag and the plan in it are lost.
+        that was removed is made again, though the bag and the plan in it are lost. With `content`
+        every byte is compared; else files of the same size and time of change pass.
 
-        Parameters
-        ----------
-        content
-            Compare every byte; else files of the same size and time of change pass.
-
-        Raises
-        ------
-        MovedError, DiskError
-            The folder was renamed or replaced; or the disk does not take what is to be restored.
-            Nothing may be recorded until it is as before: try again.
+        After a `MovedError` (the folder was renamed or replaced) or a `DiskError` nothing may be
+        recorded until it is as before: try again.
         """
         if self._closed:
             return
@@ -576,19 +529,11 @@ class SessionWriter:
         """Write to session.yaml how the session ended, and the checksums of all files.
 
         Before that every byte of them is compared with what was acknowledged (`check`), and the
-        checksums are of that. Closing again does nothing.
+        checksums are of that. Closing again does nothing. Returns what it was closed as:
+        ``aborted`` instead of ``complete`` where something is `beyond_repair`.
 
-        Returns
-        -------
-        str
-            What it was closed as: ``aborted`` instead of ``complete`` where something is
-            `beyond_repair`.
-
-        Raises
-        ------
-        DiskError
-            The disk does not take it; try again when there is room. Until then the session
-            remains readable, as aborted or without checksums.
+        After a `DiskError` try again when there is room. Until then the session remains readable,
+        as aborted or without checksums.
         """
         if self._closed:
             return self._closed_as

@@ -43,27 +43,6 @@ MESSAGE_TYPES = ('geometry_msgs/msg/PointStamped', POSE, 'mocap4r2_msgs/msg/Mark
 """`sensors.topic.driver.READERS` reads them."""
 
 
-def source_problem(key: str, source: str, message_type: str, *, single_shot: bool) -> str:
-    """Return what is wrong with the keys of such a sensor; '' where nothing is.
-
-    Parameters
-    ----------
-    key
-        Of the sensor, such as ``sensors.mocap``.
-    source, message_type, single_shot
-        As in `cell_sensor.CellSensor`.
-    """
-    if source and not message_type:
-        return f'{key}.source is no key; write it as topic, and give its message_type'
-    if message_type and message_type not in MESSAGE_TYPES:
-        meant = did_you_mean(message_type, MESSAGE_TYPES)
-        known = ', '.join(MESSAGE_TYPES)
-        return f'{key}.message_type is {message_type!r}; it can be {known}{meant}'
-    if message_type and single_shot:
-        return f'{key}.single_shot is for instruments that measure on request; a topic streams'
-    return ''
-
-
 # From the resolution of an interferometer to a depth camera's noise.
 NOISE = Bounds(1e-7, 0.05, 'm')
 # A retroreflector or sphere is seen from further round than this.
@@ -75,48 +54,32 @@ LAST_MEMBER = 65535
 
 
 class CellSensor(msgspec.Struct, forbid_unknown_fields=True):
-    """A sensor of a cell.
+    """A sensor of a cell."""
 
-    Attributes
-    ----------
-    marker
-        The marker it follows.
-    further_markers
-        Further markers that it measures, by name: in the same frame, each with its number in the
-        rigid body; or, where it is `single_shot`, one after another while the arm stands.
-    topic
-        Where its readings are published (geometry_msgs/PointStamped, sensor frame); relative to
-        the nodes' namespace, unless it begins with ``/``. Further markers have topics of their
-        own below it, ``TOPIC/NAME``; each has a message for every frame in which one of them was
-        seen, NaN where this one was not.
-    rough_position_m
-        Where it stands in the robot base, roughly.
-    single_shot
-        True for an instrument that measures on request.
-    measure_service
-        The service (std_srvs/Trigger) that makes it measure.
-    max_angle_deg
-        Largest angle between the tool's z axis and the line to the sensor at which the marker
-        is seen.
-    message_type
-        Where `topic` is of a node that is not of this package, the type of its messages, one of
-        `source_topics.MESSAGE_TYPES`.
-    noise_m, pose_noise_m, frame_noise_m
-        Standard deviations per axis that are expected: of a reading, of the error that all
-        readings at one pose share, and of the one that the markers of one frame share. Only plans
-        depend on them; a fit estimates its own.
-    """
-
+    # The marker it follows.
     marker: str
+    # Where its readings are published (geometry_msgs/PointStamped, sensor frame); relative to the
+    # nodes' namespace, unless it begins with ``/``. Further markers have topics of their own below
+    # it, ``TOPIC/NAME``; each has a message for every frame in which one of them was seen, NaN
+    # where this one was not.
     topic: str
+    # Where it stands in the robot base, roughly.
     rough_position_m: Annotated[Triple, Bounds(-FARTHEST_M, FARTHEST_M, 'm')]
+    # True for an instrument that measures on request, by this service (std_srvs/Trigger).
     single_shot: bool = False
     measure_service: str = ''
+    # Between the tool's z axis and the line to the sensor, at most, where the marker is seen.
     max_angle_deg: Annotated[float, VIEW] = 60.0
+    # Standard deviations per axis that are expected: of a reading, of the error that all readings
+    # at one pose share, and of the one that the markers of one frame share. Only plans depend on
+    # them; a fit estimates its own.
     noise_m: Annotated[float, NOISE] = SIGMA_M
     pose_noise_m: Annotated[float, Bounds(0.0, 0.05, 'm')] = POSE_SIGMA_M
     frame_noise_m: Annotated[float, Bounds(0.0, 0.05, 'm')] = 0.0
+    # By name: in the same frame, each with its number in the rigid body; or, where it is
+    # `single_shot`, one after another while the arm stands.
     further_markers: dict[str, int] = {}
+    # One of `MESSAGE_TYPES`, where `topic` is of a node that is not of this package.
     message_type: str = ''
     # No key of the file: the topic of such a node, whose readings are published on `topic` anew.
     source: str = ''
@@ -147,9 +110,19 @@ class CellSensor(msgspec.Struct, forbid_unknown_fields=True):
 
     def problem(self, where: str, markers: Mapping[str, Triple]) -> str:
         """Return what is wrong with it, being at `where` in the file; '' where nothing is."""
-        return self._marker_problem(where, markers) or source_problem(
-            where, self.source, self.message_type, single_shot=self.single_shot
-        )
+        if problem := self._marker_problem(where, markers):
+            return problem
+        if self.source and not self.message_type:
+            return f'{where}.source is no key; write it as topic, and give its message_type'
+        if self.message_type and self.message_type not in MESSAGE_TYPES:
+            meant = did_you_mean(self.message_type, MESSAGE_TYPES)
+            known = ', '.join(MESSAGE_TYPES)
+            return f'{where}.message_type is {self.message_type!r}; it can be {known}{meant}'
+        if self.message_type and self.single_shot:
+            return (
+                f'{where}.single_shot is for instruments that measure on request; a topic streams'
+            )
+        return ''
 
     def _marker_problem(self, where: str, markers: Mapping[str, Triple]) -> str:
         known = ', '.join(markers)
@@ -198,37 +171,27 @@ class CellToolBox(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class CellPoses(msgspec.Struct, forbid_unknown_fields=True):
-    """Ranges of the Latin hypercube of poses, which of them are visited, and in which order.
-
-    Attributes
-    ----------
-    design
-        ``optimal`` for the poses that tell the most, ``latin_hypercube`` for all of its poses.
-    solutions
-        ``all`` for each pose in all its free joint solutions, nearest first; ``chosen`` for the
-        configurations that take the fewest minutes, a pose again where that is shorter.
-    order
-        ``nearest`` for the nearest pose next, ``fastest`` for the least travel.
-    tool_share
-        0 for the joint offsets alone, 1 for the tool's error alone, between them for a mixture.
-    joint_std_deg, tool_std_m
-        What is to be reached: an optimal design is made for it (without, for what the Latin
-        hypercube reaches, of the joints no less than 0.005 degrees), and a collection ends where
-        it is known to be.
-    tool_box
-        Where the tool's error counts; without, at all candidate poses.
-    """
+    """Ranges of the Latin hypercube of poses, which of them are visited, and in which order."""
 
     azimuth_deg: Range = (0.0, 360.0)
     radius_m: Annotated[Range, Bounds(0.0, 10.0, 'm')] = (0.2, 0.5)
     height_m: Annotated[Range, REACH] = (0.4, 0.8)
     roll_deg: Range = (0.0, 360.0)
+    # `OPTIMAL` for the poses that tell the most, `LATIN_HYPERCUBE` for all of its poses.
     design: str = OPTIMAL
+    # `ALL` for each pose in all its free joint solutions, nearest first; `CHOSEN` for the
+    # configurations that take the fewest minutes, a pose again where that is shorter.
     solutions: str = ALL
+    # `NEAREST` for the nearest pose next, `FASTEST` for the least travel.
     order: str = NEAREST
+    # 0 for the joint offsets alone, 1 for the tool's error alone, between them for a mixture.
     tool_share: Annotated[float, Bounds(0.0, 1.0)] = 0.0
+    # What is to be reached: an optimal design is made for it (without, for what the Latin
+    # hypercube reaches, of the joints no less than 0.005 degrees), and a collection ends where it
+    # is known to be.
     joint_std_deg: Annotated[float | None, Bounds(0.0, 5.0, 'degrees', above=True)] = None
     tool_std_m: Annotated[float | None, Bounds(0.0, 0.1, 'm', above=True)] = None
+    # Where the tool's error counts; without, at all candidate poses.
     tool_box: CellToolBox | None = None
 
     def ranges(self) -> PoseRanges:
@@ -566,17 +529,9 @@ def config_path(name: str) -> Path:
 
 
 def read_cell(path: str | Path) -> Workcell:
-    """Read and check a cell file.
+    """Read and check a cell file; a bare name such as ``demo`` is the shipped cells/demo.yaml.
 
-    Parameters
-    ----------
-    path
-        The file; a bare name such as ``demo`` means the shipped config/cells/demo.yaml.
-
-    Raises
-    ------
-    InputError
-        Naming the file, the key and the remedy.
+    An `InputError` names the file, the key and the remedy.
     """
     path = Path(path)
     if not path.suffix and not path.is_file():

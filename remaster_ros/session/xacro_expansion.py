@@ -62,17 +62,9 @@ class Namespace(dict[str, Any]):
 
 
 def evaluate(expression: str, names: Mapping[str, Any]) -> Any:
-    """Return the value of an expression.
+    """Return the value of an expression; an `ExpressionError` says why it has none here.
 
-    Parameters
-    ----------
-    names
-        Properties by their names, and what `global_names` returns.
-
-    Raises
-    ------
-    ExpressionError
-        Why it has no value here.
+    `names` are properties by their names, and what `global_names` returns.
     """
     if len(expression) > LONGEST:
         raise ExpressionError(f'an expression of {len(expression)} characters')
@@ -392,16 +384,9 @@ _TOKENS = re.compile(
 
 
 class Expansion:
-    """The expansion of one file.
+    """The expansion of one file, which may do what a program may if it is trusted.
 
-    Parameters
-    ----------
-    path
-        The file.
-    package_path
-        Folders to look for ROS packages in, beside those around the file.
-    trusted
-        Whether the file may do what a program may.
+    ROS packages are looked for in the folders of `package_path`, and around the file.
     """
 
     def __init__(self, path: Path, package_path: list[Path], *, trusted: bool) -> None:

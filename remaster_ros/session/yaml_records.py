@@ -87,10 +87,7 @@ for _name, _pattern, _first in _CORE_RESOLVERS:
 def load_yaml(text: str) -> Any:
     """Return the plain data of one YAML document.
 
-    Raises
-    ------
-    YamlError
-        Not YAML, more than one document, an alias, a tag, a repeated key, or nested too deep.
+    A `YamlError` for more than one, an alias, a tag, a repeated key, or what is nested too deep.
     """
     try:
         return yaml.load(text, Loader=_Loader)
@@ -148,14 +145,7 @@ def with_line(text: str, problem: str) -> str:
 def explained(text: str, record: type[msgspec.Struct], message: str) -> str:
     """Return msgspec's message with the line of the key, and the key that was meant.
 
-    Parameters
-    ----------
-    text
-        The file.
-    record
-        What it was to be.
-    message
-        As msgspec has it.
+    The text of the file was to be a `record`.
     """
     found = _AT.search(message)
     steps = re.findall(r'\w+|\[[^\]]*\]', found[1]) if found else []
@@ -229,10 +219,7 @@ def to_plain(value: Any) -> Any:
 def from_plain(content: Any, record: Any) -> Any:
     """Return what `to_plain` made plain, a `record` (a type); its arrays are of floats.
 
-    Raises
-    ------
-    ValueError
-        The content does not fit it; names the place.
+    A `ValueError` names the place that does not fit it.
     """
     return msgspec.convert(content, record, dec_hook=lambda _, values: np.array(values, float))
 
@@ -245,25 +232,16 @@ Record = TypeVar('Record', bound=msgspec.Struct)
 
 @dataclass(frozen=True)
 class Bounds:
-    """What a number of a file may be; in any case it is finite.
-
-    Attributes
-    ----------
-    least, most
-        Smallest and largest value.
-    unit
-        Of the number. Beyond `most` m, or below `least` degrees, the message gives the value as
-        it is if it was written in millimetres or radians.
-    above
-        Whether `least` itself is refused.
-    remedy
-        Further text of the message.
-    """
+    """What a number of a file may be; in any case it is finite."""
 
     least: float = -math.inf
     most: float = math.inf
+    # Beyond `most` m, or below `least` degrees, the message gives the value as it is if it was
+    # written in millimetres or radians.
     unit: str = ''
+    # Whether `least` itself is refused.
     above: bool = False
+    # Further text of the message.
     remedy: str = ''
 
     def problem(self, key: str, value: float) -> str:
@@ -284,21 +262,9 @@ class Bounds:
 
 
 def read_yaml(data: bytes, path: Path, record: type[Record], remedy: str = '') -> Record:
-    """Read a YAML file into a record, its numbers within their bounds.
+    """Read the bytes of a YAML file into a struct, its numbers within their bounds.
 
-    Parameters
-    ----------
-    data, path
-        The file's bytes, and its name for messages.
-    record
-        The struct.
-    remedy
-        Appended to what msgspec reports of missing keys and wrong types.
-
-    Raises
-    ------
-    InputError
-        One line naming file, line or key, and the remedy.
+    The remedy is appended to what msgspec reports of missing keys and wrong types.
     """
     text = decode_text(data, path)
     try:
@@ -315,14 +281,7 @@ def read_yaml(data: bytes, path: Path, record: type[Record], remedy: str = '') -
 def out_of_bounds(value: Any, key: str = '', bounds: Bounds = Bounds()) -> str:
     """Return what is wrong with the first number that its bounds refuse; '' where none is.
 
-    Parameters
-    ----------
-    value
-        A record or a part of one.
-    key
-        Where it stands, dotted.
-    bounds
-        Of the field that it is in.
+    The value is a record or a part of one, at a dotted key, in a field with these bounds.
     """
     if isinstance(value, float):
         return bounds.problem(key, value)

@@ -26,13 +26,7 @@ _KINDS = ('Rigid Body', 'Marker', 'Rigid Body Marker')
 
 
 def read(text: str) -> Named | None:
-    """Return the columns of a take; None for anything else.
-
-    Raises
-    ------
-    InputError
-        Naming the line and what was expected there.
-    """
+    """Return the columns of a take; None for anything else."""
     start = _START.match(text)
     if start is None:
         return None

@@ -15,32 +15,30 @@ NUMBER = re.compile(r'[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?', re.ASCII)
 _FEWEST_AXES = 2
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Named:
-    """Named columns of a text; meanings as of `text_table.TextTable`.
+    """Named columns of a text."""
 
-    Attributes
-    ----------
-    kind
-        What the file is, for people.
-    names
-        Of the columns, with their units in brackets.
-    rows, lines
-        Cells, and the line of each row.
-    decimal
-        Sign of the numbers.
-    """
-
+    # What the file is, for people, where it is no plain table.
     kind: str
+    # Of the columns, with their units in brackets; numbers from 1 on where there is no header.
     names: tuple[str, ...]
+    # Cells as text, and the line of each row in the file.
     rows: tuple[tuple[str, ...], ...]
     lines: tuple[int, ...]
+    # Sign of the numbers.
     decimal: str = '.'
+    # Marker -> columns X, Y and Z, where the file itself names its markers, and -> columns of its
+    # quaternion x, y, z, w.
     groups: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
     turns: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
+    # The markers that are taken where nothing is told; () for all of them.
     points: tuple[str, ...] = ()
+    # Joint column -> (another one, 1 or -1) that the controller does not count with it.
     coupling: Mapping[str, tuple[str, Literal[1, -1]]] = field(default_factory=dict)
+    # Of the controller; '' where it is not known.
     maker: str = ''
+    # What was left out of the file, a sentence each.
     notes: tuple[str, ...] = ()
 
 
@@ -62,17 +60,8 @@ def axes_in_order(
 ) -> Named:
     """Return positions as columns: their names where any has one, then the axes in order.
 
-    Parameters
-    ----------
-    found
-        Line, name ('' for none) and axes of each position; axes as ``A1``.
-    letters
-        Of the arm's axes first; then of external axes, which are left out where they stay at 0.
-
-    Raises
-    ------
-    InputError
-        A position without one of the axes that others have.
+    Each position is `found` as its line, name ('' for none) and axes, such as ``A1``. `letters`
+    are those of the arm's axes, then of external axes, which are left out where they stay at 0.
     """
     every = {axis for _, _, values in found for axis in values}
     axes = sorted(every, key=lambda axis: (letters.index(axis[0]), int(axis[1:])))

@@ -8,7 +8,7 @@ from foreign_tables import measured, text, write
 
 import remaster_ros
 from remaster_ros.errors import InputError, InsufficientDataError
-from remaster_ros.importing.in_python import robot_of
+from remaster_ros.session.robot_description import read_arm
 
 
 @pytest.fixture
@@ -28,9 +28,9 @@ def test_of_two_arms_it_is_the_one_that_the_table_names(side, tmp_path):
     urdf, table = tmp_path / 'two.urdf', tmp_path / 'table.csv'
     urdf.write_text(f'<robot name="two">{"".join(parts)}</robot>')
     table.write_text(f'{side}_j.pos,x,y,z\n')
-    assert robot_of(urdf, None, None, [table])[1].tip_link == f'{side}_arm'
+    assert read_arm(urdf, tables=[table])[1].tip_link == f'{side}_arm'
     with pytest.raises(InputError, match='several arms of 1 joints'):
-        robot_of(urdf, None, None)
+        read_arm(urdf)
 
 
 def test_arrays_and_columns_by_name_are_a_session(arm, tmp_path):

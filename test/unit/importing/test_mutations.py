@@ -15,7 +15,7 @@ from test_makers import JOINTS, joints_of, mutated
 from remaster_ros.errors import InputError
 from remaster_ros.importing.columns import find_columns
 from remaster_ros.importing.text_table import read_table
-from remaster_ros.importing.values import labels, length_unit, numbers, times
+from remaster_ros.importing.values import length_unit, numbers, times
 
 NAMES = [f'P{i:02d}' for i in range(1, 9)]
 
@@ -70,7 +70,6 @@ def cells_of(table):
     values = numbers(table, columns, optional=True)
     assert np.all(np.isnan(values) | np.isfinite(values))
     times(table, found)
-    labels(table, found.one('name'))
     if found.point:
         length_unit(table, found, '', values[:, -3:], values[:, -3:])
     return columns, Counter(tuple(row[i] for i in columns) for row in table.rows)
