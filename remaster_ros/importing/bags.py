@@ -249,6 +249,7 @@ class _Rows:
                 f'{SWING_S:g} s after the joints stood still',
                 *self._matched,
             ),
+            length_unit=length,
             warnings=(
                 *((unsteady,) if self._unsteady else ()),
                 *((dropped,) if self._dropped else ()),

@@ -237,6 +237,10 @@ class RawRows:
         (n,); NaN and -1 where unknown.
     columns
         Column -> what it was taken for, for people.
+    points
+        Marker -> columns of X, Y and Z, where there are such.
+    length_unit
+        In which the points are.
     angle_unit
         In which the table has the joints; None where they are those of the URDF, as in a bag.
     reading
@@ -267,6 +271,8 @@ class RawRows:
     columns: dict[str, str]
     description: tuple[str, ...]
     warnings: tuple[str, ...]
+    points: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    length_unit: str = 'm'
     angle_unit: AngleUnit | None = None
     reading: IntArray | None = None
     orientation: FloatArray | None = None
@@ -470,6 +476,8 @@ def _values(
         columns=meanings,
         description=description,
         warnings=warnings,
+        points={name: tuple(table.names[i] for i in own) for name, own in columns.points.items()},
+        length_unit=length,
         angle_unit=cast(AngleUnit | None, angle),
         reading=row if several else None,
         orientation=turns[marker, row] if columns.orientations else None,

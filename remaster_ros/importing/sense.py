@@ -188,11 +188,7 @@ def _by_marker(session: Session, rows: RawRows, without: str) -> Sense | None:
     else:
         why = 'each alone; were they computed from one another? Points of one body turn with it'
     name = next(iter(fitting))
-    points = [
-        column.rpartition(': ')[2]
-        for column, meaning in rows.columns.items()
-        if any(meaning.startswith(f'{axis} of marker {name},') for axis in 'xyz')
-    ]
+    points = rows.points.get(name, ())
     return Sense(
         False,
         f'all markers together fit to {without} only, {alone} to '
@@ -276,21 +272,13 @@ def _nothing_found(given: Fitted, without: str, chain: SerialChain, oriented: bo
 def columns_of(rows: RawRows, chain: SerialChain) -> Columns:
     """Return how the table names what it holds, and in which units that was taken to be."""
     joints = tuple(split_unit(column)[0] for column in rows.joint_columns)
-    points: dict[str, str] = {}
-    lengths = ['m']
-    for name, meaning in rows.columns.items():
-        for axis in 'xyz':
-            if meaning.startswith((f'{axis} of the marker', f'{axis} of marker ')):
-                points.setdefault(axis, name)
-                if ', ' in meaning:
-                    lengths.append(meaning.split(', ')[1].split()[0])
     return Columns(
         joints=joints,
         # A column without a name is called as the robot's joint.
         shown=tuple(
             own if name.isdigit() else name for name, own in zip(joints, chain.joint_names)
         ),
-        points=tuple(points.get(axis, axis.upper()) for axis in 'xyz'),
-        length_unit=lengths[-1],
+        points=next(iter(rows.points.values()), ('X', 'Y', 'Z')),
+        length_unit=rows.length_unit,
         angle_unit=rows.angle_unit or 'rad',
     )

@@ -141,6 +141,20 @@ def test_a_proposal_is_one_that_the_program_accepts_and_that_helps(table, spoil,
     )
 
 
+def test_points_in_a_table_of_their_own_are_exchanged_as_proposed(table):
+    """The columns are named as that table has them, not as both are listed."""
+    imported = table()
+    names = [f'P{i}' for i in range(len(imported.q))]
+    joints = write(imported.folder, 'j.csv', text(['name', *NAMES], [names, *imported.q.T]))
+    mirrored = imported.points[:, [1, 0, 2]]
+    points = write(imported.folder, 'p.csv', text(['name', 'X', 'Y', 'Z'], [names, *mirrored.T]))
+    line = ['import', joints, points, '--urdf', imported.urdf, '--out', imported.folder / 's']
+    assert main([*map(str, line)]) == 1
+    error = imported.capsys.readouterr().err
+    proposed = error.split('to write it so, add ')[1].split('; to write it as')[0]
+    assert main([*map(str, line), *shlex.split(proposed)]) == 0, proposed
+
+
 def test_a_proposal_beyond_the_limits_of_the_robot_is_not_made(table):
     """As if the arm were another: 90 degrees on joint 2 fits, and is refused by the URDF."""
     imported = table()
