@@ -1,4 +1,4 @@
-"""Slow work beside the callbacks of a node: path checks, writing to a disk."""
+"""Slow work beside the callbacks of a node: path checks, planning, writing to a disk."""
 
 from __future__ import annotations
 
@@ -7,11 +7,15 @@ import threading
 from collections import deque
 from collections.abc import Callable
 from queue import SimpleQueue
-from typing import Any
+from typing import Any, TypeVar
 
+import numpy as np
 from rclpy.exceptions import InvalidHandle
 from rclpy.node import Node
 
+from remaster_ros.types import FloatArray
+
+Result = TypeVar('Result')
 Work = Callable[[], Any]
 Then = Callable[[Any], object]
 
@@ -60,3 +64,39 @@ class Background:
         while self._results:
             then, result = self._results.popleft()
             then(result)
+
+
+MOVED_RAD = 0.005
+"""An arm this far from where a way begins, in any joint, gets another one."""
+
+
+class PlanningThread:
+    """Does one thing at a time in the background: a stop must not wait for the planning."""
+
+    def __init__(self, background: Background) -> None:
+        self._background = background
+        self._q: FloatArray = np.empty(0)
+        self._what: object = None
+        self._works = False
+        # What the last job gave, in a tuple; None where it was taken.
+        self._found: tuple[Any] | None = None
+
+    def ask(self, what: object, q: FloatArray, job: Callable[[], Result]) -> tuple[Result] | None:
+        """Return what a job found, in a tuple, or raise what it raised; None while it works.
+
+        `what` names the job: the result of another one, or for an arm that has moved since from
+        `q`, rad, (k,), is forgotten.
+        """
+        if self._works:
+            return None
+        found, self._found = self._found, None
+        if found is None or self._what != what or not np.max(np.abs(self._q - q)) <= MOVED_RAD:
+            self._what, self._q, self._works = what, q, True
+            self._background.submit(job, self._take)
+            return None
+        if isinstance(found[0], Exception):
+            raise found[0]
+        return found
+
+    def _take(self, result: Any) -> None:
+        self._found, self._works = (result,), False

@@ -30,11 +30,10 @@ from remaster_ros.errors import InputError
 from remaster_ros.kinematics.same_arm import axes_apart, difference
 from remaster_ros.motion.limits import ACCELERATION, MotionLimits
 from remaster_ros.motion.motion_gate import Admitted, ForeignGate
-from remaster_ros.nodes.arm_states import JOINTS, ArmStates
 from remaster_ros.nodes.controller_link import control_messages
 from remaster_ros.nodes.messages import duration_of
 from remaster_ros.nodes.parameters import declare, parameter
-from remaster_ros.nodes.rivals import OnlyPublisher
+from remaster_ros.nodes.rivals import JOINTS, ArmStates, OnlyPublisher
 from remaster_ros.nodes.robot_bridge import DESCRIPTION, DESCRIPTION_QOS, NEWEST_STATES
 from remaster_ros.nodes.running import RemasterNode, run
 from remaster_ros.nodes.status import LEASED, RELIABLE

@@ -29,9 +29,8 @@ from trajectory_msgs.msg import JointTrajectory
 from remaster_ros.errors import InputError
 from remaster_ros.motion.actions import SupervisorRules
 from remaster_ros.motion.following import path_tolerance
-from remaster_ros.nodes.endpoints import UNNAMED
 from remaster_ros.nodes.messages import duration_of
-from remaster_ros.nodes.status import LEASED, RELIABLE
+from remaster_ros.nodes.status import LEASED, RELIABLE, UNNAMED
 from remaster_ros.sensors.registry import kind_of
 from remaster_ros.types import FloatArray
 

@@ -51,9 +51,9 @@ from remaster_ros.compensation.file import COMPENSATION_FILE, read_compensation
 from remaster_ros.compensation.verification import Visits, verify
 from remaster_ros.errors import DeviceError, InputError, RemasterError
 from remaster_ros.nodes.launching import CORE, SENSORS
-from remaster_ros.nodes.page_address import opening_path, page_name
 from remaster_ros.nodes.parameters import declare, parameter
 from remaster_ros.nodes.running import report
+from remaster_ros.nodes.runtime_files import opening_path, page_name
 from remaster_ros.nodes.status import listen
 from remaster_ros.reports.discovery_json import read_discovery
 from remaster_ros.reports.fit_json import APPLY_FOLDER, read_fit

@@ -1,13 +1,24 @@
-"""Stamps and transforms as ROS messages; what reads messages is `collection.message_fields`."""
+"""Stamps, transforms and waypoints as ROS messages; others: `collection.message_fields`."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 from builtin_interfaces.msg import Duration, Time
 from geometry_msgs.msg import TransformStamped
+from std_msgs.msg import Header
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
+from remaster_ros.collection.message_fields import refuse_repeated
+from remaster_ros.errors import InputError
 from remaster_ros.kinematics import transforms
 from remaster_ros.types import FloatArray
+
+if TYPE_CHECKING:
+    # It loads all of the planning.
+    from remaster_ros.planning.tour_order import PoseVisit
 
 
 def stamp_of(time_s: float) -> Time:
@@ -41,3 +52,68 @@ def transform_array(message: TransformStamped) -> FloatArray:
         transforms.matrix_from_quaternion_xyzw(quaternion),
         np.array([translation.x, translation.y, translation.z]),
     )
+
+
+def waypoints_message(
+    stop: PoseVisit, joint_names: Sequence[str], header: Header
+) -> JointTrajectory:
+    """Return remaster/joint_waypoints of a stop.
+
+    The configurations to go through before each solution, in order; ``time_from_start.sec`` is 1
+    + the index of the solution they lead to, as in joint_solutions. Empty where all ways are
+    straight.
+    """
+    message = JointTrajectory(joint_names=list(joint_names))
+    message.header = header
+    message.points = [
+        JointTrajectoryPoint(positions=q.tolist(), time_from_start=duration_of(i + 1.0))
+        for i, path in enumerate(stop.paths)
+        for q in path
+    ]
+    return message
+
+
+def waypoints_by_solution(
+    message: JointTrajectory, joint_names: Sequence[str]
+) -> dict[int, FloatArray]:
+    """Group remaster/joint_waypoints by the solution that they lead to.
+
+    Parameters
+    ----------
+    message
+        See `waypoints_message`; its joints may be in any order.
+    joint_names
+        The wanted order of joints.
+
+    Returns
+    -------
+    dict
+        Index of the solution -> configurations to go through before it, rad, (n, k), n >= 1;
+        without those that a straight way leads to.
+
+    Raises
+    ------
+    InputError
+        Joints that are missing or named twice, points of the wrong length, not finite or out of
+        order.
+    """
+    if not message.points:
+        return {}
+    names = list(message.joint_names)
+    missing = [name for name in joint_names if name not in names]
+    if missing:
+        raise InputError(f'joint_waypoints: {missing[0]} is missing; it has {", ".join(names)}')
+    refuse_repeated(joint_names, names, 'joint_waypoints')
+    columns = [names.index(name) for name in joint_names]
+    found: dict[int, list[FloatArray]] = {}
+    last = 0
+    for point in message.points:
+        index = point.time_from_start.sec - 1
+        positions = np.array(point.positions, dtype=float)
+        if positions.shape != (len(names),) or not np.all(np.isfinite(positions)):
+            raise InputError(f'joint_waypoints: a point {point.positions} for {len(names)} joints')
+        if index < last:
+            raise InputError(f'joint_waypoints: solution {index} after solution {last}')
+        last = index
+        found.setdefault(index, []).append(positions[columns])
+    return {index: np.array(points) for index, points in found.items()}

@@ -48,20 +48,20 @@ from remaster_ros.collection.events import OptimizerState, PoseAnnounced
 from remaster_ros.collection.message_fields import CORRECTED, JointOrder, stamp_key, wanted_of
 from remaster_ros.collection.pace import Pace, progress_text
 from remaster_ros.collection.peer_models import PeerModels
-from remaster_ros.collection.plan_confirmation import service_name
+from remaster_ros.collection.plan_confirmation import PlanConfirmation, fingerprint, service_name
 from remaster_ros.collection.preflight_facts import PreflightFacts
-from remaster_ros.collection.tour_progress import TourProgress
+from remaster_ros.collection.required_sensors import RequiredSensors
+from remaster_ros.collection.tour_progress import PlanMemory, TourProgress
 from remaster_ros.errors import InputError, RemasterError
 from remaster_ros.kinematics import transforms
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.motion.preflight import preflight
+from remaster_ros.nodes.background import Background, PlanningThread
 from remaster_ros.nodes.judging import KINDS, Judging, JudgingParameters, Kind
-from remaster_ros.nodes.locking import runtime_folder
-from remaster_ros.nodes.messages import duration_of, transform_array
+from remaster_ros.nodes.messages import duration_of, transform_array, waypoints_message
 from remaster_ros.nodes.parameters import declare, parameter
-from remaster_ros.nodes.plan_preview import PlanPreview
-from remaster_ros.nodes.planning_thread import PlanningThread
 from remaster_ros.nodes.running import RemasterNode, run
+from remaster_ros.nodes.runtime_files import runtime_folder
 from remaster_ros.nodes.status import (
     JOINT_STATES,
     LATCHED,
@@ -71,15 +71,14 @@ from remaster_ros.nodes.status import (
     Summary,
     listen,
 )
-from remaster_ros.nodes.waypoints import waypoints_message
-from remaster_ros.planning.collection_plan import session_time_s
+from remaster_ros.planning.collection_plan import look_ahead, session_time_s
 from remaster_ros.planning.rival_causes import FoundCause
 from remaster_ros.planning.separating_design import MOST_FURTHER
 from remaster_ros.planning.tour_order import FITTED, REGISTRATION, PoseVisit, Tour
 from remaster_ros.planning.tour_planner import REGISTRATION_CANDIDATES, TourPlanner
 from remaster_ros.planning.travel_time import SPEED_SHARE, TravelTime
 from remaster_ros.session.files import read_limited
-from remaster_ros.session.plan_journal import NO_FREE_PATH, PlanJournal
+from remaster_ros.session.plan_journal import NO_FREE_PATH, PlanJournal, plan_page_path
 from remaster_ros.session.reader import OBSERVATIONS_LIMIT, ROWS, read_session
 from remaster_ros.session.workcell import Workcell, read_cell
 from remaster_ros.types import FloatArray
@@ -535,6 +534,161 @@ class ProgressLines:
             self._log.info(f'{state}: {text}')
 
 
+# The plan that is next on a page, for a person to look at before the arm moves: `confirm: true`.
+#
+# The page is drawn beside the callbacks as soon as it is known where the arm stands, and again
+# when another plan is next: after the registration, which the collection is planned from.
+
+
+class PlanPreview(PlanConfirmation):
+    """Draws the plan that is next, until it is confirmed.
+
+    Parameters
+    ----------
+    cell
+        The cell.
+    tours
+        Plans the tours.
+    memory, progress
+        The plan under way, and how far it is.
+    session
+        The session's folder; the page is beside it.
+
+    Attributes
+    ----------
+    page
+        Where the page is.
+    """
+
+    def __init__(
+        self,
+        cell: Workcell,
+        tours: TourPlanner,
+        memory: PlanMemory,
+        progress: TourProgress,
+        session: Path,
+        background: Background,
+    ) -> None:
+        self.page = plan_page_path(session)
+        super().__init__(cell.confirm, str(self.page))
+        self._cell, self._tours = cell, tours
+        self._memory, self._progress = memory, progress
+        self._thread = PlanningThread(background)
+        self._drawn: object = None
+
+    def withdraw(self) -> None:
+        """Have the page drawn anew before anything can be confirmed."""
+        super().withdraw()
+        self._drawn = None
+
+    def values(self) -> dict[str, str]:
+        """Return what people are shown of it."""
+        if not self.required:
+            return {}
+        done = self.shown and self.shown == self.confirmed
+        page = str(self.page) if self.shown else ''
+        confirmed = 'yes' if done else 'no'
+        return {'plan_page': page, 'plan_shown': self.shown, 'confirmed': confirmed}
+
+    def asked(self) -> str:
+        """Return the refusal of a person's request; what could not be shown is tried again."""
+        refusal = self.refusal()
+        if self.trouble:
+            self.withdraw()
+        return refusal
+
+    def draw(self, q: FloatArray, facts: PreflightFacts) -> str:
+        """Draw what is next, where the page has something else; return what a person is told.
+
+        Parameters
+        ----------
+        q
+            Where the arm stands, rad, (k,).
+        facts
+            They tell which sensors must be registered before the collection.
+
+        Returns
+        -------
+        str
+            '' while it is drawn, and where there is nothing new.
+        """
+        if not self.required:
+            return ''
+        try:
+            what, tour = self._next(facts.required())
+        except InputError as error:
+            self.trouble = str(error)
+            return ''
+        if self.confirmed and what == self.confirmed:
+            # Also where something else was drawn meanwhile.
+            self.show(self.confirmed)
+            self._drawn = what
+        if what == self._drawn:
+            return ''
+        if self.shown:
+            self.withdraw()
+        T_R_N, stop = dict(self._progress.T_R_N), self._memory.stop
+        # As it is now: the thread must not see it change.
+        left = tour.fork() if tour is not None else None
+        try:
+            found = self._thread.ask(what, q, lambda: self._draw(what, left, stop, T_R_N, q))
+            if found is None:
+                return ''
+            self.show(found[0])
+        except RemasterError as error:
+            self.trouble = str(error)
+        self._drawn = what
+        return self.refusal()
+
+    def _next(self, required: RequiredSensors) -> tuple[str, Tour | None]:
+        """Return what is next, as `TourProgress.next` has it, by a name of it; and its tour.
+
+        That is the tour under way, by its fingerprint, or else one that is still to be planned.
+        """
+        T_R_N, tour = self._progress.T_R_N, self._memory.tour
+        registered = self._progress.phase != REGISTRATION or required.are_among(T_R_N)
+        if tour is not None and (REGISTRATION in tour.plans) != registered:
+            return fingerprint(tour), tour
+        if not registered:
+            return REGISTRATION, None
+        places = b''.join(name.encode() + T.tobytes() for name, T in sorted(T_R_N.items()))
+        return f'collection {hash(places)}', None
+
+    def _draw(
+        self,
+        what: str,
+        tour: Tour | None,
+        stop: PoseVisit | None,
+        T_R_N: dict[str, FloatArray],
+        q: FloatArray,
+    ) -> str:
+        """Write the page of what is next, and return the fingerprint of its tour."""
+        # Only here: a planner without this page needs none of it.
+        from remaster_ros.reports.plan_page import plan_page, write_plan_page
+        from remaster_ros.reports.robot_scene import robot_scene
+
+        planner, places = self._tours, T_R_N
+        if tour is None:
+            stop = None
+            tour = planner.registration() if what == REGISTRATION else planner.collection(T_R_N)
+        tours, registered = [tour], REGISTRATION not in tour.plans
+        if not registered:
+            # What is expected to follow; it is planned anew once the sensors are registered.
+            tours.append(planner.collection(planner.rough_places))
+        if not registered or not T_R_N:
+            places = planner.rough_places
+        plan = look_ahead(
+            planner, places, tours, q, stop if stop is not None and stop.ids else None
+        )
+        name = fingerprint(tour)
+        scene = robot_scene(self._cell, planner.scene).with_sensors(places)
+        html = plan_page(
+            plan, scene, Path(self._cell.file).stem, registered=registered, confirm=name
+        )
+        write_plan_page(self.page, html)
+        return name
+
+
 RETRY_WALL_S = 1.0
 """How often a full disk is tried again, wall time."""
 
@@ -554,13 +708,15 @@ class PosePlanner(RemasterNode):
         settings = self.p.plan_settings(self.cell, causes)
         folder = Path(self.p.session)
         self.journal = PlanJournal(folder, settings, self.chain, self._tours.model)
-        self.progress = TourProgress(self.journal, self._tours, PlanningThread())
+        self.progress = TourProgress(self.journal, self._tours, PlanningThread(Background(self)))
         # Of the run, and of what may be published only while it is running.
         self._lock = threading.RLock()
         self.run = CollectionRun(self.p.resume_within_s)
         self._further = FurtherMeasuring(self.p.discovery, folder, self.journal, self._tours)
         # Every pose passes its gate in `_announce`.
-        self._preview = PlanPreview(self.cell, self._tours, self.journal, self.progress, folder)
+        self._preview = PlanPreview(
+            self.cell, self._tours, self.journal, self.progress, folder, Background(self)
+        )
         self._judging = Judging(self, folder, self.p, self.cell, self._tours)
         self._living: LivingRun | None = None
         self._tried_wall = 0.0

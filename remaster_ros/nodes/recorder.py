@@ -36,11 +36,11 @@ from remaster_ros.collection.recording import EndedReading, Recording
 from remaster_ros.collection.required_sensors import RequiredSensors
 from remaster_ros.errors import DiskError, InputError, MovedError
 from remaster_ros.motion.liveness import Liveness
-from remaster_ros.nodes.arm_states import JOINTS, ArmStates
 from remaster_ros.nodes.bagging import BagRecorder
 from remaster_ros.nodes.controller_link import COMMANDS, COPIES
 from remaster_ros.nodes.messages import transform_message
 from remaster_ros.nodes.parameters import declare
+from remaster_ros.nodes.rivals import JOINTS, ArmStates
 from remaster_ros.nodes.running import RemasterNode, run
 from remaster_ros.nodes.simulated_clock import ReportsTaken, SteadyTime
 from remaster_ros.nodes.status import (

@@ -9,15 +9,19 @@ from __future__ import annotations
 
 import sys
 import time
+from collections import deque
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
+from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import JointState
-from std_msgs.msg import String
+from std_msgs.msg import Bool, String
 from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
@@ -32,6 +36,7 @@ from remaster_ros.collection.message_fields import (
 from remaster_ros.collection.peer_models import PeerModels
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.same_arm import difference
+from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.motion.actions import (
     Action,
     CheckPath,
@@ -41,16 +46,17 @@ from remaster_ros.motion.actions import (
     PathAnswer,
     Settled,
     Stop,
+    SupervisorRules,
 )
 from remaster_ros.motion.arm_supervisor import ArmSupervisor
 from remaster_ros.motion.joint_reports import JointReport, JointReports
+from remaster_ros.motion.limits import MotionLimits
 from remaster_ros.motion.motion_gate import PROBE_S, Admitted, MotionGate
 from remaster_ros.motion.move_queue import PROBE
 from remaster_ros.motion.path_check import PointSpeeds
 from remaster_ros.motion.path_search import PathSearch
-from remaster_ros.nodes.arm_states import JOINTS, ArmStates
+from remaster_ros.motion.settling import SettleRules
 from remaster_ros.nodes.background import Background
-from remaster_ros.nodes.bridge_parameters import Parameters
 from remaster_ros.nodes.controller_link import (
     COMMANDS,
     ActionLink,
@@ -58,17 +64,20 @@ from remaster_ros.nodes.controller_link import (
     TopicLink,
     control_messages,
 )
-from remaster_ros.nodes.emergency_link import EmergencyLink
-from remaster_ros.nodes.messages import duration_of, stamp_of
-from remaster_ros.nodes.parameters import declare
-from remaster_ros.nodes.rivals import OnlyPublisher
+from remaster_ros.nodes.messages import duration_of, stamp_of, waypoints_by_solution
+from remaster_ros.nodes.parameters import declare, parameter
+from remaster_ros.nodes.rivals import JOINTS, ArmStates, OnlyPublisher
 from remaster_ros.nodes.running import RemasterNode, run
 from remaster_ros.nodes.simulated_clock import ReportsTaken, SteadyTime
 from remaster_ros.nodes.status import RELIABLE, NodeStatus, Summary, listen
-from remaster_ros.nodes.waypoints import waypoints_by_solution
+from remaster_ros.parameters import SimulationParameters
 from remaster_ros.session.bridge_files import HaltFile, LastCommandFile
-from remaster_ros.session.workcell import read_cell
+from remaster_ros.session.workcell import Workcell, read_cell
 from remaster_ros.types import FloatArray
+
+if TYPE_CHECKING:
+    from remaster_ros.compensation.in_use import CorrectionInUse
+
 
 SOLUTIONS = 'remaster/joint_solutions'
 WAYPOINTS = 'remaster/joint_waypoints'
@@ -91,6 +100,219 @@ longer with it, a paused process may not.
 """
 WATCH_WALL_S = 0.05
 """How often silence and the graph are looked at."""
+
+
+@dataclass(frozen=True)
+class Parameters(SimulationParameters):
+    """Parameters of the bridge."""
+
+    REPLACED: ClassVar[Mapping[str, str]] = {
+        'offsets': 'give compensation the apply/compensation.json that fit has written beside '
+        'fit.json: limits and paths are checked by it as before, and what is commanded is '
+        'corrected'
+    }
+    cell: str = parameter('', 'cell file: a path, or the name of a shipped one; must be given')
+    speed_share: float = parameter(
+        0.3,
+        'share of each joint velocity limit that is used; while a collection runs it can be '
+        'lowered: the arm is stopped and goes on with the new one',
+        low=0.01,
+        high=1.0,
+        live=True,
+    )
+    cartesian_speed_limit_m_s: float = parameter(
+        0.25,
+        'largest speed of the fastest point of arm and tool; 0.25 is customary in manual mode, '
+        '0 means no such limit; while a collection runs it can be lowered',
+        unit='m/s',
+        low=0.0,
+        high=10.0,
+        live=True,
+    )
+    limit_margin_deg: float = parameter(
+        0.5, 'distance kept from the joint limits', unit='deg', low=0.0, high=45.0
+    )
+    compensation: str = parameter(
+        '',
+        'compensation.json by which every configuration is corrected before it is checked and '
+        'commanded; read once, at the start; empty for none',
+    )
+    settle_s: float = parameter(
+        3.0, 'how long the arm must stand still before a reading', unit='s', low=0.1, high=60.0
+    )
+    arrive_tolerance: float = parameter(
+        2e-3, 'largest distance of a joint from its target', unit='rad', low=1e-6, high=0.1
+    )
+    still_tolerance: float = parameter(
+        2e-4, 'largest spread of a joint position while still', unit='rad', low=1e-7, high=0.01
+    )
+    arrive_timeout_s: float = parameter(
+        10.0, 'beyond the expected motion and settle: not arrived', unit='s', low=1.0, high=600.0
+    )
+    answer_timeout_s: float = parameter(
+        180.0,
+        "longest wait for the recorder's answer on a settled configuration",
+        unit='s',
+        low=1.0,
+        high=3600.0,
+    )
+    heartbeat_s: float = parameter(
+        3.0,
+        'longest silence of planner, recorder or robot, wall time',
+        unit='s',
+        low=0.5,
+        high=60.0,
+    )
+    stall_s: float = parameter(
+        1.0,
+        'an arm that stands for so long after its move, and not at its target, will not get there',
+        unit='s',
+        low=0.2,
+        high=60.0,
+    )
+    reaction_s: float = parameter(
+        2.0,
+        'how long a command may take to be seen in joint_states, wall time',
+        unit='s',
+        low=0.1,
+        high=60.0,
+    )
+    lag_s: float = parameter(
+        0.35,
+        'how far the arm may be behind its trajectory; beyond it the arm is halted',
+        unit='s',
+        low=0.05,
+        high=2.0,
+    )
+    command_interface: str = parameter(
+        'topic',
+        'how the controller is commanded: by its topic …/joint_trajectory, or by its action '
+        '…/follow_joint_trajectory (needs control_msgs)',
+        choices=('topic', 'action'),
+    )
+    emergency_stop_topic: str = parameter(
+        '', "std_msgs/Bool, true while the robot's own safety stops it; empty where there is none"
+    )
+    resume_alone_s: float = parameter(
+        5.0,
+        'after a longer interruption of a collection /remaster/collect is needed, unless '
+        'emergency_stop_topic was false all the time, wall time',
+        unit='s',
+        low=0.0,
+        high=60.0,
+    )
+
+    def rules(self) -> SupervisorRules:
+        """Return what of them the supervisor keeps."""
+        return SupervisorRules(
+            settle=SettleRules(self.settle_s, self.arrive_tolerance, self.still_tolerance),
+            arrive_timeout_s=self.arrive_timeout_s,
+            answer_timeout_s=self.answer_timeout_s,
+            heartbeat_s=self.heartbeat_s,
+            stall_s=self.stall_s,
+            reaction_s=self.reaction_s,
+            lag_s=self.lag_s,
+            resume_alone_s=self.resume_alone_s,
+        )
+
+    def raised_from(self, before: Parameters) -> str:
+        """Return which limit is higher than it was before; ''. No limit is higher than any."""
+        if self.speed_share > before.speed_share:
+            return 'speed_share'
+        now, then = (p.cartesian_speed_limit_m_s or np.inf for p in (self, before))
+        return 'cartesian_speed_limit_m_s' if now > then else ''
+
+    def correction(self, cell: Workcell, chain: SerialChain) -> CorrectionInUse | None:
+        """Return the correction in use; `InputError` where it is not of this arm, or too large."""
+        if not self.compensation:
+            return None
+        # It loads SciPy, which a bridge without a correction needs not.
+        from remaster_ros.compensation.in_use import CorrectionInUse
+
+        return CorrectionInUse(self.compensation, chain, cell.urdf_text, cell.robot.urdf)
+
+    def limits(
+        self, chain: SerialChain, shifts: FloatArray | None, acceleration: FloatArray | float
+    ) -> MotionLimits:
+        """Return the limits of every motion.
+
+        Parameters
+        ----------
+        chain
+            The arm as drawn.
+        shifts
+            Least and largest that a correction adds to reported angles, rad, (2, k); None without.
+        acceleration
+            rad/s², (k,) or for all.
+        """
+        return MotionLimits.of(
+            chain,
+            self.speed_share,
+            shifts,
+            acceleration,
+            self.cartesian_speed_limit_m_s or np.inf,
+            float(np.deg2rad(self.limit_margin_deg)),
+        )
+
+
+# The link to the robot's own safety circuit: a std_msgs/Bool, true while it stops the arm.
+
+
+PERIODIC = 6
+"""By so many messages it is judged whether they come regularly."""
+
+
+class EmergencyLink:
+    """Follow a topic; a link that is silent is trouble.
+
+    Parameters
+    ----------
+    node
+        The node that listens.
+    topic
+        The topic; '' for no such link.
+    on_state
+        Called with every message's value.
+    silence_s
+        Messages that come regularly and then are silent for so much longer than between them
+        are missed, s of wall time.
+    """
+
+    def __init__(
+        self, node: Node, topic: str, on_state: Callable[[bool], None], silence_s: float
+    ) -> None:
+        self._node, self._on_state, self._silence_s = node, on_state, silence_s
+        self.topic = node.resolve_topic_name(topic) if topic else ''
+        self._stamps: deque[float] = deque(maxlen=PERIODIC)
+        if not topic:
+            return
+        # The last value of a publisher that keeps it, and whatever any publisher sends from now
+        # on: one subscription cannot have both.
+        for durability, reliability in (
+            (DurabilityPolicy.TRANSIENT_LOCAL, ReliabilityPolicy.RELIABLE),
+            (DurabilityPolicy.VOLATILE, ReliabilityPolicy.BEST_EFFORT),
+        ):
+            qos = QoSProfile(depth=50, durability=durability, reliability=reliability)
+            node.create_subscription(Bool, self.topic, self._on_message, qos)
+
+    def trouble(self) -> str:
+        """Return why the state of the circuit is not known; '' where it is, or is not used."""
+        if not self.topic:
+            return ''
+        if not self._stamps:
+            return f'{self.topic} (emergency_stop_topic) is silent: nothing moves without it'
+        if not self._node.count_publishers(self.topic):
+            return f'{self.topic} (emergency_stop_topic) has no publisher any more'
+        if len(self._stamps) == PERIODIC:
+            longest = max(later - earlier for earlier, later in pairwise(self._stamps))
+            silent_s = time.monotonic() - self._stamps[-1]
+            if longest <= self._silence_s < silent_s - longest:
+                return f'{self.topic} (emergency_stop_topic) has been silent for {silent_s:.1f} s'
+        return ''
+
+    def _on_message(self, message: Bool) -> None:
+        self._stamps.append(time.monotonic())
+        self._on_state(message.data)
 
 
 class RobotBridge(RemasterNode):

@@ -28,7 +28,7 @@ from rclpy.subscription import Subscription
 from std_srvs.srv import Trigger
 
 from remaster_ros.errors import InsufficientDataError, RemasterError
-from remaster_ros.nodes.locking import NameLock
+from remaster_ros.nodes.runtime_files import NameLock
 
 TRACEBACK = 'REMASTER_TRACEBACK'
 """Environment variable: also print where in this program a fault came from."""

@@ -31,12 +31,11 @@ from remaster_ros.collection.message_fields import JointOrder, temperature_topic
 from remaster_ros.errors import DeviceError, InputError, RemasterError
 from remaster_ros.kinematics import transforms
 from remaster_ros.nodes.controller_link import COMMANDS, COPIES
-from remaster_ros.nodes.endpoints import node_of
 from remaster_ros.nodes.messages import stamp_of, transform_array
 from remaster_ros.nodes.parameters import declare
 from remaster_ros.nodes.running import RemasterNode, fault_of_this_program, run
 from remaster_ros.nodes.simulated_clock import ReportsTaken
-from remaster_ros.nodes.status import LATCHED, RELIABLE, NodeStatus, Summary
+from remaster_ros.nodes.status import LATCHED, RELIABLE, NodeStatus, Summary, node_of
 from remaster_ros.sensors.driver import SensorClock, StreamDriver, TriggeredDriver
 from remaster_ros.sensors.registry import TOPIC, kind_of, load_driver
 from remaster_ros.sensors.topic.driver import TopicDriver

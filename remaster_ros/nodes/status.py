@@ -19,6 +19,7 @@ from rclpy.clock import Clock, ClockType
 from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, LivelinessPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.topic_endpoint_info import TopicEndpointInfo
 from std_msgs.msg import String
 
 from remaster_ros.collection.events import (
@@ -33,8 +34,17 @@ from remaster_ros.collection.events import (
 )
 from remaster_ros.errors import InputError
 from remaster_ros.motion.rivalry import DuplicateNodeCheck
-from remaster_ros.nodes.endpoints import node_of
 from remaster_ros.session.bag import LATCHED_DEPTH
+
+UNNAMED = '_NODE_NAME_UNKNOWN_'
+"""What rmw calls a node whose name it has not received yet; its endpoints may be known before."""
+
+
+def node_of(info: TopicEndpointInfo) -> str:
+    """Return the full name of an endpoint's node, or words in its place where it is not known."""
+    if info.node_name == UNNAMED:
+        return 'a node that has just started'
+    return f'{info.node_namespace.rstrip("/")}/{info.node_name}'
 
 
 def mismatch(offered: QoSProfile, wanted: QoSProfile) -> str:
@@ -75,6 +85,7 @@ def mismatches(node: Node) -> str:
 TOPIC = 'remaster/status'
 EVENTS = 'remaster/events'
 DIAGNOSTICS = 'diagnostics'
+PRECISION_TOPIC = 'remaster/precision'
 MESSAGES_TAKEN = 'remaster/taken'
 """Relative like every name: a cell in a namespace has its own, for an aggregator of its own."""
 RELIABLE = QoSProfile(depth=200, reliability=ReliabilityPolicy.RELIABLE)

@@ -35,14 +35,21 @@ from remaster_ros.collection.plan_confirmation import service_name
 from remaster_ros.errors import RemasterError
 from remaster_ros.kinematics import transforms
 from remaster_ros.nodes.background import Background
-from remaster_ros.nodes.messages import transform_array
-from remaster_ros.nodes.page_address import opening_file, page_name
+from remaster_ros.nodes.messages import transform_array, waypoints_by_solution
 from remaster_ros.nodes.parameters import declare, parameter
-from remaster_ros.nodes.precision_watch import TOPIC as PRECISION
 from remaster_ros.nodes.running import RemasterNode, run
+from remaster_ros.nodes.runtime_files import opening_file, page_name
 from remaster_ros.nodes.rviz_markers import RvizMarkers
-from remaster_ros.nodes.status import LATCHED, LEVELS, RELIABLE, TOPIC, NodeStatus, Summary, listen
-from remaster_ros.nodes.waypoints import waypoints_by_solution
+from remaster_ros.nodes.status import (
+    LATCHED,
+    LEVELS,
+    PRECISION_TOPIC,
+    RELIABLE,
+    TOPIC,
+    NodeStatus,
+    Summary,
+    listen,
+)
 from remaster_ros.reports.fit_json import FIT_FILE, REPORT_FILE, read_fit
 from remaster_ros.reports.live_server import COMMANDS, CONFIRM, Done, LiveServer, Place
 from remaster_ros.reports.live_view import FitFacts, LiveView, PlanPage
@@ -141,7 +148,12 @@ class Watch(RemasterNode):
         take(JointState, 'remaster/joint_offsets', self._on_means, LATCHED)
         take(JointState, 'remaster/joint_offsets_std', self._on_stds, LATCHED)
         take(DiagnosticArray, TOPIC, self._on_status, RELIABLE)
-        take(String, PRECISION, lambda message: self.view.take_precision(message.data), LATCHED)
+        take(
+            String,
+            PRECISION_TOPIC,
+            lambda message: self.view.take_precision(message.data),
+            LATCHED,
+        )
         for name, topics in sensors.items():
             for marker, topic in topics.items():
                 take(PointStamped, topic, partial(self._on_point, name, marker), NEWEST)

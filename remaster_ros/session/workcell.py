@@ -10,14 +10,13 @@ import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping
 from math import degrees, pi, radians
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import msgspec
 import numpy as np
 
 from remaster_ros.collection.events import ArmModel
 from remaster_ros.collection.plausibility import SMALLEST_M
-from remaster_ros.collection.stopping_rule import StoppingGoal
 from remaster_ros.errors import InputError, did_you_mean
 from remaster_ros.kinematics.bodies import Body, Shape, box, cylinder, obstacle, sphere
 from remaster_ros.kinematics.collision import HALF_STEP_M, CollisionModel, arm_bodies
@@ -32,11 +31,14 @@ from remaster_ros.planning.candidates import (
     PoseRanges,
 )
 from remaster_ros.planning.expected_sensors import POSE_SIGMA_M, SIGMA_M, ExpectedSensor, ToolBox
-from remaster_ros.planning.planned_design import DesignSettings
 from remaster_ros.session.files import URDF_LIMIT, decode_text, read_limited
 from remaster_ros.session.meshes import mesh_reader
 from remaster_ros.session.yaml_records import YAML_LIMIT, Bounds, Triple, read_yaml, with_line
 from remaster_ros.types import FARTHEST_M, FloatArray
+
+if TYPE_CHECKING:
+    from remaster_ros.collection.stopping_rule import StoppingGoal
+    from remaster_ros.planning.planned_design import DesignSettings
 
 POSE = 'geometry_msgs/msg/PoseStamped'
 MESSAGE_TYPES = ('geometry_msgs/msg/PointStamped', POSE, 'mocap4r2_msgs/msg/Markers')
@@ -205,6 +207,9 @@ class CellPoses(msgspec.Struct, forbid_unknown_fields=True):
 
     def settings(self, sensors: tuple[ExpectedSensor, ...], marker_std_m: float) -> DesignSettings:
         """Return what the design is chosen by, in SI units."""
+        # Here and below: most nodes read a cell and plan nothing.
+        from remaster_ros.planning.planned_design import DesignSettings
+
         box = self.tool_box
         return DesignSettings(
             optimal=self.design == OPTIMAL,
@@ -220,6 +225,8 @@ class CellPoses(msgspec.Struct, forbid_unknown_fields=True):
 
     def stopping_goal(self) -> StoppingGoal:
         """Return what ends a collection, in SI units: all that counts, where it is stated."""
+        from remaster_ros.collection.stopping_rule import StoppingGoal
+
         optimal, stated = self.design == OPTIMAL, (self.joint_std_deg, self.tool_std_m)
         counts = (self.tool_share < 1.0, self.tool_share > 0.0)
         if optimal and any(one and value is None for one, value in zip(counts, stated)):

@@ -74,10 +74,10 @@ def test_on_one_computer(start, client, said, tmp_path, node):
 UNLOCKED = """
 import importlib, sys
 from pathlib import Path
-from remaster_ros.nodes import locking
+from remaster_ros.nodes import runtime_files
 host, node = sys.argv[1:3]
 # As on another computer: the lock is not seen, the DDS domain is the same.
-locking.runtime_folder = lambda: Path(host)
+runtime_files.runtime_folder = lambda: Path(host)
 sys.exit(importlib.import_module('remaster_ros.nodes.' + node).main(sys.argv[2:]))
 """
 

@@ -22,7 +22,7 @@ from remaster_ros.motion.limits import MotionLimits
 from remaster_ros.motion.motion_gate import MotionGate
 from remaster_ros.motion.path_check import PointSpeeds
 from remaster_ros.nodes import robot_bridge
-from remaster_ros.nodes.bridge_parameters import Parameters
+from remaster_ros.nodes.robot_bridge import Parameters
 from remaster_ros.session.workcell import read_cell
 
 PAGE = ' '.join(

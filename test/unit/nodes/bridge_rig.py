@@ -32,8 +32,6 @@ from remaster_ros.collection.events import (
 )
 from remaster_ros.collection.message_fields import seconds
 from remaster_ros.nodes import (
-    arm_states,
-    emergency_link,
     rivals,
     robot_bridge,
     simulated_clock,
@@ -145,7 +143,7 @@ class Rig:
     def __init__(self, monkeypatch, folder, home=HOME, controller=True, first=False, **parameters):
         self.wall = 1000.0
         clock = SimpleNamespace(monotonic=lambda: self.wall, time_ns=time.time_ns)
-        for module in (simulated_clock, status, rivals, arm_states, emergency_link):
+        for module in (simulated_clock, status, rivals):
             monkeypatch.setattr(module, 'time', clock)
         # The age of the last command follows the test's clock as well.
         dated = SimpleNamespace(monotonic=clock.monotonic, time_ns=self.time_ns)

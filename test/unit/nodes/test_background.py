@@ -3,6 +3,7 @@
 import threading
 import time
 
+import numpy as np
 import pytest
 from ros_rig import OWN_DOMAIN
 
@@ -12,7 +13,8 @@ import rclpy
 from bridge_rig import PATIENCE_S
 from rclpy.executors import SingleThreadedExecutor
 
-from remaster_ros.nodes.background import Background
+from remaster_ros.errors import InputError
+from remaster_ros.nodes.background import Background, PlanningThread
 
 pytestmark = [pytest.mark.ros, pytest.mark.timeout(60)]
 
@@ -30,7 +32,7 @@ def node(monkeypatch):
         end = time.monotonic() + PATIENCE_S
         while not condition():
             assert time.monotonic() < end, 'waited in vain'
-            executor.spin_once(timeout_sec=0.5)
+            executor.spin_once(timeout_sec=0.1)
 
     made.spin_until = spin
     yield made
@@ -97,3 +99,37 @@ def test_a_process_need_not_wait_for_it(node):
     background = Background(node)
     assert background._thread.daemon
     background.close()
+
+
+def test_what_is_planned_is_for_the_arm_that_asked(node):
+    background, asked = PlanningThread(Background(node)), []
+
+    def wait_for(what, q, job):
+        found = None
+
+        def there():
+            nonlocal found
+            found = background.ask(what, q, job)
+            return found is not None
+
+        node.spin_until(there)
+        return found[0]
+
+    def job(name):
+        return lambda: asked.append(name) or name
+
+    here, there = np.zeros(3), np.full(3, 0.1)
+    assert background.ask('pose 1', here, job('first')) is None
+    # Meanwhile the arm has been moved: the first answer is of no use.
+    assert wait_for('pose 1', there, job('second')) == 'second'
+    assert asked == ['first', 'second']
+    assert background.ask('pose 1', here, job('third')) is None
+    assert wait_for('pose 2', here, job('fourth')) == 'fourth'
+    assert wait_for('end', here, lambda: None) is None
+
+    def fails():
+        raise InputError('no way')
+
+    with pytest.raises(InputError, match='no way'):
+        wait_for('bad', here, fails)
+    assert wait_for('bad', here, job('again')) == 'again'

@@ -8,7 +8,7 @@ pytest.importorskip('rclpy', reason='needs ROS 2 Jazzy or its wheels')
 
 from remaster_ros.motion.actions import SupervisorRules
 from remaster_ros.motion.settling import SettleRules
-from remaster_ros.nodes.bridge_parameters import Parameters
+from remaster_ros.nodes.robot_bridge import Parameters
 
 pytestmark = pytest.mark.ros
 

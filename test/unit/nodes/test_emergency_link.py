@@ -13,8 +13,8 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Bool
 
-from remaster_ros.nodes import emergency_link
-from remaster_ros.nodes.emergency_link import EmergencyLink
+from remaster_ros.nodes import robot_bridge
+from remaster_ros.nodes.robot_bridge import EmergencyLink
 
 pytestmark = [pytest.mark.ros, pytest.mark.timeout(60)]
 
@@ -33,7 +33,7 @@ class Bench:
     def __init__(self, monkeypatch):
         monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
         self.now = 500.0
-        monkeypatch.setattr(emergency_link, 'time', SimpleNamespace(monotonic=lambda: self.now))
+        monkeypatch.setattr(robot_bridge, 'time', SimpleNamespace(monotonic=lambda: self.now))
         self.context = rclpy.Context()
         rclpy.init(context=self.context, domain_id=OWN_DOMAIN)
         self.node = rclpy.create_node('listener', context=self.context)

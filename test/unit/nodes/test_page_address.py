@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from remaster_ros.nodes import page_address
-from remaster_ros.nodes.page_address import opening_file, opening_path, page_name
+from remaster_ros.nodes.runtime_files import opening_file, opening_path, page_name
 
 
 @pytest.fixture(autouse=True)

@@ -1,6 +1,7 @@
 """The arm follows no plan that a person has not looked at, where the cell asks for that."""
 
 import dataclasses
+import threading
 import time
 
 import numpy as np
@@ -10,14 +11,28 @@ from simple_cells import write_cell
 from remaster_ros.collection.plan_confirmation import PlanConfirmation, fingerprint
 from remaster_ros.collection.preflight_facts import PreflightFacts
 from remaster_ros.collection.tour_progress import TourProgress
-from remaster_ros.nodes.plan_preview import PlanPreview
-from remaster_ros.nodes.planning_thread import PlanningThread
+from remaster_ros.nodes.background import PlanningThread
+from remaster_ros.nodes.pose_planner import PlanPreview
 from remaster_ros.planning.tour_planner import TourPlanner
 from remaster_ros.session.plan_journal import PlanJournal
 from remaster_ros.session.workcell import read_cell
 
 START = np.deg2rad([5.0, 7.0, 0.0, 112.0, 10.0, 35.0, -20.0])
 COUNTS = {'optimization': 3, 'validation': 2, 'registration': 6}
+
+
+class Beside:
+    """A thread for each work, whose result is taken there: there is no node to take it."""
+
+    def submit(self, work, then):
+        def do():
+            try:
+                result = work()
+            except Exception as error:
+                result = error
+            then(result)
+
+        threading.Thread(target=do, daemon=True).start()
 
 
 class Bench:
@@ -30,10 +45,10 @@ class Bench:
             cell.planning_scene(self.chain), COUNTS, 0, design=cell.design_settings()
         )
         self.journal = PlanJournal(folder / 'session', {}, self.chain, self.tours.model)
-        self.progress = TourProgress(self.journal, self.tours, PlanningThread())
+        self.progress = TourProgress(self.journal, self.tours, PlanningThread(Beside()))
         self.facts = PreflightFacts(cell.sensors)
         self.preview = PlanPreview(
-            cell, self.tours, self.journal, self.progress, folder / 'session'
+            cell, self.tours, self.journal, self.progress, folder / 'session', Beside()
         )
         self.page = folder / 'session.plan.html'
 

@@ -5,13 +5,13 @@ import time
 
 import pytest
 
-from remaster_ros.nodes import locking, pose_planner
+from remaster_ros.nodes import pose_planner, runtime_files
 from remaster_ros.nodes.pose_planner import LivingRun, new_token, silence_s
 
 
 @pytest.fixture(autouse=True)
 def folder(tmp_path, monkeypatch):
-    monkeypatch.setattr(locking, 'Path', lambda _: tmp_path)
+    monkeypatch.setattr(runtime_files, 'Path', lambda _: tmp_path)
     return tmp_path / f'remaster_ros_{os.getuid()}'
 
 

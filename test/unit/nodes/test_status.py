@@ -1,6 +1,7 @@
 """What a node publishes of itself: a record for the nodes, the same as text for people."""
 
 import time
+from types import SimpleNamespace
 
 import pytest
 from ros_rig import OWN_DOMAIN
@@ -22,7 +23,7 @@ from remaster_ros.collection.events import (
     encode,
 )
 from remaster_ros.nodes import status
-from remaster_ros.nodes.status import EVENTS, RELIABLE, NodeStatus, Summary, listen, pairs
+from remaster_ros.nodes.status import EVENTS, RELIABLE, NodeStatus, Summary, listen, node_of, pairs
 
 pytestmark = [pytest.mark.ros, pytest.mark.timeout(60)]
 HALT = 'the robot does not follow'
@@ -174,3 +175,19 @@ def test_tables_have_a_pair_for_each_entry():
     assert (shown['read_age_s_mocap'], shown['read_age_s_tracker']) == ('0.0', 'none')
     assert (shown['changed_run'], shown['observations']) == ('none', '0')
     assert 'decided' not in shown
+
+
+@pytest.mark.parametrize(
+    ('namespace', 'name', 'called'),
+    [
+        ('/', 'recorder', '/recorder'),
+        ('/cell', 'recorder', '/cell/recorder'),
+        (
+            '_NODE_NAMESPACE_UNKNOWN_',
+            '_NODE_NAME_UNKNOWN_',
+            'a node that has just started',
+        ),
+    ],
+)
+def test_a_node_is_called_by_its_full_name(namespace, name, called):
+    assert node_of(SimpleNamespace(node_namespace=namespace, node_name=name)) == called

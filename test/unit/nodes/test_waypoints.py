@@ -10,8 +10,7 @@ from std_msgs.msg import Header
 from trajectory_msgs.msg import JointTrajectory
 
 from remaster_ros.errors import InputError
-from remaster_ros.nodes.planning_thread import PlanningThread
-from remaster_ros.nodes.waypoints import waypoints_by_solution, waypoints_message
+from remaster_ros.nodes.messages import waypoints_by_solution, waypoints_message
 from remaster_ros.planning.tour_order import PoseVisit
 
 NAMES = ('a', 'b', 'c')
@@ -55,37 +54,3 @@ def test_what_is_wrong_is_refused(change, message):
     change(sent)
     with pytest.raises(InputError, match=message):
         waypoints_by_solution(sent, NAMES)
-
-
-def wait_for(background, what, q, job):
-    import time
-
-    for _ in range(500):
-        found = background.ask(what, q, job)
-        if found is not None:
-            return found[0]
-        time.sleep(0.01)
-    raise AssertionError('no answer')
-
-
-def test_background_work_is_for_the_arm_that_asked():
-    background, asked = PlanningThread(), []
-
-    def job(name):
-        return lambda: asked.append(name) or name
-
-    here, there = np.zeros(3), np.full(3, 0.1)
-    assert background.ask('pose 1', here, job('first')) is None
-    # Meanwhile the arm has been moved: the first answer is of no use.
-    assert wait_for(background, 'pose 1', there, job('second')) == 'second'
-    assert asked == ['first', 'second']
-    assert background.ask('pose 1', here, job('third')) is None
-    assert wait_for(background, 'pose 2', here, job('fourth')) == 'fourth'
-    assert wait_for(background, 'end', here, lambda: None) is None
-
-    def fails():
-        raise InputError('no way')
-
-    with pytest.raises(InputError, match='no way'):
-        wait_for(background, 'bad', here, fails)
-    assert wait_for(background, 'bad', here, job('again')) == 'again'

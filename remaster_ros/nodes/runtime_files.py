@@ -1,7 +1,8 @@
-"""One process per node name and ROS domain on this computer, by a lock that the kernel keeps.
+"""Files of this user outside of every session: locks of nodes, and the way to the live page.
 
-The lock (flock) goes with the process, however that ends: a node that was killed can be started
-again at once. What runs on another computer, or for another user, is distinguished by
+There is one process per node name and ROS domain on this computer, by a lock that the kernel
+keeps. The lock (flock) goes with the process, however that ends: a node that was killed can be
+started again at once. What runs on another computer, or for another user, is distinguished by
 /remaster/events (see `remaster_ros.nodes.status.NodeStatus`).
 """
 
@@ -104,3 +105,37 @@ class NameLock:
         file, self._file = self._file, -1
         if file >= 0:
             os.close(file)
+
+
+# The file that leads to the live page, with its token: for this user alone.
+
+
+def page_name(domain: int, node: str) -> str:
+    """Return what the files of the page are called that a node serves.
+
+    Parameters
+    ----------
+    domain
+        ROS_DOMAIN_ID.
+    node
+        The node's fully qualified name, such as ``/left/watch``.
+    """
+    return f'domain_{domain}{node.replace("/", "%")}'
+
+
+def opening_path(name: str) -> Path:
+    """Return the file that leads to the page of this name."""
+    return runtime_folder() / f'{name}.html'
+
+
+def opening_file(name: str, url: str) -> Path:
+    """Write a page that leads to the address with the token, which only this user can read.
+
+    Output of a launch is kept in log files, where others may find it; a path is no secret.
+    """
+    path = opening_path(name)
+    path.unlink(missing_ok=True)
+    flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC | os.O_NOFOLLOW
+    with open(os.open(path, flags, 0o600), 'w', encoding='utf-8') as file:
+        file.write(f'<!doctype html><meta http-equiv="refresh" content="0; url={url}">\n')
+    return path

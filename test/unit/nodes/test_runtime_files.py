@@ -9,12 +9,12 @@ import time
 import pytest
 
 from remaster_ros.errors import InputError
-from remaster_ros.nodes import locking
-from remaster_ros.nodes.locking import NameLock
+from remaster_ros.nodes import runtime_files
+from remaster_ros.nodes.runtime_files import NameLock
 
 HOLD = """
 import sys, time
-from remaster_ros.nodes.locking import NameLock
+from remaster_ros.nodes.runtime_files import NameLock
 lock = NameLock(233, '/test_locking')
 print('held', flush=True)
 time.sleep(60)
@@ -41,7 +41,7 @@ def test_a_killed_one_is_followed_at_once(holder):
     holder.send_signal(signal.SIGKILL)
     began = time.monotonic()
     NameLock(233, '/test_locking').release()
-    assert time.monotonic() - began < locking.PATIENCE_S
+    assert time.monotonic() - began < runtime_files.PATIENCE_S
 
 
 def test_one_that_is_stopped_still_counts(holder):
@@ -67,14 +67,14 @@ def test_a_forked_child_does_not_keep_it():
 
 
 def test_a_folder_of_somebody_else_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr(locking, 'Path', lambda _: tmp_path)
+    monkeypatch.setattr(runtime_files, 'Path', lambda _: tmp_path)
     folder = tmp_path / f'remaster_ros_{os.getuid()}'
     folder.mkdir(mode=0o700)
-    assert locking.runtime_folder() == folder
+    assert runtime_files.runtime_folder() == folder
     folder.chmod(0o755)
     with pytest.raises(InputError, match='open to other users'):
-        locking.runtime_folder()
+        runtime_files.runtime_folder()
     folder.rmdir()
     folder.symlink_to('/')
     with pytest.raises(InputError, match='belongs to another user'):
-        locking.runtime_folder()
+        runtime_files.runtime_folder()
