@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import pytest
 
-from remaster_ros.nodes import page_address
+from remaster_ros.nodes import runtime_files
 from remaster_ros.nodes.runtime_files import opening_file, opening_path, page_name
 
 
 @pytest.fixture(autouse=True)
 def folder(tmp_path, monkeypatch):
-    monkeypatch.setattr(page_address, 'runtime_folder', lambda: tmp_path)
+    monkeypatch.setattr(runtime_files, 'runtime_folder', lambda: tmp_path)
     return tmp_path
 
 
