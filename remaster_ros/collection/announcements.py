@@ -18,13 +18,8 @@ PEERS = 2
 class Announcements:
     """Follow the announcements of the open pose, and the states of bridge and recorder.
 
-    Attributes
-    ----------
-    stamp
-        Of the last announcement, by which the others name it; '' where the pose is to be
-        announced anew.
-    bridge, recorder
-        Their last states; None before the first.
+    Attributes: ``stamp``: of the last announcement, by which the others name it; '' where the pose
+    is to be announced anew; ``bridge, recorder``: their last states; None before the first.
     """
 
     def __init__(self) -> None:

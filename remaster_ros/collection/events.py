@@ -20,35 +20,20 @@ from remaster_ros.errors import InputError
 
 
 class Body(msgspec.Struct, frozen=True, tag_field='kind'):
-    """What a record carries; ``kind`` names its type.
+    """What a record carries; ``kind`` names its type."""
 
-    Attributes
-    ----------
-    sender
-        The name of the only node that may publish it; '' for any.
-    """
-
-    sender: ClassVar[str] = ''
+    sender: ClassVar[str] = ''  # The name of the only node that may publish it; '' for any
 
 
 class OptimizerState(Body, frozen=True, kw_only=True, tag='optimizer'):
-    """State of the optimizer.
-
-    Attributes
-    ----------
-    plan
-        The plan whose session it has looked at, '' for none.
-    enough
-        Whether the precision that the cell file states is reached: no more poses to fit are
-        visited then.
-    precision
-        What is known, and what more would cost, as text.
-    """
+    """State of the optimizer."""
 
     sender: ClassVar[str] = 'optimizer'
-    plan: str
+    plan: str  # The plan whose session it has looked at, '' for none
+    # Whether the precision that the cell file states is reached: no more poses to fit are visited
+    # then
     enough: bool
-    precision: str = ''
+    precision: str = ''  # What is known, and what more would cost, as text
 
 
 VERSION = 1
@@ -65,26 +50,16 @@ class Alive(Body, frozen=True, tag='alive'):
 
 
 class PlannerState(Body, frozen=True, kw_only=True, tag='planner'):
-    """State of the planner.
-
-    Attributes
-    ----------
-    state
-        ``running`` while the arm may move; ``held`` (by a full disk), ``idle``, ``paused``,
-        ``stopped``, ``complete`` or ``failed``.
-    run
-        Token of the run under way, '' for none. Each /remaster/collect begins another one.
-    planned
-        Configurations to fit that were planned; 0 before.
-    further
-        The plan whose complete collection is gone on with, which its recorder's session is
-        opened again for; ''.
-    """
+    """State of the planner."""
 
     sender: ClassVar[str] = 'pose_planner'
+    # ``running`` while the arm may move; ``held`` (by a full disk), ``idle``, ``paused``,
+    # ``stopped``, ``complete`` or ``failed``
     state: str
-    run: str
-    planned: int = 0
+    run: str  # Token of the run under way, '' for none. Each /remaster/collect begins another one.
+    planned: int = 0  # Configurations to fit that were planned; 0 before
+    # The plan whose complete collection is gone on with, which its recorder's session is opened
+    # again for; ''
     further: str = ''
 
     def goes_further(self, plan: str) -> bool:
@@ -109,31 +84,18 @@ class PlannerState(Body, frozen=True, kw_only=True, tag='planner'):
 
 
 class BridgeState(Body, frozen=True, kw_only=True, tag='bridge'):
-    """State of the bridge.
-
-    Attributes
-    ----------
-    halted
-        Why the arm is halted until a person clears it; ''.
-    pose
-        Stamp of the pose whose solutions the bridge has, '' for none.
-    run
-        Token of the last run that the bridge has seen running.
-    asks_for_collect
-        Why nothing moves in this run before a person calls /remaster/collect, and that; ''.
-    joints_age_s, joints_trouble
-        Time since the last usable joint_states, None for never, s; what is wrong with them.
-    correction
-        SHA-256 of the compensation.json by which it corrects what it commands; '' for none.
-    """
+    """State of the bridge."""
 
     sender: ClassVar[str] = 'robot_bridge'
-    halted: str
-    pose: str = ''
-    run: str = ''
+    halted: str  # Why the arm is halted until a person clears it; ''
+    pose: str = ''  # Stamp of the pose whose solutions the bridge has, '' for none
+    run: str = ''  # Token of the last run that the bridge has seen running
+    # Why nothing moves in this run before a person calls /remaster/collect, and that; ''
     asks_for_collect: str = ''
+    # Time since the last usable joint_states, None for never, s; what is wrong with them
     joints_age_s: float | None = None
     joints_trouble: str = ''
+    # SHA-256 of the compensation.json by which it corrects what it commands; '' for none
     correction: str = ''
 
 
@@ -145,73 +107,39 @@ class Decided(msgspec.Struct, frozen=True):
 
 
 class RecorderState(Body, frozen=True, kw_only=True, tag='recorder'):
-    """State of the recorder.
-
-    Attributes
-    ----------
-    waiting_for
-        What the arm has to wait for (room on the disk, a required sensor), and why; ''.
-    state
-        ``waiting``, ``measuring`` or ``closed``.
-    exit_status
-        Of a session that is closed; ''.
-    session, observations, plan
-        The folder, how many rows it has, and the plan that they belong to.
-    pose, run
-        Stamp of the announced pose and token of the run, as the recorder has them.
-    decided
-        What is recorded of the last pose; None before the first.
-    registration
-        How far the first registration of the sensors is, as text.
-    require
-        Which sensors the arm waits for: ``all``, ``any`` or the name of one.
-    read_age_s
-        Time since the last reading of each sensor, s; None for never.
-    changed
-        What has changed at the reference configurations; ''.
-    changed_run
-        Token of the run that this change has paused; None for none, '' for one that a recorder
-        which was started again has not learned yet.
-    """
+    """State of the recorder."""
 
     sender: ClassVar[str] = 'recorder'
+    # What the arm has to wait for (room on the disk, a required sensor), and why; ''
     waiting_for: str
-    state: str = 'waiting'
-    exit_status: str = ''
+    state: str = 'waiting'  # ``waiting``, ``measuring`` or ``closed``
+    exit_status: str = ''  # Of a session that is closed; ''
+    # The folder, how many rows it has, and the plan that they belong to
     session: str = ''
     observations: int = 0
     plan: str = ''
+    # Stamp of the announced pose and token of the run, as the recorder has them
     pose: str = ''
     run: str = ''
-    decided: Decided | None = None
-    registration: str = ''
-    require: str = 'all'
+    decided: Decided | None = None  # What is recorded of the last pose; None before the first
+    registration: str = ''  # How far the first registration of the sensors is, as text
+    require: str = 'all'  # Which sensors the arm waits for: ``all``, ``any`` or the name of one
+    # Time since the last reading of each sensor, s; None for never
     read_age_s: dict[str, float | None] = msgspec.field(default_factory=dict)
-    changed: str = ''
+    changed: str = ''  # What has changed at the reference configurations; ''
+    # Token of the run that this change has paused; None for none, '' for one that a recorder which
+    # was started again has not learned yet
     changed_run: str | None = None
 
 
 class SensorReport(Body, frozen=True, kw_only=True, tag='sensor'):
-    """State of a sensor's node.
+    """State of a sensor's node."""
 
-    Attributes
-    ----------
-    sensor
-        The sensor's name in the cell.
-    ready
-        Whether it can measure a marker that it sees.
-    trouble
-        What is wrong, with the remedy; ''.
-    message
-        What the node shows to people.
-    hidden
-        The sensor does not see its marker: no reading comes before the arm has moved on.
-    """
-
-    sensor: str
-    ready: bool
-    trouble: str = ''
-    message: str = ''
+    sensor: str  # The sensor's name in the cell
+    ready: bool  # Whether it can measure a marker that it sees
+    trouble: str = ''  # What is wrong, with the remedy; ''
+    message: str = ''  # What the node shows to people
+    # The sensor does not see its marker: no reading comes before the arm has moved on
     hidden: bool = False
 
 
@@ -223,30 +151,19 @@ class TourPlanned(Body, frozen=True, tag='planned'):
 
 
 class PoseAnnounced(Body, frozen=True, kw_only=True, tag='pose'):
-    """The planner announces a pose, whose solutions follow on ``remaster/joint_solutions``.
-
-    Attributes
-    ----------
-    stamp
-        Of the messages that belong to this announcement; the same pose announced again has
-        another one.
-    pose, split
-        As in the session.
-    ids
-        The planner's own numbers of the joint solutions, in the order published.
-    plan
-        The plan that both are numbered by.
-    last
-        Whether it is the last reference of a round.
-    """
+    """The planner announces a pose, whose solutions follow on ``remaster/joint_solutions``."""
 
     sender: ClassVar[str] = 'pose_planner'
+    # Of the messages that belong to this announcement; the same pose announced again has another
+    # one
     stamp: str
+    # As in the session
     pose: int
     split: str
+    # The planner's own numbers of the joint solutions, in the order published
     ids: tuple[Index, ...]
-    plan: str = ''
-    last: bool = False
+    plan: str = ''  # The plan that both are numbered by
+    last: bool = False  # Whether it is the last reference of a round
 
 
 class SolutionCommanded(Body, frozen=True, kw_only=True, tag='commanded'):
@@ -301,43 +218,27 @@ class HaltCleared(Body, frozen=True, kw_only=True, tag='halt_cleared'):
 
 
 class ConfigurationEnded(Body, frozen=True, kw_only=True, tag='configuration'):
-    """The recorder has written down what became of a configuration; the arm may go on.
-
-    Attributes
-    ----------
-    result, reason
-        What became of it, and why where it is not ``recorded``.
-    registered
-        Whether every sensor that the arm waits for is registered.
-    measuring_s
-        From settling to the last reading; None where nothing was read, s.
-    waited_s
-        How long each sensor was waited for, s.
-    """
+    """The recorder has written down what became of a configuration; the arm may go on."""
 
     sender: ClassVar[str] = 'recorder'
     stamp: str
     solution: Index
+    # What became of it, and why where it is not ``recorded``
     result: Outcome
     reason: str = ''
-    registered: bool = False
+    registered: bool = False  # Whether every sensor that the arm waits for is registered
+    # From settling to the last reading; None where nothing was read, s
     measuring_s: float | None = None
+    # How long each sensor was waited for, s
     waited_s: dict[str, float] = msgspec.field(default_factory=dict)
 
 
 class SetupChanged(Body, frozen=True, kw_only=True, tag='changed'):
-    """The references show that something has moved.
-
-    Attributes
-    ----------
-    stops
-        Whether the collection pauses until a person has looked.
-    text, cause, size_m
-        The message; the kind of change; its size, m.
-    """
+    """The references show that something has moved."""
 
     sender: ClassVar[str] = 'recorder'
-    stops: bool
+    stops: bool  # Whether the collection pauses until a person has looked
+    # The message; the kind of change; its size, m
     text: str = ''
     cause: str = ''
     size_m: float = 0.0
@@ -352,19 +253,13 @@ class ReadByHand(Body, frozen=True, kw_only=True, tag='by_hand'):
 
 
 class RecorderBegan(Body, frozen=True, kw_only=True, tag='began'):
-    """In a bag: its recorder was started (again) here, with no reading under way.
-
-    Attributes
-    ----------
-    parameters, cell
-        Its parameters, and its cell as JSON: with them the bag gives the same rows again.
-    continued
-        It is the same process as before, which has opened a closed session again.
-    """
+    """In a bag: its recorder was started (again) here, with no reading under way."""
 
     sender: ClassVar[str] = 'recorder'
+    # Its parameters, and its cell as JSON: with them the bag gives the same rows again
     parameters: dict[str, bool | int | float | str] = msgspec.field(default_factory=dict)
     cell: str = ''
+    # It is the same process as before, which has opened a closed session again
     continued: bool = False
 
 
@@ -394,18 +289,12 @@ STATES = get_args(State)
 
 
 class ArmModel(msgspec.Struct, frozen=True, kw_only=True):
-    """Which arm and surroundings a node computes with.
+    """Which arm and surroundings a node computes with."""
 
-    Attributes
-    ----------
-    urdf, cell
-        Checksums of the URDF's content, and of what motions depend on in the cell file.
-    urdf_file, cell_file
-        Where the node has read them.
-    """
-
+    # Checksums of the URDF's content, and of what motions depend on in the cell file
     urdf: str
     cell: str
+    # Where the node has read them
     urdf_file: str = ''
     cell_file: str = ''
 
@@ -434,25 +323,15 @@ class ArmModel(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class EventRecord(msgspec.Struct, frozen=True, kw_only=True):
-    """A state or an event, and which node published it when.
+    """A state or an event, and which node published it when."""
 
-    Attributes
-    ----------
-    node
-        The node with its namespace, such as ``/left/recorder``.
-    started, uptime_s
-        Identifies this start of the node; how long it has been running, s.
-    stamp_ns
-        Time of the node's clock, ns.
-    model
-        Which arm the node computes with; None where it computes with none.
-    """
-
-    node: str
+    node: str  # The node with its namespace, such as ``/left/recorder``
     body: State | Event
+    # Identifies this start of the node; how long it has been running, s
     started: str = ''
     uptime_s: float = 0.0
-    stamp_ns: int = 0
+    stamp_ns: int = 0  # Time of the node's clock, ns
+    # Which arm the node computes with; None where it computes with none
     model: ArmModel | None = None
     version: int = VERSION
 

@@ -59,36 +59,24 @@ def are_too_many(dropped: int, frames: int) -> bool:
 
 @dataclass(frozen=True)
 class SensorRules:
-    """How one sensor's reading is taken.
+    """How one sensor's reading is taken."""
 
-    Attributes
-    ----------
-    sensor, marker
-        Names as in the session.
-    single_shot
-        True for an instrument that measures on request and integrates by itself (a laser
-        tracker); False for a stream that is averaged over the dwell.
-    dwell_s
-        Length of the average after the arm has settled, s (streams).
-    min_samples
-        While the dwell has fewer, it is prolonged, up to the time-out: a marker that was hidden
-        for a moment costs a moment and not the configuration (streams).
-    max_std_m
-        A larger standard deviation on any axis over the dwell is no still marker, m (streams).
-    timeout_s
-        How long after the dwell (stream) or settling (single shot) a reading may stay out, s.
-    further
-        Further markers: of a stream in the same frames; else measured one by one, with a message
-        (NaN) where that failed.
-    """
-
+    # Names as in the session
     sensor: str
     marker: str
+    # True for an instrument that measures on request and integrates by itself (a laser tracker);
+    # False for a stream that is averaged over the dwell
     single_shot: bool = False
-    dwell_s: float = 0.5
+    dwell_s: float = 0.5  # Length of the average after the arm has settled, s (streams)
+    # While the dwell has fewer, it is prolonged, up to the time-out: a marker that was hidden for
+    # a moment costs a moment and not the configuration (streams)
     min_samples: int = 5
+    # A larger standard deviation on any axis over the dwell is no still marker, m (streams)
     max_std_m: float = 0.5e-3
+    # How long after the dwell (stream) or settling (single shot) a reading may stay out, s
     timeout_s: float = 2.0
+    # Further markers: of a stream in the same frames; else measured one by one, with a message
+    # (NaN) where that failed
     further: tuple[str, ...] = ()
 
     @property
@@ -99,52 +87,32 @@ class SensorRules:
 
 @dataclass(frozen=True)
 class PairedReading:
-    """One sensor's accepted reading of a marker at one configuration.
-
-    Attributes
-    ----------
-    stamp_s
-        End of the dwell, or the time of the single shot, s.
-    q
-        Mean reported joint positions from settling to `stamp_s`, rad, (k,).
-    position, std
-        Mean marker position and sample standard deviation (None for a single shot), m, (3,).
-    samples
-        Samples in the mean.
-    orientation
-        Of the measured body, mean as x, y, z, w, (4,); None where no sample has one.
-    dropped
-        Frames of the dwell that are not in the mean: too far from the others (`frame_mean`).
-    """
+    """One sensor's accepted reading of a marker at one configuration."""
 
     sensor: str
     marker: str
-    stamp_s: float
-    q: FloatArray
+    stamp_s: float  # End of the dwell, or the time of the single shot, s
+    q: FloatArray  # Mean reported joint positions from settling to `stamp_s`, rad, (k,)
+    # Mean marker position and sample standard deviation (None for a single shot), m, (3,)
     position: FloatArray
     std: FloatArray | None = None
-    samples: int = 1
+    samples: int = 1  # Samples in the mean
+    # Of the measured body, mean as x, y, z, w, (4,); None where no sample has one
     orientation: FloatArray | None = None
+    # Frames of the dwell that are not in the mean: too far from the others
     dropped: int = 0
 
 
 @dataclass(frozen=True)
 class Rejection:
-    """Why a sensor, or one of its markers, has no observation at a configuration.
-
-    Attributes
-    ----------
-    reason
-        A name to count by: ``moving``, ``unseen``, ``clock``, ``stale``, ``too_few``,
-        ``unsteady``, ``scattered``, ``frozen``, ``swapped``, ``device``, ``absent`` or
-        ``not_waited``; of a single marker also ``hidden``.
-    detail
-        One line with the numbers.
-    """
+    """Why a sensor, or one of its markers, has no observation at a configuration."""
 
     sensor: str
+    # A name to count by: ``moving``, ``unseen``, ``clock``, ``stale``, ``too_few``, ``unsteady``,
+    # ``scattered``, ``frozen``, ``swapped``, ``device``, ``absent`` or ``not_waited``; of a single
+    # marker also ``hidden``
     reason: str
-    detail: str
+    detail: str  # One line with the numbers
 
 
 LONGEST_GAP_S = 5.0

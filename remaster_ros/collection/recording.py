@@ -59,33 +59,18 @@ class SettledArm:
 
 @dataclass(frozen=True)
 class EndedReading:
-    """What became of a configuration.
+    """What became of a configuration."""
 
-    Attributes
-    ----------
-    settled
-        Which one.
-    from_q
-        Where the arm came from, rad, (k,); None where that is not known.
-    accepted, rejected
-        What each sensor gave, a reading of each of its markers that was seen, or why nothing.
-    left_out
-        Markers without a reading, of sensors that gave others.
-    waited_s
-        How long the arm stood for each sensor, s.
-    last_s
-        Stamp of the last reading that was accepted; of the last joint states where none was, s.
-    temperature_c
-        The last one from before the arm settled, degrees Celsius; None where that is long ago.
-    """
-
-    settled: SettledArm
-    from_q: FloatArray | None
+    settled: SettledArm  # Which one
+    from_q: FloatArray | None  # Where the arm came from, rad, (k,); None where that is not known
+    # What each sensor gave, a reading of each of its markers that was seen, or why nothing
     accepted: Sequence[PairedReading]
     rejected: Sequence[Rejection]
-    left_out: Sequence[Rejection]
-    waited_s: Mapping[str, float]
+    left_out: Sequence[Rejection]  # Markers without a reading, of sensors that gave others
+    waited_s: Mapping[str, float]  # How long the arm stood for each sensor, s
+    # Stamp of the last reading that was accepted; of the last joint states where none was, s
     last_s: float
+    # The last one from before the arm settled, degrees Celsius; None where that is long ago
     temperature_c: float | None
 
     @property

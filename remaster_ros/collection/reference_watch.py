@@ -60,12 +60,8 @@ def replay(
 ) -> list[SetupChange]:
     """Judge the references of a recorded session; return what was found, round by round.
 
-    Parameters
-    ----------
-    readings
-        In the order measured.
-    others
-        Numbers of the configurations that are no references, in any order.
+    ``readings``: in the order measured; ``others``: numbers of the configurations that are no
+    references, in any order.
     """
     other = np.sort(np.asarray(others, dtype=int))
     found: list[SetupChange] = []
@@ -91,39 +87,21 @@ class ReferenceReading(PairedReading):
 
 @dataclass(frozen=True)
 class SetupChange:
-    """What has changed.
+    """What has changed."""
 
-    Attributes
-    ----------
-    kind
-        ``sensor``, ``base``, ``marker``, ``tool``, ``joint``, or ``unexplained`` (no one cause) or
-        ``unsteady`` (the references do not repeat from the first).
-    subject
-        For people.
-    drifts
-        Whether it grows with time; else it came at once.
-    size_m
-        Largest displacement of a marker at a reference.
-    turn_rad
-        Of the sensor, base, tool or joint; None where nothing turns.
-    after, before
-        Configurations that it happened between: the last one that was as at first (None where it
-        was so from the first) and the first one that was not.
-    p_value
-        Of the round that showed it.
-    look_alikes
-        Other subjects that explain the same readings.
-    """
-
+    # ``sensor``, ``base``, ``marker``, ``tool``, ``joint``, or ``unexplained`` (no one cause) or
+    # ``unsteady`` (the references do not repeat from the first)
     kind: str
-    subject: str
-    drifts: bool
-    size_m: float
-    turn_rad: float | None
+    subject: str  # For people
+    drifts: bool  # Whether it grows with time; else it came at once
+    size_m: float  # Largest displacement of a marker at a reference
+    turn_rad: float | None  # Of the sensor, base, tool or joint; None where nothing turns
+    # Configurations that it happened between: the last one that was as at first (None where it was
+    # so from the first) and the first one that was not
     after: int | None
     before: int
-    p_value: float
-    look_alikes: tuple[str, ...] = ()
+    p_value: float  # Of the round that showed it
+    look_alikes: tuple[str, ...] = ()  # Other subjects that explain the same readings
 
     def describe(self) -> str:
         """Return it in a sentence."""
@@ -179,21 +157,11 @@ Displacements = Mapping[tuple[int, tuple[int, str]], FloatArray]
 class ReferenceWatch:
     """Judge round after round of the references.
 
-    Parameters
-    ----------
-    chain
-        The arm as drawn: what it moves between two visits, by less than its repeatability.
-    markers
-        Nominal positions in the tool frame, m, (3,).
-    stop_m
-        Two first rounds that lie further apart than this show nothing of later changes, m.
-    false_alarm
-        See `FALSE_ALARM`.
-
-    Attributes
-    ----------
-    change
-        The last one found since the beginning or `accept`; None where nothing has changed.
+    ``chain``: the arm as drawn: what it moves between two visits, by less than its repeatability;
+    ``markers``: nominal positions in the tool frame, m, (3,); ``stop_m``: two first rounds that
+    lie further apart than this show nothing of later changes, m.
+    Attributes: ``change``: the last one found since the beginning or `accept`; None where nothing
+    has changed.
     """
 
     def __init__(
@@ -263,11 +231,8 @@ class ReferenceWatch:
     def judge(self, T_R_N: Mapping[str, FloatArray]) -> SetupChange | None:
         """Judge the last round, once; return what has changed, None where nothing has.
 
-        Parameters
-        ----------
-        T_R_N
-            Sensor -> its frame in R, (4, 4); a first registration is good enough, since only
-            differences count. A sensor without one is not judged.
+        ``T_R_N``: sensor -> its frame in R, (4, 4); a first registration is good enough, since
+        only differences count. A sensor without one is not judged.
         """
         number = len(self._rounds) - 1
         if number < 0 or self._rounds[number].judged:

@@ -42,21 +42,13 @@ MOST_TESTS = 20
 
 @dataclass(frozen=True)
 class StoppingGoal:
-    """What is to be known at the end; None where it does not matter.
+    """What is to be known at the end; None where it does not matter."""
 
-    Attributes
-    ----------
-    joint_std_rad
-        Root mean square of the standard deviations of the identifiable joints, rad.
-    tool_std_m
-        Root mean square of the 3-D error of the predicted markers in the box, m.
-    box
-        None for wherever the tool was measured.
-    """
-
+    # Root mean square of the standard deviations of the identifiable joints, rad
     joint_std_rad: float | None = None
+    # Root mean square of the 3-D error of the predicted markers in the box, m
     tool_std_m: float | None = None
-    box: ToolBox | None = None
+    box: ToolBox | None = None  # None for wherever the tool was measured
 
     @property
     def stated(self) -> bool:
@@ -66,68 +58,37 @@ class StoppingGoal:
 
 @dataclass(frozen=True, eq=False)
 class Look:
-    """What is known after so many configurations.
+    """What is known after so many configurations."""
 
-    Attributes
-    ----------
-    configurations
-        To fit, that were measured by then.
-    elapsed_s
-        From the first reading of the session to the last one by then, s; NaN where nothing is
-        known of the times.
-    joint_std
-        Of each joint, rad; None where it is not identifiable. Empty where there is no fit.
-    joint_rms, tool_rms
-        As in `StoppingGoal`, rad and m; infinite where unknown.
-    freedom, parameters
-        Degrees of freedom, and free parameters.
-    structure
-        What the residuals show by now, the clearest first.
-    lacking
-        Why this is not enough; '' where it is, or where nothing is to be reached.
-    more
-        How many further configurations to fit the goal takes: 0 where it is reached, None where no
-        number does or none is known.
-    more_s
-        How long they take at the pace so far, s; NaN where unknown.
-    """
-
-    configurations: int
+    configurations: int  # To fit, that were measured by then
+    # From the first reading of the session to the last one by then, s; NaN where nothing is known
+    # of the times
     elapsed_s: float
+    # Of each joint, rad; None where it is not identifiable. Empty where there is no fit.
     joint_std: Mapping[str, float | None] = field(default_factory=dict)
+    # As in `StoppingGoal`, rad and m; infinite where unknown
     joint_rms: float = np.inf
     tool_rms: float = np.inf
+    # Degrees of freedom, and free parameters
     freedom: int = 0
     parameters: int = 0
-    structure: tuple[StructureTest, ...] = ()
-    lacking: str = ''
+    structure: tuple[StructureTest, ...] = ()  # What the residuals show by now, the clearest first
+    lacking: str = ''  # Why this is not enough; '' where it is, or where nothing is to be reached
+    # How many further configurations to fit the goal takes: 0 where it is reached, None where no
+    # number does or none is known
     more: int | None = None
-    more_s: float = np.nan
+    more_s: float = np.nan  # How long they take at the pace so far, s; NaN where unknown
 
 
 @dataclass(frozen=True)
 class StoppingRule:
-    """Looks at a session under way.
+    """Looks at a session under way."""
 
-    Attributes
-    ----------
-    goal
-        What is to be reached.
-    planned
-        Configurations to fit that are planned.
-    every
-        Configurations between two looks.
-    floors
-        Least poses and repeats.
-    priors
-        What is known before a fit, in place of what the session states.
-    """
-
-    goal: StoppingGoal
-    planned: int
-    every: int
-    floors: Floors = field(default_factory=Floors)
-    priors: Priors | None = None
+    goal: StoppingGoal  # What is to be reached
+    planned: int  # Configurations to fit that are planned
+    every: int  # Configurations between two looks
+    floors: Floors = field(default_factory=Floors)  # Least poses and repeats
+    priors: Priors | None = None  # What is known before a fit, in place of what the session states
 
     @property
     def counts(self) -> tuple[int, ...]:
@@ -292,14 +253,9 @@ def configurations(session: Session) -> int:
 def so_far(session: Session, count: int) -> tuple[Session, float, float]:
     """Return a session up to its configuration number `count` to fit, with times.
 
-    Returns
-    -------
-    session
-        With what was held out by then as well.
-    elapsed_s
-        From the first reading to the last one, s; NaN where nothing is known of the times.
-    pace_s
-        Time per configuration of any kind, s.
+    Returns session: With what was held out by then as well; elapsed_s: From the first reading to
+    the last one, s; NaN where nothing is known of the times; pace_s: Time per configuration of any
+    kind, s.
     """
     given = session.measurements
     fitted = np.flatnonzero(~given.is_validation)

@@ -23,10 +23,7 @@ Then = Callable[[Any], object]
 class Background:
     """One thread that does what it is given, one after the other.
 
-    Parameters
-    ----------
-    node
-        In whose callbacks the results are taken.
+    ``node``: in whose callbacks the results are taken.
     """
 
     def __init__(self, node: Node) -> None:

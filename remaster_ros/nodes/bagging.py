@@ -33,25 +33,12 @@ MOST_EARLY = 20_000
 class BagRecorder:
     """Record topics of a node into a bag.
 
-    Parameters
-    ----------
-    node
-        The node that subscribes.
-    folder
-        The bag's folder, gone on with where there is one.
-    began
-        What it begins with; None records nothing and only hands messages on.
-    begin
-        False to record nothing before `reopen`.
-
-    Attributes
-    ----------
-    notes
-        How the bag was found, for the user.
-    dropped
-        Messages that found no room, neither on the disk nor in memory.
-    taken
-        How many messages of each topic, by its name in bags, were handed on and received.
+    ``folder``: the bag's folder, gone on with where there is one; ``began``: what it begins with;
+    None records nothing and only hands messages on; ``begin``: false to record nothing before
+    `reopen`.
+    Attributes: ``notes``: how the bag was found, for the user; ``dropped``: messages that found no
+    room, neither on the disk nor in memory; ``taken``: how many messages of each topic, by its
+    name in bags, were handed on and received.
     """
 
     def __init__(

@@ -338,10 +338,7 @@ class CompensatorNode(RemasterNode):
     def _passed(self, message: JointTrajectory) -> Any:
         """Return what is to be sent for a planner's trajectory.
 
-        Raises
-        ------
-        InputError
-            One line: why it is not sent.
+        Raises InputError: one line: why it is not sent.
         """
         why = self._trouble()
         if not why and self._on is None:
@@ -504,10 +501,7 @@ def _points(
 ) -> tuple[FloatArray, FloatArray, FloatArray | None]:
     """Return times (n,), positions and velocities (n, k), joints in the order of `names`.
 
-    Raises
-    ------
-    InputError
-        Other joints than the arm's, or points that are not whole.
+    Raises InputError: other joints than the arm's, or points that are not whole.
     """
     given = tuple(message.joint_names)
     none = np.zeros((0, len(names)))

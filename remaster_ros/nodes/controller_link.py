@@ -62,18 +62,7 @@ def action_of(topic: str) -> str:
 
 
 class ForeignGoals:
-    """Whether another client than the bridge sends goals; the topic is no way round them.
-
-    Parameters
-    ----------
-    node
-        The node that depends on it.
-
-    Attributes
-    ----------
-    own
-        The goals that are the bridge's.
-    """
+    """Whether another client than the bridge sends goals; the topic is no way round them."""
 
     def __init__(self, node: Node) -> None:
         self.own: set[bytes] = set()
@@ -111,13 +100,7 @@ class ForeignGoals:
 
 
 class TopicLink:
-    """Publish the commands on the controller's topic.
-
-    Parameters
-    ----------
-    node
-        The bridge.
-    """
+    """Publish the commands on the controller's topic."""
 
     def __init__(self, node: Node) -> None:
         self._node = node
@@ -165,21 +148,10 @@ class _Goal:
 class ActionLink:
     """Send the commands as goals of FollowJointTrajectory.
 
-    Parameters
-    ----------
-    node
-        The bridge.
-    rules
-        What the arm is judged by here is what the controller is told to keep.
-    foreign
-        Is told which goals are ours.
-    failed
-        Called with the reason where the controller does not take the newest goal, or gives it up.
-
-    Raises
-    ------
-    InputError
-        control_msgs is not installed.
+    ``rules``: what the arm is judged by here is what the controller is told to keep; ``foreign``:
+    is told which goals are ours; ``failed``: called with the reason where the controller does not
+    take the newest goal, or gives it up.
+    Raises InputError: control_msgs is not installed.
     """
 
     def __init__(
@@ -330,10 +302,7 @@ class ActionLink:
 def control_messages() -> tuple[Any, Any]:
     """Return FollowJointTrajectory and JointTolerance.
 
-    Raises
-    ------
-    InputError
-        They are not installed.
+    Raises InputError: they are not installed.
     """
     try:
         action = importlib.import_module('control_msgs.action').FollowJointTrajectory

@@ -85,12 +85,8 @@ def _die_with_parent() -> None:
 class NodeProcesses:
     """The node processes of a run.
 
-    Parameters
-    ----------
-    log_folder
-        Each process writes its output to ``<name>.log`` there.
-    environment
-        Variables added to the processes' environment.
+    ``log_folder``: each process writes its output to ``<name>.log`` there; ``environment``:
+    variables added to the processes' environment.
     """
 
     def __init__(self, log_folder: Path, environment: Mapping[str, str]) -> None:
@@ -127,11 +123,8 @@ class NodeProcesses:
     def check(self) -> list[str]:
         """Start again whoever was killed, as a supervisor does; return their names.
 
-        Raises
-        ------
-        DeviceError
-            With the last line of its log, if a process has ended by itself, or is killed again
-            and again as soon as it is there.
+        Raises DeviceError: with the last line of its log, if a process has ended by itself, or is
+        killed again and again as soon as it is there.
         """
         killed = []
         for name, process in list(self._running.items()):
@@ -179,10 +172,7 @@ class ConfigurationTimes:
     the dwell of a stream, or search and integration of a laser tracker. Software is wall time:
     from the bridge's report that the arm has settled to its next command, less the measuring.
 
-    Parameters
-    ----------
-    rate
-        World time over wall time.
+    ``rate``: world time over wall time.
     """
 
     def __init__(self, rate: float) -> None:
@@ -417,12 +407,7 @@ class Conductor(Node):
 class Demo:
     """One run of the demo.
 
-    Parameters
-    ----------
-    node
-        The conductor.
-    stopping
-        Filled by a signal; looked at between all steps.
+    ``stopping``: filled by a signal; looked at between all steps.
     """
 
     def __init__(self, node: Conductor, stopping: list[int]) -> None:
@@ -706,10 +691,7 @@ def output_folder(path: Path) -> Path:
 
     A demo that was interrupted before its session began has left nothing but logs.
 
-    Raises
-    ------
-    InputError
-        If it holds something or cannot be written.
+    Raises InputError: if it holds something or cannot be written.
     """
     session = path / 'session'
     try:

@@ -62,26 +62,7 @@ class JudgingParameters:
 
 
 class Judging:
-    """Plans the visits, and has them judged.
-
-    Parameters
-    ----------
-    node
-        The planner.
-    session
-        Its folder.
-    p
-        What the arm is judged by.
-    cell, tours
-        The cell, and what plans its tours.
-
-    Attributes
-    ----------
-    verdict
-        In a line; '' before there is one.
-    trouble
-        Why there is none; ''.
-    """
+    """Plans the visits, and has them judged."""
 
     def __init__(
         self, node: Node, session: Path, p: JudgingParameters, cell: Workcell, tours: TourPlanner
@@ -127,10 +108,8 @@ class Judging:
     def tour(self, kind: Kind) -> tuple[Callable[[], Tour], str]:
         """Return what plans the visits, and what a person is told before the arm moves.
 
-        Raises
-        ------
-        InputError
-            The table of a check is none, or the arm cannot stand at one of its configurations.
+        Raises InputError: the table of a check is none, or the arm cannot stand at one of its
+        configurations.
         """
         if kind == 'check':
             # Imported when it is needed, as it takes a while.

@@ -25,12 +25,8 @@ def describe_launch(
 ) -> LaunchDescription:
     """Return the description of a launch file.
 
-    Parameters
-    ----------
-    nodes
-        Returns what to start from the arguments, all of them text; `InputError` ends the launch.
-    arguments
-        Name -> description, and default value unless the argument is mandatory.
+    ``nodes``: returns what to start from the arguments, all of them text; `InputError` ends the
+    launch; ``arguments``: name -> description, and default value unless the argument is mandatory.
     """
 
     def start(context: Any) -> list[Node]:

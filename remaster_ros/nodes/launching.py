@@ -40,28 +40,16 @@ COMMANDS = 'joint_trajectory_controller/joint_trajectory'
 
 @dataclass(frozen=True)
 class NodeToStart:
-    """A node of a launch file.
+    """A node of a launch file."""
 
-    Attributes
-    ----------
-    executable, name
-        What runs, and the node's name.
-    parameters
-        A parameter file, then values that override it.
-    remappings
-        From and to; relative names, so that they hold in a namespace.
-    namespace
-        Of the node and its names.
-    ros_arguments
-        Further ones.
-    """
-
+    # What runs, and the node's name
     executable: str
     name: str
-    parameters: tuple[str | dict[str, Any], ...]
+    parameters: tuple[str | dict[str, Any], ...]  # A parameter file, then values that override it
+    # From and to; relative names, so that they hold in a namespace
     remappings: tuple[tuple[str, str], ...] = ()
-    namespace: str = ''
-    ros_arguments: tuple[str, ...] = ()
+    namespace: str = ''  # Of the node and its names
+    ros_arguments: tuple[str, ...] = ()  # Further ones
 
 
 def real_nodes(
@@ -75,24 +63,11 @@ def real_nodes(
 ) -> list[NodeToStart]:
     """Return the nodes of a real cell.
 
-    Parameters
-    ----------
-    cell, params
-        Paths of the cell file and of the parameter file.
-    sensors
-        ``all``, or names of the cell file's sensors with commas.
-    namespace
-        Of the nodes.
-    controller, joint_states
-        The arm's controller and the topic of its joint states; empty for ros2_control's usual
-        names in the namespace.
-    dashboard
-        ``true`` to serve the live page too.
-
-    Raises
-    ------
-    InputError
-        A file is missing or wrong, or a node would run on its defaults.
+    ``sensors``: ``all``, or names of the cell file's sensors with commas; ``controller,
+    joint_states``: the arm's controller and the topic of its joint states; empty for
+    ros2_control's usual names in the namespace; ``dashboard``: ``true`` to serve the live page
+    too.
+    Raises InputError: a file is missing or wrong, or a node would run on its defaults.
     """
     for name, path in (('cell', cell), ('params', params)):
         if not Path(path).is_file():
@@ -182,11 +157,8 @@ def _is_true(name: str, text: str) -> bool:
 def read_sections(params: str, namespace: str = '') -> dict[str, Mapping[str, Any]]:
     """Return the sections of a parameter file that hold in a namespace, by node.
 
-    Raises
-    ------
-    InputError
-        It is no parameter file, or has a section for none of our nodes in this namespace: that
-        node would run on its defaults.
+    Raises InputError: it is no parameter file, or has a section for none of our nodes in this
+    namespace: that node would run on its defaults.
     """
     path = Path(params)
     try:
@@ -217,11 +189,8 @@ def read_sections(params: str, namespace: str = '') -> dict[str, Mapping[str, An
 def exit_ends_launch(process: str, returncode: int | None) -> bool:
     """Return whether the end of a node ends them all: started again it would end the same way.
 
-    Parameters
-    ----------
-    process
-        The executable's name, then a hyphen and a number. The live page, which the others do not
-        need, ends nobody.
+    ``process``: the executable's name, then a hyphen and a number. The live page, which the others
+    do not need, ends nobody.
     """
     return returncode == WRONG and process.rpartition('-')[0] != PAGE
 

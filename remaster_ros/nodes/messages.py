@@ -78,24 +78,10 @@ def waypoints_by_solution(
 ) -> dict[int, FloatArray]:
     """Group remaster/joint_waypoints by the solution that they lead to.
 
-    Parameters
-    ----------
-    message
-        See `waypoints_message`; its joints may be in any order.
-    joint_names
-        The wanted order of joints.
-
-    Returns
-    -------
-    dict
-        Index of the solution -> configurations to go through before it, rad, (n, k), n >= 1;
-        without those that a straight way leads to.
-
-    Raises
-    ------
-    InputError
-        Joints that are missing or named twice, points of the wrong length, not finite or out of
-        order.
+    Returns index of the solution -> configurations to go through before it, rad, (n, k), n >= 1;
+    without those that a straight way leads to.
+    Raises InputError: joints that are missing or named twice, points of the wrong length, not
+    finite or out of order.
     """
     if not message.points:
         return {}

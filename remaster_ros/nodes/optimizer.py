@@ -99,23 +99,8 @@ class Parameters:
 class PrecisionWatch:
     """Fit the session after every few configurations and publish what is known.
 
-    Parameters
-    ----------
-    node
-        The optimizer.
-    session
-        Folder of the session.
-    goal
-        What the cell file wants to be known at the end.
-    every
-        Configurations between two looks; 0 for none.
-    priors
-        Reads what is known before a fit.
-
-    Attributes
-    ----------
-    state
-        For the planner.
+    ``goal``: what the cell file wants to be known at the end; ``every``: configurations between
+    two looks; 0 for none.
     """
 
     def __init__(

@@ -34,20 +34,10 @@ _ALWAYS = ('use_sim_time', 'start_type_description_service')
 def declare(node: Node, kind: type[T], on_change: Callable[[T], None] | None = None) -> T:
     """Declare the fields of `kind` on `node` and return their values.
 
-    Parameters
-    ----------
-    node
-        The node.
-    kind
-        Its dataclass of parameters.
-    on_change
-        Called with all parameters when live ones are to change, in an executor's thread; from its
-        return on the new ones hold. `InputError` refuses the change, with its text as the reason.
-
-    Raises
-    ------
-    InputError
-        Naming the node, the parameter and what it may be.
+    ``on_change``: called with all parameters when live ones are to change, in an executor's
+    thread; from its return on the new ones hold. `InputError` refuses the change, with its text as
+    the reason.
+    Raises InputError: naming the node, the parameter and what it may be.
     """
     overrides: Mapping[str, Any] = node._parameter_overrides
     fields = parameter_fields(kind)

@@ -95,14 +95,7 @@ DISCOVER = '/remaster/discover'
 class FurtherMeasuring:
     """Decides whether and what is measured further.
 
-    Parameters
-    ----------
-    discovery
-        Folder of the optimizer's discovery; '' where nothing is measured further.
-    session
-        The recorder's folder.
-    journal, tours
-        The plan so far; plans the tours.
+    ``discovery``: folder of the optimizer's discovery; '' where nothing is measured further.
     """
 
     def __init__(
@@ -114,17 +107,9 @@ class FurtherMeasuring:
     def ask(self, state: str, *, under_way: bool) -> tuple[str | None, partial[Tour] | None]:
         """Return why nothing is measured further, '' where it is, and what plans it if it is new.
 
-        Parameters
-        ----------
-        state
-            The planner's: behind a collection that is not complete nothing is measured, None.
-        under_way
-            Whether something is being measured further already.
-
-        Returns
-        -------
-        str or None, callable or None
-            The latter of registrations.
+        ``state``: the planner's: behind a collection that is not complete nothing is measured,
+        None; ``under_way``: whether something is being measured further already.
+        Returns str or None, callable or None: The latter of registrations.
         """
         if state != 'complete':
             return '' if under_way else None, None
@@ -307,15 +292,7 @@ LISTENERS = ('robot_bridge', 'recorder')
 
 
 class PosePublisher:
-    """Publishes poses, and the stop that takes them back.
-
-    Parameters
-    ----------
-    node
-        The planner.
-    chain
-        Its arm.
-    """
+    """Publishes poses, and the stop that takes them back."""
 
     def __init__(self, node: RemasterNode, chain: SerialChain) -> None:
         self._node, self._chain = node, chain
@@ -341,12 +318,8 @@ class PosePublisher:
     def announce(self, stop: PoseVisit, plan: str, status: NodeStatus, *, last: bool) -> str:
         """Publish a pose with what is left of its solutions; return the announcement's stamp.
 
-        Parameters
-        ----------
-        plan
-            The plan that poses and solutions are numbered by.
-        last
-            Whether it is the last reference of a round.
+        ``plan``: the plan that poses and solutions are numbered by; ``last``: whether it is the
+        last reference of a round.
         """
         pose = PoseStamped()
         pose.header.stamp = self._node.get_clock().now().to_msg()
@@ -404,18 +377,7 @@ def new_token() -> str:
 
 
 class LivingRun:
-    """A run under way in this process; its sign of life is a file outside of every session.
-
-    Parameters
-    ----------
-    token
-        Names the run.
-
-    Attributes
-    ----------
-    token
-        The run's name.
-    """
+    """A run under way in this process; its sign of life is a file outside of every session."""
 
     def __init__(self, token: str) -> None:
         self.token = token
@@ -465,15 +427,7 @@ MEASURE_EVERY_WALL_S = 5.0
 
 
 class MeasureCalls:
-    """Have single-shot sensors show that they see their markers.
-
-    Parameters
-    ----------
-    node
-        The node that calls.
-    cell
-        Its sensors.
-    """
+    """Have single-shot sensors show that they see their markers."""
 
     def __init__(self, node: Node, cell: Workcell) -> None:
         self._clients: dict[str, Client] = {
@@ -500,14 +454,7 @@ EVERY_S = 20.0
 class ProgressLines:
     """Logs the progress of a collection while it runs, and where it ends.
 
-    Parameters
-    ----------
-    node
-        Its log is used.
-    clock
-        Steady.
-    counts, state
-        Return the figures of `TourProgress.counts`, and the state of the run.
+    ``counts, state``: return the figures of `TourProgress.counts`, and the state of the run.
     """
 
     def __init__(
@@ -543,21 +490,7 @@ class ProgressLines:
 class PlanPreview(PlanConfirmation):
     """Draws the plan that is next, until it is confirmed.
 
-    Parameters
-    ----------
-    cell
-        The cell.
-    tours
-        Plans the tours.
-    memory, progress
-        The plan under way, and how far it is.
-    session
-        The session's folder; the page is beside it.
-
-    Attributes
-    ----------
-    page
-        Where the page is.
+    ``session``: the session's folder; the page is beside it.
     """
 
     def __init__(
@@ -600,17 +533,8 @@ class PlanPreview(PlanConfirmation):
     def draw(self, q: FloatArray, facts: PreflightFacts) -> str:
         """Draw what is next, where the page has something else; return what a person is told.
 
-        Parameters
-        ----------
-        q
-            Where the arm stands, rad, (k,).
-        facts
-            They tell which sensors must be registered before the collection.
-
-        Returns
-        -------
-        str
-            '' while it is drawn, and where there is nothing new.
+        ``facts``: they tell which sensors must be registered before the collection.
+        Returns '' while it is drawn, and where there is nothing new.
         """
         if not self.required:
             return ''

@@ -86,10 +86,7 @@ class _Shot:
 class TriggeredSensors:
     """The measurements that one configuration after the other needs.
 
-    Parameters
-    ----------
-    clients
-        Client of the measure service (std_srvs/Trigger), per sensor.
+    ``clients``: client of the measure service (std_srvs/Trigger), per sensor.
     """
 
     def __init__(self, clients: Mapping[str, Client]) -> None:
@@ -137,22 +134,7 @@ class TriggeredSensors:
 class CellSensors:
     """Subscribe to the readings of all sensors, and find which sensors are missing.
 
-    Parameters
-    ----------
-    node, p
-        The recorder and its parameters.
-    cell
-        Its sensors.
-
-    Raises
-    ------
-    InputError
-        The parameter ``require`` names no sensor of the cell.
-
-    Attributes
-    ----------
-    required
-        The sensors that the arm waits for.
+    Raises InputError: the parameter ``require`` names no sensor of the cell.
     """
 
     def __init__(self, node: RemasterNode, p: Parameters, cell: Workcell) -> None:
@@ -236,25 +218,9 @@ CHECK_S = 1.0
 class SessionKeeper:
     """Write a session, one thing at a time.
 
-    Parameters
-    ----------
-    node
-        The node that records; its log gets what is for a person.
-    folder
-        The session's.
-    header
-        The session without observations.
-    began
-        What a bag begins with; None to record none.
-
-    Attributes
-    ----------
-    journal, bag
-        What is written.
-    full
-        Why the disk does not take what waits; '' where nothing waits.
-    restored
-        What was last found changed by others and restored; ''.
+    ``began``: what a bag begins with; None to record none.
+    Attributes: ``journal, bag``: what is written; ``full``: why the disk does not take what waits;
+    '' where nothing waits; ``restored``: what was last found changed by others and restored; ''.
     """
 
     def __init__(
@@ -289,10 +255,7 @@ class SessionKeeper:
     def look(self) -> bool:
         """Try again what waits, and restore what others did to the files, once a second.
 
-        Returns
-        -------
-        bool
-            Whether something was restored.
+        Returns whether something was restored.
         """
         now = time.monotonic()
         if self._waiting is not None and now - self._tried_wall > RETRY_S:

@@ -169,10 +169,7 @@ class Replay(RemasterNode):
     def _refuse_live(self) -> None:
         """Refuse to publish where an arm may move by it.
 
-        Raises
-        ------
-        InputError
-            Naming the node. One that was killed stays listed for some 20 s.
+        Raises InputError: naming the node. One that was killed stays listed for some 20 s.
         """
         own = self.get_name(), self.get_namespace()
         for topic in SOURCES:
@@ -268,10 +265,7 @@ class Replay(RemasterNode):
     def _require_all(self) -> None:
         """Check that nothing was dropped.
 
-        Raises
-        ------
-        InsufficientDataError
-            Something was; with the topics.
+        Raises InsufficientDataError: something was; with the topics.
         """
         for topic in list(self._untaken):
             self._await_taken(topic)
@@ -303,15 +297,8 @@ class Replay(RemasterNode):
 class Acknowledged:
     """What of the messages sent a recorder has taken, as it answers; nothing where there is none.
 
-    Parameters
-    ----------
-    node
-        The replay, which is spun by another thread than the one that waits here.
-
-    Attributes
-    ----------
-    sent
-        Messages sent by topic, and on remaster/events by `taken_key`.
+    ``node``: the replay, which is spun by another thread than the one that waits here.
+    Attributes: ``sent``: messages sent by topic, and on remaster/events by `taken_key`.
     """
 
     def __init__(self, node: RemasterNode) -> None:
@@ -322,10 +309,7 @@ class Acknowledged:
     def begin(self, wait_s: float, ending: threading.Event) -> None:
         """Find out whether a recorder is there, and how many messages it has taken already.
 
-        Raises
-        ------
-        InputError
-            It is there and does not answer.
+        Raises InputError: it is there and does not answer.
         """
         settled = self._node.resolve_topic_name(IN_ORDER[0].lstrip('/'))
         subscribers = self._node.get_subscriptions_info_by_topic(settled)
@@ -357,10 +341,7 @@ class Acknowledged:
     def wait(self, ending: threading.Event) -> dict[str, int]:
         """Wait until the recorder has taken what was sent since the last call.
 
-        Returns
-        -------
-        dict
-            How many messages it has not taken, where for `TAKEN_S` it took no more of them.
+        Returns how many messages it has not taken, where for `TAKEN_S` it took no more of them.
         """
         if self._before is None or not self.sent:
             return {}
@@ -409,10 +390,7 @@ def _live(info: TopicEndpointInfo, does: str) -> str:
 def message_class(type_name: str) -> Any:
     """Return the class of a message type such as ``sensor_msgs/msg/JointState``.
 
-    Raises
-    ------
-    InputError
-        If this machine has no such type.
+    Raises InputError: if this machine has no such type.
     """
     package, _, name = type_name.partition('/msg/')
     try:

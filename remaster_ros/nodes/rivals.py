@@ -34,14 +34,7 @@ COUNT_WALL_S = 3.0
 class OnlyPublisher:
     """See that a topic has one publisher, or none.
 
-    Parameters
-    ----------
-    node
-        The node that depends on it.
-    topic, message_type
-        The topic.
-    allowed
-        How many publishers it may have: 1, or 0.
+    ``allowed``: how many publishers it may have: 1, or 0.
     """
 
     def __init__(self, node: Node, topic: str, message_type: Any, allowed: int = 1) -> None:
@@ -116,19 +109,9 @@ NUMBER = 'publication_sequence_number'
 class ArmStates:
     """Take joint positions of an arm from joint_states, whoever else publishes there.
 
-    Parameters
-    ----------
-    node
-        The node that subscribes.
-    names
-        The arm's joints, in the wanted order.
-    hold_s
-        A second publisher counts for so long after it was noticed last, s of wall time.
-
-    Attributes
-    ----------
-    others
-        What a message is that has none of the arm's joints, for whom the arm's do not come; ''.
+    ``hold_s``: A second publisher counts for so long after it was noticed last, s of wall time.
+    Attributes: ``others``: what a message is that has none of the arm's joints, for whom the arm's
+    do not come; ''.
     """
 
     def __init__(self, node: Node, names: Sequence[str], hold_s: float) -> None:
@@ -145,10 +128,7 @@ class ArmStates:
     def take(self, message: JointState, info: Mapping[str, Any]) -> FloatArray | None:
         """Return the arm's positions, rad, (k,); None from a message of another device.
 
-        Raises
-        ------
-        InputError
-            As of `JointOrder.positions`.
+        Raises InputError: as of `JointOrder.positions`.
         """
         return self._order.positions(message) if self.note(message, info) else None
 

@@ -236,14 +236,8 @@ class Parameters(SimulationParameters):
     ) -> MotionLimits:
         """Return the limits of every motion.
 
-        Parameters
-        ----------
-        chain
-            The arm as drawn.
-        shifts
-            Least and largest that a correction adds to reported angles, rad, (2, k); None without.
-        acceleration
-            rad/s², (k,) or for all.
+        ``shifts``: least and largest that a correction adds to reported angles, rad, (2, k); None
+        without; ``acceleration``: rad/s², (k,) or for all.
         """
         return MotionLimits.of(
             chain,
@@ -265,17 +259,9 @@ PERIODIC = 6
 class EmergencyLink:
     """Follow a topic; a link that is silent is trouble.
 
-    Parameters
-    ----------
-    node
-        The node that listens.
-    topic
-        The topic; '' for no such link.
-    on_state
-        Called with every message's value.
-    silence_s
-        Messages that come regularly and then are silent for so much longer than between them
-        are missed, s of wall time.
+    ``topic``: the topic; '' for no such link; ``on_state``: called with every message's value;
+    ``silence_s``: messages that come regularly and then are silent for so much longer than between
+    them are missed, s of wall time.
     """
 
     def __init__(

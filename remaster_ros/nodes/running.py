@@ -40,25 +40,14 @@ ANSWERS_DELIVERED_S = 3.0
 class RemasterNode(Node):
     """A node that `run` can end, and of whose name there is one in a ROS domain.
 
-    Raises
-    ------
-    InputError
-        Another process on this computer is that node.
-
-    Attributes
-    ----------
-    failure
-        Set (from any thread) to end the process with this error.
-    finished
-        Set (from any thread) to end the process with status 0.
-    outlives_faults
-        True for a node that a fault of this program in one of its services does not end. It is
-        ended otherwise: a node that others count on is better gone, which they notice and hold
-        the arm for, than there in an unforeseen state.
+    Raises InputError: another process on this computer is that node.
     """
 
+    # Set, from any thread, to end the process with this error, or with status 0.
     failure: RemasterError | None = None
     finished = False
+    # A fault of this program in one of its services ends it otherwise: a node that others count on
+    # is better gone, which they notice and hold the arm for, than there in an unforeseen state.
     outlives_faults = False
 
     def __init__(self, node_name: str, **options: Any) -> None:
@@ -168,15 +157,9 @@ def run(
 ) -> int:
     """Spin the node that `make_node` returns until a signal, its failure or its finish.
 
-    Parameters
-    ----------
-    threads
-        More than one lets a callback block (a service that measures) while others run.
-
-    Returns
-    -------
-    int
-        Exit status, see `exit_status`; 0 after SIGINT or SIGTERM. An error is one line on stderr.
+    ``threads``: more than one lets a callback block (a service that measures) while others run.
+    Returns exit status, see `exit_status`; 0 after SIGINT or SIGTERM. An error is one line on
+    stderr.
     """
     stopping: list[int] = []
 

@@ -27,10 +27,7 @@ def runtime_folder() -> Path:
     Always below /tmp: XDG_RUNTIME_DIR is set in one shell and not in the other (ssh, services),
     and two processes must find the same folder.
 
-    Raises
-    ------
-    InputError
-        It belongs to another user, or cannot be made.
+    Raises InputError: it belongs to another user, or cannot be made.
     """
     folder = Path('/tmp') / f'remaster_ros_{os.getuid()}'
     try:
@@ -49,17 +46,8 @@ def runtime_folder() -> Path:
 class NameLock:
     """The right to be the node of a name in a domain; kept until `release` or the process's end.
 
-    Parameters
-    ----------
-    domain
-        ROS_DOMAIN_ID.
-    name
-        The node's fully qualified name, such as ``/left/recorder``.
-
-    Raises
-    ------
-    InputError
-        Another process of this user is that node; names its process id.
+    ``name``: the node's fully qualified name, such as ``/left/recorder``.
+    Raises InputError: another process of this user is that node; names its process id.
     """
 
     def __init__(self, domain: int, name: str, patience_s: float = PATIENCE_S) -> None:
@@ -113,12 +101,7 @@ class NameLock:
 def page_name(domain: int, node: str) -> str:
     """Return what the files of the page are called that a node serves.
 
-    Parameters
-    ----------
-    domain
-        ROS_DOMAIN_ID.
-    node
-        The node's fully qualified name, such as ``/left/watch``.
+    ``node``: the node's fully qualified name, such as ``/left/watch``.
     """
     return f'domain_{domain}{node.replace("/", "%")}'
 

@@ -34,14 +34,7 @@ SENSOR_COLORS = ('#3b82c4', '#e07b39', '#2f9e78', '#a86bc0')
 class RvizMarkers:
     """Publishes the markers and the sensors' frames.
 
-    Parameters
-    ----------
-    node
-        The node.
-    scene
-        The arm and what stands around it.
-    publish_tf
-        Whether /tf_static is published.
+    ``publish_tf``: whether /tf_static is published.
     """
 
     def __init__(self, node: Node, scene: RobotScene, *, publish_tf: bool) -> None:

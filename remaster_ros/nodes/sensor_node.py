@@ -56,22 +56,9 @@ NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 class MeasureService:
     """What a node adds for a sensor that measures on request.
 
-    Parameters
-    ----------
-    node
-        Of the sensor.
-    driver
-        Of the device.
-    cell
-        The workcell.
-    ending
-        Set when the node ends.
-
-    Raises
-    ------
-    InputError
-        The node listens to the arm's commands under a name by which the bridge would take it for
-        a controller.
+    ``ending``: set when the node ends.
+    Raises InputError: the node listens to the arm's commands under a name by which the bridge
+    would take it for a controller.
     """
 
     def __init__(
@@ -233,10 +220,7 @@ ANY = QoSProfile(depth=200, reliability=ReliabilityPolicy.BEST_EFFORT)
 def subscribe_to_source(node: Node, driver: TopicDriver, sensor: CellSensor) -> None:
     """Hand all messages of a sensor's source to its driver.
 
-    Raises
-    ------
-    InputError
-        The package of the message type is not installed.
+    Raises InputError: the package of the message type is not installed.
     """
     package, _, name = sensor.message_type.partition('/msg/')
     try:
@@ -264,26 +248,12 @@ RETRY_S = 0.5
 class SensorNode(RemasterNode):
     """A node that publishes the markers which one of the cell's sensors measures.
 
-    Parameters
-    ----------
-    name
-        Of the node, where none is given on its command line; it chooses the driver, unless it is
-        that of no registered sensor: then the given one does.
-
-    Attributes
-    ----------
-    kind
-        Key of the driver in `remaster_ros.sensors.registry.DRIVERS`.
-    driver
-        Of the device.
-    sensor
-        Its name in the cell, which is the frame of its readings.
-    published
-        Number of readings.
-    trouble
-        Why the device was not opened, or what it refused last; ''.
-    in_use
-        Held while a command of the device is under way.
+    ``name``: of the node, where none is given on its command line; it chooses the driver, unless
+    it is that of no registered sensor: then the given one does.
+    Attributes: ``kind``: key of the driver in `remaster_ros.sensors.registry.DRIVERS`; ``sensor``:
+    its name in the cell, which is the frame of its readings; ``trouble``: why the device was not
+    opened, or what it refused last; ''; ``in_use``: held while a command of the device is under
+    way.
     """
 
     def __init__(self, name: str) -> None:

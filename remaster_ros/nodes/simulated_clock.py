@@ -31,17 +31,8 @@ class SteadyTime:
     In a simulation that waits for its nodes it is the simulated clock's divided by its rate, which
     never runs faster than the wall's; and the wall's where the simulated clock has ended.
 
-    Parameters
-    ----------
-    node
-        Its clock is read.
-    rate
-        `simulated_clock_rate`; 0 for the wall clock.
-
-    Raises
-    ------
-    InputError
-        A rate without ``use_sim_time``.
+    ``rate``: `simulated_clock_rate`; 0 for the wall clock.
+    Raises InputError: a rate without ``use_sim_time``.
     """
 
     def __init__(self, node: RemasterNode, rate: float) -> None:
@@ -82,12 +73,8 @@ class SteadyTime:
 class ReportsTaken:
     """Publishes, in a simulation, until when a node has taken what came.
 
-    Parameters
-    ----------
-    node
-        The node.
-    simulated
-        `simulated_clock_rate`, or whether the clock is simulated; else nothing is published.
+    ``simulated``: `simulated_clock_rate`, or whether the clock is simulated; else nothing is
+    published.
     """
 
     def __init__(self, node: RemasterNode, simulated: float) -> None:

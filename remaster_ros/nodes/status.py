@@ -119,39 +119,19 @@ LEVELS = {
 
 
 class Summary(NamedTuple):
-    """What a node reports of itself now.
+    """What a node reports of itself now."""
 
-    Attributes
-    ----------
-    level
-        ``ok``, ``warn`` or ``error``.
-    message
-        For people.
-    values
-        Counts and settings, for people.
-    state
-        For the other nodes; people are shown its fields too.
-    """
-
-    level: str
-    message: str
-    values: Mapping[str, Any]
-    state: State = Alive()
+    level: str  # ``ok``, ``warn`` or ``error``
+    message: str  # For people
+    values: Mapping[str, Any]  # Counts and settings, for people
+    state: State = Alive()  # For the other nodes; people are shown its fields too
 
 
 class NodeStatus:
     """Publish a node's state and events; end the node where another of its name is longer there.
 
-    Parameters
-    ----------
-    node
-        The node that reports. Its `failure` is set where it must end.
-    summary
-        Returns what to report now.
-    hardware_id
-        In /diagnostics: the device that the node is for.
-    model
-        Which arm the node computes with; every record carries it.
+    ``hardware_id``: in /diagnostics: the device that the node is for; ``model``: which arm the
+    node computes with; every record carries it.
     """
 
     def __init__(
@@ -196,13 +176,7 @@ class NodeStatus:
         return self._duplicates.alone_since_s
 
     def alone(self, now: float) -> bool:
-        """Whether this node has listened for 1.5 s and found no other of its name.
-
-        Parameters
-        ----------
-        now
-            `time.monotonic`, s.
-        """
+        """Whether this node has listened for 1.5 s and found no other of its name."""
         return self._duplicates.alone(now)
 
     def _look_at_qos(self) -> None:
@@ -337,12 +311,8 @@ def listen(
 ) -> None:
     """Subscribe to the records of all nodes, or to what they show to people.
 
-    Parameters
-    ----------
-    on_record
-        Called with every record.
-    on_summary
-        Called with (node, message, values) of every status; for programs that show them.
+    ``on_summary``: called with (node, message, values) of every status; for programs that show
+    them.
     """
     if on_record is not None:
         node.create_subscription(String, EVENTS, receiver(node, on_record), RELIABLE)

@@ -313,12 +313,8 @@ def _tolerant(callback: Callable[[Any], None]) -> Callable[[Any], None]:
 def fit_facts(folder: Path, offsets: Mapping[str, float]) -> FitFacts:
     """Return what the page shows of a fit beside its offsets.
 
-    Parameters
-    ----------
-    folder
-        The optimizer's, on this computer; where it is elsewhere there is nothing to show.
-    offsets
-        As published, joint -> rad: the file has to be that of the same fit.
+    ``folder``: the optimizer's, on this computer; where it is elsewhere there is nothing to show;
+    ``offsets``: as published, joint -> rad: the file has to be that of the same fit.
     """
     try:
         fit = read_fit(folder / FIT_FILE)

@@ -55,6 +55,9 @@ class Planner:
         until = time.monotonic() + 30.0
         while not condition():
             assert time.monotonic() < until, what
+            # As the executor does: what was planned is taken, and the timer is due.
+            for thread in (self.node.progress._planning, self.node._preview._thread):
+                thread._background._deliver()
             self.node._step()
             time.sleep(0.005)
 
