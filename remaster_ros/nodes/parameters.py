@@ -41,11 +41,6 @@ def declare(node: Node, kind: type[T], on_change: Callable[[T], None] | None = N
     """
     overrides: Mapping[str, Any] = node._parameter_overrides
     fields = parameter_fields(kind)
-    for name, remedy in getattr(kind, 'REPLACED', {}).items():
-        if name in overrides:
-            raise InputError(
-                f'{node.get_name()}: there is no parameter {name!r} any more; {remedy}'
-            )
     for name in overrides:
         if name not in fields and name not in _ALWAYS and not name.startswith('qos_overrides.'):
             known = ', '.join(sorted(fields))

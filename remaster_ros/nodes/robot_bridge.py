@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from rclpy.node import Node
@@ -106,11 +106,6 @@ WATCH_WALL_S = 0.05
 class Parameters(SimulationParameters):
     """Parameters of the bridge."""
 
-    REPLACED: ClassVar[Mapping[str, str]] = {
-        'offsets': 'give compensation the apply/compensation.json that fit has written beside '
-        'fit.json: limits and paths are checked by it as before, and what is commanded is '
-        'corrected'
-    }
     cell: str = parameter('', 'cell file: a path, or the name of a shipped one; must be given')
     speed_share: float = parameter(
         0.3,
