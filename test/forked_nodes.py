@@ -23,6 +23,7 @@ import subprocess
 import sys
 import tempfile
 import threading
+import time
 from pathlib import Path
 from typing import Any
 
@@ -108,17 +109,19 @@ def _serve(tests: socket.socket) -> list[str]:
             for number in (born, bears, *streams):
                 os.close(number)
             continue
-        ready, go = os.pipe()
+        parent = os.getpid()
         node = os.fork()
         if node:
             os.write(bears, str(node).encode())
             os._exit(0)
-        # Not before its parent has ended, whose death it may be told of.
-        os.close(go)
-        os.read(ready, 1)
+        # Not before its parent has ended, whose death it would be told of: a moment after that has
+        # closed its files the kernel passes it on to the tests.
+        while os.getppid() == parent:
+            time.sleep(0.001)
+        time.sleep(0.001)
         # Tests that are killed leave no node behind.
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
-        for number in (ready, born, bears):
+        for number in (born, bears):
             os.close(number)
         tests.close()
         for number, stream in enumerate(streams):
