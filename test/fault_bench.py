@@ -1,6 +1,6 @@
 """Real nodes on fake devices in a ROS domain of their own, to spoil one part of it at a time.
 
-Every node is a process as in `remaster demo`. The bench's own node observes (`fault_observer`),
+Every node is a process of its own. The bench's own node observes (`fault_observer`),
 publishes what strangers would, and, where asked, stands between two nodes and hands on what the
 one tells the other, spoiled. An operator calls the services that a person would.
 """
@@ -21,6 +21,7 @@ from pathlib import Path
 import numpy as np
 from fault_observer import Observer
 from fault_relay import Relay
+from forked_nodes import NodeProcess
 from ros_rig import ASKED, PATIENCE
 
 from remaster_ros.collection.events import ConfigurationEnded, PoseAnnounced, SolutionSettled
@@ -105,7 +106,7 @@ class Bench:
         hidden = {'world': str(folder / 'world')}
         self._values = {
             # Faults begin between two messages of the clock: as fine as the page has it.
-            'fake_robot': {**hidden, 'clock_rate': 100.0},
+            'fake_robot': {**hidden, 'clock_rate': 100.0, 'joint_state_rate': 20.0},
             'fake_optitrack': {**hidden, **ports, 'rate': 20.0},
             'fake_laser_tracker': {**hidden, 'port': tracker},
             'pose_planner': {
@@ -190,7 +191,7 @@ class Bench:
 
     def start(self, name: str) -> None:
         """Start a node (again)."""
-        command = [sys.executable, '-m', 'remaster_ros.nodes', name, '--ros-args']
+        command = [sys.executable, '-m', f'remaster_ros.nodes.{name}', '--ros-args']
         command += ['--params-file', str(config_path('fake.yaml'))]
         own = {} if name in FAKES else {'cell': self._cell}
         for key, value in {**own, **self._values[name]}.items():
@@ -200,7 +201,7 @@ class Bench:
             for written in (topic, f'/{topic}'):
                 command += ['-r', f'{written}:=/bench/{topic}']
         with (self.folder / 'log' / f'{name}.log').open('ab') as log:
-            self.processes[name] = subprocess.Popen(
+            self.processes[name] = NodeProcess(
                 command, stdout=log, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL,
                 env=self._environment,
             )  # fmt: skip
