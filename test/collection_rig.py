@@ -127,13 +127,8 @@ class Cell:
             return start(f'remaster_ros.nodes.{name}', *arguments)
 
         self._begin = begin
-        # A world that runs while nodes are starting costs as much as one in which an arm moves.
-        fakes = [name for name in own if name.startswith('fake_')]
-        nodes = own.keys() - set(fakes)
-        self.nodes = {name: begin(name) for name in nodes}
+        self.nodes = {name: begin(name) for name in own}
         self.nodes |= {f'vendor_{name}': begin(f'vendor_{name}') for name in foreign or {}}
-        self.until(lambda: self.said.keys() >= nodes, 'the nodes')
-        self.nodes |= {name: begin(name) for name in fakes}
         if by_action:
             self.nodes['action_adapter'] = begin('action_adapter')
         self.until(lambda: self.said.get('pose_planner', {}).get('robot') == 'heard', 'the robot')

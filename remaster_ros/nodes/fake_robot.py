@@ -103,7 +103,9 @@ class FakeRobotNode(RemasterNode):
         """Publish states and the clock, and let world time go on; what is late is left out."""
         state_s, clock_s = 1.0 / self.p.joint_state_rate, self.world.rate / self.p.clock_rate
         state_due = clock_due = self.world.now()
-        clock_wall, wait_s = 0.0, 0.0
+        clock_wall, wait_s, moved = 0.0, 0.0, False
+        # What world time is ahead of the wall clock's.
+        ahead_s = self.world.now() - time.monotonic()
         while not self._ending.wait(wait_s):
             if (now := self.world.now()) >= state_due:
                 self._publish_state()
@@ -113,7 +115,8 @@ class FakeRobotNode(RemasterNode):
             if now >= clock_due or wall - clock_wall > STANDING_CLOCK_WALL_S:
                 self._clock_publisher.publish(ClockMessage(clock=stamp_of(now)))
                 clock_due, clock_wall = _next_due(clock_due, clock_s, now), wall
-            self._pace.go_on()
+            moved = moved or self.world.has_moved
+            self._pace.go_on(math.inf if moved else wall + ahead_s)
             left_s = min(state_due, clock_due) - self.world.now()
             wait_s = max(left_s / self.world.rate, POLL_WALL_S)
 

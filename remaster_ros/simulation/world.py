@@ -134,6 +134,11 @@ class World:
         with (self.folder / MOTION_FILE).open('a') as file:
             file.write(json.dumps([start_s, to_plain(list(waypoints))]) + '\n')
 
+    @property
+    def has_moved(self) -> bool:
+        """Whether the arm was ever commanded."""
+        return (self.folder / MOTION_FILE).stat().st_size > 0
+
     def _read_motions(self) -> None:
         """Read the trajectories that have been added to the file since the last look."""
         if self._lines is None:

@@ -2,8 +2,10 @@
 
 World time runs `rate` times as fast as the wall clock up to a limit, and stands there. The fake
 robot moves the limit on as the programs that are tested, and the fake sensors, have kept up: on a
-busy machine the world is slower, and nothing in it is late. A file of a few numbers holds the line
-and the limit; every process computes the same time from it and from the machine's monotonic clock.
+busy machine the world is slower, and nothing in it is late. Before the arm's first motion, while
+nodes start and plan, it runs no faster than the wall clock, since nothing happens in it. A file of
+a few numbers holds the line and the limit; every process computes the same time from it and from
+the machine's monotonic clock.
 
 A limit that is not renewed for `HELD_WALL_S` no longer holds: a fake robot that was killed or
 paused is a fault that a test injects, and the world goes on without it.
@@ -92,8 +94,8 @@ class Pace:
                 known.append(self._took[pid].done_s)
             self._took[pid] = _Participant(max(known), time.monotonic())
 
-    def go_on(self) -> None:
-        """Let world time run as far as it may."""
+    def go_on(self, most_s: float = math.inf) -> None:
+        """Let world time run as far as it may, and not past `most_s`."""
         wall, now = time.monotonic(), self._clock.now()
         for pid, done_s in self._clock.slots().values():
             known = self._fakes.get(pid)
@@ -106,7 +108,7 @@ class Pace:
                 self._reports.popleft()
             since = [published_s for _, published_s in list(self._reports)[:1]]
         since += _waited_for(self._fakes, wall)
-        self._clock.hold(min([now, *since]) + self._ahead_s)
+        self._clock.hold(min(min([now, *since]) + self._ahead_s, most_s))
 
 
 def _waited_for(participants: dict[int, _Participant], wall: float) -> Iterable[float]:

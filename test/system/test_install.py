@@ -14,6 +14,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from ros_rig import domains
 
 pytest.importorskip('rclpy', reason='needs ROS 2 Jazzy or its wheels')
 pytestmark = [pytest.mark.ros, pytest.mark.slow]
@@ -145,8 +146,8 @@ def start_wrongly(executable: str, installed: tuple[Path, dict[str, str]], cwd: 
     if executable == 'sensor_markers':
         # The name of this node chooses what it is.
         wrong += ['-r', '__node:=optitrack_markers']
-    env = {**env, 'ROS_DOMAIN_ID': '77', 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}
-    done = run([str(prefix / 'lib' / 'remaster_ros' / executable), *wrong], env, cwd)
+    here = {'ROS_DOMAIN_ID': str(next(domains)), 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}
+    done = run([str(prefix / 'lib' / 'remaster_ros' / executable), *wrong], {**env, **here}, cwd)
     assert done.returncode == 2
     assert done.stderr.count('\n') == 1, done.stderr
     assert 'nonsense' in done.stderr
