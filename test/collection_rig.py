@@ -154,7 +154,7 @@ class Cell:
             for _ in range(20):
                 self.client.spin_some()
             for name, process in self.nodes.items():
-                assert process.poll() is None, (name, process.communicate())
+                assert process.poll() is None, (name, process.returncode, process.communicate())
             return condition()
 
         try:
