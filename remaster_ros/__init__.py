@@ -330,7 +330,7 @@ def plan(
     import numpy as np
 
     from remaster_ros.session.workcell import read_cell
-    from remaster_ros.simulation.offline_tour import plan_tour
+    from remaster_ros.simulation.simulated_workcell import plan_tour
 
     workcell = read_cell(os.fspath(cell))
     counts = {'optimization': poses, 'validation': validation_poses}

@@ -20,6 +20,7 @@ class ReflectorWorld:
         self.path = path or (lambda t: MARKER)
         self.visible = True
         self.speed = lambda t: 0.0
+        self.faulty: dict[str, float] = {}
         self._started = time.monotonic()
 
     def now(self) -> float:
@@ -44,7 +45,7 @@ class ReflectorWorld:
         return self.visible
 
     def faults(self, device: str) -> dict[str, float]:
-        return {}
+        return self.faulty
 
     def warming_k(self, t: float) -> float:
         return 0.0

@@ -316,12 +316,7 @@ class SerialChain:
             moved = np.where(self.slides[:, None], axes, moved)
         return np.swapaxes(moved, -1, -2)
 
-    def gravity_torque(
-        self,
-        q: ArrayLike,
-        gravity: ArrayLike = (0.0, 0.0, -9.81),
-        joint_offsets: ArrayLike | None = None,
-    ) -> FloatArray:
+    def gravity_torque(self, q: ArrayLike, gravity: ArrayLike = (0.0, 0.0, -9.81)) -> FloatArray:
         """Return gravity's torque about each joint: axis · (r × m g) over what hangs on it.
 
         Positive where gravity turns the joint its own way; a motor that holds the arm still has
@@ -333,8 +328,6 @@ class SerialChain:
             Joint angles, rad, (..., k).
         gravity
             Acceleration in R, m/s², (3,).
-        joint_offsets
-            Zero-offsets, rad, (..., k).
 
         Returns
         -------
@@ -342,7 +335,7 @@ class SerialChain:
             N m, (..., k); zeros where the URDF has no masses (`has_inertials`). Of a joint that
             slides gravity's force along it, N.
         """
-        frames = self.frames(q, joint_offsets)
+        frames = self.frames(q)
         centers = apply(frames, self.centers_of_mass)
         moments = self.masses[:, None] * centers
         # Sums over the joint's own link and all further out.

@@ -145,25 +145,3 @@ def looking_at(position: ArrayLike, target: ArrayLike, roll_rad: float = 0.0) ->
     azimuth = np.arctan2(x, -y) if level > 1e-9 * abs(z) else 0.0
     angles = azimuth, np.arctan2(level, z), roll_rad
     return np.asarray(Rotation.from_euler('ZXZ', angles).as_matrix())
-
-
-def twist_logarithm(T: ArrayLike) -> FloatArray:
-    """Return the screw motions that make transforms: the SE(3) logarithm.
-
-    Turning by a twist's rotation while shifting by its translation, steadily, from identity,
-    arrives at T. A turn about any line gives a twist along that line's screw, however large.
-
-    ``T``: rigid transforms of angles below pi, (..., 4, 4).
-    Returns translation part, m, then rotation vector, rad, (..., 6).
-    """
-    T = np.asarray(T, dtype=float)
-    rotation = matrix_to_rotation_vector(T[..., :3, :3])
-    translation = T[..., :3, 3]
-    angle = np.linalg.norm(rotation, axis=-1, keepdims=True)
-    near = angle < 1e-4
-    half = np.where(near, 1.0, angle) / 2
-    # (1 - x cot x) / (2 x)^2 with x half the angle; its series is 1/12 + x^2/180.
-    weight = np.where(near, 1 / 12, (1 - half / np.tan(half)) / (4 * half**2))
-    turned = np.cross(rotation, translation)
-    linear = translation - turned / 2 + weight * np.cross(rotation, turned)
-    return np.concatenate((linear, rotation), axis=-1)

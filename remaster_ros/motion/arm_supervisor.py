@@ -31,7 +31,7 @@ from remaster_ros.motion.interlocks import Interlocks
 from remaster_ros.motion.joint_reports import JointReport, JointReports
 from remaster_ros.motion.limits import MotionLimits
 from remaster_ros.motion.motion_gate import MotionGate, MotionRefusedError, StartMovedError
-from remaster_ros.motion.motion_under_way import MotionUnderWay
+from remaster_ros.motion.motion_under_way import MotionUnderWay, Visit
 from remaster_ros.motion.move_queue import (
     NO_REFUSALS,
     NO_WAYPOINTS,
@@ -42,7 +42,6 @@ from remaster_ros.motion.move_queue import (
     probe_path,
 )
 from remaster_ros.motion.path_check import FreePath
-from remaster_ros.motion.visit import Visit
 from remaster_ros.types import FloatArray
 
 DOUBT_S = 0.5

@@ -102,11 +102,6 @@ class RobotScene:
         ]
         return replace(self, sights=sights)
 
-    def sight_ends(self, q: FloatArray) -> FloatArray:
-        """Return where the marker of each sight is at joint angles (..., k): m, (..., s, 3)."""
-        markers = np.array([sight.marker_T for sight in self.sights])
-        return self.chain.positions(np.asarray(q)[..., None, :], markers)
-
 
 def robot_scene(cell: Workcell, scene: PlanningScene) -> RobotScene:
     """Return the scene of a cell.

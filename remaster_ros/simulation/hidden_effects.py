@@ -2,9 +2,8 @@
 
 Nothing here is shared with the code that estimates (`discovery.effects`). An effect is linear in
 its values: `HiddenEffect.values` times what its rule adds to a `Deviation`. A rule reads the
-`Circumstances` of every configuration. `NAMED` are the effects with a name, `UNNAMED` (in
-`hidden_unnamed`) those without one. Compliance and thermal growth are drawn with the sign of
-physics.
+`Circumstances` of every configuration. `NAMED` are the effects with a name, `UNNAMED` those
+without one. Compliance and thermal growth are drawn with the sign of physics.
 """
 
 from __future__ import annotations

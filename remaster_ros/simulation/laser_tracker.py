@@ -8,7 +8,7 @@ import socket
 import threading
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -32,6 +32,7 @@ from remaster_ros.sensors.laser_tracker.protocol.packets import (
     encode,
 )
 from remaster_ros.simulation.faults import Numbers
+from remaster_ros.simulation.world import World
 from remaster_ros.types import FloatArray
 
 LENGTH_UNITS_M = (1.0, 1e-3, 1e-6, 0.3048, 0.9144, 0.0254)
@@ -134,9 +135,6 @@ def refusal(command: Command, values: tuple[Value, ...]) -> Status:
 # standard deviations.
 
 
-if TYPE_CHECKING:
-    from remaster_ros.simulation.world import World
-
 STEP_S = 0.1
 """World time between two looks at the world."""
 _SIGHT_EVERY_S = 0.5
@@ -167,8 +165,7 @@ class Beam:
         # The reflector that it is locked on.
         self._on = ''
         self.locked = False
-        self.home = self.reflector(t) if aim is None else np.asarray(aim, float)
-        self.aim = self.home
+        self.aim = self.reflector(t) if aim is None else np.asarray(aim, float)
         self._sight_at = -np.inf
         self._swept_rad = 0.0
         self._move_judged = False
@@ -277,13 +274,10 @@ def adm_result(
 
 # How the fake laser tracker behaves: packets in, packets out, world time as an argument.
 #
-# The beam is described in `laser_tracker_beam`. A search winds a spiral about the place the
+# A search winds a spiral about the place the
 # tracker points to. The ADM averages over the integration time and refuses a target that moves
 # meanwhile.
 
-
-if TYPE_CHECKING:
-    from remaster_ros.simulation.world import World
 
 _LONGEST_CATCH_UP_S = 5.0
 
@@ -317,8 +311,6 @@ class TrackerInstrument:
         self._time = switched_on_s
         self._initialized = False
         self._operation: Operation | None = None
-        self._command = Command.UNKNOWN
-        self._last_measured: FloatArray | None = None
         self._out: list[Event] = []
         self._settings = {setting.get: setting.initial for setting in SETTINGS.values()}
 
@@ -347,10 +339,6 @@ class TrackerInstrument:
             self._set(command, request.values)
         elif command in _TAKES_TIME:
             self._begin(command, request.values)
-        elif command is Command.STOP_MEASUREMENT:
-            self._reply(command)
-            if self._operation and self._command is Command.START_MEASUREMENT:
-                self.abort()
         elif answers := self._answers(command):
             for values in answers:
                 self._reply(command, 0, values)
@@ -423,10 +411,6 @@ class TrackerInstrument:
             processor = 5 if self._initialized else 3
             laser, adm = (3, 2) if self._time >= self._warm_at else (0, 1)
             return [(Status.ALL_OK, processor, laser, adm, 3, 8, 500, 0, 0, 390001)]
-        if command is Command.GET_MEASUREMENT_STATUS_INFO:
-            # Tracker, its compensation, ADM, its compensation, reflector, face 1, initialised.
-            flags = 1 | 2 | 4 | 8 | self.locked * 2048 | 4096 | self._initialized * 65536
-            return [(Status.ALL_OK, flags)]
         if command is Command.GET_REFLECTORS:
             return [
                 (len(REFLECTORS), number, kind, offset / self._unit_m, name.encode('utf-16le'))
@@ -444,7 +428,7 @@ class TrackerInstrument:
         if command is Command.START_MEASUREMENT:
             # Its result follows later.
             self._reply(command)
-        self._command, self._operation = command, self._start(command, values)
+        self._operation = self._start(command, values)
         self._out.append(self._readiness_change())
         self._advance()
 
@@ -455,16 +439,7 @@ class TrackerInstrument:
             return self._initialize()
         if command is Command.FIND_REFLECTOR:
             return self._search(command, self._beam.aim, float(values[0]) * self._unit_m)
-        if command in (Command.GO_POSITION, Command.POINT_LASER):
-            target = np.array(values[:3], float) * self._unit_m
-        elif command is Command.GO_LAST_MEASURED_POINT and self._last_measured is not None:
-            target = self._last_measured
-        elif command is Command.CHANGE_FACE:
-            target = self._beam.aim
-        else:
-            target = self._beam.home
-        if command in _ONLY_TURNS:
-            return self._point(command, target)
+        target = np.array(values[:3], float) * self._unit_m
         return self._search(command, target, float(np.linalg.norm(target)))
 
     def _why_not(self, command: Command, values: tuple[Value, ...]) -> Status:
@@ -477,13 +452,11 @@ class TrackerInstrument:
             return Status.TRACKER_NOT_INITIALIZED
         if command is Command.START_MEASUREMENT and not self.locked:
             return Status.MEASUREMENT_STATUS_NOT_READY
-        if command is Command.GO_LAST_MEASURED_POINT and self._last_measured is None:
-            return Status.NO_LAST_MEASURED_POINT
         if not np.all(np.isfinite(np.array(values, float))):
             return Status.INVALID_INPUT_DATA
         if command is Command.FIND_REFLECTOR and not float(values[0]) > 0:
             return Status.WRONG_PARAMETER_1
-        if command in (Command.GO_POSITION, Command.POINT_LASER) and not any(values[:3]):
+        if command is Command.GO_POSITION and not any(values[:3]):
             return Status.WRONG_PARAMETER
         return Status.ALL_OK
 
@@ -515,10 +488,6 @@ class TrackerInstrument:
             b.slew_settle_s + angle_between(self._beam.aim, target) / b.slew_rad_s
         )
         self._beam.aim = target
-
-    def _point(self, command: Command, target: FloatArray) -> Operation:
-        yield from self._turn(target)
-        self._reply(command)
 
     def _search(self, command: Command, target: FloatArray, distance: float) -> Operation:
         """Turn to the target and wind a spiral about it.
@@ -563,12 +532,12 @@ class TrackerInstrument:
 
     def _result(self, truth: FloatArray) -> Measurement:
         cov = covariance(truth, self.behaviour)
-        self._last_measured = self._rng.multivariate_normal(truth, cov)
+        position = self._rng.multivariate_normal(truth, cov)
         temperature, pressure, humidity = map(float, self._settings[Command.GET_ENVIRONMENT])
         # The weather station measures the warming on top of the temperature that was set.
         temperature += self._world.warming_k(self._time)
         return adm_result(
-            self._last_measured,
+            position,
             np.sqrt(np.diag(cov)),
             self._unit_m,
             (temperature, pressure, humidity),
@@ -580,20 +549,13 @@ class TrackerInstrument:
             self._out.append(self._readiness_change())
 
 
-_ONLY_TURNS = (Command.POINT_LASER, Command.GO_BIRD_BATH, Command.GO_BIRD_BATH_2)
 _TAKES_TIME = (
-    *_ONLY_TURNS,
     Command.INITIALIZE,
     Command.START_MEASUREMENT,
     Command.FIND_REFLECTOR,
     Command.GO_POSITION,
-    Command.GO_LAST_MEASURED_POINT,
-    Command.CHANGE_FACE,
 )
 
-
-if TYPE_CHECKING:
-    from remaster_ros.simulation.world import World
 
 _POLL_WALL_S = 0.005
 """How often the instrument goes on in time; this sets its latency, not its results."""
@@ -617,8 +579,6 @@ class FakeLaserTracker:
         Address to listen on; port 0 takes a free one, see `address`.
     behaviour
         See `TrackerBehaviour`.
-    aim
-        Where it points at first, in its own frame, m, (3,); None: at the reflector.
     further
         Further reflectors of the tool by name, with their numbers.
     """
@@ -632,7 +592,6 @@ class FakeLaserTracker:
         host: str = '127.0.0.1',
         port: int = 0,
         behaviour: TrackerBehaviour | None = None,
-        aim: FloatArray | None = None,
         further: Mapping[str, int] | None = None,
     ) -> None:
         self._world, self._further = world, further
@@ -640,7 +599,7 @@ class FakeLaserTracker:
         self._behaviour, self._restarted, self._lost_s = behaviour, False, 0.0
         self._looked_at = world.now()
         self._instrument = TrackerInstrument(
-            world, sensor, rng, self._looked_at, behaviour, aim, further
+            world, sensor, rng, self._looked_at, behaviour, further=further
         )
         self._wanted = (host, port)
         self._lock = threading.Lock()
@@ -649,7 +608,6 @@ class FakeLaserTracker:
         self._listener: socket.socket | None = None
         self._client: socket.socket | None = None
         self._reader = PacketReader('server')
-        self._cut_after: int | None = None
 
     def __enter__(self) -> FakeLaserTracker:
         """Start."""
@@ -710,11 +668,6 @@ class FakeLaserTracker:
         with self._lock:
             self._send(self._instrument.break_beam())
 
-    def cut_next_packet(self, after_bytes: int) -> None:
-        """Send only the first bytes of the next packet, then close the connection."""
-        with self._lock:
-            self._cut_after = after_bytes
-
     def _serve(self) -> None:
         while not self._closing.is_set():
             ready = [key.fileobj for key, _ in self._selector.select(_POLL_WALL_S)]
@@ -755,8 +708,6 @@ class FakeLaserTracker:
                 further=self._further,
             )
         self._restarted = 'renumbered' in faults
-        if 'cut' in faults:
-            self._cut_after = int(faults['cut'])
         if 'garbage' in faults and self._client is not None:
             with contextlib.suppress(OSError):
                 self._client.sendall(self._rng.bytes(64))
@@ -811,10 +762,9 @@ class FakeLaserTracker:
         for event in events:
             if self._client is None:
                 return
-            packet = encode(event)
-            cut, self._cut_after = self._cut_after, None
+            packet, cut = encode(event), self._world.faults(self._sensor).get('cut')
             try:
-                self._client.sendall(packet if cut is None else packet[:cut])
+                self._client.sendall(packet if cut is None else packet[: int(cut)])
             except OSError:
                 self._drop_client()
             if cut is not None:

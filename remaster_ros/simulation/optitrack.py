@@ -14,7 +14,7 @@ import time
 from collections import deque
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -45,6 +45,7 @@ from remaster_ros.sensors.optitrack.protocol.natnet import (
 )
 from remaster_ros.sensors.optitrack.settings import open_socket, require_group
 from remaster_ros.simulation.faults import Numbers
+from remaster_ros.simulation.world import World
 from remaster_ros.types import FloatArray
 
 JUMP_M = 0.5
@@ -106,9 +107,6 @@ class FrameFaults:
                 yield frame
 
 
-if TYPE_CHECKING:
-    from remaster_ros.simulation.world import World
-
 CLOCK_HZ = 10_000_000
 """Ticks per second of the server's fine clock, as on usual Windows hosts."""
 
@@ -142,8 +140,6 @@ class OptiTrackBehaviour:
     # Standard deviation of a position across the line of sight (sensor x, y) and along it (z)
     noise_across_m: float = 25e-6
     noise_along_m: float = 100e-6
-    # Whether frames carry the time of exposure; USB cameras send 0
-    mid_exposure_clock: bool = False
     # How often one of the markers that are followed is hidden, and for how long on average
     # (exponential distributions), in world time
     occlusions_per_s: float = 0.0
@@ -272,7 +268,6 @@ class OptiTrackScene:
                 MarkerSet('all', tool),
             ),
             other_markers=strays,
-            mid_exposure=ticks if behaviour.mid_exposure_clock else 0,
             data_received=ticks,
             transmitted=self.ticks(self._world.now()),
         )
@@ -318,9 +313,6 @@ def _tuples(points: FloatArray) -> tuple[Vec3, ...]:
     """Turn an array of points, (n, 3), into plain tuples."""
     return tuple(map(tuple, points.tolist()))
 
-
-if TYPE_CHECKING:
-    from remaster_ros.simulation.world import World
 
 MAX_CLIENTS = 16
 PAUSED_S = 2.0
@@ -497,8 +489,7 @@ class FakeOptiTrackServer:
             # Before the wait: time that stood until this frame is sent would never get there.
             self._world.kept_up(self._sensor, due_s)
             self._world.sleep_until(due_s)
-            frame = self._scene.frame(number, self._version, due_s)
-            self._latest = frame
+            self._latest = frame = self._scene.frame(number, self._version, due_s)
             for message in self._spoiler.spoil(frame, self._world.faults(self._sensor)):
                 self._distribute(message)
 

@@ -16,7 +16,7 @@ from remaster_ros.errors import InputError
 from remaster_ros.session.workcell import Workcell, config_path
 from remaster_ros.simulation.effect_sampling import EffectSpec, with_effects
 from remaster_ros.simulation.hidden_arm import model_of_tour
-from remaster_ros.simulation.offline_tour import plan_tour, visit
+from remaster_ros.simulation.simulated_workcell import plan_tour, visit
 from remaster_ros.simulation.truth import SessionTruth, SimulatedSensor, Warming, place_sensor
 from remaster_ros.simulation.world import START_S, WORLD_FILE, World, WorldContent
 from remaster_ros.types import FloatArray

@@ -11,15 +11,82 @@ import numpy as np
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.inverse_kinematics import FREE_JOINTS
 from remaster_ros.kinematics.serial_chain import SerialChain
+from remaster_ros.planning.planned_design import designed_plans
 from remaster_ros.planning.tour_order import Tour
+from remaster_ros.planning.travel_time import TravelTime
 from remaster_ros.session.files import decode_text, read_limited
 from remaster_ros.session.reader import URDF_LIMIT
 from remaster_ros.session.workcell import CellRobot, Workcell, config_path
 from remaster_ros.simulation.effect_sampling import EffectSpec, with_effects
 from remaster_ros.simulation.hidden_arm import SECONDS_PER_CONFIGURATION, model_of_tour
-from remaster_ros.simulation.offline_tour import plan_tour, visit
 from remaster_ros.simulation.truth import SessionTruth, SimulatedSensor, Warming, place_sensor
 from remaster_ros.types import FloatArray, Measurements, Session
+
+# A tour of a cell, planned and ordered as the planner node does it, all at once.
+
+
+def plan_tour(
+    chain: SerialChain,
+    cell: Workcell,
+    places: Mapping[str, FloatArray] | None,
+    counts: Mapping[str, int],
+    rng: np.random.Generator,
+    *,
+    without_meshes: bool = True,
+) -> Tour:
+    """Plan poses that face one sensor and that all of them see, for every split with a count.
+
+    Parameters
+    ----------
+    chain, cell
+        The arm, and where it works.
+    places
+        T_R_N of every sensor that has to see its marker, (4, 4); None for the cell's rough places.
+    counts
+        Split -> number of candidate poses.
+    rng
+        Source of randomness.
+    without_meshes
+        Take capsules in place of meshes: a simulated arm can hurt no one, and its meshes may be on
+        another machine.
+
+    Raises
+    ------
+    InputError
+        No way to solve for the joints of this robot, or no pose to fit that it can take.
+    """
+    scene = cell.planning_scene(chain, without_meshes=without_meshes)
+    sensors_R = scene.rough_R
+    if places is not None:
+        sensors_R = {name: T_R_N[:3, 3] for name, T_R_N in places.items()}
+    plans = {split: scene.plan(n, sensors_R, rng) for split, n in counts.items() if n}
+    settings = cell.design_settings()
+    if settings.optimal and plans['optimization'].poses:
+        travel = TravelTime.of(scene.model, acceleration=cell.acceleration_limits(chain))
+        plans = dict(designed_plans(scene, settings, plans, sensors_R, travel, rng).plans)
+    tour = Tour(chain, plans)
+    if not tour.poses['optimization']:
+        raise InputError(
+            f'{tour.describe()}: no pose is left to fit; give more --poses, or a --cell with '
+            'ranges of poses that suit this robot'
+        )
+    return tour
+
+
+def visit(tour: Tour, chain: SerialChain) -> dict[str, list[FloatArray]]:
+    """Return each split's joint solutions, (m, k) per pose, in the order of the visits.
+
+    A simulated session goes from one split to the other, each nearest first.
+    """
+    visits: dict[str, list[FloatArray]] = {'optimization': [], 'validation': []}
+    q = np.clip(np.zeros(len(chain)), chain.lower, chain.upper)
+    for split, plan in tour.plans.items():
+        part = Tour(chain, {split: plan})
+        while (stop := part.next(q)) is not None:
+            visits[split].append(stop.solutions)
+            q = stop.solutions[-1]
+    return visits
+
 
 # A session from a known truth: for users, for quick checks, for calibration studies.
 #

@@ -19,8 +19,7 @@ import tracker_world
 
 from remaster_ros.calibration.registration import register_ransac
 from remaster_ros.errors import DeviceError, InsufficientDataError
-from remaster_ros.sensors.laser_tracker.client import LaserTrackerClient
-from remaster_ros.sensors.laser_tracker.settings import LaserTrackerSettings
+from remaster_ros.sensors.laser_tracker.client import LaserTrackerClient, LaserTrackerSettings
 from remaster_ros.sensors.optitrack.client import NatNetClient
 from remaster_ros.sensors.optitrack.frame_gate import MarkerChoice
 from remaster_ros.sensors.optitrack.marker_follower import warning

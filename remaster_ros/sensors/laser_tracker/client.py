@@ -15,12 +15,14 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from enum import Enum
 from types import TracebackType
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from remaster_ros.errors import DeviceError, InputError
+from remaster_ros.parameters import check_all, parameter
 from remaster_ros.sensors.laser_tracker.protocol import packets
 from remaster_ros.sensors.laser_tracker.protocol.packets import (
     NEED_DATA,
@@ -42,14 +44,79 @@ from remaster_ros.sensors.laser_tracker.protocol.packets import (
     describe_status,
     encode,
 )
-from remaster_ros.sensors.laser_tracker.settings import (
-    CHANGES_OF_READINGS,
-    SET_FOR_READINGS,
-    LaserTrackerSettings,
-    TrackerReading,
-    TrackerStatus,
+from remaster_ros.types import FARTHEST_M, FloatArray, MarkerReading
+
+_UNITS = (
+    packets.METRE,
+    packets.RADIAN,
+    packets.CELSIUS,
+    packets.MILLIBAR,
+    packets.RELATIVE_HUMIDITY,
 )
-from remaster_ros.types import FARTHEST_M, FloatArray
+SET_FOR_READINGS: tuple[tuple[Command, Command, tuple[Value, ...], str], ...] = (
+    (Command.SET_UNITS, Command.GET_UNITS, _UNITS, 'units (metre, radian, °C, mbar)'),
+    (
+        Command.SET_COORDINATE_SYSTEM_TYPE,
+        Command.GET_COORDINATE_SYSTEM_TYPE,
+        (packets.RIGHT_HANDED_CARTESIAN,),
+        'coordinate system (right-handed Cartesian)',
+    ),
+    (
+        Command.SET_MEASUREMENT_MODE,
+        Command.GET_MEASUREMENT_MODE,
+        (packets.STATIONARY,),
+        'measurement mode (stationary)',
+    ),
+)
+"""What a reading depends on: the command that sets it, the one that reads it back, the values, and
+what they are."""
+CHANGES_OF_READINGS = (Change.UNITS, Change.COORDINATE_SYSTEM_TYPE, Change.MEASUREMENT_MODE)
+"""Status changes after which these are read back."""
+
+
+class TrackerStatus(Enum):
+    """What the instrument last reported."""
+
+    DISCONNECTED = 'disconnected'
+    NOT_READY = 'not ready'
+    """Warming up, not initialised, or no reflector locked."""
+    BUSY = 'busy'
+    READY = 'ready'
+    """A reflector is locked; it can be measured."""
+
+
+@dataclass(frozen=True)
+class LaserTrackerSettings:
+    """What the client sets on the instrument, and how long it waits.
+
+    Those made with `parameter` are parameters of the node as well.
+    """
+
+    search_radius_m: float = parameter(
+        0.05,
+        'how far about the expected place it searches, at the distance of the reflector',
+        unit='m',
+        low=1e-3,
+        high=5.0,
+    )
+    search_timeout_s: float = parameter(20.0, 'longest search', unit='s', low=0.1, high=600.0)
+    integration_s: float = parameter(
+        1.0, 'averaging time of one measurement', unit='s', low=0.05, high=60.0
+    )
+    connect_timeout_s: float = 5.0  # Of the TCP connection, in wall time
+    reply_timeout_s: float = 5.0  # Of a command that only sets or reads something
+    initialise_timeout_s: float = 300.0  # Of the initialisation, waiting for the warm-up included
+
+    def __post_init__(self) -> None:
+        """Refuse what no instrument can do.
+
+        Raises InputError: naming the setting.
+        """
+        check_all('laser tracker', self)
+        for name, value in vars(self).items():
+            if name.endswith(('_s', '_m')) and not 0 < value < np.inf:
+                raise InputError(f'laser tracker: {name} is {value}; it must be above 0')
+
 
 _LEAST_WALL_S = 2.0
 """Simulated time may run many times as fast as the wall clock; networks do not."""
@@ -445,14 +512,13 @@ class LaserTrackerClient:
         self._status = _STATUS_OF_READINESS.get(readiness, TrackerStatus.NOT_READY)
         return self._status
 
-    def initialise(self, *, force: bool = False) -> None:
+    def initialise(self) -> None:
         """Initialise the instrument unless it is, and set everything a reading depends on.
 
-        Waits for the end of the warm-up. An instrument that is initialised already keeps its lock;
-        `force` initialises it again.
+        Waits for the end of the warm-up. An instrument that is initialised already keeps its lock.
         """
         processor = self._ask(Command.GET_SYSTEM_STATUS, what='system status')[1]
-        if force or processor != packets.TRACKER_INITIALIZED:
+        if processor != packets.TRACKER_INITIALIZED:
             self._initialise()
         s = self.settings
         for command, _, values, _ in SET_FOR_READINGS:
@@ -462,11 +528,6 @@ class LaserTrackerClient:
             Command.SET_STATISTIC_MODE, packets.STANDARD_STATISTICS, packets.STANDARD_STATISTICS
         )
         self._set_search()
-        if s.reflector_id is not None:
-            self._ask(Command.SET_REFLECTOR, s.reflector_id)
-        if s.environment is not None:
-            e = s.environment
-            self._ask(Command.SET_ENVIRONMENT, e.temperature_c, e.pressure_hpa, e.humidity_percent)
         self._check_settings()
         self.request_status()
 
@@ -526,10 +587,10 @@ class LaserTrackerClient:
             status,
         ) from failure
 
-    def measure(self, timeout_s: float | None = None) -> TrackerReading:
+    def measure(self, timeout_s: float | None = None) -> MarkerReading:
         """Measure the locked reflector once.
 
-        ``timeout_s``: none: the integration time and two reply time-outs.
+        ``timeout_s``: None for the integration time and two reply time-outs.
         Raises LaserTrackerError: `Status.MEASUREMENT_STATUS_NOT_READY` without a lock,
         `Status.SENSOR_NOT_STABLE` for a moving target, `Status.SERVER_BUSY`; or the result is not
         usable.
@@ -554,14 +615,7 @@ class LaserTrackerClient:
             raise
         self._link.count('measurements')
         self._distance_m = float(np.linalg.norm(position))
-        return TrackerReading(
-            stamp_s=stamp_s,
-            position=position,
-            std=std,
-            temperature_c=result.temperature,
-            pressure_hpa=result.pressure,
-            humidity_percent=result.humidity,
-        )
+        return MarkerReading(stamp_s, position, result.temperature)
 
     def _ask(
         self, command: Command, *values: Value, what: str = '', timeout_s: float | None = None

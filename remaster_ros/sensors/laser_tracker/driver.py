@@ -15,13 +15,13 @@ import numpy as np
 from remaster_ros.errors import DeviceError
 from remaster_ros.parameters import parameter
 from remaster_ros.sensors.driver import SensorClock, SensorParameters, SensorState, TriggeredDriver
-from remaster_ros.sensors.laser_tracker.client import LaserTrackerClient, LaserTrackerError
-from remaster_ros.sensors.laser_tracker.settings import (
+from remaster_ros.sensors.laser_tracker.client import (
+    LaserTrackerClient,
+    LaserTrackerError,
     LaserTrackerSettings,
-    TrackerReading,
     TrackerStatus,
 )
-from remaster_ros.types import FloatArray
+from remaster_ros.types import FloatArray, MarkerReading
 
 
 @dataclass(frozen=True)
@@ -122,7 +122,7 @@ class LaserTrackerDriver(TriggeredDriver):
             self._search_narrowly()
         return self.tracker.ensure_locked(expected, attempts=1)
 
-    def measure(self, expected: FloatArray | None) -> TrackerReading:
+    def measure(self, expected: FloatArray | None) -> MarkerReading:
         """Measure the reflector that is where it should be; see `TriggeredDriver.measure`."""
         failure: DeviceError | None = None
         for _ in range(self.p.attempts):

@@ -58,11 +58,8 @@ _FRAME_ID = MessageId.FRAMEOFDATA.to_bytes(2, 'little')
 class NatNetClient(MarkerFollower):
     """Follows one marker of an OptiTrack server, NatNet 2.6 to 4.3, multicast or unicast.
 
-    ``settings``: how to reach the server, and which marker to follow; ``on_sample``: called in the
-    client's thread with every reading. What it raises is logged; ``clock``: gives the time at
-    which a datagram arrived, s; ``Examples``: ; ``--------``: ; ``>>> client =
-    NatNetClient(NatNetSettings(server='192.168.1.10'), print)  # doctest: +SKIP``: ; ``>>>
-    client.start(wait_s=5.0)  # doctest: +SKIP``: .
+    ``on_sample``: called in the client's thread with every reading; what it raises is logged;
+    ``clock``: gives the time at which a datagram arrived, s.
     """
 
     def __init__(

@@ -250,14 +250,10 @@ class MarkerSample:
 
     frame_number: int
     timestamp_s: float  # Time of the frame on the server, s since the stream started
-    # Time of exposure by the server's fine clock, s; another zero than `timestamp_s`. None where
-    # the cameras have no such clock (USB cameras, NatNet before 3.0).
-    mid_exposure_s: float | None
     # Time from exposure (or, without such a clock, from the data's arrival at the server) to
     # transmission, s; before 3.0 the server's own estimate of its latency
     age_s: float
     position: FloatArray  # In the sensor's frame N, m, (3,)
-    residual_m: float  # How well the cameras' rays meet, m per ray; NaN before NatNet 3
     received_s: float  # When the datagram arrived here, by the clock given to the client, s
     marker: str = ''  # Name of a further marker; '' for the calibration marker itself
 
@@ -449,19 +445,15 @@ def _implausible(reading: MarkerSample) -> Dropped | None:
 def _sample(
     frame: Frame, marker: LabeledMarker, received_s: float, ticks_per_s: int
 ) -> MarkerSample:
-    mid_exposure_s = None
     age_s = max(frame.software_latency, 0.0)
     if ticks_per_s:
-        if frame.mid_exposure:
-            mid_exposure_s = frame.mid_exposure / ticks_per_s
+        # USB cameras have no clock of their own, and leave the exposure out.
         begin = frame.mid_exposure or frame.data_received
         age_s = max(frame.transmitted - begin, 0) / ticks_per_s if begin else 0.0
     return MarkerSample(
         frame_number=frame.number,
         timestamp_s=frame.timestamp,
-        mid_exposure_s=mid_exposure_s,
         age_s=age_s,
         position=np.array(marker.position),
-        residual_m=math.nan if marker.residual is None else marker.residual,
         received_s=received_s,
     )

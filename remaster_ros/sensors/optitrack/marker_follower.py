@@ -442,7 +442,7 @@ class MarkerFollower(ABC):
             return []
         # A message for every marker: whoever listens to several topics then knows, by the stamps
         # alone, that nothing of a frame is still to come.
-        hidden = replace(seen, position=np.full(3, np.nan), residual_m=np.nan)
+        hidden = replace(seen, position=np.full(3, np.nan))
         return [replace(sample or hidden, marker=name) for name, sample in found.items()]
 
     def _begin_source(self, source: Source) -> None:

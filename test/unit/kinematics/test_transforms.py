@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from scipy.linalg import expm
 
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics import transforms
@@ -111,18 +110,6 @@ def test_rpy_is_yaw_times_pitch_times_roll():
 
     expected = turn(2, yaw) @ turn(1, pitch) @ turn(0, roll)
     np.testing.assert_allclose(transforms.matrix_from_rpy([roll, pitch, yaw]), expected)
-
-
-@pytest.mark.parametrize('angle', [0.0, 1e-9, 3e-5, 3e-4, 1.0, 3.1])
-def test_twist_logarithm_is_the_inverse_of_the_matrix_exponential(rng, angle):
-    axis = rng.normal(size=(4, 3))
-    rotation = angle * axis / np.linalg.norm(axis, axis=1, keepdims=True)
-    twists = np.concatenate((rng.normal(size=(4, 3)), rotation), axis=1)
-    generators = np.zeros((4, 4, 4))
-    generators[:, :3, 3] = twists[:, :3]
-    generators[:, :3, :3] = np.swapaxes(np.cross(twists[:, None, 3:], np.eye(3)), -1, -2)
-    T = np.array([expm(generator) for generator in generators])
-    np.testing.assert_allclose(transforms.twist_logarithm(T), twists, atol=1e-9)
 
 
 @pytest.mark.parametrize('target', [[0.0, 0.1, 0.6], [1.9, 0.2, 5.0], [1.9, 0.2, -5.0]])

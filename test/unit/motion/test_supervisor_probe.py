@@ -15,10 +15,10 @@ from remaster_ros.motion.actions import (
     SupervisorRules,
 )
 from remaster_ros.motion.limits import MotionLimits
+from remaster_ros.motion.motion_under_way import PROBE_WAIT_S
 from remaster_ros.motion.move_queue import PROBE
 from remaster_ros.motion.settling import SettleRules
 from remaster_ros.motion.trajectory import Line
-from remaster_ros.motion.visit import PROBE_WAIT_S
 
 
 def copying(low=(-1.0, -2.0), high=(1.0, 2.0), home=HOME):

@@ -7,9 +7,9 @@ import pytest
 
 from remaster_ros.motion.actions import SupervisorRules
 from remaster_ros.motion.following import ON_PATH_RAD, STANDING_S, Following, Seen
+from remaster_ros.motion.motion_under_way import MOVED_RAD, PROBE_WAIT_S, Braking, Visit
 from remaster_ros.motion.settling import SettleDetector, SettleRules
 from remaster_ros.motion.trajectory import Line, Trajectory
-from remaster_ros.motion.visit import MOVED_RAD, PROBE_WAIT_S, Braking, Visit
 
 RULES = SupervisorRules(
     settle=SettleRules(settle_s=1.0, arrive_tolerance=2.0**-8, still_tolerance=2.0**-12),

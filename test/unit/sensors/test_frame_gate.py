@@ -36,7 +36,6 @@ def test_a_measured_marker_is_a_reading():
     assert sample is not None
     np.testing.assert_array_equal(sample.position, [0.5, 0.25, 2.0])
     assert (sample.frame_number, sample.timestamp_s, sample.received_s) == (1, 0.01, 50.0)
-    assert (sample.mid_exposure_s, sample.residual_m) == (2.0, 2e-4)
     assert sample.age_s == pytest.approx(0.01)
     assert (gate.counts.frames, gate.counts.accepted, gate.counts.last_reason) == (1, 1, None)
     assert not any(gate.counts.dropped.values())
@@ -45,13 +44,11 @@ def test_a_measured_marker_is_a_reading():
 def test_without_a_mid_exposure_clock_the_frame_time_remains():
     _gate, admit = gate_for()
     sample = admit(frame(1, marker(), data_received=10_000_000, transmitted=10_050_000))
-    assert sample.mid_exposure_s is None
     assert sample.age_s == pytest.approx(0.005)
     old = MarkerGate(MarkerChoice(marker_id=MARKER_ID), GateCounts()).admit(
         frame(1, marker()._replace(residual=None), software_latency=0.004), 50.0, 0
     )
-    assert (old.mid_exposure_s, old.age_s) == (None, 0.004)
-    assert math.isnan(old.residual_m)
+    assert old.age_s == 0.004
 
 
 def test_a_marker_that_repeats_itself_to_the_last_bit_is_frozen():

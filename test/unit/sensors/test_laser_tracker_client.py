@@ -13,13 +13,13 @@ import pytest
 from tracker_world import MARKER, ReflectorWorld, across_and_along, wait_for
 
 from remaster_ros.errors import DeviceError, InputError
-from remaster_ros.sensors.laser_tracker.client import LaserTrackerClient, LaserTrackerError
-from remaster_ros.sensors.laser_tracker.protocol.packets import Status
-from remaster_ros.sensors.laser_tracker.settings import (
-    Environment,
+from remaster_ros.sensors.laser_tracker.client import (
+    LaserTrackerClient,
+    LaserTrackerError,
     LaserTrackerSettings,
     TrackerStatus,
 )
+from remaster_ros.sensors.laser_tracker.protocol.packets import Status
 from remaster_ros.simulation.laser_tracker import FakeLaserTracker, TrackerBehaviour
 
 QUICK = TrackerBehaviour(warm_up_s=0.5, initialise_s=0.5, search_failure_share=0.0)
@@ -44,10 +44,7 @@ def client_of(address, world, settings=None) -> LaserTrackerClient:
 
 def test_warm_up_search_and_measurement():
     """Errors within 6 standard deviations: fails less than once in 10^7 runs."""
-    settings = LaserTrackerSettings(
-        reflector_id=2, environment=Environment(22.0, 1000.0, 40.0), integration_s=0.5
-    )
-    with bench(settings=settings) as (world, _fake, client):
+    with bench(settings=LaserTrackerSettings(integration_s=0.5)) as (world, _fake, client):
         assert client.status is TrackerStatus.NOT_READY
         client.find_reflector(2.1)
         assert client.request_status() is TrackerStatus.READY
@@ -58,9 +55,7 @@ def test_warm_up_search_and_measurement():
     assert across < 6 * 14e-6 * np.sqrt(2)
     assert abs(along) < 6 * 6e-6
     assert before < reading.stamp_s < after
-    assert 0 < np.linalg.norm(reading.std) < 50e-6
-    air = (reading.temperature_c, reading.pressure_hpa, reading.humidity_percent)
-    assert air == (22.0, 1000.0, 40.0)
+    assert reading.temperature_c == 20.0
 
 
 def test_an_initialised_instrument_keeps_its_lock_for_the_next_client():
@@ -71,8 +66,6 @@ def test_an_initialised_instrument_keeps_its_lock_for_the_next_client():
         with client_of(fake.address, world) as second:
             assert second.status is TrackerStatus.READY
             second.measure()
-            second.initialise(force=True)
-            assert second.status is TrackerStatus.NOT_READY
 
 
 def test_beam_break_then_go_position_then_measure():
@@ -170,14 +163,15 @@ def test_warm_up_that_lasts_too_long():
 
 @pytest.mark.parametrize('after_bytes', [1, 7, 40, 155])
 def test_connection_cut_in_mid_packet_then_reconnect(after_bytes):
-    with bench() as (_world, fake, client):
+    with bench() as (world, _fake, client):
         client.ensure_locked()
         replies = client.counts['measurements']
-        fake.cut_next_packet(after_bytes)
+        world.faulty = {'cut': after_bytes}
         with pytest.raises(LaserTrackerError, match='connect again') as caught:
             client.measure()
         assert caught.value.status is None
         assert client.status is TrackerStatus.DISCONNECTED
+        world.faulty = {}
         with pytest.raises(LaserTrackerError, match='connect again'):
             client.ensure_locked(MARKER)
         client.connect()

@@ -14,7 +14,11 @@ import pytest
 from tracker_world import wait_for
 
 from remaster_ros.errors import DeviceError
-from remaster_ros.sensors.laser_tracker.client import LaserTrackerClient, LaserTrackerError
+from remaster_ros.sensors.laser_tracker.client import (
+    LaserTrackerClient,
+    LaserTrackerError,
+    LaserTrackerSettings,
+)
 from remaster_ros.sensors.laser_tracker.protocol.packets import (
     NEED_DATA,
     Change,
@@ -29,7 +33,6 @@ from remaster_ros.sensors.laser_tracker.protocol.packets import (
     UnknownPacket,
     encode,
 )
-from remaster_ros.sensors.laser_tracker.settings import LaserTrackerSettings
 
 RESULT = Measurement(
     *(0, 0, 0, (2.0, 0.5, -0.3), (1e-5,) * 3, 2e-5, (0.0,) * 3, (1e-5,) * 3),

@@ -280,7 +280,6 @@ def test_search_fails_now_and_then():
         (Command.GO_POSITION, (np.inf, 0.0, 0.0, 1), Status.INVALID_INPUT_DATA),
         (Command.GO_POSITION, (0.0, 0.0, 0.0, 1), Status.WRONG_PARAMETER),
         (Command.FIND_REFLECTOR, (-1.0,), Status.WRONG_PARAMETER_1),
-        (Command.GO_LAST_MEASURED_POINT, (), Status.NO_LAST_MEASURED_POINT),
         (Command.GET_DIRECTION, (), Status.NOT_IMPLEMENTED),
     ],
 )
@@ -295,16 +294,6 @@ def test_search_radius_keeps_its_length_when_the_unit_changes():
     ((radius, timeout_ms),) = (e.values for e in bench.send(Command.GET_SEARCH))
     assert radius == pytest.approx(40.0)
     assert timeout_ms == 8000
-
-
-def test_stop_ends_a_measurement():
-    bench = Bench().locked()
-    bench.send(Command.START_MEASUREMENT)
-    assert bench.send(Command.STOP_MEASUREMENT) == [
-        Reply(Command.STOP_MEASUREMENT),
-        StatusChange(Change.READY),
-    ]
-    assert bench.run(3.0) == []
 
 
 def test_a_long_sleep_of_the_process_is_caught_up_in_bounded_work():

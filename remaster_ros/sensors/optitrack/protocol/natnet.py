@@ -1,9 +1,8 @@
 """NatNet, OptiTrack's streaming protocol: datagrams to events and back; no sockets.
 
 A client decodes with `decode_message` and encodes with the ``encode_…_request`` functions; a
-server decodes with `decode_request` and encodes with `encode_message` and its kin. The layout of
-frames is in `frames`, that of model definitions in `models`. One exception comes out of bad bytes:
-`ProtocolError`.
+server decodes with `decode_request` and encodes with `encode_message` and its kin. One exception
+comes out of bad bytes: `ProtocolError`.
 """
 
 from __future__ import annotations
