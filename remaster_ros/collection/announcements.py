@@ -5,46 +5,30 @@ Times are wall time and arguments.
 
 from __future__ import annotations
 
-from remaster_ros.collection.events import BridgeState, EventRecord, RecorderState
+from remaster_ros.collection.events import BridgeState, RecorderState
+from remaster_ros.collection.peers import Heard, Peers
 
 ANNOUNCE_WALL_S = 5.0
 """A node that does not have an announcement so long after it has missed it, s."""
 MATCH_WALL_S = 0.5
 """The other side of a DDS match comes so much later than ours at most, s."""
-PEERS = 2
-"""Bridge and recorder."""
+PEERS = BridgeState.sender, RecorderState.sender
 
 
 class Announcements:
-    """Follow the announcements of the open pose, and the states of bridge and recorder.
+    """Follow the announcements of the open pose, as bridge and recorder have them."""
 
-    Attributes: ``stamp``: of the last announcement, by which the others name it; '' where the pose
-    is to be announced anew; ``bridge, recorder``: their last states; None before the first.
-    """
-
-    def __init__(self) -> None:
+    def __init__(self, peers: Peers) -> None:
+        self._peers = peers
+        # Of the last announcement, by which the others name it; '' where the pose is to be
+        # announced anew.
         self.stamp = ''
-        self.bridge: BridgeState | None = None
-        self.recorder: RecorderState | None = None
-        # Of each peer: when its state came, which start of it, and which pose it has.
-        self._seen: dict[str, tuple[float, str, str]] = {}
         # Stamp of each announcement of the open pose -> its solutions, in the order announced.
         self._ids: dict[str, tuple[int, ...]] = {}
         self._announced_wall = 0.0
         # Which start of each peer was there when the pose was announced.
         self._told: dict[str, str] = {}
         self._matched_wall: float | None = None
-
-    def take(self, record: EventRecord, now: float) -> None:
-        """Take a state of bridge or recorder; anything else is ignored."""
-        match record.body:
-            case BridgeState() as state:
-                self.bridge = state
-            case RecorderState() as state:
-                self.recorder = state
-            case _:
-                return
-        self._seen[state.sender] = now, record.started, state.pose
 
     def matched(self, subscribers: int, now: float) -> bool:
         """Whether bridge and recorder are there for the next pose.
@@ -56,12 +40,13 @@ class Announcements:
         subscribers
             How many subscribe to the solutions, as DDS shows it.
         """
-        if subscribers < PEERS or len(self._seen) < PEERS:
+        recorder = self._peers.recorder
+        if subscribers < len(PEERS) or self._peers.bridge is None or recorder is None:
             self._matched_wall = None
             return False
         if self._matched_wall is None:
             self._matched_wall = now
-        if self.recorder is not None and self.recorder.exit_status == 'complete':
+        if recorder.exit_status == 'complete':
             return False
         return now - self._matched_wall > MATCH_WALL_S
 
@@ -74,7 +59,7 @@ class Announcements:
         """Take it that the pose is announced now, with these of its solutions."""
         self.stamp, self._announced_wall = stamp, now
         self._ids[stamp] = ids
-        self._told = {node: started for node, (_, started, _) in self._seen.items()}
+        self._told = {node: heard.started for node, heard in self._heard()}
 
     def is_lost(self) -> bool:
         """Whether the open pose is to be announced (again): bridge or recorder lacks it.
@@ -84,13 +69,18 @@ class Announcements:
         """
         if not self.stamp:
             return True
-        if self.recorder is not None and self.recorder.state == 'measuring':
+        if (recorder := self._peers.recorder) is not None and recorder.state == 'measuring':
             return False
         missed_wall = self._announced_wall + ANNOUNCE_WALL_S
         return any(
-            pose != self.stamp and (started != self._told.get(node) or seen_wall > missed_wall)
-            for node, (seen_wall, started, pose) in self._seen.items()
+            heard.body.pose != self.stamp
+            and (heard.started != self._told.get(node) or heard.wall > missed_wall)
+            for node, heard in self._heard()
         )
+
+    def _heard(self) -> list[tuple[str, Heard]]:
+        found = [(node, self._peers.heard(node)) for node in PEERS]
+        return [(node, heard) for node, heard in found if heard is not None]
 
     def retract(self) -> None:
         """Have what is left of the open pose announced anew before anything else."""

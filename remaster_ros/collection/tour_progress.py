@@ -7,7 +7,7 @@ from collections.abc import Callable, Collection
 from typing import Any, Protocol, TypeVar
 
 from remaster_ros.collection.events import PlannerState, RecorderState
-from remaster_ros.collection.required_sensors import RequiredSensors
+from remaster_ros.collection.peers import RequiredSensors
 from remaster_ros.errors import InputError, InsufficientDataError
 from remaster_ros.planning.collection_plan import Expected, with_expected
 from remaster_ros.planning.tour_order import FITTED, REFERENCE, REGISTRATION, PoseVisit, Tour

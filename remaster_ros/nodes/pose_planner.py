@@ -47,10 +47,8 @@ from remaster_ros.collection.collection_run import CollectionRun
 from remaster_ros.collection.events import OptimizerState, PoseAnnounced
 from remaster_ros.collection.message_fields import CORRECTED, JointOrder, stamp_key, wanted_of
 from remaster_ros.collection.pace import Pace, progress_text
-from remaster_ros.collection.peer_models import PeerModels
+from remaster_ros.collection.peers import PeerModels, Peers, RequiredSensors
 from remaster_ros.collection.plan_confirmation import PlanConfirmation, fingerprint, service_name
-from remaster_ros.collection.preflight_facts import PreflightFacts
-from remaster_ros.collection.required_sensors import RequiredSensors
 from remaster_ros.collection.tour_progress import PlanMemory, TourProgress
 from remaster_ros.errors import InputError, RemasterError
 from remaster_ros.kinematics import transforms
@@ -530,16 +528,16 @@ class PlanPreview(PlanConfirmation):
             self.withdraw()
         return refusal
 
-    def draw(self, q: FloatArray, facts: PreflightFacts) -> str:
+    def draw(self, q: FloatArray, peers: Peers) -> str:
         """Draw what is next, where the page has something else; return what a person is told.
 
-        ``facts``: they tell which sensors must be registered before the collection.
+        ``peers``: they tell which sensors must be registered before the collection.
         Returns '' while it is drawn, and where there is nothing new.
         """
         if not self.required:
             return ''
         try:
-            what, tour = self._next(facts.required())
+            what, tour = self._next(peers.required())
         except InputError as error:
             self.trouble = str(error)
             return ''
@@ -645,7 +643,9 @@ class PosePlanner(RemasterNode):
         self._living: LivingRun | None = None
         self._tried_wall = 0.0
         self._resume()
-        self._poses, self._announcements = PosePublisher(self, self.chain), Announcements()
+        self._poses = PosePublisher(self, self.chain)
+        self._peers = Peers(self.cell.sensors)
+        self._announcements = Announcements(self._peers)
         self._joint_states: Subscription | None = self._listen_to_the_arm()
         self.create_subscription(JointState, 'remaster/settled', self._on_settled, RELIABLE)
         self.create_subscription(
@@ -661,7 +661,6 @@ class PosePlanner(RemasterNode):
         self.create_service(Trigger, 'remaster/stop', self._on_stop, callback_group=at_once)
         model = self.cell.model()
         self.status = NodeStatus(self, self._summary, Path(self.cell.robot.urdf).stem, model)
-        self._facts = PreflightFacts(self.cell.sensors)
         self._models = PeerModels(self.get_fully_qualified_name(), model)
         self._cleared = self._described = False
         self._session_s = 0.0
@@ -684,7 +683,7 @@ class PosePlanner(RemasterNode):
 
     def _take_up_run(self) -> None:
         """Go on with the run that a killed planner has left, if that certainly still lives."""
-        left, peers = self.run.left, self._announcements
+        left, peers = self.run.left, self._peers
         silent_s, progress = silence_s(left), self.progress.describe()
         with self._lock:
             # A pause or a stop may have come meanwhile.
@@ -721,7 +720,7 @@ class PosePlanner(RemasterNode):
 
     def _on_judge(self, kind: Kind, request: Trigger.Request, response: Trigger.Response) -> Any:
         """Begin, or go on with, visits by which the arm is judged; afterwards tell the verdict."""
-        tour, recorder = self.journal.tour, self._announcements.recorder
+        tour, recorder = self.journal.tour, self._peers.recorder
         own = tour is not None and tour.judges == kind
         if own and self.run.state == 'complete':
             response.success, response.message = self._judging.told()
@@ -735,7 +734,7 @@ class PosePlanner(RemasterNode):
                 'new session folder'
             )
         else:
-            response.message = self._judging.refusal(kind, self._announcements.bridge)
+            response.message = self._judging.refusal(kind, self._peers.bridge)
             try:
                 plan, words = self._judging.tour(kind) if not response.message else (None, '')
             except RemasterError as error:
@@ -749,7 +748,7 @@ class PosePlanner(RemasterNode):
         self, response: Trigger.Response, judging: Callable[[], Tour] | None = None
     ) -> Any:
         """Begin a run or go on; with `judging` that plans what is visited, once it is running."""
-        bridge, recorder = self._announcements.bridge, self._announcements.recorder
+        bridge, recorder = self._peers.bridge, self._peers.recorder
         further, plan = self._further.ask(self.run.state, under_way=self.progress.goes_further)
         has_joints = self._q is not None
         refusal = self.run.refusal(bridge, recorder, has_joints=has_joints, further=further)
@@ -838,9 +837,8 @@ class PosePlanner(RemasterNode):
 
     def _on_record(self, record: events.EventRecord) -> None:
         now = time.monotonic()
-        self._facts.take(record.body, now)
+        self._peers.take(record, now)
         self._models.take(record, now)
-        self._announcements.take(record, now)
         match record.body:
             case events.ArmHalted(reason=why) | events.BridgeState(halted=why) if why:
                 # It goes on when a person has looked at the arm and calls /remaster/collect.
@@ -896,9 +894,9 @@ class PosePlanner(RemasterNode):
         self._write_state()
         if self.journal.trouble and not self._is_written():
             return
-        q, recorder, now = self._q, self._announcements.recorder, time.monotonic()
+        q, recorder, now = self._q, self._peers.recorder, time.monotonic()
         if self.run.state in ('idle', 'paused', 'stopped') and q is not None:
-            self.run.why = self._preview.draw(q, self._facts) or self.run.why
+            self.run.why = self._preview.draw(q, self._peers) or self.run.why
             self._offer(self._preview.shown)
         if self.run.state != 'running' or q is None:
             return
@@ -908,7 +906,7 @@ class PosePlanner(RemasterNode):
                 return
             self.progress.check_session(recorder, self.journal.path)
             if self.progress.open_pose is None:
-                required = self._facts.required()
+                required = self._peers.required()
                 stop = self.progress.next(q, required, recorder.registration)
                 if stop is not None:
                     self._announcements.close()
@@ -941,7 +939,7 @@ class PosePlanner(RemasterNode):
         if not self._cleared:
             # Once, before the first motion. No pose was begun before a preflight was passed.
             seen_before = self.progress.resumed or bool(self.progress.T_R_N)
-            facts = self._facts.facts(now, seen_before=seen_before)
+            facts = self._peers.facts(now, seen_before=seen_before)
             self._measure.call([s.name for s in facts.sensors if s.ready and s.read_age_s], now)
             findings = preflight(facts)
             self._cleared = not findings

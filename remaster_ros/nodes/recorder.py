@@ -32,8 +32,8 @@ from remaster_ros.collection import events
 from remaster_ros.collection.events import EventRecord, RecorderBegan, SensorReport
 from remaster_ros.collection.message_fields import temperature_topic
 from remaster_ros.collection.pairing import Pairing
+from remaster_ros.collection.peers import RequiredSensors
 from remaster_ros.collection.recording import EndedReading, Recording
-from remaster_ros.collection.required_sensors import RequiredSensors
 from remaster_ros.errors import DiskError, InputError, MovedError
 from remaster_ros.motion.liveness import Liveness
 from remaster_ros.nodes.bagging import BagRecorder

@@ -33,7 +33,7 @@ from remaster_ros.collection.message_fields import (
     solutions_of,
     stamp_key,
 )
-from remaster_ros.collection.peer_models import PeerModels
+from remaster_ros.collection.peers import PeerModels
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.same_arm import difference
 from remaster_ros.kinematics.serial_chain import SerialChain

@@ -10,20 +10,22 @@ from remaster_ros.collection.events import (
     PlannerState,
     RecorderState,
 )
+from remaster_ros.collection.peers import Peers
 
 
 class Bench:
     """The planner's side, with both peers there and matched."""
 
     def __init__(self):
-        self.known, self.now = Announcements(), 100.0
+        self.peers, self.now = Peers(()), 100.0
+        self.known = Announcements(self.peers)
         self.started = {'robot_bridge': 'first', 'recorder': 'first'}
         self.bridge()
         self.recorder()
 
     def take(self, body):
         record = EventRecord(node=f'/{body.sender}', body=body, started=self.started[body.sender])
-        self.known.take(record, self.now)
+        self.peers.take(record, self.now)
 
     def bridge(self, pose=''):
         self.take(BridgeState(halted='', pose=pose))
@@ -36,7 +38,7 @@ class Bench:
 
 
 def test_it_waits_until_both_are_matched_for_a_while():
-    known = Announcements()
+    known = Announcements(Peers(()))
     assert not known.matched(2, 0.0)
     bench = Bench()
     assert not bench.known.matched(1, 100.0)
@@ -48,12 +50,13 @@ def test_it_waits_until_both_are_matched_for_a_while():
 
 
 def test_other_nodes_are_no_peers():
-    known = Announcements()
+    peers = Peers(())
+    known = Announcements(peers)
     for name, body in (('optimizer', Alive()), ('pose_planner', PlannerState(state='', run=''))):
-        known.take(EventRecord(node=f'/{name}', body=body), 0.0)
+        peers.take(EventRecord(node=f'/{name}', body=body), 0.0)
     known.matched(2, 0.0)
     assert not known.matched(2, 9.0)
-    assert (known.bridge, known.recorder) == (None, None)
+    assert (peers.bridge, peers.recorder) == (None, None)
 
 
 def test_a_pose_that_both_know_is_not_lost():

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from remaster_ros.collection.events import Decided, RecorderState
-from remaster_ros.collection.required_sensors import RequiredSensors
+from remaster_ros.collection.peers import RequiredSensors
 from remaster_ros.collection.tour_progress import TourProgress
 from remaster_ros.errors import InputError, InsufficientDataError
 from remaster_ros.planning.candidates import Plan, PlannedPose

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from simple_cells import write_cell
 
+from remaster_ros.collection.peers import Peers
 from remaster_ros.collection.plan_confirmation import PlanConfirmation, fingerprint
-from remaster_ros.collection.preflight_facts import PreflightFacts
 from remaster_ros.collection.tour_progress import TourProgress
 from remaster_ros.nodes.background import PlanningThread
 from remaster_ros.nodes.pose_planner import PlanPreview
@@ -46,7 +46,7 @@ class Bench:
         )
         self.journal = PlanJournal(folder / 'session', {}, self.chain, self.tours.model)
         self.progress = TourProgress(self.journal, self.tours, PlanningThread(Beside()))
-        self.facts = PreflightFacts(cell.sensors)
+        self.peers = Peers(cell.sensors)
         self.preview = PlanPreview(
             cell, self.tours, self.journal, self.progress, folder / 'session', Beside()
         )
@@ -55,7 +55,7 @@ class Bench:
     def draw(self):
         """Draw what is next; return what a person is told."""
         until = time.monotonic() + 60.0
-        while not (told := self.preview.draw(START, self.facts)):
+        while not (told := self.preview.draw(START, self.peers)):
             assert time.monotonic() < until
             time.sleep(0.01)
         return told
@@ -93,7 +93,7 @@ def test_the_plan_is_shown_and_followed_only_once_it_is_confirmed(bench):
     # Nothing new: the page stays as it is.
     before = bench.page.stat().st_mtime_ns
     for _ in range(5):
-        assert preview.draw(START, bench.facts) == ''
+        assert preview.draw(START, bench.peers) == ''
     assert bench.page.stat().st_mtime_ns == before
 
 
@@ -105,7 +105,7 @@ def test_another_plan_needs_another_confirmation(bench):
     assert not preview.allows(collection)
     bench.registered()
     # From now on the page is out of date, and cannot be confirmed.
-    assert preview.draw(START, bench.facts) == ''
+    assert preview.draw(START, bench.peers) == ''
     assert not preview.confirm()[0]
     assert 'it is being drawn' in preview.asked()
     assert fingerprint(collection) in bench.draw()
@@ -120,7 +120,7 @@ def test_another_plan_needs_another_confirmation(bench):
     stop = collection.next(START)
     bench.journal.open_stop(stop)
     bench.journal.outcome(stop.ids[0], 'recorded')
-    assert preview.draw(START, bench.facts) == ''
+    assert preview.draw(START, bench.peers) == ''
     assert preview.asked() == ''
     assert preview.allows(bench.journal.tour)
 
@@ -161,7 +161,7 @@ def test_only_the_plan_that_a_person_has_seen_is_confirmed(bench):
     assert not done
     assert why.startswith('plan 00000000 is not the one that is next; plan ')
     bench.registered()
-    preview.draw(START, bench.facts)
+    preview.draw(START, bench.peers)
     # While the next one is drawn, no name is right.
     assert not preview.confirm(first)[0]
     bench.draw()
@@ -193,7 +193,7 @@ def test_a_page_that_cannot_be_written_holds_the_arm_and_is_tried_again(bench):
 
 def test_cells_that_do_not_ask_for_it_go_without(tmp_path):
     bench = Bench(tmp_path, confirm=False)
-    assert bench.preview.draw(START, bench.facts) == ''
+    assert bench.preview.draw(START, bench.peers) == ''
     assert bench.preview.asked() == ''
     assert bench.preview.allows(bench.tours.registration())
     done, why = bench.preview.confirm()
@@ -231,7 +231,7 @@ def test_poses_to_judge_by_are_shown_and_confirmed_like_any_other(bench):
     bench.draw()
     bench.progress.judging = bench.tours.verification
     until = time.monotonic() + 60.0
-    required = bench.facts.required()
+    required = bench.peers.required()
     while (stop := bench.progress.next(START, required, '')) is None:
         assert time.monotonic() < until
         time.sleep(0.01)

@@ -12,7 +12,7 @@ import rclpy
 from simple_cells import write_cell
 from std_srvs.srv import Trigger
 
-from remaster_ros.collection.events import RecorderState
+from remaster_ros.collection.events import EventRecord, RecorderState
 from remaster_ros.nodes.pose_planner import PosePlanner
 
 pytestmark = [pytest.mark.ros, pytest.mark.timeout(60)]
@@ -38,7 +38,8 @@ class Planner:
         rclpy.init(args=args, domain_id=OWN_DOMAIN)
         self.node = node = PosePlanner()
         node._q = START
-        node._announcements.recorder = RecorderState(waiting_for='', run='')
+        state = RecorderState(waiting_for='', run='')
+        node._peers.take(EventRecord(node='/recorder', body=state), time.monotonic())
         node._hindrance = lambda now: ''
         self.announced = []
         node._poses.announce = self._announce
