@@ -12,7 +12,7 @@ from remaster_ros.types import FloatArray
 
 
 def seconds(stamp: Any) -> float:
-    """Return a stamp (builtin_interfaces/Time) in seconds."""
+    """Return a stamp or duration (builtin_interfaces/Time, /Duration) in seconds."""
     return stamp.sec + 1e-9 * stamp.nanosec
 
 

@@ -22,11 +22,6 @@ class Pace:
         self._took_s: deque[float] = deque(maxlen=KEPT)
         self._since_s = 0.0
 
-    @property
-    def running_s(self) -> float:
-        """How long the collection has been running since this was begun, s."""
-        return self._running_s
-
     def update(self, done: int, now_s: float, *, running: bool) -> None:
         """Take how far the collection is.
 

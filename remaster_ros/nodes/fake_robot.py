@@ -141,7 +141,7 @@ class FakeRobotNode(RemasterNode):
     def _on_trajectory(self, message: JointTrajectory) -> None:
         points = [
             ServoPoint(
-                point.time_from_start.sec + 1e-9 * point.time_from_start.nanosec,
+                seconds(point.time_from_start),
                 np.array(point.positions),
                 np.array(point.velocities) if point.velocities else None,
             )

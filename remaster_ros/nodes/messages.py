@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from builtin_interfaces.msg import Duration, Time
@@ -33,25 +34,44 @@ def duration_of(time_s: float) -> Duration:
     return Duration(sec=nanoseconds // 10**9, nanosec=nanoseconds % 10**9)
 
 
+def write_place(T: FloatArray, position: Any, turn: Any) -> None:
+    """Write a transform (4, 4) into the two halves of a Pose or Transform message."""
+    position.x, position.y, position.z = map(float, T[:3, 3])
+    turn.x, turn.y, turn.z, turn.w = map(float, transforms.quaternion_xyzw(T[:3, :3]))
+
+
+def read_place(position: Any, turn: Any) -> FloatArray:
+    """Undo `write_place`; returns (4, 4)."""
+    quaternion = np.array([turn.x, turn.y, turn.z, turn.w])
+    return transforms.transform(
+        transforms.matrix_from_quaternion_xyzw(quaternion),
+        np.array([position.x, position.y, position.z]),
+    )
+
+
 def transform_message(parent: str, child: str, T_parent_child: FloatArray) -> TransformStamped:
     """Return a transform (4, 4) as a message."""
     message = TransformStamped()
     message.header.frame_id, message.child_frame_id = parent, child
-    translation, rotation = message.transform.translation, message.transform.rotation
-    translation.x, translation.y, translation.z = map(float, T_parent_child[:3, 3])
-    quaternion = transforms.quaternion_xyzw(T_parent_child[:3, :3])
-    rotation.x, rotation.y, rotation.z, rotation.w = map(float, quaternion)
+    write_place(T_parent_child, message.transform.translation, message.transform.rotation)
     return message
 
 
 def transform_array(message: TransformStamped) -> FloatArray:
     """Undo `transform_message`; returns (4, 4)."""
-    translation, rotation = message.transform.translation, message.transform.rotation
-    quaternion = np.array([rotation.x, rotation.y, rotation.z, rotation.w])
-    return transforms.transform(
-        transforms.matrix_from_quaternion_xyzw(quaternion),
-        np.array([translation.x, translation.y, translation.z]),
-    )
+    return read_place(message.transform.translation, message.transform.rotation)
+
+
+def message_class(type_name: str) -> Any:
+    """Return the class of a message type such as ``sensor_msgs/msg/JointState``.
+
+    Raises InputError: this machine has no such type.
+    """
+    package, _, name = type_name.partition('/msg/')
+    try:
+        return getattr(importlib.import_module(f'{package}.msg'), name)
+    except (ImportError, AttributeError):
+        raise InputError(f'this machine has no message type {type_name}') from None
 
 
 def waypoints_message(

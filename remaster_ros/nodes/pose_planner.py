@@ -51,12 +51,16 @@ from remaster_ros.collection.peers import PeerModels, Peers, RequiredSensors
 from remaster_ros.collection.plan_confirmation import PlanConfirmation, fingerprint, service_name
 from remaster_ros.collection.tour_progress import PlanMemory, TourProgress
 from remaster_ros.errors import InputError, RemasterError
-from remaster_ros.kinematics import transforms
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.motion.preflight import preflight
 from remaster_ros.nodes.background import Background, PlanningThread
 from remaster_ros.nodes.judging import KINDS, Judging, JudgingParameters, Kind
-from remaster_ros.nodes.messages import duration_of, transform_array, waypoints_message
+from remaster_ros.nodes.messages import (
+    duration_of,
+    transform_array,
+    waypoints_message,
+    write_place,
+)
 from remaster_ros.nodes.parameters import declare, parameter
 from remaster_ros.nodes.running import RemasterNode, run
 from remaster_ros.nodes.runtime_files import runtime_folder
@@ -329,10 +333,7 @@ class PosePublisher:
                 stamp=key, pose=stop.pose, split=stop.split, ids=stop.ids, plan=plan, last=last
             )
         )
-        position, orientation = pose.pose.position, pose.pose.orientation
-        position.x, position.y, position.z = map(float, stop.T_R_T[:3, 3])
-        quaternion = transforms.quaternion_xyzw(stop.T_R_T[:3, :3])
-        orientation.x, orientation.y, orientation.z, orientation.w = map(float, quaternion)
+        write_place(stop.T_R_T, pose.pose.position, pose.pose.orientation)
         self._poses.publish(pose)
         # Before the solutions: with those the bridge begins to move.
         self._waypoints.publish(waypoints_message(stop, self._chain.joint_names, pose.header))

@@ -9,14 +9,12 @@ and ends with status 1.
 
 from __future__ import annotations
 
-import importlib
 import json
 import threading
 import time
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from rclpy.duration import Duration
 from rclpy.publisher import Publisher
@@ -29,7 +27,7 @@ from std_srvs.srv import Trigger
 
 from remaster_ros.collection import events
 from remaster_ros.errors import InputError, InsufficientDataError, RemasterError
-from remaster_ros.nodes.messages import stamp_of
+from remaster_ros.nodes.messages import message_class, stamp_of
 from remaster_ros.nodes.parameters import declare, parameter
 from remaster_ros.nodes.running import RemasterNode, run
 from remaster_ros.nodes.status import EVENTS, MESSAGES_TAKEN, node_of, taken_key
@@ -385,18 +383,6 @@ def _live(info: TopicEndpointInfo, does: str) -> str:
         f'replay: this graph is live: {node_of(info)} {does}; end it, or replay in another ROS '
         'domain (ROS_DOMAIN_ID) or namespace'
     )
-
-
-def message_class(type_name: str) -> Any:
-    """Return the class of a message type such as ``sensor_msgs/msg/JointState``.
-
-    Raises InputError: if this machine has no such type.
-    """
-    package, _, name = type_name.partition('/msg/')
-    try:
-        return getattr(importlib.import_module(f'{package}.msg'), name)
-    except (ImportError, AttributeError):
-        raise InputError(f'this machine has no message type {type_name}') from None
 
 
 def main(args: list[str] | None = None) -> int:

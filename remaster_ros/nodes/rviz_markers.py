@@ -17,8 +17,7 @@ from rclpy.node import Node
 from std_msgs.msg import ColorRGBA
 from visualization_msgs.msg import Marker, MarkerArray
 
-from remaster_ros.kinematics import transforms
-from remaster_ros.nodes.messages import transform_message
+from remaster_ros.nodes.messages import transform_message, write_place
 from remaster_ros.nodes.status import LATCHED, RELIABLE
 from remaster_ros.reports.robot_scene import RobotScene, Surface, coarser
 from remaster_ros.types import FloatArray
@@ -73,7 +72,7 @@ class RvizMarkers:
         if scene['q'] is not None:
             frames = self._scene.transforms(np.array(scene['q']))
             for marker, surface in zip(self._surfaces, self._scene.surfaces, strict=True):
-                _place(marker, frames[surface.link])
+                write_place(frames[surface.link], marker.pose.position, marker.pose.orientation)
                 markers.append(marker)
         way = self._marker('way', 0, Marker.LINE_STRIP, '#e0a83c', 0.006)
         way.points = _points(np.reshape(scene['way'], (-1, 3)))
@@ -117,12 +116,6 @@ class RvizMarkers:
 
 def _color(red: float, green: float, blue: float) -> ColorRGBA:
     return ColorRGBA(r=float(red), g=float(green), b=float(blue), a=1.0)
-
-
-def _place(marker: Marker, T: FloatArray) -> None:
-    place, turn = marker.pose.position, marker.pose.orientation
-    place.x, place.y, place.z = map(float, T[:3, 3])
-    turn.x, turn.y, turn.z, turn.w = map(float, transforms.quaternion_xyzw(T[:3, :3]))
 
 
 def _points(points: FloatArray) -> list[Point]:

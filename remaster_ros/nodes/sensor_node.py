@@ -8,7 +8,6 @@ the state that preflight, planner and recorder need.
 from __future__ import annotations
 
 import contextlib
-import importlib
 import math
 import threading
 import time
@@ -27,11 +26,11 @@ from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory
 
 from remaster_ros.collection.events import SensorReport, ShotMeasured
-from remaster_ros.collection.message_fields import JointOrder, temperature_topic
+from remaster_ros.collection.message_fields import JointOrder, seconds, temperature_topic
 from remaster_ros.errors import DeviceError, InputError, RemasterError
 from remaster_ros.kinematics import transforms
 from remaster_ros.nodes.controller_link import COMMANDS, COPIES
-from remaster_ros.nodes.messages import stamp_of, transform_array
+from remaster_ros.nodes.messages import message_class, read_place, stamp_of, transform_array
 from remaster_ros.nodes.parameters import declare
 from remaster_ros.nodes.running import RemasterNode, fault_of_this_program, run
 from remaster_ros.nodes.simulated_clock import ReportsTaken
@@ -107,13 +106,7 @@ class MeasureService:
         )
 
     def _on_pose(self, message: PoseStamped) -> None:
-        position, quaternion = message.pose.position, message.pose.orientation
-        self._T_R_T = transforms.transform(
-            transforms.matrix_from_quaternion_xyzw(
-                np.array([quaternion.x, quaternion.y, quaternion.z, quaternion.w])
-            ),
-            np.array([position.x, position.y, position.z]),
-        )
+        self._T_R_T = read_place(message.pose.position, message.pose.orientation)
 
     def _on_joints(self, message: JointState) -> None:
         # What is wrong with joint states, the bridge reports.
@@ -129,8 +122,7 @@ class MeasureService:
     def _on_trajectory(self, message: JointTrajectory) -> None:
         # One point alone is a stop on the way, where nothing is to be found.
         if len(message.points) > 1:
-            duration = message.points[-1].time_from_start
-            self._arrival_s = self._node.now_s() + duration.sec + 1e-9 * duration.nanosec
+            self._arrival_s = self._node.now_s() + seconds(message.points[-1].time_from_start)
             self._commanded.set()
 
     def _expected(self, marker: str = '') -> FloatArray | None:
@@ -222,10 +214,10 @@ def subscribe_to_source(node: Node, driver: TopicDriver, sensor: CellSensor) -> 
 
     Raises InputError: the package of the message type is not installed.
     """
-    package, _, name = sensor.message_type.partition('/msg/')
     try:
-        kind = getattr(importlib.import_module(f'{package}.msg'), name)
-    except ImportError:
+        kind = message_class(sensor.message_type)
+    except InputError:
+        package = sensor.message_type.partition('/msg/')[0]
         raise InputError(
             f'{node.get_name()}: message_type is {sensor.message_type}, and {package} is not '
             'installed here; install that package, or have its driver publish PointStamped'

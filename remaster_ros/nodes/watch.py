@@ -33,9 +33,8 @@ from remaster_ros.collection.events import EventRecord
 from remaster_ros.collection.message_fields import JointOrder, solutions_of
 from remaster_ros.collection.plan_confirmation import service_name
 from remaster_ros.errors import RemasterError
-from remaster_ros.kinematics import transforms
 from remaster_ros.nodes.background import Background
-from remaster_ros.nodes.messages import transform_array, waypoints_by_solution
+from remaster_ros.nodes.messages import read_place, transform_array, waypoints_by_solution
 from remaster_ros.nodes.parameters import declare, parameter
 from remaster_ros.nodes.running import RemasterNode, run
 from remaster_ros.nodes.runtime_files import opening_file, page_name
@@ -202,12 +201,7 @@ class Watch(RemasterNode):
         self.view.residuals.reading(sensor, marker, position)
 
     def _on_target(self, message: PoseStamped) -> None:
-        place, turn = message.pose.position, message.pose.orientation
-        rotation = transforms.matrix_from_quaternion_xyzw(
-            np.array([turn.x, turn.y, turn.z, turn.w])
-        )
-        T = transforms.transform(rotation, np.array([place.x, place.y, place.z]))
-        self.view.take_target(T)
+        self.view.take_target(read_place(message.pose.position, message.pose.orientation))
 
     def _on_waypoints(self, message: JointTrajectory) -> None:
         self._waypoints = message
