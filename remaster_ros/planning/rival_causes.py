@@ -16,15 +16,18 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from remaster_ros.discovery.effects.base import LARGEST_M, Cell
 from remaster_ros.discovery.effects.context import Context
 from remaster_ros.discovery.effects.registry import EFFECTS
-from remaster_ros.discovery.explain import FoundEffect
 from remaster_ros.planning.design_information import DesignInformation, FurtherColumns
 from remaster_ros.types import FloatArray
+
+if TYPE_CHECKING:
+    from remaster_ros.discovery.explain import FoundEffect
 
 AMPLITUDE = 'amplitude'
 FREE_STD = 1e3

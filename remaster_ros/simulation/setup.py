@@ -16,7 +16,6 @@ from remaster_ros.errors import InputError
 from remaster_ros.session.workcell import Workcell, config_path
 from remaster_ros.simulation.effect_sampling import EffectSpec, with_effects
 from remaster_ros.simulation.hidden_arm import model_of_tour
-from remaster_ros.simulation.simulated_workcell import plan_tour, visit
 from remaster_ros.simulation.truth import SessionTruth, SimulatedSensor, Warming, place_sensor
 from remaster_ros.simulation.world import START_S, WORLD_FILE, World, WorldContent
 from remaster_ros.types import FloatArray
@@ -134,6 +133,9 @@ def make_world(
     warming = Warming(rng.uniform(2.0, 6.0), rng.uniform(300.0, 1500.0), START_S)
     truth = SessionTruth(joint_offsets, markers, sensors, warming)
     if hidden:
+        # Imported here: a fake device plans nothing.
+        from remaster_ros.simulation.simulated_workcell import plan_tour, visit
+
         # Effects get the requested sizes on a tour like the one that will be visited.
         rng = np.random.default_rng([seed, 2])
         places = {name: sensor.T_R_N for name, sensor in sensors.items()}

@@ -194,7 +194,7 @@ def test_the_clearance_covers_what_is_still_unknown(rig, tmp_path, known, unknow
     assert bridge._search._model.unknown_offset == pytest.approx(np.deg2rad(unknown_deg))
 
 
-def test_a_compensation_of_another_arm_or_by_the_old_name_is_refused_at_the_start(rig, tmp_path):
+def test_a_compensation_of_another_arm_or_by_another_name_is_refused_at_the_start(rig, tmp_path):
     file = corrected_by(tmp_path, {'joint_1': 1.0})
     cell = write_cell(tmp_path / 'cell.yaml')
     (tmp_path / 'other.urdf').write_text(read_cell('demo').urdf_text + '<!-- another -->')
@@ -204,7 +204,7 @@ def test_a_compensation_of_another_arm_or_by_the_old_name_is_refused_at_the_star
     cell.write_text(text.replace(urdf, f'{indent}urdf: other.urdf'))
     with pytest.raises(InputError, match='is of another URDF'):
         rig(ready=False, cell=cell, compensation=file)
-    with pytest.raises(InputError, match="no parameter 'offsets' any more; give compensation"):
+    with pytest.raises(InputError, match="unknown parameter 'offsets'"):
         rig(ready=False, offsets=tmp_path / 'fit.json')
 
 

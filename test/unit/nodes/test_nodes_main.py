@@ -39,3 +39,17 @@ def test_what_a_node_may_never_need_is_not_loaded_when_it_starts():
     )
     done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == '[]'
+
+
+def test_nodes_that_measure_and_move_load_neither_fit_nor_search_when_they_start():
+    pytest.importorskip('rclpy', reason='needs ROS 2 Jazzy or its wheels')
+    planning = ('pose_planner', 'optimizer', 'watch', 'demo')
+    code = (
+        'import importlib, sys\n'
+        f'for name in {[name for name in NODES if name not in planning]}: '
+        'importlib.import_module(f"remaster_ros.nodes.{name}")\n'
+        'late = "calibration.estimate", "discovery.screening", "planning.pose_design"\n'
+        'print([name for name in late if f"remaster_ros.{name}" in sys.modules])'
+    )
+    done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == '[]'
