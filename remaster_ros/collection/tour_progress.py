@@ -44,7 +44,7 @@ class PlanMemory(Protocol):
 
 
 class Planning(Protocol):
-    """Does one thing at a time beside the callbacks; see `nodes.planning_thread`."""
+    """Does one thing at a time beside the callbacks; see `nodes.background`."""
 
     def ask(self, what: object, q: FloatArray, job: Callable[[], Result]) -> tuple[Result] | None:
         """Return what a job found, in a tuple; None while it works."""
