@@ -13,6 +13,7 @@ ANNOUNCE_WALL_S = 5.0
 MATCH_WALL_S = 0.5
 """The other side of a DDS match comes so much later than ours at most, s."""
 PEERS = BridgeState.sender, RecorderState.sender
+"""Nodes that a pose is announced to. A viewer or `ros2 topic echo` stands for none of them."""
 
 
 class Announcements:

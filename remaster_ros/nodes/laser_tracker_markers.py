@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from remaster_ros.nodes.sensor_node import run_sensor
+from remaster_ros.nodes.sensor_markers import run_sensor
 from remaster_ros.sensors.laser_tracker.driver import Parameters
 
 __all__ = ['Parameters', 'main']

@@ -42,7 +42,7 @@ from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from remaster_ros.collection import events
-from remaster_ros.collection.announcements import Announcements
+from remaster_ros.collection.announcements import PEERS, Announcements
 from remaster_ros.collection.collection_run import CollectionRun
 from remaster_ros.collection.events import OptimizerState, PoseAnnounced
 from remaster_ros.collection.message_fields import CORRECTED, JointOrder, stamp_key, wanted_of
@@ -289,10 +289,6 @@ class Parameters(JudgingParameters):
 # Publish a pose with all its joint solutions to bridge and recorder.
 
 
-LISTENERS = ('robot_bridge', 'recorder')
-"""Nodes that a pose is announced to. A viewer or `ros2 topic echo` stands for none of them."""
-
-
 class PosePublisher:
     """Publishes poses, and the stop that takes them back."""
 
@@ -310,7 +306,7 @@ class PosePublisher:
     def subscribers(self) -> int:
         """How many nodes subscribe to the solutions, without those that only look on."""
         found = self._node.get_subscriptions_info_by_topic(self._solutions.topic_name)
-        others = sum(info.node_name not in LISTENERS for info in found)
+        others = sum(info.node_name not in PEERS for info in found)
         return int(self._solutions.get_subscription_count()) - others
 
     def stop(self) -> None:

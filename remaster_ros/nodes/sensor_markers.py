@@ -1,16 +1,435 @@
-"""The node of any registered sensor; its name begins with that of the driver.
+"""The node of any sensor: its markers' readings out, and whether the sensor is ready.
 
-``ros2 run remaster_ros sensor_markers --ros-args -r __node:=NAME -p sensor:=…``; which names there
-are stands in `remaster_ros.sensors.registry`. Its parameters are those below and the driver's own.
+Its name begins with that of its driver: ``ros2 run remaster_ros sensor_markers --ros-args -r
+__node:=NAME -p sensor:=…``; which names there are stands in `remaster_ros.sensors.registry`. Its
+parameters are those below and the driver's own. Two devices have executables of their own.
+
+What is particular to a device lies in its driver (`remaster_ros.sensors`). The node opens the
+driver, tries again while that fails, publishes readings with their time of capture, and publishes
+the state that preflight, planner and recorder need.
 """
 
 from __future__ import annotations
 
-from remaster_ros.nodes.sensor_node import run_sensor
-from remaster_ros.sensors.driver import SensorParameters as Parameters
-from remaster_ros.sensors.registry import GENERIC
+import contextlib
+import math
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from typing import Any
 
-__all__ = ['Parameters', 'main']
+import numpy as np
+from geometry_msgs.msg import PointStamped, PoseStamped, TransformStamped
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
+from rclpy.node import Node
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import JointState, Temperature
+from std_srvs.srv import Trigger
+from trajectory_msgs.msg import JointTrajectory
+
+from remaster_ros.collection.events import SensorReport, ShotMeasured
+from remaster_ros.collection.message_fields import JointOrder, seconds, temperature_topic
+from remaster_ros.errors import DeviceError, InputError, RemasterError
+from remaster_ros.kinematics import transforms
+from remaster_ros.nodes.controller_link import COMMANDS, COPIES
+from remaster_ros.nodes.messages import message_class, read_place, stamp_of, transform_array
+from remaster_ros.nodes.parameters import declare
+from remaster_ros.nodes.running import RemasterNode, fault_of_this_program, run
+from remaster_ros.nodes.simulated_clock import ReportsTaken
+from remaster_ros.nodes.status import LATCHED, RELIABLE, NodeStatus, Summary, node_of
+from remaster_ros.sensors.driver import SensorClock, StreamDriver, TriggeredDriver
+from remaster_ros.sensors.driver import SensorParameters as Parameters
+from remaster_ros.sensors.registry import GENERIC, TOPIC, kind_of, load_driver
+from remaster_ros.sensors.topic.driver import TopicDriver
+from remaster_ros.session.workcell import CellSensor, Workcell, read_cell
+from remaster_ros.types import FloatArray, MarkerReading
+
+__all__ = ['Parameters', 'SensorNode', 'main', 'run_sensor']
+
+# Measurements on request: the service, where the marker should be, and when the arm arrives.
+#
+# Between requests the driver may find a lost marker again: `prepare` is called as soon as the arm
+# has arrived, so that a search falls into the settle time. Several markers are measured one after
+# another, once the sensor is registered: before, it is not known where the others are.
+
+
+NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+"""Of joint states only the last counts."""
+
+
+class MeasureService:
+    """What a node adds for a sensor that measures on request.
+
+    ``ending``: set when the node ends.
+    Raises InputError: the node listens to the arm's commands under a name by which the bridge
+    would take it for a controller.
+    """
+
+    def __init__(
+        self, node: SensorNode, driver: TriggeredDriver, cell: Workcell, ending: threading.Event
+    ) -> None:
+        self._node, self._driver, self._ending = node, driver, ending
+        sensor = cell.sensors[node.sensor]
+        self._markers_T = {
+            '' if name == sensor.marker else name: np.array(cell.markers[name])
+            for name in sensor.markers
+        }
+        # The one that was measured last is measured first: the beam may be on it still.
+        self._last = ''
+        self._T_N_R: FloatArray | None = None
+        self._T_R_T: FloatArray | None = None
+        self._arrival_s = 0.0
+        self._commanded = threading.Event()
+        self._temperatures = node.create_publisher(
+            Temperature, temperature_topic(sensor.topic), RELIABLE
+        )
+        if len(self._markers_T) > 1:
+            # Which of them the beam is on shows by their places alone, and a node that was
+            # started again in the middle of a pose has not heard of the pose.
+            self._chain = cell.chain()
+            self._joint_order = JointOrder(self._chain.joint_names)
+            node.create_subscription(JointState, 'joint_states', self._on_joints, NEWEST)
+        else:
+            node.create_subscription(PoseStamped, 'remaster/target_pose', self._on_pose, RELIABLE)
+        node.create_subscription(
+            TransformStamped, 'remaster/registration', self._on_registration, LATCHED
+        )
+        if type(driver).prepare is not TriggeredDriver.prepare:
+            if not kind_of(node.get_name()):
+                raise InputError(
+                    f'{node.get_name()}: this node listens to the commands of the arm, and the '
+                    'robot_bridge takes a node of this name for a controller; begin its name '
+                    f'with {node.kind}'
+                )
+            for commands in (COMMANDS, COPIES):
+                node.create_subscription(JointTrajectory, commands, self._on_trajectory, RELIABLE)
+        node.create_service(
+            Trigger,
+            sensor.measure_service or f'{node.kind.removesuffix("_markers")}/measure',
+            self._on_measure,
+            callback_group=MutuallyExclusiveCallbackGroup(),
+        )
+
+    def _on_pose(self, message: PoseStamped) -> None:
+        self._T_R_T = read_place(message.pose.position, message.pose.orientation)
+
+    def _on_joints(self, message: JointState) -> None:
+        # What is wrong with joint states, the bridge reports.
+        with contextlib.suppress(InputError):
+            q = self._joint_order.positions(message)
+            if np.all(np.isfinite(q)):
+                self._T_R_T = self._chain.forward(q)
+
+    def _on_registration(self, message: TransformStamped) -> None:
+        if message.child_frame_id == self._node.sensor:
+            self._T_N_R = transforms.inverse(transform_array(message))
+
+    def _on_trajectory(self, message: JointTrajectory) -> None:
+        # One point alone is a stop on the way, where nothing is to be found.
+        if len(message.points) > 1:
+            self._arrival_s = self._node.now_s() + seconds(message.points[-1].time_from_start)
+            self._commanded.set()
+
+    def _expected(self, marker: str = '') -> FloatArray | None:
+        """Where a marker should be in the sensor's frame; None before registration."""
+        if self._T_N_R is None or self._T_R_T is None:
+            return None
+        return transforms.apply(self._T_N_R @ self._T_R_T, self._markers_T[marker])
+
+    def step(self) -> None:
+        """Wait half a second for a command of the arm; prepare the driver when it has arrived."""
+        if not self._commanded.wait(0.5):
+            return
+        self._commanded.clear()
+        while self._node.now_s() < self._arrival_s:
+            if self._ending.wait(0.005):
+                return
+        with self._node.in_use:
+            try:
+                self._driver.prepare(self._expected())
+            except DeviceError as error:
+                # The request that follows tries again, and reports.
+                self._node.trouble = str(error)
+
+    def _on_measure(self, request: Trigger.Request, response: Trigger.Response) -> Any:
+        """Measure each marker once; the points are published before the answer goes out."""
+        node = self._node
+        if node.clock_trouble:
+            response.message = node.clock_trouble
+            return response
+        if self._driver.phase != 'ready':
+            response.message = f'the {self._driver.device} is {self._driver.phase}: {node.trouble}'
+            return response
+        began = time.monotonic()
+        failures: list[str] = []
+        stamps_s: dict[str, float] = {}
+        with node.in_use:
+            for marker in self._order():
+                try:
+                    stamps_s[marker] = self._measure(marker)
+                except DeviceError as error:
+                    failures.append(str(error))
+        node.trouble = '; '.join(failures)
+        # A device that was lost is opened and asked again; the readings so far remain the first.
+        if not stamps_s or not self._driver.connected:
+            response.message = node.trouble
+            return response
+        for marker in self._markers_T.keys() - stamps_s:
+            # Who waits for all of them learns that this one does not come.
+            none = MarkerReading(max(stamps_s.values()), np.full(3, np.nan), marker=marker)
+            node.publish_reading(none)
+        # For the report of times: what the instrument took is not the software's.
+        node.status.event(ShotMeasured(time.monotonic() - began))
+        response.success, response.message = True, node.trouble or 'measured'
+        return response
+
+    def _order(self) -> list[str]:
+        """Return the markers that can be measured now, that of the last reading first."""
+        if self._expected() is None:
+            return ['']
+        return [self._last, *(name for name in self._markers_T if name != self._last)]
+
+    def _measure(self, marker: str) -> float:
+        """Measure a marker once and publish it; return its stamp, s."""
+        expected = self._expected(marker)
+        if len(self._markers_T) > 1 and expected is not None:
+            self._driver.turn_to(marker, expected)
+        reading = replace(self._driver.measure(expected), marker=marker)
+        self._last = marker
+        self._publish_temperature(reading)
+        self._node.publish_reading(reading)
+        return reading.stamp_s
+
+    def _publish_temperature(self, reading: MarkerReading) -> None:
+        """Publish it under the reading's stamp, before the point."""
+        if not math.isfinite(reading.temperature_c):
+            return
+        message = Temperature(temperature=float(reading.temperature_c))
+        message.header.stamp = stamp_of(reading.stamp_s)
+        message.header.frame_id = self._node.sensor
+        self._temperatures.publish(message)
+
+
+ANY = QoSProfile(depth=200, reliability=ReliabilityPolicy.BEST_EFFORT)
+"""Matches publishers that are reliable, best-effort, volatile or latched."""
+
+
+def subscribe_to_source(node: Node, driver: TopicDriver, sensor: CellSensor) -> None:
+    """Hand all messages of a sensor's source to its driver.
+
+    Raises InputError: the package of the message type is not installed.
+    """
+    try:
+        kind = message_class(sensor.message_type)
+    except InputError:
+        package = sensor.message_type.partition('/msg/')[0]
+        raise InputError(
+            f'{node.get_name()}: message_type is {sensor.message_type}, and {package} is not '
+            'installed here; install that package, or have its driver publish PointStamped'
+        ) from None
+    topic = node.resolve_topic_name(sensor.source)
+
+    def publishers() -> list[tuple[str, str]]:
+        return [
+            (node_of(info), info.topic_type) for info in node.get_publishers_info_by_topic(topic)
+        ]
+
+    driver.follow(topic, sensor.message_type, sensor.marker, publishers)
+    group = MutuallyExclusiveCallbackGroup()
+    node.create_subscription(kind, sensor.source, driver.take, ANY, callback_group=group)
+
+
+RETRY_S = 0.5
+
+
+class SensorNode(RemasterNode):
+    """A node that publishes the markers which one of the cell's sensors measures.
+
+    ``name``: of the node, where none is given on its command line; it chooses the driver, unless
+    it is that of no registered sensor: then the given one does.
+    Attributes: ``kind``: key of the driver in `remaster_ros.sensors.registry.DRIVERS`; ``sensor``:
+    its name in the cell, which is the frame of its readings; ``trouble``: why the device was not
+    opened, or what it refused last; ''; ``in_use``: held while a command of the device is under
+    way.
+    """
+
+    def __init__(self, name: str) -> None:
+        super().__init__(name)
+        self.kind = kind_of(name) or kind_of(self.get_name())
+        driver = load_driver(self.kind or self.get_name())
+        p = declare(self, driver.parameters_type)
+        cell, self.sensor = read_cell(p.cell), p.sensor
+        if self.sensor not in cell.sensors:
+            raise InputError(
+                f'{self.get_name()}: parameter sensor is {self.sensor!r}; the cell has '
+                f'{", ".join(cell.sensors)}'
+            )
+        described = cell.sensors[self.sensor]
+        triggered = issubclass(driver, TriggeredDriver)
+        if described.single_shot != triggered:
+            raise InputError(
+                f'{self.get_name()}: sensor {self.sensor} of {p.cell} has single_shot '
+                f'{str(described.single_shot).lower()}, but a {driver.device} '
+                f'{"measures on request" if triggered else "streams"}; correct single_shot'
+            )
+        if bool(described.source) != issubclass(driver, TopicDriver):
+            raise InputError(
+                f'{self.get_name()}: sensor {self.sensor} of {p.cell} '
+                + (
+                    f'has a message_type; its node is a {TOPIC}'
+                    if described.source
+                    else 'has no message_type; give that of its topic, such as '
+                    'geometry_msgs/msg/PoseStamped'
+                )
+            )
+        if described.further_markers and not driver.several_markers:
+            raise InputError(
+                f'{self.get_name()}: sensor {self.sensor} of {p.cell} has further_markers, but a '
+                f'{driver.device} measures one marker alone; leave them out'
+            )
+        p = replace(p, further_markers=described.further_markers)
+        self._readings = {
+            '' if marker == described.marker else marker: self.create_publisher(
+                PointStamped, topic, RELIABLE
+            )
+            for marker, topic in described.topics.items()
+        }
+        self._poses = (
+            self.create_publisher(PoseStamped, described.pose_topic, RELIABLE)
+            if described.pose_topic
+            else None
+        )
+        self.published = 0
+        self.trouble = ''
+        self.in_use = threading.Lock()
+        self._ending = threading.Event()
+        self._start_by = time.monotonic() + p.start_timeout_s
+        self._started = False
+        simulated = bool(self.get_parameter('use_sim_time').value)
+        self.driver = driver(p, SensorClock(self.now_s, self._sleep, simulated))
+        # What measures on request waits for a world that would wait for it.
+        streams = isinstance(self.driver, StreamDriver)
+        self._taken = ReportsTaken(self, simulated and streams)
+        if isinstance(self.driver, TopicDriver):
+            subscribe_to_source(self, self.driver, described)
+        if isinstance(self.driver, TriggeredDriver):
+            self._step: Callable[[], float | None] = MeasureService(
+                self, self.driver, cell, self._ending
+            ).step
+        elif isinstance(self.driver, StreamDriver):
+            self._step = partial(self._read, self.driver)
+        self.status = NodeStatus(self, self._summary, self.sensor, cell.model())
+        self._thread = threading.Thread(target=self._work, name=self.sensor, daemon=True)
+        self._thread.start()
+
+    def _sleep(self, duration_s: float) -> None:
+        """Wait on the node's clock, which may be simulated and may stand still."""
+        until = self.now_s() + duration_s
+        while self.now_s() < until and not self._ending.wait(0.002):
+            pass
+
+    def _work(self) -> None:
+        """Keep the device open and serve it; the body of the thread."""
+        try:
+            while not (self._ending.is_set() or self.failure):
+                came_s = None
+                if self.driver.phase == 'ready' and self.driver.connected:
+                    came_s = self._step()
+                else:
+                    self._open()
+                self._taken.take(stamp_of(self.now_s() if came_s is None else came_s))
+        except Exception as error:
+            if not self._ending.is_set():
+                self.failure = fault_of_this_program(error)
+
+    def _open(self) -> None:
+        """Try to open the device; the first time until the start time-out."""
+        with self.in_use:
+            self.driver.phase = 'connecting'
+            try:
+                self.driver.open()
+            except DeviceError as error:
+                self.driver.phase = 'connecting'
+                self.trouble = str(error)
+                self.driver.close()
+                self._require_start(error)
+            else:
+                self.driver.phase, self.trouble = 'ready', ''
+                self._started = self._started or isinstance(self.driver, TriggeredDriver)
+        if self.trouble:
+            self._ending.wait(RETRY_S)
+
+    def _require_start(self, error: RemasterError) -> None:
+        """End the node with this error where the device has never worked and the time is over."""
+        over = time.monotonic() > self._start_by
+        if over and not (self._started or self._ending.is_set()):
+            self.failure = error
+
+    def _read(self, driver: StreamDriver) -> float | None:
+        """Publish the next reading of a stream; return when it came, s, None where none did."""
+        try:
+            reading = driver.read()
+        except DeviceError as error:
+            self.trouble, driver.phase = str(error), 'connecting'
+            driver.close()
+            self._require_start(error)
+            self._ending.wait(RETRY_S)
+            return None
+        if reading is not None:
+            self._started = True
+            self.publish_reading(reading)
+            return driver.received_s
+        why = driver.state().trouble or 'no reading of the marker'
+        self._require_start(DeviceError(f'{driver.device}: {why}'))
+        return None
+
+    def publish_reading(self, reading: MarkerReading) -> None:
+        """Publish a measured position under its time of capture."""
+        message = PointStamped()
+        message.header.stamp = stamp_of(reading.stamp_s)
+        message.header.frame_id = self.sensor
+        position = np.asarray(reading.position, float)
+        message.point.x, message.point.y, message.point.z = map(float, position)
+        self._readings[reading.marker].publish(message)
+        if self._poses is not None:
+            pose = PoseStamped(header=message.header)
+            pose.pose.position = message.point
+            turn, xyzw = pose.pose.orientation, reading.orientation
+            turn.x, turn.y, turn.z, turn.w = map(float, (np.nan,) * 4 if xyzw is None else xyzw)
+            self._poses.publish(pose)
+        self.published += reading.seen
+
+    def _summary(self) -> Summary:
+        state = self.driver.state()
+        open_now = self.driver.phase == 'ready' and self.driver.connected
+        trouble, level = state.trouble, state.level
+        if self.trouble:
+            trouble, level = self.trouble, 'warn' if self.driver.phase == 'ready' else 'error'
+        if self.clock_trouble:
+            trouble, level = self.clock_trouble, 'error'
+        ready = open_now and state.ready and not self.clock_trouble
+        report = SensorReport(
+            sensor=self.sensor,
+            ready=ready,
+            trouble=trouble,
+            message=trouble or state.message,
+            hidden=state.values.get('fault') == 'marker',
+        )
+        values = {'state': self.driver.phase, 'published': self.published, **state.values}
+        return Summary(level, report.message, values, report)
+
+    def close(self) -> None:
+        """Disconnect from the device."""
+        self._ending.set()
+        self.driver.close()
+        self._thread.join(2.0)
+
+
+def run_sensor(name: str, args: list[str] | None = None, threads: int = 3) -> int:
+    """Run the node of a sensor; parameters as of `SensorNode` and `run`."""
+    return run(lambda: SensorNode(name), args, threads=threads)
 
 
 def main(args: list[str] | None = None) -> int:

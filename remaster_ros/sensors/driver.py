@@ -1,4 +1,4 @@
-"""What the driver of a sensor gives; no ROS. `remaster_ros.nodes.sensor_node` runs any of them.
+"""What the driver of a sensor gives; no ROS. `remaster_ros.nodes.sensor_markers` runs any of them.
 
 A device is one folder beside this file with one class that derives from `StreamDriver` or from
 `TriggeredDriver`, and one line in `remaster_ros.sensors.registry`.

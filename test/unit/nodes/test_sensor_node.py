@@ -23,7 +23,7 @@ from remaster_ros.collection.message_fields import seconds
 from remaster_ros.errors import DeviceError, InputError
 from remaster_ros.kinematics.transforms import transform
 from remaster_ros.nodes.messages import transform_message
-from remaster_ros.nodes.sensor_node import SensorNode
+from remaster_ros.nodes.sensor_markers import SensorNode
 from remaster_ros.nodes.simulated_clock import TAKEN
 from remaster_ros.nodes.status import LATCHED, pairs
 from remaster_ros.parameters import parameter

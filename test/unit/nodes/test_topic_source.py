@@ -18,7 +18,7 @@ from remaster_ros.collection.events import SensorReport
 from remaster_ros.collection.message_fields import seconds
 from remaster_ros.errors import InputError
 from remaster_ros.nodes.messages import stamp_of
-from remaster_ros.nodes.sensor_node import SensorNode
+from remaster_ros.nodes.sensor_markers import SensorNode
 from remaster_ros.sensors.registry import GENERIC
 from remaster_ros.session.workcell import config_path
 
