@@ -33,7 +33,7 @@ def random_poses(count: int, rng: np.random.Generator, solutions: int = 5) -> li
         T = CHAIN.forward(q)
         if not (0.2 < np.hypot(*T[:2, 3]) < 0.6 and 0.3 < T[2, 3] < 0.9):
             continue
-        found = _INVERSE.solutions(T)
+        found = _INVERSE.usable(_INVERSE.solutions_of_each(T[None])[0])
         if len(found) > 1:
             poses.append(found[rng.permutation(len(found))[:solutions]])
     return poses
@@ -93,7 +93,7 @@ def one_tool_direction(seed: int, turned: float = 0.01, noise_m: float = 1e-3) -
     while len(poses) < 40:
         T = CHAIN.forward(start)
         T[:3, 3] += rng.uniform(-0.1, 0.1, 3)
-        found = inverse.solutions(T)
+        found = inverse.usable(inverse.solutions_of_each(T[None])[0])
         if len(found):
             nearest = found[np.argmin(np.linalg.norm(found - start, axis=1))]
             poses.append(nearest + turned * rng.standard_normal((2, 7)))

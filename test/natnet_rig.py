@@ -5,8 +5,9 @@ from __future__ import annotations
 import contextlib
 
 import numpy as np
-from optitrack_world import SENSOR, MarkerWorld
+from optitrack_world import SENSOR, MarkerWorld, eventually
 
+from remaster_ros.errors import DeviceError
 from remaster_ros.sensors.optitrack.client import NatNetClient
 from remaster_ros.sensors.optitrack.settings import NatNetSettings
 from remaster_ros.simulation.optitrack import FakeOptiTrackServer, OptiTrackBehaviour
@@ -29,6 +30,17 @@ def fake_server(data_port, command_port=0, world=None, **options):
         yield server
 
 
+def wait_for_the_marker(client, within_s=20.0):
+    """Wait for the first believed frame and the marker's identity; else raise the diagnosis."""
+
+    def is_there():
+        status = client.status()
+        return status.silent_s is not None and not status.problem
+
+    if not eventually(is_there, within_s):
+        raise DeviceError(client.diagnosis().message)
+
+
 @contextlib.contextmanager
 def client_of(port, data_port, on_sample=lambda sample: None, wait_s=20.0, clock=None, **settings):
     client = NatNetClient(
@@ -38,8 +50,10 @@ def client_of(port, data_port, on_sample=lambda sample: None, wait_s=20.0, clock
         on_sample,
         *([clock] if clock else []),
     )
-    client.start(wait_s)
+    client.start()
     try:
+        if wait_s:
+            wait_for_the_marker(client, wait_s)
         yield client
     finally:
         client.stop()

@@ -41,7 +41,6 @@ from typing import Literal
 
 import numpy as np
 from eaik.IK_HP import HPRobot
-from numpy.typing import ArrayLike
 from scipy.special import gammaincinv
 
 from remaster_ros.errors import InputError
@@ -419,28 +418,6 @@ class InverseKinematics:
         return MissedSolutions(
             len(times), int(times.sum()), int(np.sum(times == 1)), int(np.sum(times == 2))
         )
-
-    def solutions(self, T: ArrayLike, within_limits: bool = True) -> FloatArray:
-        """Return the joint solutions of one tool pose.
-
-        Parameters
-        ----------
-        T
-            T_R_T, (4, 4).
-        within_limits
-            Keep solutions within the joint limits only, each joint turned by whole turns towards
-            the middle of its range. Without, angles lie in [-pi, pi].
-
-        Returns
-        -------
-        ndarray
-            rad, (m, k); m is 0 where no solution exists.
-        """
-        T = np.asarray(T, dtype=float)
-        if T.shape != (4, 4) or not np.all(np.isfinite(T)):
-            raise ValueError(f'a pose is a finite matrix of shape (4, 4), not {T.shape}')
-        (q,) = self.solutions_of_each(T[None])
-        return self.usable(q) if within_limits else q
 
     def solutions_of_each(self, T: FloatArray) -> list[FloatArray]:
         """Return the joint solutions in [-pi, pi] of many tool poses (n, 4, 4), limits aside.

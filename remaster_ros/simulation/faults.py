@@ -61,7 +61,7 @@ A laser tracker:
 ``garbage``        sends random bytes
 ``cut``            breaks off each packet after so many bytes
 ``intermittent``   loses the beam every other period of so many seconds
-``search_fails``   finds no reflector
+``occluded``       sees no reflector
 ``hidden``         does not see the reflector of this number
 ``renumbered``     has been switched off and on, once
 ``bumped``         has been moved by so many metres, across its line of sight

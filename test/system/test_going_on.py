@@ -83,7 +83,7 @@ def test_a_collection_goes_on_where_the_tracker_does_not_see_its_marker(start, c
     """
     cell = Cell(start, client, tmp_path, 'all', ['mocap', 'tracker'])
     cell.until(lambda: cell.results.count('recorded') == 1, 'the first registration pose')
-    inject(tmp_path / 'world', {'tracker': {'search_fails': 1}})
+    inject(tmp_path / 'world', {'tracker': {'occluded': 1}})
     cell.kill_and_start('recorder')
     cell.said.pop('pose_planner', None)
     cell.kill_and_start('pose_planner')

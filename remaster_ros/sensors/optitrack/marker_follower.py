@@ -12,7 +12,6 @@ from typing import Literal
 
 import numpy as np
 
-from remaster_ros.errors import DeviceError
 from remaster_ros.sensors.optitrack.frame_gate import (
     Dropped,
     GateCounts,
@@ -290,18 +289,13 @@ class MarkerFollower(ABC):
         self._believed_before: Source | None = None
         self._thread: threading.Thread | None = None
         self._stopping = threading.Event()
-        self._ready = threading.Event()
-
         self._frame_at: float | None = None
         self._sample_at: float | None = None
 
-    def start(self, wait_s: float = 0.0) -> None:
+    def start(self) -> None:
         """Open the sockets and begin; the client keeps trying until `stop`.
 
-        ``wait_s``: how long to wait for the first frame and the marker's identity, s (wall clock);
-        0 returns at once.
-        Raises DeviceError: if a socket cannot be opened, or nothing useful came within `wait_s`;
-        the message is that of `diagnosis`. The client is stopped then.
+        Raises DeviceError: if a socket cannot be opened.
         """
         settings = self._settings
         self._status.server_ip = resolve(settings.server)
@@ -309,14 +303,9 @@ class MarkerFollower(ABC):
             self._status.server_ip, settings.command_port
         )
         self._stopping.clear()
-        self._ready.clear()
         self._open()
         self._thread = threading.Thread(target=self._run, name='natnet', daemon=True)
         self._thread.start()
-        if wait_s and not self._ready.wait(wait_s):
-            message = self.diagnosis().message or 'frames come, but no reading of the marker'
-            self.stop()
-            raise DeviceError(f'OptiTrack: {message}')
 
     def stop(self) -> None:
         """End the thread and close the sockets; may be repeated."""
@@ -435,8 +424,6 @@ class MarkerFollower(ABC):
             name: gate.admit(frame, received_s, ticks_per_s)
             for name, gate in {'': self._gate, **self._further}.items()
         }
-        if self._gate.resolved:
-            self._ready.set()
         seen = next(filter(None, found.values()), None)
         if seen is None:
             return []

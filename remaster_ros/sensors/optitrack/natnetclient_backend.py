@@ -17,7 +17,7 @@ import warnings
 from collections.abc import Callable
 from typing import Any
 
-from remaster_ros.errors import DeviceError, InputError
+from remaster_ros.errors import InputError
 from remaster_ros.sensors.optitrack.frame_gate import Dropped, MarkerSample
 from remaster_ros.sensors.optitrack.marker_follower import Diagnosis, MarkerFollower
 from remaster_ros.sensors.optitrack.protocol import natnet
@@ -70,14 +70,6 @@ class NatNetClientBackend(MarkerFollower):
         super().__init__(dataclasses.replace(settings, marker=marker), on_sample, clock)
         self._kind = _quiet_client()
         self._refusal = ''
-
-    def start(self, wait_s: float = 0.0) -> None:
-        """Begin; as `NatNetClient.start`, and a server that is too new is refused at once."""
-        self._refusal = ''
-        super().start(wait_s)
-        if self._refusal:
-            self.stop()
-            raise DeviceError(f'OptiTrack: {self._refusal}')
 
     def diagnosis(self) -> Diagnosis:
         """Return what is wrong when readings are missing, and the remedy."""
@@ -136,7 +128,6 @@ class NatNetClientBackend(MarkerFollower):
             self._refusal = (
                 f'natnetclient reads {READS}; the server streams {version}: set client to builtin'
             )
-            self._ready.set()
         return not self._refusal
 
     def _follow(self, client: Any) -> None:

@@ -105,7 +105,7 @@ def test_kept_solutions_reach_the_pose_within_limits_and_all_candidates_are_acco
     candidates = candidate_poses(60, PoseRanges(), SENSOR, np.random.default_rng(5))
     plan = plan_poses(ik, capsules(ik.chain), candidates, SIGHTS, limit_margin_rad=0.05)
     assert len(plan.poses) + sum(plan.dropped.values()) == 60
-    total = sum(len(ik.solutions(T, within_limits=False)) for T in candidates)
+    total = sum(len(ik.solutions_of_each(T[None])[0]) for T in candidates)
     kept = sum(len(pose.solutions) for pose in plan.poses)
     assert kept + sum(plan.dropped_solutions.values()) == total
     order = [np.flatnonzero((candidates == pose.T_R_T).all(axis=(1, 2))) for pose in plan.poses]

@@ -188,13 +188,17 @@ def test_a_server_that_never_answers_is_named_in_time():
         deaf.bind((LOCAL, 0))
         port = deaf.getsockname()[1]
         before = threading.active_count(), open_descriptors()
-        with pytest.raises(DeviceError, match=f'no answer from 127.0.0.1:{port}'):
-            NatNetClient(NatNetSettings(command_port=port, data_port=free_port()), print).start(
-                1.0
-            )
+        with (
+            pytest.raises(DeviceError, match=f'no answer from 127.0.0.1:{port}'),
+            client_of(port, free_port(), wait_s=1.0),
+        ):
+            pass
         assert (threading.active_count(), open_descriptors()) == before
-    with pytest.raises(DeviceError, match=f'nothing listens on UDP port {port}'):
-        NatNetClient(NatNetSettings(command_port=port, data_port=free_port()), print).start(1.0)
+    with (
+        pytest.raises(DeviceError, match=f'nothing listens on UDP port {port}'),
+        client_of(port, free_port(), wait_s=1.0),
+    ):
+        pass
 
 
 @pytest.mark.parametrize(
