@@ -253,9 +253,8 @@ def configurations(session: Session) -> int:
 def so_far(session: Session, count: int) -> tuple[Session, float, float]:
     """Return a session up to its configuration number `count` to fit, with times.
 
-    Returns session: With what was held out by then as well; elapsed_s: From the first reading to
-    the last one, s; NaN where nothing is known of the times; pace_s: Time per configuration of any
-    kind, s.
+    The session has what was held out by then as well. The times are from the first reading to the
+    last one, s, NaN where nothing is known of it, and per configuration of any kind, s.
     """
     given = session.measurements
     fitted = np.flatnonzero(~given.is_validation)

@@ -109,9 +109,8 @@ class FurtherMeasuring:
     def ask(self, state: str, *, under_way: bool) -> tuple[str | None, partial[Tour] | None]:
         """Return why nothing is measured further, '' where it is, and what plans it if it is new.
 
-        ``state``: the planner's: behind a collection that is not complete nothing is measured,
-        None; ``under_way``: whether something is being measured further already.
-        Returns str or None, callable or None: The latter of registrations.
+        With the planner's ``state``: behind a collection that is not complete nothing is measured,
+        None. ``under_way``: whether something is being measured further already.
         """
         if state != 'complete':
             return '' if under_way else None, None

@@ -109,7 +109,7 @@ NUMBER = 'publication_sequence_number'
 class ArmStates:
     """Take joint positions of an arm from joint_states, whoever else publishes there.
 
-    ``hold_s``: A second publisher counts for so long after it was noticed last, s of wall time.
+    ``hold_s``: a second publisher counts for so long after it was noticed last, s of wall time.
     Attributes: ``others``: what a message is that has none of the arm's joints, for whom the arm's
     do not come; ''.
     """
@@ -128,7 +128,7 @@ class ArmStates:
     def take(self, message: JointState, info: Mapping[str, Any]) -> FloatArray | None:
         """Return the arm's positions, rad, (k,); None from a message of another device.
 
-        Raises InputError: as of `JointOrder.positions`.
+        Raises as `JointOrder.positions`.
         """
         return self._order.positions(message) if self.note(message, info) else None
 

@@ -158,7 +158,7 @@ def run(
     """Spin the node that `make_node` returns until a signal, its failure or its finish.
 
     ``threads``: more than one lets a callback block (a service that measures) while others run.
-    Returns exit status, see `exit_status`; 0 after SIGINT or SIGTERM. An error is one line on
+    Returns the exit status, see `report`; 0 after SIGINT or SIGTERM. An error is one line on
     stderr.
     """
     stopping: list[int] = []
