@@ -13,7 +13,7 @@ from scipy.linalg import solve_triangular
 from scipy.optimize import brentq
 from scipy.stats import chi2, ncx2
 
-from remaster_ros.simulation.hidden_effect import HiddenEffect
+from remaster_ros.simulation.hidden_effects import HiddenEffect
 from remaster_ros.types import FloatArray
 
 

@@ -39,15 +39,6 @@ class MarkerWorld:
     def faults(self, device: str) -> dict[str, float]:
         return {}
 
-    def warming_k(self, t: float) -> float:
-        return 0.0
-
-    def is_moving(self, t: float) -> bool:
-        return True
-
-    def joint_speed(self, t: float) -> float:
-        return 1.0
-
 
 class SteppedWorld(MarkerWorld):
     """The same, with a time that the test sets."""

@@ -9,8 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from remaster_ros.simulation.hidden_effect import HiddenEffect
-from remaster_ros.simulation.hidden_effects import KINDS, NAMED, UNNAMED
+from remaster_ros.simulation.hidden_effects import KINDS, NAMED, UNNAMED, HiddenEffect
 
 Cause = tuple[str, tuple[int, ...], str]
 """Name, joints, and the place and driver of what is hidden without a name; for a sensor its name.

@@ -6,7 +6,7 @@ import numpy as np
 
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.transforms import apply
-from remaster_ros.simulation.hidden_effect import Deviation
+from remaster_ros.simulation.hidden_effects import Deviation
 from remaster_ros.simulation.truth import SessionTruth
 from remaster_ros.simulation.world_model import (
     ArmState,

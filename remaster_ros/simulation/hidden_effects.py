@@ -8,28 +8,252 @@ without one. Compliance and thermal growth are drawn with the sign of physics.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, fields, replace
+from typing import Any
 
 import numpy as np
 
-from remaster_ros.simulation.hidden_effect import (
-    ARC_MINUTE,
-    Circumstances,
-    Deviation,
-    Draw,
-    DrawContext,
-    HiddenEffect,
-    HiddenKind,
-    Part,
-    at_some_time,
-    no_joint,
-    of_sensor,
-    one_value,
-    two_joints,
-)
 from remaster_ros.types import FloatArray
 
-# What a hidden world can hide that has no name of its own in `hidden_effects.NAMED`.
+# A hidden effect: what it may depend on, what it changes, how it is drawn.
+
+ARC_MINUTE = np.deg2rad(1.0 / 60.0)
+# A joint that moved less than this, rad, keeps the flank of its gears that it had.
+SLACK_RAD = 2e-4
+
+
+@dataclass(frozen=True, eq=False)
+class Circumstances:
+    """What effects may depend on at n configurations of k joints."""
+
+    # Reported joint angles, and how far each joint came by its last move, rad, (n, k)
+    q: FloatArray
+    move: FloatArray
+    # Direction of each joint's last move that was a move at all, -1, 0 or 1, (n, k)
+    approach: FloatArray
+    # Since the first measurement, (n,); the arm's temperature above its first, K, (n,)
+    time_s: FloatArray
+    warming_k: FloatArray
+    # Gravity's torque about each joint, (n, k), and about the base, N m, (n, 3)
+    torque: FloatArray
+    base_moment: FloatArray
+    segments: FloatArray  # From each joint to the next, in the frame between, m, (k + 1, 3)
+    axes: FloatArray  # Axis of each joint in its own frame, (k, 3)
+    tool: FloatArray  # Rotation of the tool, (n, 3, 3)
+
+
+@dataclass(eq=False)
+class Deviation:
+    """How the true arm and sensors differ from their drawings at n configurations."""
+
+    sensors: tuple[str, ...]
+    markers: tuple[str, ...]
+    angle: FloatArray  # Added to the true joint angles, rad, (n, k)
+    # Added to each segment, in the frame after its joint (0: the base), m, (n, k + 1, 3)
+    shift: FloatArray
+    tilt: FloatArray  # Turns each joint's frame before its own turn, rad, (n, k, 3)
+    base: FloatArray  # Turns the base about its origin, axes of R, rad, (n, 3)
+    marker: FloatArray  # Added to each marker (c of them) in the tool frame, m, (n, c, 3)
+    # What each sensor (s of them) adds to a point p = (x, y, z) that it measures, in its frame N:
+    # beside, m, (n, s, 3); turn × p, rad, (n, s, 3); scale p, (n, s, 3); radial (x² + y²) (x, y,
+    # 0), 1/m², (n, s, 1); along the line of sight a + b |p|² + c |p|³, in m, 1/m, 1/m², (n, s, 3);
+    # and z u² half where u = (x, y)/z along half is positive, (n, s, 2): the rays of one half of
+    # its view bend
+    beside: FloatArray
+    turn: FloatArray
+    scale: FloatArray
+    radial: FloatArray
+    along: FloatArray
+    half: FloatArray
+
+    @classmethod
+    def none(
+        cls, n: int, k: int, sensors: tuple[str, ...] = (), markers: tuple[str, ...] = ()
+    ) -> Deviation:
+        """Return an arm and sensors as drawn."""
+        s = len(sensors)
+        shapes = ((k,), (k + 1, 3), (k, 3), (3,), (len(markers), 3))
+        per_sensor = ((s, 3), (s, 3), (s, 3), (s, 1), (s, 3), (s, 2))
+        return cls(sensors, markers, *(np.zeros((n, *shape)) for shape in (*shapes, *per_sensor)))
+
+    def map(self, change: Callable[..., FloatArray], *others: Deviation) -> Deviation:
+        """Apply a function to every array of this and other deviations."""
+        names = [s.name for s in fields(self) if s.name not in ('sensors', 'markers')]
+        changed: dict[str, Any] = {
+            name: change(getattr(self, name), *(getattr(other, name) for other in others))
+            for name in names
+        }
+        return replace(self, **changed)
+
+    def measured(self, sensor: str, points: FloatArray) -> FloatArray:
+        """Return what a sensor makes of points p in its frame N, m, (n, 3)."""
+        s = self.sensors.index(sensor)
+        across = points * (1.0, 1.0, 0.0)
+        square = np.sum(across**2, axis=1, keepdims=True)
+        distance = np.linalg.norm(points, axis=1, keepdims=True)
+        powers = distance ** np.array([0.0, 2.0, 3.0])
+        along = np.sum(self.along[:, s] * powers, axis=1, keepdims=True)
+        added = self.scale[:, s] * points + self.radial[:, s] * square * across
+        added += np.cross(self.turn[:, s], points) + along * points / distance
+        half = self.half[:, s]
+        length = np.maximum(np.linalg.norm(half, axis=1, keepdims=True), 1e-30)
+        towards = np.sum(half * points[:, :2], axis=1, keepdims=True) / length
+        bent = np.maximum(towards, 0.0) ** 2 / points[:, 2:]
+        added[:, :2] += bent * half
+        return points + self.beside[:, s] + added
+
+
+@dataclass(frozen=True, eq=False)
+class HiddenEffect:
+    """One effect of a certain size."""
+
+    kind: str  # Its name, a key of `NAMED` or `UNNAMED`
+    joints: tuple[int, ...]  # Numbers from 1: the joints whose angle, link or axis is wrong
+    values: FloatArray  # Its parameters in SI units, (m,); their meaning is in the rule's text
+    # What else the rule needs: an order, a direction, another joint, a sensor
+    detail: Mapping[str, Any] = field(default_factory=dict)
+
+    def scaled(self, factor: float) -> HiddenEffect:
+        """Return the same effect, so many times as large."""
+        return replace(self, values=factor * self.values)
+
+    def __str__(self) -> str:
+        shown = {key: value for key, value in self.detail.items() if np.ndim(value) < 1}
+        detail = ''.join(f', {key} {value}' for key, value in shown.items())
+        values = ' '.join(f'{value:.3g}' for value in self.values)
+        return f'{self.kind} {list(self.joints)} = [{values}]{detail}'
+
+
+@dataclass(frozen=True, eq=False)
+class DrawContext:
+    """What an effect is drawn from."""
+
+    rng: np.random.Generator
+    joints: int
+    circumstances: Circumstances  # Of the visits
+    distance_m: Mapping[str, float]  # Sensor -> mean distance of what it measures, m
+    markers: tuple[str, ...]
+
+    @property
+    def sensors(self) -> tuple[str, ...]:
+        """Names of the sensors."""
+        return tuple(self.distance_m)
+
+    def joint(self, first: int = 1) -> tuple[int]:
+        """Draw a joint, 1-based."""
+        return (int(self.rng.integers(first, self.joints + 1)),)
+
+    def sign(self) -> float:
+        """Draw -1 or 1."""
+        return float(self.rng.choice((-1.0, 1.0)))
+
+    def direction(self, size: int) -> FloatArray:
+        """Draw a unit vector."""
+        values = self.rng.standard_normal(size)
+        return values / np.linalg.norm(values)
+
+
+Draw = Callable[[str, DrawContext], HiddenEffect]
+"""(kind, what to draw from) -> an effect."""
+
+
+def one_value(largest: float, first_joint: int = 1, positive: bool = False) -> Draw:
+    """Draw a joint and, unless physics has only the positive one, a sign."""
+    return lambda kind, context: HiddenEffect(
+        kind,
+        context.joint(first_joint),
+        np.array([largest * (1.0 if positive else context.sign())]),
+    )
+
+
+def no_joint(largest: float) -> Draw:
+    """One value, whose sign is that of physics: nothing is left to draw."""
+    return lambda kind, context: HiddenEffect(kind, (), np.array([largest]))
+
+
+def of_sensor(largest: float, size: int = 1, forms: tuple[str, ...] = ('',)) -> Draw:
+    """Draw a sensor, a form and a direction."""
+
+    def draw(kind: str, context: DrawContext) -> HiddenEffect:
+        detail = {
+            'sensor': str(context.rng.choice(context.sensors)),
+            'form': str(context.rng.choice(forms)),
+        }
+        return HiddenEffect(kind, (), largest * context.direction(size), detail)
+
+    return draw
+
+
+def two_joints(largest: float, forms: tuple[str, ...] = ('',)) -> Draw:
+    """Draw the joint that errs and the one that it follows."""
+
+    def draw(kind: str, context: DrawContext) -> HiddenEffect:
+        joint, by = (int(j) for j in 1 + context.rng.choice(context.joints, 2, replace=False))
+        form = str(context.rng.choice(forms))
+        values = largest * context.direction(2 if form == 'sin/cos' else 1)
+        return HiddenEffect(kind, (joint,), values, {'by': by, 'form': form})
+
+    return draw
+
+
+def at_some_time(draw: Draw) -> Draw:
+    """Draw also the moment from which on the effect is there."""
+
+    def timed(kind: str, context: DrawContext) -> HiddenEffect:
+        effect = draw(kind, context)
+        moment = float(context.rng.uniform(0.15, 0.85) * context.circumstances.time_s[-1])
+        return replace(effect, detail={**effect.detail, 'moment_s': moment})
+
+    return timed
+
+
+Rule = Callable[[HiddenEffect, Deviation, Circumstances], None]
+"""Adds what an effect makes of the circumstances to a deviation."""
+
+
+@dataclass(frozen=True)
+class Part:
+    """A parameter under the name that discovery gives it."""
+
+    # With ``{j}`` for the joint, ``{by}`` for the one that drives it, ``{order}`` for the order of
+    # a wave, ``{sensor}`` for the sensor
+    name: str
+    # The effect's values where this parameter is 1 and all others are 0
+    values: tuple[float, ...] = (1.0,)
+    # What the effect has to have in its detail
+    detail: Mapping[str, str] = field(default_factory=dict)
+
+    def of(self, effect: HiddenEffect) -> dict[str, float]:
+        """Return name and true value, SI units, of an effect of one joint and one order."""
+        if any(effect.detail.get(key) != value for key, value in self.detail.items()):
+            return {}
+        values = np.array(self.values)
+        value = float(values @ effect.values / (values @ values))
+        if abs(value) < 1e-9 * np.linalg.norm(effect.values):
+            return {}
+        words = {'j': effect.joints[0] if effect.joints else 0, **effect.detail}
+        if 'orders' in words:
+            (words['order'],) = words['orders']
+        return {self.name.format(**words): value}
+
+
+@dataclass(frozen=True)
+class HiddenKind:
+    """A kind of effect."""
+
+    # Where it enters, and what drives it
+    place: str
+    driver: str
+    rule: Rule  # Its equation
+    # Draws one of about the largest size that is plausible; `WorldModel.of_size` makes it smaller
+    draw: Draw
+    # What discovery should find; none where it has no parameters that could be compared one by one
+    parts: tuple[Part, ...] = ()
+    answers: tuple[str, ...] = ()  # Names of discovery.json that name it too, beside its own
+
+
+# What a hidden world can hide that has no name of its own in `NAMED`.
 #
 # Each is written from its equation, as there. A search should still find where it lies, what
 # drives it, or report that structure is left there.
@@ -128,18 +352,16 @@ UNNAMED = {
     'foreign_torque': HiddenKind(
         'joint_angle',
         'gravity_torque',
-        'linear',
         _foreign_torque,
         two_joints(4e-4),
         (Part('joint_{j}_by_gravity_torque_of_joint_{by}'),),
     ),
     'creeping_joint': HiddenKind(
-        'joint_angle', 'time', 'linear', _creep, one_value(1e-6, 2), (Part('joint_{j}_by_time'),)
+        'joint_angle', 'time', _creep, one_value(1e-6, 2), (Part('joint_{j}_by_time'),)
     ),
     'slipped_joint': HiddenKind(
         'joint_angle',
         'time',
-        'step',
         _slip,
         at_some_time(one_value(15 * ARC_MINUTE, 2)),
         (Part('joint_{j}_step'),),
@@ -147,25 +369,19 @@ UNNAMED = {
     'warm_joint': HiddenKind(
         'joint_angle',
         'temperature',
-        'linear',
         _warm_joint,
         one_value(5e-4, 2),
         (Part('joint_{j}_by_temperature'),),
     ),
-    'bent_coupling': HiddenKind(
-        'joint_angle', 'angle', 'quadratic', _bent_coupling, two_joints(3e-3)
-    ),
-    'sagging_tool': HiddenKind('marker', 'gravity', 'linear', _sagging_tool, no_joint(3e-3)),
-    'bumped_sensor': HiddenKind(
-        'sensor_frame', 'time', 'step', _bumped_sensor, at_some_time(_draw_bump)
-    ),
+    'bent_coupling': HiddenKind('joint_angle', 'angle', _bent_coupling, two_joints(3e-3)),
+    'sagging_tool': HiddenKind('marker', 'gravity', _sagging_tool, no_joint(3e-3)),
+    'bumped_sensor': HiddenKind('sensor_frame', 'time', _bumped_sensor, at_some_time(_draw_bump)),
     'slipped_marker': HiddenKind(
-        'marker', 'time', 'step', _slipped_marker, at_some_time(_draw_marker_slip)
+        'marker', 'time', _slipped_marker, at_some_time(_draw_marker_slip)
     ),
     'range_distortion': HiddenKind(
         'sensor_frame',
         'position',
-        'quadratic, along the line of sight',
         _range_distortion,
         _about_mean_distance(0.05),
         answers=('sensor_distortion',),
@@ -173,7 +389,6 @@ UNNAMED = {
     'spherical_distortion': HiddenKind(
         'sensor_frame',
         'position',
-        'radial',
         _spherical_distortion,
         _about_mean_distance(0.02),
         # It is the sum of the two.
@@ -182,7 +397,6 @@ UNNAMED = {
     'one_sided_lens': HiddenKind(
         'sensor_frame',
         'position',
-        'one-sided',
         _one_sided_lens,
         of_sensor(0.05, 2),
         answers=('sensor_distortion',),
@@ -352,25 +566,21 @@ NAMED = {
     'joint_compliance': HiddenKind(
         'joint_angle',
         'gravity_torque',
-        'linear',
         _compliance,
         _draw_compliance,
         (Part('compliance_{j}'),),
     ),
     'encoder_eccentricity': HiddenKind(
-        'joint_angle', 'joint_angle', 'sin/cos', _eccentricity, _draw_eccentricity, WAVES
+        'joint_angle', 'joint_angle', _eccentricity, _draw_eccentricity, WAVES
     ),
     'encoder_scale': HiddenKind(
-        'joint_angle', 'joint_angle', 'linear', _scale, one_value(5e-3), (Part('scale_{j}'),)
+        'joint_angle', 'joint_angle', _scale, one_value(5e-3), (Part('scale_{j}'),)
     ),
-    'gear_periodic': HiddenKind(
-        'joint_angle', 'joint_angle', 'sin/cos', _eccentricity, _draw_gear, WAVES
-    ),
-    'joint_error_curve': HiddenKind('joint_angle', 'joint_angle', 'free', _curve, _draw_curve),
+    'gear_periodic': HiddenKind('joint_angle', 'joint_angle', _eccentricity, _draw_gear, WAVES),
+    'joint_error_curve': HiddenKind('joint_angle', 'joint_angle', _curve, _draw_curve),
     'backlash': HiddenKind(
         'joint_angle',
         'approach',
-        'step',
         _backlash,
         one_value(15 * ARC_MINUTE, positive=True),
         (Part('half_backlash_{j}', (2.0,)),),
@@ -378,7 +588,6 @@ NAMED = {
     'settling': HiddenKind(
         'joint_angle',
         'last_move',
-        'linear',
         _settling,
         one_value(3e-3, positive=True),
         (Part('settling_{j}'),),
@@ -386,7 +595,6 @@ NAMED = {
     'joint_coupling': HiddenKind(
         'joint_angle',
         'other_joint',
-        'linear or sin/cos',
         _coupling,
         two_joints(5e-3, ('linear', 'sin/cos')),
         (
@@ -398,7 +606,6 @@ NAMED = {
     'link_length': HiddenKind(
         'link_translation',
         'constant',
-        'constant',
         _link_length,
         _draw_link,
         (
@@ -409,19 +616,17 @@ NAMED = {
     'joint_axis_tilt': HiddenKind(
         'link_rotation',
         'constant',
-        'constant',
         _tilt,
         _draw_tilt,
         tuple(Part(f'tilt_{axis}_{{j}}', unit) for axis, unit in zip('xyz', UNIT)),
     ),
-    'marker_offset': HiddenKind('marker', 'constant', 'constant', _marker, _draw_marker),
+    'marker_offset': HiddenKind('marker', 'constant', _marker, _draw_marker),
     'thermal_growth': HiddenKind(
-        'link_translation', 'temperature', 'linear', _thermal, no_joint(2e-4), (Part('growth'),)
+        'link_translation', 'temperature', _thermal, no_joint(2e-4), (Part('growth'),)
     ),
     'base_compliance': HiddenKind(
         'base_rotation',
         'gravity_moment',
-        'linear',
         _base,
         no_joint(1e-4),
         (Part('base_compliance'),),
@@ -429,7 +634,6 @@ NAMED = {
     'registration_drift': HiddenKind(
         'sensor_frame',
         'time',
-        'linear',
         _drift,
         of_sensor(1e-6, 3),
         tuple(Part(f'drift_{axis}_{{sensor}}', unit) for axis, unit in zip('xyz', UNIT)),
@@ -437,7 +641,6 @@ NAMED = {
     'sensor_scale': HiddenKind(
         'sensor_frame',
         'position',
-        'linear',
         _sensor_scale,
         of_sensor(1e-2, 1, ('all', 'depth')),
         (
@@ -448,7 +651,6 @@ NAMED = {
     'sensor_distortion': HiddenKind(
         'sensor_frame',
         'position',
-        'quadratic, radial',
         _distortion,
         of_sensor(0.2),
         (Part('radial_{sensor}'),),

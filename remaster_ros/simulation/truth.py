@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.transforms import looking_at, quaternion_xyzw, transform
-from remaster_ros.simulation.hidden_effect import HiddenEffect
+from remaster_ros.simulation.hidden_effects import HiddenEffect
 from remaster_ros.types import FloatArray
 
 ROLL_RAD = 0.2

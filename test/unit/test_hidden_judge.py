@@ -14,8 +14,7 @@ from hidden_judge import judge, part_of
 from hidden_tours import visits, world
 from hidden_world import HiddenTruth, HiddenWorld, Noise
 
-from remaster_ros.simulation.hidden_effect import HiddenEffect
-from remaster_ros.simulation.hidden_effects import true_parameters
+from remaster_ros.simulation.hidden_effects import HiddenEffect, true_parameters
 
 STEP = HiddenEffect('slipped_joint', (3,), np.array([1e-3]), {'moment_s': 500.0})
 BENT = HiddenEffect(

@@ -12,8 +12,7 @@ from remaster_ros.session.workcell import read_cell
 from remaster_ros.simulation.arm_motion import ServoPoint
 from remaster_ros.simulation.effect_sampling import RANDOM, EffectSpec, hide
 from remaster_ros.simulation.hidden_arm import ChainArm, WrongArm
-from remaster_ros.simulation.hidden_effect import HiddenEffect
-from remaster_ros.simulation.hidden_effects import NAMED, UNNAMED
+from remaster_ros.simulation.hidden_effects import NAMED, UNNAMED, HiddenEffect
 from remaster_ros.simulation.setup import make_world
 from remaster_ros.simulation.truth import (
     SessionTruth,
