@@ -24,7 +24,7 @@ from remaster_ros.importing.standstills import (
 )
 from remaster_ros.importing.units import LENGTHS
 from remaster_ros.kinematics.serial_chain import SerialChain
-from remaster_ros.session.bag import BagReader
+from remaster_ros.session.bag import BagReader, jazzy_types
 from remaster_ros.types import FARTHEST_M, FloatArray
 
 JOINT_STATE = 'sensor_msgs/msg/JointState'
@@ -105,40 +105,30 @@ def _messages(path: Path, seen: dict[str, str]) -> Iterator[tuple[str, str, Any,
     """Give the joint states and points of a bag of any kind; `seen` gets its topics."""
     # Imported here: it takes a quarter of a second, which tables need not wait for.
     from rosbags.highlevel import AnyReader
-    from rosbags.typesys import Stores, get_typestore
 
-    types = get_typestore(Stores.ROS2_JAZZY)
     wanted = (JOINT_STATE, POINT)
     if path.suffix == '.mcap' or (path.is_dir() and any(path.glob('*.mcap'))):
         bag = BagReader(path)
         seen.update(bag.topics)
         for topic, kind, data, stamp_ns in bag:
             if kind in wanted:
-                try:
-                    message = types.deserialize_cdr(data, kind)
-                except Exception as error:
-                    raise _damaged(path, error) from None
-                yield topic, kind, message, 1e-9 * stamp_ns
+                yield topic, kind, bag.decoded(kind, data), 1e-9 * stamp_ns
         return
     folder = path.parent if path.suffix == '.db3' else path
     # rosbags raises whatever bad bytes lead to.
     try:
-        with AnyReader([folder], default_typestore=types) as reader:
+        with AnyReader([folder], default_typestore=jazzy_types()) as reader:
             seen.update({c.topic: c.msgtype for c in reader.connections})
             kept = [c for c in reader.connections if c.msgtype in wanted]
             for connection, stamp_ns, data in reader.messages(connections=kept):
                 message = reader.deserialize(data, connection.msgtype)
                 yield connection.topic, connection.msgtype, message, 1e-9 * stamp_ns
     except Exception as error:
-        raise _damaged(path, error) from None
-
-
-def _damaged(path: Path, error: Exception) -> InputError:
-    what = ' '.join(str(error).split())[:120]
-    return InputError(
-        f'{path}: not a bag that can be read ({type(error).__name__}: {what}); take another copy, '
-        'or convert it with "ros2 bag convert"'
-    )
+        what = ' '.join(str(error).split())[:120]
+        raise InputError(
+            f'{path}: not a bag that can be read ({type(error).__name__}: {what}); take another '
+            'copy, or convert it with "ros2 bag convert"'
+        ) from None
 
 
 def _topics(seen: dict[str, str]) -> str:

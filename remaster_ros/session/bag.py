@@ -9,9 +9,10 @@ import zlib
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from functools import cache
 from io import BytesIO
 from pathlib import Path
-from typing import IO, Any, NamedTuple
+from typing import IO, TYPE_CHECKING, Any, NamedTuple
 
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
@@ -22,6 +23,9 @@ from remaster_ros.errors import InputError
 from remaster_ros.session.files import reason
 from remaster_ros.session.manifest import check_file, read_manifest
 from remaster_ros.session.yaml_records import dump_yaml
+
+if TYPE_CHECKING:
+    from rosbags.typesys.store import Typestore
 
 METADATA_FILE = 'metadata.yaml'
 
@@ -239,6 +243,15 @@ RECORDED = {
 whoever publishes it: a player that takes a bag as it is must not drive an arm."""
 
 
+@cache
+def jazzy_types() -> Typestore:
+    """Return the message types of ROS 2 Jazzy."""
+    # Imported here: it takes a quarter of a second.
+    from rosbags.typesys import Stores, get_typestore
+
+    return get_typestore(Stores.ROS2_JAZZY)
+
+
 def live_name(topic: str) -> str:
     """Return the name that a topic of a bag had when it was recorded."""
     return _LIVE.get(topic, topic)
@@ -315,6 +328,18 @@ class BagReader:
         """Yield the messages in the order they were recorded."""
         for file in self.files:
             yield from self.messages_of(file)
+
+    def decoded(self, msgtype: str, cdr: bytes) -> Any:
+        """Return a message; an `InputError` names the bag where its bytes are none."""
+        try:
+            return jazzy_types().deserialize_cdr(cdr, msgtype)
+        # rosbags raises whatever bad bytes lead to.
+        except Exception as error:
+            what = ' '.join(str(error).split())[:120]
+            raise InputError(
+                f'{self.path}: a damaged message ({type(error).__name__}: {what}); take another '
+                'copy of the bag'
+            ) from None
 
     def messages_of(self, file: FileMetadata, first_look: bool = False) -> Iterator[BagMessage]:
         """Yield the messages of one of `files`; the first look also notes where it breaks off."""

@@ -114,11 +114,7 @@ def record_from_bag(
     """
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise InputError(f'{out}: there is something already; name a new folder for the session')
-    # Imported here: it takes a quarter of a second.
-    from rosbags.typesys import Stores, get_typestore
-
-    types = get_typestore(Stores.ROS2_JAZZY)
-    began, from_bag = _first_start(bag, types)
+    began, from_bag = _first_start(bag)
     cell = cell or from_bag
     if cell is None:
         raise InputError(
@@ -135,10 +131,10 @@ def record_from_bag(
         if number % 1000 == 0:
             progress(number / total)
         if topic == EVENTS:
-            for record in _records(bag, types, data, kind):
+            for record in _records(bag, kind, data):
                 recorder.take_record(record)
         elif topic in take:
-            take[topic](_decoded(bag, types, data, kind))
+            take[topic](bag.decoded(kind, data))
         else:
             continue
         recorder.look()
@@ -170,33 +166,21 @@ def _absolute(topic: str) -> str:
     return f'/{topic.lstrip("/")}'
 
 
-def _decoded(bag: BagReader, types: Any, data: bytes, kind: str) -> Any:
-    try:
-        return types.deserialize_cdr(data, kind)
-    # rosbags raises whatever bad bytes lead to.
-    except Exception as error:
-        what = ' '.join(str(error).split())[:120]
-        raise InputError(
-            f'{bag.path}: a damaged message ({type(error).__name__}: {what}); take another copy '
-            'of the bag'
-        ) from None
-
-
-def _records(bag: BagReader, types: Any, data: bytes, kind: str) -> list[events.EventRecord]:
+def _records(bag: BagReader, kind: str, data: bytes) -> list[events.EventRecord]:
     """Return the record in a message; one of no program that is known here is left out."""
     try:
-        return [events.decode(_decoded(bag, types, data, kind).data)]
+        return [events.decode(bag.decoded(kind, data).data)]
     except InputError as error:
         log.warning('%s: %s', bag.path, error)
         return []
 
 
-def _first_start(bag: BagReader, types: Any) -> tuple[events.RecorderBegan, Workcell | None]:
+def _first_start(bag: BagReader) -> tuple[events.RecorderBegan, Workcell | None]:
     """Return the first start of a recorder in a bag, and its cell."""
     for topic, kind, data, _ in bag:
         if topic != EVENTS:
             continue
-        for record in _records(bag, types, data, kind):
+        for record in _records(bag, kind, data):
             if isinstance(record.body, events.RecorderBegan):
                 return record.body, _cell(bag, record.body.cell)
     raise InputError(

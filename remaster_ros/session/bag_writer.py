@@ -12,7 +12,6 @@ import os
 from functools import cache
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING
 
 from mcap.writer import CompressionType, Writer
 
@@ -23,6 +22,7 @@ from remaster_ros.session.bag import (
     BagReader,
     FileMetadata,
     TopicMetadata,
+    jazzy_types,
     metadata_text,
     qos_text,
 )
@@ -37,23 +37,13 @@ from remaster_ros.session.files import (
 from remaster_ros.session.manifest import add_to_manifest, read_manifest
 from remaster_ros.version import __version__
 
-if TYPE_CHECKING:
-    from rosbags.typesys.store import Typestore
-
-
-@cache
-def _jazzy() -> Typestore:
-    from rosbags.typesys import Stores, get_typestore
-
-    return get_typestore(Stores.ROS2_JAZZY)
-
 
 @cache
 def definition_of(msgtype: str) -> tuple[str, str]:
     """Return the message definition of one of Jazzy's types and its RIHS01 hash."""
     from rosbags.typesys.store import TypesysError
 
-    types = _jazzy()
+    types = jazzy_types()
     try:
         definition, _ = types.generate_msgdef(msgtype, ros_version=2)
         return definition, types.hash_rihs01(msgtype)

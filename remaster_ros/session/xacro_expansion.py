@@ -1,8 +1,8 @@
 """Expand one xacro file, in a process of its own, which `robot_description` starts and bounds.
 
-xacro's places where a file does something are replaced: expressions (`xacro_expressions`),
-substitutions ``$(…)``, which files are read, and XML that declares entities. With trust only the
-way to find packages is, as outside of ROS there is no ament_index_python.
+xacro's places where a file does something are replaced: expressions, substitutions ``$(…)``, which
+files are read, and XML that declares entities. With trust only the way to find packages is, as
+outside of ROS there is no ament_index_python.
 """
 
 from __future__ import annotations
