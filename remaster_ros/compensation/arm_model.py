@@ -42,30 +42,17 @@ BLOCK_ROWS = 2_000
 
 @dataclass(frozen=True, eq=False)
 class Function:
-    """A function of one driver, linear in its coefficients.
+    """A function of one driver, linear in its coefficients."""
 
-    Attributes
-    ----------
-    driver
-        What it depends on; ``joint`` is the index of the joint whose angle or torque it is.
-    joint
-        -1 where the driver belongs to none.
-    form
-        Of the m coefficients' m features.
-    order
-        Of a sine or cosine: cycles per turn.
-    knots, degree
-        Of splines, in the driver's unit; beyond the ends the end value holds.
-    turn_start
-        The driver is brought to the turn that begins there, rad; NaN where it is not.
-    """
-
+    # What it depends on; ``joint`` is the index of the joint whose angle or torque it is
     driver: Driver
-    form: Form
-    joint: int = -1
-    order: int = 0
+    form: Form  # Of the m coefficients' m features
+    joint: int = -1  # -1 where the driver belongs to none
+    order: int = 0  # Of a sine or cosine: cycles per turn
+    # Of splines, in the driver's unit; beyond the ends the end value holds
     knots: FloatArray = field(default_factory=lambda: np.zeros(0))
     degree: int = 0
+    # The driver is brought to the turn that begins there, rad; NaN where it is not
     turn_start: float = np.nan
 
     @property
@@ -111,41 +98,23 @@ class Function:
 
 @dataclass(frozen=True, eq=False)
 class JointTerm:
-    """What adds to the angle of a joint beside its zero-offset.
+    """What adds to the angle of a joint beside its zero-offset."""
 
-    Attributes
-    ----------
-    joint
-        Its index.
-    effect
-        The physical cause, as in discovery.json.
-    function, coefficients
-        Of its driver, rad, (m,).
-    """
-
-    joint: int
-    effect: str
+    joint: int  # Its index
+    effect: str  # The physical cause, as in discovery.json
+    # Of its driver, rad, (m,)
     function: Function
     coefficients: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
 class BaseTerm:
-    """What turns the whole arm about the origin of R.
+    """What turns the whole arm about the origin of R."""
 
-    Attributes
-    ----------
-    effect
-        The physical cause.
-    function
-        Of one coefficient; of ``gravity_moment`` each axis of R has its own moment.
-    coefficients
-        About x, y and z of R, rad per unit of the function, (3,).
-    """
-
-    effect: str
+    effect: str  # The physical cause
+    # Of one coefficient; of ``gravity_moment`` each axis of R has its own moment
     function: Function
-    coefficients: FloatArray
+    coefficients: FloatArray  # About x, y and z of R, rad per unit of the function, (3,)
 
 
 Term = TypeVar('Term', JointTerm, BaseTerm)
@@ -153,18 +122,10 @@ Term = TypeVar('Term', JointTerm, BaseTerm)
 
 @dataclass(frozen=True, eq=False)
 class Geometry:
-    """Shifts and turns of the joints' origins; the last row is the tool's.
+    """Shifts and turns of the joints' origins; the last row is the tool's."""
 
-    Attributes
-    ----------
-    shifts
-        In the frame of the link that the joint before moves, m, (k + 1, 3).
-    turns
-        Rotation vectors in the joint's frame, rad, (k + 1, 3).
-    """
-
-    shifts: FloatArray
-    turns: FloatArray
+    shifts: FloatArray  # In the frame of the link that the joint before moves, m, (k + 1, 3)
+    turns: FloatArray  # Rotation vectors in the joint's frame, rad, (k + 1, 3)
 
     @classmethod
     def none(cls, joints: int) -> Geometry:
@@ -179,27 +140,13 @@ class Geometry:
 
 @dataclass(frozen=True, eq=False)
 class Drivers:
-    """Values of the drivers in n rows.
+    """Values of the drivers in n rows."""
 
-    Attributes
-    ----------
-    q
-        Reported angles, rad, (n, k).
-    warming
-        Temperature above that at which nothing has grown, K, (n,).
-    torque
-        Gravity's, N m, (n, k); zeros where no term takes it.
-    base_moment
-        Gravity's about the origin of R, N m, (n, 3); likewise.
-    moment
-        Gravity's on each link about its joint, N m, (n, k, 3); likewise.
-    """
-
-    q: FloatArray
-    warming: FloatArray
-    torque: FloatArray
-    base_moment: FloatArray
-    moment: FloatArray
+    q: FloatArray  # Reported angles, rad, (n, k)
+    warming: FloatArray  # Temperature above that at which nothing has grown, K, (n,)
+    torque: FloatArray  # Gravity's, N m, (n, k); zeros where no term takes it
+    base_moment: FloatArray  # Gravity's about the origin of R, N m, (n, 3); likewise
+    moment: FloatArray  # Gravity's on each link about its joint, N m, (n, k, 3); likewise
 
     def of(self, function: Function) -> FloatArray:
         """Return the value of a function's driver, (n,)."""
@@ -214,69 +161,37 @@ class Drivers:
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """Where the arm is in n rows.
+    """Where the arm is in n rows."""
 
-    Attributes
-    ----------
-    drivers
-        Values of the drivers.
-    angles
-        True joint angles, rad, (n, k).
-    before, frames
-        Frame of each joint before and after its turn, in R, (n, k, 4, 4).
-    tool
-        T_R_T, (n, 4, 4).
-    """
-
-    drivers: Drivers
-    angles: FloatArray
+    drivers: Drivers  # Values of the drivers
+    angles: FloatArray  # True joint angles, rad, (n, k)
+    # Frame of each joint before and after its turn, in R, (n, k, 4, 4)
     before: FloatArray
     frames: FloatArray
-    tool: FloatArray
+    tool: FloatArray  # T_R_T, (n, 4, 4)
 
 
 @dataclass(frozen=True, eq=False)
 class ArmModel:
-    """An arm of k joints as it was found to be.
+    """An arm of k joints as it was found to be."""
 
-    Attributes
-    ----------
-    chain
-        The nominal robot; its masses are those that the torques were computed with.
-    joint_offsets
-        δ, rad, (k,).
-    joint_terms, base_terms
-        See there.
-    geometry, growth
-        Constant, and per kelvin.
-    lateral_compliance
-        Of each link's bearing across the joint's axis, rad/(N m), (k,).
-    reference_c
-        Temperature at which nothing has grown, °C; NaN where nothing does.
-    mean_c
-        That of the measurements, taken where none is given, °C.
-    T_R_N
-        Registrations that belong to the offsets, by sensor.
-    markers
-        Likewise, in T, m.
-    root
-        U with U' U the covariance of `parameter_names`, (r, p).
-    widening
-        How many times larger standard deviations were found on poses left out than in theory.
-    """
-
+    # The nominal robot; its masses are those that the torques were computed with
     chain: SerialChain
-    joint_offsets: FloatArray
+    joint_offsets: FloatArray  # δ, rad, (k,)
+    # see `JointTerm`, `BaseTerm`
     joint_terms: tuple[JointTerm, ...]
     base_terms: tuple[BaseTerm, ...]
+    # Constant, and per kelvin
     geometry: Geometry
     growth: Geometry
+    # Of each link's bearing across the joint's axis, rad/(N m), (k,)
     lateral_compliance: FloatArray
-    reference_c: float
-    mean_c: float
-    T_R_N: Mapping[str, FloatArray]
-    markers: Mapping[str, FloatArray]
-    root: FloatArray
+    reference_c: float  # Temperature at which nothing has grown, °C; NaN where nothing does
+    mean_c: float  # That of the measurements, taken where none is given, °C
+    T_R_N: Mapping[str, FloatArray]  # Registrations that belong to the offsets, by sensor
+    markers: Mapping[str, FloatArray]  # Likewise, in T, m
+    root: FloatArray  # U with U' U the covariance of `parameter_names`, (r, p)
+    # How many times larger standard deviations were found on poses left out than in theory
     widening: float
 
     @classmethod

@@ -27,24 +27,13 @@ TABLE_LIMIT = 1_000_000
 
 @dataclass(frozen=True, eq=False)
 class CheckVisits:
-    """Configurations in the order of the visits, and what a check of them finds.
+    """Configurations in the order of the visits, and what a check of them finds."""
 
-    Attributes
-    ----------
-    joint_names
-        Of k joints.
-    q
-        rad, (n, k).
-    noise_m
-        That the cell file states for its sensor, of one axis, m.
-    detectable_m
-        The smallest change of each joint that one check finds at that noise, m at the tool, (k,);
-        NaN where a moved sensor looks the same.
-    """
-
-    joint_names: tuple[str, ...]
-    q: FloatArray
-    noise_m: float
+    joint_names: tuple[str, ...]  # Of k joints
+    q: FloatArray  # rad, (n, k)
+    noise_m: float  # That the cell file states for its sensor, of one axis, m
+    # The smallest change of each joint that one check finds at that noise, m at the tool, (k,);
+    # NaN where a moved sensor looks the same
     detectable_m: FloatArray
 
     def table(self) -> str:

@@ -58,22 +58,13 @@ TELLING = 20.0
 
 @dataclass(frozen=True, eq=False)
 class Measured:
-    """A check: n readings of k joints.
+    """A check: n readings of k joints."""
 
-    Attributes
-    ----------
-    q
-        Reported joints, rad, (n, k).
-    sensor, marker
-        Names, (n,).
-    position
-        In the sensor's frame, m, (n, 3).
-    """
-
-    q: FloatArray
+    q: FloatArray  # Reported joints, rad, (n, k)
+    # Names, (n,)
     sensor: tuple[str, ...]
     marker: tuple[str, ...]
-    position: FloatArray
+    position: FloatArray  # In the sensor's frame, m, (n, 3)
 
     def merged(self) -> Measured:
         """Return the mean of the readings of each pose by each sensor of each marker."""
@@ -118,40 +109,23 @@ class Measured:
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """What a check says beside where its sensors stand.
+    """What a check says beside where its sensors stand."""
 
-    Attributes
-    ----------
-    rest
-        Errors that a moved sensor cannot explain, m, (3 n,).
-    joints, tool
-        What a radian of each joint, and a metre of each marker, adds, (3 n, k), (3 n, 3 m).
-    unsure
-        What one standard deviation of each thing not known of the correction adds, (3 n, r).
-    freedom
-        How many numbers of the rest are free.
-    lever_m
-        How far a radian of each joint moves the markers, RMS, m, (k,).
-    T_R_N
-        Where each sensor stands.
-    """
-
-    rest: FloatArray
+    rest: FloatArray  # Errors that a moved sensor cannot explain, m, (3 n,)
+    # What a radian of each joint, and a metre of each marker, adds, (3 n, k), (3 n, 3 m)
     joints: FloatArray
     tool: FloatArray
+    # What one standard deviation of each thing not known of the correction adds, (3 n, r)
     unsure: FloatArray
-    freedom: int
-    lever_m: FloatArray
-    T_R_N: Mapping[str, FloatArray]
+    freedom: int  # How many numbers of the rest are free
+    lever_m: FloatArray  # How far a radian of each joint moves the markers, RMS, m, (k,)
+    T_R_N: Mapping[str, FloatArray]  # Where each sensor stands
 
 
 def seen(model: ArmModel, measured: Measured) -> Seen:
     """Compare a check with the correction's model.
 
-    Raises
-    ------
-    InsufficientDataError
-        Too few poses to fit where the sensors stand.
+    Raises InsufficientDataError: too few poses to fit where the sensors stand.
     """
     n, k = measured.q.shape
     state = model.state(measured.q)
@@ -224,21 +198,12 @@ def _is_seen(joints: FloatArray, lever_m: FloatArray) -> BoolArray:
 
 @dataclass(frozen=True)
 class Change:
-    """Whether the mean of a series of T results has changed.
+    """Whether the mean of a series of T results has changed."""
 
-    Attributes
-    ----------
-    evidence
-        Of the e-process.
-    at
-        The first result after the change; 0 where there is none to name.
-    size, std, half
-        Of the change where it is most likely, its standard deviation and half of its 95 %
-        interval; infinite where two results do not tell.
-    """
-
-    evidence: float
-    at: int
+    evidence: float  # Of the e-process
+    at: int  # The first result after the change; 0 where there is none to name
+    # Of the change where it is most likely, its standard deviation and half of its 95 % interval;
+    # infinite where two results do not tell
     size: float
     std: float
     half: float
@@ -250,15 +215,9 @@ def bayes_factors(x: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     Both means and the variance are integrated out under their invariant priors; the size of the
     change has a normal prior of `PRIOR_STD` standard deviations of a result.
 
-    Parameters
-    ----------
-    x
-        Series, (…, T), T >= 2.
-
-    Returns
-    -------
-    odds, size, left
-        (…, T - 1) each, for a change before result 1, 2, …; `left` is a sum of squares.
+    ``x``: series, (…, T), T >= 2.
+    Returns odds, size, left: (…, T - 1) each, for a change before result 1, 2, …; `left` is a sum
+    of squares.
     """
     T = x.shape[-1]
     j = np.arange(1.0, T)
@@ -348,43 +307,22 @@ class JointCheck:
 
 @dataclass(frozen=True)
 class Checked:
-    """What all checks so far say.
+    """What all checks so far say."""
 
-    Attributes
-    ----------
-    verdict
-        Of the newest check, with all before it.
-    evidence
-        Mean over joints and markers, of the e-process.
-    joints
-        One of each joint, base to tip.
-    changed
-        Indices of the joints that the change may be of; they look alike where there are several.
-    since
-        Index of the first check after the change; None where none is named.
-    tool_moved
-        A marker moved on the tool, rather than a joint.
-    moved_m
-        By how much the sensors see the markers elsewhere than in the check before (the session
-        of the correction, for the first), RMS.
-    again
-        Whether to check again at once.
-    noise_m
-        Of a reading, per axis.
-    series_m
-        What each check says of each joint, at the tool, m, (T, k): where it alone has changed, or
-        beside what is named.
-    """
-
-    verdict: Verdict
-    evidence: float
-    joints: tuple[JointCheck, ...]
+    verdict: Verdict  # Of the newest check, with all before it
+    evidence: float  # Mean over joints and markers, of the e-process
+    joints: tuple[JointCheck, ...]  # One of each joint, base to tip
+    # Indices of the joints that the change may be of; they look alike where there are several
     changed: tuple[int, ...]
-    since: int | None
-    tool_moved: bool
+    since: int | None  # Index of the first check after the change; None where none is named
+    tool_moved: bool  # A marker moved on the tool, rather than a joint
+    # By how much the sensors see the markers elsewhere than in the check before (the session of
+    # the correction, for the first), RMS
     moved_m: float
-    again: bool
-    noise_m: float
+    again: bool  # Whether to check again at once
+    noise_m: float  # Of a reading, per axis
+    # What each check says of each joint, at the tool, m, (T, k): where it alone has changed, or
+    # beside what is named
     series_m: FloatArray
 
 
@@ -584,22 +522,10 @@ def chosen_poses(
     Configurations are exchanged one by one, as long as the least information on a joint, divided
     by the square of its lever, grows.
 
-    Parameters
-    ----------
-    q
-        To choose from, rad, (c, k), c >= count.
-    sensor, marker
-        What is measured by what.
-    count
-        How many.
-    rng
-        Draws the first ones, of five tries.
-
-    Returns
-    -------
-    rows, sizes
-        Of `q`, (count,); the smallest change of each joint that is found with a noise of 1 m per
-        axis, m at the tool, (k,), NaN where a moved sensor looks the same.
+    ``q``: to choose from, rad, (c, k), c >= count; ``sensor, marker``: what is measured by what;
+    ``count``: how many; ``rng``: draws the first ones, of five tries.
+    Returns rows, sizes: of `q`, (count,); the smallest change of each joint that is found with a
+    noise of 1 m per axis, m at the tool, (k,), NaN where a moved sensor looks the same.
     """
     k = q.shape[1]
     state = model.state(q)

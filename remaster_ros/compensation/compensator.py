@@ -33,24 +33,14 @@ MOST_STEPS_BACK = 60
 
 @dataclass(frozen=True, eq=False)
 class Correction:
-    """What was done to n rows of wanted joint angles.
+    """What was done to n rows of wanted joint angles."""
 
-    Attributes
-    ----------
-    command
-        What to command, rad, (n, k).
-    residual_m, residual_rad
-        How far the tool remains from where it is wanted, if the model is right, (n,).
-    faded
-        Rows near a singularity, in which not all of the pose is corrected, (n,).
-    outside_range
-        Rows beyond the angles at which a curve was measured: its end value holds, (n,).
-    """
-
-    command: FloatArray
+    command: FloatArray  # What to command, rad, (n, k)
+    # How far the tool remains from where it is wanted, if the model is right, (n,)
     residual_m: FloatArray
     residual_rad: FloatArray
-    faded: BoolArray
+    faded: BoolArray  # Rows near a singularity, in which not all of the pose is corrected, (n,)
+    # Rows beyond the angles at which a curve was measured: its end value holds, (n,)
     outside_range: BoolArray
 
 

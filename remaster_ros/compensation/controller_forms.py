@@ -78,28 +78,15 @@ class Part:
 
 @dataclass(frozen=True, eq=False)
 class Held:
-    """What of a correction a form holds.
+    """What of a correction a form holds."""
 
-    Attributes
-    ----------
-    model
-        The arm that it makes of the nominal one.
-    parts
-        What it does not hold.
-    rms_mm, max_mm
-        At the marker after all, over the measured range.
-    never
-        What no form corrects.
-    nearer
-        Which file's export is nearer to what was measured; ''.
-    """
-
-    model: ArmModel
-    parts: tuple[Part, ...]
+    model: ArmModel  # The arm that it makes of the nominal one
+    parts: tuple[Part, ...]  # What it does not hold
+    # At the marker after all, over the measured range
     rms_mm: float
     max_mm: float
-    never: tuple[LeftPart, ...] = ()
-    nearer: str = ''
+    never: tuple[LeftPart, ...] = ()  # What no form corrects
+    nearer: str = ''  # Which file's export is nearer to what was measured; ''
 
     @property
     def words(self) -> list[str]:

@@ -45,32 +45,19 @@ _LIMITS = {
 
 @dataclass(frozen=True, eq=False)
 class ZeroOffsets:
-    """Zero-offsets of k joints as they are written for a controller.
+    """Zero-offsets of k joints as they are written for a controller."""
 
-    Attributes
-    ----------
-    urdf, chain
-        The nominal robot, text and joints.
-    joint_offsets, std
-        rad, m of joints that slide, (k,).
-    identifiable
-        Whether the data determine each, (k,); the others are not applied.
-    why
-        Of those that are not.
-    controller
-        How the pad writes the joints; None where it writes them as the URDF, in degrees.
-    check_first
-        What must be checked before anything is loaded, a line each.
-    """
-
+    # The nominal robot, text and joints
     urdf: str
     chain: SerialChain
+    # rad, m of joints that slide, (k,)
     joint_offsets: FloatArray
     std: FloatArray
-    identifiable: BoolArray
-    why: Sequence[str]
+    identifiable: BoolArray  # Whether the data determine each, (k,); the others are not applied
+    why: Sequence[str]  # Of those that are not
+    # How the pad writes the joints; None where it writes them as the URDF, in degrees
     controller: Controller | None = None
-    check_first: Sequence[str] = ()
+    check_first: Sequence[str] = ()  # What must be checked before anything is loaded, a line each
 
     @classmethod
     def of(cls, result: FitResult) -> ZeroOffsets:

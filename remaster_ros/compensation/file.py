@@ -188,24 +188,12 @@ class CompensationPart(Struct):
 
 @dataclass(frozen=True, eq=False)
 class Compensation:
-    """What a file holds.
+    """What a file holds."""
 
-    Attributes
-    ----------
-    path
-        Where it was read from.
-    compensator
-        The correction, ready to use.
-    content
-        As it stands in the file.
-    sha256
-        Of the file.
-    """
-
-    path: Path
-    compensator: Compensator
-    content: CompensationPart
-    sha256: str
+    path: Path  # Where it was read from
+    compensator: Compensator  # The correction, ready to use
+    content: CompensationPart  # As it stands in the file
+    sha256: str  # Of the file
 
     @property
     def model(self) -> ArmModel:

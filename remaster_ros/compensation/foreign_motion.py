@@ -49,38 +49,21 @@ EVERY_S = 0.02
 
 @dataclass(frozen=True)
 class Trajectory:
-    """A planner's trajectory: n points of k joints in the arm's order.
+    """A planner's trajectory: n points of k joints in the arm's order."""
 
-    Attributes
-    ----------
-    times_s
-        From its start, (n,).
-    positions, velocities
-        rad and rad/s, (n, k); velocities are None where the controller draws lines.
-    """
-
-    times_s: FloatArray
+    times_s: FloatArray  # From its start, (n,)
+    # rad and rad/s, (n, k); velocities are None where the controller draws lines
     positions: FloatArray
     velocities: FloatArray | None
 
 
 @dataclass(frozen=True)
 class Passed:
-    """What is sent in place of a planner's trajectory.
+    """What is sent in place of a planner's trajectory."""
 
-    Attributes
-    ----------
-    admitted
-        What the gate has let pass.
-    end_s
-        When it ends, from its start.
-    notes
-        What a person is to know of it, a line each.
-    """
-
-    admitted: Admitted
-    end_s: float
-    notes: tuple[str, ...] = ()
+    admitted: Admitted  # What the gate has let pass
+    end_s: float  # When it ends, from its start
+    notes: tuple[str, ...] = ()  # What a person is to know of it, a line each
 
 
 class Present:
@@ -141,10 +124,7 @@ class Present:
 class TrueAngles:
     """Angles of the nominal arm with its tool where the arm has it, report by report.
 
-    Parameters
-    ----------
-    compensator
-        The correction.
+    ``compensator``: the correction.
     """
 
     def __init__(self, compensator: Compensator) -> None:
@@ -191,25 +171,11 @@ def passed_on(
     `trajectories.corrected_trajectory` does. While it moves the points alone are corrected: how
     the controller comes to the first of them is its own.
 
-    Parameters
-    ----------
-    wanted
-        The trajectory, which begins at once; of no points: the arm is to be held.
-    arm
-        Where it is now.
-    gate
-        Checks what is sent.
-    correction
-        May be one that corrects nothing.
-    tolerance_m
-        How far the tool may leave the wanted path between points, m.
-    temperature_c
-        Of the arm.
-
-    Raises
-    ------
-    InputError
-        The trajectory is refused; one line.
+    ``wanted``: the trajectory, which begins at once; of no points: the arm is to be held; ``arm``:
+    where it is now; ``gate``: checks what is sent; ``correction``: may be one that corrects
+    nothing; ``tolerance_m``: how far the tool may leave the wanted path between points, m;
+    ``temperature_c``: of the arm.
+    Raises InputError: the trajectory is refused; one line.
     """
     if not len(wanted.times_s):
         return Passed(gate.admit((), arm.q, arm.velocity), 0.0)

@@ -40,25 +40,15 @@ SEED = 22
 
 @dataclass(frozen=True, eq=False)
 class Commands:
-    """What is commanded for n wanted configurations.
+    """What is commanded for n wanted configurations."""
 
-    Attributes
-    ----------
-    command, change
-        What to command, and how much that is from what was wanted, rad, (n, k); of a refused
-        row the command is not a number.
-    refused
-        Row -> why it must not be commanded.
-    notes
-        What a person is to know of a row, a line each.
-    faded, outside_range
-        As of a `compensator.Correction`, (n,).
-    """
-
+    # What to command, and how much that is from what was wanted, rad, (n, k); of a refused row the
+    # command is not a number
     command: FloatArray
     change: FloatArray
-    refused: dict[int, str]
-    notes: tuple[str, ...]
+    refused: dict[int, str]  # Row -> why it must not be commanded
+    notes: tuple[str, ...]  # What a person is to know of a row, a line each
+    # As of a `compensator.Correction`, (n,)
     faded: BoolArray
     outside_range: BoolArray
 

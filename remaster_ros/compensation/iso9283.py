@@ -24,18 +24,12 @@ CYCLES = 30
 
 @dataclass(frozen=True, eq=False)
 class Visited:
-    """What the sensor and the marker that saw most say of repeated visits.
+    """What the sensor and the marker that saw most say of repeated visits."""
 
-    Attributes
-    ----------
-    visits
-        Of each configuration, most first, (p,). Readings one after the other are one visit.
-    accuracy_m, repeatability_m
-        AP and RP of each of the configurations with `CYCLES` visits, m; empty where fewer than
-        `POSES` have so many.
-    """
-
+    # Of each configuration, most first, (p,). Readings one after the other are one visit.
     visits: tuple[int, ...]
+    # AP and RP of each of the configurations with `CYCLES` visits, m; empty where fewer than
+    # `POSES` have so many
     accuracy_m: FloatArray
     repeatability_m: FloatArray
 

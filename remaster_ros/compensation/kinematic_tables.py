@@ -37,24 +37,14 @@ TURNS = ('theta', 'alpha', 'beta', 'roll', 'pitch', 'yaw')
 
 @dataclass(frozen=True)
 class Row:
-    """One number of a table.
+    """One number of a table."""
 
-    Attributes
-    ----------
-    table
-        ``dh``, ``hayati`` or ``poe``.
-    part
-        A joint, ``base``, ``end`` or ``home``.
-    parameter, unit
-        Its name and unit.
-    nominal, delta
-        Of the nominal robot, and what is to be added.
-    """
-
-    table: str
-    part: str
+    table: str  # ``dh``, ``hayati`` or ``poe``
+    part: str  # A joint, ``base``, ``end`` or ``home``
+    # Its name and unit
     parameter: str
     unit: str
+    # Of the nominal robot, and what is to be added
     nominal: float
     delta: float
 

@@ -31,33 +31,21 @@ _STEP_MM = 10.0
 
 @dataclass(frozen=True)
 class MasteringStep:
-    """One joint to be set on the pad.
+    """One joint to be set on the pad."""
 
-    Attributes
-    ----------
-    joint, pad_name
-        Its name in the URDF and on the pad.
-    unit
-        Of what the pad shows; mm of a joint that slides.
-    determined
-        False where the joint's own zero stays, and what the pad shows changes with another joint.
-    offset, std
-        Of the URDF's joint, in degrees; in mm of a joint that slides.
-    drive_to, set_to
-        What the pad shows in the place in which it is set, before and after, in `unit`.
-    zero_in_reach
-        Whether the joint can be driven to where the pad shows 0 afterwards.
-    """
-
+    # Its name in the URDF and on the pad
     joint: str
     pad_name: str
-    unit: AngleUnit | Literal['mm']
+    unit: AngleUnit | Literal['mm']  # Of what the pad shows; mm of a joint that slides
+    # False where the joint's own zero stays, and what the pad shows changes with another joint
     determined: bool
+    # Of the URDF's joint, in degrees; in mm of a joint that slides
     offset: float
     std: float
+    # What the pad shows in the place in which it is set, before and after, in `unit`
     drive_to: float
     set_to: float
-    zero_in_reach: bool
+    zero_in_reach: bool  # Whether the joint can be driven to where the pad shows 0 afterwards
 
     @property
     def slides(self) -> bool:

@@ -50,66 +50,39 @@ _DRIVERS: dict[str, Driver] = {
 
 @dataclass(frozen=True)
 class Slot:
-    """Where in an `ArmModel` some coefficients stand.
+    """Where in an `ArmModel` some coefficients stand."""
 
-    Attributes
-    ----------
-    kind
-        ``joint``, ``base``, ``geometry``, ``growth`` or ``lateral``.
-    joint
-        Its index; k for the tool.
-    effect, function
-        Of a term; None for the others.
-    """
-
-    kind: str
-    joint: int = -1
+    kind: str  # ``joint``, ``base``, ``geometry``, ``growth`` or ``lateral``
+    joint: int = -1  # Its index; k for the tool
+    # Of a term; None for the others
     effect: str = ''
     function: Function | None = None
 
 
 @dataclass(frozen=True)
 class NotCorrected:
-    """What a correction leaves as it is.
+    """What a correction leaves as it is."""
 
-    Attributes
-    ----------
-    effect, joints
-        As in discovery.json.
-    size_m
-        RMS displacement of the marker over the rows of the session, m.
-    why, instead
-        A sentence each.
-    """
-
+    # As in discovery.json
     effect: str
     joints: tuple[int, ...]
-    size_m: float
+    size_m: float  # RMS displacement of the marker over the rows of the session, m
+    # A sentence each
     why: str
     instead: str
 
 
 @dataclass(frozen=True, eq=False)
 class Described:
-    """The arm of a result, and what is not in it.
+    """The arm of a result, and what is not in it."""
 
-    Attributes
-    ----------
-    model
-        The arm.
-    identifiable, why
-        Of each joint's offset, as of `FitResult`.
-    range_rad
-        Least and largest reported angle of each joint in the rows fitted, (k, 2).
-    not_corrected
-        What is left.
-    """
-
-    model: ArmModel
+    model: ArmModel  # The arm
+    # Of each joint's offset, as of `FitResult`
     identifiable: tuple[bool, ...]
     why: tuple[str, ...]
+    # Least and largest reported angle of each joint in the rows fitted, (k, 2)
     range_rad: FloatArray
-    not_corrected: tuple[NotCorrected, ...] = ()
+    not_corrected: tuple[NotCorrected, ...] = ()  # What is left
     notes: tuple[str, ...] = field(default=())
 
 

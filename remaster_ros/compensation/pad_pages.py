@@ -83,21 +83,11 @@ belong to that state alone.
 
 @dataclass(frozen=True)
 class MotorNumber:
-    """What a controller has stored of a motor.
+    """What a controller has stored of a motor."""
 
-    Attributes
-    ----------
-    old
-        The stored number.
-    counts_per_degree
-        Of the joint, above 0.
-    direction
-        1 where the reported angle grows with the stored number, -1 where it falls.
-    """
-
-    old: float
-    counts_per_degree: float
-    direction: int
+    old: float  # The stored number
+    counts_per_degree: float  # Of the joint, above 0
+    direction: int  # 1 where the reported angle grows with the stored number, -1 where it falls
 
 
 def motor_text(offsets: ZeroOffsets, motors: Mapping[str, MotorNumber]) -> str:

@@ -35,35 +35,21 @@ STEP_RAD = 1e-4
 
 @dataclass(frozen=True, eq=False)
 class CorrectedTrajectory:
-    """What to send: n points of k joints.
+    """What to send: n points of k joints."""
 
-    Attributes
-    ----------
-    times_s
-        From the start, (n,).
-    positions, velocities
-        rad and rad/s, (n, k); velocities are None where none were given.
-    change
-        Of the positions, by the correction, rad, (n, k).
-    stretched
-        How many times longer it takes than it was to.
-    deviation_m
-        Largest distance of the tool from the wanted path between points, where it was compared.
-    added_speed, added_acceleration
-        Of each joint's largest, before all was slowed down, as a share of the wanted one, (k,); 0
-        where the joint was to stand, and NaN for accelerations of straight lines.
-    faded, outside_range
-        As of a `Correction`, (n,).
-    """
-
-    times_s: FloatArray
+    times_s: FloatArray  # From the start, (n,)
+    # rad and rad/s, (n, k); velocities are None where none were given
     positions: FloatArray
     velocities: FloatArray | None
-    change: FloatArray
-    stretched: float
+    change: FloatArray  # Of the positions, by the correction, rad, (n, k)
+    stretched: float  # How many times longer it takes than it was to
+    # Largest distance of the tool from the wanted path between points, where it was compared
     deviation_m: float
+    # Of each joint's largest, before all was slowed down, as a share of the wanted one, (k,); 0
+    # where the joint was to stand, and NaN for accelerations of straight lines
     added_speed: FloatArray
     added_acceleration: FloatArray
+    # As of a `Correction`, (n,)
     faded: BoolArray
     outside_range: BoolArray
 
@@ -81,26 +67,12 @@ def corrected_trajectory(
 ) -> CorrectedTrajectory:
     """Return the trajectory to send for a wanted one of the nominal robot.
 
-    Parameters
-    ----------
-    compensator
-        The correction.
-    times_s
-        Ascending, (n,), n >= 2.
-    positions, velocities
-        Wanted, rad and rad/s, (n, k).
-    tolerance_m
-        Of the tool between points.
-    velocity_limits, acceleration_limits
-        rad/s and rad/s², (k,); those of the URDF, and none, where None.
-    temperature_c
-        Of the arm.
-
-    Raises
-    ------
-    InputError
-        Numbers that are not finite, times that do not ascend, other shapes, or a path whose
-        correction no point per millisecond follows.
+    ``compensator``: the correction; ``times_s``: ascending, (n,), n >= 2; ``positions,
+    velocities``: wanted, rad and rad/s, (n, k); ``tolerance_m``: of the tool between points;
+    ``velocity_limits, acceleration_limits``: rad/s and rad/s², (k,); those of the URDF, and none,
+    where None; ``temperature_c``: of the arm.
+    Raises InputError: numbers that are not finite, times that do not ascend, other shapes, or a
+    path whose correction no point per millisecond follows.
     """
     t, q, v = _checked(compensator, times_s, positions, velocities)
     wanted = _Path(t, q, v)
@@ -245,12 +217,8 @@ def corrected_points(
 ) -> tuple[Correction, FloatArray | None]:
     """Return what to command for points, and their velocities.
 
-    Parameters
-    ----------
-    compensator, temperature_c
-        As of `corrected_trajectory`.
-    q, v
-        Wanted, rad and rad/s, (n, k); None where there are no velocities.
+    ``compensator, temperature_c``: as of `corrected_trajectory`; ``q, v``: wanted, rad and rad/s,
+    (n, k); None where there are no velocities.
     """
     done = compensator.correct(q, temperature_c)
     if v is None:

@@ -50,28 +50,15 @@ BEYOND_STD = 3.3
 
 @dataclass(frozen=True, eq=False)
 class Visits:
-    """Rows that were measured for wanted joint angles; n rows of k joints.
+    """Rows that were measured for wanted joint angles; n rows of k joints."""
 
-    Attributes
-    ----------
-    wanted
-        Of the nominal robot, rad, (n, k).
-    on
-        Whether the correction was on, (n,).
-    configuration
-        Rows of one belong together, on and off, (n,).
-    sensor, marker
-        Names of them, (n,).
-    position
-        In the sensor's frame, m, (n, 3).
-    """
-
-    wanted: FloatArray
-    on: BoolArray
-    configuration: IntArray
+    wanted: FloatArray  # Of the nominal robot, rad, (n, k)
+    on: BoolArray  # Whether the correction was on, (n,)
+    configuration: IntArray  # Rows of one belong together, on and off, (n,)
+    # Names of them, (n,)
     sensor: tuple[str, ...]
     marker: tuple[str, ...]
-    position: FloatArray
+    position: FloatArray  # In the sensor's frame, m, (n, 3)
 
 
 @dataclass(frozen=True)
@@ -93,35 +80,22 @@ class Mean:
 
 @dataclass(frozen=True)
 class Verified:
-    """What the rows say.
+    """What the rows say."""
 
-    Attributes
-    ----------
-    verdict
-        Of the absolute estimate.
-    toggle
-        None without configurations that were visited on and off.
-    absolute, joints
-        Of the rows with the correction on; of each joint, by name.
-    error_on, error_off
-        Against what was wanted, base and marker fitted to each; None where there are too few.
-    remains_mm
-        RMS of what the rows with the correction on leave, less what base and marker take up.
-    noise_mm
-        RMS of the differences on - off less the best share of the predicted move, of one row;
-        None without toggles.
-    poses
-        How many would do, where it is unclear; None where none would, or where it is clear.
-    """
-
-    verdict: Verdict
-    toggle: Estimate | None
+    verdict: Verdict  # Of the absolute estimate
+    toggle: Estimate | None  # None without configurations that were visited on and off
+    # Of the rows with the correction on; of each joint, by name
     absolute: Estimate
     joints: Mapping[str, Estimate]
+    # Against what was wanted, base and marker fitted to each; None where there are too few
     error_on: Mean
     error_off: Mean | None
+    # RMS of what the rows with the correction on leave, less what base and marker take up
     remains_mm: float
+    # RMS of the differences on - off less the best share of the predicted move, of one row; None
+    # without toggles
     noise_mm: float | None
+    # How many would do, where it is unclear; None where none would, or where it is clear
     poses: int | None
 
 

@@ -36,20 +36,13 @@ _FULL_TURN = (0.0, 2 * np.pi)
 
 @dataclass(frozen=True)
 class PoseRanges:
-    """The box the candidates are drawn from; the defaults are the paper's.
+    """The box the candidates are drawn from; the defaults are the paper's."""
 
-    Attributes
-    ----------
-    azimuth_rad, radius_m, height_m
-        Cylinder coordinates of the tool about the Z axis of R, (lower, upper).
-    roll_rad
-        Turn about the tool's Z axis, (lower, upper).
-    """
-
+    # Cylinder coordinates of the tool about the Z axis of R, (lower, upper)
     azimuth_rad: tuple[float, float] = _FULL_TURN
     radius_m: tuple[float, float] = (0.2, 0.5)
     height_m: tuple[float, float] = (0.4, 0.8)
-    roll_rad: tuple[float, float] = _FULL_TURN
+    roll_rad: tuple[float, float] = _FULL_TURN  # Turn about the tool's Z axis, (lower, upper)
 
     def __post_init__(self) -> None:
         for spec in fields(self):
@@ -64,28 +57,15 @@ class PoseRanges:
 
 @dataclass(frozen=True)
 class LineOfSight:
-    """A sensor that has to see a marker at every configuration.
+    """A sensor that has to see a marker at every configuration."""
 
-    Attributes
-    ----------
-    sensor
-        Its name, for the counts.
-    sensor_R
-        Its origin in R, m, (3,).
-    marker_T
-        The marker it follows, in the tool frame, m, (3,).
-    max_angle_rad
-        Largest angle between the tool's Z axis and the line to the sensor at which the marker
-        is still seen; a quarter turn keeps the sensor in front of the tool plate.
-    marker
-        The marker's name.
-    """
-
-    sensor: str
-    sensor_R: FloatArray
-    marker_T: FloatArray
+    sensor: str  # Its name, for the counts
+    sensor_R: FloatArray  # Its origin in R, m, (3,)
+    marker_T: FloatArray  # The marker it follows, in the tool frame, m, (3,)
+    # Largest angle between the tool's Z axis and the line to the sensor at which the marker is
+    # still seen; a quarter turn keeps the sensor in front of the tool plate
     max_angle_rad: float = np.pi / 2
-    marker: str = ''
+    marker: str = ''  # The marker's name
 
 
 @dataclass(frozen=True)
@@ -103,49 +83,26 @@ class PlannedPose:
 
 @dataclass(frozen=True)
 class Plan:
-    """The poses to visit, and why the other candidates were dropped.
+    """The poses to visit, and why the other candidates were dropped."""
 
-    Attributes
-    ----------
-    poses
-        In the order of the candidates.
-    dropped
-        Reason -> number of poses that lost all their solutions, most of them for this reason.
-    dropped_solutions
-        Reason -> number of joint solutions dropped, of kept poses too; the first reason counts.
-    """
-
-    poses: tuple[PlannedPose, ...]
+    poses: tuple[PlannedPose, ...]  # In the order of the candidates
+    # Reason -> number of poses that lost all their solutions, most of them for this reason
     dropped: Mapping[str, int] = field(default_factory=dict)
+    # Reason -> number of joint solutions dropped, of kept poses too; the first reason counts
     dropped_solutions: Mapping[str, int] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class PlanningScene:
-    """All that poses are planned from: an arm, what it can hit, and the sensors before it.
+    """All that poses are planned from: an arm, what it can hit, and the sensors before it."""
 
-    Attributes
-    ----------
-    inverse_kinematics
-        Of the arm; its held values decide how many solutions a pose has.
-    model
-        The arm with everything that it can hit.
-    ranges
-        What the candidates are drawn from.
-    sights
-        Every sensor, at its rough place.
-    aim_at
-        The sensor that the tool faces.
-    limit_margin_rad
-        Distance to keep from the joint limits, rad.
-    """
-
+    # Of the arm; its held values decide how many solutions a pose has
     inverse_kinematics: InverseKinematics
-    model: CollisionModel
-    ranges: PoseRanges
-    sights: Sequence[LineOfSight]
-    aim_at: str
-    limit_margin_rad: float = LIMIT_MARGIN_RAD
+    model: CollisionModel  # The arm with everything that it can hit
+    ranges: PoseRanges  # What the candidates are drawn from
+    sights: Sequence[LineOfSight]  # Every sensor, at its rough place
+    aim_at: str  # The sensor that the tool faces
+    limit_margin_rad: float = LIMIT_MARGIN_RAD  # Distance to keep from the joint limits, rad
 
     @property
     def rough_R(self) -> dict[str, FloatArray]:
@@ -240,23 +197,11 @@ def plan_poses(
 ) -> Plan:
     """Keep the candidates' joint solutions that the arm can take and every sensor can see.
 
-    Parameters
-    ----------
-    inverse_kinematics
-        Of the arm; its held values decide how many solutions there are.
-    arm
-        The same arm with everything it can hit.
-    candidates
-        T_R_T, (n, 4, 4).
-    lines_of_sight
-        What has to be visible.
-    limit_margin_rad
-        Distance to keep from the joint limits, rad.
-
-    Returns
-    -------
-    Plan
-        With `dropped` and `len(poses)` adding up to n.
+    ``inverse_kinematics``: of the arm; its held values decide how many solutions there are;
+    ``arm``: the same arm with everything it can hit; ``candidates``: T_R_T, (n, 4, 4);
+    ``lines_of_sight``: what has to be visible; ``limit_margin_rad``: distance to keep from the
+    joint limits, rad.
+    Returns with `dropped` and `len(poses)` adding up to n.
     """
     chain = inverse_kinematics.chain
     reachable = inverse_kinematics.solutions_of_each(candidates)
@@ -312,19 +257,9 @@ def order_solutions(
     All distances are from ``q_current``, not from one solution to the next: the slowest joint's
     travel, divided by its velocity limit.
 
-    Parameters
-    ----------
-    solutions
-        rad, (m, k).
-    q_current
-        rad, (k,).
-    velocity_limits
-        rad/s, (k,); where a limit is unknown (infinite) it counts as 1 rad/s.
-
-    Returns
-    -------
-    ndarray
-        Indices into solutions, (m,).
+    ``solutions``: rad, (m, k); ``q_current``: rad, (k,); ``velocity_limits``: rad/s, (k,); where a
+    limit is unknown (infinite) it counts as 1 rad/s.
+    Returns indices into solutions, (m,).
     """
     limits = np.asarray(velocity_limits, dtype=float)
     speeds = np.where(np.isfinite(limits), limits, 1.0)

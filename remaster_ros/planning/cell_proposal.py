@@ -35,27 +35,15 @@ _TURN = np.pi
 
 @dataclass(frozen=True)
 class HeldJoint:
-    """Which joint to hold so that poses have joint solutions, and how these are found.
+    """Which joint to hold so that poses have joint solutions, and how these are found."""
 
-    Attributes
-    ----------
-    joint
-        Its index; None where the arm has six.
-    values_rad
-        Where it is held.
-    solutions
-        Mean number of joint solutions of a pose, those that cannot be reached among them.
-    tried
-        Name of each joint that was tried -> that number, or why it is not held.
-    kinematics
-        All joint solutions, with this joint held.
-    """
-
-    joint: int | None
-    values_rad: tuple[float, ...]
+    joint: int | None  # Its index; None where the arm has six
+    values_rad: tuple[float, ...]  # Where it is held
+    # Mean number of joint solutions of a pose, those that cannot be reached among them
     solutions: float
+    # Name of each joint that was tried -> that number, or why it is not held
     tried: Mapping[str, float | str]
-    kinematics: InverseKinematics
+    kinematics: InverseKinematics  # All joint solutions, with this joint held
 
     def values(self) -> dict[int, tuple[float, ...]]:
         """Return what `InverseKinematics` takes."""
@@ -144,17 +132,10 @@ def _mean_solutions(kinematics: InverseKinematics, poses: FloatArray) -> float:
 
 @dataclass(frozen=True)
 class Reach:
-    """How far an arm reaches.
+    """How far an arm reaches."""
 
-    Attributes
-    ----------
-    reach_m
-        From the axis of the first joint, m.
-    low_m, high_m
-        Heights that the tool takes, m.
-    """
-
-    reach_m: float
+    reach_m: float  # From the axis of the first joint, m
+    # Heights that the tool takes, m
     low_m: float
     high_m: float
 

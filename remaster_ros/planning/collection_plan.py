@@ -25,24 +25,12 @@ REGISTERING = 3
 
 @dataclass(frozen=True, eq=False)
 class PlannedVisit:
-    """A configuration that is measured.
+    """A configuration that is measured."""
 
-    Attributes
-    ----------
-    split
-        ``optimization``, ``validation``, ``reference`` or ``registration``.
-    pose
-        Which of the poses of its split.
-    trajectory
-        The way, from the configuration before to this one.
-    tool_speed_m_s
-        Largest speed of the fastest point of arm and tool on it, m/s.
-    """
-
-    split: str
-    pose: int
-    trajectory: Trajectory
-    tool_speed_m_s: float
+    split: str  # ``optimization``, ``validation``, ``reference`` or ``registration``
+    pose: int  # Which of the poses of its split
+    trajectory: Trajectory  # The way, from the configuration before to this one
+    tool_speed_m_s: float  # Largest speed of the fastest point of arm and tool on it, m/s
 
     @property
     def points(self) -> FloatArray:
@@ -68,50 +56,26 @@ NOTHING_EXPECTED = Expected({}, np.nan, np.nan)
 
 @dataclass(frozen=True, eq=False)
 class CollectionPlan:
-    """What a collection will do, and what its fit is expected to state.
+    """What a collection will do, and what its fit is expected to state."""
 
-    Attributes
-    ----------
-    tour
-        As planned.
-    visits
-        All configurations in the order of their visits: registration, fit, held out, and
-        references each time.
-    unreached
-        Configurations that no free path leads to.
-    measuring_s
-        Settling and dwell at each of them, s.
-    robot_time_s
-        Motion, settling and dwell of all visits, s: of the whole session where all of it is
-        ahead.
-    max_tool_speed_m_s
-        Of the fastest point of arm and tool, m/s.
-    joint_std
-        Expected standard deviation of each joint's offset, rad; None where not identifiable.
-    joint_rms
-        Root mean square of them, rad.
-    tool_rms
-        Root mean square of the 3-D error of the predicted markers, m.
-    designed
-        Of an optimal design; None without one.
-    undetermined
-        What these configurations do not determine at all, so that there are no standard
-        deviations (None and NaN above); ''.
-    separated
-        What was added to separate causes; None without causes.
-    """
-
-    tour: Tour
+    tour: Tour  # As planned
+    # All configurations in the order of their visits: registration, fit, held out, and references
+    # each time
     visits: tuple[PlannedVisit, ...]
-    unreached: int
-    measuring_s: float
+    unreached: int  # Configurations that no free path leads to
+    measuring_s: float  # Settling and dwell at each of them, s
+    # Motion, settling and dwell of all visits, s: of the whole session where all of it is ahead
     robot_time_s: float
-    max_tool_speed_m_s: float
+    max_tool_speed_m_s: float  # Of the fastest point of arm and tool, m/s
+    # Expected standard deviation of each joint's offset, rad; None where not identifiable
     joint_std: Mapping[str, float | None]
-    joint_rms: float
-    tool_rms: float
-    designed: Designed | None
+    joint_rms: float  # Root mean square of them, rad
+    tool_rms: float  # Root mean square of the 3-D error of the predicted markers, m
+    designed: Designed | None  # Of an optimal design; None without one
+    # What these configurations do not determine at all, so that there are no standard deviations
+    # (None and NaN above); ''
     undetermined: str = ''
+    # What was added to separate causes; None without causes
     separated: SeparatingDesign | None = None
 
     @property
@@ -302,14 +266,8 @@ def with_expected(
 class _Steps:
     """Go from stop to stop.
 
-    Parameters
-    ----------
-    here
-        Where the arm stands, rad, (k,).
-    travel
-        How long the robot takes.
-    progress
-        Is told how many configurations are done.
+    ``here``: where the arm stands, rad, (k,); ``travel``: how long the robot takes; ``progress``:
+    is told how many configurations are done.
     """
 
     def __init__(

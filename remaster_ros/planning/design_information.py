@@ -46,21 +46,12 @@ first choices finite, and changes no standard deviation once the parameters are 
 
 @dataclass(frozen=True, eq=False)
 class FurtherColumns:
-    """Parameters beyond those of the offsets model: of causes that are to be distinguished.
+    """Parameters beyond those of the offsets model: of causes that are to be distinguished."""
 
-    Attributes
-    ----------
-    names
-        m of them.
-    displacement
-        Of a context: displacement of the marker in R, m per unit, (n, 3, m).
-    std
-        Standard deviation of the prior on each about 0, (m,).
-    """
-
-    names: tuple[str, ...]
+    names: tuple[str, ...]  # m of them
+    # Of a context: displacement of the marker in R, m per unit, (n, 3, m)
     displacement: Callable[[Context], FloatArray]
-    std: FloatArray
+    std: FloatArray  # Standard deviation of the prior on each about 0, (m,)
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,47 +59,23 @@ class DesignInformation:
     """Information of n configurations on the f free parameters, which have unit information.
 
     The parameters are divided by `scale`, so that all are of one size.
-
-    Attributes
-    ----------
-    joint_names
-        Of the k joints.
-    q
-        The configurations, rad, (n, k).
-    pose
-        Which pose each belongs to, (n,).
-    own
-        Information of each configuration, but for the error that its pose shares, (n, f, f).
-    weighted
-        Mean derivative over the markers of each frame, over its variance, (n, sensors, 3, f).
-    weight
-        1/v of a frame, m^-2, (sensors,).
-    pose_variance
-        pose_sigma², m², (sensors,).
-    prior
-        Information of the priors, (f, f).
-    tool
-        Mean of J'J over the markers and the configurations in the box, m² per unit, (f, f).
-    scale
-        (f,).
-    identifiable
-        Joint -> its index among the free parameters.
-    names
-        Of the free parameters, as the fit has them.
     """
 
-    joint_names: tuple[str, ...]
-    q: FloatArray
-    pose: IntArray
+    joint_names: tuple[str, ...]  # Of the k joints
+    q: FloatArray  # The configurations, rad, (n, k)
+    pose: IntArray  # Which pose each belongs to, (n,)
+    # Information of each configuration, but for the error that its pose shares, (n, f, f)
     own: FloatArray
+    # Mean derivative over the markers of each frame, over its variance, (n, sensors, 3, f)
     weighted: FloatArray
-    weight: FloatArray
-    pose_variance: FloatArray
-    prior: FloatArray
+    weight: FloatArray  # 1/v of a frame, m^-2, (sensors,)
+    pose_variance: FloatArray  # pose_sigma², m², (sensors,)
+    prior: FloatArray  # Information of the priors, (f, f)
+    # Mean of J'J over the markers and the configurations in the box, m² per unit, (f, f)
     tool: FloatArray
-    scale: FloatArray
-    identifiable: Mapping[int, int]
-    names: tuple[str, ...]
+    scale: FloatArray  # (f,)
+    identifiable: Mapping[int, int]  # Joint -> its index among the free parameters
+    names: tuple[str, ...]  # Of the free parameters, as the fit has them
 
     @classmethod
     def of(
@@ -123,29 +90,14 @@ class DesignInformation:
     ) -> DesignInformation:
         """Differentiate the model at the nominal arm.
 
-        Parameters
-        ----------
-        chain
-            The nominal arm.
-        poses
-            Poses that can be measured, each with the solutions that can be.
-        sensors
-            What measures them; a marker that two sensors follow has one position.
-        marker_std_m
-            How well the markers' positions are known, per axis, m.
-        priors
-            What is known of offsets and registrations beforehand.
-        box
-            Where the tool is to be accurate; None for wherever these poses are.
-        further
-            Parameters beyond those of the offsets model; behind the others.
-
-        Raises
-        ------
-        InputError
-            No configuration, or none with the tool in the box.
-        InsufficientDataError
-            All these configurations together do not determine the parameters.
+        ``chain``: the nominal arm; ``poses``: poses that can be measured, each with the solutions
+        that can be; ``sensors``: what measures them; a marker that two sensors follow has one
+        position; ``marker_std_m``: how well the markers' positions are known, per axis, m;
+        ``priors``: what is known of offsets and registrations beforehand; ``box``: where the tool
+        is to be accurate; None for wherever these poses are; ``further``: parameters beyond those
+        of the offsets model; behind the others.
+        Raises InputError: no configuration, or none with the tool in the box;
+        InsufficientDataError: all these configurations together do not determine the parameters.
         """
         q = np.concatenate([np.empty((0, len(chain))), *(pose.solutions for pose in poses)])
         if not len(q):

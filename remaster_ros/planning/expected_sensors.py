@@ -22,30 +22,15 @@ POSE_SIGMA_M = 0.2e-3
 
 @dataclass(frozen=True)
 class ExpectedSensor:
-    """A sensor, the markers that it measures in every frame, and its noise.
+    """A sensor, the markers that it measures in every frame, and its noise."""
 
-    Attributes
-    ----------
-    name
-        Of the sensor.
-    position_R
-        Its origin in R, m, (3,).
-    markers
-        Marker name -> position in the tool frame, m, (3,).
-    sigma_m
-        Noise of each marker, per axis, m.
-    pose_sigma_m
-        Error that all its readings at one pose share, per axis, m.
-    frame_sigma_m
-        Error that the markers of one frame share, per axis, m: the arm's repeatability belongs
-        here.
-    """
-
-    name: str
-    position_R: FloatArray
-    markers: Mapping[str, FloatArray]
-    sigma_m: float = SIGMA_M
+    name: str  # Of the sensor
+    position_R: FloatArray  # Its origin in R, m, (3,)
+    markers: Mapping[str, FloatArray]  # Marker name -> position in the tool frame, m, (3,)
+    sigma_m: float = SIGMA_M  # Noise of each marker, per axis, m
+    # Error that all its readings at one pose share, per axis, m
     pose_sigma_m: float = POSE_SIGMA_M
+    # Error that the markers of one frame share, per axis, m: the arm's repeatability belongs here
     frame_sigma_m: float = 0.0
 
 

@@ -24,26 +24,11 @@ def free_order(
     the next from there, and so on. Where no straight way is free, one around is looked for, to the
     nearest first; a solution that cannot be reached is tried again from each that could be.
 
-    Parameters
-    ----------
-    model
-        What must not be hit; with None every straight way is free.
-    q
-        Where the arm stands, rad, (k,).
-    solutions
-        rad, (m, k).
-    velocity_limits
-        rad/s, (k,).
-    rng
-        Source of randomness.
-    one
-        One solution is enough.
-
-    Returns
-    -------
-    order, paths
-        Indices into solutions, without those that could not be reached, and for each the
-        configurations to go through before it, rad, (n, k).
+    ``model``: what must not be hit; with None every straight way is free; ``q``: where the arm
+    stands, rad, (k,); ``solutions``: rad, (m, k); ``velocity_limits``: rad/s, (k,); ``one``: one
+    solution is enough.
+    Returns order, paths: indices into solutions, without those that could not be reached, and for
+    each the configurations to go through before it, rad, (n, k).
     """
     left = [int(i) for i in order_solutions(solutions, q, velocity_limits)]
     straight = np.empty((0, solutions.shape[1]))

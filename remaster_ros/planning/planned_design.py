@@ -39,15 +39,8 @@ def fastest_order(times: FloatArray) -> list[int]:
     McGeoch, "The Traveling Salesman Problem: A Case Study in Local Optimization", 1997). A search
     from 100 perturbed orders shortens tours of 60 places by another 1 %, of 180 by 1.5 %.
 
-    Parameters
-    ----------
-    times
-        From each place to each, symmetric, s, (n, n); place 0 is where the arm stands.
-
-    Returns
-    -------
-    list of int
-        All places but the first, in order.
+    ``times``: from each place to each, symmetric, s, (n, n); place 0 is where the arm stands.
+    Returns all places but the first, in order.
     """
     n = len(times)
     order = _nearest(times)
@@ -124,42 +117,23 @@ DETOUR = 2.0
 
 @dataclass(frozen=True)
 class DesignSettings:
-    """What the poses to fit are chosen by; see `pose_design`.
+    """What the poses to fit are chosen by; see `pose_design`."""
 
-    Attributes
-    ----------
-    optimal
-        False for all poses of the Latin hypercube.
-    whole_poses
-        Visit each pose in all its solutions, nearest first, before the next one; otherwise the
-        design chooses single configurations, and the fastest order comes back to a pose.
-    fastest
-        Visit poses, or configurations, in the order of least travel, not the nearest next.
-    sensors
-        What will measure, with its expected noise.
-    marker_std_m
-        How well the markers' positions are known, m.
-    tool_share
-        See `Goal`.
-    joint_std_rad, tool_std_m
-        What is to be reached; None for what the Latin hypercube's poses reach, of the joints no
-        less than `ENOUGH_RAD`.
-    box
-        Where the tool is to be accurate; None for wherever the poses are.
-    priors
-        What is known beforehand.
-    """
-
-    optimal: bool = False
+    optimal: bool = False  # False for all poses of the Latin hypercube
+    # Visit each pose in all its solutions, nearest first, before the next one; otherwise the
+    # design chooses single configurations, and the fastest order comes back to a pose
     whole_poses: bool = True
+    # Visit poses, or configurations, in the order of least travel, not the nearest next
     fastest: bool = False
-    sensors: tuple[ExpectedSensor, ...] = ()
-    marker_std_m: float = 0.5e-3
-    tool_share: float = 0.0
+    sensors: tuple[ExpectedSensor, ...] = ()  # What will measure, with its expected noise
+    marker_std_m: float = 0.5e-3  # How well the markers' positions are known, m
+    tool_share: float = 0.0  # See `Goal`
+    # What is to be reached; None for what the Latin hypercube's poses reach, of the joints no less
+    # than `ENOUGH_RAD`
     joint_std_rad: float | None = None
     tool_std_m: float | None = None
-    box: ToolBox | None = None
-    priors: Priors = field(default_factory=Priors)
+    box: ToolBox | None = None  # Where the tool is to be accurate; None for wherever the poses are
+    priors: Priors = field(default_factory=Priors)  # What is known beforehand
 
     def before(self, sensors_R: Mapping[str, FloatArray]) -> DesignSettings:
         """Return them for sensors that stand at these places in R, m, (3,) each."""
@@ -180,23 +154,12 @@ class DesignSettings:
 
 @dataclass(frozen=True)
 class Designed:
-    """Plans by a design.
+    """Plans by a design."""
 
-    Attributes
-    ----------
-    plans
-        Split -> its poses, each with the solutions that were chosen.
-    goal
-        What was to be reached.
-    reached
-        Whether it is, with the floors.
-    joint_rms, tool_rms
-        What is expected, rad and m.
-    """
-
-    plans: Mapping[str, Plan]
-    goal: Goal
-    reached: bool
+    plans: Mapping[str, Plan]  # Split -> its poses, each with the solutions that were chosen
+    goal: Goal  # What was to be reached
+    reached: bool  # Whether it is, with the floors
+    # What is expected, rad and m
     joint_rms: float
     tool_rms: float
 
@@ -328,22 +291,11 @@ def visit_order(
 ) -> list[tuple[str, int, int]]:
     """Order all configurations of some plans by travel time.
 
-    Parameters
-    ----------
-    plans
-        Split -> its plan; those to fit and those held out are mixed.
-    model
-        What the arm must not hit: a way that is not straight counts as longer.
-    travel
-        How long the ways take.
-    whole_poses
-        Visit a pose in all its solutions before the next one: poses count as far apart as the
-        nearest of their solutions.
-
-    Returns
-    -------
-    list of (str, int, int)
-        Split, pose and solution of each visit.
+    ``plans``: split -> its plan; those to fit and those held out are mixed; ``model``: what the
+    arm must not hit: a way that is not straight counts as longer; ``travel``: how long the ways
+    take; ``whole_poses``: visit a pose in all its solutions before the next one: poses count as
+    far apart as the nearest of their solutions.
+    Returns split, pose and solution of each visit.
     """
     visits = [
         (split, index, number)

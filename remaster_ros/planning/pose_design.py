@@ -59,17 +59,11 @@ class Floors:
 
     A design for the offsets alone would repeat few poses. The offsets' model is then fitted where
     it is bent the most, and nothing looks whether it holds in between.
-
-    Attributes
-    ----------
-    poses
-        Different poses to fit; `discovery.screening` needs as many for its p-values.
-    repeated
-        Of them with at least two solutions.
     """
 
+    # Different poses to fit; `discovery.screening` needs as many for its p-values
     poses: int = FEWEST_POSES
-    repeated: int = REPEATED_POSES
+    repeated: int = REPEATED_POSES  # Of them with at least two solutions
 
     def hold(self, pose: IntArray) -> bool:
         """Tell whether chosen configurations of these poses (n,) reach them."""
@@ -79,30 +73,19 @@ class Floors:
 
 @dataclass(frozen=True)
 class Goal:
-    """What is to be reached, and what to weigh by.
+    """What is to be reached, and what to weigh by."""
 
-    Attributes
-    ----------
-    joint_std_rad
-        Root mean square of the standard deviations of the identifiable joints, rad.
-    tool_std_m
-        Root mean square of the 3-D error of the predicted markers in the box, m.
-    tool_share
-        0 for the joints alone (A-optimal), 1 for the tool alone (I-optimal); between them for a
-        mixture, in which each counts in units of what is to be reached.
-    """
-
+    # Root mean square of the standard deviations of the identifiable joints, rad
     joint_std_rad: float
-    tool_std_m: float
+    tool_std_m: float  # Root mean square of the 3-D error of the predicted markers in the box, m
+    # 0 for the joints alone (A-optimal), 1 for the tool alone (I-optimal); between them for a
+    # mixture, in which each counts in units of what is to be reached
     tool_share: float = 0.0
 
     def weights(self, information: DesignInformation) -> FloatArray:
         """Return L with criterion = trace(L' M^-1 L), (f, r), 1 or less at the goal.
 
-        Raises
-        ------
-        InsufficientDataError
-            No joint is identifiable.
+        Raises InsufficientDataError: no joint is identifiable.
         """
         parts = []
         if self.tool_share < 1.0:
@@ -135,18 +118,10 @@ class Goal:
 
 @dataclass(frozen=True)
 class Design:
-    """Chosen configurations.
+    """Chosen configurations."""
 
-    Attributes
-    ----------
-    chosen
-        Indices of the configurations, in no order.
-    reached
-        Whether the goal and the floors are reached.
-    """
-
-    chosen: tuple[int, ...]
-    reached: bool
+    chosen: tuple[int, ...]  # Indices of the configurations, in no order
+    reached: bool  # Whether the goal and the floors are reached
 
 
 def choose(
@@ -162,22 +137,10 @@ def choose(
 ) -> Design:
     """Choose configurations.
 
-    Parameters
-    ----------
-    information
-        Of all that can be measured.
-    travel
-        What they cost.
-    goal, floors
-        What is to be reached.
-    rng
-        Which poses are tried in exchange.
-    most
-        Configurations chosen at most.
-    exchanges
-        Tried at most.
-    whole_poses
-        Choose poses with all their configurations; single ones otherwise.
+    ``information``: of all that can be measured; ``travel``: what they cost; ``goal, floors``:
+    what is to be reached; ``rng``: which poses are tried in exchange; ``most``: configurations
+    chosen at most; ``exchanges``: tried at most; ``whole_poses``: choose poses with all their
+    configurations; single ones otherwise.
     """
     units = _Units(information, travel, whole_poses)
     search = _Search(units, goal, floors)
@@ -197,18 +160,9 @@ def choose(
 class _Units:
     """What is chosen one by one: configurations, or poses with all of theirs.
 
-    Attributes
-    ----------
-    whole
-        Whether they are poses.
-    information
-        Of each of the n units.
-    members
-        Which configurations each is.
-    solutions
-        How many, (n,).
-    stay_s
-        Time of measuring them and of the ways between them, s, (n,).
+    ``whole``: whether they are poses; ``information``: of each of the n units; ``members``: which
+    configurations each is; ``solutions``: how many, (n,); ``stay_s``: time of measuring them and
+    of the ways between them, s, (n,).
     """
 
     def __init__(self, information: DesignInformation, travel: TravelTime, whole: bool) -> None:

@@ -20,45 +20,25 @@ MOST_EXCHANGES = 3
 
 @dataclass(frozen=True)
 class Place:
-    """A marker that a sensor follows at a reference configuration.
+    """A marker that a sensor follows at a reference configuration."""
 
-    Attributes
-    ----------
-    q
-        rad, (k,).
-    sensor, marker
-        Their names.
-    marker_T
-        The marker in the tool frame, m, (3,).
-    """
-
-    q: FloatArray
+    q: FloatArray  # rad, (k,)
+    # Their names
     sensor: str
     marker: str
-    marker_T: FloatArray
+    marker_T: FloatArray  # The marker in the tool frame, m, (3,)
 
 
 @dataclass(frozen=True)
 class Cause:
-    """One thing that can change.
+    """One thing that can change."""
 
-    Attributes
-    ----------
-    kind
-        ``sensor``, ``base``, ``marker``, ``tool`` or ``joint``.
-    subject
-        For people: what has changed.
-    jacobian
-        Displacement of the measured markers by the parameters, m per unit, (places, 3, p): shifts
-        in m come first, then turns in rad.
-    shifts
-        How many of the p parameters are shifts.
-    """
-
-    kind: str
-    subject: str
+    kind: str  # ``sensor``, ``base``, ``marker``, ``tool`` or ``joint``
+    subject: str  # For people: what has changed
+    # Displacement of the measured markers by the parameters, m per unit, (places, 3, p): shifts in
+    # m come first, then turns in rad
     jacobian: FloatArray
-    shifts: int
+    shifts: int  # How many of the p parameters are shifts
 
 
 def rigid(points: FloatArray, center: FloatArray) -> FloatArray:
@@ -135,22 +115,11 @@ def choose_references(
     the rigid moves is `wanted` times the noise for a shift of `shift_m` and a turn of `turn_rad`;
     before one more is added, those chosen are exchanged for others that show these moves better.
 
-    Parameters
-    ----------
-    chain
-        The arm.
-    candidates
-        Configurations that every sensor sees, rad, (n, k).
-    seen
-        Sensor -> the marker that it follows, by name and in the tool frame, m, (3,).
-    fewest, most
-        How many are chosen.
-    noise_m
-        Of one reading, with the arm's repeatability, per axis.
-    shift_m, turn_rad
-        The change that is to show; a turn of 1 mrad moves what is half a metre away by 0.5 mm.
-    wanted
-        By how many standard deviations.
+    ``chain``: the arm; ``candidates``: configurations that every sensor sees, rad, (n, k);
+    ``seen``: sensor -> the marker that it follows, by name and in the tool frame, m, (3,);
+    ``fewest, most``: how many are chosen; ``noise_m``: of one reading, with the arm's
+    repeatability, per axis; ``shift_m, turn_rad``: the change that is to show; a turn of 1 mrad
+    moves what is half a metre away by 0.5 mm; ``wanted``: by how many standard deviations.
     """
     places = [
         Place(q, sensor, marker, marker_T)
@@ -189,11 +158,8 @@ def _exchanged(
 ) -> tuple[list[int], float]:
     """Exchange one reference after the other while that shows rigid moves better.
 
-    Returns
-    -------
-    chosen, smallest
-        What was chosen last, and its smallest singular value; as soon as that is `wanted`, no more
-        is exchanged, since the first choice distinguishes the causes best.
+    Returns chosen, smallest: What was chosen last, and its smallest singular value; as soon as
+    that is `wanted`, no more is exchanged, since the first choice distinguishes the causes best.
     """
     best, smallest = list(chosen), min(_smallest(move[list(chosen)]) for move in moves)
     for _ in range(MOST_EXCHANGES):
@@ -224,16 +190,9 @@ def _smallest(signals: FloatArray) -> float:
 
 @dataclass(frozen=True)
 class Choice:
-    """References that were chosen.
+    """References that were chosen."""
 
-    Attributes
-    ----------
-    indices
-        Into the candidates, in the order chosen.
-    smallest
-        How many standard deviations the least visible shift (0.5 mm) or turn (1 mrad) of a sensor
-        or the base shows by, over one round.
-    """
-
-    indices: tuple[int, ...]
+    indices: tuple[int, ...]  # Into the candidates, in the order chosen
+    # How many standard deviations the least visible shift (0.5 mm) or turn (1 mrad) of a sensor or
+    # the base shows by, over one round
     smallest: float

@@ -38,25 +38,15 @@ BY_THE_WAY = ('approach', 'last_move')
 
 @dataclass(frozen=True)
 class FoundCause:
-    """A cause as discovery.json has it.
+    """A cause as discovery.json has it."""
 
-    Attributes
-    ----------
-    name, joints
-        What it is; joints 1-based.
-    sizes
-        Parameter -> value, in its unit.
-    look_alikes
-        Name, joints and, in words, which measurements separate it from each.
-    driver
-        What drives it, where its name leaves that open; ''.
-    """
-
+    # What it is; joints 1-based
     name: str
     joints: tuple[int, ...]
-    sizes: Mapping[str, float]
+    sizes: Mapping[str, float]  # Parameter -> value, in its unit
+    # Name, joints and, in words, which measurements separate it from each
     look_alikes: tuple[tuple[str, tuple[int, ...], str], ...]
-    driver: str = ''
+    driver: str = ''  # What drives it, where its name leaves that open; ''
 
     @classmethod
     def of(cls, effect: FoundEffect) -> FoundCause:
@@ -76,19 +66,12 @@ class FoundCause:
 
 @dataclass(frozen=True, eq=False)
 class Rivals:
-    """A cause of a stated size, and another of any size.
+    """A cause of a stated size, and another of any size."""
 
-    Attributes
-    ----------
-    found, size
-        Cells of the one and their parameters, (m,).
-    other
-        Cells of the other.
-    """
-
+    # Cells of the one and their parameters, (m,)
     found: tuple[Cell, ...]
     size: FloatArray
-    other: tuple[Cell, ...]
+    other: tuple[Cell, ...]  # Cells of the other
 
     @property
     def by_the_way(self) -> bool:
@@ -124,12 +107,7 @@ class Rivals:
     def imitation(self, information: DesignInformation, measured: Sequence[int]) -> Rivals:
         """Return the other way round: the other of the size that imitates the one best.
 
-        Parameters
-        ----------
-        information
-            With `columns`.
-        measured
-            The configurations on which it does.
+        ``information``: with `columns`; ``measured``: the configurations on which it does.
         """
         matrix = information.finite(information.total(measured))
         place = information.names.index(AMPLITUDE)

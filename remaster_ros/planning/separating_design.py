@@ -55,63 +55,37 @@ BREAK_S = 300.0
 
 @dataclass(frozen=True)
 class Separated:
-    """How two causes are told apart.
+    """How two causes are told apart."""
 
-    Attributes
-    ----------
-    cause, look_alike
-        In words.
-    before, after
-        Standard deviations between the two, by the plan alone and with what is added: of both
-        ways round the smaller.
-    """
-
+    # In words
     cause: str
     look_alike: str
+    # Standard deviations between the two, by the plan alone and with what is added: of both ways
+    # round the smaller
     before: float
     after: float
 
 
 @dataclass(frozen=True)
 class SeparatingDesign:
-    """What to measure.
+    """What to measure."""
 
-    Attributes
-    ----------
-    poses
-        To add, each with the solutions that were chosen.
-    pairs
-        What they separate.
-    otherwise
-        Sentences on pairs that no choice of configurations separates.
-    order
-        Pose and solution of each visit, in the order of the choice.
-    """
-
-    poses: tuple[PlannedPose, ...]
-    pairs: tuple[Separated, ...]
-    otherwise: tuple[str, ...]
+    poses: tuple[PlannedPose, ...]  # To add, each with the solutions that were chosen
+    pairs: tuple[Separated, ...]  # What they separate
+    otherwise: tuple[str, ...]  # Sentences on pairs that no choice of configurations separates
+    # Pose and solution of each visit, in the order of the choice
     order: tuple[tuple[int, int], ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
 class MeasuredSoFar:
-    """What a session has of its configurations to fit, for causes that time or ways drive.
+    """What a session has of its configurations to fit, for causes that time or ways drive."""
 
-    Attributes
-    ----------
-    from_q
-        Where the arm came from to each, rad, (n, k).
-    stamp_s, temperature_c
-        (n,); NaN where unknown.
-    last_q
-        Where the arm stood last, rad, (k,).
-    """
-
-    from_q: FloatArray
+    from_q: FloatArray  # Where the arm came from to each, rad, (n, k)
+    # (n,); NaN where unknown
     stamp_s: FloatArray
     temperature_c: FloatArray
-    last_q: FloatArray
+    last_q: FloatArray  # Where the arm stood last, rad, (k,)
 
 
 def further_scene(scene: PlanningScene) -> PlanningScene:
@@ -163,23 +137,11 @@ def separate(
 ) -> SeparatingDesign:
     """Choose configurations that separate causes from their look-alikes.
 
-    Parameters
-    ----------
-    chain
-        The arm.
-    planned
-        What is measured anyway, or was.
-    candidates
-        Poses that can be added, each with the solutions that can be measured.
-    sensors, marker_std_m, priors
-        As of `DesignInformation.of`.
-    causes
-        That were found.
-    measured
-        Of the configurations of `planned`, in their order, where they were measured: without it
-        nothing is known of times and ways.
-    most
-        Configurations that may be added.
+    ``chain``: the arm; ``planned``: what is measured anyway, or was; ``candidates``: poses that
+    can be added, each with the solutions that can be measured; ``sensors, marker_std_m, priors``:
+    as of `DesignInformation.of`; ``causes``: that were found; ``measured``: of the configurations
+    of `planned`, in their order, where they were measured: without it nothing is known of times
+    and ways; ``most``: configurations that may be added.
     """
     poses = [*planned, *_thinned(candidates)]
     choice = _Choice(chain, poses, len(planned), sensors, marker_std_m, priors, measured, most)
@@ -207,16 +169,10 @@ def _thinned(candidates: Sequence[PlannedPose]) -> list[PlannedPose]:
 
 @dataclass(eq=False)
 class _Choice:
-    """The pairs, and the configurations to choose from.
-
-    Attributes
-    ----------
-    poses
-        Planned ones first, `given` of them.
-    """
+    """The pairs, and the configurations to choose from."""
 
     chain: SerialChain
-    poses: Sequence[PlannedPose]
+    poses: Sequence[PlannedPose]  # Planned ones first, `given` of them
     given: int
     sensors: Sequence[ExpectedSensor]
     marker_std_m: float

@@ -26,56 +26,30 @@ FIRST_ROUNDS = 2
 
 
 class Route(NamedTuple):
-    """The way to joint solutions of one pose, in the order of the visits.
+    """The way to joint solutions of one pose, in the order of the visits."""
 
-    Attributes
-    ----------
-    ids
-        Which of the pose's planned solutions they are.
-    paths
-        The way to each from the one before (to the first from where the arm stands):
-        configurations to go through in between, rad, (n, k); n = 0 where the straight way is free.
-    unreached
-        The pose's other solutions that no free path leads to.
-    """
-
-    ids: Sequence[int]
+    ids: Sequence[int]  # Which of the pose's planned solutions they are
+    # The way to each from the one before (to the first from where the arm stands): configurations
+    # to go through in between, rad, (n, k); n = 0 where the straight way is free
     paths: Sequence[FloatArray]
-    unreached: Sequence[int]
+    unreached: Sequence[int]  # The pose's other solutions that no free path leads to
 
 
 @dataclass(frozen=True)
 class PoseVisit:
-    """A pose to visit now.
+    """A pose to visit now."""
 
-    Attributes
-    ----------
-    pose
-        Its number in the session; registration poses have numbers of their own, below zero.
-    split
-        ``registration``, ``reference``, ``optimization`` or ``validation``.
-    T_R_T
-        The tool's pose in the robot base, (4, 4).
-    solutions
-        Joint solutions, nearest first, rad, (m, k).
-    index
-        Which of the poses planned for its split.
-    ids, paths, unreached
-        Which of that pose's planned solutions each of `solutions` is, and the way there: a
-        `Route`.
-    correction
-        As of a `PlannedPose`.
-    """
-
+    # Its number in the session; registration poses have numbers of their own, below zero
     pose: int
-    split: str
-    T_R_T: FloatArray
-    solutions: FloatArray
-    index: int
+    split: str  # ``registration``, ``reference``, ``optimization`` or ``validation``
+    T_R_T: FloatArray  # The tool's pose in the robot base, (4, 4)
+    solutions: FloatArray  # Joint solutions, nearest first, rad, (m, k)
+    index: int  # Which of the poses planned for its split
+    # Which of that pose's planned solutions each of `solutions` is, and the way there: a `Route`
     ids: tuple[int, ...]
     paths: tuple[FloatArray, ...] = ()
     unreached: tuple[int, ...] = ()
-    correction: str = ''
+    correction: str = ''  # As of a `PlannedPose`
 
     def __post_init__(self) -> None:
         if not self.paths:

@@ -46,21 +46,10 @@ def registration_tour(
 
     The others follow in case a sensor cannot see one of them.
 
-    Parameters
-    ----------
-    chain
-        The arm.
-    plan
-        Poses that face roughly towards the sensors.
-    markers_T
-        The markers that are seen, in the tool frame, m, (3,) each.
-    model
-        What the arm must not hit on its way.
-
-    Raises
-    ------
-    InsufficientDataError
-        If there are fewer than three poses.
+    ``chain``: the arm; ``plan``: poses that face roughly towards the sensors; ``markers_T``: the
+    markers that are seen, in the tool frame, m, (3,) each; ``model``: what the arm must not hit on
+    its way.
+    Raises InsufficientDataError: if there are fewer than three poses.
     """
     if len(plan.poses) < 3:
         reasons = ', '.join(f'{count} {reason}' for reason, count in plan.dropped.items())

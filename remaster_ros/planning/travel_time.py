@@ -26,20 +26,11 @@ SAMPLES = 5
 
 @dataclass(frozen=True, eq=False)
 class TravelTime:
-    """Times of motion and of measuring.
+    """Times of motion and of measuring."""
 
-    Attributes
-    ----------
-    limits
-        Speeds and accelerations of the bridge.
-    speeds
-        Of the fastest point of arm and tool.
-    settle_s, dwell_s
-        How long the arm stands still before a reading, and the reading takes, s.
-    """
-
-    limits: MotionLimits
-    speeds: PointSpeeds
+    limits: MotionLimits  # Speeds and accelerations of the bridge
+    speeds: PointSpeeds  # Of the fastest point of arm and tool
+    # How long the arm stands still before a reading, and the reading takes, s
     settle_s: float = SETTLE_S
     dwell_s: float = DWELL_S
 
