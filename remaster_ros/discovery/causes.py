@@ -38,9 +38,8 @@ NEEDED = 3.0
 HYSTERESIS = 0.5
 # Of the best by the screening, which has the noise and the variances of the set before.
 SHORTLIST = 3
-# Exchanges of a set that is larger would take longer than the search; pairs of one smaller.
+# Exchanges of a set that is larger would take longer than the search.
 MOST_EXCHANGED = 7
-MOST_MERGED = 4
 # Fewer members are no family.
 FEWEST_MEMBERS = 3
 # A search ends after so many steps; real arms of six joints take up to ten.
@@ -178,7 +177,7 @@ class Search:
             solution = more
 
     def _exchanged(self, solution: Solution) -> Solution:
-        """Replace cells, or two by one or two others, by what explains more in their place."""
+        """Replace cells by what explains more in their place."""
         for _ in range(MOST_EXCHANGED):
             cells = solution.cells
             if len(cells) > MOST_EXCHANGED:
@@ -186,15 +185,6 @@ class Search:
             least = solution.log_evidence + HYSTERESIS
             singles = [self.without(solution, cell) for cell in cells]
             candidates = [fit for rest in singles for fit in self.in_place(rest, least)]
-            if len(cells) <= MOST_MERGED:
-                pairs = [
-                    self.without(rest, other)
-                    for index, rest in enumerate(singles)
-                    for other in cells[index + 1 :]
-                ]
-                first = [fit for rest in pairs for fit in self.in_place(rest)]
-                candidates += first
-                candidates += [fit for one in first for fit in self.in_place(one, least)]
             best = _best(candidates)
             if best is None or best.log_evidence < solution.log_evidence + HYSTERESIS:
                 break
