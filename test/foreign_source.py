@@ -19,7 +19,7 @@ from remaster_ros.kinematics.transforms import matrix_from_rpy, quaternion_xyzw
 from remaster_ros.nodes.messages import stamp_of
 from remaster_ros.simulation.world import World
 
-RATE_HZ = 15.0
+RATE_HZ = 10.0
 SIGMA_M, SIGMA_RAD = 0.05e-3, 0.2e-3
 JUMP_M = 0.02
 R_T_B = matrix_from_rpy(np.array([0.4, -0.2, 1.1]))

@@ -1,7 +1,7 @@
 """What can go wrong between a bridge and its arm, at random moments of a move under way.
 
 Each injection is a function of the scene; it returns from when on the arm must receive nothing
-(`SILENT`), where that is so. What is expected of the bridge stands in `hostile_kinds`.
+(`SILENT`), where that is so. What is expected of the bridge stands in `hostile_campaign`.
 """
 
 from __future__ import annotations
