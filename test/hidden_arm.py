@@ -64,6 +64,12 @@ class PinocchioArm:
             [pin.computePotentialEnergy(self.model, self._data, angles) for angles in q]
         )
 
+    def base_moment(self, q: FloatArray) -> FloatArray:
+        """Moment of the moving links' weight about the base's origin, N m, (n, 3)."""
+        mass = sum(inertia.mass for inertia in self.model.inertias.tolist()[1:])
+        centers = np.array([pin.centerOfMass(self.model, self._data, angles) for angles in q])
+        return np.cross(centers, mass * GRAVITY)
+
     def segments(self) -> FloatArray:
         """From each joint's origin to the next one's, the last to the tool's, m, (k + 1, 3).
 
