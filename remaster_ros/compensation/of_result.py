@@ -87,10 +87,24 @@ class Described:
 
 
 def offsets_alone(fit: FitResult, widening: float, notes: Sequence[str] = ()) -> Described:
-    """Return the arm of a fit's zero-offsets; those that are not identifiable stay as they are."""
+    """Return the arm of a fit's zero-offsets; those that are not identifiable stay as they are.
+
+    Registrations and markers are the most likely ones with these offsets: where a prior alone
+    tells an offset from a place of the marker, leaving out the one moves the other.
+    """
     described = _described(fit, [], np.zeros(0), None, widening)
+    model = described.model
+    k, root = model.joints, model.root
     offsets = np.where(fit.identifiable, fit.joint_offsets, 0.0)
-    model = replace(described.model, joint_offsets=offsets)
+    if np.any(offsets != model.joint_offsets):
+        tied = np.linalg.pinv(root[:, :k], rcond=1e-9)
+        step = root.T @ (tied.T @ (offsets - model.joint_offsets))
+        left = root - root[:, :k] @ (tied @ root)
+        left[:, :k] = 0.0
+        model = replace(model.moved(step), joint_offsets=offsets, root=left)
+        if fit.found is not None:
+            model = _as_predicted(model, fit, fit.found.problem, [])
+        model = replace(model, root=root)
     return replace(described, model=model, notes=(*described.notes, *notes))
 
 

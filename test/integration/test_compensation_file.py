@@ -95,6 +95,14 @@ def test_of_a_fit_the_file_has_its_offsets_and_nothing_else(hidden, tmp_path):
     assert all(joint.why for joint in file.content.joints if not joint.identifiable)
     q = fit.session.measurements.q[:20]
     assert np.linalg.eigvalsh(file.uncertainty(q)).min() > 0.0
+    # An offset that only a prior tells from a place of the marker is left out, its effect is not.
+    assert np.any(fit.joint_offsets[~known] != 0.0)
+    alone, m = offsets_alone(fit, 1.0).model, fit.session.measurements
+    assert not np.any(alone.joint_offsets[~known])
+    rows = ~m.is_validation
+    seen = alone.in_sensor(alone.state(m.q[rows]), 'mocap', 'sir')
+    expected = (m.position - fit.residuals_after)[rows]
+    np.testing.assert_allclose(seen, expected, atol=1e-5)
 
 
 @pytest.mark.parametrize(
