@@ -275,7 +275,10 @@ def _of_discovery(path: Path) -> dict[str, Any]:
         'judgement': content['judgement']['mood'],
         'headline': content['judgement']['headline'],
         'effects': [
-            {key: one.get(key) for key in ('name', 'joints', 'title', 'size_mm')}
+            {
+                **{key: one[key] for key in ('name', 'joints', 'title')},
+                'size_mm': 1e3 * one['size_m'],
+            }
             for one in content['effects']
         ],
     }

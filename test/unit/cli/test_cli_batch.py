@@ -32,8 +32,8 @@ def rows(folder: Path) -> dict[str, dict]:
 @pytest.fixture(scope='module')
 def sessions(tmp_path_factory):
     folder = tmp_path_factory.mktemp('sessions')
-    for seed in (1, 2):
-        given = ['--poses', '12', '--validation', '6', '--seed', str(seed), '--quiet']
+    for seed, hidden in ((1, ['--effect', 'joint_compliance@2:1.0']), (2, [])):
+        given = ['--poses', '12', '--validation', '6', '--seed', str(seed), '--quiet', *hidden]
         assert main(['simulate', str(folder / f's{seed}'), *given]) == 0
     return folder
 
@@ -50,6 +50,11 @@ def test_rows_do_not_depend_on_the_workers_and_are_not_made_again(sessions, tmp_
     assert main(['batch', *two, '--out', str(tmp_path / 'two'), '--workers', '2', '--quiet']) == 0
     first, second = rows(tmp_path / 'one'), rows(tmp_path / 'two')
     assert first[one[0]]['status'] == 'done'
+    (cause,) = first[one[0]]['discovery']['effects']
+    assert (cause['name'], cause['joints']) == ('joint_compliance', [2])
+    (folder,) = (tmp_path / 'one').glob('s1-*')
+    told = json.loads((folder / 'discovery' / 'discovery.json').read_bytes())['effects']
+    assert cause['size_mm'] == 1e3 * told[0]['size_m'] > 0.1
     for session in one[:1]:
         assert first[session] == second[session]
         name = next((tmp_path / 'one').glob(f'{Path(session).name}-*')).name
