@@ -113,10 +113,14 @@ class Held:
     @property
     def words(self) -> list[str]:
         """What is left out, a line each."""
+
+        def of_joints(joints: list[int]) -> str:
+            several = 's' if len(joints) > 1 else ''
+            return f' of joint{several} {", ".join(map(str, joints))}' if joints else ''
+
         never = [
             f'Corrected in no form: {left.effect}'
-            f'{" of joints " + ", ".join(map(str, left.joints)) if left.joints else ""}, '
-            f'{left.size_mm:.3f} mm RMS: {left.instead}'
+            f'{of_joints(left.joints)}, {left.size_mm:.3f} mm RMS: {left.instead}'
             for left in self.never
         ]
         if not self.parts:
