@@ -27,7 +27,7 @@ IN_95 = 7.815
 
 @dataclass(frozen=True)
 class Judged:
-    """Errors of the marker at poses away from singularities.
+    """Errors of the marker at poses away from singularities; at all where there are none such.
 
     Attributes
     ----------
@@ -60,7 +60,8 @@ def judged(hidden: HiddenSession, compensator: Compensator, tour: Visits) -> Jud
     wanted = apply(inverse(T), apply(nominal, place))
     effects = [effect for effect in hidden.truth.effects if effect.kind in ARM_KINDS]
     seen = hidden.world.on(replace(tour, q=found.command)).seen(effects)
-    whole = ~found.faded
+    # A small arm's Jacobian has a direction that fades everywhere: judged where it is, then.
+    whole = ~found.faded if not found.faded.all() else found.faded
     error = (seen - wanted)[whole]
     spread = T[:3, :3].T @ compensator.spread(tour.q[whole])
     covariance = spread @ np.swapaxes(spread, 1, 2)

@@ -14,7 +14,6 @@ from remaster_ros.linear_algebra import one_thread
 from remaster_ros.planning.candidates import Plan, PlannedPose, PlanningScene
 from remaster_ros.planning.design_information import DesignInformation
 from remaster_ros.planning.expected_sensors import ExpectedSensor, ToolBox
-from remaster_ros.planning.free_order import free_way
 from remaster_ros.planning.pose_design import (
     HELD_OUT_POSES,
     HELD_OUT_SOLUTIONS,
@@ -22,6 +21,7 @@ from remaster_ros.planning.pose_design import (
     Goal,
     choose,
 )
+from remaster_ros.planning.tour_order import free_way
 from remaster_ros.planning.travel_time import TravelTime
 from remaster_ros.types import FloatArray, IntArray, Priors
 

@@ -15,7 +15,6 @@ from remaster_ros.kinematics.collision import CollisionModel
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.transforms import transform
 from remaster_ros.planning.candidates import Plan, PlannedPose, PlanningScene, order_solutions
-from remaster_ros.planning.free_order import free_way
 from remaster_ros.planning.planned_design import (
     POOL_CANDIDATES,
     Designed,
@@ -31,7 +30,14 @@ from remaster_ros.planning.separating_design import (
     measured_so_far,
     separate,
 )
-from remaster_ros.planning.tour_order import FITTED, HELD_OUT, REFERENCE, REGISTRATION, Tour
+from remaster_ros.planning.tour_order import (
+    FITTED,
+    HELD_OUT,
+    REFERENCE,
+    REGISTRATION,
+    Tour,
+    free_way,
+)
 from remaster_ros.planning.travel_time import TravelTime
 from remaster_ros.types import FloatArray, Measurements
 

@@ -17,8 +17,7 @@ from remaster_ros.planning.candidates import (
     candidate_poses,
     plan_poses,
 )
-from remaster_ros.planning.free_order import free_order
-from remaster_ros.planning.tour_order import Tour, nearest_solution
+from remaster_ros.planning.tour_order import Tour, free_order, nearest_solution
 from remaster_ros.planning.tour_planner import registration_tour
 from remaster_ros.session.workcell import read_cell
 
