@@ -11,11 +11,11 @@ import re
 import threading
 import time
 
-import fault_page
 import numpy as np
 import optitrack_world
 import pytest
 import tracker_world
+from faults import page
 
 from remaster_ros.calibration.registration import register_ransac
 from remaster_ros.errors import DeviceError, InsufficientDataError
@@ -46,10 +46,10 @@ def observe(who: str, kind: str, text: str) -> None:
     text = re.sub(r'no answer to the [a-z ]+ within', 'no answer within', text)
     text = text[0].upper() + text[1:]
     if who in DEVICES:
-        fault_page.compare('matrix', ('', *KINDS), f'**{who}**', kind, text)
+        page.compare('matrix', ('', *KINDS), f'**{who}**', kind, text)
     else:
         assert kind in NAMED
-        fault_page.compare('named', ('fault', 'what happens'), kind, 'what happens', text)
+        page.compare('named', ('fault', 'what happens'), kind, 'what happens', text)
 
 
 # The devices at their wires
@@ -381,7 +381,7 @@ def test_a_stray_during_the_registration(tmp_path):
 
 def test_the_page_has_no_other_faults():
     """What is tried is compared where it is tried; a row of something else would stay."""
-    matrix = fault_page.cells('matrix')
+    matrix = page.cells('matrix')
     assert list(matrix) == [f'**{who}**' for who in DEVICES]
     assert all(tuple(row) == KINDS for row in matrix.values())
-    assert set(fault_page.cells('named')) == NAMED
+    assert set(page.cells('named')) == NAMED

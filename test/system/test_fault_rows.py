@@ -1,7 +1,7 @@
 """Faults in running collections of real nodes, and the page of them.
 
 `make faults` tries every row and writes docs/faults.md; `make test` tries those marked quick, and
-compares. What is injected, and what must hold whatever happens, is in `fault_rows`.
+compares. What is injected, and what must hold whatever happens, is in `faults.rows`.
 """
 
 import itertools
@@ -9,19 +9,16 @@ import os
 import subprocess
 import sys
 
-import fault_observation
-import fault_observer
-import fault_page
-import fault_rows
 import numpy as np
 import pytest
+from faults import observation, observer, page, rows
 from ros_rig import ROOT, domains
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(900)]
 
-ALL = bool(fault_page.MODE)
-TRIED = [row for row in fault_rows.ROWS if ALL or row.quick]
-TRIED.sort(key=lambda row: (list(fault_observation.BENCHES).index(row.bench), not row.quick))
+ALL = bool(page.MODE)
+TRIED = [row for row in rows.ROWS if ALL or row.quick]
+TRIED.sort(key=lambda row: (list(observation.BENCHES).index(row.bench), not row.quick))
 TRIES = 3
 ENOUGH = 12
 """So many configurations must be left for another row."""
@@ -47,11 +44,11 @@ class Benches:
         ):
             self.close()
         if self._bench is None:
-            from fault_bench import Bench
+            from faults.bench import Bench
 
             folder = self._folders.mktemp(f'faults_{next(self._numbers)}')
             self._kind, self.broken = kind, True
-            self._bench = Bench(folder, next(domains), **fault_observation.BENCHES[kind])
+            self._bench = Bench(folder, next(domains), **observation.BENCHES[kind])
             self._bench.begin()
         return self._bench
 
@@ -74,46 +71,46 @@ def benches(tmp_path_factory):
 def write(section, seen):
     """Put a row that was seen beside, or in the place of, what the page has of it."""
     keys = 1 if section == 'five' else 2
-    order = [(row.fault,) if keys == 1 else (row.who, row.fault) for row in fault_rows.ROWS]
-    rows = fault_page.rows(section)
-    if fault_page.MODE == 'write':
-        rows = [row for row in rows if row[:keys] != seen[:keys]]
-    known = [row for row in rows if row[:keys] == seen[:keys]]
-    if not any(fault_page.same(seen, other) for other in known):
-        rows.append(seen)
+    order = [(row.fault,) if keys == 1 else (row.who, row.fault) for row in rows.ROWS]
+    lines = page.rows(section)
+    if page.MODE == 'write':
+        lines = [row for row in lines if row[:keys] != seen[:keys]]
+    known = [row for row in lines if row[:keys] == seen[:keys]]
+    if not any(page.same(seen, other) for other in known):
+        lines.append(seen)
     order += OTHERS
-    rows = [row for row in rows if row[:keys] in order]
-    rows.sort(key=lambda row: order.index(row[:keys]))
-    heading = FIVE_HEADING if keys == 1 else fault_observation.COLUMNS
-    fault_page.replace(section, fault_page.table(heading, rows))
+    lines = [row for row in lines if row[:keys] in order]
+    lines.sort(key=lambda row: order.index(row[:keys]))
+    heading = FIVE_HEADING if keys == 1 else observation.COLUMNS
+    page.replace(section, page.table(heading, lines))
 
 
 def is_on_page(section, row):
     """Return whether the page has this row, and the lines that it has of this fault."""
     keys = 1 if section == 'five' else 2
-    page = [other for other in fault_page.rows(section) if other[:keys] == row[:keys]]
-    heading = FIVE_HEADING if section == 'five' else fault_observation.COLUMNS
-    return fault_page.allows(page, row, heading.index('what is said')), page
+    lines = [other for other in page.rows(section) if other[:keys] == row[:keys]]
+    heading = FIVE_HEADING if section == 'five' else observation.COLUMNS
+    return page.allows(lines, row, heading.index('what is said')), lines
 
 
 def compare(section, row):
     """See that the page has this row, or write it there."""
-    if fault_page.WRITES:
+    if page.WRITES:
         write(section, row)
         return
-    known, page = is_on_page(section, row)
-    assert known, f'docs/faults.md is not what was observed (make faults):\n{row}\n{page}'
+    known, lines = is_on_page(section, row)
+    assert known, f'docs/faults.md is not what was observed (make faults):\n{row}\n{lines}'
 
 
 def cells(row, seen):
     """Return the section and the line of the page."""
     texts = seen.said[0].upper() + seen.said[1:], seen.goes_on
-    if row not in fault_rows.FIVE:
+    if row not in rows.FIVE:
         return 'nodes', (row.who, row.fault, texts[0], seen.commanded, texts[1])
     commanded = seen.commanded
     if seen.share:
         commanded += f' ({seen.travel_deg:.1f}° onward, {100 * seen.share:.0f} %)'
-    return 'five', (row.fault, fault_rows.BEFORE[row.fault], commanded, *texts)
+    return 'five', (row.fault, rows.BEFORE[row.fault], commanded, *texts)
 
 
 @pytest.mark.parametrize('row', TRIED, ids=lambda row: f'{row.who}: {row.fault}')
@@ -126,14 +123,14 @@ def test_row(benches, row):
         bench = benches.of(row.bench)
         benches.broken = True
         try:
-            seen = fault_observation.observe(bench, row)
-        except fault_observation.TooBusyError as busy:
+            seen = observation.observe(bench, row)
+        except observation.TooBusyError as busy:
             benches.broken = False
             pytest.skip(str(busy))
         benches.broken = False
         section, line = cells(row, seen)
         print(line)
-        if fault_page.WRITES or tried == TRIES or is_on_page(section, line)[0]:
+        if page.WRITES or tried == TRIES or is_on_page(section, line)[0]:
             break
     compare(section, line)
 
@@ -141,7 +138,7 @@ def test_row(benches, row):
 @pytest.mark.skipif(not ALL, reason='needs a set of nodes of its own: make faults')
 def test_a_robot_that_copies_its_commands_never_moves(tmp_path):
     """Found by a probe of a micrometre, before the first motion."""
-    from fault_bench import Bench
+    from faults.bench import Bench
 
     bench = Bench(tmp_path, next(domains))
     try:
@@ -152,7 +149,7 @@ def test_a_robot_that_copies_its_commands_never_moves(tmp_path):
         moved = bench.world.reported(bench.world.now())[0] - bench.world.start_q
         assert np.max(np.abs(moved)) < 1e-4
         assert all(command.travel_rad < 1e-4 for command in bench.observer.commands)
-        said = fault_observer.plain(bench.halted)
+        said = observer.plain(bench.halted)
         bench.inject()
         took = bench.operate()
         bench.until(lambda: any(c.is_move for c in bench.observer.commands), 60, 'a move')

@@ -13,10 +13,10 @@ import pytest
 pytest.importorskip('rclpy', reason='needs ROS 2 Jazzy or its wheels')
 pytest.importorskip('pinocchio', reason='the judge needs pinocchio (pip install .[test])')
 
-from hostile_campaign import in_parallel
-from hostile_judge import Rules
-from hostile_known import known_situations, situations
-from hostile_outcomes import report
+from hostile.campaign import in_parallel
+from hostile.judge import Rules
+from hostile.known import known_situations, situations
+from hostile.outcomes import report
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(900)]
 

@@ -14,10 +14,10 @@ from ros_rig import ROOT, call, clear_halt, node_arguments, wait_until
 pytest.importorskip('rclpy', reason='needs ROS 2 Jazzy or its wheels')
 pytest.importorskip('pinocchio', reason='the judge needs pinocchio (pip install .[test])')
 
-from hostile_arm import Command
-from hostile_judge import GRACE_S, Judge, Rules, after
-from hostile_lines import RELIABLE
-from hostile_scene import demo_body
+from hostile.arm import Command
+from hostile.judge import GRACE_S, Judge, Rules, after
+from hostile.lines import RELIABLE
+from hostile.scene import demo_body
 
 from remaster_ros.nodes.demo import free_ports
 from remaster_ros.session.bridge_files import LastCommandFile

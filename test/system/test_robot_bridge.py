@@ -9,10 +9,10 @@ pytest.importorskip('rclpy', reason='needs ROS 2 Jazzy or its wheels')
 pytest.importorskip('pinocchio', reason='the judge needs pinocchio (pip install .[test])')
 
 from compensation_files import arm, save
-from hostile_bench import Bench
-from hostile_lines import EMERGENCY
-from hostile_process import environment
-from hostile_scene import HOME
+from hostile.bench import Bench
+from hostile.lines import EMERGENCY
+from hostile.process import environment
+from hostile.scene import HOME
 from ros_rig import PATIENCE, found
 from simple_cells import write_cell
 from std_msgs.msg import String

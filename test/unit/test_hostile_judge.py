@@ -5,8 +5,8 @@ import pytest
 
 pytest.importorskip('pinocchio', reason='needs the judge: pip install pin')
 
-from hostile_arm import Command, HostileArm
-from hostile_judge import Judge, Rules, along
+from hostile.arm import Command, HostileArm
+from hostile.judge import Judge, Rules, along
 from numpy.testing import assert_allclose
 
 HOME = np.array([0.0, 0.3, 0.0, 1.0, 0.0, 0.5, 0.0])
@@ -16,7 +16,7 @@ STILL = np.zeros(7)
 @pytest.fixture(scope='module')
 def body():
     pytest.importorskip('pinocchio')
-    from hostile_scene import demo_body
+    from hostile.scene import demo_body
 
     return demo_body()
 

@@ -12,7 +12,7 @@ import numpy as np
 import rclpy
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray
-from hostile_arm import HostileArm
+from hostile.arm import HostileArm
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import QoSProfile
 from ros_rig import OWN_DOMAIN

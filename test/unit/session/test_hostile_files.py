@@ -8,7 +8,7 @@ import shutil
 from pathlib import Path
 
 import pytest
-from hostile_files import check_read, read_urdf, spoil_and_read
+from hostile.files import check_read, read_urdf, spoil_and_read
 
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.urdf import parse_urdf

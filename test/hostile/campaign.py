@@ -13,8 +13,8 @@ from multiprocessing import Queue, get_context
 from pathlib import Path
 
 import numpy as np
-from hostile_bench import Bench
-from hostile_injections import (
+from hostile.bench import Bench
+from hostile.injections import (
     a_little_late,
     another_robots_joints,
     clock_set_back,
@@ -64,10 +64,10 @@ from hostile_injections import (
     wrapped,
     wrapped_once,
 )
-from hostile_judge import GRACE_S, Body, Judge, Rules, after
-from hostile_lines import EMERGENCY
-from hostile_outcomes import Outcome
-from hostile_scene import HOME, Scene, begin, bench_of, demo_body, target
+from hostile.judge import GRACE_S, Body, Judge, Rules, after
+from hostile.lines import EMERGENCY
+from hostile.outcomes import Outcome
+from hostile.scene import HOME, Scene, begin, bench_of, demo_body, target
 
 from remaster_ros.collection.events import SolutionFailed
 
@@ -125,7 +125,7 @@ WITHOUT_TOPIC = (
 
 
 HALT_WITHIN_S = 4.0
-"""A halt not shown so long after the injection was not made, s: see `hostile_scene.FAST`."""
+"""A halt not shown so long after the injection was not made, s: see `hostile.scene.FAST`."""
 
 BEGUN_S = 3.0
 """A bridge has been up for so long before a collection is begun, s."""

@@ -1,7 +1,7 @@
 """What a command to an arm means physically: speeds, accelerations, limits, the way of a stop.
 
 Written from the physics of the arm alone: pinocchio's kinematics of the URDF, the controller's
-interpolation of `hostile_arm`, and nothing of the code that makes the commands.
+interpolation of `hostile.arm`, and nothing of the code that makes the commands.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from itertools import pairwise
 
 import numpy as np
 import pinocchio as pin
-from hostile_arm import Command
+from hostile.arm import Command
 
 from remaster_ros.types import FloatArray
 

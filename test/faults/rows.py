@@ -1,6 +1,6 @@
 """The faults of docs/faults.md that are tried on real nodes.
 
-A row is one fault in the middle of a running collection (`fault_observation`).
+A row is one fault in the middle of a running collection (`faults.observation`).
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ import time
 from collections.abc import Callable
 
 import numpy as np
-from fault_bench import RATE, SENSOR_OF, Bench
-from fault_observation import Row, wait_until
+from faults.bench import RATE, SENSOR_OF, Bench
+from faults.observation import Row, wait_until
 
 from remaster_ros.collection.events import VERSION, SolutionSettled
 

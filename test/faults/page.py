@@ -11,7 +11,7 @@ import os
 import re
 from pathlib import Path
 
-PAGE = Path(__file__).parents[1] / 'docs' / 'faults.md'
+PAGE = Path(__file__).parents[2] / 'docs' / 'faults.md'
 BEGIN, END = '<!-- observed by the tests: {} -->', '<!-- end -->'
 MODE = os.environ.get('FAULTS_PAGE', '')
 WRITES = MODE in ('write', 'add')

@@ -21,8 +21,8 @@ import rclpy
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
-from hostile_arm import Command, HostileArm
-from hostile_lines import (
+from hostile.arm import Command, HostileArm
+from hostile.lines import (
     COMMANDS,
     EMERGENCY,
     INTRUDER,
@@ -33,7 +33,7 @@ from hostile_lines import (
     Lines,
     Seen,
 )
-from hostile_process import BridgeProcess
+from hostile.process import BridgeProcess
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import SetParameters
 from rclpy.executors import SingleThreadedExecutor

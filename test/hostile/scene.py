@@ -8,9 +8,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from hostile_bench import Bench
-from hostile_judge import Body, Rules
-from hostile_process import environment
+from hostile.bench import Bench
+from hostile.judge import Body, Rules
+from hostile.process import environment
 
 from remaster_ros.session.workcell import read_cell
 from remaster_ros.types import FloatArray

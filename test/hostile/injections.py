@@ -1,7 +1,7 @@
 """What can go wrong between a bridge and its arm, at random moments of a move under way.
 
 Each injection is a function of the scene; it returns from when on the arm must receive nothing
-(`SILENT`), where that is so. What is expected of the bridge stands in `hostile_campaign`.
+(`SILENT`), where that is so. What is expected of the bridge stands in `hostile.campaign`.
 """
 
 from __future__ import annotations
@@ -11,9 +11,9 @@ import time
 from collections.abc import Callable
 
 import numpy as np
-from hostile_bench import Bench
-from hostile_lines import COMMANDS, INTRUDER, RELIABLE
-from hostile_scene import ANSWER_S, HOME, SPREAD, Scene
+from hostile.bench import Bench
+from hostile.lines import COMMANDS, INTRUDER, RELIABLE
+from hostile.scene import ANSWER_S, HOME, SPREAD, Scene
 from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 

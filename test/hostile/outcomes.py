@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from hostile_judge import Judgement, Rules, percentiles
+from hostile.judge import Judgement, Rules, percentiles
 
 STALLED_S = 0.15
 """The test's own process did not run for so long: joint states came late by it, s."""

@@ -11,7 +11,7 @@ from typing import Any
 
 from forked_nodes import NodeProcess
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 
 
 class BridgeProcess:

@@ -13,11 +13,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from hostile_bench import Bench
-from hostile_judge import GRACE_S, Body, Judge, Rules, after
-from hostile_lines import RELIABLE
-from hostile_outcomes import Outcome
-from hostile_scene import HOME, begin, bench_of, demo_body
+from hostile.bench import Bench
+from hostile.judge import GRACE_S, Body, Judge, Rules, after
+from hostile.lines import RELIABLE
+from hostile.outcomes import Outcome
+from hostile.scene import HOME, begin, bench_of, demo_body
 from sensor_msgs.msg import JointState
 
 START = HOME + np.array([-1.2, 0.1, 0.2, -0.2, 0.3, 0.0, -0.4])

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from fault_bench import Bench
-from fault_observer import plain
+from faults.bench import Bench
+from faults.observer import plain
 from ros_rig import PATIENCE
 
 from remaster_ros.collection.events import (

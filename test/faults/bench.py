@@ -1,6 +1,6 @@
 """Real nodes on fake devices in a ROS domain of their own, to spoil one part of it at a time.
 
-Every node is a process of its own. The bench's own node observes (`fault_observer`),
+Every node is a process of its own. The bench's own node observes (`faults.observer`),
 publishes what strangers would, and, where asked, stands between two nodes and hands on what the
 one tells the other, spoiled. An operator calls the services that a person would.
 """
@@ -19,7 +19,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-from fault_observer import Observer
+from faults.observer import Observer
 from forked_nodes import NodeProcess
 from ros_rig import ASKED, PATIENCE
 
@@ -65,7 +65,7 @@ class Relay:
         self._send(self._last)
 
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 SEED, RATE, SPEED_SHARE = 11, 4.0, 0.2
 SENSOR_OF = {'optitrack_markers': 'mocap', 'laser_tracker_markers': 'tracker'}
 NODES = ('pose_planner', 'robot_bridge', 'recorder', *SENSOR_OF)
