@@ -75,13 +75,15 @@ class InverseJudge:
                 if i not in held
             ]
         )
+        kinds = [joint.shortname() for joint in self.model.joints][1:]
+        self._slides = np.array(['JointModelP' in kind for kind in kinds])
         neutral = pin.neutral(self.model)
         pin.framesForwardKinematics(self.model, self.data, neutral)
         self._base = self.data.oMf[self.model.getFrameId(base)].copy()
 
     def tool(self, free: FloatArray) -> pin.SE3:
-        """Return T_R_T at angles of the joints that are not held, (6,)."""
-        q = np.empty(6)
+        """Return T_R_T at positions of the joints that are not held, (k,)."""
+        q = np.empty(self.model.nq)
         q[self._at] = free
         pin.framesForwardKinematics(self.model, self.data, q)
         return self._base.actInv(self.data.oMf[self.tip])
@@ -92,10 +94,10 @@ class InverseJudge:
         return float(np.linalg.norm(screw[:3])), float(np.linalg.norm(screw[3:]))
 
     def solutions(self, T: FloatArray, starts: int, rng: np.random.Generator) -> FloatArray:
-        """Return the distinct solutions in [-pi, pi] that random starts arrive at, (m, 6)."""
+        """Return the distinct solutions in [-pi, pi] that random starts arrive at, (m, k)."""
         found: list[FloatArray] = []
         goal = self._base * pin.SE3(T)
-        for q in rng.uniform(-np.pi, np.pi, (starts, 6)):
+        for q in rng.uniform(-np.pi, np.pi, (starts, self.model.nq)):
             for _ in range(80):
                 pin.computeJointJacobians(self.model, self.data, q)
                 pin.updateFramePlacement(self.model, self.data, self.tip)
@@ -103,14 +105,15 @@ class InverseJudge:
                 screw = pin.log6(self.data.oMf[self.tip].actInv(goal)).vector
                 size = screw @ screw
                 if size < 1e-22:
-                    free = (q[self._at] + np.pi) % (2 * np.pi) - np.pi
+                    turned = (q + np.pi) % (2 * np.pi) - np.pi
+                    free = np.where(self._slides, q, turned)[self._at]
                     if not found or np.min(apart(free, np.array(found))) > SAME_RAD:
                         found.append(free)
                     break
-                damped = J @ J.T + min(0.02 * size, 0.1) * np.eye(6)
-                step = J.T @ np.linalg.solve(damped, screw)
+                damped = J.T @ J + min(0.02 * size, 0.1) * np.eye(self.model.nv)
+                step = np.linalg.solve(damped, J.T @ screw)
                 q = q + step * min(1.0, 0.7 / np.max(np.abs(step)))
-        return np.array(found).reshape(-1, 6)
+        return np.array(found).reshape(-1, self.model.nq)
 
 
 def apart(q: FloatArray, others: FloatArray) -> FloatArray:

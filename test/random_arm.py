@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
+
 import numpy as np
 
 
-def random_arm_urdf(rng: np.random.Generator, joints: int = 6) -> str:
-    """Return a URDF whose chain base_link … tool has ``joints`` moving and some fixed joints."""
+def random_arm_urdf(
+    rng: np.random.Generator, joints: int = 6, slides: Collection[int] = ()
+) -> str:
+    """Return a URDF whose chain base_link … tool has ``joints`` moving and some fixed joints.
+
+    Those with the indices ``slides`` (0 is the base's) are prismatic.
+    """
 
     def numbers(values):
         return ' '.join(f'{value:.17g}' for value in values)
@@ -30,9 +37,10 @@ def random_arm_urdf(rng: np.random.Generator, joints: int = 6) -> str:
     parts = [link('base_link')]
     parent = 'base_link'
     for i in range(1, joints + 1):
+        kind = 'prismatic' if i - 1 in slides else 'revolute'
         # A fixed joint before, and a side branch with a gripper's finger after the link.
         parts += [link(f'mount_{i}'), joint(f'fixed_{i}', 'fixed', parent, f'mount_{i}')]
-        parts += [link(f'link_{i}'), joint(f'joint_{i}', 'revolute', f'mount_{i}', f'link_{i}')]
+        parts += [link(f'link_{i}'), joint(f'joint_{i}', kind, f'mount_{i}', f'link_{i}')]
         parts += [link(f'finger_{i}'), joint(f'side_{i}', 'fixed', f'link_{i}', f'finger_{i}')]
         parent = f'link_{i}'
     parts += [link('tool'), joint('tool_joint', 'fixed', parent, 'tool')]

@@ -21,6 +21,7 @@ from remaster_ros.kinematics.urdf import parse_urdf
 from remaster_ros.kinematics.urdf_geometry import chain_bodies, mesh_names
 from remaster_ros.planning.candidates import candidate_poses
 from remaster_ros.planning.cell_proposal import (
+    link_radius,
     marker_height,
     propose_held_joint,
     ranges_around,
@@ -168,6 +169,7 @@ def _propose(
         held = propose_held_joint(chain, facing)
     except InputError as error:
         raise InputError(f'{args.robot}: {error}') from None
+    thickness = link_radius(reach, LINK_RADIUS_M)
     found, missing = _meshes(text, args.robot, args.package_path)
     read_mesh = mesh_reader(urdf, [Path(folder) for folder in found])
     bodies = chain_bodies(text, chain, lambda name: None if name in missing else read_mesh(name))
@@ -181,7 +183,8 @@ def _propose(
         reach=reach,
         ranges=ranges,
         kept='',
-        marker_z=marker_height(chain, bodies, LINK_RADIUS_M),
+        marker_z=marker_height(chain, bodies, thickness),
+        link_radius=thickness,
         sensor_R=place,
         sensors=args.sensors,
         mesh_path=found,

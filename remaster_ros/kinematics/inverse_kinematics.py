@@ -16,6 +16,12 @@ one: of a six-joint arm's starts spread evenly, nearly all do where the pose can
 each of its solutions about as often. How many solutions such starts may have missed follows from
 how often each was found [3]_ [4]_.
 
+An arm with fewer than six joints takes few of all poses: one of five axes brings its tool to a
+place and an axis of it into a direction, but not the tool's own axis into any, since the last
+joint turns about that one in nearly all of them; a SCARA's tool stays upright. So its poses are
+drawn among those that it takes (`planning.candidates`), and their solutions reach them in position
+and orientation, as those of other arms do.
+
 References
 ----------
 .. [1] D. Ostermeier, J. Külz, M. Althoff, "Automatic Geometric Decomposition for Analytical
@@ -58,7 +64,8 @@ DISTINCT = 1e-4
 # Steps are taken until a hundredth of what is certified remains; where two solutions are about to
 # meet they halve the rest, as from 0.1 rad to 1e-4 rad in ten steps.
 _STEPS = 60
-# Longer steps leave what the derivative at their start holds for: sin x is x to 4 % up to here.
+# Longer steps leave what the derivative at their start holds for: sin x is x to 4 % up to here. A
+# joint that slides moves the tool in proportion: steps of it alone have any length.
 _LONGEST_RAD = 0.5
 # Rows computed at a time, which bounds the memory: some 2 kB each.
 _ROWS = 20_000
@@ -69,15 +76,17 @@ def reach_from(
 ) -> tuple[FloatArray, FloatArray]:
     """Bring starts to the poses that they are for.
 
-    ``free``: joints that may turn, six; ``starts``: rad, (m, k); ``T``: T_R_T of each, (m, 4, 4).
-    Returns q: Where they arrive, in [-pi, pi] for the free joints, rad, (m, k); left: The larger
+    ``free``: joints that may move, at most six; ``starts``: rad or m, (m, k); ``T``: T_R_T of
+    each, (m, 4, 4).
+    Returns q: Where they arrive, (m, k), in [-pi, pi] for free joints that turn; left: The larger
     of the translation, m, and rotation, rad, between tool and pose, (m,).
     """
     q, left = starts.copy(), np.empty(len(starts))
     for first in range(0, len(q), _ROWS):
         rows = slice(first, first + _ROWS)
         q[rows], left[rows] = _newton(chain, list(free), q[rows], T[rows])
-    q[:, free] = wrapped(q[:, free])
+    turning = [joint for joint in free if not chain.slides[joint]]
+    q[:, turning] = wrapped(q[:, turning])
     return q, left
 
 
@@ -86,7 +95,7 @@ def _newton(
 ) -> tuple[FloatArray, FloatArray]:
     left = np.full(len(q), np.inf)
     going = np.arange(len(q))
-    diagonal = np.arange(6)
+    diagonal, turning = np.arange(len(free)), ~chain.slides[free]
     for step in range(_STEPS + 1):
         screws, rotation, position = screws_and_tool(chain, q[going])
         missing = twists_to(T[going], rotation, position)
@@ -97,21 +106,23 @@ def _newton(
             break
         jacobian, missing = screws[wrong][:, :, free], missing[wrong]
         transposed = np.swapaxes(jacobian, 1, 2)
-        normal = jacobian @ transposed
+        normal = transposed @ jacobian
         # Damped in proportion to the square of what is missing, so that the last steps are
         # Newton's; 1e-12 keeps them solvable where the arm is singular.
         squared = np.sum(missing**2, axis=1)
         normal[:, diagonal, diagonal] += (0.01 * np.minimum(squared, 1.0) + 1e-12)[:, None]
-        turns = (transposed @ np.linalg.solve(normal, missing[:, :, None]))[:, :, 0]
-        longest = np.max(np.abs(turns), axis=1, keepdims=True)
-        q[going[:, None], free] += turns * (_LONGEST_RAD / np.maximum(longest, _LONGEST_RAD))
+        moves = np.linalg.solve(normal, transposed @ missing[:, :, None])[:, :, 0]
+        longest = np.max(np.abs(moves) * turning, axis=1, keepdims=True)
+        q[going[:, None], free] += moves * (_LONGEST_RAD / np.maximum(longest, _LONGEST_RAD))
     return q, left
 
 
 def screws_and_tool(
     chain: SerialChain, q: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the joints' screws in R, o × a and a, (m, 6, k), and the tool in R at q (m, k).
+    """Return the joints' screws in R and the tool in R at q (m, k).
+
+    A screw is o × a and a; a and 0 of a joint that slides.
 
     The same as from `SerialChain.frames`, several times as fast: joint frames have their axis
     as Z, and a turn about it costs no product of matrices.
@@ -126,6 +137,12 @@ def screws_and_tool(
     sines, cosines = np.sin(q)[:, None, :], np.cos(q)[:, None, :]
     for i in range(k):
         axis = rotation[:, :, 2]
+        if chain.slides[i]:
+            screws[:, :3, i], screws[:, 3:, i] = axis, 0.0
+            moved = (rotation.reshape(-1, 3) @ fixed[i + 1]).reshape(m, 3, 4)
+            position = position + q[:, i, None] * axis + moved[:, :, 3]
+            rotation = moved[:, :, :3]
+            continue
         screws[:, :3, i], screws[:, 3:, i] = _cross(position, axis), axis
         s, c = sines[:, :, i], cosines[:, :, i]
         turned = np.stack(
@@ -182,17 +199,30 @@ def wrapped(angles: FloatArray) -> FloatArray:
     return angles - 2 * np.pi * np.round(angles / (2 * np.pi))
 
 
-def distinct(q: FloatArray) -> tuple[FloatArray, IntArray]:
+def distinct(chain: SerialChain, q: FloatArray) -> tuple[FloatArray, IntArray]:
     """Return the rows of q (m, k) that differ modulo whole turns, in order, and how often each is.
 
-    Returns q, counts: rad, (n, k); (n,).
+    Returns q, counts: rad or m, (n, k); (n,).
     """
-    one = np.max(np.abs(wrapped(q[:, None] - q[None])), axis=-1) <= DISTINCT
+    gaps = q[:, None] - q[None]
+    gaps = np.abs(np.where(chain.slides, gaps, wrapped(gaps)))
+    one = np.all(gaps <= DISTINCT * chain.per_radian, axis=-1)
     kept: list[int] = []
     for i in range(len(q)):
         if not one[i, kept].any():
             kept.append(i)
     return q[kept], np.sum(one[kept], axis=1)
+
+
+def spread(chain: SerialChain, free: Sequence[int], count: int) -> FloatArray:
+    """Return positions of joints, (count, n), spread evenly over whole turns, always the same.
+
+    Those of joints that slide are spread over their limits, m.
+    """
+    angles = spread_angles(count, len(free))
+    slides, low, high = chain.slides[free], chain.lower[free], chain.upper[free]
+    travel = low + (angles + np.pi) / (2 * np.pi) * np.where(slides, high - low, 0.0)
+    return np.where(slides, travel, angles)
 
 
 def spread_angles(count: int, joints: int) -> FloatArray:
@@ -237,6 +267,8 @@ class MissedSolutions:
 
 
 FREE_JOINTS = 6
+FEWEST_JOINTS = 3
+"""With fewer the tool is led along a surface, where most zero-offsets look like one another."""
 
 OWN_CONFIGURATIONS = (
     'poses cannot be planned for it; measure configurations of your own choice, and make a '
@@ -260,8 +292,9 @@ ONE_START_RAD = 0.05
 STARTS = 160
 # Poses by which it is judged what they miss.
 TRIAL_POSES = 20
-# The tool cannot be moved in six ways where the smallest singular value of the Jacobian (m, rad)
-# stays below. Errors of axes of some mrad lend a held elbow no more.
+# The free joints cannot move the tool in as many ways as they are where the smallest singular
+# value of the Jacobian (m, rad) stays below. Errors of axes of some mrad lend a held elbow no
+# more.
 IMMOBILE = 5e-3
 
 
@@ -331,17 +364,17 @@ class InverseKinematics:
     Parameters
     ----------
     chain
-        The arm: six joints, or more with the rest held.
+        The arm: at most six joints, or more with the rest held.
     held
-        Joint index (0 is the base's) -> the values, rad, at which this joint is held. None holds
-        nothing on six joints and the third joint at 0 on seven, as the counts of poses and
+        Joint index (0 is the base's) -> the values, rad or m, at which it is held. None holds
+        nothing on up to six joints and the third joint at 0 on seven, as the counts of poses and
         solutions in Van Wyk et al. suggest they did.
 
     Raises
     ------
     InputError
-        The arm has not six free joints, a held value lies outside the joint's limits, or the arm
-        is singular wherever it is.
+        The arm has other than six free joints, or more than three where it has no more; a held
+        value lies outside the joint's limits, or the arm is singular wherever it is.
     """
 
     def __init__(
@@ -392,8 +425,14 @@ class InverseKinematics:
             )
         trial = self.missed_solutions()
         share = trial.missed / max(trial.found + trial.missed, 1.0)
+        why = (
+            'No arm with a closed form is near this one, so'
+            if len(self._free) == FREE_JOINTS
+            else f'An arm with {len(self._free)} joints takes few of all poses, and is given such '
+            'as it takes. Their'
+        )
         return (
-            f'No arm with a closed form is near this one, so joint solutions are sought by '
+            f'{why} joint solutions are sought by '
             f"Newton's method from {STARTS} starts a pose; {within}. Of {TRIAL_POSES} poses "
             f'{trial.arrived} starts arrived at {trial.found} solutions, {trial.once} of which '
             f'were found once: {100.0 * share:.1f} % are missed (by Chao), and the chance that '
@@ -403,17 +442,17 @@ class InverseKinematics:
 
     def missed_solutions(self) -> MissedSolutions:
         """Return what many starts find of poses whose joint angles are spread evenly."""
-        seeds = spread_angles(TRIAL_POSES, len(self.chain))
+        seeds = spread(self.chain, range(len(self.chain)), TRIAL_POSES)
         counts = []
         for q in seeds:
             values, _ = self._parts[0]
             q[list(self.held)] = values
             pose = self.chain.forward(q)
-            starts = self._with_held(spread_angles(STARTS, FREE_JOINTS), values)
+            starts = self._with_held(spread(self.chain, self._free, STARTS), values)
             found, left = reach_from(
                 self.chain, self._free, starts, np.broadcast_to(pose, (STARTS, 4, 4))
             )
-            counts.append(distinct(found[left < CERTIFIED])[1])
+            counts.append(distinct(self.chain, found[left < CERTIFIED])[1])
         times = np.concatenate(counts)
         return MissedSolutions(
             len(times), int(times.sum()), int(np.sum(times == 1)), int(np.sum(times == 2))
@@ -437,7 +476,7 @@ class InverseKinematics:
         )
         reached = left < CERTIFIED
         ends = np.cumsum(np.bincount(owner[reached], minlength=len(T)))[:-1]
-        return [distinct(mine)[0] for mine in np.split(q[reached], ends)]
+        return [distinct(self.chain, mine)[0] for mine in np.split(q[reached], ends)]
 
     def usable(self, q: FloatArray) -> FloatArray:
         """Return those of joint solutions (m, k) that a turn brings within the limits, (n, k)."""
@@ -448,7 +487,7 @@ class InverseKinematics:
         self, values: tuple[float, ...], exact: _Exact | None, T: FloatArray
     ) -> FloatArray:
         """Return where Newton's method starts for one combination of held values, (m, k)."""
-        free = spread_angles(STARTS, FREE_JOINTS) if exact is None else exact.starts(T)
+        free = spread(self.chain, self._free, STARTS) if exact is None else exact.starts(T)
         return self._with_held(free, values)
 
     def _with_held(self, free: FloatArray, values: tuple[float, ...]) -> FloatArray:
@@ -458,7 +497,7 @@ class InverseKinematics:
         return q
 
     def _require_mobility(self) -> None:
-        """Refuse held joints that leave the tool fewer than six ways to move, wherever it is.
+        """Refuse held joints that leave the tool fewer ways to move than joints, wherever it is.
 
         Holding the elbow of an S-R-S arm does: the wrist stays at its distance to the shoulder,
         and the arm still swings about the line between them.
@@ -468,7 +507,7 @@ class InverseKinematics:
             return
         names = ', '.join(chain.joint_names[joint] for joint in self.held)
         others = [
-            f'{name} (at {np.degrees(value):.0f} degrees, say)'
+            f'{name} (at {chain.shown_offset(joint, value, 0)}, say)'
             for joint, name in enumerate(chain.joint_names)
             for value in (_middle(chain, joint),)
             if len(self.held) == 1 and _is_mobile(chain, {joint: value})
@@ -486,6 +525,8 @@ class InverseKinematics:
     def _nearest_exact(self, values: tuple[float, ...]) -> _Exact | None:
         """Return the nearest arm with a closed form; None where none is near."""
         chain, free = self.chain, self._free
+        if len(free) < FREE_JOINTS or chain.slides[free].any():
+            return None
         q = np.zeros(len(chain))
         q[list(self.held)] = values
         frames, tip = chain.frames(q), chain.forward(q)
@@ -505,7 +546,10 @@ class InverseKinematics:
             axes=axes,
             **{
                 name: getattr(chain, name)[free]
-                for name in ('lower', 'upper', 'velocity_limits', 'masses', 'centers_of_mass')
+                for name in (
+                    *('lower', 'upper', 'velocity_limits', 'masses', 'centers_of_mass'),
+                    'slides',
+                )
             },
         )
         turned = spread_angles(200, FREE_JOINTS)
@@ -520,15 +564,19 @@ class InverseKinematics:
         )
 
     def _towards_middle(self, q: FloatArray) -> FloatArray:
-        """Turn joints by whole turns as near the middle of their ranges as they come."""
+        """Turn joints by whole turns as near the middle of their ranges as they come.
+
+        What slides has no turns.
+        """
         bounded = np.isfinite(self.chain.lower) & np.isfinite(self.chain.upper)
         middle = np.zeros(len(self.chain))
         middle[bounded] = (self.chain.lower + self.chain.upper)[bounded] / 2
-        return q + 2 * np.pi * np.round((middle - q) / (2 * np.pi))
+        turns = np.where(self.chain.slides, 0.0, np.round((middle - q) / (2 * np.pi)))
+        return q + 2 * np.pi * turns
 
 
 def _is_mobile(chain: SerialChain, held: Mapping[int, float]) -> bool:
-    """Return whether the free joints move the tool in six ways at any of a few places."""
+    """Return whether the free joints move the tool in as many ways at any of a few places."""
     spread = np.sin(np.arange(8.0 * len(chain))).reshape(8, -1)
     spread[:, list(held)] = list(held.values())
     free = [i for i in range(len(chain)) if i not in held]
@@ -538,10 +586,11 @@ def _is_mobile(chain: SerialChain, held: Mapping[int, float]) -> bool:
 
 def _check_held(chain: SerialChain, held: Mapping[int, Sequence[float]]) -> None:
     free = len(chain) - len(held)
-    if free != FREE_JOINTS:
+    if free != min(len(chain), FREE_JOINTS) or free < FEWEST_JOINTS:
         raise InputError(
             f'inverse kinematics: {len(chain)} joints with {len(held)} held leave {free} free; '
-            f'poses need {FREE_JOINTS} free joints: hold none of six, one of seven'
+            f'poses need {FREE_JOINTS} free joints, or all of {FEWEST_JOINTS} to '
+            f'{FREE_JOINTS - 1}: hold none of six or fewer, one of seven'
         )
     for joint, values in held.items():
         if not 0 <= joint < len(chain):
@@ -556,7 +605,8 @@ def _check_held(chain: SerialChain, held: Mapping[int, Sequence[float]]) -> None
             if not chain.lower[joint] <= value <= chain.upper[joint]:
                 raise InputError(
                     f'inverse kinematics: {chain.joint_names[joint]} cannot be held at {value} '
-                    f'rad; its limits are {chain.lower[joint]:.4f} to {chain.upper[joint]:.4f}'
+                    f'{chain.units[joint]}; its limits are {chain.lower[joint]:.4f} to '
+                    f'{chain.upper[joint]:.4f}'
                 )
 
 
@@ -623,6 +673,8 @@ def _may_have_closed_form(axes: FloatArray, origins: FloatArray) -> bool:
 
 
 def _middle(chain: SerialChain, joint: int) -> float:
-    """Return zero, or mid-range where the limits exclude it, rad."""
-    low, high = max(chain.lower[joint], -np.pi), min(chain.upper[joint], np.pi)
+    """Return zero, or mid-range where the limits exclude it, rad or m."""
+    low, high = chain.lower[joint], chain.upper[joint]
+    if not chain.slides[joint]:
+        low, high = max(low, -np.pi), min(high, np.pi)
     return 0.0 if low < 0.0 < high else float(low + high) / 2

@@ -1,9 +1,10 @@
 """Which poses to measure: spread over the workspace, facing the sensor, reachable and visible.
 
 Candidates follow Van Wyk et al., section III-A, equations (2) to (5): a Latin hypercube over
-azimuth, radius, height and roll, the tool's Z axis at the sensor. Each is then reached in all its
-joint solutions, less those that the arm, its limits or the line of sight forbid; every one that
-is dropped is counted with the reason.
+azimuth, radius, height and roll, the tool's Z axis at the sensor; for an arm with fewer than six
+joints, poses near these that it takes. Each is then reached in all its joint solutions, less those
+that the arm, its limits or the line of sight forbid; every one that is dropped is counted with the
+reason.
 """
 
 from __future__ import annotations
@@ -20,7 +21,8 @@ from numpy.typing import ArrayLike
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.body_pairs import RESERVE_M
 from remaster_ros.kinematics.collision import CollisionModel
-from remaster_ros.kinematics.inverse_kinematics import InverseKinematics
+from remaster_ros.kinematics.inverse_kinematics import FREE_JOINTS, InverseKinematics
+from remaster_ros.kinematics.serial_chain import LEVER_M, SerialChain
 from remaster_ros.kinematics.transforms import rotation_vector_to_matrix, transform
 from remaster_ros.types import BoolArray, FloatArray, IntArray
 
@@ -30,6 +32,13 @@ NO_LINE_OF_SIGHT = 'no line of sight to '  # the sensor's name follows
 
 LIMIT_MARGIN_RAD = np.deg2rad(1.0)
 """Distance kept from the joint limits by default, rad."""
+
+# Joint positions drawn at a time for an arm of few joints, and how many times at most: one in
+# thirty to one in several hundred turns the tool within 25 degrees to a sensor, in the ranges.
+# With so many as there are poses the last pose would have to take what is left, wherever it is.
+PLACES = 10_000
+PLACES_TIMES = 20
+ENOUGH = 3
 
 _FULL_TURN = (0.0, 2 * np.pi)
 
@@ -53,6 +62,16 @@ class PoseRanges:
                 )
         if self.radius_m[0] < 0.0:
             raise InputError(f'planning: radius_m starts at {self.radius_m[0]}; it must be >= 0')
+
+    def contain(self, places: FloatArray) -> BoolArray:
+        """Return whether places (n, 3), m in R, lie in them, (n,)."""
+        x, y, height = places.T
+        # How far beyond the lower azimuth, less whole turns.
+        beyond = (np.arctan2(y, x) - self.azimuth_rad[0]) % (2 * np.pi)
+        inside = beyond <= self.azimuth_rad[1] - self.azimuth_rad[0]
+        for values, (low, high) in ((np.hypot(x, y), self.radius_m), (height, self.height_m)):
+            inside &= (values >= low) & (values <= high)
+        return np.asarray(inside)
 
 
 @dataclass(frozen=True)
@@ -131,6 +150,10 @@ class PlanningScene:
             if sight.sensor in sensors_R
         ]
         candidates = candidate_poses(count, self.ranges, aim, rng)
+        if len(self.inverse_kinematics.chain) < FREE_JOINTS:
+            (angle,) = (s.max_angle_rad for s in self.sights if s.sensor == self.aim_at)
+            chain = self.inverse_kinematics.chain
+            candidates = taken_poses(chain, candidates, self.ranges, aim, angle, rng)
         return plan_poses(
             self.inverse_kinematics, self.model, candidates, sights, self.limit_margin_rad
         )
@@ -186,6 +209,47 @@ def candidate_poses(
     y = np.cross(z, x)  # (4)
     about_z = rotation_vector_to_matrix(roll[:, None] * np.array([0.0, 0.0, 1.0]))
     return transform(np.stack((x, y, z), axis=-1) @ about_z, positions)  # (5)
+
+
+def taken_poses(
+    chain: SerialChain,
+    poses: FloatArray,
+    ranges: PoseRanges,
+    sensor_R: FloatArray,
+    max_angle_rad: float,
+    rng: np.random.Generator,
+) -> FloatArray:
+    """Return for each drawn pose one near it that an arm with fewer than six joints takes.
+
+    Such an arm takes few of all poses: one of five axes brings its tool to a place, but the
+    tool's axis there only into directions of a plane. So joint positions are drawn all over their
+    limits, and each pose gets the nearest tool pose of them that lies in the ranges, faces the
+    sensor and is no other one's. A turn by a radian counts as a way of `LEVER_M`.
+
+    ``poses``: T_R_T, (n, 4, 4); ``sensor_R``: m, (3,); ``max_angle_rad``: between the tool's Z
+    axis and the line to the sensor.
+    Returns T_R_T, (n, 4, 4). Where so few were found that none is left, a pose stays as it is
+    drawn, out of the arm's reach.
+    """
+    turn = np.where(chain.slides, np.inf, np.pi)
+    low, high = np.maximum(chain.lower, -turn), np.minimum(chain.upper, turn)
+    there = np.empty((0, 4, 4))
+    for _ in range(PLACES_TIMES):
+        places = chain.forward(rng.uniform(low, high, (PLACES, len(chain))))
+        to_sensor = sensor_R - places[:, :3, 3]
+        facing = np.sum(places[:, :3, 2] * to_sensor, axis=1)
+        seen = facing >= np.cos(max_angle_rad) * np.linalg.norm(to_sensor, axis=1)
+        there = np.concatenate((there, places[seen & ranges.contain(places[:, :3, 3])]))
+        if len(there) >= ENOUGH * len(poses):
+            break
+    # The Frobenius norm of a difference of small turns is sqrt(2) of the angle.
+    weights = np.array([LEVER_M / np.sqrt(2.0)] * 3 + [1.0])
+    left, found = (weights * there[:, :3]).reshape(-1, 12), poses.copy()
+    for i in range(min(len(poses), len(there))):
+        off = np.sum((left - (weights * poses[i, :3]).ravel()) ** 2, axis=1)
+        nearest = int(np.argmin(off))
+        found[i], left[nearest] = there[nearest], np.inf
+    return found
 
 
 def plan_poses(

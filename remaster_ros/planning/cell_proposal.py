@@ -14,6 +14,7 @@ import numpy as np
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.bodies import Body
 from remaster_ros.kinematics.inverse_kinematics import (
+    FEWEST_JOINTS,
     FREE_JOINTS,
     OWN_CONFIGURATIONS,
     InverseKinematics,
@@ -29,6 +30,9 @@ OTHER_VALUES = tuple(np.radians((-40.0, 0.0, 40.0)).tolist())
 # A marker in front of the tool plate, and how far it is kept from the last link, m.
 LEAST_MARKER_M = 0.05
 CLEAR_M = 0.03
+# Arms that reach farther are taken to have links of the thickness that cell files have where they
+# give none, m; smaller arms are built alike.
+FULL_SIZE_M = 0.9
 # A joint that goes on turning counts as one of a turn each way.
 _TURN = np.pi
 
@@ -37,7 +41,7 @@ _TURN = np.pi
 class HeldJoint:
     """Which joint to hold so that poses have joint solutions, and how these are found."""
 
-    joint: int | None  # Its index; None where the arm has six
+    joint: int | None  # Its index; None where the arm has at most six
     values_rad: tuple[float, ...]  # Where it is held
     # Mean number of joint solutions of a pose, those that cannot be reached among them
     solutions: float
@@ -64,16 +68,17 @@ def propose_held_joint(chain: SerialChain, facing: FloatArray) -> HeldJoint:
     Raises
     ------
     InputError
-        An arm with other than six or seven joints, or one that is singular everywhere; with the
-        reason.
+        An arm with fewer than three or more than seven joints, or one that is singular
+        everywhere; with the reason.
     """
-    if len(chain) == FREE_JOINTS:
+    if FEWEST_JOINTS <= len(chain) <= FREE_JOINTS:
         kinematics = InverseKinematics(chain, {})
         return HeldJoint(None, (), _mean_solutions(kinematics, facing), {}, kinematics)
     if len(chain) != FREE_JOINTS + 1:
         raise InputError(
             f"robot '{chain.name}' has {len(chain)} joints between '{chain.base_link}' and "
-            f"'{chain.tip_link}'; poses are planned for six, or for seven with one held. "
+            f"'{chain.tip_link}'; poses are planned for {FEWEST_JOINTS} to {FREE_JOINTS}, or for "
+            f'{FREE_JOINTS + 1} with one held. '
             'Other links are named by --base-link and --tip-link. As it is, '
             f'{OWN_CONFIGURATIONS}'
         )
@@ -146,6 +151,11 @@ def reach_of(chain: SerialChain, rng: np.random.Generator) -> Reach:
     first = chain.T_fixed[0]
     radius = np.linalg.norm((places - first[:3, 3])[:, :2], axis=1)
     return Reach(float(radius.max()), float(places[:, 2].min()), float(places[:, 2].max()))
+
+
+def link_radius(reach: Reach, full_size: float) -> float:
+    """Return how thick links are, m, given what they are in arms of full size."""
+    return round(full_size * min(reach.reach_m / FULL_SIZE_M, 1.0), 3)
 
 
 def widest_ranges(reach: Reach, floor_z: float | None) -> PoseRanges:

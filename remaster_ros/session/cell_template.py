@@ -13,7 +13,7 @@ import numpy as np
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.planning.candidates import PoseRanges
 from remaster_ros.planning.cell_proposal import HeldJoint, Reach
-from remaster_ros.session.workcell import LINK_RADIUS_M, CellSensor
+from remaster_ros.session.workcell import CellSensor
 from remaster_ros.session.yaml_records import load_yaml
 
 _PLAIN = re.compile(r'[A-Za-z/.][\w./+-]*')
@@ -58,6 +58,8 @@ class CellProposal:
         What became of poses everywhere around the arm, for people; '' before it is known.
     marker_z
         Where the markers are along the tool's Z axis, m.
+    link_radius
+        How thick links are, m.
     """
 
     source: str
@@ -70,6 +72,7 @@ class CellProposal:
     ranges: PoseRanges
     kept: str
     marker_z: float
+    link_radius: float
     sensor_R: Sequence[float]
     sensors: Sequence[str]
     mesh_path: Sequence[str]
@@ -147,10 +150,10 @@ def cell_text(p: CellProposal) -> str:
         '#   table: {center_m: [0.8, 0.0, 0.2], size_m: [0.5, 1.0, 0.4], yaw_deg: 15.0}',
         'obstacles: {}',
         *_comment(
-            'How thick links are for the line of sight, and for collisions where the robot '
+            'CHECK: how thick links are for the line of sight, and for collisions where the robot '
             'description has no geometry. A marker nearer to the last joint counts as hidden.'
         ),
-        f'link_radius_m: {LINK_RADIUS_M}',
+        f'link_radius_m: {p.link_radius:.3f}',
         *_comment('In base_link; null where there is none (an arm that hangs).'),
         f'floor_z_m: {_value(p.floor_z)}',
         *_comment('CHECK: parts of the tool that the robot description has not, in tip_link:'),
@@ -174,7 +177,8 @@ def _held_lines(p: CellProposal) -> list[str]:
     if held.joint is None:
         text = f'no joint is held. A pose has {held.solutions:.1f} joint solutions on average.'
         how = held.kinematics.in_words()
-        return [*_comment(f'Six joints: {text} {how}'), "held_joint: ''"]
+        count = {3: 'Three', 4: 'Four', 5: 'Five'}.get(len(chain), 'Six')
+        return [*_comment(f'{count} joints: {text} {how}'), "held_joint: ''"]
     tried = ', '.join(
         f'{name} {count:.1f}' if isinstance(count, float) else f'{name} none ({count})'
         for name, count in held.tried.items()

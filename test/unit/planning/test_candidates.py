@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from robot_descriptions import irb120
 
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics import body_pairs
@@ -17,6 +18,7 @@ from remaster_ros.planning.candidates import (
     candidate_poses,
     order_solutions,
     plan_poses,
+    taken_poses,
 )
 
 ROBOTS = Path(__file__).parents[3] / 'config' / 'robots'
@@ -52,6 +54,40 @@ def test_candidates_are_a_latin_hypercube_over_the_ranges():
     for values, (lower, upper) in zip(cylinder(T), boxes, strict=True):
         strata = np.floor((values - lower) / (upper - lower) * n).astype(int)
         assert sorted(strata) == list(range(n))
+
+
+def test_ranges_contain_what_is_drawn_from_them_and_no_other():
+    rng = np.random.default_rng(7)
+    ranges = PoseRanges((5.5, 7.0), (0.3, 0.4), (-0.1, 0.2))
+    T = candidate_poses(200, ranges, SENSOR, rng)
+    assert np.all(ranges.contain(T[:, :3, 3]))
+    azimuth, radius, height = cylinder(T)
+    outside = np.column_stack((radius * np.cos(azimuth + np.pi), radius * np.sin(azimuth + np.pi)))
+    assert not np.any(ranges.contain(np.column_stack((outside, height))))
+    assert not np.any(ranges.contain(T[:, :3, 3] * (1.4, 1.4, 1.0)))
+    assert not np.any(ranges.contain(T[:, :3, 3] + (0.0, 0.0, 0.4)))
+
+
+def test_poses_of_an_arm_with_few_joints_are_its_own_face_the_sensor_and_differ():
+    """Each is a pose of the arm: solved, within the ranges, and not the pose of another."""
+    description = irb120()
+    chain = SerialChain.from_urdf(description.urdf, 'base_link', 'link_5')
+    ranges, rng = PoseRanges(radius_m=(0.2, 0.55), height_m=(0.1, 0.8)), np.random.default_rng(6)
+    drawn = candidate_poses(30, ranges, SENSOR, rng)
+    T = taken_poses(chain, drawn, ranges, SENSOR, np.radians(30.0), rng)
+    ik = InverseKinematics(chain)
+    assert all(len(ik.usable(q)) for q in ik.solutions_of_each(T))
+    assert not any(len(q) for q in ik.solutions_of_each(drawn))
+    assert np.all(ranges.contain(T[:, :3, 3]))
+    to_sensor = SENSOR - T[:, :3, 3]
+    cosines = np.sum(T[:, :3, 2] * to_sensor, axis=1) / np.linalg.norm(to_sensor, axis=1)
+    assert np.min(cosines) >= np.cos(np.radians(30.0)) - 1e-12
+    assert len(np.unique(T[:, :3, 3].round(9), axis=0)) == 30
+    # Where it takes none, the drawn pose stays, out of reach.
+    far = PoseRanges(radius_m=(5.0, 6.0))
+    drawn = candidate_poses(5, far, SENSOR, rng)
+    kept = taken_poses(chain, drawn, far, SENSOR, np.radians(30.0), rng)
+    np.testing.assert_array_equal(kept, drawn)
 
 
 def test_candidates_are_rotations_that_point_at_the_sensor():
