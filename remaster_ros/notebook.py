@@ -15,7 +15,7 @@ from remaster_ros.discovery.discover import Discovery
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from remaster_ros.reports.discovery_schema import Discovered
+    from remaster_ros.reports.schemas import Discovered
 
 # In px; what is longer is scrolled.
 SCREEN_HEIGHT = 620
@@ -35,15 +35,15 @@ class Fit(FitResult):
         return summary(self)
 
     def _repr_html_(self) -> str:
-        from remaster_ros.reports.report import report_html
+        from remaster_ros.reports.report import fit_html
 
-        return _first_screen(report_html(self, {}))
+        return _first_screen(fit_html(self, {}))
 
     def figures(self) -> dict[str, Figure]:
         """Return the report's figures by name."""
-        from remaster_ros.reports.figures import as_figures, figures_of
+        from remaster_ros.reports.figures import as_figures, fit_figures
 
-        return as_figures(figures_of(self), self)
+        return as_figures(fit_figures(self), self)
 
     def save(self, folder: str | os.PathLike[str]) -> Path:
         """Write what ``remaster fit --out`` writes, the files for the robot among it.
@@ -82,9 +82,9 @@ class Found(Discovery):
         return summary(self, judged, to_load=self._content.loadable or ())
 
     def _repr_html_(self) -> str:
-        from remaster_ros.reports.discovery_report import report_html
+        from remaster_ros.reports.report import discovery_html
 
-        return _first_screen(report_html(self, None, self._content, {}))
+        return _first_screen(discovery_html(self, None, self._content, {}))
 
     @cached_property
     def _content(self) -> Discovered:
@@ -94,10 +94,9 @@ class Found(Discovery):
 
     def figures(self) -> dict[str, Figure]:
         """Return the report's figures by name."""
-        from remaster_ros.reports.discovery_report import figures_of
-        from remaster_ros.reports.figures import as_figures
+        from remaster_ros.reports.figures import as_figures, discovery_figures
 
-        return as_figures(figures_of(self), self)
+        return as_figures(discovery_figures(self), self)
 
     def save(self, folder: str | os.PathLike[str]) -> Path:
         """Write what ``remaster discover --out`` writes, the files for the robot among it.

@@ -25,13 +25,16 @@ from remaster_ros.discovery.discover import Discovery, discover_session
 from remaster_ros.discovery.words import part_words, percent, sentence_case, shown
 from remaster_ros.errors import InsufficientDataError
 from remaster_ros.kinematics.serial_chain import SerialChain
-from remaster_ros.reports.discovery_apply import load_words
-from remaster_ros.reports.discovery_json import held_out_coverage, predictions_of, read_discovery
-from remaster_ros.reports.discovery_schema import Discovered, Loadable
+from remaster_ros.reports.discovery_json import (
+    earlier_pairs,
+    held_out_coverage,
+    load_words,
+    predictions_of,
+    read_discovery,
+)
 from remaster_ros.reports.fit_json import DISCOVERY_FILE
-from remaster_ros.reports.found_causes import earlier_pairs
 from remaster_ros.reports.result_folder import prepare_folder, save_discovery
-from remaster_ros.reports.schemas import Judgement
+from remaster_ros.reports.schemas import Discovered, Judgement, Loadable
 from remaster_ros.session.files import undone_on_failure
 from remaster_ros.session.reader import read_session
 

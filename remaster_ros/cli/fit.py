@@ -129,7 +129,7 @@ def summary(result: FitResult) -> str:
     """Return offsets, errors and verdict in a few lines."""
     import numpy as np
 
-    from remaster_ros.reports.judgement import verdict
+    from remaster_ros.reports.sentences import verdict
 
     lines = []
     for joint, mean, std, slides, seen, why in zip(

@@ -14,10 +14,9 @@ from remaster_ros.calibration.fit import fit_session
 from remaster_ros.cli.console import progress_bar, show
 from remaster_ros.cli.sessions import read_to_fit
 from remaster_ros.kinematics.serial_chain import SerialChain
-from remaster_ros.reports.answer import Answer
-from remaster_ros.reports.answer_inputs import parts, read_inputs
-from remaster_ros.reports.answer_plan import PlanFacts, plan_facts, plan_to_dict
+from remaster_ros.reports.answer import Answer, parts, read_inputs
 from remaster_ros.reports.fit_json import FIT_FILE, REPORT_FILE
+from remaster_ros.reports.report import PlanFacts, plan_facts, plan_to_dict
 from remaster_ros.reports.result_folder import prepare_folder, save_fit
 from remaster_ros.session.files import undone_on_failure
 from remaster_ros.session.plan_journal import read_plan
@@ -54,7 +53,7 @@ def run(args: argparse.Namespace) -> int:
     plan = read_plan(args.session, chain)
     out = args.out or Path(f'{args.session.resolve().name}-report')
     # Matplotlib takes a second to import: after what may be refused at once.
-    from remaster_ros.reports.answer_report import require_ready, write_answer
+    from remaster_ros.reports.report import require_ready, write_answer
 
     require_ready(out, args.pdf)
     with undone_on_failure(), progress_bar(args.quiet or args.json) as progress:

@@ -133,7 +133,7 @@ class FoundEffect:
             found = replace(found, sizes=sizes, size_m=size_m)
         found = replace(found, parameters=parameters)
         found = replace(found, cause=with_sizes(self.cause, found._clear_sizes(group)))
-        if found.sigmas >= UNCERTAIN:
+        if found.is_certain:
             return found
         doubt = (
             f'With what the choice of causes costs this is {found.sigmas:.1f} standard deviations '
@@ -162,6 +162,11 @@ class FoundEffect:
         """Size of its clearest parameter in standard deviations."""
         known = [abs(one.value) / one.std for one in self.parameters if one.std > 0.0]
         return max(known, default=np.inf)
+
+    @property
+    def is_certain(self) -> bool:
+        """Whether its clearest parameter is clearly not nothing."""
+        return self.sigmas >= UNCERTAIN
 
 
 def _later(remedy: str) -> str:

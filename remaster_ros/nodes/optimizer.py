@@ -248,7 +248,7 @@ class Optimizer(RemasterNode):
         # Imported when it is needed, as it takes a second: the node is there at once.
         from remaster_ros.discovery.decision import decisions
         from remaster_ros.discovery.discover import discover_session
-        from remaster_ros.reports.found_causes import earlier_pairs
+        from remaster_ros.reports.discovery_json import earlier_pairs
         from remaster_ros.reports.result_folder import save_discovery
 
         out = Path(self.p.discovery)

@@ -117,8 +117,8 @@ class FurtherMeasuring:
         if self._journal.tour is not None and self._journal.tour.judges:
             return 'it was no calibration; name a new session folder', None
         # Imported when it is needed, as it takes a while.
+        from remaster_ros.reports.discovery_json import read_causes
         from remaster_ros.reports.fit_json import DISCOVERY_FILE
-        from remaster_ros.reports.found_causes import read_causes
 
         path = Path(self._discovery) / DISCOVERY_FILE
         if not self._discovery or not path.exists():
@@ -260,7 +260,7 @@ class Parameters(JudgingParameters):
         if not self.separate:
             return ()
         # Imported when it is needed, as it takes a while.
-        from remaster_ros.reports.found_causes import read_causes
+        from remaster_ros.reports.discovery_json import read_causes
 
         return read_causes(self.separate, joint_names)
 

@@ -3,24 +3,261 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
 from typing import Literal, NamedTuple
 
+import msgspec
 import numpy as np
 
+from remaster_ros.calibration.comparison import predicted_rows
+from remaster_ros.calibration.estimate import Problem, estimate
 from remaster_ros.calibration.gauge_words import listed
 from remaster_ros.calibration.noise_check import MEAN_LENGTH
 from remaster_ros.calibration.outliers import LARGEST_SHARE
 from remaster_ros.compensation.export import LAYER_FILE, MODEL_FILE, REMASTER_FILE, URDF_FILE
 from remaster_ros.compensation.mastering import MasteringStep, mastering
+from remaster_ros.discovery.words import clock_time
+from remaster_ros.errors import InputError
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.transforms import matrix_from_quaternion_xyzw, transform
-from remaster_ros.reports.answer_inputs import Inputs, all_taken_out
-from remaster_ros.reports.discovery_schema import Effect
-from remaster_ros.reports.judgement import NOTICEABLE_GAIN
-from remaster_ros.reports.remaining import Remaining, what_remains
-from remaster_ros.reports.schemas import JointOffset, Judgement
+from remaster_ros.reports.discovery_json import read_discovery
+from remaster_ros.reports.fit_json import (
+    APPLY_FOLDER,
+    DISCOVERY_FILE,
+    FIT_FILE,
+    FIT_LIMIT,
+    read_fit,
+)
+from remaster_ros.reports.rows_csv import (
+    AFTER,
+    BEFORE,
+    PREDICTED,
+    PREDICTIONS_FILE,
+    RESIDUALS_FILE,
+    read_columns,
+)
+from remaster_ros.reports.schemas import (
+    Discovered,
+    Effect,
+    Fit,
+    FittedGeometry,
+    JointOffset,
+    Judgement,
+    Loadable,
+)
+from remaster_ros.reports.sentences import NOTICEABLE_GAIN, more_than_noise
+from remaster_ros.session.files import decode_text, read_limited
+from remaster_ros.session.plan_journal import RecordedPlan
 from remaster_ros.types import BoolArray, FloatArray, Session
+
+# What it is made of: a session, its fit, and its discovery if any.
+
+
+@dataclass(frozen=True, eq=False)
+class Inputs:
+    """What was read; n rows.
+
+    Attributes
+    ----------
+    session
+        All rows.
+    fit, found
+        fit.json and discovery.json; None without the latter.
+    before_mm, after_mm
+        3-D error of every row with all offsets at zero and with those of the fit, (n,).
+    causes_mm
+        With the causes as well, (n,); None where there are none.
+    model_mm
+        With the robot model of all lengths, tilts and zero-offsets and nothing else, (n,); None
+        where there is none that predicts held-out poses better.
+    model
+        That file.
+    plan
+        Of its collection; None where the session's folder has none.
+    """
+
+    session: Session
+    fit: Fit
+    found: Discovered | None
+    before_mm: FloatArray
+    after_mm: FloatArray
+    causes_mm: FloatArray | None
+    model_mm: FloatArray | None = None
+    model: Path | None = None
+    plan: RecordedPlan | None = None
+
+    @property
+    def judgement(self) -> Judgement:
+        """Of the fit."""
+        assert isinstance(self.fit.judgement, Judgement)
+        return self.fit.judgement
+
+    @property
+    def gross(self) -> list[int]:
+        """``observation`` of the gross errors: with the causes some are none that the fit has."""
+        if self.found is not None:
+            return self.found.noise.outliers
+        checks = self.fit.explained_by_noise
+        held_out = checks.values() if isinstance(checks, dict) else ()
+        return [*self.fit_left_out, *(row for check in held_out for row in check.gross)]
+
+    @cached_property
+    def fit_left_out(self) -> dict[int, str]:
+        """``observation`` of every row that was not fitted, and why."""
+        return {row.observation: row.why for row in self.fit.left_out}
+
+    @property
+    def T_R_N(self) -> dict[str, FloatArray]:
+        """Where every sensor stands as fitted, (4, 4)."""
+        return {
+            sensor: transform(
+                matrix_from_quaternion_xyzw(np.array(frame.rotation_xyzw)),
+                np.array(frame.translation_m),
+            )
+            for sensor, frame in self.fit.registration.items()
+        }
+
+
+def located(path: Path) -> Path:
+    """Return the file fit.json or discovery.json that a path is, or that is in a folder.
+
+    Raises
+    ------
+    InputError
+        Neither, or both.
+    """
+    if not path.is_dir():
+        return path
+    there = [path / name for name in (FIT_FILE, DISCOVERY_FILE) if (path / name).exists()]
+    if len(there) != 1:
+        raise InputError(
+            f'{path}: holds {"both" if there else "neither"} {FIT_FILE} '
+            f'{"and" if there else "nor"} {DISCOVERY_FILE}; give one of the files'
+        )
+    return there[0]
+
+
+def read_inputs(
+    session: Session, fit_path: Path, found_path: Path | None, plan: RecordedPlan | None = None
+) -> Inputs:
+    """Read the results of a session, and refuse those of another.
+
+    Parameters
+    ----------
+    session
+        As read from its folder.
+    fit_path, found_path
+        fit.json and discovery.json; residuals.csv and predictions.csv are beside them.
+    plan
+        Of the session.
+
+    Raises
+    ------
+    InputError
+        One line naming file and remedy.
+    """
+    fit = msgspec.convert(read_fit(fit_path), Fit)
+    _require_same(session, fit, fit_path, 'fit')
+    residuals = read_columns(fit_path.parent / RESIDUALS_FILE, session, BEFORE + AFTER, 'fit')
+    before_mm, after_mm = _lengths_mm(residuals[:, :3]), _lengths_mm(residuals[:, 3:])
+    if found_path is None:
+        model, model_mm = _model(session, fit_path, _file_of(fit.geometry), 'fit')
+        return Inputs(session, fit, None, before_mm, after_mm, None, model_mm, model, plan)
+    found = msgspec.convert(read_discovery(found_path), Discovered)
+    _require_same(session, found, found_path, 'discover')
+    causes_mm = None
+    if found.effects:
+        path = found_path.parent / PREDICTIONS_FILE
+        predicted = read_columns(path, session, PREDICTED, 'discover')
+        causes_mm = _lengths_mm(session.measurements.position - predicted)
+    rows = found.loadable if isinstance(found.loadable, list) else []
+    model, model_mm = _model(
+        session,
+        found_path,
+        ''.join(_file_of(r) for r in rows if r.result == 'geometry'),
+        'discover',
+    )
+    return Inputs(session, fit, found, before_mm, after_mm, causes_mm, model_mm, model, plan)
+
+
+def _file_of(source: Loadable | FittedGeometry | msgspec.UnsetType) -> str:
+    return '' if isinstance(source, msgspec.UnsetType) else source.file
+
+
+def _model(
+    session: Session, result: Path, file: str, verb: str
+) -> tuple[Path | None, FloatArray | None]:
+    """Return a result's robot model and the errors with it, mm; None where it has none."""
+    if not file:
+        return None, None
+    path = result.parent / APPLY_FOLDER / MODEL_FILE
+    data = read_limited(path, FIT_LIMIT, f'{verb} again, which writes it')
+    return path, errors_with_model_mm(session, decode_text(data, path))
+
+
+def all_taken_out(found: Discovered | None) -> bool:
+    """Whether all causes lie in how the arm was measured, and there is at least one."""
+    return (
+        found is not None
+        and found.verdict != 'undetermined'
+        and bool(found.effects)
+        and all(effect.of_measurement for effect in found.effects)
+    )
+
+
+def errors_with_model_mm(session: Session, urdf: str) -> FloatArray:
+    """Return the 3-D error of every row with another robot model, as it is, mm, (n,).
+
+    Registrations and markers are fitted to the optimization rows, as for the error of today.
+    """
+    found = estimate(Problem.of(replace(session, urdf=urdf)))
+    predicted = predicted_rows(found.problem, found.model, found.before.z)
+    return _lengths_mm(session.measurements.position - predicted)
+
+
+def _lengths_mm(errors: FloatArray) -> FloatArray:
+    lengths: FloatArray = 1e3 * np.linalg.norm(errors, axis=1)
+    return lengths
+
+
+def _require_same(session: Session, result: Fit | Discovered, path: Path, verb: str) -> None:
+    """Refuse the result of other data, or of a version whose files lack what the page has."""
+    if (
+        not isinstance(result.session, msgspec.Struct)
+        or not isinstance(result.judgement, msgspec.Struct)
+        or (isinstance(result, Discovered) and not all(e.title for e in result.effects))
+    ):
+        raise InputError(f'{path}: of an earlier version; {verb} this session again')
+    if result.session.observations_sha256 != session.observations_sha256:
+        raise InputError(
+            f'{path}: of other data than this session (observations.csv has another SHA-256); '
+            f'{verb} this session'
+        )
+
+
+def parts(paths: Sequence[Path]) -> tuple[Path | None, Path | None]:
+    """Return which of at most two paths is fit.json and which discovery.json.
+
+    Raises
+    ------
+    InputError
+        Two of one kind, or a file of another name.
+    """
+    found: dict[str, Path] = {}
+    for path in map(located, paths):
+        if path.name not in (FIT_FILE, DISCOVERY_FILE):
+            raise InputError(
+                f'{path}: give {FIT_FILE} or {DISCOVERY_FILE}, or the folder of one of them'
+            )
+        if path.name in found:
+            raise InputError(f'{path}: two files {path.name}; give one of each')
+        found[path.name] = path
+    return found.get(FIT_FILE), found.get(DISCOVERY_FILE)
+
+
+# What to do, and what it brings.
 
 ALL_FILES = (REMASTER_FILE, URDF_FILE, LAYER_FILE, MODEL_FILE)
 Mood = Literal['good', 'caution', 'bad']
@@ -331,12 +568,124 @@ def _headline(
     )
 
 
-def registrations(inputs: Inputs) -> dict[str, FloatArray]:
-    """Return T_R_N of every sensor as fitted, (4, 4)."""
-    return {
-        sensor: transform(
-            matrix_from_quaternion_xyzw(np.array(frame.rotation_xyzw)),
-            np.array(frame.translation_m),
+# What the deed leaves: causes, gross errors, data that disagree, and the remedy.
+
+# Fewer gross errors are in the table of left-out rows alone.
+FEWEST_GROSS, LEAST_SHARE = 3, 0.01
+# In place of a remedy that is a file: it is beside the page only where it belongs to the deed.
+NO_FILE = (
+    'No robot model beside this page holds it: correcting it brings no noticeable gain beside the '
+    'zero-offsets, or the page says to set nothing.'
+)
+# The first screen names so many causes, with so many sizes each; all of them stand below.
+MOST_NAMED, MOST_SIZES = 4, 2
+
+
+class Remaining(NamedTuple):
+    """Something that the deed leaves: its name, its size in words, and what to do."""
+
+    what: str
+    size: str
+    remedy: str
+
+    @property
+    def sentence(self) -> str:
+        """All of it."""
+        size = self.size.rstrip('.')
+        return f'{self.what}{": " if size else ""}{size}. {self.remedy}'.rstrip()
+
+
+def what_remains(inputs: Inputs, loads_model: bool, held_out: bool) -> list[Remaining]:
+    """Return what the deed leaves, the causes first."""
+    found, judgement = inputs.found, inputs.judgement
+    rows = [] if found is None else _of_discovery(found, loads_model)
+    if found is None and (lines := judgement.findings or judgement.doubts):
+        rows.append(
+            Remaining(
+                'More than noise' if judgement.findings else 'Not shown to be noise',
+                lines[0],
+                'Search for its cause: remaster discover SESSION --out DIR, then give DIR to '
+                'remaster report.'
+                if judgement.findings
+                else '',
+            )
         )
-        for sensor, frame in inputs.fit.registration.items()
-    }
+    elif found is not None and not rows:
+        # Causes have answered the findings of the fit without them.
+        left = more_than_noise(found)
+        if not left and not found.effects:
+            left = next(iter(judgement.findings), '')
+        if left:
+            rows.append(
+                Remaining(
+                    'More than noise',
+                    f'{left.rstrip(".")}. No cause that was tried explains it',
+                    'Look at the largest errors below; measure again, with references in between.',
+                )
+            )
+    if (gross := _gross(inputs)) is not None:
+        rows.append(gross)
+    rows += [Remaining('The data disagree', line, '') for line in judgement.disagreements]
+    if not held_out:
+        rows.append(
+            Remaining('Not proven', 'no poses were held out', 'Measure some more, and fit again.')
+        )
+    if not rows:
+        words = (
+            'every cause was tried, and none explains more of what is left than chance does'
+            if found is not None
+            else 'what is left is what noise explains'
+        )
+        rows.append(Remaining('Noise', '. '.join([words, *judgement.doubts[:1]]), ''))
+    return rows
+
+
+def _of_discovery(found: Discovered, loads_model: bool) -> list[Remaining]:
+    """Return the causes that stay, and what has none."""
+    rows: list[Remaining] = []
+    stay = [e for e in found.effects if not (loads_model and e.in_robot_model)]
+    for effect in stay[:MOST_NAMED]:
+        sizes = effect.sizes if isinstance(effect.sizes, list) else []
+        size = '; '.join(sizes)
+        if len(sizes) > MOST_SIZES and isinstance(effect.size_m, float):
+            size = f'{1e3 * effect.size_m:.3f} mm RMS at the marker'
+        remedy = effect.remedy if isinstance(effect.remedy, str) else ''
+        remedy = NO_FILE if effect.in_robot_model else remedy
+        rows.append(Remaining(effect.title, size, remedy))
+    if more := stay[MOST_NAMED:]:
+        largest = max(e.size_m for e in more if isinstance(e.size_m, float))
+        size = f'up to {1e3 * largest:.3f} mm RMS at the marker'
+        name = f'{len(more)} smaller cause{"s" if len(more) > 1 else ""}'
+        rows.append(Remaining(name, size, 'See below.'))
+    if found.verdict == 'undetermined':
+        remedy = 'Measure what the look-alikes below call for.'
+        rows.append(Remaining('Undecided', 'another explanation fits as well', remedy))
+    if isinstance(found.unexplained, list):
+        rows += [
+            Remaining('Unexplained', f'{1e3 * left.size_m:.3f} mm RMS', left.next)
+            for left in found.unexplained
+        ]
+    return rows
+
+
+def _gross(inputs: Inputs) -> Remaining | None:
+    """Return how many readings are gross errors, of which sensors and when; None of few."""
+    session, m = inputs.session, inputs.session.measurements
+    rows = np.isin(m.observation, inputs.gross)
+    if rows.sum() < max(FEWEST_GROSS, LEAST_SHARE * len(m)):
+        return None
+    sensors = listed([session.sensor_names[i] for i in np.unique(m.sensor[rows])])
+    first, last = m.stamp_s[rows].min(), m.stamp_s[rows].max()
+    when = f'configurations {m.configuration[rows].min()} to {m.configuration[rows].max()}'
+    if session.timed:
+        start = m.stamp_s.min()
+        when += f', {(first - start) / 60.0:.1f} to {(last - start) / 60.0:.1f} min'
+        if clock := clock_time(float(first)):
+            when += f' after the first reading, from {clock} on'
+        else:
+            when += ' after the first reading'
+    return Remaining(
+        'Gross errors',
+        f'{rows.sum()} of {len(m)} readings, of {sensors}: {when}',
+        'Find out what was moved or hidden then.',
+    )

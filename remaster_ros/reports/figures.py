@@ -1,4 +1,4 @@
-"""The figures of a fit as SVG text: traces, posteriors, errors before and after.
+"""The figures of a fit, of its causes and of the answer, as SVG text.
 
 Drawn on Matplotlib figures of their own (no pyplot, no window, no shared state). Lines and text
 are in marker colours, so that a page can swap them for its own in the dark; data colours are
@@ -10,16 +10,21 @@ from __future__ import annotations
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from io import StringIO
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import matplotlib
 import numpy as np
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
 from remaster_ros.calibration.predictive_accuracy import predicted_accuracy, tool_places
+from remaster_ros.discovery.effects.drivers import driver_named
+from remaster_ros.kinematics.serial_chain import SerialChain
+from remaster_ros.kinematics.transforms import apply
+from remaster_ros.planning.tour_order import FITTED, REFERENCE
 from remaster_ros.types import BoolArray, FloatArray
 
 if TYPE_CHECKING:
@@ -27,6 +32,12 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
     from remaster_ros.calibration.result import FitResult
+    from remaster_ros.discovery.discover import Discovery
+    from remaster_ros.discovery.effects.base import Cell
+    from remaster_ros.discovery.effects.context import Context
+    from remaster_ros.discovery.explain import FoundEffect
+    from remaster_ros.reports.answer import Answer, Inputs
+
 
 INK, GRID, PAPER = '#1b1f25', '#d8dce1', '#fefefd'
 BEFORE, AFTER = '#e07b39', '#3b82c4'
@@ -39,7 +50,7 @@ MAP_POINTS, MAP_TILES = 4000, 22
 TRACE_POINTS = 1500
 SCATTER_POINTS = 1500
 WHOLE_TURN_DEG = 359.999
-Subject = TypeVar('Subject')
+Drawn = TypeVar('Drawn')
 
 STYLE: Any = {
     'svg.fonttype': 'none',
@@ -75,12 +86,12 @@ STYLE: Any = {
 }
 
 
-def draw_figures(result: FitResult) -> dict[str, str]:
+def draw_fit(result: FitResult) -> dict[str, str]:
     """Return every figure as SVG text, by file name without ending."""
-    return as_svg(figures_of(result), result)
+    return as_svg(fit_figures(result), result)
 
 
-def figures_of(_: FitResult) -> dict[str, Callable[[FitResult], Figure]]:
+def fit_figures(_: FitResult) -> dict[str, Callable[[FitResult], Figure]]:
     """Return what draws each figure of a fit, by file name without ending."""
     return {
         'posteriors': posteriors,
@@ -93,14 +104,14 @@ def figures_of(_: FitResult) -> dict[str, Callable[[FitResult], Figure]]:
 
 
 def as_figures(
-    figures: Mapping[str, Callable[[Subject], Figure]], subject: Subject
+    figures: Mapping[str, Callable[[Drawn], Figure]], subject: Drawn
 ) -> dict[str, Figure]:
     """Draw figures of a fit or a discovery, by the same names."""
     with matplotlib.rc_context(STYLE):
         return {name: draw(subject) for name, draw in figures.items()}
 
 
-def as_svg(figures: dict[str, Callable[[Subject], Figure]], subject: Subject) -> dict[str, str]:
+def as_svg(figures: dict[str, Callable[[Drawn], Figure]], subject: Drawn) -> dict[str, str]:
     """Draw figures of a fit or a discovery and return them as SVG text, by the same names."""
     texts = {}
     for name, draw in figures.items():
@@ -414,3 +425,635 @@ def _splits(result: FitResult) -> list[tuple[str, BoolArray]]:
         ('Optimization poses (fitted)', ~m.is_validation & ~left_out),
     ]
     return [(title, rows) for title, rows in splits if rows.any()]
+
+
+# Of a discovery: errors by driver, causes with their bands, the gain.
+
+ARC_MINUTE = np.radians(1.0 / 60.0)
+BINS = 12
+CAUSE_POINTS = 800
+MOST_CAUSES = 8
+# Of a larger session the curves are drawn at the rows that were searched.
+MOST_DRAWN = 20_000
+# A curve's line ends so many knots from the last value that was measured.
+NEAR = 0.5
+# A wave is not drawn across a larger share of its range without a measurement.
+WIDE_GAP = 1.0 / 30.0
+# Nor is anything else across such a share.
+EMPTY = 1.0 / 8.0
+
+
+def draw_discovery(discovery: Discovery) -> dict[str, str]:
+    """Return every figure as SVG text, by file name without ending."""
+    return as_svg(discovery_figures(discovery), discovery)
+
+
+def discovery_figures(discovery: Discovery) -> dict[str, Callable[[Discovery], Figure]]:
+    """Return what draws each figure of a discovery, by file name without ending."""
+    figures: dict[str, Callable[[Discovery], Figure]] = {'gain': gain, 'drivers': drivers}
+    if discovery.groups:
+        figures['causes'] = causes
+    return figures
+
+
+def gain(discovery: Discovery) -> Figure:
+    """Draw the errors before and after, and what a pose's readings share of them, where known."""
+    figure = Figure(figsize=(WIDTH_IN, 2.6), layout='constrained')
+    left, right = figure.subplots(1, 2, width_ratios=(3, 2))
+    data = discovery.residuals
+    held_out = data.context.measurements.is_validation
+    rows = held_out if held_out.any() else np.isin(np.arange(len(held_out)), data.rows.source)
+    errors = discovery.residuals_before, discovery.fit.residuals_after
+    lengths = [1e3 * np.linalg.norm(error[rows], axis=1) for error in errors]
+    error_histograms(left, *(np.maximum(values, 1e-4) for values in lengths))
+    left.set_title('Held-out poses' if held_out.any() else 'Fitted poses')
+    legend_above(left)
+
+    model = data.noise_model
+    fits = discovery.empty, discovery.solution
+    noises = [model.sensor_noise(fit.noise) for fit in fits]
+    # Where a sensor has one reading at every pose, what they share is not known.
+    separable = {model.channels[index].sensor for index in model.separable}
+    labels, values = [], []
+    for sensor, name in enumerate(data.context.sensor_names):
+        within = [np.hypot(noise.sigma, noise.frame_sigma)[sensor] for noise in noises]
+        if sensor in separable:
+            labels += [f'{name[:20]}, shared', f'{name[:20]}, within']
+            values += [[noise.pose_sigma[sensor] for noise in noises], within]
+        else:
+            labels.append(name[:20])
+            values.append(within)
+    y = np.arange(len(values))
+    for column, (color, label) in enumerate(((BEFORE, 'before'), (AFTER, 'after'))):
+        lengths_mm = 1e3 * np.array(values)[:, column]
+        right.barh(y + 0.36 * column - 0.18, lengths_mm, 0.34, color=color, label=label)
+    right.set_yticks(y.tolist(), labels)
+    right.invert_yaxis()
+    right.grid(False, axis='y')
+    right.set_xlabel('RMS per axis (mm)')
+    right.set_title('Shared by a pose, and within' if separable else 'Errors of a reading')
+    return figure
+
+
+def drivers(discovery: Discovery) -> Figure:
+    """Draw, joint by joint, the errors along the joint's motion against every driver."""
+    data = discovery.residuals
+    context = data.part
+    candidates: list[tuple[bool, str, Callable[[int], FloatArray]]] = [
+        (True, 'own angle (°)', lambda j: np.degrees(context.measurements.q[:, j])),
+        (context.has_gravity, 'gravity torque (N m)', lambda j: context.gravity_torque[:, j]),
+        (context.has_approach, 'last move (°)', lambda j: np.degrees(context.last_move[:, j])),
+        (context.has_time, 'time (h)', lambda j: context.elapsed_s / 3600.0),
+        (context.has_temperature, 'temperature (K)', lambda j: context.warming),
+    ]
+    kept = [(label, value) for known, label, value in candidates if known]
+    joints = context.joints
+    height = 1.05 * len(kept) + 0.6
+    figure = Figure(figsize=(WIDTH_IN, height))
+    # Fixed margins: to find them for so many panels takes longer than to draw them.
+    axes = figure.subplots(len(kept), joints, squeeze=False, sharey=True)
+    figure.subplots_adjust(
+        left=0.07,
+        right=0.985,
+        bottom=0.4 / height,
+        top=1.0 - 0.38 / height,
+        hspace=0.7,
+        wspace=0.1,
+    )
+    motion = context.jacobian
+    length = np.maximum(np.linalg.norm(motion, axis=1), 1e-6)
+    fits = [(discovery.empty, BEFORE, 'before')]
+    if discovery.groups:
+        fits.append((discovery.solution, AFTER, 'after'))
+    for fit, color, _ in fits:
+        left = data.left(fit)
+        along = 1e3 * np.einsum('nij,ni->nj', motion, left) / length
+        for row, (_, value) in enumerate(kept):
+            for joint in range(joints):
+                _binned(axes[row, joint], value(joint), along[:, joint], color)
+    for row, (label, _) in enumerate(kept):
+        for joint in range(joints):
+            ax = axes[row, joint]
+            ax.tick_params(labelsize=5.5, length=2)
+            # Labels at the very ends would touch those of the next panel.
+            ax.xaxis.set_major_locator(MaxNLocator(4, prune='both'))
+            if ax.has_data():
+                ax.axhline(0.0, color=INK, linewidth=0.5)
+            else:
+                ax.set_xticks([])
+                ax.text(0.5, 0.5, 'constant', transform=ax.transAxes, ha='center', fontsize=5.5)
+            if row == 0:
+                ax.set_title(f'joint {joint + 1}', fontsize=7.5)
+        axes[row, joints // 2].set_xlabel(label, fontsize=7)
+    figure.supylabel('mean error along the motion of the joint (mm)', fontsize=7.5)
+    handles = [Line2D([], [], color=color, marker='.', label=label) for _, color, label in fits]
+    figure.legend(handles=handles, loc='upper right', ncols=2, fontsize=7, frameon=False)
+    return figure
+
+
+def _binned(ax: Axes, x: FloatArray, y: FloatArray, color: str) -> None:
+    """Draw means with their standard errors in bins of equal counts."""
+    if np.ptp(x) < 1e-3:
+        return
+    order = np.argsort(x)
+    # No bin, and no line from bin to bin, across what was not measured.
+    for part in np.split(order, np.flatnonzero(np.diff(x[order]) > EMPTY * np.ptp(x)) + 1):
+        bins = max(1, min(round(BINS * len(part) / len(x)), len(part) // 8))
+        groups = np.array_split(part, bins)
+        centers = [float(x[g].mean()) for g in groups]
+        means = [float(y[g].mean()) for g in groups]
+        spread = [float(y[g].std() / np.sqrt(len(g))) for g in groups]
+        ax.errorbar(
+            centers, means, spread, color=color, linewidth=0.9, elinewidth=0.6, marker='.', ms=3
+        )
+
+
+def causes(discovery: Discovery) -> Figure:
+    """Draw each cause: what is left without it against what drives it, and the fit with band."""
+    panels = [
+        cell
+        for group in discovery.groups
+        for cell in group
+        if cell.place == 'joint_angle' or cell.happened
+    ]
+    constant = [
+        effect
+        for effect, group in zip(discovery.effects, discovery.groups, strict=False)
+        if not any(cell in panels for cell in group)
+    ]
+    panels = panels[: 2 * MOST_CAUSES]
+    count = len(panels) + bool(constant)
+    lines = -(-count // 2)
+    figure = Figure(figsize=(WIDTH_IN, 2.2 * lines + 0.2), layout='constrained')
+    axes = list(figure.subplots(lines, 2 if count > 1 else 1, squeeze=False).flat)
+    for cell, ax in zip(panels, axes, strict=False):
+        (_cause if cell.place == 'joint_angle' else _step)(ax, discovery, cell)
+    if constant:
+        _sizes(axes[len(panels)], discovery, constant)
+    for spare in axes[count:]:
+        spare.set_visible(False)
+    return figure
+
+
+def _sizes(ax: Axes, discovery: Discovery, effects: Sequence[FoundEffect]) -> None:
+    """Draw how large the causes without a curve are, beside the noise."""
+    sizes = [1e3 * effect.size_m for effect in effects]
+    noise = 1e3 * discovery.gain.noise_floor_m
+    y = np.arange(len(sizes) + 1)
+    ax.barh(y[:-1], sizes, color=AFTER, height=0.4)
+    ax.barh(y[-1:], [noise], color=GRID, edgecolor=INK, linewidth=0.5, height=0.4)
+    names = [textwrap.fill(effect.title, 26) for effect in effects]
+    ax.set_yticks(y.tolist(), [*names, 'noise alone'])
+    # Few bars are no thicker than many.
+    ax.set_ylim(max(len(y), 4) - 0.5, -0.7)
+    ax.grid(False, axis='y')
+    ax.set_xlabel('RMS at the marker (mm)')
+    ax.set_title('Causes without a curve')
+
+
+def _estimate(discovery: Discovery, cell: Cell) -> FloatArray:
+    """Return a cause's parameters in the whole model, where they may be some of a larger cell."""
+    solution = discovery.solution
+    names = [name for one in solution.cells for name in one.parameters]
+    return solution.parameters[[names.index(name) for name in cell.parameters]]
+
+
+def _step(ax: Axes, discovery: Discovery, cell: Cell) -> None:
+    """Draw a jump of a sensor, marker or base over time, along its own direction, mm."""
+    data, solution = discovery.residuals, discovery.solution
+    context = data.part
+    columns = cell.columns(context).displacement(context)
+    jump = columns @ _estimate(discovery, cell)
+    moved = np.linalg.norm(jump, axis=1) > 0.0
+    # Before the moment every column is zero: what moved later tells which rows it is about.
+    own = np.isin(context.sensor, context.sensor[moved]) & np.isin(
+        context.marker, context.marker[moved]
+    )
+    way = jump[moved].mean(axis=0)
+    way /= np.linalg.norm(way)
+    along = 1e3 * (data.left(solution) + jump) @ way
+    minutes = context.elapsed_s / 60.0
+    ax.plot(minutes[own], along[own], '.', color=BEFORE, markersize=3, alpha=0.6)
+    index = {name: i for i, name in enumerate(discovery.fit.theta_names)}
+    draws = discovery.fit.theta_draws.reshape(-1, len(index))
+    chosen = draws[:, [index[name] for name in cell.parameters]]
+    levels = 1e3 * np.einsum('nij,i->nj', columns[moved], way).mean(axis=0) @ chosen.T
+    edge = cell.moment / 60.0
+    low, high = minutes[own].min(), minutes[own].max()
+    ax.plot([low, edge], [0.0, 0.0], color=AFTER, linewidth=1.3)
+    level, width = float(levels.mean()), 2.0 * float(levels.std())
+    ax.fill_between([edge, high], level - width, level + width, color=AFTER, alpha=0.25)
+    ax.plot([edge, high], [level, level], color=AFTER, linewidth=1.3)
+    ax.axvline(edge, color=INK, linewidth=0.8, ls=(0, (4, 2)))
+    ax.set_xlabel('minutes after the first reading')
+    ax.set_ylabel('along the jump (mm)')
+    ax.set_title(f'{cell.subject or "base"}: jump after {edge:.1f} min')
+
+
+def _driver(context: Context, cell: Cell, features: FloatArray) -> tuple[str, FloatArray, float]:
+    """Return label and value (n,) of what drives a cause, and how much of it the label's unit is.
+
+    What is no single number is drawn by what it adds per unit of its first parameter.
+    """
+    driver = driver_named(cell.driver, cell.joints[-1])
+    if driver is None:
+        name = cell.driver.replace('_', ' ')
+        return f'{name} (per unit of {cell.parameters[0]})', features[:, 0], 1.0
+    unit = f' ({driver.shown_unit})' if driver.shown_unit else ''
+    return f'{driver.label}{unit}', driver.value(context), driver.per_shown
+
+
+def _cause(ax: Axes, discovery: Discovery, cell: Cell) -> None:
+    """Draw one cause at a joint's angle, in arc minutes."""
+    data, solution = discovery.residuals, discovery.solution
+    whole = len(data.context) <= MOST_DRAWN
+    context = data.context if whole else data.part
+    left = data.unexplained(solution) if whole else data.left(solution)
+    fitted = np.ones(len(context), dtype=bool)
+    if whole:
+        fitted = np.isin(np.arange(len(context)), data.rows.source)
+    parameters = _estimate(discovery, cell) / ARC_MINUTE
+    index = {name: i for i, name in enumerate(discovery.fit.theta_names)}
+    chosen = [index[name] for name in cell.parameters]
+    draws = discovery.fit.theta_draws[..., chosen].reshape(-1, len(chosen)) / ARC_MINUTE
+    mean = draws.mean(axis=0)
+    draws = draws[:: max(1, len(draws) // 400)]
+    columns = cell.columns(context)
+    assert columns.at is not None
+    values = columns.values
+    label, x, per_shown = _driver(context, cell, values)
+    if cell.form == 'sin/cos':
+        # Its mean is a zero-offset.
+        values = values - values[fitted].mean(axis=0)
+    effect = values @ mean
+    motion = context.jacobian[:, :, columns.at]
+    # What is left, as an angle of this joint: only where the marker is far from its axis.
+    square = np.sum(motion**2, axis=1)
+    far = fitted & (square > 0.1 * np.median(square))
+    angle = np.sum(motion * left, axis=1)[far] / square[far] / ARC_MINUTE
+    shown = slice(None, None, max(1, int(far.sum()) // CAUSE_POINTS))
+    points = (values[far] @ parameters + angle)[shown]
+    if cell.driver.startswith('approach'):
+        band = 2.0 * (values @ draws.T).std(axis=1)
+        _sides(ax, x, effect, band, (x[far][shown], points))
+    else:
+        at, line = np.sort(x), effect[np.argsort(x)]
+        if cell.curve is not None:
+            # Everywhere, so that the band opens where nothing was measured; the line is not there.
+            x, at = cell.curve.in_turn(x), cell.curve.grid()
+            values = cell.curve.columns(at)
+            line = np.where(cell.curve.seen(at, NEAR), values @ mean, np.nan)
+        else:
+            values = values[np.argsort(x)]
+            # No straight line where nothing was measured.
+            widest = WIDE_GAP if cell.form == 'sin/cos' else EMPTY
+            gap = np.diff(at, prepend=at[0]) > widest * np.ptp(at)
+            line = np.where(gap, np.nan, line)
+        spread = 2.0 * (values @ draws.T).std(axis=1)
+        middle = values @ mean
+        if cell.curve is None:
+            # Nor a straight band: a curve's own is known everywhere.
+            holes = np.flatnonzero(gap)
+            around = np.insert(at, holes, at[holes])
+            middle, spread = (np.insert(v, holes, np.nan) for v in (middle, spread))
+        else:
+            around = at
+        ax.plot(x[far][shown] / per_shown, points, '.', color=BEFORE, markersize=2.5, alpha=0.6)
+        low, high = middle - spread, middle + spread
+        ax.fill_between(around / per_shown, low, high, color=AFTER, alpha=0.25, linewidth=0)
+        # What jumps has no slope between two readings.
+        drawn = 'default' if not cell.happened else 'steps-mid'
+        ax.plot(at / per_shown, line, color=AFTER, linewidth=1.3, drawstyle=drawn)
+    limit = np.quantile(np.abs(points), 0.99)
+    ax.set_ylim(-1.2 * limit, 1.2 * limit)
+    ax.set_xlabel(label)
+    ax.set_ylabel('arc minutes')
+    name = 'slip' if cell.happened else cell.name.replace('_', ' ')
+    ax.set_title(f'joint {cell.joints[0]}: {name}')
+
+
+def _sides(
+    ax: Axes,
+    x: FloatArray,
+    effect: FloatArray,
+    band: FloatArray,
+    shown: tuple[FloatArray, FloatArray],
+) -> None:
+    """Draw a step: the points of each side spread out, and the step's level beside them."""
+    places, points = shown
+    spread_out = places + 0.3 * np.linspace(-1.0, 1.0, len(places))
+    ax.plot(spread_out, points, '.', color=BEFORE, markersize=2.5, alpha=0.6)
+    for side in (-1.0, 1.0):
+        if np.any(x == side):
+            level, width = float(effect[x == side][0]), float(band[x == side][0])
+            span = [side - 0.4, side + 0.4]
+            ax.fill_between(span, level - width, level + width, color=AFTER, alpha=0.25)
+            ax.plot(span, [level, level], color=AFTER, linewidth=1.3)
+    ax.set_xticks([-1.0, 1.0], ['from above', 'from below'])
+
+
+# Of `remaster report`: errors by stage, over the session, and over the workspace.
+
+MODEL, ALL_CAUSES = '#8a6fc4', '#2f9e78'
+# Narrower than the figures of many panels: to be read on a phone.
+NARROW_IN, WIDE_IN = 5.2, 8.4
+MOST_POINTS = 1500
+ARMS = 4
+NOT_MEASURED = 'not measured'
+# Marker, colour and words.
+PLANNED_AS = {
+    FITTED: ('o', AFTER, 'poses to fit'),
+    'validation': ('s', BEFORE, 'held out'),
+    REFERENCE: ('D', INK, 'references'),
+    NOT_MEASURED: ('x', '#c0392b', NOT_MEASURED),
+}
+LETTERS = 'ABCDEFGHIJKLMNOPQRSTUVWXYZ'
+
+
+class Subject(NamedTuple):
+    """What is drawn."""
+
+    inputs: Inputs
+    answer: Answer
+    chain: SerialChain
+
+
+def draw_answer(subject: Subject) -> dict[str, str]:
+    """Return every figure as SVG text, by file name without ending."""
+    figures: dict[str, Callable[[Subject], Figure]] = {
+        'session': over_session,
+        'workspace': workspace,
+    }
+    if subject.inputs.plan is not None:
+        figures['plan'] = planned
+    return draw_stages(subject.answer) | as_svg(figures, subject)
+
+
+def draw_stages(answer: Answer) -> dict[str, str]:
+    """Return the figure of the first screen as SVG text, by its name."""
+    return as_svg({'stages': stages}, answer)
+
+
+def stages(answer: Answer) -> Figure:
+    """Draw the errors of the judged rows at each stage, with their mean and 95 %."""
+    shown = answer.stages
+    figure = Figure(figsize=(NARROW_IN, 0.62 * len(shown) + 0.75), layout='constrained')
+    ax = figure.subplots()
+    colors = (BEFORE, AFTER, *((MODEL,) if len(shown) > 3 else ()), ALL_CAUSES)
+    for row, (stage, color) in enumerate(zip(shown, colors, strict=False)):
+        errors = np.maximum(np.sort(stage.errors), 1e-4)
+        if len(errors) > MOST_POINTS:
+            picked = np.linspace(0, len(errors) - 1, MOST_POINTS).round().astype(int)
+            errors = errors[picked]
+        # Spread out evenly and without chance, so that no two figures of a session differ.
+        height = row + 0.22 * np.sin(2.399963 * np.arange(len(errors)))
+        ax.plot(errors, height, '.', color=color, markersize=3.0, alpha=0.55, markeredgewidth=0)
+        ax.plot(2 * [stage.mean], [row - 0.36, row + 0.36], color=color, linewidth=2.2)
+        ax.plot(
+            2 * [stage.most], [row - 0.3, row + 0.3], color=color, linewidth=1.0, ls=(0, (2, 1))
+        )
+    if noise := [row.reading_mm for row in answer.noise if row.reading_mm > 0.0]:
+        low, high = min(noise), max(noise)
+        ax.axvspan(low / 1.01, high * 1.01, color=FAINT, alpha=0.35, linewidth=0)
+    log_axis(ax, 'x')
+    ax.set_yticks(range(len(shown)), [_two_lines(stage.title) for stage in shown])
+    ax.set_ylim(len(shown) - 0.45, -0.55)
+    ax.grid(False, axis='y')
+    ax.spines['left'].set_visible(False)
+    ax.tick_params(axis='y', length=0)
+    ax.set_xlabel('3-D error of the marker (mm)')
+    entries = [
+        Line2D([], [], color=INK, linewidth=2.2, label='mean'),
+        Line2D([], [], color=INK, linewidth=1.0, ls=(0, (2, 1)), label='95 %'),
+    ]
+    if answer.noise:
+        entries.append(Line2D([], [], color=FAINT, alpha=0.5, linewidth=5, label='sensor noise'))
+    figure.legend(handles=entries, loc='outside upper right', ncols=3)
+    return figure
+
+
+def over_session(subject: Subject) -> Figure:
+    """Draw the error of every row in the order measured, as it is today and after the deed."""
+    inputs, answer = subject.inputs, subject.answer
+    m = inputs.session.measurements
+    timed = inputs.session.timed
+    x = (m.stamp_s - m.stamp_s.min()) / 60.0 if timed else m.configuration.astype(float)
+    figure = Figure(figsize=(WIDE_IN, 2.5), layout='constrained')
+    ax = figure.subplots()
+    shown = np.linspace(0, len(m) - 1, min(len(m), MOST_POINTS)).round().astype(int)
+    entries = [legend_entry('_', BEFORE, 'today'), legend_entry('_', AFTER, 'after')]
+    for sensor, name in enumerate(inputs.session.sensor_names):
+        mine = shown[m.sensor[shown] == sensor]
+        if not len(mine):
+            continue
+        marker = SENSOR_MARKERS[sensor % len(SENSOR_MARKERS)]
+        for errors, color in ((inputs.before_mm, BEFORE), (answer.final_mm, AFTER)):
+            for held_out in (False, True):
+                rows = mine[m.is_validation[mine] == held_out]
+                ax.plot(
+                    x[rows],
+                    np.maximum(errors[rows], 1e-4),
+                    marker,
+                    color=color,
+                    markersize=3.2,
+                    markerfacecolor=color if held_out else 'none',
+                    markeredgewidth=0.7,
+                    alpha=0.85,
+                )
+        entries.append(legend_entry(marker, INK, name))
+    _mark_moments(ax, subject)
+    log_axis(ax, 'y')
+    ax.set_ylabel('3-D error (mm)')
+    ax.set_xlabel('minutes after the first reading' if timed else 'joint configuration')
+    ax.margins(x=0.01)
+    figure.legend(handles=entries, loc='outside upper right', ncols=len(entries))
+    return figure
+
+
+def _mark_moments(ax: Axes, subject: Subject) -> None:
+    found = subject.inputs.found
+    for effect in found.effects if found is not None else ():
+        if effect.moment_s is None:
+            continue
+        at = effect.moment_s / 60.0
+        ax.axvline(at, color=INK, linewidth=1.0, ls=(0, (4, 2)))
+        low, high = ax.get_xlim()
+        left = at > 0.5 * (low + high)
+        ax.annotate(
+            effect.title,
+            (at, 1.0),
+            xycoords=('data', 'axes fraction'),
+            xytext=(-4 if left else 4, 3),
+            textcoords='offset points',
+            ha='right' if left else 'left',
+            fontweight='bold',
+        )
+
+
+def workspace(subject: Subject) -> Figure:
+    """Draw from above and from the side where the markers were, coloured by what remains."""
+    inputs, chain = subject.inputs, subject.chain
+    m = inputs.session.measurements
+    frames = inputs.T_R_N
+    # A sensor that has measured nothing has no place, and no rows either.
+    T_R_N = np.array([frames.get(name, np.eye(4)) for name in inputs.session.sensor_names])
+    shown = np.linspace(0, len(m) - 1, min(len(m), MOST_POINTS)).round().astype(int)
+    points = apply(T_R_N[m.sensor[shown]], m.position[shown])
+    errors = subject.answer.final_mm[shown]
+    order = np.argsort(errors)
+    rows = inputs.fit.joint_offsets
+    offsets = np.array([row.mean_and_std[0] if row.identifiable else 0.0 for row in rows])
+    chosen = m.q[np.linspace(0, len(m) - 1, min(len(m), ARMS)).round().astype(int)]
+    joints = chain.frames(chosen, offsets)[..., :3, 3]
+    tips = chain.forward(chosen, offsets)[:, None, :3, 3]
+    arms = np.concatenate((np.zeros((len(chosen), 1, 3)), joints, tips), axis=1)
+    everything = np.concatenate((points, arms.reshape(-1, 3)))
+    figure = Figure(figsize=(WIDE_IN, 4.0), layout=_with_room())
+    top = float(np.quantile(errors, 0.98))
+    axes = two_views(figure, everything, frames)
+    for ax, (a, b) in axes:
+        for arm in arms:
+            ax.plot(arm[:, a], arm[:, b], color=FAINT, linewidth=2.0, alpha=0.6)
+            ax.plot(arm[:, a], arm[:, b], 'o', color=FAINT, markersize=3, alpha=0.6)
+        dots = ax.scatter(
+            points[order, a],
+            points[order, b],
+            c=errors[order],
+            s=11,
+            cmap='plasma_r',
+            vmin=0.0,
+            vmax=top,
+            linewidths=0.3,
+            edgecolors=INK,
+        )
+    bar = figure.colorbar(dots, ax=[ax for ax, _ in axes], shrink=0.85, pad=0.02, extend='max')
+    bar.set_label('error after (mm)')
+    bar.outline.set_linewidth(0.5)
+    entries = sensor_entries(frames)
+    figure.legend(handles=entries, loc='outside lower center', ncols=3, handletextpad=0.2)
+    return figure
+
+
+def planned(subject: Subject) -> Figure:
+    """Draw from above and from the side where the tool was to be, and what became of that."""
+    plan, chain = subject.inputs.plan, subject.chain
+    assert plan is not None
+    kinds: dict[str, list[FloatArray]] = {}
+    solutions = []
+    for split, poses in plan.tour.plans.items():
+        for index, pose in enumerate(poses.poses):
+            results = {plan.outcomes.get((split, index, i)) for i in range(len(pose.solutions))}
+            lost = split != REFERENCE and not results & {'recorded', 'partial'}
+            kinds.setdefault(NOT_MEASURED if lost else split, []).append(pose.T_R_T[:3, 3])
+            solutions.append(pose.solutions[0])
+    chosen = np.array(solutions)[np.linspace(0, len(solutions) - 1, ARMS).round().astype(int)]
+    arms = np.concatenate(
+        (
+            np.zeros((len(chosen), 1, 3)),
+            chain.frames(chosen)[..., :3, 3],
+            chain.forward(chosen)[:, None, :3, 3],
+        ),
+        axis=1,
+    )
+    frames = subject.inputs.T_R_N
+    figure = Figure(figsize=(WIDE_IN, 4.9), layout=_with_room())
+    everything = np.concatenate((*map(np.array, kinds.values()), arms.reshape(-1, 3)))
+    for ax, (a, b) in two_views(figure, everything, frames):
+        for arm in arms:
+            ax.plot(arm[:, a], arm[:, b], 'o-', color=FAINT, linewidth=2, markersize=3, alpha=0.5)
+        for kind, (marker, color, _) in PLANNED_AS.items():
+            at = np.array(kinds.get(kind, np.empty((0, 3))))
+            ax.plot(at[:, a], at[:, b], marker, color=color, markersize=4.5, mew=1.3, mfc='none')
+    entries = [
+        Line2D([], [], marker=marker, color=color, ls='', mfc='none', mew=1.3, label=words)
+        for kind, (marker, color, words) in PLANNED_AS.items()
+        if kind in kinds
+    ]
+    figure.legend(handles=entries, loc='outside upper right', ncols=4, handletextpad=0.2)
+    entries = sensor_entries(frames)
+    figure.legend(handles=entries, loc='outside lower center', ncols=3, handletextpad=0.2)
+    return figure
+
+
+def two_views(
+    figure: Figure, everything: FloatArray, frames: dict[str, FloatArray]
+) -> list[tuple[Axes, tuple[int, int]]]:
+    """Return panels from above and from the side, with the sensors, each with its two axes.
+
+    Parameters
+    ----------
+    everything
+        Points that must be in them, in the robot base, m, (n, 3).
+    frames
+        Registrations, sensor -> (4, 4).
+    """
+    middle = 0.5 * (everything.min(axis=0) + everything.max(axis=0))
+    reach = 0.55 * float(np.ptp(everything, axis=0).max())
+    views = ((0, 1, 'from above'), (0, 2, 'from the side'))
+    found = []
+    for ax, (a, b, name) in zip(figure.subplots(1, 2), views, strict=True):
+        ax.set_xlim(middle[a] - reach, middle[a] + reach)
+        ax.set_ylim(middle[b] - reach, middle[b] + reach)
+        # Of equal spans: one metre is as long in both.
+        ax.set_box_aspect(1.0)
+        ax.set_title(f'{name}, in the robot base')
+        ax.set_xlabel(f'{"xyz"[a]} (m)')
+        ax.set_ylabel(f'{"xyz"[b]} (m)')
+        _sensors(ax, frames, middle, reach, (a, b))
+        found.append((ax, (a, b)))
+    return found
+
+
+def _with_room() -> ConstrainedLayoutEngine:
+    """Return a layout for figures with a title on top: printers draw letters a little higher."""
+    return ConstrainedLayoutEngine(h_pad=0.1)
+
+
+def sensor_entries(frames: dict[str, FloatArray]) -> list[Line2D]:
+    """Return what the legend of `two_views` has of the sensors."""
+    labels = [
+        f'{letter}: {name[:24]}, {np.linalg.norm(T[:3, 3]):.1f} m from the base'
+        for letter, (name, T) in zip(LETTERS, frames.items(), strict=False)
+    ]
+    return [Line2D([], [], color=ALL_CAUSES, marker='D', ls='', label=text) for text in labels]
+
+
+def _sensors(
+    ax: Axes,
+    frames: dict[str, FloatArray],
+    middle: FloatArray,
+    reach: float,
+    plane: tuple[int, int],
+) -> None:
+    """Draw a sensor at its place, or the direction to one that lies outside, with its distance."""
+    for letter, T in zip(LETTERS, frames.values(), strict=False):
+        centre = middle[list(plane)]
+        way = T[:3, 3][list(plane)] - centre
+        outside = float(np.abs(way).max()) / reach
+        start, end = (tuple(centre + way * share / outside) for share in (0.86, 0.98))
+        if outside > 0.98:
+            arrow = {'arrowstyle': '-|>', 'color': ALL_CAUSES, 'linewidth': 1.5}
+            ax.annotate('', end, xytext=start, arrowprops=arrow)
+        else:
+            start = tuple(centre + way)
+            ax.plot(*start, 'D', color=ALL_CAUSES, markersize=5)
+        ax.annotate(
+            letter,
+            start,
+            # Several sensors on one side: one letter above, the next below.
+            xytext=(0, 4 if LETTERS.index(letter) % 2 == 0 else -11),
+            textcoords='offset points',
+            ha='center',
+            color=ALL_CAUSES,
+            fontweight='bold',
+        )
+
+
+def _two_lines(text: str) -> str:
+    """Break a title near its middle."""
+    words = text.split(' ')
+    if len(words) < 3:
+        return text
+    breaks = [(abs(len(' '.join(words[:i])) - len(text) / 2), i) for i in range(1, len(words))]
+    i = min(breaks)[1]
+    return ' '.join(words[:i]) + '\n' + ' '.join(words[i:])

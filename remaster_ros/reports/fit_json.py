@@ -25,9 +25,9 @@ from remaster_ros.discovery.geometry_model import GeometryModel, geometry_model
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.transforms import quaternion_xyzw
 from remaster_ros.reports import schemas
-from remaster_ros.reports.discovery_schema import Discovered
-from remaster_ros.reports.judgement import verdict
 from remaster_ros.reports.rows_csv import RESIDUALS_FILE
+from remaster_ros.reports.schemas import Discovered
+from remaster_ros.reports.sentences import verdict
 from remaster_ros.session.files import (
     make_folder,
     read_limited,

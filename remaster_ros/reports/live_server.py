@@ -52,7 +52,7 @@ from tornado.iostream import IOStream
 from tornado.web import Application, HTTPError, RequestHandler
 
 from remaster_ros.errors import InputError
-from remaster_ros.reports.scene_view import view_script
+from remaster_ros.reports.robot_scene import view_script
 
 # Connections to the live page: few, short until they have shown the token, and no flood of words.
 #

@@ -21,9 +21,9 @@ from remaster_ros.discovery.words import (
     sentence_case,
     shown,
 )
-from remaster_ros.reports.discovery_schema import Effect
 from remaster_ros.reports.figures import GRID, INK, PAPER
 from remaster_ros.reports.fit_json import REPORT_FILE
+from remaster_ros.reports.schemas import Effect
 from remaster_ros.session.files import make_folder, write_atomically
 
 

@@ -18,8 +18,7 @@ from remaster_ros.motion.trajectory import RAMP_S, REST_S
 from remaster_ros.planning.collection_plan import FITTED, CollectionPlan
 from remaster_ros.planning.tour_order import REFERENCE, REGISTRATION
 from remaster_ros.reports.plan_json import HELD_OUT, minutes_text, missed_goal
-from remaster_ros.reports.robot_scene import RobotScene
-from remaster_ros.reports.scene_view import compressed, scene_to_dict, view_script
+from remaster_ros.reports.robot_scene import RobotScene, compressed, scene_to_dict, view_script
 from remaster_ros.session.files import make_folder, undone_on_failure, write_atomically
 from remaster_ros.version import __version__
 

@@ -1,4 +1,4 @@
-"""report.html: one self-contained page with what the fit found and how reliable it is."""
+"""report.html of a fit, of a discovery and of both: self-contained pages; the last also as PDF."""
 
 from __future__ import annotations
 
@@ -6,35 +6,68 @@ import base64
 import gzip
 import importlib.resources
 import json
-from collections.abc import Mapping
+import logging
+import re
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
+from xml.etree import ElementTree
 
 import msgspec
 import numpy as np
 from markupsafe import Markup
+from msgspec import UNSET
 
 from remaster_ros.calibration.orientation_accuracy import METRICS as ORIENTATION
+from remaster_ros.collection.plan_confirmation import fingerprint
+from remaster_ros.compensation.export import MODEL_FILE
+from remaster_ros.compensation.file import COMPENSATION_FILE
+from remaster_ros.compensation.file import FILE_LIMIT as COMPENSATION_BYTES
+from remaster_ros.discovery.confirmation import Confirmation, in_words
+from remaster_ros.discovery.discover import Discovery
+from remaster_ros.discovery.effects.registry import EFFECTS
+from remaster_ros.discovery.words import clock_time
+from remaster_ros.errors import InputError
+from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.transforms import apply
-from remaster_ros.reports.answer import answer_of
-from remaster_ros.reports.answer_figures import draw_stages
-from remaster_ros.reports.answer_inputs import Inputs
-from remaster_ros.reports.figures import draw_figures
-from remaster_ros.reports.fit_json import fit_content
-from remaster_ros.reports.judgement import references
+from remaster_ros.reports.answer import (
+    ALL_FILES,
+    NO_FILE,
+    Answer,
+    Inputs,
+    answer_of,
+)
+from remaster_ros.reports.discovery_json import load_words
+from remaster_ros.reports.figures import (
+    AFTER,
+    BEFORE,
+    Subject,
+    draw_answer,
+    draw_discovery,
+    draw_fit,
+    draw_stages,
+)
+from remaster_ros.reports.fit_json import APPLY_FOLDER, REPORT_FILE, fit_content
 from remaster_ros.reports.pages import inlined, page, write_report
-from remaster_ros.reports.schemas import Accuracy
+from remaster_ros.reports.plan_page import WORDS, check_plan_page, read_plan_page
+from remaster_ros.reports.schemas import Accuracy, Discovered
+from remaster_ros.reports.sentences import references
+from remaster_ros.session.files import decode_text, make_folder, read_limited, write_atomically
+from remaster_ros.session.plan_journal import RecordedPlan
 from remaster_ros.types import FloatArray, IntArray, Session
+
+if TYPE_CHECKING:
+    from remaster_ros.calibration.result import FitResult
+
 
 # The 3-D view of a fit: arm, measured markers, magnified error vectors, sensors (for plotly.js).
 #
 # Only the description is made here, as plain data; the page brings the script.
 
 
-if TYPE_CHECKING:
-    from remaster_ros.calibration.result import FitResult
-
-BEFORE, AFTER, ARM, SENSOR, TEXT = '#e07b39', '#3b82c4', '#7d8896', '#2f9e78', '#808a96'
+ARM, SENSOR, TEXT = '#7d8896', '#2f9e78', '#808a96'
 ARMS_SHOWN = 5
 ROWS_SHOWN = 600
 # A sensor farther from the middle of the data than so many times their extent is not at its place.
@@ -286,10 +319,6 @@ def marker_rows(fit: Mapping[str, Any], session: Session) -> list[dict[str, Any]
     return rows
 
 
-if TYPE_CHECKING:
-    from remaster_ros.calibration.result import FitResult
-
-
 def write_fit_report(result: FitResult, folder: Path) -> Path:
     """Write report.html and the figures of a fit to a folder, made if missing; return its path.
 
@@ -298,8 +327,8 @@ def write_fit_report(result: FitResult, folder: Path) -> Path:
     InputError
         The folder cannot be written to.
     """
-    drawings = draw_figures(result) | draw_stages(answer_of(inputs_of(result)))
-    return write_report(folder, drawings, report_html(result, drawings))
+    drawings = draw_fit(result) | draw_stages(answer_of(inputs_of(result)))
+    return write_report(folder, drawings, fit_html(result, drawings))
 
 
 def inputs_of(result: FitResult) -> Inputs:
@@ -312,8 +341,8 @@ def inputs_of(result: FitResult) -> Inputs:
     return Inputs(result.session, fit_content(result), None, before_mm, after_mm, None)
 
 
-def report_html(result: FitResult, drawings: dict[str, str]) -> str:
-    """Return the page; with drawings (of `draw_figures`) it also has the 3-D view."""
+def fit_html(result: FitResult, drawings: dict[str, str]) -> str:
+    """Return the page; with drawings (of `draw_fit`) it also has the 3-D view."""
     scene: View3D | None = None
     if drawings:
         scene = draw_view(result)
@@ -344,3 +373,501 @@ def _json(content: Any) -> Markup:
     """Return JSON that no script element can be left with."""
     text = json.dumps(content, separators=(',', ':'), allow_nan=False)
     return Markup(text.replace('<', '\\u003c'))
+
+
+# The page of a discovery.
+
+# Long lists of spline coefficients are for other programs; the figure shows the curve.
+MOST_PARAMETERS = 8
+
+
+def write_discovery_report(
+    discovery: Discovery,
+    confirmation: Confirmation | None,
+    content: Discovered,
+    folder: Path,
+) -> Path:
+    """Write report.html and the figures of what was found; return its path.
+
+    Parameters
+    ----------
+    discovery, confirmation
+        What was found.
+    content
+        The same as discovery.json has it.
+    folder
+        Where to; made if missing.
+
+    Raises
+    ------
+    InputError
+        The folder cannot be written to.
+    """
+    drawings = draw_discovery(discovery)
+    html = discovery_html(discovery, confirmation, content, drawings)
+    return write_report(folder, drawings, html)
+
+
+def discovery_html(
+    discovery: Discovery,
+    confirmation: Confirmation | None,
+    content: Discovered,
+    drawings: dict[str, str],
+) -> str:
+    """Return the page, with those drawings (of `draw_discovery`) that are given."""
+    return page(
+        'discovery.html.jinja',
+        found=msgspec.to_builtins(content),
+        session=discovery.fit.session,
+        equations={name: effect.equation for name, effect in EFFECTS.items()},
+        sources={name: effect.source for name, effect in EFFECTS.items()},
+        most_parameters=MOST_PARAMETERS,
+        confirmed=in_words(discovery, confirmation) if confirmation else (),
+        to_load=[(row, *load_words(row)) for row in content.loadable or ()],
+        drawings={name: inlined(name, text) for name, text in drawings.items()},
+    )
+
+
+# What was planned, what became of it, what it gave.
+
+PLAN_FILE = 'plan.html'
+RECORDED = ('recorded', 'partial')
+NOT_VISITED = 'not visited'
+AS_EXPECTED = 1.5
+"""Standard deviations that are, in the middle, no more than so many times larger or smaller than
+the expected ones are as expected."""
+
+
+class PlannedRow(NamedTuple):
+    """A split: what was planned, and what became of it."""
+
+    words: str
+    poses: int
+    planned: int
+    recorded: int
+    lost: dict[str, int]
+
+
+class StdRow(NamedTuple):
+    """Standard deviation of a joint's offset, degrees: expected, and of the fit; None for none."""
+
+    joint: str
+    expected: float | None
+    fit: float | None
+
+
+@dataclass(frozen=True)
+class PlanFacts:
+    """What the page has of a plan.
+
+    Attributes
+    ----------
+    name
+        Its fingerprint.
+    rows
+        Of each split.
+    visits
+        Visits to references that were recorded.
+    minutes
+        From the first reading to the last; None where times are not known.
+    dropped
+        Reason -> poses and configurations that were never in the plan.
+    stds
+        Of each joint; empty where nothing was noted.
+    ratio
+        Median of the fit's standard deviations over the expected ones; None where there are none.
+    tool_mm
+        Expected error of the predicted markers (RMS); None.
+    enough
+        Whether poses were left out as enough was known.
+    drawn
+        Whether there is a page that plays it.
+    """
+
+    name: str
+    rows: tuple[PlannedRow, ...]
+    visits: int
+    minutes: float | None
+    dropped: dict[str, tuple[int, int]]
+    stds: tuple[StdRow, ...]
+    ratio: float | None
+    tool_mm: float | None
+    enough: bool
+    drawn: bool
+
+    @property
+    def verdict(self) -> str:
+        """What the standard deviations tell of the readings; '' where nothing is known."""
+        if self.ratio is None:
+            return ''
+        if self.ratio < 1.0 / AS_EXPECTED:
+            return (
+                f'The fit states the offsets {1.0 / self.ratio:.1f} times better than was '
+                'expected: the readings scatter less than noise_m and pose_noise_m of the cell '
+                'file state.'
+            )
+        if self.ratio <= AS_EXPECTED:
+            return 'The fit states the offsets about as well as was expected.'
+        return (
+            f'The fit states the offsets {self.ratio:.1f} times less well than was expected: the '
+            'readings scatter more than noise_m and pose_noise_m of the cell file state, or '
+            'configurations were lost.'
+        )
+
+
+def plan_facts(inputs: Inputs) -> PlanFacts | None:
+    """Return what the page has of the session's plan; None where it has none."""
+    plan, session = inputs.plan, inputs.session
+    if plan is None:
+        return None
+    splits = [split for split in WORDS if split in plan.tour.configurations]
+    stds = _stds(inputs, plan)
+    ratios = [row.fit / row.expected for row in stds if row.fit and row.expected]
+    stamps = [session.measurements.stamp_s]
+    stamps += [] if session.references is None else [session.references.stamp_s]
+    tour = plan.tour
+    return PlanFacts(
+        fingerprint(tour),
+        tuple(_row(plan, split) for split in splits),
+        sum(plan.references[result] for result in RECORDED),
+        float(np.ptp(np.concatenate(stamps))) / 60.0 if session.timed else None,
+        {
+            reason: (tour.dropped[reason], tour.dropped_solutions[reason])
+            for reason in (tour.dropped_solutions + tour.dropped)
+        },
+        stds,
+        float(np.median(ratios)) if ratios else None,
+        1e3 * plan.expected.tool_rms_m if plan.expected is not None else None,
+        plan.enough,
+        bool(drawn_plan(plan)),
+    )
+
+
+def _row(plan: RecordedPlan, split: str) -> PlannedRow:
+    poses = plan.tour.plans[split].poses
+    ends = Counter(result for (own, *_), result in plan.outcomes.items() if own == split)
+    recorded = sum(ends.pop(result, 0) for result in RECORDED)
+    planned = plan.tour.configurations[split]
+    left = planned - recorded - ends.total()
+    lost = {result.replace('_', ' '): count for result, count in ends.most_common()}
+    lost |= {NOT_VISITED: left} if left > 0 else {}
+    return PlannedRow(WORDS[split][0], len(poses), planned, recorded, lost)
+
+
+def _stds(inputs: Inputs, plan: RecordedPlan) -> tuple[StdRow, ...]:
+    if plan.expected is None:
+        return ()
+    expected = plan.expected.joint_std_rad
+    rows = []
+    for row in inputs.fit.joint_offsets:
+        # Of the model alone, as what is expected: where other errors are left it is wider.
+        std = row.std_deg if row.model_std_deg is UNSET else row.model_std_deg
+        before = expected.get(row.joint)
+        degrees = None if before is None else float(np.degrees(before))
+        rows.append(StdRow(row.joint, degrees, std if row.identifiable else None))
+    return tuple(rows)
+
+
+def drawn_plan(plan: RecordedPlan) -> bytes:
+    """Return the page that plays the plan, where the planner has left one beside the session."""
+    try:
+        return read_plan_page(plan.page, fingerprint(plan.tour))
+    except InputError:
+        return b''
+
+
+def copy_plan(plan: RecordedPlan | None, folder: Path) -> None:
+    """Copy the page of the plan, so that this one can be handed on with it."""
+    (folder / PLAN_FILE).unlink(missing_ok=True)
+    if plan is not None and (html := drawn_plan(plan)):
+        write_atomically(folder / PLAN_FILE, html)
+
+
+def plan_to_dict(plan: PlanFacts) -> dict[str, Any]:
+    """Return what ``remaster report --json`` prints of it."""
+    return {
+        'name': plan.name,
+        'splits': [row._asdict() for row in plan.rows],
+        'reference_visits': plan.visits,
+        'minutes': plan.minutes,
+        'dropped': {reason: counts[0] for reason, counts in plan.dropped.items()},
+        'dropped_configurations': {reason: counts[1] for reason, counts in plan.dropped.items()},
+        'std_deg': {row.joint: {'expected': row.expected, 'fit': row.fit} for row in plan.stds},
+    }
+
+
+# The page of `remaster report`: the answer first, then its reasons.
+
+PDF_FILE = 'report.pdf'
+ANSWER_GENERATOR = 'remaster report'
+WORST_ROWS = 10
+# Of the figures that `fit` and `discover` wrote, those that this page shows.
+FIT_FIGURES = ('posteriors', 'traces', 'tool_places', 'accuracy_map')
+FOUND_FIGURES = ('causes', 'drivers')
+FILE_LIMIT = 64 * 1024**2
+PDF_REMEDY = "pip install 'remaster_ros[pdf]'"
+
+
+class WorstRow(NamedTuple):
+    """A row with a large error: which, when, where, and how large."""
+
+    observation: int
+    pose: int
+    configuration: int
+    split: str
+    sensor: str
+    when: str
+    place_mm: FloatArray
+    before_mm: float
+    after_mm: float
+    remark: str
+
+
+def write_answer(
+    inputs: Inputs,
+    fit_folder: Path,
+    found_folder: Path | None,
+    folder: Path,
+    figures: bool = True,
+    pdf: bool = False,
+) -> Answer:
+    """Write report.html, the files to apply and, if asked for, report.pdf; return the answer.
+
+    Parameters
+    ----------
+    inputs
+        What was read.
+    fit_folder, found_folder
+        Of the fit and of the discovery, which hold figures and files to apply.
+    folder
+        Where to; made if missing.
+    figures, pdf
+        Whether to have figures, and report.pdf.
+
+    Raises
+    ------
+    InputError
+        The folder holds another's report or cannot be written to, or there is no library for PDF.
+    """
+    printer = require_ready(folder, pdf)
+    answer = answer_of(inputs)
+    subject = Subject(inputs, answer, _chain(inputs))
+    drawings: dict[str, str] = {}
+    if figures:
+        drawings = draw_answer(subject) | _figures_of(fit_folder, FIT_FIGURES)
+        if found_folder is not None:
+            drawings |= _figures_of(found_folder, FOUND_FIGURES)
+    make_folder(folder)
+    html = answer_html(subject, {name: inlined(name, svg) for name, svg in drawings.items()})
+    source = found_folder if answer.uses_causes and found_folder else fit_folder
+    compensation = next(
+        (
+            path
+            for one in (found_folder, fit_folder)
+            if one is not None and (path := one / APPLY_FOLDER / COMPENSATION_FILE).exists()
+        ),
+        None,
+    )
+    _copy_apply(source / APPLY_FOLDER, inputs.model, compensation, answer, folder)
+    copy_plan(inputs.plan, folder)
+    write_atomically(folder / REPORT_FILE, html)
+    if printer is not None:
+        printed = {name: as_image(svg) for name, svg in drawings.items()}
+        document = printer.HTML(string=answer_html(subject, printed, printing=True))
+        write_atomically(folder / PDF_FILE, document.write_pdf())
+    return answer
+
+
+def require_ready(folder: Path, pdf: bool) -> Any:
+    """Refuse a folder with a report of another command; return the library for PDF if asked for.
+
+    Raises
+    ------
+    InputError
+        One line with the remedy.
+    """
+    path = folder / REPORT_FILE
+    if path.exists():
+        head = read_limited(path, FILE_LIMIT, 'it was there')[:2000]
+        if f'name="generator" content="{ANSWER_GENERATOR}"'.encode() not in head:
+            raise InputError(
+                f'{path}: is not of "remaster report"; name another folder with --out'
+            )
+    check_plan_page(folder / PLAN_FILE)
+    return _pdf_library() if pdf else None
+
+
+def answer_html(subject: Subject, drawings: dict[str, Markup], printing: bool = False) -> str:
+    """Return the page."""
+    inputs, answer = subject.inputs, subject.answer
+    fit = msgspec.to_builtins(inputs.fit)
+    found = msgspec.to_builtins(inputs.found) if inputs.found is not None else None
+    if found is not None and MODEL_FILE not in answer.files:
+        for effect in found['effects']:
+            if effect['in_robot_model']:
+                effect['remedy'] = NO_FILE
+    source = fit
+    if found is not None and answer.uses_causes:
+        source = fit | {key: found[key] for key in ('registration', 'markers', 'sampler')}
+        source |= {
+            'joint_offsets': found['joint_offsets_after'],
+            'noise': found['noise']['sensors'],
+        }
+    return page(
+        'answer.html.jinja',
+        generator=ANSWER_GENERATOR,
+        answer=answer,
+        session=inputs.session,
+        fit=fit,
+        found=found,
+        source=source,
+        how_sure=_how_sure(inputs, answer),
+        accuracy=accuracy_rows(inputs.fit.accuracy),
+        markers=marker_rows(source, inputs.session),
+        worst=worst_rows(inputs, answer),
+        plan=plan_facts(inputs),
+        measured=measured_when(inputs),
+        drawings=drawings,
+        printing=printing,
+    )
+
+
+def _chain(inputs: Inputs) -> SerialChain:
+    session = inputs.session
+    return SerialChain.from_urdf(session.urdf, session.base_link, session.tip_link)
+
+
+def _how_sure(inputs: Inputs, answer: Answer) -> list[str]:
+    """Return what else matters: of the fit, of the model with causes, of the other session."""
+    judgement, found = inputs.judgement, inputs.found
+    answered = judgement.findings if found is not None else []
+    lines = [] if answer.uses_causes else judgement.points
+    lines = [line for line in lines if line not in (*answered, *judgement.disagreements)]
+    if found is not None and isinstance(found.judgement, msgspec.Struct):
+        lines += [found.judgement.headline, *found.judgement.points, *found.judgement.doubts]
+    return lines
+
+
+def measured_when(inputs: Inputs) -> str:
+    """Return the date of the measurement, from the session or from its times."""
+    stamps = inputs.session.measurements.stamp_s
+    if inputs.session.timed and (first := clock_time(float(stamps.min()))):
+        last = clock_time(float(stamps.max()))
+        return f'{first} to {last.removesuffix(first[8:])}'.strip()
+    return inputs.session.created
+
+
+def worst_rows(inputs: Inputs, answer: Answer) -> list[WorstRow]:
+    """Return the rows with the largest errors after the deed, the largest first."""
+    session, m = inputs.session, inputs.session.measurements
+    final = answer.final_mm
+    frames = inputs.T_R_N
+    first = float(m.stamp_s.min())
+    gross = inputs.found.noise.outliers if inputs.found is not None else ()
+    left_out = {} if answer.uses_causes else inputs.fit_left_out
+    rows = []
+    for i in np.argsort(-final, kind='stable')[:WORST_ROWS]:
+        number, sensor = int(m.observation[i]), session.sensor_names[m.sensor[i]]
+        when = ''
+        if session.timed:
+            clock = clock_time(float(m.stamp_s[i]))[:8]
+            when = clock or f'{(m.stamp_s[i] - first) / 60.0:.1f} min'
+        remark = left_out.get(number, 'gross error' if number in gross else '')
+        rows.append(
+            WorstRow(
+                number,
+                int(m.pose[i]),
+                int(m.configuration[i]),
+                'held out' if m.is_validation[i] else 'fitted',
+                sensor,
+                when,
+                1e3 * apply(frames[sensor], m.position[i]),
+                float(inputs.before_mm[i]),
+                float(final[i]),
+                remark,
+            )
+        )
+    return rows
+
+
+def _copy_apply(
+    source: Path, model: Path | None, compensation: Path | None, answer: Answer, folder: Path
+) -> None:
+    """Copy the files of the deed, so that the page can be handed on with them."""
+    make_folder(folder / APPLY_FOLDER)
+    for name in ALL_FILES:
+        # One of an earlier page would contradict this one.
+        (folder / APPLY_FOLDER / name).unlink(missing_ok=True)
+    (folder / APPLY_FOLDER / COMPENSATION_FILE).unlink(missing_ok=True)
+    if answer.files and compensation is not None:
+        data = read_limited(compensation, COMPENSATION_BYTES, 'it was there')
+        write_atomically(folder / APPLY_FOLDER / COMPENSATION_FILE, data)
+    for name in answer.files:
+        path = model if model is not None and name == MODEL_FILE else source / name
+        data = read_limited(path, FILE_LIMIT, 'fit or discover again, which write it')
+        write_atomically(folder / APPLY_FOLDER / name, data)
+
+
+def _figures_of(folder: Path, names: Sequence[str]) -> dict[str, str]:
+    """Return those figures of a fit or a discovery that are there."""
+    texts = {}
+    for name in names:
+        path = folder / 'figures' / f'{name}.svg'
+        if path.exists():
+            data = read_limited(path, FILE_LIMIT, 'it was there')
+            texts[name] = checked_svg(decode_text(data, path), path)
+    return texts
+
+
+# What Matplotlib draws with. A page runs nothing, and loads nothing, that a file brings along.
+SVG_ELEMENTS = {
+    *('svg', 'g', 'path', 'use', 'text', 'tspan', 'rect', 'clipPath', 'defs', 'style', 'title'),
+    *('metadata', 'line', 'circle', 'image', 'pattern', 'linearGradient', 'stop'),
+}
+
+
+def checked_svg(text: str, path: Path) -> str:
+    """Return a figure, refused where it holds more than a drawing.
+
+    Raises
+    ------
+    InputError
+        It is no SVG, or has scripts or addresses in it.
+    """
+    try:
+        root = ElementTree.fromstring(text)
+    except ElementTree.ParseError:
+        raise InputError(f'{path}: no SVG figure; fit or discover again') from None
+    for element in root.iter():
+        space, _, name = str(element.tag).rpartition('}')
+        drawn = name in SVG_ELEMENTS or not space.endswith('svg')
+        for key, value in element.attrib.items():
+            local = key.rpartition('}')[2].lower()
+            outside = local == 'href' and not value.startswith(('#', 'data:image/png;'))
+            drawn = drawn and not local.startswith('on') and not outside
+        if not drawn or (name == 'style' and re.search(r'@import|url\(', element.text or '')):
+            raise InputError(f'{path}: holds more than a drawing; fit or discover again')
+    return text
+
+
+def as_image(svg: str) -> Markup:
+    """Return a figure as an image of its own, in the colours of paper."""
+    data = base64.b64encode(svg.encode()).decode()
+    return Markup('<img alt="" src="data:image/svg+xml;base64,{}">').format(data)
+
+
+def _pdf_library() -> Any:
+    """Import the library that makes PDF; an `InputError` says how to get it."""
+    try:
+        import weasyprint
+    except ImportError:
+        raise InputError(f'--pdf needs WeasyPrint: {PDF_REMEDY}') from None
+    except OSError as error:
+        # Of its wheel everything but Pango, which draws text.
+        raise InputError(
+            f'--pdf: WeasyPrint lacks a library of the system ({str(error).splitlines()[0]}): '
+            'apt install libpango-1.0-0 libpangoft2-1.0-0 libharfbuzz-subset0'
+        ) from None
+    # It warns of every rule of a style sheet that is for screens.
+    logging.getLogger('weasyprint').setLevel(logging.ERROR)
+    return weasyprint

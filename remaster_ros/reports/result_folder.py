@@ -152,8 +152,7 @@ def save_discovery(
         The folder cannot be written to.
     """
     # `fit` does not need what discovers.
-    from remaster_ros.reports.discovery_apply import applied
-    from remaster_ros.reports.discovery_json import discovery_content, predictions_of
+    from remaster_ros.reports.discovery_json import applied, discovery_content, predictions_of
 
     folder = Path(folder)
     make_folder(folder)
@@ -170,7 +169,7 @@ def save_discovery(
         remove_report(folder)
         return folder / DISCOVERY_FILE
     # Matplotlib and the templates take a second to import: only where a report is made.
-    from remaster_ros.reports.discovery_report import write_discovery_report
+    from remaster_ros.reports.report import write_discovery_report
 
     return write_discovery_report(discovery, confirmation, content, folder)
 

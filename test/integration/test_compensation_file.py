@@ -17,8 +17,7 @@ import remaster_ros
 from remaster_ros.compensation.compensator import Compensator
 from remaster_ros.compensation.of_result import offsets_alone
 from remaster_ros.errors import InputError
-from remaster_ros.reports.discovery_apply import compensation_of, holds_everything
-from remaster_ros.reports.discovery_json import predictions_of
+from remaster_ros.reports.discovery_json import compensation_of, holds_everything, predictions_of
 from remaster_ros.reports.result_folder import save_discovery, save_fit
 from remaster_ros.types import Correction
 

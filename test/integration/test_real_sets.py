@@ -13,8 +13,7 @@ from remaster_ros.calibration.fit import FitResult, fit_session
 from remaster_ros.compensation.compensator import Compensator
 from remaster_ros.compensation.controller_forms import held
 from remaster_ros.discovery.discover import discover_session
-from remaster_ros.reports.discovery_apply import compensation_of
-from remaster_ros.reports.discovery_json import predictions_of
+from remaster_ros.reports.discovery_json import compensation_of, predictions_of
 from remaster_ros.reports.result_folder import save_discovery
 from remaster_ros.session.reader import read_session
 from remaster_ros.types import Session

@@ -18,8 +18,7 @@ from parallel import in_parallel
 import remaster_ros
 from remaster_ros.compensation.compensator import Compensator
 from remaster_ros.compensation.of_result import offsets_alone
-from remaster_ros.reports.discovery_apply import compensation_of
-from remaster_ros.reports.discovery_json import predictions_of
+from remaster_ros.reports.discovery_json import compensation_of, predictions_of
 
 ARMS = int(os.environ.get('COMPENSATED_ARMS', '20'))
 WORKERS = int(os.environ.get('COMPENSATED_WORKERS', '2'))

@@ -19,7 +19,7 @@ from remaster_ros.calibration.result import (
     parts_of,
 )
 from remaster_ros.calibration.smooth_functions import whitened
-from remaster_ros.reports.judgement import verdict
+from remaster_ros.reports.sentences import verdict
 from remaster_ros.types import FloatArray, Session
 
 NONE = np.zeros(0, np.int64)

@@ -6,7 +6,7 @@ import numpy as np
 from calibration_scenes import scene
 
 from remaster_ros.calibration.fit import fit_session
-from remaster_ros.reports.judgement import verdict
+from remaster_ros.reports.sentences import verdict
 
 
 def test_held_out_gross_errors_that_make_up_the_error_are_named_and_not_green():

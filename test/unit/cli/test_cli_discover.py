@@ -11,8 +11,7 @@ from remaster_ros.discovery.confirmation import Compared, Confirmation, Confirme
 from remaster_ros.discovery.explain import FoundEffect, LookAlike
 from remaster_ros.discovery.gain import Gain
 from remaster_ros.discovery.thinning import Thinning
-from remaster_ros.reports.discovery_schema import Loadable
-from remaster_ros.reports.schemas import Judgement
+from remaster_ros.reports.schemas import Judgement, Loadable
 
 EFFECT = FoundEffect(
     name='joint_compliance',

@@ -21,9 +21,8 @@ from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.discovery.effects.splines import Curve
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.serial_chain import SerialChain
-from remaster_ros.reports import discovery_json, discovery_report
-from remaster_ros.reports.discovery_apply import load_words, loadable
-from remaster_ros.reports.discovery_json import read_discovery
+from remaster_ros.reports import discovery_json, figures
+from remaster_ros.reports.discovery_json import load_words, loadable, read_discovery
 from remaster_ros.reports.fit_json import model_text
 from remaster_ros.reports.result_folder import save_discovery
 
@@ -96,12 +95,12 @@ def test_curves_of_a_large_session_are_drawn_at_the_rows_that_were_searched(save
 
     def curve():
         # Points of what is left, then the curve.
-        _, line = discovery_report.causes(found).axes[0].lines
+        _, line = figures.causes(found).axes[0].lines
         return line.get_xdata(), line.get_ydata()
 
     x, y = curve()
     assert len(x) == len(found.residuals.context)
-    monkeypatch.setattr(discovery_report, 'MOST_DRAWN', 0)
+    monkeypatch.setattr(figures, 'MOST_DRAWN', 0)
     few_x, few_y = curve()
     assert len(few_x) == len(found.residuals) < len(x)
     # A gap in the line begins with what was measured, so the two differ at gaps alone.
@@ -139,7 +138,7 @@ def test_a_free_curve_is_drawn_where_it_was_measured_with_a_band_that_opens(save
         solution=solution,
         fit=replace(found.fit, theta_names=names, theta_draws=draws[None]),
     )
-    (axes,) = discovery_report.causes(drawn).axes
+    (axes,) = figures.causes(drawn).axes
     _, line = axes.lines
     at, heights = np.radians(line.get_xdata()), line.get_ydata()
     gap = np.abs(at - np.median(q)) < 0.2
@@ -186,7 +185,7 @@ def test_noise_along_the_line_of_sight_is_drawn_by_sensor(saved):
         empty=replace(found.empty, noise=noise),
         solution=replace(found.solution, noise=noise),
     )
-    figure = discovery_report.gain(drawn)
+    figure = figures.gain(drawn)
     widths = [bar.get_width() for bar in figure.axes[1].patches]
     np.testing.assert_allclose(widths, 2 * [0.6 * np.sqrt(2.0 / 3.0), 0.3 / np.sqrt(3.0)])
 

@@ -15,10 +15,10 @@ from matplotlib.figure import Figure
 from remaster_ros.cli.discover import summary
 from remaster_ros.discovery.discover import Verdict, discover_session
 from remaster_ros.discovery.gain import Gain
-from remaster_ros.reports import discovery_report
+from remaster_ros.reports import figures
 from remaster_ros.reports.discovery_json import read_discovery
-from remaster_ros.reports.discovery_schema import Discovered
 from remaster_ros.reports.result_folder import save_discovery
+from remaster_ros.reports.schemas import Discovered
 from remaster_ros.types import Measurements
 
 
@@ -166,7 +166,7 @@ def test_a_posterior_that_is_only_approximate_is_never_green(found, tmp_path):
 
 
 def test_one_cause_without_a_curve_is_a_thin_bar_beside_the_noise(found):
-    (axes,) = [ax for ax in discovery_report.causes(found['scale']).axes if ax.patches]
+    (axes,) = [ax for ax in figures.causes(found['scale']).axes if ax.patches]
     low, high = sorted(axes.get_ylim())
     assert len(axes.patches) >= 2
     assert all(bar.get_height() < 0.15 * (high - low) for bar in axes.patches)
@@ -177,7 +177,7 @@ def test_no_bin_and_no_line_lies_where_nothing_was_measured():
     rng = np.random.default_rng(5)
     x = np.concatenate((rng.uniform(-100, -60, 70), rng.uniform(50, 90, 30)))
     ax = Figure().subplots()
-    discovery_report._binned(ax, x, rng.normal(size=100), 'black')
+    figures._binned(ax, x, rng.normal(size=100), 'black')
     assert len(ax.containers) == 2
     for container in ax.containers:
         places = container[0].get_xdata()
@@ -192,10 +192,10 @@ def test_a_wave_has_no_band_where_nothing_was_measured(found, monkeypatch):
     rows = np.flatnonzero(np.abs(q - middle) > 25.0)
     shown = replace(discovery, residuals=data.only(np.intersect1d(rows, data.rows.source)))
     # Drawn at the rows that were searched.
-    monkeypatch.setattr(discovery_report, 'MOST_DRAWN', 0)
+    monkeypatch.setattr(figures, 'MOST_DRAWN', 0)
     ax = Figure().subplots()
     (cell,) = discovery.groups[0]
-    discovery_report._cause(ax, shown, cell)
+    figures._cause(ax, shown, cell)
     (band,) = ax.collections
     sides = [path.vertices[:, 0] for path in band.get_paths()]
     assert len(sides) >= 2

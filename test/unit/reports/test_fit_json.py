@@ -23,7 +23,7 @@ from remaster_ros.errors import InputError
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.transforms import matrix_from_quaternion_xyzw, matrix_from_rpy
 from remaster_ros.reports.fit_json import fit_content, joint_offsets_rad, read_fit, write_fit
-from remaster_ros.reports.report import report_html
+from remaster_ros.reports.report import fit_html
 from remaster_ros.reports.result_folder import prepare_folder, save_fit
 
 
@@ -224,11 +224,11 @@ def test_wider_intervals_and_their_reason_are_in_the_file(fit_result):
     places = (*content['registration'].values(), *content['markers'].values())
     assert len(places) > 1
     assert all(place['std_is_lower_limit'] for place in places)
-    assert 'lower limits' in report_html(found, {})
+    assert 'lower limits' in fit_html(found, {})
     healthy = replace(found, structure=ResidualStructure(tests[1:]))
     assert not healthy.other_errors
     assert 'std_is_lower_limit' not in str(msgspec.to_builtins(fit_content(healthy)))
-    assert 'lower limits' not in report_html(healthy, {})
+    assert 'lower limits' not in fit_html(healthy, {})
     assert 'intervals' not in msgspec.to_builtins(fit_content(replace(fit_result, structure=None)))
 
 

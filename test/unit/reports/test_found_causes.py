@@ -5,7 +5,7 @@ import json
 import pytest
 
 from remaster_ros.errors import InputError
-from remaster_ros.reports.found_causes import earlier_pairs, read_causes
+from remaster_ros.reports.discovery_json import earlier_pairs, read_causes
 
 
 def alike(name, joints=(), **more):

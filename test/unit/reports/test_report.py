@@ -16,9 +16,9 @@ import pytest
 from remaster_ros.calibration.noise_estimate import NoiseEstimate
 from remaster_ros.kinematics import transforms
 from remaster_ros.kinematics.transforms import apply
-from remaster_ros.reports.judgement import verdict
-from remaster_ros.reports.report import _round_factor, draw_view, report_html
+from remaster_ros.reports.report import _round_factor, draw_view, fit_html
 from remaster_ros.reports.result_folder import save_fit
+from remaster_ros.reports.sentences import verdict
 
 VOID = {'meta', 'br', 'img', 'link', 'hr', 'input'}
 
@@ -217,7 +217,7 @@ def test_a_session_without_validation_has_a_report(fit_result):
         compare=lambda: comparison,
         left_out=(),
     )
-    html = report_html(result, {})
+    html = fit_html(result, {})
     assert 'not proven' in html
     assert 'No observation was left out' in html
 
@@ -226,9 +226,9 @@ def test_noise_along_the_line_of_sight_has_rows_of_its_own(fit_result):
     name = next(iter(fit_result.noise))
     part = NoiseEstimate(0.0123e-3, 1e-6, None, None)
     noise = replace(fit_result.noise[name], directions={'along': part, 'across': part})
-    plain = report_html(fit_result, {})
+    plain = fit_html(fit_result, {})
     assert 'line of sight' not in plain
-    html = report_html(replace(fit_result, noise={**fit_result.noise, name: noise}), {})
+    html = fit_html(replace(fit_result, noise={**fit_result.noise, name: noise}), {})
     assert 'along the line of sight' in html
     assert html.count('0.0123') == 2
 
@@ -282,16 +282,16 @@ def with_references(fit_result, shift_m):
 
 
 def test_what_changed_in_the_session_is_reported_first(fit_result):
-    assert 'id="references"' not in report_html(fit_result, {})
+    assert 'id="references"' not in fit_html(fit_result, {})
     result, _ = with_references(fit_result, 0.0)
-    html = report_html(result, {})
+    html = fit_html(result, {})
     assert '4 rounds of the same few configurations' in html
     assert 'Nothing did' in html
     result, name = with_references(fit_result, 3e-3)
     judged = verdict(result)
     assert any(f'{name} or the base was moved between' in point for point in judged.points)
     assert judged.mood != 'good'
-    html = report_html(result, {})
+    html = fit_html(result, {})
     assert html.count('was moved between configurations') == 2
     assert 'off by up to 3.0' in html
 

@@ -11,8 +11,8 @@ from remaster_ros.calibration.fit import fit_session
 from remaster_ros.calibration.noise_check import NoiseCheck
 from remaster_ros.calibration.residual_structure import ResidualStructure, StructureTest
 from remaster_ros.cli.fit import summary
-from remaster_ros.reports.judgement import verdict
-from remaster_ros.reports.report import report_html
+from remaster_ros.reports.report import fit_html
+from remaster_ros.reports.sentences import verdict
 
 
 def with_accuracy(result, split, before, after):
@@ -58,7 +58,7 @@ def test_an_approximation_that_fails_its_check_is_never_green(fit_result):
     assert judged.mood == 'caution'
     assert 'known only approximately' in judged.headline
     assert any(message in point for point in judged.points)
-    text = report_html(replace(fit_result, sampler=sampler), {})
+    text = fit_html(replace(fit_result, sampler=sampler), {})
     assert 'no chain reaches the precision' in text
 
 
@@ -120,7 +120,7 @@ def test_an_error_that_noise_does_not_explain_is_never_green(fit_result, check, 
         assert 'this session cannot show' in judged.headline
         assert 'measure poses in all their joint solutions' in told
     assert judged.points[0].startswith('tracker: ')
-    html = report_html(replace(fit_result, noise_checks=(check,)), {})
+    html = fit_html(replace(fit_result, noise_checks=(check,)), {})
     assert 'verdict caution' in html
 
 
