@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import shutil
@@ -10,6 +11,7 @@ import subprocess
 import sys
 import time
 from concurrent.futures import Executor, ProcessPoolExecutor
+from contextlib import redirect_stdout
 from pathlib import Path
 
 import numpy as np
@@ -38,36 +40,65 @@ def sessions(tmp_path_factory):
     return folder
 
 
-def test_rows_do_not_depend_on_the_workers_and_are_not_made_again(sessions, tmp_path, capsys):
-    """One worker, then two with a session more; a broken one has its error and stops nobody."""
-    (tmp_path / 'empty').mkdir()
-    one = [str(sessions / 's1'), str(tmp_path / 'empty')]
-    assert main(['batch', *one, '--out', str(tmp_path / 'one'), '--workers', '1']) == 0
-    out = capsys.readouterr().out
-    assert '1 done, 1 error' in out
-    assert 'session.yaml: no such file' in out
-    two = [str(sessions / 's2'), one[0]]
-    assert main(['batch', *two, '--out', str(tmp_path / 'two'), '--workers', '2', '--quiet']) == 0
-    first, second = rows(tmp_path / 'one'), rows(tmp_path / 'two')
-    assert first[one[0]]['status'] == 'done'
-    (cause,) = first[one[0]]['discovery']['effects']
+@pytest.fixture(scope='module')
+def by_one(sessions, tmp_path_factory):
+    """Return the folder that one worker filled, of s1, a copy of it and a broken one.
+
+    And the rows that the calls printed: at the first two something lay where s1 is written.
+    """
+    folder = tmp_path_factory.mktemp('one')
+    (folder / 'empty').mkdir()
+    shutil.copytree(sessions / 's1', folder / 'copy')
+    out = folder / 'out'
+    out.mkdir()
+    job = batch._job((sessions / 's1').resolve(), out.resolve(), 0, '')
+    Path(job.out).write_text('in the way', encoding='utf-8')
+    given = [str(sessions / 's1'), str(folder / 'copy'), str(folder / 'empty')]
+    printed = []
+    for sessions_given in (given[:1], given[:1], given):
+        if sessions_given == given:
+            Path(job.out).unlink()
+        with io.StringIO() as text, redirect_stdout(text):
+            status = main(
+                ['batch', *sessions_given, '--out', str(out), '--workers', '1', '--json']
+            )
+            printed.append((status, json.loads(text.getvalue())['rows']))
+    return out, printed
+
+
+@pytest.fixture(scope='module')
+def by_two(sessions, tmp_path_factory):
+    """Return the folder that two workers filled."""
+    out = tmp_path_factory.mktemp('two') / 'out'
+    both = [str(sessions / 's2'), str(sessions / 's1')]
+    assert main(['batch', *both, '--out', str(out), '--workers', '2', '--quiet']) == 0
+    return out
+
+
+def test_rows_do_not_depend_on_the_workers_and_are_not_made_again(
+    sessions, by_one, by_two, capsys
+):
+    """A broken session has its error and stops nobody."""
+    out, (*_, (status, printed)) = by_one
+    assert status == 0
+    assert [row['status'] for row in printed] == ['done', 'done', 'error']
+    assert 'session.yaml: no such file' in printed[2]['error']
+    s1 = str(sessions / 's1')
+    row = {k: v for k, v in printed[0].items() if k != 'crc32'}
+    (cause,) = row['discovery']['effects']
     assert (cause['name'], cause['joints']) == ('joint_compliance', [2])
-    (folder,) = (tmp_path / 'one').glob('s1-*')
+    (folder,), (other,) = [fit.parent for fit in out.glob('*/fit')], by_two.glob('s1-*')
     told = json.loads((folder / 'discovery' / 'discovery.json').read_bytes())['effects']
     assert cause['size_mm'] == 1e3 * told[0]['size_m'] > 0.1
-    for session in one[:1]:
-        assert first[session] == second[session]
-        name = next((tmp_path / 'one').glob(f'{Path(session).name}-*')).name
-        for file in ('fit/fit.json', 'discovery/discovery.json', 'fit/apply/compensation.json'):
-            texts = [(tmp_path / o / name / file).read_bytes() for o in ('one', 'two')]
-            assert texts[0] == texts[1]
-    before = (tmp_path / 'one' / batch.ROWS).read_bytes()
-    (tmp_path / 'one' / batch.PAGE).unlink()
-    assert main(['batch', *one, '--out', str(tmp_path / 'one'), '--json']) == 0
-    printed = json.loads(capsys.readouterr().out)
-    assert [row['status'] for row in printed['rows']] == ['done', 'error']
-    assert (tmp_path / 'one' / batch.ROWS).read_bytes() == before, 'made again'
-    assert 's1' in (tmp_path / 'one' / batch.PAGE).read_text(encoding='utf-8')
+    assert row == rows(by_two)[s1]
+    for file in ('fit/fit.json', 'discovery/discovery.json', 'fit/apply/compensation.json'):
+        assert (folder / file).read_bytes() == (other / file).read_bytes()
+    before = (out / batch.ROWS).read_bytes()
+    (out / batch.PAGE).unlink()
+    assert main(['batch', s1, str(out.parent / 'empty'), '--out', str(out)]) == 0
+    assert '1 done, 1 error' in capsys.readouterr().out
+    assert (out / batch.ROWS).read_bytes() == before, 'made again'
+    assert 's1' in (out / batch.PAGE).read_text(encoding='utf-8')
 
 
 def test_a_row_is_of_the_files_the_seed_and_the_baseline(sessions, tmp_path):
@@ -83,20 +114,21 @@ def test_a_row_is_of_the_files_the_seed_and_the_baseline(sessions, tmp_path):
     assert len(set(keys)) == 4
 
 
-def test_copies_are_worked_on_once_and_each_has_its_name(sessions, tmp_path, capsys):
+def test_copies_are_worked_on_once_and_each_has_its_name(sessions, by_one, tmp_path, capsys):
     """Also a session that was moved between two calls."""
-    for name in ('copy', 'moved'):
-        shutil.copytree(sessions / 's1', tmp_path / name)
-    given = [str(sessions / 's1'), str(tmp_path / 'copy')]
-    out = ['--out', str(tmp_path / 'out'), '--workers', '1', '--json']
-    assert main(['batch', *given, *out]) == 0
-    assert [row['session'] for row in json.loads(capsys.readouterr().out)['rows']] == given
-    assert main(['batch', str(tmp_path / 'moved'), *out]) == 0
+    out, (*_, (_, printed)) = by_one
+    s1, copy = str(sessions / 's1'), str(out.parent / 'copy')
+    assert [row['session'] for row in printed][:2] == [s1, copy]
+    assert len(list(out.glob('*/fit'))) == 1
+    shutil.copytree(sessions / 's1', tmp_path / 'moved')
+    again = ['batch', str(tmp_path / 'moved'), '--out', str(out), '--workers', '1', '--json']
+    before = (out / batch.ROWS).read_bytes()
+    assert main(again) == 0
     (moved,) = json.loads(capsys.readouterr().out)['rows']
     assert moved['session'] == str(tmp_path / 'moved')
-    assert len(read_journal(tmp_path / 'out' / batch.ROWS).records) == 1
+    assert (out / batch.ROWS).read_bytes() == before
     # Against the correction of one session, made of each: another arm's, and its own.
-    (baseline,) = (tmp_path / 'out').glob('*/fit/apply/compensation.json')
+    (baseline,) = out.glob('*/fit/apply/compensation.json')
     other, own = sessions / 's2', sessions / 's1'
     job = batch.Job('', str(other), '', 0, str(baseline))
     found = batch._of_check(job, read_session(other))
@@ -106,18 +138,15 @@ def test_copies_are_worked_on_once_and_each_has_its_name(sessions, tmp_path, cap
         batch._of_check(job, read_session(own))
 
 
-def test_an_error_that_is_none_of_the_session_is_tried_again(sessions, tmp_path, capsys):
-    job = batch._job((sessions / 's1').resolve(), tmp_path.resolve(), 0, '')
-    Path(job.out).write_text('in the way', encoding='utf-8')
-    given = ['batch', job.session, '--out', str(tmp_path), '--workers', '1', '--json']
-    for _ in range(2):
-        assert main(given) == 1
-        (row,) = json.loads(capsys.readouterr().out)['rows']
+def test_an_error_that_is_none_of_the_session_is_tried_again(sessions, by_one):
+    out, printed = by_one
+    job = batch._job((sessions / 's1').resolve(), out.resolve(), 0, '')
+    for status, (row,) in printed[:2]:
+        assert status == 1
         assert row['status'] == 'error'
         assert Path(job.out).name in row['error']
-    assert len(read_journal(tmp_path / batch.ROWS).records) == 1, 'says the same twice'
-    Path(job.out).unlink()
-    assert main(given) == 0
+    found = read_journal(out / batch.ROWS).records
+    assert len([row for row in found if row['key'] == job.key]) == 2, 'says the same twice'
 
 
 STARTS = """
@@ -232,12 +261,10 @@ def scheduler():
     cluster.close(timeout=60)
 
 
-def test_a_scheduler_makes_the_same_rows(scheduler, sessions, tmp_path):
-    given = [str(sessions / 's1'), str(sessions / 's2'), '--quiet', '--out']
-    one, two = str(tmp_path / 'one'), str(tmp_path / 'two')
-    assert main(['batch', *given, one, '--workers', '1']) == 0
-    assert main(['batch', *given, two, '--scheduler', scheduler.scheduler_address]) == 0
-    assert rows(tmp_path / 'one') == rows(tmp_path / 'two')
+def test_a_scheduler_makes_the_same_rows(scheduler, sessions, by_two, tmp_path):
+    given = [str(sessions / 's1'), str(sessions / 's2'), '--quiet', '--out', str(tmp_path)]
+    assert main(['batch', *given, '--scheduler', scheduler.scheduler_address]) == 0
+    assert rows(tmp_path) == rows(by_two)
 
 
 SCHEDULER = """
