@@ -47,7 +47,7 @@ test: $(VENV)/installed
 # What make test leaves out: repetitions, sweeps, campaigns, every row of docs/faults.md; an hour.
 # PYTEST=test/… runs these files alone, PYTEST='-k name' those of all that have the name.
 qualify: $(VENV)/installed
-	FAULTS_PAGE=none tools/run-tests $(BIN)/python $(if $(filter-out -%,$(firstword $(PYTEST))),,test) \
+	tools/run-tests $(BIN)/python $(if $(filter-out -%,$(firstword $(PYTEST))),,test) \
 		-m '' $(PYTEST)
 
 check: $(VENV)/installed
@@ -90,7 +90,7 @@ $(VENV)/docs-installed: $(VENV)/installed
 	@touch $@
 
 faults: $(VENV)/installed
-	FAULTS_PAGE=$(or $(FAULTS),write) tools/run-tests $(BIN)/python -q \
+	FAULTS_PAGE=$(or $(FAULTS),write) tools/run-tests $(BIN)/python -q -m '' \
 		test/integration/test_device_faults.py test/system/test_fault_rows.py
 
 format: $(VENV)/installed

@@ -70,8 +70,6 @@ class Row:
         ``move`` or ``reading``: what is under way when it begins.
     bench
         Which set of nodes it is tried in, see `BENCHES`.
-    quick
-        Whether `make test` tries it.
     times
         Whether it makes joint_states late or early; only a busy machine does else.
     """
@@ -83,7 +81,6 @@ class Row:
     lasts_s: float = 4.0
     during: str = 'move'
     bench: str = 'plain'
-    quick: bool = False
     times: bool = False
 
 

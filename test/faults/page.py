@@ -1,8 +1,7 @@
 """The tables of docs/faults.md, which the tests write (FAULTS_PAGE=write or add) or compare.
 
 ``write`` replaces the rows that were tried; ``add`` keeps what they were before as well: where a
-fault ends differently from time to time, the page has a line for each. ``none`` tries every row,
-as these two do, and compares.
+fault ends differently from time to time, the page has a line for each.
 """
 
 from __future__ import annotations

@@ -252,7 +252,6 @@ FIVE = (
         paused_in_an_emergency,
         lasts_s=4.0,
         times=True,
-        quick=True,
     ),
     *(
         Row(
@@ -260,7 +259,6 @@ FIVE = (
             f'joint_states come {late:g} s late, then a pause',
             then_pause(robot(late=late * RATE)),
             lasts_s=2.5,
-            quick=late == 1.0,
             times=True,
         )
         for late in (0.5, 1.0, 2.0)
@@ -278,7 +276,6 @@ FIVE = (
         strangers_leave,
         lasts_s=3.0,
         times=True,
-        quick=True,
     ),
 )
 BEFORE = {
@@ -345,7 +342,6 @@ def _common(name: str) -> tuple[Row, ...]:
             inject,
             end,
             lasts_s,
-            quick=(name, kind) == ('recorder', 'stuck'),
             times=name == 'robot_bridge',
         )
         for kind, fault, inject, end, lasts_s in rows

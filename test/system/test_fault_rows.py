@@ -1,7 +1,7 @@
 """Faults in running collections of real nodes, and the page of them.
 
-`make faults` tries every row and writes docs/faults.md; `make test` tries those marked quick, and
-compares. What is injected, and what must hold whatever happens, is in `faults.rows`.
+`make faults` tries every row and writes docs/faults.md, `make qualify` compares with it. What is
+injected is in `faults.rows`, and what must hold whatever happens in `faults.observation`.
 """
 
 import itertools
@@ -16,9 +16,7 @@ from ros_rig import ROOT, domains
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(900)]
 
-ALL = bool(page.MODE)
-TRIED = [row for row in rows.ROWS if ALL or row.quick]
-TRIED.sort(key=lambda row: (list(observation.BENCHES).index(row.bench), not row.quick))
+TRIED = sorted(rows.ROWS, key=lambda row: list(observation.BENCHES).index(row.bench))
 TRIES = 3
 ENOUGH = 12
 """So many configurations must be left for another row."""
@@ -113,6 +111,7 @@ def cells(row, seen):
     return 'five', (row.fault, rows.BEFORE[row.fault], commanded, *texts)
 
 
+@pytest.mark.qualify
 @pytest.mark.parametrize('row', TRIED, ids=lambda row: f'{row.who}: {row.fault}')
 def test_row(benches, row):
     """The commands must be right every time; the messages, in one of some tries.
@@ -135,7 +134,7 @@ def test_row(benches, row):
     compare(section, line)
 
 
-@pytest.mark.skipif(not ALL, reason='needs a set of nodes of its own: make faults')
+@pytest.mark.qualify
 def test_a_robot_that_copies_its_commands_never_moves(tmp_path):
     """Found by a probe of a micrometre, before the first motion."""
     from faults.bench import Bench

@@ -269,6 +269,7 @@ def test_a_cell_in_which_fewer_than_ten_poses_can_be_planned_ends_with_status_1(
     assert (tmp_path / 'cell.yaml').exists()
 
 
+@pytest.mark.qualify
 def test_an_arm_of_five_axes_is_planned(do, tmp_path):
     status, printed, error = do(written(tmp_path, ROBOTS['irb120']()), '--tip-link', 'link_5')
     assert (status, error) == (0, '')
