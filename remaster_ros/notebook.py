@@ -30,9 +30,10 @@ class Fit(FitResult):
         return cls(**{one.name: getattr(result, one.name) for one in fields(result)})
 
     def __repr__(self) -> str:
-        from remaster_ros.cli.fit import summary
+        from remaster_ros.reports.fit_json import fit_content
+        from remaster_ros.reports.sentences import fit_lines
 
-        return summary(self)
+        return '\n'.join(fit_lines(fit_content(self)))
 
     def _repr_html_(self) -> str:
         from remaster_ros.reports.report import fit_html
@@ -74,17 +75,14 @@ class Found(Discovery):
         return cls(**{one.name: getattr(found, one.name) for one in fields(found)})
 
     def __repr__(self) -> str:
-        from remaster_ros.cli.discover import summary
-        from remaster_ros.reports.schemas import Judgement
+        from remaster_ros.reports.sentences import discovery_lines
 
-        judged = self._content.judgement
-        assert isinstance(judged, Judgement)
-        return summary(self, judged, to_load=self._content.loadable or ())
+        return '\n'.join(discovery_lines(self._content))
 
     def _repr_html_(self) -> str:
         from remaster_ros.reports.report import discovery_html
 
-        return _first_screen(discovery_html(self, None, self._content, {}))
+        return _first_screen(discovery_html(self._content, self.fit.session, {}))
 
     @cached_property
     def _content(self) -> Discovered:

@@ -16,6 +16,7 @@ from remaster_ros.cli.console import progress_bar, show
 from remaster_ros.cli.sessions import read_to_fit
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.reports.fit_json import joint_offsets_rad, read_fit, require_own
+from remaster_ros.reports.sentences import METRICS
 from remaster_ros.session.files import make_folder, undone_on_failure, write_atomically
 from remaster_ros.types import Session
 from remaster_ros.version import __version__
@@ -31,16 +32,7 @@ DESCRIPTION = (
     'visited and at 1,000 random configurations.'
 )
 SIDES = ('before', 'after')
-METRICS = {
-    'relative': 'relative (eq. 17)',
-    'relative_orientation': '… orientation',
-    'post_registration': 'absolute, after registration',
-    'post_registration_orientation': '… orientation',
-    'theoretical': 'theoretical (section V-C)',
-    'paper_theoretical': 'theoretical, in the base frame',
-    'theoretical_random': 'theoretical, 1,000 random places',
-    'paper_theoretical_random': '… in the base frame',
-}
+WIDTH = 2 + max(map(len, METRICS.values()))
 
 log = logging.getLogger('remaster_ros')
 
@@ -124,7 +116,7 @@ def warn_of_harm(judged: OffsetsJudgement, path: Path) -> None:
 
 def table(judged: OffsetsJudgement) -> str:
     """Return the metrics, one a line."""
-    lines = [f'{"mean error [95 % interval], mm":44s} {"before":28s} after']
+    lines = [f'{"mean error [95 % interval], mm":{WIDTH + 2}s} {"before":28s} after']
     for split, metrics in judged.accuracy.items():
         if metrics is None:
             lines.append(f'{split}: no such rows')
@@ -135,13 +127,13 @@ def table(judged: OffsetsJudgement) -> str:
                 continue
             values = metrics[key]
             if values['after'] is None:
-                lines.append(f'  {name:42s} {values["why"]}')
+                lines.append(f'  {name:{WIDTH}s} {values["why"]}')
                 continue
             before, after = (interval(values[side]) for side in SIDES)
-            lines.append(f'  {name:42s} {before:28s} {after}')
+            lines.append(f'  {name:{WIDTH}s} {before:28s} {after}')
             if values.get('after_offsets_only'):
                 before, after = (interval(values[f'{side}_offsets_only']) for side in SIDES)
-                lines.append(f'  {"… without the noise":42s} {before:28s} {after}')
+                lines.append(f'  {"… without the noise":{WIDTH}s} {before:28s} {after}')
     for observation, why in judged.left_out:
         lines.append(f'left out: observation {observation}: {why}')
     return '\n'.join(lines)

@@ -31,6 +31,7 @@ from remaster_ros.types import BoolArray, Controller, FloatArray
 if TYPE_CHECKING:
     from remaster_ros.calibration.result import FitResult
 
+APPLY_FOLDER = 'apply'
 REMASTER_FILE = 'remaster.txt'
 LAYER_FILE = 'offset_layer.yaml'
 URDF_FILE = 'robot_calibrated.urdf'

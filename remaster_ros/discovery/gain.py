@@ -41,21 +41,6 @@ class Gain:
     held_out_kept_after_m: float | None = None
 
 
-def held_out_words(gain: Gain) -> str:
-    """Return the errors on held-out poses in words; '' without such poses."""
-    before, after = gain.held_out_kept_before_m, gain.held_out_kept_after_m
-    if before is None or after is None or gain.held_out_rms_after_m is None:
-        return ''
-    words = f'{1e3 * before:.3f} mm RMS before, {1e3 * after:.3f} mm after; the noise alone is '
-    words += f'{1e3 * gain.noise_floor_m:.3f} mm'
-    if gain.held_out_gross:
-        words += (
-            f'; {gain.held_out_gross} gross error{"s" if gain.held_out_gross > 1 else ""} not '
-            f'counted (with them {1e3 * gain.held_out_rms_after_m:.3f} mm after)'
-        )
-    return words
-
-
 def gain_of(
     found: Estimate,
     data: Residuals,

@@ -24,6 +24,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import rclpy
 import yaml
@@ -47,6 +48,7 @@ from remaster_ros.collection.events import (
     TourPlanned,
 )
 from remaster_ros.compensation.compensator import Compensator
+from remaster_ros.compensation.export import APPLY_FOLDER
 from remaster_ros.compensation.file import COMPENSATION_FILE, read_compensation
 from remaster_ros.compensation.verification import Visits, verify
 from remaster_ros.errors import DeviceError, InputError, RemasterError
@@ -56,7 +58,9 @@ from remaster_ros.nodes.running import report
 from remaster_ros.nodes.runtime_files import opening_path, page_name
 from remaster_ros.nodes.status import listen
 from remaster_ros.reports.discovery_json import read_discovery
-from remaster_ros.reports.fit_json import APPLY_FOLDER, read_fit
+from remaster_ros.reports.fit_json import read_fit
+from remaster_ros.reports.schemas import Discovered
+from remaster_ros.reports.sentences import discovery_lines
 from remaster_ros.session.files import cannot_write, make_folder, undone_on_failure
 from remaster_ros.session.reader import HEADER, read_session
 from remaster_ros.session.session_journal import is_complete
@@ -287,22 +291,8 @@ def print_hidden(console: Console, discovery: dict[str, Any], truth: SessionTrut
     for cause in found:
         table.add_row('nothing of the kind', describe(cause))
     console.print(table)
-    for effect in discovery['effects']:
-        console.print(effect['cause'])
-        for other in effect['confusable_with']:
-            console.print(
-                f'  looks like {other["name"]}; to distinguish them: {other["separate_by"]}'
-            )
-    gain = discovery['gain']
-    if gain['held_out_rms_before_m'] is not None:
-        before, after, floor = (
-            1e3 * gain[key]
-            for key in ('held_out_rms_before_m', 'held_out_rms_after_m', 'noise_floor_m')
-        )
-        console.print(
-            f'verdict: {discovery["verdict"]}; error on validation poses {before:.3f} mm with '
-            f'offsets only, {after:.3f} mm with what was found, noise {floor:.3f} mm (RMS)'
-        )
+    for line in discovery_lines(msgspec.convert(discovery, Discovered)):
+        console.print(line)
 
 
 AFTERWARDS = 5

@@ -16,7 +16,13 @@ from remaster_ros.calibration.estimate import Problem, estimate
 from remaster_ros.calibration.gauge_words import listed
 from remaster_ros.calibration.noise_check import MEAN_LENGTH
 from remaster_ros.calibration.outliers import LARGEST_SHARE
-from remaster_ros.compensation.export import LAYER_FILE, MODEL_FILE, REMASTER_FILE, URDF_FILE
+from remaster_ros.compensation.export import (
+    APPLY_FOLDER,
+    LAYER_FILE,
+    MODEL_FILE,
+    REMASTER_FILE,
+    URDF_FILE,
+)
 from remaster_ros.compensation.mastering import MasteringStep, mastering
 from remaster_ros.discovery.words import clock_time
 from remaster_ros.errors import InputError
@@ -24,7 +30,6 @@ from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.transforms import matrix_from_quaternion_xyzw, transform
 from remaster_ros.reports.discovery_json import read_discovery
 from remaster_ros.reports.fit_json import (
-    APPLY_FOLDER,
     DISCOVERY_FILE,
     FIT_FILE,
     FIT_LIMIT,
@@ -47,7 +52,13 @@ from remaster_ros.reports.schemas import (
     Judgement,
     Loadable,
 )
-from remaster_ros.reports.sentences import NOTICEABLE_GAIN, more_than_noise
+from remaster_ros.reports.sentences import (
+    NOTICEABLE_GAIN,
+    at_marker,
+    more_than_noise,
+    not_counted,
+    times_smaller,
+)
 from remaster_ros.session.files import decode_text, read_limited
 from remaster_ros.session.plan_journal import RecordedPlan
 from remaster_ros.types import BoolArray, FloatArray, Session
@@ -395,7 +406,7 @@ def answer_of(inputs: Inputs) -> Answer:
     fit, found = inputs.fit, inputs.found
     effects = found.effects if found is not None else []
     judged, held_out = judged_rows(inputs)
-    not_counted = int(inputs.session.measurements.is_validation.sum()) - int(judged.sum())
+    gross = int(inputs.session.measurements.is_validation.sum()) - int(judged.sum())
     rows = _stages(inputs)
     stages = tuple(Stage(text, errors[judged]) for text, errors in rows)
     uses_causes = inputs.causes_mm is not None and all_taken_out(found)
@@ -416,7 +427,7 @@ def answer_of(inputs: Inputs) -> Answer:
         mood=_mood(inputs, loads_model, held_out and action != 'wait'),
         headline=reason
         or _headline(
-            known, stages, brings, held_out, measured, loads_model, not_counted if held_out else 0
+            known, stages, brings, held_out, measured, loads_model, gross if held_out else 0
         ),
         action=action,
         uses_causes=uses_causes,
@@ -425,7 +436,7 @@ def answer_of(inputs: Inputs) -> Answer:
         brings=brings,
         final_mm=rows[brings][1],
         held_out=held_out,
-        not_counted=not_counted if held_out else 0,
+        not_counted=gross if held_out else 0,
         noise=_noise(inputs),
         remains=tuple(what_remains(inputs, loads_model, held_out)),
         offsets=tuple(offsets),
@@ -544,7 +555,7 @@ def _headline(
     held_out: bool,
     measured: Sequence[str],
     loads_model: bool,
-    not_counted: int,
+    gross: int,
 ) -> str:
     """Return the deed and its gain; ``measured`` is what was found of the measurement."""
     before, after = stages[0], stages[brings]
@@ -552,8 +563,8 @@ def _headline(
     if loads_model:
         deed = 'Load the robot model with all lengths, tilts and zero-offsets'
     where = 'poses that were never fitted' if held_out else 'the fitted poses'
-    if not_counted:
-        where += f' ({not_counted} gross error{"s" if not_counted > 1 else ""} not counted)'
+    if gross:
+        where += f' ({not_counted(gross)})'
     if measured:
         # That part of the errors was never the arm's.
         return (
@@ -561,10 +572,9 @@ def _headline(
             f'measuring error ({listed(measured)}) is taken out; the {before.mean:.3f} mm of '
             'today contain it.'
         )
-    times = before.mean / max(after.mean, 1e-9)
     return (
         f'{deed}: the mean error on {where} falls from {before.mean:.3f} mm to {after.mean:.3f} '
-        f'mm, {times:.{1 if times < 10 else 0}f} times smaller.'
+        f'mm, {times_smaller(before.mean, after.mean)}.'
     )
 
 
@@ -648,13 +658,13 @@ def _of_discovery(found: Discovered, loads_model: bool) -> list[Remaining]:
         sizes = effect.sizes if isinstance(effect.sizes, list) else []
         size = '; '.join(sizes)
         if len(sizes) > MOST_SIZES and isinstance(effect.size_m, float):
-            size = f'{1e3 * effect.size_m:.3f} mm RMS at the marker'
+            size = at_marker(effect.size_m)
         remedy = effect.remedy if isinstance(effect.remedy, str) else ''
         remedy = NO_FILE if effect.in_robot_model else remedy
         rows.append(Remaining(effect.title, size, remedy))
     if more := stay[MOST_NAMED:]:
         largest = max(e.size_m for e in more if isinstance(e.size_m, float))
-        size = f'up to {1e3 * largest:.3f} mm RMS at the marker'
+        size = f'up to {at_marker(largest)}'
         name = f'{len(more)} smaller cause{"s" if len(more) > 1 else ""}'
         rows.append(Remaining(name, size, 'See below.'))
     if found.verdict == 'undetermined':

@@ -12,9 +12,8 @@ import numpy as np
 
 from remaster_ros.calibration.predictions import Coverage, Predictions, predict
 from remaster_ros.compensation.export import (
-    LAYER_FILE,
+    APPLY_FOLDER,
     MODEL_FILE,
-    REMASTER_FILE,
     URDF_FILE,
     exports,
 )
@@ -36,7 +35,6 @@ from remaster_ros.errors import InputError
 from remaster_ros.planning.rival_causes import FoundCause
 from remaster_ros.reports import schemas
 from remaster_ros.reports.fit_json import (
-    APPLY_FOLDER,
     DISCOVERY_FILE,
     correction_text,
     estimates,
@@ -111,17 +109,24 @@ def discovery_content(
             for one in decided
         ]
     if confirmation is not None:
-        content['confirmation'] = vars(confirmation) | {
-            'offsets_rms_sigmas': confirmation.offsets_rms_sigmas,
-            'parameters_rms_sigmas': confirmation.parameters_rms_sigmas,
-            'effects': [
-                {'name': effect.name, 'joints': effect.joints, **vars(cause)}
-                for effect, cause in zip(discovery.effects, confirmation.effects, strict=False)
-            ],
-        }
+        content['confirmation'] = confirmation_content(discovery.effects, confirmation)
     checked = schemas.checked(content, Discovered)
     checked.judgement = judgement(discovery, confirmation, checked)
     return checked
+
+
+def confirmation_content(
+    effects: Sequence[FoundEffect], confirmation: Confirmation
+) -> dict[str, Any]:
+    """Return how causes do in another session as discovery.json has it."""
+    return vars(confirmation) | {
+        'offsets_rms_sigmas': confirmation.offsets_rms_sigmas,
+        'parameters_rms_sigmas': confirmation.parameters_rms_sigmas,
+        'effects': [
+            {'name': effect.name, 'joints': effect.joints, **vars(cause)}
+            for effect, cause in zip(effects, confirmation.effects, strict=False)
+        ],
+    }
 
 
 def _covariance(discovery: Discovery) -> dict[str, Any]:
@@ -142,18 +147,13 @@ def _covariance(discovery: Discovery) -> dict[str, Any]:
     }
 
 
-def held_out_coverage(discovery: Discovery, predictions: Predictions) -> Coverage:
-    """Return how many of the held-out rows lie in their 95 % regions."""
-    return Coverage.of(predictions.inside[discovery.residuals.context.measurements.is_validation])
-
-
 def _regions(discovery: Discovery, predictions: Predictions) -> dict[str, Any]:
     measurements = discovery.residuals.context.measurements
     gross = [observation for observation, _ in discovery.fit.left_out]
     fitted = ~measurements.is_validation & ~np.isin(measurements.observation, gross)
     return {
         'widening': predictions.widening,
-        'held_out': held_out_coverage(discovery, predictions),
+        'held_out': Coverage.of(predictions.inside[measurements.is_validation]),
         'fitted': Coverage.of(predictions.inside[fitted]),
     }
 
@@ -195,6 +195,9 @@ def applied(discovery: Discovery, widening: float, result_sha256: str) -> dict[s
         described, discovery.fit.session, 'discover', result_sha256
     )
     return files
+
+
+_ALONE = 'only zero-offsets are corrected here'
 
 
 def compensation_of(discovery: Discovery, widening: float) -> Described:
@@ -260,29 +263,6 @@ def loadable(discovery: Discovery) -> list[Loadable]:
         rows.append(Loadable(name, shown, mean_mm < least, file))
         least = min(least, mean_mm)
     return rows
-
-
-def load_words(row: Loadable) -> tuple[str, str]:
-    """Return what a result is, and what to do with it."""
-    if row.result != 'offsets' and row.held_out_mean_mm is not None and not row.better:
-        what_to_do = 'leave it: no better than what stands before it'
-    elif row.file:
-        what_to_do = f'{row.file}{_MORE.get(row.result, "")}'
-    else:
-        what_to_do = 'leave it: no file holds it'
-    return _RESULTS[row.result], what_to_do
-
-
-_RESULTS = {
-    'offsets': 'zero-offsets alone',
-    'geometry': 'all lengths, tilts and zero-offsets together',
-    'everything': 'everything that a command can correct',
-}
-_MORE = {
-    'offsets': f', {REMASTER_FILE} or {LAYER_FILE}',
-    'everything': ', by remaster compensate or remaster_ros.read_compensation',
-}
-_ALONE = 'only zero-offsets are corrected here'
 
 
 def _remarks(discovery: Discovery) -> list[str]:

@@ -15,6 +15,7 @@ from remaster_ros.calibration.estimate import Problem
 from remaster_ros.calibration.predictions import predict
 from remaster_ros.compensation.arm_model import Geometry
 from remaster_ros.compensation.export import (
+    APPLY_FOLDER,
     MODEL_FILE,
     URDF_FILE,
     calibrated_urdf,
@@ -42,7 +43,6 @@ if TYPE_CHECKING:
 
 FIT_FILE = 'fit.json'
 REPORT_FILE = 'report.html'
-APPLY_FOLDER = 'apply'
 DISCOVERY_FILE = 'discovery.json'
 FORMATS = {FIT_FILE: schemas.FIT_FORMAT, DISCOVERY_FILE: schemas.DISCOVERY_FORMAT}
 # What the commands write beside their result.

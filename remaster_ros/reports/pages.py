@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.resources
 import re
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -14,16 +15,23 @@ from markupsafe import Markup
 from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.discovery.effects.unnamed import EFFECT as NO_NAME
 from remaster_ros.discovery.words import (
-    called,
     p_value_text,
-    part_words,
     percent,
-    sentence_case,
     shown,
 )
 from remaster_ros.reports.figures import GRID, INK, PAPER
 from remaster_ros.reports.fit_json import REPORT_FILE
-from remaster_ros.reports.schemas import Effect
+from remaster_ros.reports.schemas import Coverage, Effect, LookAlike, MeasuredSession
+from remaster_ros.reports.sentences import (
+    METRICS,
+    NO_TIMES,
+    NOT_PROVEN,
+    counts_words,
+    coverage_words,
+    look_alike_name,
+    not_counted,
+    size_words,
+)
 from remaster_ros.session.files import make_folder, write_atomically
 
 
@@ -43,20 +51,32 @@ def page(template: str, **content: Any) -> str:
         lstrip_blocks=True,
         loader=FunctionLoader(_template),
     )
+    environment.globals |= {'no_times': NO_TIMES, 'not_proven': NOT_PROVEN}
     environment.filters |= {
         'fixed': _fixed,
         'signed': _signed,
         'percent': percent,
         'p_value': p_value_text,
         'shown': shown,
-        'look_alike': lambda other, of: (
-            part_words(of['name'], of['joints'], other['name'], other['joints'])
-            or sentence_case(other.get('title') or called(other['name'], other['joints']))
+        'heading': lambda words: words[:1].upper() + words[1:],
+        'metric': METRICS.__getitem__,
+        'not_counted': not_counted,
+        'counts': lambda session: counts_words(msgspec.convert(session, MeasuredSession)),
+        'coverage': lambda rows: coverage_words(msgspec.convert(rows, Coverage)),
+        'summarized': summarized,
+        'size': lambda effect: size_words(msgspec.convert(effect, Effect)),
+        'look_alike': lambda other, of: look_alike_name(
+            msgspec.convert(of, Effect), msgspec.convert(other, LookAlike)
         ),
-        'called': lambda one: called(one['name'], one['joints']),
         'law': lambda effect: law(msgspec.convert(effect, Effect)),
     }
     return environment.get_template(template).render(**content)
+
+
+def summarized(effect: Mapping[str, Any]) -> Markup:
+    """Return a cause with its size, for a list."""
+    size = size_words(msgspec.convert(effect, Effect))
+    return Markup('{} <span class="soft">({})</span>').format(effect['cause'], size)
 
 
 def _template(name: str) -> str:

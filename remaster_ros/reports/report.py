@@ -22,12 +22,10 @@ from msgspec import UNSET
 
 from remaster_ros.calibration.orientation_accuracy import METRICS as ORIENTATION
 from remaster_ros.collection.plan_confirmation import fingerprint
-from remaster_ros.compensation.export import MODEL_FILE
+from remaster_ros.compensation.export import APPLY_FOLDER, MODEL_FILE
 from remaster_ros.compensation.file import COMPENSATION_FILE
 from remaster_ros.compensation.file import FILE_LIMIT as COMPENSATION_BYTES
-from remaster_ros.discovery.confirmation import Confirmation, in_words
 from remaster_ros.discovery.discover import Discovery
-from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.discovery.words import clock_time
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.serial_chain import SerialChain
@@ -39,7 +37,6 @@ from remaster_ros.reports.answer import (
     Inputs,
     answer_of,
 )
-from remaster_ros.reports.discovery_json import load_words
 from remaster_ros.reports.figures import (
     AFTER,
     BEFORE,
@@ -49,11 +46,18 @@ from remaster_ros.reports.figures import (
     draw_fit,
     draw_stages,
 )
-from remaster_ros.reports.fit_json import APPLY_FOLDER, REPORT_FILE, fit_content
+from remaster_ros.reports.fit_json import REPORT_FILE, fit_content
 from remaster_ros.reports.pages import inlined, page, write_report
 from remaster_ros.reports.plan_page import WORDS, check_plan_page, read_plan_page
 from remaster_ros.reports.schemas import Accuracy, Discovered
-from remaster_ros.reports.sentences import references
+from remaster_ros.reports.sentences import (
+    METRICS,
+    MOST_PARAMETERS,
+    as_drawn,
+    load_words,
+    loadable_of_fit,
+    references,
+)
 from remaster_ros.session.files import decode_text, make_folder, read_limited, write_atomically
 from remaster_ros.session.plan_journal import RecordedPlan
 from remaster_ros.types import FloatArray, IntArray, Session
@@ -268,22 +272,12 @@ def _plain(text: str) -> str:
 
 def accuracy_rows(accuracy: Accuracy) -> list[dict[str, Any]]:
     """Return one row per split and metric, and the reason where there is no number."""
-    titles = {
-        'post_registration': 'Position, sensor registered (eq.\u00a018)',
-        'post_registration_orientation': '… orientation',
-        'relative': 'Distances between solutions of a pose (eq.\u00a017)',
-        'relative_orientation': '… angles',
-        'theoretical': 'What the posterior predicts (section V-C)',
-        'paper_theoretical': '… in the robot base, offsets alone, as the paper has it',
-        'theoretical_random': 'The same predicted at 1,000 random configurations',
-        'paper_theoretical_random': '… in the robot base, as the paper has it',
-    }
     rows = []
     for split in ('validation', 'optimization'):
         metrics = getattr(accuracy, split)
         if metrics is None:
             continue
-        for metric, title in titles.items():
+        for metric in METRICS:
             at_random = metric.endswith('_random')
             if at_random and split == 'validation':
                 continue  # They are the same for both.
@@ -293,7 +287,7 @@ def accuracy_rows(accuracy: Accuracy) -> list[dict[str, Any]]:
             rows.append(
                 {
                     'split': 'any' if at_random else split,
-                    'title': title,
+                    'metric': metric,
                     'angular': metric in ORIENTATION,
                     'cells': [sides.get(side) for side in ('before', 'after')],
                     'offsets_only': sides.get('after_offsets_only'),
@@ -347,10 +341,13 @@ def fit_html(result: FitResult, drawings: dict[str, str]) -> str:
     if drawings:
         scene = draw_view(result)
     inputs = inputs_of(result)
-    fit = msgspec.to_builtins(inputs.fit)
+    fit, geometry = msgspec.to_builtins(inputs.fit), inputs.fit.geometry
+    loadable = [] if geometry is msgspec.UNSET else loadable_of_fit(geometry)
     return page(
         'report.html.jinja',
         fit=fit,
+        as_drawn='' if geometry is msgspec.UNSET else as_drawn(geometry, geometry.imitations),
+        to_load=[(row, *load_words(row)) for row in loadable],
         answer=answer_of(inputs),
         accuracy=accuracy_rows(inputs.fit.accuracy),
         markers=marker_rows(fit, result.session),
@@ -377,24 +374,14 @@ def _json(content: Any) -> Markup:
 
 # The page of a discovery.
 
-# Long lists of spline coefficients are for other programs; the figure shows the curve.
-MOST_PARAMETERS = 8
 
-
-def write_discovery_report(
-    discovery: Discovery,
-    confirmation: Confirmation | None,
-    content: Discovered,
-    folder: Path,
-) -> Path:
+def write_discovery_report(discovery: Discovery, content: Discovered, folder: Path) -> Path:
     """Write report.html and the figures of what was found; return its path.
 
     Parameters
     ----------
-    discovery, confirmation
-        What was found.
-    content
-        The same as discovery.json has it.
+    discovery, content
+        What was found, and the same as discovery.json has it.
     folder
         Where to; made if missing.
 
@@ -404,25 +391,17 @@ def write_discovery_report(
         The folder cannot be written to.
     """
     drawings = draw_discovery(discovery)
-    html = discovery_html(discovery, confirmation, content, drawings)
+    html = discovery_html(content, discovery.fit.session, drawings)
     return write_report(folder, drawings, html)
 
 
-def discovery_html(
-    discovery: Discovery,
-    confirmation: Confirmation | None,
-    content: Discovered,
-    drawings: dict[str, str],
-) -> str:
+def discovery_html(content: Discovered, session: Session, drawings: dict[str, str]) -> str:
     """Return the page, with those drawings (of `draw_discovery`) that are given."""
     return page(
         'discovery.html.jinja',
         found=msgspec.to_builtins(content),
-        session=discovery.fit.session,
-        equations={name: effect.equation for name, effect in EFFECTS.items()},
-        sources={name: effect.source for name, effect in EFFECTS.items()},
+        session=session,
         most_parameters=MOST_PARAMETERS,
-        confirmed=in_words(discovery, confirmation) if confirmation else (),
         to_load=[(row, *load_words(row)) for row in content.loadable or ()],
         drawings={name: inlined(name, text) for name, text in drawings.items()},
     )

@@ -9,12 +9,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from remaster_ros.compensation.export import MODEL_FILE, exports
+from remaster_ros.compensation.export import APPLY_FOLDER, MODEL_FILE, exports
 from remaster_ros.compensation.file import COMPENSATION_FILE
 from remaster_ros.errors import InputError
 from remaster_ros.reports import schemas
 from remaster_ros.reports.fit_json import (
-    APPLY_FOLDER,
     DISCOVERY_FILE,
     FIT_FILE,
     FORMATS,
@@ -171,7 +170,7 @@ def save_discovery(
     # Matplotlib and the templates take a second to import: only where a report is made.
     from remaster_ros.reports.report import write_discovery_report
 
-    return write_discovery_report(discovery, confirmation, content, folder)
+    return write_discovery_report(discovery, content, folder)
 
 
 def _write_applied(folder: Path, files: Mapping[str, str | bytes]) -> None:

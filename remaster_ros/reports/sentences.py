@@ -7,24 +7,65 @@ from typing import TYPE_CHECKING, Literal
 
 import msgspec
 import numpy as np
+from msgspec import Struct
 
 from remaster_ros.calibration.gauge_words import listed
 from remaster_ros.calibration.measured_again import MeasuredAgain
 from remaster_ros.calibration.noise_check import SPOILT, NoiseCheck
 from remaster_ros.calibration.residual_structure import FEWEST_POSES
 from remaster_ros.collection.reference_watch import changes
-from remaster_ros.discovery.gain import held_out_words
-from remaster_ros.discovery.words import sentence_case
-from remaster_ros.reports.schemas import Discovered, Judgement
+from remaster_ros.compensation.export import APPLY_FOLDER, LAYER_FILE, REMASTER_FILE, URDF_FILE
+from remaster_ros.discovery.words import called, part_words, percent, sentence_case, shown
+from remaster_ros.reports.schemas import (
+    Confirmed,
+    Coverage,
+    Discovered,
+    Effect,
+    Fit,
+    FittedGeometry,
+    Imitation,
+    JointOffset,
+    Judgement,
+    Loadable,
+    LookAlike,
+    MeasuredSession,
+)
 
 if TYPE_CHECKING:
     from remaster_ros.calibration.result import FitResult
     from remaster_ros.discovery.confirmation import Confirmation
     from remaster_ros.discovery.discover import Discovery
+    from remaster_ros.discovery.gain import Gain
 
 
 # Less than this is no gain a user would notice.
 NOTICEABLE_GAIN = 1.1
+NOT_PROVEN = 'No poses were held out, so the gain is not proven: measure some, and run this again.'
+NO_TIMES = 'without times, so nothing that changes with time can be seen'
+# Of accuracy in fit.json.
+METRICS = {
+    'post_registration': 'position, sensor registered (eq. 18)',
+    'post_registration_orientation': '… orientation',
+    'relative': 'distances between solutions of a pose (eq. 17)',
+    'relative_orientation': '… angles',
+    'theoretical': 'what the posterior predicts (section V-C)',
+    'paper_theoretical': '… in the robot base, offsets alone, as the paper has it',
+    'theoretical_random': 'the same at 1,000 random configurations',
+    'paper_theoretical_random': '… in the robot base, as the paper has it',
+}
+# Of a curve's hundred values a table has one line; discovery.json has them all.
+MOST_PARAMETERS = 8
+
+
+def not_counted(gross: int) -> str:
+    """Return '3 gross errors not counted'."""
+    return f'{gross} gross error{"s" if gross > 1 else ""} not counted'
+
+
+def times_smaller(before: float, after: float) -> str:
+    """Return '9.0 times smaller'."""
+    times = before / max(after, 1e-9)
+    return f'{times:.{1 if times < 10 else 0}f} times smaller'
 
 
 def references(result: FitResult) -> tuple[int, list[str]]:
@@ -44,7 +85,7 @@ def verdict(result: FitResult) -> Judgement:
         where = 'on held-out poses, most of which were fitted as well'
     gross = sum(len(check.gross) for check in result.noise_checks) if validated else 0
     if gross:
-        where += f' ({gross} gross error{"s" if gross > 1 else ""} not counted)'
+        where += f' ({not_counted(gross)})'
     change = f'{before:.3f} mm to {after:.3f} mm {where}'
     unexplained = [check for check in result.noise_checks if check.explained is False]
     untold = [check for check in result.noise_checks if check.explained is None]
@@ -78,8 +119,7 @@ def verdict(result: FitResult) -> Judgement:
         if doubtful:
             headline += f' {_dominated(result, unexplained)}'
     elif gain >= NOTICEABLE_GAIN:
-        times = f'{gain:.1f} times' if gain < 10 else f'{gain:.0f} times'
-        headline = f'The mean position error falls from {change}: {times} smaller.'
+        headline = f'The mean position error falls from {change}: {times_smaller(before, after)}.'
         if doubtful:
             headline += f' {_dominated(result, unexplained)}'
         elif result.sampler.converged and not unproven:
@@ -104,9 +144,7 @@ def verdict(result: FitResult) -> Judgement:
     if note := result.session.correction_note:
         points.append(note)
     if not validated:
-        points.append(
-            'There are no validation poses, so the gain is not proven: measure some and fit again.'
-        )
+        points.append(NOT_PROVEN)
     sampler = result.sampler
     if sampler.converged and sampler.method == 'metropolis':
         points.append(f'The chains agree with each other ({sampler.message}).')
@@ -362,7 +400,7 @@ def headline(
 def _result(discovery: Discovery, confirmation: Confirmation | None, *, left: bool) -> str:
     gain = discovery.gain
     change = ''
-    if words := held_out_words(gain):
+    if words := _held_out(gain):
         change = f' The error on poses it never fitted: {words}.'
     doubt = ''
     if not discovery.fit.sampler.converged:
@@ -406,3 +444,230 @@ def _result(discovery: Discovery, confirmation: Confirmation | None, *, left: bo
     elif confirmation is not None and confirmation.gone:
         change += ' Not all of it is there in the other session.'
     return f'Beyond the zero-offsets there {"is" if count == 1 else "are"} {causes}.{change}'
+
+
+def _held_out(gain: Gain) -> str:
+    """Return the errors on held-out poses in words; '' without such poses."""
+    before, after = gain.held_out_kept_before_m, gain.held_out_kept_after_m
+    if before is None or after is None or gain.held_out_rms_after_m is None:
+        return ''
+    words = f'{1e3 * before:.3f} mm RMS before, {1e3 * after:.3f} mm after; the noise alone is '
+    words += f'{1e3 * gain.noise_floor_m:.3f} mm'
+    if gain.held_out_gross:
+        words += (
+            f'; {not_counted(gain.held_out_gross)} '
+            f'(with them {1e3 * gain.held_out_rms_after_m:.3f} mm after)'
+        )
+    return words
+
+
+# What one fact is called wherever it stands: on the terminal, on a page, in a file.
+
+
+def counts_words(session: MeasuredSession) -> str:
+    """Return how much was fitted and held out."""
+    fitted, held_out = (
+        f'({counts.configurations} configurations of {counts.poses} poses)'
+        for counts in (session.optimization, session.validation)
+    )
+    return (
+        f'{session.optimization.observations} observations fitted {fitted}, '
+        f'{session.validation.observations} held out {held_out}'
+    )
+
+
+def at_marker(size_m: float) -> str:
+    """Return the size of an error."""
+    return f'{1e3 * size_m:.3f} mm RMS at the marker'
+
+
+def size_words(effect: Effect) -> str:
+    """Return the size of a cause, and what is lost without it; '' in files of others."""
+    if not isinstance(effect.size_m, float):
+        return ''
+    if not isinstance(effect.share, float):
+        return at_marker(effect.size_m)
+    lost = f'without it {percent(effect.share)} of the gain is lost'
+    return f'{at_marker(effect.size_m)}, {lost}'
+
+
+def look_alike_name(effect: Effect, other: LookAlike) -> str:
+    """Return what a look-alike of a cause is called."""
+    fewer = part_words(effect.name, effect.joints, other.name, other.joints)
+    return fewer or sentence_case(other.title or called(other.name, other.joints))
+
+
+def coverage_words(held_out: Coverage) -> str:
+    """Return how many held-out rows lie where they were predicted; '' where there are none."""
+    if held_out.share is None:
+        return ''
+    return (
+        f'{held_out.inside} of {held_out.rows} held-out rows ({percent(held_out.share)}) lie in '
+        'the regions predicted for them with 95 %'
+    )
+
+
+def as_drawn(geometry: FittedGeometry, imitations: Sequence[Imitation]) -> str:
+    """Return what lengths and tilts off their drawing do to the offsets."""
+    moved = '; '.join(
+        f'{"link" if one.cause == "link_length" else "the axis of joint"} {one.of} is '
+        f'{one.deg:.3f} deg at {one.joint}'
+        for one in imitations
+    )
+    return (
+        'the standard deviations are for an arm as drawn: '
+        f'{geometry.tolerance_mm:.1f} mm at {moved}'
+    )
+
+
+def loadable_of_fit(geometry: FittedGeometry) -> list[Loadable]:
+    """Return the results of a fit that a robot can load, as of a discovery."""
+    return [
+        Loadable(
+            'offsets', geometry.drawing_held_out_mean_mm, True, f'{APPLY_FOLDER}/{URDF_FILE}'
+        ),
+        Loadable('geometry', geometry.held_out_mean_mm, bool(geometry.file), geometry.file),
+    ]
+
+
+def load_words(row: Loadable) -> tuple[str, str]:
+    """Return what a result is, and what to do with it."""
+    if row.result != 'offsets' and row.held_out_mean_mm is not None and not row.better:
+        what_to_do = 'leave it: no better than what stands before it'
+    elif row.file:
+        what_to_do = f'{row.file}{_MORE.get(row.result, "")}'
+    elif row.held_out_mean_mm is None:
+        what_to_do = 'leave it: no held-out poses show that it is better'
+    else:
+        what_to_do = 'leave it: no file holds it'
+    return _RESULTS[row.result], what_to_do
+
+
+_RESULTS = {
+    'offsets': 'zero-offsets alone',
+    'geometry': 'all lengths, tilts and zero-offsets together',
+    'everything': 'everything that a command can correct',
+}
+_MORE = {
+    'offsets': f', {REMASTER_FILE} or {LAYER_FILE}',
+    'everything': ', by remaster compensate or remaster_ros.read_compensation',
+}
+
+
+# A whole result on the terminal, from what its file holds.
+
+
+def fit_lines(fit: Fit) -> list[str]:
+    """Return offsets, errors and verdict, a line each."""
+    assert isinstance(fit.judgement, Judgement)
+    lines = [f'{row.joint:12s} {_offset(row)}' for row in fit.joint_offsets]
+    for split in ('optimization', 'validation'):
+        metrics = getattr(fit.accuracy, split)
+        if metrics is None:
+            lines.append(f'{split}: no such rows')
+            continue
+        for metric in ('relative', 'post_registration'):
+            if (sides := metrics[metric])['before'] and sides['after']:
+                before, after = sides['before']['mean_mm'], sides['after']['mean_mm']
+                change = f'{before:.3f} mm before, {after:.3f} mm after'
+                lines.append(f'{split}, {METRICS[metric]}: {change}')
+            turned = metrics.get(f'{metric}_orientation') or {}
+            if turned.get('after'):
+                before, after = turned['before']['mean_deg'], turned['after']['mean_deg']
+                lines.append(f'… orientation: {before:.4f} deg before, {after:.4f} deg after')
+    lines += [fit.judgement.headline, *fit.judgement.points]
+    if isinstance(fit.geometry, Struct) and (moved := fit.geometry.imitations):
+        lines.append(as_drawn(fit.geometry, [max(moved, key=lambda one: one.deg)]))
+        if fit.geometry.file:
+            lines += _to_load(loadable_of_fit(fit.geometry), '')
+    if any(row.unit == 'mm' for row in fit.joint_offsets):
+        lines.append(
+            'of an arm with a joint that slides neither lengths and tilts off their drawing nor '
+            'other causes are looked for, and there is no compensation.json'
+        )
+    if isinstance(fit.session, Struct) and fit.session.times == 'none':
+        lines.append(f'the session is {NO_TIMES}')
+    if fit.left_out:
+        rows = ', '.join(str(row.observation) for row in fit.left_out)
+        lines.append(f'left out as gross errors: observation {rows}')
+    return lines
+
+
+def _offset(row: JointOffset) -> str:
+    if not row.identifiable:
+        return f'   not identifiable: {row.why}'
+    if row.unit == 'mm':
+        return f'{row.mean_mm:+9.4f} ± {row.std_mm:.4f} mm'
+    return f'{row.mean_deg:+9.4f} ± {row.std_deg:.4f} deg'
+
+
+def _to_load(rows: Sequence[Loadable], taken_out: str) -> list[str]:
+    lines = []
+    for row in rows:
+        what, to_do = load_words(row)
+        mean = row.held_out_mean_mm
+        error = '' if mean is None else f', mean error on held-out poses {mean:.3f} mm{taken_out}'
+        lines.append(f'to load: {what}{error}: {to_do}')
+    return lines
+
+
+def discovery_lines(found: Discovered) -> list[str]:
+    """Return verdict, causes, what can be loaded, and the coverage of held-out rows in lines."""
+    assert isinstance(found.judgement, Judgement)
+    lines = [f'verdict: {found.verdict}', found.judgement.headline]
+    for effect in found.effects:
+        lines.append(f'{effect.title}: {size_words(effect)}. {effect.cause}')
+        if effect.remedy:
+            lines.append(f'    to do: {effect.remedy}')
+        lines += [
+            f'    could be {look_alike_name(effect, other)}; to decide: {other.separate_by}'
+            for other in effect.confusable_with
+        ]
+    lines += [f'unexplained: {left.next}' for left in found.unexplained or ()]
+    measured = any(effect.of_measurement for effect in found.effects)
+    lines += _to_load(found.loadable or (), ' (measuring errors taken out)' if measured else '')
+    regions = found.predicted_regions95
+    if isinstance(regions, Struct) and (words := coverage_words(regions.held_out)):
+        lines.append(words)
+    if isinstance(found.rows_searched, Struct):
+        part = found.rows_searched
+        before, after = (
+            np.nan if rms is None else 1e3 * rms
+            for rms in (part.others_rms_before_m, part.others_rms_after_m)
+        )
+        lines.append(
+            f'searched: {part.searched} of {part.rows} rows; the others fall from '
+            f'{before:.3f} to {after:.3f} mm RMS with the causes as found, frozen'
+        )
+    lines += [f'not testable: {name}: {why}' for name, why in (found.untestable or {}).items()]
+    lines += found.judgement.doubts
+    lines += [f'other session: {line}' for line in found.judgement.points]
+    if isinstance(found.confirmation, Struct):
+        lines += _side_by_side(found, found.confirmation)
+    return lines + [one.sentence for one in found.decided or ()]
+
+
+def _side_by_side(found: Discovered, confirmation: Confirmed) -> list[str]:
+    """Return a table of the zero-offsets and the causes' parameters in both sessions."""
+    tables = [('zero-offsets', confirmation.joint_offsets or [])]
+    tables += [
+        (effect.title, cause.parameters or [])
+        for effect, cause in zip(found.effects, confirmation.effects, strict=False)
+    ]
+    width = max((len(row.name) for _, rows in tables for row in rows), default=0)
+    lines = []
+    for name, rows in tables:
+        if len(rows) > MOST_PARAMETERS:
+            apart = [row.sigmas for row in rows if row.sigmas is not None]
+            lines.append(
+                f'    {name}: {len(rows)} values, which differ by '
+                f'{np.sqrt(np.mean(np.square(apart))):.1f} standard deviations on the average'
+            )
+            continue
+        for row in rows:
+            here = ' ± '.join(shown(row.value, row.std, row.unit)[:2])
+            value, std, unit = shown(row.other_value, row.other_std, row.unit)
+            sigmas = '–' if row.sigmas is None else f'{row.sigmas:+.1f}'.replace('-', '−')
+            there = f'{value} ± {std}'
+            lines.append(f'    {row.name:{width}}  {here:>18}  {there:>18} {unit:7}  {sigmas} σ')
+    return ['here and there, and the difference in standard deviations:', *lines] if lines else []

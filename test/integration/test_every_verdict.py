@@ -263,7 +263,7 @@ def test_discover_without_validation(healthy: Path, tmp_path: Path) -> None:
     out = tmp_path / 'causes'
     assert remaster('discover', session, '--out', out).returncode == 0
     page, _, _ = page_of(out)
-    assert 'No validation poses: the gain is not proven' in page
+    assert 'No poses were held out, so the gain is not proven' in page
     # That nothing was found in a healthy arm has been checked by nothing.
     assert 'class="verdict caution"' in page
     assert 'no poses were held out to check it' in page

@@ -13,8 +13,8 @@ from scipy.stats import binom
 
 import remaster_ros
 from remaster_ros.calibration.fit import fit_session
-from remaster_ros.cli.fit import summary
 from remaster_ros.reports.fit_json import fit_content
+from remaster_ros.reports.sentences import fit_lines
 
 ERROR_RATE = 1e-3
 
@@ -156,7 +156,7 @@ def test_report_and_file_tell_that_they_were_used_and_how_sure():
     turn = Rotation.from_rotvec(axis * made.joint_offsets[-1]).as_matrix() @ made.R_T_B
     away = (Rotation.from_matrix(turn).inv() * Rotation.from_quat(body.rotation_xyzw)).magnitude()
     assert np.degrees(away) < 4.0 * np.linalg.norm(body.std_deg)
-    assert 'orientations are fitted' in summary(fit)
+    assert 'orientations are fitted' in '\n'.join(fit_lines(fit_content(fit)))
     assert all(
         found.std_positions_deg[row.joint] > 0.9 * row.std_deg
         for row in content.joint_offsets

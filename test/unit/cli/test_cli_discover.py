@@ -5,13 +5,14 @@ import re
 import types
 from dataclasses import replace
 
-from remaster_ros.cli.discover import summary as summary_of
 from remaster_ros.cli.main import main
 from remaster_ros.discovery.confirmation import Compared, Confirmation, ConfirmedCause, in_words
 from remaster_ros.discovery.explain import FoundEffect, LookAlike
 from remaster_ros.discovery.gain import Gain
 from remaster_ros.discovery.thinning import Thinning
-from remaster_ros.reports.schemas import Judgement, Loadable
+from remaster_ros.reports.discovery_json import confirmation_content
+from remaster_ros.reports.schemas import Discovered, Judgement, Loadable, checked
+from remaster_ros.reports.sentences import discovery_lines
 
 EFFECT = FoundEffect(
     name='joint_compliance',
@@ -56,8 +57,22 @@ TO_LOAD = (
 
 def summary(session, confirmation=None, to_load=()):
     points = in_words(session, confirmation) if confirmation else []
-    judged = Judgement('good', 'The headline.', points)
-    return summary_of(session, judged, confirmation, to_load=to_load)
+    content = {
+        'format': 'remaster-discovery/1',
+        'verdict': session.verdict,
+        'effects': session.effects,
+        'gain': session.gain,
+        'noise': {'pose_common_fraction': 0.0, 'outliers': (), 'heteroscedastic': {}},
+        'joint_offsets_after': (),
+        'untestable': session.untestable,
+        'loadable': to_load,
+        'judgement': Judgement('good', 'The headline.', points),
+    }
+    if session.thinning is not None:
+        content['rows_searched'] = session.thinning
+    if confirmation is not None:
+        content['confirmation'] = confirmation_content(session.effects, confirmation)
+    return '\n'.join(discovery_lines(checked(content, Discovered)))
 
 
 def test_causes_look_alikes_and_gain_are_said():
@@ -67,14 +82,14 @@ def test_causes_look_alikes_and_gain_are_said():
     assert 'can correct, mean error on held-out poses 0.300 mm: apply/compensation.json' in text
     assert 'verdict: effects' in text
     assert (
-        'Joint compliance of joints 2 and 4: 0.500 mm, without it 100 % of the gain is lost'
-        in text
+        'Joint compliance of joints 2 and 4: 0.500 mm RMS at the marker, without it 100 % of the '
+        'gain is lost' in text
     )
     assert 'to do: Stiffen it.' in text
     nothing = summary(found((replace(EFFECT, share=-0.004),), Gain(None, None, 1e-4, {}), {}))
     assert ', without it 0 % of the gain is lost' in nothing
-    assert 'could be encoder scale of joint 2; to distinguish: a payload' in text
-    assert 'could be joint 4 alone; to distinguish: another payload' in text
+    assert 'could be encoder scale of joint 2; to decide: a payload' in text
+    assert 'could be joint 4 alone; to decide: another payload' in text
 
 
 def test_nothing_found_and_what_cannot_be_tested_are_said():

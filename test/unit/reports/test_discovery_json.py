@@ -22,9 +22,10 @@ from remaster_ros.discovery.effects.splines import Curve
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.reports import discovery_json, figures
-from remaster_ros.reports.discovery_json import load_words, loadable, read_discovery
+from remaster_ros.reports.discovery_json import loadable, read_discovery
 from remaster_ros.reports.fit_json import model_text
 from remaster_ros.reports.result_folder import save_discovery
+from remaster_ros.reports.sentences import load_words
 
 
 def bent(session):

@@ -12,13 +12,13 @@ import pytest
 from discovery_scenes import at_joint, session_with
 from matplotlib.figure import Figure
 
-from remaster_ros.cli.discover import summary
 from remaster_ros.discovery.discover import Verdict, discover_session
 from remaster_ros.discovery.gain import Gain
 from remaster_ros.reports import figures
 from remaster_ros.reports.discovery_json import read_discovery
 from remaster_ros.reports.result_folder import save_discovery
 from remaster_ros.reports.schemas import Discovered
+from remaster_ros.reports.sentences import coverage_words, discovery_lines, size_words
 from remaster_ros.types import Measurements
 
 
@@ -68,9 +68,16 @@ def saved(discovery, folder):
     content = msgspec.convert(read_discovery(folder / 'discovery.json'), Discovered)
     assert content.verdict == discovery.verdict
     # One verdict, in the file, on the page and on the terminal.
-    printed = summary(discovery, content.judgement).splitlines()
+    printed = discovery_lines(content)
     assert printed[:2] == [f'verdict: {discovery.verdict}', content.judgement.headline]
-    assert html.escape(content.judgement.headline) in page.replace('&#34;', '&quot;')
+    shown = page.replace('&#34;', '&quot;')
+    assert html.escape(content.judgement.headline) in shown
+    # One phrase of one fact.
+    facts = [size_words(effect) for effect in content.effects]
+    facts += filter(None, [coverage_words(content.predicted_regions95.held_out)])
+    for words in facts:
+        assert words in '\n'.join(printed)
+        assert html.escape(words) in shown
     mood = re.search(r'class="verdict (\w+)"', page)
     return page, mood and mood.group(1), names
 
@@ -123,7 +130,7 @@ def test_causes_are_drawn(found, scene, tmp_path):
     assert mood in ('good', 'caution')
     for effect in found[scene].effects:
         assert effect.cause in page
-    assert ('No validation poses' in page) == (scene == 'unproven')
+    assert ('No poses were held out' in page) == (scene == 'unproven')
 
 
 @pytest.mark.parametrize('verdict', get_args(Verdict))

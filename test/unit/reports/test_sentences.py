@@ -10,9 +10,9 @@ import pytest
 from remaster_ros.calibration.fit import fit_session
 from remaster_ros.calibration.noise_check import NoiseCheck
 from remaster_ros.calibration.residual_structure import ResidualStructure, StructureTest
-from remaster_ros.cli.fit import summary
+from remaster_ros.reports.fit_json import fit_content
 from remaster_ros.reports.report import fit_html
-from remaster_ros.reports.sentences import verdict
+from remaster_ros.reports.sentences import fit_lines, verdict
 
 
 def with_accuracy(result, split, before, after):
@@ -46,7 +46,7 @@ def test_the_verdict_is_honest(fit_result, split, before, after, converged, mood
     assert words in judged.headline
     told = ' '.join(judged.points)
     assert ('fit again with more draws' in told) != converged
-    assert ('no validation poses' in told) == (split == 'optimization')
+    assert ('No poses were held out' in told) == (split == 'optimization')
 
 
 def test_an_approximation_that_fails_its_check_is_never_green(fit_result):
@@ -80,7 +80,9 @@ def test_structure_in_the_residuals_is_never_green(fit_result):
     assert 'follows the position in front of the sensor from pose to pose (p < 0.0001)' in told
     assert 'follows time' not in told
     assert 'up to 3.1 times as wide' in told
-    printed = summary(replace(fit_result, noise_checks=(), structure=structure))
+    printed = '\n'.join(
+        fit_lines(fit_content(replace(fit_result, noise_checks=(), structure=structure)))
+    )
     assert 'other errors dominate; run "remaster discover"' in printed
 
 
@@ -152,7 +154,7 @@ def test_a_marker_that_is_not_where_it_was_stated_to_be_is_named(fit_result):
     assert judged.mood != 'good'
     assert f'{line}.' in judged.points
     assert f'{line}.' in judged.disagreements
-    assert line in summary(result)
+    assert line in '\n'.join(fit_lines(fit_content(result)))
     # Stated as well as it is known, the place contradicts nothing.
     known = replace(session, markers=stated, marker_std_m=5e-3)
     assert fit_session(known, rng=np.random.default_rng(0), draws=100).displaced_markers == ()

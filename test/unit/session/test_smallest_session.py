@@ -11,11 +11,12 @@ import pytest
 
 from remaster_ros.calibration.estimate import Problem, estimate
 from remaster_ros.calibration.fit import fit_session
-from remaster_ros.cli.fit import summary
 from remaster_ros.discovery.effects import registration_drift, thermal_growth
 from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.errors import InputError
+from remaster_ros.reports.fit_json import fit_content
 from remaster_ros.reports.result_folder import save_fit
+from remaster_ros.reports.sentences import fit_lines
 from remaster_ros.session.reader import read_session, write_session
 
 PAGE = Path(__file__).parents[3] / 'docs/session-format.md'
@@ -45,7 +46,7 @@ def test_it_can_be_fitted_and_its_page_tells_that_times_are_unknown(folder, tmp_
     assert result.identifiable.tolist() == [False, True, False]
     # The numbers of the page were made with this offset, and 0.05 mm of noise.
     assert abs(result.joint_offsets[1] - 0.004) < 4.0 * result.joint_offsets_std[1]
-    assert 'no times' in summary(result)
+    assert 'without times' in '\n'.join(fit_lines(fit_content(result)))
     save_fit(result, tmp_path / 'fit')
     assert 'without times' in (tmp_path / 'fit/report.html').read_text()
 
