@@ -229,8 +229,6 @@ class ConfigurationEnded(Body, frozen=True, kw_only=True, tag='configuration'):
     registered: bool = False  # Whether every sensor that the arm waits for is registered
     # From settling to the last reading; None where nothing was read, s
     measuring_s: float | None = None
-    # How long each sensor was waited for, s
-    waited_s: dict[str, float] = msgspec.field(default_factory=dict)
 
 
 class SetupChanged(Body, frozen=True, kw_only=True, tag='changed'):
@@ -238,10 +236,7 @@ class SetupChanged(Body, frozen=True, kw_only=True, tag='changed'):
 
     sender: ClassVar[str] = 'recorder'
     stops: bool  # Whether the collection pauses until a person has looked
-    # The message; the kind of change; its size, m
-    text: str = ''
-    cause: str = ''
-    size_m: float = 0.0
+    text: str = ''  # What has moved, and by how much
 
 
 class ReadByHand(Body, frozen=True, kw_only=True, tag='by_hand'):

@@ -95,7 +95,6 @@ class EndedReading:
             reason=self.why,
             registered=registered,
             measuring_s=self.last_s - self.settled.stamp_s,
-            waited_s=dict(self.waited_s),
         )
 
 

@@ -581,12 +581,7 @@ class SetupChanges:
             return None
         if self.stops:
             self.stopped_run = run
-        return SetupChanged(
-            stops=self.stops,
-            text=self.describe(),
-            cause=self.change.kind,
-            size_m=self.change.size_m,
-        )
+        return SetupChanged(stops=self.stops, text=self.describe())
 
     def accept(self) -> None:
         """Take it that a person has seen to the change: the next round is a new beginning."""

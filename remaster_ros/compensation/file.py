@@ -402,14 +402,30 @@ def read_compensation(path: str | os.PathLike[str]) -> Compensation:
     try:
         content = msgspec.json.decode(data, type=CompensationPart)
     except msgspec.DecodeError as error:
-        raise _not_one(path, str(error)) from None
+        raise _not_one(path, _other_format(data) or str(error)) from None
     if content.format != FORMAT:
-        raise _not_one(path, f'its format is {content.format!r}, not {FORMAT!r}')
+        raise _not_one(path, _other_format(data) or 'its format is empty')
     try:
         model = _model(content)
     except InputError as error:
         raise InputError(f'{path}: {error}') from None
     return Compensation(path, Compensator(model), content, hashlib.sha256(data).hexdigest())
+
+
+class _AnyFile(Struct):
+    """What every JSON file of this program has."""
+
+    format: str = ''
+
+
+def _other_format(data: bytes) -> str:
+    """Return which other file of this program it is; '' where that is not known."""
+    try:
+        given = msgspec.json.decode(data, type=_AnyFile).format
+    except msgspec.DecodeError:
+        return ''
+    # Before its keys: another file's would only confuse.
+    return f'its format is {given[:60]!r}, not {FORMAT!r}' if given not in ('', FORMAT) else ''
 
 
 def _not_one(path: Path, why: str) -> InputError:

@@ -21,6 +21,7 @@ from remaster_ros.collection import events
 from remaster_ros.collection.live_residuals import LiveResiduals
 from remaster_ros.collection.pace import Pace, minutes_text
 from remaster_ros.kinematics.serial_chain import SerialChain
+from remaster_ros.reports.precision_json import Precision
 from remaster_ros.types import FloatArray
 
 STOP_LABEL = 'Stop the collection'
@@ -81,21 +82,6 @@ def commands(
             'note': 'Nothing moves before you begin the collection or go on.',
         },
     }
-
-
-class Look(msgspec.Struct, frozen=True):
-    """Of `precision_json`: what was known after so many configurations."""
-
-    configurations: int
-    minutes: float | None
-    joint_std_deg: dict[str, float | None]
-
-
-class Precision(msgspec.Struct, frozen=True):
-    """What the page shows of `precision_json`."""
-
-    message: str = ''
-    looks: list[Look] = []
 
 
 @dataclass(frozen=True)

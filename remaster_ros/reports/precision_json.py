@@ -2,68 +2,80 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from typing import Any
 
+import msgspec
 import numpy as np
+from msgspec import Struct
 
 from remaster_ros.collection.stopping_rule import Look, StoppingRule
 
 FORMAT = 'remaster-precision/1'
 
 
+class Known(Struct):
+    """What was known after so many configurations; None where nothing is."""
+
+    configurations: int
+    minutes: float | None
+    joint_std_deg: dict[str, float | None]
+    joint_rms_deg: float | None = None
+    tool_rms_mm: float | None = None
+    degrees_of_freedom: int = 0
+    parameters: int = 0
+
+
+class Precision(Struct):
+    """All looks so far, the newest last, in degrees, millimetres and minutes."""
+
+    format: str = FORMAT
+    goal: dict[str, float | None] = {}
+    planned_configurations: int = 0
+    enough: bool = False
+    message: str = ''
+    more: dict[str, float | None] | None = None
+    structure: list[dict[str, Any]] = []
+    looks: list[Known] = []
+
+
 def precision_json(rule: StoppingRule, looks: Sequence[Look]) -> str:
-    """Return all looks so far, the newest last, in degrees, millimetres and minutes.
-
-    Parameters
-    ----------
-    rule
-        What they were judged by.
-    looks
-        At least one.
-    """
+    """Return at least one look, and how the newest does by the rule."""
     last, goal = looks[-1], rule.goal
-    return json.dumps(
-        {
-            'format': FORMAT,
-            'goal': {
-                'joint_std_deg': _scaled(goal.joint_std_rad, np.degrees(1.0)),
-                'tool_std_mm': _scaled(goal.tool_std_m, 1e3),
-            },
-            'planned_configurations': rule.planned,
-            'enough': rule.is_enough(last),
-            'message': rule.describe(last),
-            'more': None
-            if last.more is None
-            else {'configurations': last.more, 'minutes': _scaled(last.more_s, 1.0 / 60.0)},
-            'structure': [
-                {
-                    'driver': test.driver,
-                    'between_poses': test.between_poses,
-                    'p_value': test.p_value,
-                    'message': test.words,
-                }
-                for test in last.structure
-            ],
-            'looks': [_look(look) for look in looks],
+    found = Precision(
+        goal={
+            'joint_std_deg': _scaled(goal.joint_std_rad, np.degrees(1.0)),
+            'tool_std_mm': _scaled(goal.tool_std_m, 1e3),
         },
-        allow_nan=False,
+        planned_configurations=rule.planned,
+        enough=rule.is_enough(last),
+        message=rule.describe(last),
+        more=None
+        if last.more is None
+        else {'configurations': last.more, 'minutes': _scaled(last.more_s, 1.0 / 60.0)},
+        structure=[
+            {
+                'driver': test.driver,
+                'between_poses': test.between_poses,
+                'p_value': test.p_value,
+                'message': test.words,
+            }
+            for test in last.structure
+        ],
+        looks=[
+            Known(
+                look.configurations,
+                _scaled(look.elapsed_s, 1.0 / 60.0),
+                {name: _scaled(std, np.degrees(1.0)) for name, std in look.joint_std.items()},
+                _scaled(look.joint_rms, np.degrees(1.0)),
+                _scaled(look.tool_rms, 1e3),
+                look.freedom,
+                look.parameters,
+            )
+            for look in looks
+        ],
     )
-
-
-def _look(look: Look) -> dict[str, Any]:
-    return {
-        'configurations': look.configurations,
-        'minutes': _scaled(look.elapsed_s, 1.0 / 60.0),
-        'joint_std_deg': {
-            name: _scaled(std, np.degrees(1.0)) for name, std in look.joint_std.items()
-        },
-        'joint_rms_deg': _scaled(look.joint_rms, np.degrees(1.0)),
-        'tool_rms_mm': _scaled(look.tool_rms, 1e3),
-        'degrees_of_freedom': look.freedom,
-        'parameters': look.parameters,
-    }
+    return msgspec.json.encode(found).decode()
 
 
 def _scaled(value: float | None, factor: float) -> float | None:

@@ -424,3 +424,20 @@ def test_what_is_refused_is_one_line(tmp_path, capsys, erring):
     text = with_transmissions(UR.urdf, 0.0).replace('<offset>0.0<', '<offset>${x}<')
     broken.write_text(text)
     assert 'expand the xacro' in refused('--to', 'ros2_control', '--base', broken)
+
+
+def test_another_file_of_this_program_is_refused_by_its_format(tmp_path, capsys):
+    file = tmp_path / 'fit.json'
+    for content, words in (
+        ({'format': 'remaster-fit/1'}, "'remaster-fit/1', not 'remaster-compensation/1'"),
+        ({'format': 'remaster-compensation/1'}, 'missing required field `robot`'),
+        ({'format': 1}, 'Expected `str`'),
+        ([], 'Expected `object`'),
+    ):
+        file.write_text(json.dumps(content))
+        out = tmp_path / 'refused'
+        assert main(['export', str(file), '--to', 'urdf', '--out', str(out)]) == 2
+        assert not out.exists()
+        (line,) = capsys.readouterr().err.splitlines()
+        assert words in line
+        assert 'give the one in the folder apply' in line

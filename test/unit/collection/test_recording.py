@@ -78,7 +78,7 @@ def test_a_settled_configuration_is_read_and_reported():
     event = ended.event(registered=True)
     assert (event.stamp, event.solution, event.registered) == (POSE.stamp, 1, True)
     assert event.measuring_s == pytest.approx(0.5)
-    assert event.waited_s.keys() == {'mocap'}
+    assert ended.waited_s.keys() == {'mocap'}
     assert bench.recording.is_idle
     ((sensor, T_R_N, anywhere),) = bench.judge.asked
     assert (sensor, anywhere) == ('mocap', False)

@@ -122,7 +122,7 @@ def test_a_large_change_stops_the_run_until_another_one_begins(arm):
     changes = large(arm)
     event = changes.report('a')
     assert (event.stops, event.text) == (True, changes.describe())
-    assert event.size_m == pytest.approx(2e-3, rel=0.3)
+    assert changes.change.size_m == pytest.approx(2e-3, rel=0.3)
     assert changes.stopped_run == 'a'
     for state, run in (('running', 'a'), ('paused', ''), ('idle', ''), ('complete', '')):
         assert not changes.follow(state, run), 'a person has not looked'
