@@ -56,23 +56,14 @@ log = logging.getLogger('remaster_ros')
 
 @dataclass(frozen=True)
 class Job:
-    """A session to work on; all of it can be sent to another process.
+    """A session to work on; all of it can be sent to another process."""
 
-    Attributes
-    ----------
-    key
-        Of its files, this version, the seed and the baseline.
-    session, out
-        Its folder, and where its results go.
-    baseline
-        A compensation.json to check against; '' for none.
-    """
-
-    key: str
+    key: str  # Of its files, this version, the seed and the baseline
+    # Its folder, and where its results go
     session: str
     out: str
     seed: int
-    baseline: str = ''
+    baseline: str = ''  # A compensation.json to check against; '' for none
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -305,28 +296,15 @@ def _of_check(job: Job, session: Any) -> dict[str, Any]:
 
 def work_off(
     jobs: Sequence[Any],
-    work: Callable[[Any], dict[str, Any]],
-    make: Callable[[], Executor],
-    ahead: int,
-    finished: Callable[[Any, dict[str, Any]], None],
+    work: Callable[[Any], dict[str, Any]],  # Of a module, which a worker can import
+    make: Callable[[], Executor],  # Called again after one has broken
+    ahead: int,  # So many jobs are handed out at a time
+    finished: Callable[[Any, dict[str, Any]], None],  # Called in the order in which they end
 ) -> None:
     """Hand jobs out until all have a row.
 
     Where a worker dies, all that were under way are done again, one at a time: so it is known
     which of them it dies of, and that one's row says so.
-
-    Parameters
-    ----------
-    jobs
-        What `work` takes.
-    work
-        A function of a module, which a worker can import.
-    make
-        Makes an executor, again after one has broken.
-    ahead
-        How many jobs are handed out at a time.
-    finished
-        Called with each job and what its row says, in the order in which they are done.
     """
     waiting, deaths = list(reversed(jobs)), dict.fromkeys(map(id, jobs), 0)
     suspects: list[Any] = []

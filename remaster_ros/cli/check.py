@@ -135,13 +135,7 @@ def _record(one: Measured, name: str, sha256: str, baseline: Compensation) -> di
 
 
 def _require_history(path: Path) -> None:
-    """Refuse any other file before it is opened, which drops what is no whole line of a journal.
-
-    Raises
-    ------
-    InputError
-        It is neither empty nor begins as a history does.
-    """
+    """Refuse another file before it is opened, which drops what is no whole line of a journal."""
     start = format_record({'format': HISTORY})[: len(f'{{"format":"{HISTORY}"')]
     try:
         with path.open('rb') as file:

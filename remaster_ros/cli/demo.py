@@ -113,13 +113,7 @@ def free_folder() -> Path:
 
 
 def run_node(name: str, parameters: dict[str, object]) -> NoReturn:
-    """Replace this process by the node `name` with these parameters; does not return.
-
-    Raises
-    ------
-    InputError
-        If there is no ROS on this machine; its text names what to install.
-    """
+    """Replace this process by the node `name` with these parameters; does not return."""
     if importlib.util.find_spec('rclpy') is None:
         raise InputError(f'remaster {name} {WITHOUT_ROS}')
     command = [sys.executable, '-m', 'remaster_ros.nodes', name, '--ros-args']

@@ -237,13 +237,7 @@ def _narrowed(
 
 
 def _plan(cell: Workcell, without_meshes: bool, seed: int) -> tuple[dict[str, Any], str, int]:
-    """Plan in the new cell as the nodes do, without the ways.
-
-    Returns
-    -------
-    plan, text, poses
-        For JSON; for people; how many poses there are to fit.
-    """
+    """Plan in the new cell as the nodes do, without the ways: as JSON, in words, poses to fit."""
     scene = cell.planning_scene(cell.chain(), without_meshes=without_meshes)
     counts = {'optimization': CANDIDATES, 'validation': CANDIDATES}
     try:

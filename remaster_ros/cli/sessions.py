@@ -13,13 +13,7 @@ from remaster_ros.types import Session
 
 
 def read_together(folders: Sequence[Path]) -> tuple[Session, list[str]]:
-    """Read one session or several of one arm, and lines on how their rows are named.
-
-    Raises
-    ------
-    InputError
-        As `read_to_fit` and `together`.
-    """
+    """Read one session or several of one arm, and lines on how their rows are named."""
     sessions = [(str(folder), read_to_fit(folder)) for folder in folders]
     if len(sessions) == 1:
         return sessions[0][1], []
@@ -40,15 +34,7 @@ def _one_arm(session: Session, folder: Path) -> Session:
 
 
 def read_to_fit(folder: Path) -> Session:
-    """Read a session; where its joints are outside their limits, look for the mistake behind it.
-
-    Raises
-    ------
-    InputError
-        As `read_session`.
-    MistakeFoundError
-        Joints outside their limits, and the mistake without which the session fits its robot.
-    """
+    """Read a session; where joints are outside their limits, look for the mistake behind it."""
     try:
         return _one_arm(read_session(folder), folder)
     except InputError as refused:

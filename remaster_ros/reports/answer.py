@@ -68,36 +68,21 @@ from remaster_ros.types import BoolArray, FloatArray, Session
 
 @dataclass(frozen=True, eq=False)
 class Inputs:
-    """What was read; n rows.
+    """What was read; n rows."""
 
-    Attributes
-    ----------
-    session
-        All rows.
-    fit, found
-        fit.json and discovery.json; None without the latter.
-    before_mm, after_mm
-        3-D error of every row with all offsets at zero and with those of the fit, (n,).
-    causes_mm
-        With the causes as well, (n,); None where there are none.
-    model_mm
-        With the robot model of all lengths, tilts and zero-offsets and nothing else, (n,); None
-        where there is none that predicts held-out poses better.
-    model
-        That file.
-    plan
-        Of its collection; None where the session's folder has none.
-    """
-
-    session: Session
+    session: Session  # All rows
+    # fit.json and discovery.json; None without the latter
     fit: Fit
     found: Discovered | None
+    # 3-D error of every row with all offsets at zero and with those of the fit, (n,)
     before_mm: FloatArray
     after_mm: FloatArray
-    causes_mm: FloatArray | None
+    causes_mm: FloatArray | None  # With the causes as well, (n,); None where there are none
+    # With the robot model of all lengths, tilts and zero-offsets and nothing else, (n,); None
+    # where there is none that predicts held-out poses better
     model_mm: FloatArray | None = None
-    model: Path | None = None
-    plan: RecordedPlan | None = None
+    model: Path | None = None  # That file
+    plan: RecordedPlan | None = None  # Of its collection; None where the session's folder has none
 
     @property
     def judgement(self) -> Judgement:
@@ -132,13 +117,7 @@ class Inputs:
 
 
 def located(path: Path) -> Path:
-    """Return the file fit.json or discovery.json that a path is, or that is in a folder.
-
-    Raises
-    ------
-    InputError
-        Neither, or both.
-    """
+    """Return the file fit.json or discovery.json that a path is, or that is in a folder."""
     if not path.is_dir():
         return path
     there = [path / name for name in (FIT_FILE, DISCOVERY_FILE) if (path / name).exists()]
@@ -275,18 +254,10 @@ Mood = Literal['good', 'caution', 'bad']
 
 
 class Stage(NamedTuple):
-    """The 3-D errors of the judged rows at one stage, mm.
+    """The 3-D errors of the judged rows at one stage, mm."""
 
-    Attributes
-    ----------
-    title
-        What is corrected.
-    errors
-        Of the judged rows, mm, (m,).
-    """
-
-    title: str
-    errors: FloatArray
+    title: str  # What is corrected
+    errors: FloatArray  # Of the judged rows, mm, (m,)
 
     @property
     def mean(self) -> float:
@@ -305,72 +276,38 @@ class Stage(NamedTuple):
 
 
 class SensorNoise(NamedTuple):
-    """The mean 3-D error that a sensor's noise makes, mm.
-
-    Attributes
-    ----------
-    reading_mm
-        Of one reading.
-    shared_mm
-        With what all readings of a pose have in common; None where that is not known.
-    """
+    """The mean 3-D error that a sensor's noise makes, mm."""
 
     sensor: str
-    reading_mm: float
+    reading_mm: float  # Of one reading
+    # With what all readings of a pose have in common; None where that is not known
     shared_mm: float | None
 
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """The first screen.
+    """The first screen."""
 
-    Attributes
-    ----------
-    mood, headline
-        The judgement: 'good' where held-out poses bear out all of it.
-    action
-        'set' the offsets, 'wait' with them, or 'nothing' has to be set.
-    uses_causes
-        The offsets are those of the model with the causes: all lie in the measurement.
-    loads_model
-        The deed is to load the robot model with all lengths, tilts and zero-offsets.
-    stages
-        From today on, each with more corrected.
-    brings
-        Index of the stage that the deed reaches.
-    final_mm
-        The error of every row there, (n,).
-    held_out
-        The stages are judged by poses that were never fitted.
-    not_counted
-        Of their readings so many are gross errors, by which no stage is judged.
-    noise
-        Of every sensor for which it is known.
-    remains
-        What the deed leaves.
-    offsets
-        Of every joint.
-    on_the_pad
-        What to do on the robot's pad, in its own numbers, in groups of coupled joints.
-    pad_names
-        Joint of the URDF -> its name on the pad, where that is known.
-    """
-
+    # The judgement: 'good' where held-out poses bear out all of it
     mood: Mood
     headline: str
+    # 'set' the offsets, 'wait' with them, or 'nothing' has to be set
     action: Literal['set', 'wait', 'nothing']
+    # The offsets are those of the model with the causes: all lie in the measurement
     uses_causes: bool
+    # The deed is to load the robot model with all lengths, tilts and zero-offsets
     loads_model: bool
-    stages: tuple[Stage, ...]
-    brings: int
-    final_mm: FloatArray
-    held_out: bool
-    not_counted: int
-    noise: tuple[SensorNoise, ...]
-    remains: tuple[Remaining, ...]
-    offsets: tuple[JointOffset, ...]
+    stages: tuple[Stage, ...]  # From today on, each with more corrected
+    brings: int  # Index of the stage that the deed reaches
+    final_mm: FloatArray  # The error of every row there, (n,)
+    held_out: bool  # The stages are judged by poses that were never fitted
+    not_counted: int  # Of their readings so many are gross errors, by which no stage is judged
+    noise: tuple[SensorNoise, ...]  # Of every sensor for which it is known
+    remains: tuple[Remaining, ...]  # What the deed leaves
+    offsets: tuple[JointOffset, ...]  # Of every joint
+    # What to do on the robot's pad, in its own numbers, in groups of coupled joints
     on_the_pad: tuple[tuple[MasteringStep, ...], ...]
-    pad_names: Mapping[str, str]
+    pad_names: Mapping[str, str]  # Joint of the URDF -> its name on the pad, where that is known
 
     @property
     def plain_pad(self) -> bool:

@@ -75,18 +75,11 @@ def summary_of(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 def differing(values: FloatArray, level: float) -> list[int]:
     """Return which of the values (n,) are none of the normal distribution of the others.
 
+    ``level``: how often any is named where none differs; simulated for 5 to 200 values.
+
     The generalised extreme Studentised deviate test: values are taken out one by one, up to a
-    third of them, so that several do not hide each other.
-
-    Parameters
-    ----------
-    level
-        How often any is named where none differs; simulated for 5 to 200 values.
-
-    Notes
-    -----
-    B. Rosner, "Percentage points for a generalized ESD many-outlier procedure", Technometrics 25,
-    1983, equation 2.5.
+    third of them, so that several do not hide each other (B. Rosner, "Percentage points for a
+    generalized ESD many-outlier procedure", Technometrics 25, 1983, equation 2.5).
     """
     left = list(range(len(values)))
     out: list[int] = []

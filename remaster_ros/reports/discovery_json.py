@@ -175,17 +175,7 @@ def read_discovery(path: str | os.PathLike[str]) -> dict[str, Any]:
 
 
 def applied(discovery: Discovery, widening: float, result_sha256: str) -> dict[str, str]:
-    """Return the files of the folder ``apply``: name -> text.
-
-    Parameters
-    ----------
-    discovery
-        What was found.
-    widening
-        Of its predictions.
-    result_sha256
-        Of discovery.json.
-    """
+    """Return the files of the folder ``apply``: name -> text; ``widening``: of the predictions."""
     files = exports(discovery.alone, _remarks(discovery))
     if discovery.loads_geometry:
         assert discovery.geometry is not None

@@ -980,12 +980,7 @@ def two_views(
 ) -> list[tuple[Axes, tuple[int, int]]]:
     """Return panels from above and from the side, with the sensors, each with its two axes.
 
-    Parameters
-    ----------
-    everything
-        Points that must be in them, in the robot base, m, (n, 3).
-    frames
-        Registrations, sensor -> (4, 4).
+    ``everything``: points that must be in them, in the robot base, m, (n, 3).
     """
     middle = 0.5 * (everything.min(axis=0) + everything.max(axis=0))
     reach = 0.55 * float(np.ptp(everything, axis=0).max())

@@ -334,13 +334,7 @@ def _describe(session: Session) -> dict[str, Any]:
 
 
 def write_fit(result: FitResult, path: str | os.PathLike[str]) -> None:
-    """Write fit.json in one step.
-
-    Raises
-    ------
-    InputError
-        The folder cannot be written to.
-    """
+    """Write fit.json in one step."""
     path = Path(path)
     make_folder(path.parent)
     write_atomically(path, schemas.encode(fit_content(result)))
@@ -364,13 +358,7 @@ def read_result(
     name: str,
     verb: str,
 ) -> dict[str, Any]:
-    """Read the file `name` that a verb wrote, and check it against its schema and format.
-
-    Raises
-    ------
-    InputError
-        One line naming the file, the key and the remedy.
-    """
+    """Read the file `name` that a verb wrote, and check it against its schema and format."""
     data = read_limited(path, FIT_LIMIT, f'give the {name} that "remaster {verb}" wrote')
     try:
         content = msgspec.json.decode(data)

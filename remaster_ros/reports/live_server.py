@@ -203,21 +203,14 @@ def log_rarely(loop: asyncio.AbstractEventLoop) -> None:
 
 @dataclass(frozen=True)
 class Place:
-    """Where the page is served.
+    """Where the page is served."""
 
-    Attributes
-    ----------
-    address, port
-        The IP address to listen on, and the port; 0 for any free one.
-    names
-        Names of this computer by which a browser may ask besides the address.
-    certificate, key
-        PEM files for https; an address that other computers reach needs them.
-    """
-
+    # The IP address to listen on, and the port; 0 for any free one
     address: str = '127.0.0.1'
     port: int = 0
+    # Names of this computer by which a browser may ask besides the address
     names: tuple[str, ...] = ()
+    # PEM files for https; an address that other computers reach needs them
     certificate: str = ''
     key: str = ''
 

@@ -32,31 +32,15 @@ STOP_NOTE = (
 
 def commands(
     *,
-    state: str,
-    silent: bool,
-    halted: bool,
-    begun: bool,
-    measured: bool,
-    unconfirmed: bool,
-    confirmation: dict[str, Any] | None,
+    state: str,  # Of the planner
+    silent: bool,  # It was not heard for long
+    halted: bool,  # The arm is
+    begun: bool,  # Something was visited
+    measured: bool,  # Something was recorded
+    unconfirmed: bool,  # The arm waits until a plan is confirmed
+    confirmation: dict[str, Any] | None,  # Which plan that is; None as long as none is shown
 ) -> dict[str, dict[str, Any]]:
-    """Return what each command is called, whether it is of use now, and a note.
-
-    Parameters
-    ----------
-    state
-        Of the planner.
-    silent
-        Whether the planner was not heard for long.
-    halted
-        Whether the arm is halted.
-    begun, measured
-        Whether something was visited, and recorded.
-    unconfirmed
-        Whether the arm waits until a plan is confirmed.
-    confirmation
-        Which plan that is (`LiveView`); None as long as it is not shown.
-    """
+    """Return what each command is called, whether it is of use now, and a note."""
     plan = confirmation['plan'] if confirmation else ''
     why = 'the planner is silent' if silent else ''
     if not why and halted:
@@ -86,39 +70,20 @@ def commands(
 
 @dataclass(frozen=True)
 class PlanPage:
-    """Where the page of a plan is served.
+    """Where the page of a plan is served."""
 
-    Attributes
-    ----------
-    plan
-        Fingerprint of the plan.
-    address
-        Below that of the live page; '' where it is not served.
-    trouble
-        Why it is not; ''.
-    """
-
-    plan: str = ''
-    address: str = ''
-    trouble: str = ''
+    plan: str = ''  # Fingerprint of the plan
+    address: str = ''  # Below that of the live page; '' where it is not served
+    trouble: str = ''  # Why it is not; ''
 
 
 @dataclass(frozen=True)
 class FitFacts:
-    """What is known of a fit beside its offsets.
+    """What is known of a fit beside its offsets."""
 
-    Attributes
-    ----------
-    shown
-        Label -> text.
-    unidentifiable
-        Joints whose offset is not to be believed.
-    markers
-        Where the markers were found, in the tool frame, m, (3,).
-    """
-
-    shown: Mapping[str, str] = field(default_factory=dict)
-    unidentifiable: frozenset[str] = frozenset()
+    shown: Mapping[str, str] = field(default_factory=dict)  # Label -> text
+    unidentifiable: frozenset[str] = frozenset()  # Joints whose offset is not to be believed
+    # Where the markers were found, in the tool frame, m, (3,)
     markers: Mapping[str, FloatArray] = field(default_factory=dict)
 
 
@@ -457,15 +422,7 @@ class LiveView:
 
 
 def tool_path(chain: SerialChain, way: FloatArray, steps: int = 12) -> FloatArray:
-    """Return where the tool goes along straight lines between configurations, m, (m, 3).
-
-    Parameters
-    ----------
-    way
-        The configurations, rad, (n, k).
-    steps
-        Points for each line.
-    """
+    """Return where the tool goes along straight lines between configurations (n, k), m, (m, 3)."""
     if len(way) < 2:
         return np.empty((0, 3))
     share = np.linspace(0.0, 1.0, steps)[:, None]

@@ -96,13 +96,7 @@ def inlined(name: str, svg: str) -> Markup:
 
 
 def write_report(folder: Path, drawings: dict[str, str], html: str) -> Path:
-    """Write report.html, and the figures as SVG files under ``figures``; return its path.
-
-    Raises
-    ------
-    InputError
-        The folder cannot be written to.
-    """
+    """Write report.html, and the figures as SVG files under ``figures``; return its path."""
     make_folder(folder / 'figures')
     for name, text in drawings.items():
         write_atomically(folder / 'figures' / f'{name}.svg', text)

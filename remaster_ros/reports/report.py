@@ -79,26 +79,17 @@ FAR = 1.0
 
 
 class View3D(NamedTuple):
-    """A plotly figure as plain data, and the figures of its caption.
+    """A plotly figure as plain data, and the figures of its caption."""
 
-    Attributes
-    ----------
-    data, layout
-        For ``Plotly.newPlot``.
-    magnification
-        By what the error vectors are drawn too long.
-    rows_shown, rows
-        How many observations are drawn, of how many.
-    far_sensors
-        Sensors so far off that only their direction is drawn: at its place one would leave the arm
-        tiny.
-    """
-
+    # For Plotly.newPlot
     data: list[dict[str, Any]]
     layout: dict[str, Any]
-    magnification: int
+    magnification: int  # By what the error vectors are drawn too long
+    # How many observations are drawn, of how many
     rows_shown: int
     rows: int
+    # Sensors so far off that only their direction is drawn: at its place one would leave the arm
+    # tiny
     far_sensors: list[str]
 
 
@@ -314,13 +305,7 @@ def marker_rows(fit: Mapping[str, Any], session: Session) -> list[dict[str, Any]
 
 
 def write_fit_report(result: FitResult, folder: Path) -> Path:
-    """Write report.html and the figures of a fit to a folder, made if missing; return its path.
-
-    Raises
-    ------
-    InputError
-        The folder cannot be written to.
-    """
+    """Write report.html and the figures of a fit to a folder, made if missing; return its path."""
     drawings = draw_fit(result) | draw_stages(answer_of(inputs_of(result)))
     return write_report(folder, drawings, fit_html(result, drawings))
 
@@ -376,20 +361,7 @@ def _json(content: Any) -> Markup:
 
 
 def write_discovery_report(discovery: Discovery, content: Discovered, folder: Path) -> Path:
-    """Write report.html and the figures of what was found; return its path.
-
-    Parameters
-    ----------
-    discovery, content
-        What was found, and the same as discovery.json has it.
-    folder
-        Where to; made if missing.
-
-    Raises
-    ------
-    InputError
-        The folder cannot be written to.
-    """
+    """Write report.html and the figures of what was found to a folder; return its path."""
     drawings = draw_discovery(discovery)
     html = discovery_html(content, discovery.fit.session, drawings)
     return write_report(folder, drawings, html)
@@ -437,42 +409,20 @@ class StdRow(NamedTuple):
 
 @dataclass(frozen=True)
 class PlanFacts:
-    """What the page has of a plan.
+    """What the page has of a plan."""
 
-    Attributes
-    ----------
-    name
-        Its fingerprint.
-    rows
-        Of each split.
-    visits
-        Visits to references that were recorded.
-    minutes
-        From the first reading to the last; None where times are not known.
-    dropped
-        Reason -> poses and configurations that were never in the plan.
-    stds
-        Of each joint; empty where nothing was noted.
-    ratio
-        Median of the fit's standard deviations over the expected ones; None where there are none.
-    tool_mm
-        Expected error of the predicted markers (RMS); None.
-    enough
-        Whether poses were left out as enough was known.
-    drawn
-        Whether there is a page that plays it.
-    """
-
-    name: str
-    rows: tuple[PlannedRow, ...]
-    visits: int
-    minutes: float | None
+    name: str  # Its fingerprint
+    rows: tuple[PlannedRow, ...]  # Of each split
+    visits: int  # Visits to references that were recorded
+    minutes: float | None  # From the first reading to the last; None where times are not known
+    # Reason -> poses and configurations that were never in the plan
     dropped: dict[str, tuple[int, int]]
-    stds: tuple[StdRow, ...]
+    stds: tuple[StdRow, ...]  # Of each joint; empty where nothing was noted
+    # Median of the fit's standard deviations over the expected ones; None where there are none
     ratio: float | None
-    tool_mm: float | None
-    enough: bool
-    drawn: bool
+    tool_mm: float | None  # Expected error of the predicted markers (RMS); None
+    enough: bool  # Whether poses were left out as enough was known
+    drawn: bool  # Whether there is a page that plays it
 
     @property
     def verdict(self) -> str:
@@ -806,13 +756,7 @@ SVG_ELEMENTS = {
 
 
 def checked_svg(text: str, path: Path) -> str:
-    """Return a figure, refused where it holds more than a drawing.
-
-    Raises
-    ------
-    InputError
-        It is no SVG, or has scripts or addresses in it.
-    """
+    """Return a figure, refused where it holds more than a drawing."""
     try:
         root = ElementTree.fromstring(text)
     except ElementTree.ParseError:

@@ -79,13 +79,7 @@ def prepare_folder(folder: str | os.PathLike[str], result: str) -> None:
 
 
 def remove_report(folder: Path) -> None:
-    """Remove the report of an earlier run, which would contradict the new result.
-
-    Raises
-    ------
-    InputError
-        It cannot be removed.
-    """
+    """Remove the report of an earlier run, which would contradict the new result."""
     try:
         (folder / REPORT_FILE).unlink(missing_ok=True)
     except OSError as error:

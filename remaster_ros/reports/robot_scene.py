@@ -41,55 +41,27 @@ _FINEST_M, _COARSEST_M = 5e-4, 0.05
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """Triangles that move together.
+    """Triangles that move together."""
 
-    Attributes
-    ----------
-    name
-        What it is, for people.
-    link
-        0 for what stands still, i for what moves with joint i.
-    role
-        ``link``, ``tool``, ``marker`` or ``obstacle``.
-    vertices
-        In the frame of `RobotScene.transforms` for that link, m, (n, 3).
-    faces
-        Which three vertices each triangle has, (m, 3), seen from outside counter-clockwise.
-    color
-        Red, green and blue, 0 to 1; None where the robot description gives none.
-    """
-
-    name: str
-    link: int
-    role: str
-    vertices: FloatArray
+    name: str  # What it is, for people
+    link: int  # 0 for what stands still, i for what moves with joint i
+    role: str  # link, tool, marker or obstacle
+    vertices: FloatArray  # In the frame of `RobotScene.transforms` for that link, m, (n, 3)
+    # Which three vertices each triangle has, (m, 3), seen from outside counter-clockwise
     faces: IntArray
+    # Red, green and blue, 0 to 1; None where the robot description gives none
     color: Color | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class RobotScene:
-    """An arm, its tool and what stands around it.
+    """An arm, its tool and what stands around it."""
 
-    Attributes
-    ----------
-    chain
-        The arm.
-    surfaces
-        All that is drawn.
-    sights
-        Where each sensor is, and which marker it follows.
-    floor_z
-        Height of the floor, m; None where there is none.
-    notes
-        What is not drawn as the robot description has it, and the remedy.
-    """
-
-    chain: SerialChain
-    surfaces: Sequence[Surface]
-    sights: Sequence[LineOfSight]
-    floor_z: float | None
-    notes: Sequence[str]
+    chain: SerialChain  # The arm
+    surfaces: Sequence[Surface]  # All that is drawn
+    sights: Sequence[LineOfSight]  # Where each sensor is, and which marker it follows
+    floor_z: float | None  # Height of the floor, m; None where there is none
+    notes: Sequence[str]  # What is not drawn as the robot description has it, and the remedy
 
     def transforms(self, q: FloatArray) -> FloatArray:
         """Return where the links are at joint angles (..., k), rad: T_R_link, (..., k + 1, 4, 4).
@@ -132,15 +104,8 @@ def arm_surfaces(
 ) -> tuple[list[Surface], list[str]]:
     """Return the surfaces of an arm and all around it, and what is not drawn as described.
 
-    Parameters
-    ----------
-    visuals
-        Of the URDF.
-    bodies
-        Of the collision checks; drawn are tool, markers, obstacles, and the links whose visual
-        geometry is missing.
-    mesh_parts
-        Reads a mesh by its name in the URDF; its InputError means that it is missing.
+    Of the ``bodies`` of the collision checks tool, markers and obstacles are drawn, and the links
+    whose visual geometry is missing. An InputError of ``mesh_parts`` means that a mesh is missing.
     """
     surfaces: list[Surface] = []
     missing: dict[str, None] = {}
@@ -331,13 +296,7 @@ def _base64(values: Any, kind: str) -> str:
 
 
 def three_js() -> str:
-    """Return the source of three.js, as trimesh has it in the page of its own viewer.
-
-    Raises
-    ------
-    InputError
-        A trimesh without it.
-    """
+    """Return the source of three.js, as trimesh has it in the page of its own viewer."""
     # Found without importing trimesh, which takes a second.
     spec = importlib.util.find_spec('trimesh')
     folder = Path(spec.origin).parent if spec is not None and spec.origin else Path()

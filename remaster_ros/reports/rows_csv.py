@@ -79,14 +79,7 @@ def residuals_text(result: FitResult) -> str:
 def predictions_text(session: Session, predictions: Predictions, left_out: set[int]) -> str:
     """Return the file: positions in the frame of the row's sensor, m; 1 is yes and 0 no.
 
-    Parameters
-    ----------
-    session
-        All n rows.
-    predictions
-        Of the same rows.
-    left_out
-        ``observation`` of the gross errors.
+    ``left_out``: ``observation`` of the gross errors.
     """
     m: Measurements = session.measurements
     upper = predictions.covariance[:, [a for a, _ in PAIRS], [b for _, b in PAIRS]]
@@ -105,13 +98,7 @@ def predictions_text(session: Session, predictions: Predictions, left_out: set[i
 
 
 def read_columns(path: Path, session: Session, columns: Sequence[str], verb: str) -> FloatArray:
-    """Read columns of numbers of such a file, (n, columns), one line for each row of a session.
-
-    Raises
-    ------
-    InputError
-        One line naming file, line, column and remedy: no such file, or not of this session.
-    """
+    """Read columns of numbers of such a file, (n, columns), one line for each row of a session."""
     data = read_limited(path, ROWS_LIMIT, f'run "remaster {verb}" again, which writes it')
     reader = csv.DictReader(io.StringIO(decode_text(data, path)))
     missing = {'observation', *columns} - set(reader.fieldnames or ())

@@ -332,13 +332,7 @@ class Fit(Struct):
 
 
 def checked(content: Mapping[str, Any], schema: type[Content]) -> Content:
-    """Return a file's content by its schema: arrays as lists, NaN as None, other keys left out.
-
-    Raises
-    ------
-    msgspec.ValidationError
-        A key that other programs rely on is missing or of another type.
-    """
+    """Return a file's content by its schema: arrays as lists, NaN as None, other keys left out."""
     return msgspec.json.decode(msgspec.json.encode(content, enc_hook=_plain), type=schema)
 
 

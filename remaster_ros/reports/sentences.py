@@ -281,12 +281,7 @@ def judgement(
 ) -> Judgement:
     """Judge what was found: 'good' where all data agree with the verdict, else 'caution'.
 
-    Parameters
-    ----------
-    discovery, confirmation
-        What was found.
-    content
-        The same as discovery.json has it.
+    ``content``: the same as discovery.json has it.
     """
     more = more_than_noise(content)
     again = MeasuredAgain.of(discovery.fit.session.measurements)
