@@ -14,18 +14,19 @@ import numpy as np
 from remaster_ros.cli.console import progress_bar, show
 from remaster_ros.cli.options import CANDIDATES, add_description, names, number, xacro_arguments
 from remaster_ros.errors import InputError, InsufficientDataError, did_you_mean
-from remaster_ros.kinematics.arm_ends import likely_base, likely_tip, likely_tips, moving_before
-from remaster_ros.kinematics.inverse_kinematics import InverseKinematics
+from remaster_ros.kinematics.arm_ends import likely_base, likely_tips, moving_before
+from remaster_ros.kinematics.inverse_kinematics import FREE_JOINTS, InverseKinematics
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.urdf import parse_urdf
 from remaster_ros.kinematics.urdf_geometry import chain_bodies, mesh_names
-from remaster_ros.planning.candidates import candidate_poses
+from remaster_ros.planning.candidates import candidate_poses, taken_poses
 from remaster_ros.planning.cell_proposal import (
     link_radius,
     marker_height,
     propose_held_joint,
     ranges_around,
     reach_of,
+    turned_to,
     widest_ranges,
 )
 from remaster_ros.planning.collection_plan import FITTED, outlook
@@ -154,9 +155,9 @@ def _propose(
         model = parse_urdf(text)
         base = likely_base(model) if args.base_link is None else args.base_link
         tips = likely_tips(model, base)
-        tip = likely_tip(model, base) if args.tip_link is None else args.tip_link
+        tip = tips[0] if args.tip_link is None else args.tip_link
         before = moving_before(model, base)
-        chain = SerialChain.from_urdf(text, base, tip)
+        chain = SerialChain.from_urdf(text, base, tip, sliding=True)
         reach = reach_of(chain, rng)
         place = args.sensor_at or [
             reach.reach_m + SENSOR_BEHIND_M,
@@ -165,7 +166,14 @@ def _propose(
         ]
         floor = None if args.no_floor else 0.0
         ranges = widest_ranges(reach, floor)
-        facing = candidate_poses(COMPARED, ranges, np.array(place), rng)
+        at = np.array(place)
+        angles = {
+            name: turned_to(chain, at, SENSORS[name].max_angle_deg, rng) for name in args.sensors
+        }
+        facing = candidate_poses(COMPARED, ranges, at, rng)
+        if len(chain) < FREE_JOINTS:
+            angle = np.radians(angles[args.sensors[0]])
+            facing = taken_poses(chain, facing, ranges, at, angle, rng)
         held = propose_held_joint(chain, facing)
     except InputError as error:
         raise InputError(f'{args.robot}: {error}') from None
@@ -187,6 +195,7 @@ def _propose(
         link_radius=thickness,
         sensor_R=place,
         sensors=args.sensors,
+        max_angle_deg=angles,
         mesh_path=found,
         missing_meshes=missing,
         floor_z=floor,
@@ -238,7 +247,8 @@ def _narrowed(
 
 def _plan(cell: Workcell, without_meshes: bool, seed: int) -> tuple[dict[str, Any], str, int]:
     """Plan in the new cell as the nodes do, without the ways: as JSON, in words, poses to fit."""
-    scene = cell.planning_scene(cell.chain(), without_meshes=without_meshes)
+    chain = cell.chain(sliding=True)
+    scene = cell.planning_scene(chain, without_meshes=without_meshes)
     counts = {'optimization': CANDIDATES, 'validation': CANDIDATES}
     try:
         tour, expected = outlook(TourPlanner(scene, counts, seed, design=cell.design_settings()))
@@ -258,9 +268,9 @@ def _as_text(p: CellProposal) -> str:
         f'{", ".join(f"{value:.1f}" for value in p.sensor_R)} m',
     ]
     if held.joint is not None:
-        angles = ', '.join(f'{np.degrees(value):.0f}' for value in held.values_rad)
+        values = ', '.join(chain.shown_offset(held.joint, v, 0) for v in held.values_held)
         lines.append(
-            f'{chain.joint_names[held.joint]} is held at {angles} degrees, which gives the most '
+            f'{chain.joint_names[held.joint]} is held at {values}, which gives the most '
             f'joint solutions of a pose: {held.solutions:.1f} on average'
         )
     lines += [held.kinematics.in_words(), p.kept]

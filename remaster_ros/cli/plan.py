@@ -100,7 +100,7 @@ def run(args: argparse.Namespace) -> int:
     if args.out is not None:
         check_plan_page(args.out)
     cell = read_cell(args.cell)
-    scene = cell.planning_scene(cell.chain())
+    scene = cell.planning_scene(cell.chain(sliding=True))
     with progress_bar(args.quiet or args.json) as progress:
         progress('planning', 0.0)
         plan = planned(cell, scene, args, lambda share: progress('planning', share))
@@ -136,7 +136,8 @@ def _check(
     cell: Workcell, scene: PlanningScene, plan: CollectionPlan, args: argparse.Namespace
 ) -> tuple[dict[str, Any], str]:
     """Choose and write the configurations of a check; return what is expected, and in words."""
-    chain = scene.model.chain
+    # Of the arm's joints none may slide: what is checked are angles.
+    chain = cell.chain()
     q = np.unique([visit.q for visit in plan.visits], axis=0)
     if len(q) < CHECK_POSES:
         raise InsufficientDataError(
@@ -189,7 +190,7 @@ def planned(
 
 
 def free_start(model: CollisionModel, seed: int) -> FloatArray:
-    """Return joints at which the arm can stand, rad, (k,): zero where it can, else near to it.
+    """Return joints, (k,), at which the arm can stand: zero where it can, else near to it.
 
     At zero some arms lie stretched out along the floor (a UR does), from where no way is free.
     """

@@ -21,18 +21,18 @@ _WHOLE = ('roll', 'rot', 'pitch', 'yaw', 'wrist', 'turn', 'spin', 'flex')
 _HAND_BEHIND = 5
 
 
-def likely_base(model: UrdfModel, names: Container[str] = (), *, sliding: bool = False) -> str:
+def likely_base(model: UrdfModel, names: Container[str] = ()) -> str:
     """Return the root, or what is fixed to it where the root is the world.
 
-    Where a joint that slides (a rail, a lift) carries the arm, it is the base of what it carries,
-    unless that joint is known to be the arm's and ``sliding`` ones are taken.
+    Where a joint that slides (a rail, a lift) carries an arm of five or more joints that turn, it
+    is the base of what it carries, unless that joint is known to be the arm's.
 
     Parameters
     ----------
     names
         As of `likely_tips`.
     """
-    sliders = _sliders(model, names if sliding else ())
+    sliders = _sliders(model, names, carrying=False)
     arms = {
         link: arm
         for link in model.links
@@ -62,14 +62,12 @@ def likely_base(model: UrdfModel, names: Container[str] = (), *, sliding: bool =
     return children[0] if len(children) == 1 else model.root
 
 
-def likely_tips(
-    model: UrdfModel, base_link: str, names: Container[str] = (), *, sliding: bool = False
-) -> list[str]:
+def likely_tips(model: UrdfModel, base_link: str, names: Container[str] = ()) -> list[str]:
     """Return the links behind the last joint of the arm, the likeliest tool frame first.
 
-    The arm is the way from the base with the most joints that turn and none that slides, but for
-    those in `names` where ``sliding`` ones are taken; a gripper's jaws and fingers are no joints
-    of it.
+    The arm is the way from the base with the most joints; a gripper's jaws and fingers are no
+    joints of it, nor what slides behind five joints that turn and carries none. Where `names` has
+    joints of the robot, only those that slide are the arm's that it has.
 
     Parameters
     ----------
@@ -84,7 +82,7 @@ def likely_tips(
     """
     if base_link not in model.links:
         raise InputError(f"URDF: there is no link '{base_link}'; it has {', '.join(model.links)}")
-    sliders = _sliders(model, names if sliding else ())
+    sliders = _sliders(model, names, carrying=True)
     arms = {
         link: arm[1]
         for link in model.links
@@ -92,7 +90,7 @@ def likely_tips(
     }
     most = max(((_named(arm, names), len(arm)) for arm in arms.values()), default=(0, 0))
     if not most[1]:
-        raise InputError(f"URDF: no joint turns behind link '{base_link}'; name another base link")
+        raise InputError(f"URDF: no joint moves behind link '{base_link}'; name another base link")
     ends = [link for link, arm in arms.items() if (_named(arm, names), len(arm)) == most]
     parents = {joint.parent for joint in model.parent_joint.values()}
 
@@ -115,25 +113,22 @@ def likely_tips(
     return ordered
 
 
-def likely_tip(
-    model: UrdfModel, base_link: str, names: Container[str] = (), *, sliding: bool = False
-) -> str:
+def likely_tip(model: UrdfModel, base_link: str, names: Container[str] = ()) -> str:
     """Return the first of `likely_tips`.
 
     Raises
     ------
     InputError
-        As `likely_tips`, or the arm goes on behind a joint that slides.
+        As `likely_tips`, or the arm goes on behind a joint that slides and is not named.
     """
-    tip = likely_tips(model, base_link, names, sliding=sliding)[0]
-    last = _arm(model, tip, base_link, _sliders(model, names if sliding else ()))
+    tip = likely_tips(model, base_link, names)[0]
+    last = _arm(model, tip, base_link, _sliders(model, names, carrying=True))
     for joint in _moved_from(model, last[1][-1].child if last else tip):
         beyond = [j for j in _moved_from(model, joint.child) if not _is_jaw(j)]
         if joint.kind == 'prismatic' and not joint.mimic and not _is_jaw(joint) and beyond:
             raise InputError(
                 f"URDF: joint '{joint.name}' of the arm slides, and the arm goes on behind it "
-                f"with '{beyond[0].name}'; such an arm can be imported, from a table that names "
-                'its joints, and fitted, no more'
+                f"with '{beyond[0].name}'; a table that names others has to name it, too"
             )
     return tip
 
@@ -148,10 +143,54 @@ def moving_before(model: UrdfModel, base_link: str) -> list[str]:
     return joints[::-1]
 
 
-def _sliders(model: UrdfModel, names: Container[str]) -> set[str]:
-    """Return the joints that slide among those known to be the arm's."""
+def _sliders(model: UrdfModel, names: Container[str], *, carrying: bool) -> set[str]:
+    """Return the joints that slide and are likely the arm's.
+
+    Parameters
+    ----------
+    names
+        Where it has joints of the robot, those of them that slide.
+    carrying
+        Whether one that carries an arm of five joints that turn is taken.
+    """
     joints = model.parent_joint.values()
-    return {joint.name for joint in joints if joint.kind == 'prismatic' and joint.name in names}
+    named = [joint for joint in joints if joint.kind != 'fixed' and joint.name in names]
+    if named:
+        return {joint.name for joint in named if joint.kind == 'prismatic'}
+    likely = set()
+    for joint in joints:
+        if joint.kind != 'prismatic' or joint.mimic or _is_jaw(joint):
+            continue
+        before, behind = _turning_before(model, joint.parent), _turning_behind(model, joint.child)
+        is_hand = before >= _HAND_BEHIND and not behind
+        if not is_hand and (carrying or behind < _HAND_BEHIND):
+            likely.add(joint.name)
+    return likely
+
+
+def _turning_before(model: UrdfModel, link: str) -> int:
+    """Return how many joints turn between the root and a link."""
+    count = 0
+    while (joint := model.parent_joint.get(link)) is not None:
+        count += _turns(joint)
+        link = joint.parent
+    return count
+
+
+def _turning_behind(model: UrdfModel, link: str) -> int:
+    """Return how many joints turn one after the other behind a link, at most."""
+    return max(
+        (
+            _turns(joint) + _turning_behind(model, joint.child)
+            for joint in model.parent_joint.values()
+            if joint.parent == link
+        ),
+        default=0,
+    )
+
+
+def _turns(joint: UrdfJoint) -> bool:
+    return joint.kind in ('revolute', 'continuous') and not joint.mimic and not _is_jaw(joint)
 
 
 def _arm(
@@ -162,8 +201,8 @@ def _arm(
 ) -> tuple[str, list[UrdfJoint]] | None:
     """Return where the arm that carries a link starts, and its joints; None behind its tool.
 
-    It starts at `base_link`, or at the root, or at what a joint carries that does not turn and is
-    none of the sliders.
+    It starts at `base_link`, or at the root, or at what a joint carries that neither turns nor is
+    one of the sliders.
     """
     joints: list[UrdfJoint] = []
     while link != base_link and (joint := model.parent_joint.get(link)) is not None:

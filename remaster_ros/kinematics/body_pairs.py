@@ -128,12 +128,12 @@ class BodyPairs:
 
     ``bodies``: everything, by link; ``floor_z``: height of the floor in R, m; None where there is
     none to hit; ``margin``: fixed part of the clearance, m; ``unknown_offset``: what a joint's
-    zero-offset may be off by, rad.
+    zero-offset may be off by, rad; of one that slides by `LEVER_M` times as much, in m.
     Attributes: ``inner, outer``: indices of the two bodies of each pair, (P,); inner is -1 for the
     floor; ``is_floor, contact_only``: pairs with the floor, and those that are kept from touching
     only, (P,); ``levers``: bounds of how far the outer body moves relative to the inner one for a
-    radian of each joint, m, (P, k); ``most_kept``: the largest clearance of each pair, m, (P,);
-    ``left_out``: the pairs that are not checked, or only for contact, and why.
+    radian or metre of each joint, (P, k); ``most_kept``: the largest clearance of each pair, m,
+    (P,); ``left_out``: the pairs that are not checked, or only for contact, and why.
     """
 
     def __init__(
@@ -145,7 +145,9 @@ class BodyPairs:
         unknown_offset: float,
     ) -> None:
         self.chain, self.bodies, self.floor_z = chain, tuple(bodies), floor_z
-        self.margin, self.unknown_offset = margin, unknown_offset
+        self.margin = margin
+        # rad, or m of a joint that slides, (k,)
+        self._unknown = unknown_offset * chain.per_radian
         self.left_out: tuple[str, ...] = ()
         self._link = np.array([body.link for body in self.bodies], dtype=np.int64)
         ends = [body.capsule for body in self.bodies]
@@ -165,7 +167,8 @@ class BodyPairs:
             if second.link == 0:
                 continue
             for i, one in enumerate(self.bodies[:j]):
-                near = second.link - one.link <= 1 and {one.role, second.role} == {'link'}
+                apart = range(one.link, second.link)
+                near = {one.role, second.role} == {'link'} and self._on_one_line(apart)
                 if one.link < second.link and not near:
                     inner.append(i)
                     outer.append(j)
@@ -173,6 +176,18 @@ class BodyPairs:
                 inner.append(-1)
                 outer.append(j)
         return np.array(inner, dtype=np.int64), np.array(outer, dtype=np.int64)
+
+    def _on_one_line(self, joints: Sequence[int]) -> bool:
+        """Return whether a single joint is between two links, or slides and turns on one line."""
+        if len(joints) < 2:
+            return True
+        if not any(self.chain.slides[joint] for joint in joints):
+            return False
+        frames = self.chain.frames(np.zeros(len(self.chain)))
+        axes = self.chain.axes_in_base(frames)[joints]
+        steps = np.diff(frames[joints, :3, 3], axis=0)
+        off = np.cross(np.vstack((axes[1:], steps)), axes[0])
+        return bool(np.max(np.linalg.norm(off, axis=1)) < 1e-9)
 
     def _set_pairs(
         self, inner: IntArray, outer: IntArray, contact_only: BoolArray | None = None
@@ -188,9 +203,9 @@ class BodyPairs:
         self._is_exact = ~self.is_floor & is_capsule[inner] & is_capsule[outer]
         joints = np.arange(1, len(self.chain) + 1)
         between = joints > links[:, None]
-        # A first joint about the vertical moves nothing up or down.
+        # A first joint that turns about the vertical moves nothing up or down.
         upright = abs((self.chain.T_fixed[0][:3, :3] @ self.chain.axes[0])[2]) > 1 - 1e-12
-        if upright:
+        if upright and not self.chain.slides[0]:
             between[self.is_floor, 0] = False
         self._between = between & (joints <= self._link[outer][:, None])
         self.levers = np.where(self._between, self._reach[outer], 0.0)
@@ -200,7 +215,7 @@ class BodyPairs:
         self.most_kept = np.where(
             self.contact_only,
             0.0,
-            self.margin + self.unknown_offset * np.linalg.norm(self.levers, axis=1),
+            self.margin + np.linalg.norm(self.levers * self._unknown, axis=1),
         )
         self._kinds = (
             np.flatnonzero(self.is_floor),
@@ -240,8 +255,12 @@ class BodyPairs:
         return inner, self.bodies[self.outer[pair]].name
 
     def _reaches(self) -> FloatArray:
-        """Bound each body's distance from each joint's axis in any configuration, m, (B, k)."""
+        """Bound each body's distance from each joint's axis in any configuration, m, (B, k).
+
+        That is how far it moves for a radian; for a metre of a joint that slides a metre.
+        """
         chain = self.chain
+        travel = np.where(chain.slides, np.maximum(np.abs(chain.lower), np.abs(chain.upper)), 0.0)
         reach = np.zeros((len(self.bodies), len(chain)))
         for b, body in enumerate(self.bodies):
             far = 0.0
@@ -250,8 +269,8 @@ class BodyPairs:
                 # What a further joint turns stays as far from that joint's origin.
                 axis = chain.axes[joint]
                 across = np.linalg.norm(points - (points @ axis)[:, None] * axis, axis=1)
-                reach[b, joint] = far + across.max()
-                far += np.linalg.norm(points, axis=1).max()
+                reach[b, joint] = 1.0 if chain.slides[joint] else far + across.max()
+                far += np.linalg.norm(points, axis=1).max() + travel[joint]
                 points = chain.T_fixed[joint][None, :3, 3]
         return reach
 
@@ -303,8 +322,10 @@ class BodyPairs:
             np.abs(arms[..., 2]).max(axis=1) + radius * level,
             np.linalg.norm(arms, axis=-1).max(axis=1) + radius,
         )
+        sliding = np.where(on_floor[:, None], np.abs(axes[..., 2]), 1.0)
+        levers = np.where(self.chain.slides, sliding, levers)
         levers = np.where(self._between[pairs], levers, 0.0)
-        kept = self.margin + self.unknown_offset * np.linalg.norm(levers, axis=1)
+        kept = self.margin + np.linalg.norm(levers * self._unknown, axis=1)
         # Not above the bound: the capsule around a body is wider than the body.
         return np.minimum(kept, self.most_kept[pairs])
 

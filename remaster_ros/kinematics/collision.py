@@ -8,7 +8,9 @@ Clearance covers what is not known yet. Each joint's zero-offset is unknown by `
 (1 degree unless stated), independently of the others: two bodies may be nearer to each other than
 the model has it by unknown_offset · √(Σ lever²), summed over the joints between the two. A lever
 is the largest distance of the outer body from the joint's axis at that configuration; for the
-floor only its horizontal part counts, and a vertical axis has none. A fixed margin comes on top:
+floor only its horizontal part counts, and a vertical axis has none. A joint that slides has the
+lever 0.25 m (`serial_chain.LEVER_M`): so far it may be off for each radian of unknown_offset. A
+fixed margin comes on top:
 
     kept = margin + unknown_offset · √(Σ lever²)
 
@@ -17,7 +19,8 @@ more than 10 mm relative to another from one check to the next, so that it is no
 5 mm less than at the checks.
 
 Not checked are, by this rule: bodies of one link; links next to each other, which their joint
-keeps apart (tools and markers are checked against the link before theirs); two bodies of the arm
+keeps apart, or several that slide and turn on one line, as a SCARA's do (tools and markers are
+checked against the link before theirs); two bodies of the arm
 that overlap as modelled in 95 % of sampled configurations; and a body that overlaps an obstacle
 or the floor in every one. Bodies that come nearer than what is kept in 95 % of the configurations
 (all of them for obstacles and floor), but do not overlap, are kept from touching only. `left_out`
@@ -39,6 +42,7 @@ from remaster_ros.kinematics.bodies import Body, capsule, enclosing_points
 from remaster_ros.kinematics.body_pairs import OBSTACLE, BodyPairs, Shortfall
 from remaster_ros.kinematics.line_of_sight import LinkCapsules
 from remaster_ros.kinematics.serial_chain import SerialChain
+from remaster_ros.kinematics.transforms import apply
 from remaster_ros.types import BoolArray, FloatArray, IntArray
 
 STEP_M = 0.01
@@ -50,11 +54,14 @@ ESCAPE_TOLERANCE_M = 1e-4
 """How much nearer what is too near may come from one check of a way out to the next, m."""
 
 _STRIDE = 8
-_LIMIT_TOLERANCE_RAD = 1e-6
+_LIMIT_TOLERANCE = 1e-6  # rad or m
 
 
 def arm_bodies(chain: SerialChain, given: Sequence[Body], link_radius: float) -> list[Body]:
     """Add a capsule along each link that has no body: from its joint to the next one, or the tip.
+
+    What leads a joint that slides is added, too: where the base has no body, a rail along all of
+    the way of a first joint; else a rod that slides with the joint's link, as long as its way.
 
     Parameters
     ----------
@@ -72,6 +79,17 @@ def arm_bodies(chain: SerialChain, given: Sequence[Body], link_radius: float) ->
             name = 'the base' if link == 0 else f'the link of {chain.joint_names[link - 1]}'
             end = chain.T_fixed[link][:3, 3]
             bodies.append(Body(name, link, capsule(np.zeros(3), end, link_radius)))
+    for joint in np.flatnonzero(chain.slides):
+        carrier, axis = (0 if joint == 0 else int(joint) + 1), chain.axes[joint]
+        if carrier in covered:
+            continue
+        if joint == 0:
+            name, T = 'the rail', chain.T_fixed[0]
+            ends = apply(T, np.outer((chain.lower[0], chain.upper[0]), axis))
+        else:
+            name = f'the rod of {chain.joint_names[joint]}'
+            ends = -np.outer((chain.lower[joint], chain.upper[joint]), axis)
+        bodies.append(Body(name, carrier, capsule(ends[0], ends[1], link_radius)))
     return bodies
 
 
@@ -89,7 +107,7 @@ class CollisionModel:
     margin
         Fixed part of the clearance, m; at least half a step of a swept path, 5 mm.
     unknown_offset
-        What a joint's zero-offset may be off by, rad.
+        What a joint's zero-offset may be off by, rad; of one that slides see above.
     link_radius
         Of the capsules that stand for the links in the line of sight, m.
 
@@ -190,7 +208,7 @@ class CollisionModel:
             return 'a joint angle of the path is not finite'
         outside = np.maximum(self.chain.lower - q, q - self.chain.upper)
         further = outside - np.maximum(outside[0], 0.0)
-        if np.max(further) > _LIMIT_TOLERANCE_RAD:
+        if np.max(further) > _LIMIT_TOLERANCE:
             return self._limit_trouble(q)
         parts = [q[:1]]
         for a, b in pairwise(q):
@@ -278,13 +296,15 @@ class CollisionModel:
         """Return which waypoint (n, k) is outside the joint limits; '' for none."""
         chain = self.chain
         over = np.maximum(chain.lower - q, q - chain.upper)
-        if np.max(over) <= _LIMIT_TOLERANCE_RAD:
+        if np.max(over) <= _LIMIT_TOLERANCE:
             return ''
-        row, joint = np.unravel_index(int(np.argmax(over)), over.shape)
-        return (
-            f'{chain.joint_names[joint]} at {np.degrees(q[row, joint]):.2f} deg, its limits are '
-            f'{np.degrees(chain.lower[joint]):.2f} to {np.degrees(chain.upper[joint]):.2f} deg'
+        row, number = np.unravel_index(int(np.argmax(over)), over.shape)
+        joint = int(number)
+        at, low, high = (
+            chain.shown_offset(joint, value)
+            for value in (q[row, joint], chain.lower[joint], chain.upper[joint])
         )
+        return f'{chain.joint_names[joint]} at {at}, its limits are {low.split()[0]} to {high}'
 
     # Swept paths
 

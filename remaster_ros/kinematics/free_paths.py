@@ -20,7 +20,7 @@ from remaster_ros.types import FloatArray
 MOST_CHECKS = 400
 """Segments checked for one path at most."""
 REACH_RAD = 0.6
-"""How far a tree grows at a time, in its largest joint angle."""
+"""How far a tree grows at a time, in its largest joint angle (`SerialChain.per_radian`)."""
 _SHORTCUTS = 10
 _POINT_COST = 0.2  # of looking at one configuration, in segments
 
@@ -153,7 +153,8 @@ class _Search:
             draw = low + rng.random(len(chain)) * (high - low)
             if rng.random() < 0.5:
                 along = self._start + rng.random() * (self._end - self._start)
-                draw = np.clip(along + rng.normal(0.0, 0.6, len(chain)), low, high)
+                beside = rng.normal(0.0, 0.6, len(chain)) * chain.per_radian
+                draw = np.clip(along + beside, low, high)
             if not self._model.free_mask(draw[None], self._extra)[0]:
                 self._left -= _POINT_COST
                 continue
@@ -167,7 +168,8 @@ class _Search:
 
     def _extend(self, tree: list[_Node], goal: FloatArray) -> _Node | None:
         """Grow a tree one step towards a configuration; return the new node."""
-        distances = np.max(np.abs(np.array([node.q for node in tree]) - goal), axis=1)
+        ways = np.abs(np.array([node.q for node in tree]) - goal)
+        distances = np.max(ways / self._model.chain.per_radian, axis=1)
         nearest = tree[int(np.argmin(distances))]
         share = min(1.0, REACH_RAD / max(float(np.min(distances)), 1e-9))
         new = _Node(nearest.q + share * (goal - nearest.q), nearest)

@@ -3,8 +3,8 @@
 The true joint angle is the reported one plus the zero-offset, everywhere. All methods take any
 number of leading dimensions in ``q``, ``points`` and ``joint_offsets``, and broadcast them.
 
-A joint that slides (prismatic) has metres where others have radians, in all of these arrays. Most
-of what takes a chain supposes angles (limits of motion, causes of errors, inverse kinematics), so
+A joint that slides (prismatic) has metres where others have radians, in all of these arrays. Much
+of what takes a chain supposes angles (what moves an arm, causes of errors), so
 `SerialChain.from_urdf` refuses such a joint unless its caller states that it takes them.
 """
 
@@ -153,6 +153,18 @@ class SerialChain:
         """The unit of each joint's position, k names: rad or m."""
         return tuple('m' if slides else 'rad' for slides in self.slides)
 
+    @cached_property
+    def usual_range(self) -> tuple[FloatArray, FloatArray]:
+        """Limits, (k,) each; a turn from -pi to pi of joints that turn farther or without end."""
+        turn = np.where(self.slides, np.inf, np.pi)
+        return np.maximum(self.lower, -turn), np.minimum(self.upper, turn)
+
+    def shown_limits(self, joint: int) -> str:
+        """Return the limits of a joint as people read them, without a unit: degrees or mm."""
+        factor = 1e3 if self.slides[joint] else np.degrees(1.0)
+        ends = (self.lower[joint], self.upper[joint])
+        return ' to '.join(f'{factor * e:.0f}' if np.isfinite(e) else 'without end' for e in ends)
+
     def shown_offset(self, joint: int, value: float, digits: int = 2) -> str:
         """Return an offset of a joint (rad or m) as people read it: in degrees or mm.
 
@@ -177,8 +189,11 @@ class SerialChain:
             upper=self.upper - joint_offsets,
         )
 
-    def within_limits(self, q: ArrayLike, tolerance: float = 0.0) -> BoolArray:
-        """Return whether all joints of q (..., k) are within limits (+ tolerance, rad), (...)."""
+    def within_limits(self, q: ArrayLike, tolerance: float | FloatArray = 0.0) -> BoolArray:
+        """Return whether all joints of q (..., k) are within limits, (...).
+
+        ``tolerance``: how far beyond they may be, rad and m, one number or (k,).
+        """
         q = np.asarray(q, dtype=float)
         inside = (q >= self.lower - tolerance) & (q <= self.upper + tolerance)
         return np.all(inside, axis=-1)
@@ -391,7 +406,8 @@ def _require_kind(joint: UrdfJoint, sliding: bool) -> None:
         if not sliding:
             raise InputError(
                 f"URDF: joint '{joint.name}' is prismatic; an arm with a joint that slides can be "
-                'imported and fitted, no more: this needs joints that turn, between other links'
+                'planned, imported and fitted, no more: this needs joints that turn, between '
+                'other links'
             )
     elif joint.kind not in ('revolute', 'continuous'):
         raise InputError(

@@ -11,7 +11,8 @@ from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.types import FloatArray
 
 UNKNOWN_VELOCITY = 1.0
-"""Where a robot model has no velocity limit, rad/s: slow for any arm."""
+"""Where a robot model has no velocity limit, rad/s: slow for any arm. Here and below a joint that
+slides has `SerialChain.per_radian` (0.25 m) times as much, in metres."""
 ACCELERATION = 5.0
 """Largest joint acceleration where a cell file gives none, rad/s².
 
@@ -27,9 +28,10 @@ class MotionLimits:
     # Position limits in reported angles, rad, (k,)
     lower: FloatArray
     upper: FloatArray
-    # Largest commanded joint velocities (the share of the robot's limits), rad/s, (k,)
+    # Largest commanded joint velocities (the share of the robot's limits), rad/s or m/s, (k,)
     velocity: FloatArray
-    acceleration: FloatArray  # Largest commanded joint accelerations, rad/s², (k,)
+    # Largest commanded joint accelerations, rad/s² or m/s², (k,)
+    acceleration: FloatArray
     # Largest speed of the fastest point of arm and tool, m/s; infinite for none
     tool_speed: float = np.inf
     margin: float = 0.0  # Distance kept from the position limits, rad
@@ -40,7 +42,7 @@ class MotionLimits:
         chain: SerialChain,
         speed_share: float,
         offsets: FloatArray | None = None,
-        acceleration: FloatArray | float = ACCELERATION,
+        acceleration: FloatArray | float | None = None,
         tool_speed: float = np.inf,
         margin: float = 0.0,
     ) -> MotionLimits:
@@ -60,20 +62,23 @@ class MotionLimits:
             What true angles have on top of reported ones, rad: zero-offsets in use, (k,), or the
             least and the largest of what is in use, (2, k); None for none.
         acceleration
-            rad/s², for all joints or (k,).
+            rad/s² or m/s², one number for all joints or (k,); None for `ACCELERATION`.
         tool_speed, margin
             See the attributes.
         """
         shift = np.zeros(len(chain)) if offsets is None else offsets
         least, largest = np.broadcast_to(shift, (2, len(chain)))
         known = np.isfinite(chain.velocity_limits)
-        velocity = np.where(known, chain.velocity_limits, UNKNOWN_VELOCITY)
+        velocity = np.where(known, chain.velocity_limits, UNKNOWN_VELOCITY * chain.per_radian)
         return cls(
             chain.joint_names,
             np.maximum(chain.lower, chain.lower - least),
             np.minimum(chain.upper, chain.upper - largest),
             speed_share * velocity,
-            np.broadcast_to(acceleration, velocity.shape),
+            np.broadcast_to(
+                ACCELERATION * chain.per_radian if acceleration is None else acceleration,
+                velocity.shape,
+            ),
             tool_speed,
             margin,
         )

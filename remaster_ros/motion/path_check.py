@@ -16,7 +16,8 @@ from remaster_ros.kinematics.transforms import with_z_along
 from remaster_ros.types import FloatArray
 
 PEAK_STEP_RAD = 0.02
-"""The peak speed on a line is looked for every so many radians of its fastest joint."""
+"""The peak speed on a line is looked for every so many radians of its fastest joint; of one that
+slides every `SerialChain.per_radian` times as many metres."""
 
 
 class PointSpeeds:
@@ -33,7 +34,8 @@ class PointSpeeds:
     Attributes
     ----------
     reach_m
-        How far from each joint a point that it moves can be in any configuration, m, (k,).
+        How far from each joint a point that it moves can be in any configuration, m, (k,): its
+        speed in m/s for each rad/s of the joint. A joint that slides has 1, for each m/s.
     """
 
     def __init__(self, chain: SerialChain, extents: Sequence[FloatArray]) -> None:
@@ -44,15 +46,19 @@ class PointSpeeds:
             _velocities(points @ with_z_along(axis)) if len(points) else None
             for axis, points in zip(chain.axes, extents, strict=True)
         ]
+        self._slides, self._per_radian = chain.slides, chain.per_radian
         # The way from each joint along the links behind it to the farthest point, at full stretch.
-        links = [0.0, *np.linalg.norm(chain.T_fixed[1:-1, :3, 3], axis=1)]
-        origins = np.cumsum(links)
+        links = np.array([0.0, *np.linalg.norm(chain.T_fixed[1:-1, :3, 3], axis=1)])
+        # What slides carries its own origin along.
+        travel = np.maximum(np.abs(chain.lower), np.abs(chain.upper))
+        origins = np.cumsum(links + np.where(chain.slides, travel, 0.0))
         bodies = [
             origin + max(np.linalg.norm(points, axis=1), default=0.0) if len(points) else 0.0
             for origin, points in zip(origins, extents)
         ]
         farthest = np.maximum.accumulate(bodies[::-1])[::-1]
         self.reach_m: FloatArray = np.maximum(farthest - origins, 0.0)
+        self.reach_m[chain.slides] = 1.0
 
     def fastest(self, q: FloatArray, velocity: FloatArray) -> FloatArray:
         """Return the speed of the fastest point, m/s, (n,), at q and joint velocities (n, k)."""
@@ -64,10 +70,16 @@ class PointSpeeds:
         sines, cosines = np.sin(q), np.cos(q)
         for joint, (step, points) in enumerate(zip(self._steps, self._points, strict=True)):
             motion = (motion.reshape(-1, 6) @ step).reshape(-1, 2, 3)
-            s, c = sines[:, joint, None], cosines[:, joint, None]
             x, y = motion[..., 0].copy(), motion[..., 1].copy()
-            motion[..., 0], motion[..., 1] = c * x + s * y, c * y - s * x
-            motion[:, 0, 2] += velocity[:, joint]
+            if self._slides[joint]:
+                # The origin has gone along Z: it moves with v + w × q Z, and by the joint.
+                motion[:, 1, 0] += y[:, 0] * q[:, joint]
+                motion[:, 1, 1] -= x[:, 0] * q[:, joint]
+                motion[:, 1, 2] += velocity[:, joint]
+            else:
+                s, c = sines[:, joint, None], cosines[:, joint, None]
+                motion[..., 0], motion[..., 1] = c * x + s * y, c * y - s * x
+                motion[:, 0, 2] += velocity[:, joint]
             if points is not None:
                 squares = ((motion.reshape(-1, 6) @ points) ** 2).reshape(len(q), 3, -1)
                 fastest = np.maximum(fastest, np.max(np.sum(squares, axis=1), axis=1))
@@ -76,7 +88,7 @@ class PointSpeeds:
     def peak_m(self, start: FloatArray, end: FloatArray) -> float:
         """Return the fastest point's peak speed where the line takes a second, m/s."""
         way = end - start
-        count = 3 + int(np.max(np.abs(way)) / PEAK_STEP_RAD)
+        count = 3 + int(np.max(np.abs(way) / self._per_radian) / PEAK_STEP_RAD)
         q = start + np.linspace(0.0, 1.0, count)[:, None] * way
         return float(np.max(self.fastest(q, np.broadcast_to(way, q.shape))))
 

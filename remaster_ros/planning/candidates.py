@@ -231,8 +231,7 @@ def taken_poses(
     Returns T_R_T, (n, 4, 4). Where so few were found that none is left, a pose stays as it is
     drawn, out of the arm's reach.
     """
-    turn = np.where(chain.slides, np.inf, np.pi)
-    low, high = np.maximum(chain.lower, -turn), np.minimum(chain.upper, turn)
+    low, high = chain.usual_range
     there = np.empty((0, 4, 4))
     for _ in range(PLACES_TIMES):
         places = chain.forward(rng.uniform(low, high, (PLACES, len(chain))))
@@ -264,13 +263,14 @@ def plan_poses(
     ``inverse_kinematics``: of the arm; its held values decide how many solutions there are;
     ``arm``: the same arm with everything it can hit; ``candidates``: T_R_T, (n, 4, 4);
     ``lines_of_sight``: what has to be visible; ``limit_margin_rad``: distance to keep from the
-    joint limits, rad.
+    joint limits, rad; of one that slides `SerialChain.per_radian` times as much, m.
     Returns with `dropped` and `len(poses)` adding up to n.
     """
     chain = inverse_kinematics.chain
     reachable = inverse_kinematics.solutions_of_each(candidates)
     within = [inverse_kinematics.usable(q) for q in reachable]
-    within = [q[chain.within_limits(q, -limit_margin_rad)] for q in within]
+    margin = limit_margin_rad * chain.per_radian
+    within = [q[chain.within_limits(q, -margin)] for q in within]
     owner = np.repeat(np.arange(len(within)), [len(q) for q in within])
     q = np.concatenate([np.empty((0, len(chain))), *within])
     reasons = _reasons(arm, q, lines_of_sight)
@@ -322,7 +322,7 @@ def order_solutions(
     travel, divided by its velocity limit.
 
     ``solutions``: rad, (m, k); ``q_current``: rad, (k,); ``velocity_limits``: rad/s, (k,); where a
-    limit is unknown (infinite) it counts as 1 rad/s.
+    limit is unknown (infinite) it counts as 1 rad/s, or 1 m/s.
     Returns indices into solutions, (m,).
     """
     limits = np.asarray(velocity_limits, dtype=float)

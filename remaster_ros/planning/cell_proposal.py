@@ -13,6 +13,7 @@ import numpy as np
 
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.bodies import Body
+from remaster_ros.kinematics.collision import arm_bodies
 from remaster_ros.kinematics.inverse_kinematics import (
     FEWEST_JOINTS,
     FREE_JOINTS,
@@ -27,14 +28,16 @@ from remaster_ros.types import FloatArray
 # With fewer joint solutions of a pose on average the joint is held at several values, rad.
 FEW_SOLUTIONS = 1.5
 OTHER_VALUES = tuple(np.radians((-40.0, 0.0, 40.0)).tolist())
+# A joint that slides is held at these shares of its way: what it carries is to be measured there.
+SHARES = (0.25, 0.5, 0.75)
+# Of 3,000 places of an arm so many face a sensor, or it is taken not to.
+FACING, MOST = 30, 0.95
 # A marker in front of the tool plate, and how far it is kept from the last link, m.
 LEAST_MARKER_M = 0.05
 CLEAR_M = 0.03
 # Arms that reach farther are taken to have links of the thickness that cell files have where they
 # give none, m; smaller arms are built alike.
 FULL_SIZE_M = 0.9
-# A joint that goes on turning counts as one of a turn each way.
-_TURN = np.pi
 
 
 @dataclass(frozen=True)
@@ -42,7 +45,7 @@ class HeldJoint:
     """Which joint to hold so that poses have joint solutions, and how these are found."""
 
     joint: int | None  # Its index; None where the arm has at most six
-    values_rad: tuple[float, ...]  # Where it is held
+    values_held: tuple[float, ...]  # Where it is held, rad or m
     # Mean number of joint solutions of a pose, those that cannot be reached among them
     solutions: float
     # Name of each joint that was tried -> that number, or why it is not held
@@ -51,7 +54,7 @@ class HeldJoint:
 
     def values(self) -> dict[int, tuple[float, ...]]:
         """Return what `InverseKinematics` takes."""
-        return {} if self.joint is None else {self.joint: self.values_rad}
+        return {} if self.joint is None else {self.joint: self.values_held}
 
 
 def propose_held_joint(chain: SerialChain, facing: FloatArray) -> HeldJoint:
@@ -107,7 +110,13 @@ def propose_held_joint(chain: SerialChain, facing: FloatArray) -> HeldJoint:
     assert best is not None
     count, joint = best
     kinematics, tried = able[joint], {name: tried[name] for name in chain.joint_names}
-    if count < FEW_SOLUTIONS:
+    if chain.slides[joint]:
+        low, high = chain.lower[joint], chain.upper[joint]
+        # To millimetres, as cell files have them.
+        values = tuple(round(low + share * (high - low), 3) for share in SHARES)
+        kinematics = InverseKinematics(chain, {joint: values})
+        count = _mean_solutions(kinematics, facing)
+    elif count < FEW_SOLUTIONS:
         value, span = kinematics.held[joint][0], (chain.lower[joint], chain.upper[joint])
         values = tuple(value + step for step in OTHER_VALUES if span[0] < value + step < span[1])
         kinematics = InverseKinematics(chain, {joint: values})
@@ -116,8 +125,10 @@ def propose_held_joint(chain: SerialChain, facing: FloatArray) -> HeldJoint:
 
 
 def _resting(chain: SerialChain, joint: int) -> float:
-    """Return 0 where it is well inside the limits of a joint, else their middle, rad."""
+    """Return 0 where it is well inside the limits of a joint, else their middle, rad or m."""
     low, high = chain.lower[joint], chain.upper[joint]
+    if chain.slides[joint]:
+        return float(low + high) / 2
     if not np.isfinite(high - low):
         return 0.0
     margin = 0.2 * (high - low)
@@ -126,8 +137,7 @@ def _resting(chain: SerialChain, joint: int) -> float:
 
 
 def _random_joints(chain: SerialChain, count: int, rng: np.random.Generator) -> FloatArray:
-    low, high = np.maximum(chain.lower, -_TURN), np.minimum(chain.upper, _TURN)
-    return rng.uniform(low, high, (count, len(chain)))
+    return rng.uniform(*chain.usual_range, (count, len(chain)))
 
 
 def _mean_solutions(kinematics: InverseKinematics, poses: FloatArray) -> float:
@@ -158,6 +168,26 @@ def link_radius(reach: Reach, full_size: float) -> float:
     return round(full_size * min(reach.reach_m / FULL_SIZE_M, 1.0), 3)
 
 
+def turned_to(
+    chain: SerialChain,
+    sensor_R: FloatArray,
+    max_angle_deg: float,
+    rng: np.random.Generator,
+) -> float:
+    """Return the angle within which the tool can face a sensor, degrees.
+
+    That is `max_angle_deg`, but for an arm that cannot turn its tool so, like a SCARA, whose tool
+    stays upright: it has an angle within which nearly all of its places face the sensor.
+    """
+    T = chain.forward(_random_joints(chain, 3000, rng))
+    to_sensor = sensor_R - T[:, :3, 3]
+    cosines = np.sum(T[:, :3, 2] * to_sensor, axis=1) / np.linalg.norm(to_sensor, axis=1)
+    angles = np.degrees(np.arccos(np.clip(cosines, -1.0, 1.0)))
+    if np.sum(angles <= max_angle_deg) >= FACING:
+        return max_angle_deg
+    return float(min(5.0 * np.ceil(np.quantile(angles, MOST) / 5.0), 180.0))
+
+
 def widest_ranges(reach: Reach, floor_z: float | None) -> PoseRanges:
     """Return ranges of poses everywhere around an arm."""
     lowest = reach.low_m if floor_z is None else max(reach.low_m, floor_z + 0.1 * reach.reach_m)
@@ -182,7 +212,9 @@ def ranges_around(places: FloatArray) -> PoseRanges:
 
 
 def marker_height(chain: SerialChain, bodies: Sequence[Body], link_radius: float) -> float:
-    """Return how far along the tool's Z axis a marker is clear of the arm, m.
+    """Return where on the tool's Z axis a marker is clear of the arm, m.
+
+    It is in front of the last link, or behind it where Z points back along the arm.
 
     Parameters
     ----------
@@ -191,13 +223,23 @@ def marker_height(chain: SerialChain, bodies: Sequence[Body], link_radius: float
     link_radius
         How thick links are for the line of sight, m.
     """
-    last = [body.outline for body in bodies if body.link == len(chain)]
     # The last joint's origin ends the link before it.
     T_T_joint = inverse(chain.T_fixed[-1])
-    along = [T_T_joint[2, 3] + link_radius]
-    if last:
-        along.append(apply(T_T_joint, np.concatenate(last))[:, 2].max())
-    return max(LEAST_MARKER_M, float(np.ceil(100.0 * (max(along) + CLEAR_M)) / 100.0))
+    ends = [T_T_joint[2, 3] + link_radius, link_radius - T_T_joint[2, 3]]
+    before, (ahead, back) = list(ends), ends
+    for body in bodies:
+        if body.link == len(chain):
+            z = apply(T_T_joint, body.outline)[:, 2]
+            ahead, back = max(ahead, z.max()), max(back, -z.min())
+    for body in arm_bodies(chain, bodies, link_radius):
+        if body.link == len(chain) - 1:
+            outline = body.outline - chain.T_fixed[-2][:3, 3]
+            points = apply(T_T_joint, outline @ chain.T_fixed[-2][:3, :3])
+            points = points[np.hypot(*points[:, :2].T) < link_radius + CLEAR_M]
+            before = [max([e, *s]) for e, s in zip(before, (points[:, 2], -points[:, 2]))]
+    points_back = max(back, before[1]) < max(ahead, before[0])
+    clear = np.ceil(100.0 * ((back if points_back else ahead) + CLEAR_M)) / 100.0
+    return float(max(LEAST_MARKER_M, clear) * (-1.0 if points_back else 1.0))
 
 
 def _rounded(values: FloatArray, step: float) -> tuple[float, float]:

@@ -67,9 +67,9 @@ class CollectionPlan:
     # Motion, settling and dwell of all visits, s: of the whole session where all of it is ahead
     robot_time_s: float
     max_tool_speed_m_s: float  # Of the fastest point of arm and tool, m/s
-    # Expected standard deviation of each joint's offset, rad; None where not identifiable
+    # Expected standard deviation of each joint's offset, rad or m; None where not identifiable
     joint_std: Mapping[str, float | None]
-    joint_rms: float  # Root mean square of them, rad
+    joint_rms: float  # Root mean square of them, rad; see `DesignInformation.joint_rms`
     tool_rms: float  # Root mean square of the 3-D error of the predicted markers, m
     designed: Designed | None  # Of an optimal design; None without one
     # What these configurations do not determine at all, so that there are no standard deviations

@@ -76,6 +76,7 @@ class DesignInformation:
     scale: FloatArray  # (f,)
     identifiable: Mapping[int, int]  # Joint -> its index among the free parameters
     names: tuple[str, ...]  # Of the free parameters, as the fit has them
+    per_radian: FloatArray  # What of each joint's unit counts as a radian, (k,)
 
     @classmethod
     def of(
@@ -165,6 +166,7 @@ class DesignInformation:
                 if not held.why[joint]
             },
             tuple(names),
+            chain.per_radian,
         )
 
     def __len__(self) -> int:
@@ -259,7 +261,7 @@ class DesignInformation:
         return information + UNKNOWN * np.eye(len(self.scale))
 
     def joint_std(self, chosen: Sequence[int]) -> dict[str, float | None]:
-        """Return the expected standard deviation of each joint, rad; None if not identifiable."""
+        """Return each joint's expected standard deviation, rad or m; None if not identifiable."""
         variance = np.diag(self.covariance(chosen))
         return {
             name: float(np.sqrt(variance[self.identifiable[joint]]))
@@ -269,8 +271,15 @@ class DesignInformation:
         }
 
     def joint_rms(self, chosen: Sequence[int]) -> float:
-        """Return the root mean square of the identifiable joints' standard deviations, rad."""
-        std = [value for value in self.joint_std(chosen).values() if value is not None]
+        """Return the root mean square of the identifiable joints' standard deviations, rad.
+
+        That of a joint that slides is divided by `SerialChain.per_radian`.
+        """
+        std = [
+            value / unit
+            for value, unit in zip(self.joint_std(chosen).values(), self.per_radian)
+            if value is not None
+        ]
         return float(np.sqrt(np.mean(np.square(std))))
 
     def tool_rms(self, chosen: Sequence[int]) -> float:

@@ -89,11 +89,12 @@ class Goal:
         """
         parts = []
         if self.tool_share < 1.0:
-            places = sorted(information.identifiable.values())
+            places = list(information.identifiable.values())
             if not places:
                 raise InsufficientDataError('the poses determine the zero-offset of no joint')
+            units = information.per_radian[list(information.identifiable)]
             joints = np.zeros((len(information.scale), len(places)))
-            joints[places, np.arange(len(places))] = information.scale[places]
+            joints[places, np.arange(len(places))] = information.scale[places] / units
             share = (1.0 - self.tool_share) / len(places)
             parts.append(np.sqrt(share) / self.joint_std_rad * joints)
         if self.tool_share > 0.0:

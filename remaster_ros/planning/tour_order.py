@@ -117,7 +117,7 @@ class Tour:
         order: Sequence[tuple[str, int, int]] = (),
         begin_at: int = 0,
     ) -> None:
-        self._chain, self._model = chain, model
+        self.chain, self._model = chain, model
         self.order, self.begin_at = tuple(order), begin_at
         self.reference_every = reference_every
         self.in_order, self.one_solution = in_order, one_solution
@@ -176,7 +176,7 @@ class Tour:
 
     def _again(self, plans: Mapping[str, Plan], model: CollisionModel | None) -> Tour:
         return Tour(
-            self._chain,
+            self.chain,
             plans,
             in_order=self.in_order,
             one_solution=self.one_solution,
@@ -207,7 +207,7 @@ class Tour:
 
     def _nearest(self, left: Sequence[tuple[str, int]], q: FloatArray) -> tuple[str, int]:
         """Return which pose is next where no order is given."""
-        here = self._chain.forward(q)[:3, 3]
+        here = self.chain.forward(q)[:3, 3]
         places = [self.plans[split].poses[index].T_R_T[:3, 3] for split, index in left]
         distances = np.linalg.norm(np.array(places) - here, axis=1)
         return left[0 if self.in_order else int(np.argmin(distances))]
@@ -244,14 +244,14 @@ class Tour:
         """
         goals = [pose.solutions[0] for pose in self.plans[REFERENCE].poses]
         goal, before = goals[index], goals[index - 1]
-        last = free_way(self._model, before, goal, self._chain.velocity_limits, index)
+        last = free_way(self._model, before, goal, self.chain.velocity_limits, index)
         if last is not None:
             if nearest_solution(before[None], q) is not None:
                 return last
-            first = free_way(self._model, q, before, self._chain.velocity_limits, index)
+            first = free_way(self._model, q, before, self.chain.velocity_limits, index)
             if first is not None:
                 return np.concatenate((first, before[None], last))
-        return free_way(self._model, q, goal, self._chain.velocity_limits, index)
+        return free_way(self._model, q, goal, self.chain.velocity_limits, index)
 
     def take(self, proposed: PoseVisit) -> PoseVisit:
         """Count a proposed stop visited and return it with its number."""
@@ -340,7 +340,7 @@ class Tour:
         # The same draws whenever this pose is planned: a tour can be repeated.
         rng = np.random.default_rng([index, *split.encode()])
         order, paths = free_order(
-            self._model, q, solutions, self._chain.velocity_limits, rng, self.one_solution
+            self._model, q, solutions, self.chain.velocity_limits, rng, self.one_solution
         )
         found = [ids[i] for i in order]
         if self.one_solution:

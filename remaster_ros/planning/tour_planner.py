@@ -307,7 +307,7 @@ class TourPlanner:
         InputError
             The arm cannot stand at one of them.
         """
-        margin = self.scene.limit_margin_rad
+        margin = self.scene.limit_margin_rad * self._chain.per_radian
         for number, (one, why) in enumerate(zip(q, self.model.reasons(q, RESERVE_M)), 1):
             if why or not self._chain.within_limits(one, -margin):
                 raise InputError(

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from remaster_ros.kinematics.collision import CollisionModel
-from remaster_ros.motion.limits import ACCELERATION, MotionLimits
+from remaster_ros.motion.limits import MotionLimits
 from remaster_ros.motion.path_check import PointSpeeds
 from remaster_ros.motion.trajectory import HEADROOM, RAMP_S, STOPPABLE, Trajectory, plan_trajectory
 from remaster_ros.types import FloatArray
@@ -40,7 +40,7 @@ class TravelTime:
         model: CollisionModel,
         speed_share: float = SPEED_SHARE,
         tool_speed: float = np.inf,
-        acceleration: FloatArray | float = ACCELERATION,
+        acceleration: FloatArray | float | None = None,
         settle_s: float = SETTLE_S,
         dwell_s: float = DWELL_S,
     ) -> TravelTime:
@@ -55,7 +55,7 @@ class TravelTime:
         tool_speed
             Largest speed of the fastest point of arm and tool, m/s; infinite for none.
         acceleration
-            Largest joint acceleration, rad/s², for all joints or (k,).
+            As of `MotionLimits.of`.
         settle_s, dwell_s
             See the attributes.
         """

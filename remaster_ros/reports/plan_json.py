@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from remaster_ros.kinematics.serial_chain import LEVER_M, SerialChain
 from remaster_ros.planning.collection_plan import FITTED, CollectionPlan, Expected
 from remaster_ros.planning.planned_design import DesignSettings
 from remaster_ros.planning.separating_design import DECIDED, SeparatingDesign
@@ -21,7 +22,8 @@ def plan_to_dict(plan: CollectionPlan) -> dict[str, Any]:
 
     ``robot_time_s`` is that of the whole session: registration, what is fitted, what is held out
     and references. ``dropped`` counts poses that lost all their solutions,
-    ``dropped_configurations`` solutions. ``expected_tool_std_mm`` is the root mean square of the
+    ``dropped_configurations`` solutions. Joints that slide are in ``expected_std_mm`` in place of
+    ``expected_std_deg``. ``expected_tool_std_mm`` is the root mean square of the
     3-D error of the predicted markers.
     """
     visits = Counter(visit.split for visit in plan.visits)
@@ -31,7 +33,7 @@ def plan_to_dict(plan: CollectionPlan) -> dict[str, Any]:
         'poses': sum(count for split, count in plan.poses.items() if split != REFERENCE),
         'dropped': dict(plan.tour.dropped),
         'robot_time_s': round(plan.robot_time_s, 1),
-        'expected_std_deg': _degrees(plan.joint_std),
+        **_expected_std(plan.joint_std, plan.tour.chain),
         'expected_tool_std_mm': plan.tool_rms * 1e3,
         'max_tool_speed_m_s': round(plan.max_tool_speed_m_s, 4),
         'splits': {
@@ -91,7 +93,7 @@ def plan_text(plan: CollectionPlan, settings: DesignSettings) -> str:
         f'robot time of the whole session: {minutes_text(plan.robot_time_s)}, '
         f'fastest point at {plan.max_tool_speed_m_s:.2f} m/s',
     ]
-    lines += _expected_lines(plan.joint_std, plan.joint_rms, plan.tool_rms)
+    lines += _expected_lines(plan.tour.chain, plan.joint_std, plan.joint_rms, plan.tool_rms)
     if plan.separated is not None:
         lines += _separated_text(plan.separated)
     if missed := missed_goal(plan):
@@ -106,7 +108,7 @@ def outlook_to_dict(tour: Tour, expected: Expected) -> dict[str, Any]:
         'poses': sum(tour.poses.values()),
         'dropped': dict(tour.dropped),
         'dropped_configurations': dict(tour.dropped_solutions),
-        'expected_std_deg': _degrees(expected.joint_std),
+        **_expected_std(expected.joint_std, tour.chain),
         'expected_tool_std_mm': expected.tool_rms * 1e3,
         'splits': {
             split: {'poses': poses, 'configurations': tour.configurations[split]}
@@ -124,27 +126,40 @@ def outlook_text(tour: Tour, expected: Expected) -> str:
         f'held out: {held_out[0]} configurations at {held_out[1]} poses',
         f'dropped poses: {_counts(tour.dropped)}',
     ]
-    return '\n'.join([*lines, *_expected_lines(*expected)])
+    return '\n'.join([*lines, *_expected_lines(tour.chain, *expected)])
 
 
 def _expected_lines(
-    joint_std: Mapping[str, float | None], joint_rms: float, tool_rms: float
+    chain: SerialChain, joint_std: Mapping[str, float | None], joint_rms: float, tool_rms: float
 ) -> list[str]:
     lines = ['expected standard deviation of the offsets:']
-    for name, std in joint_std.items():
-        value = 'not identifiable' if std is None else f'{np.degrees(std):.4f} deg'
+    for joint, (name, std) in enumerate(joint_std.items()):
+        value = 'not identifiable' if std is None else chain.shown_offset(joint, std, 4)
         lines.append(f'  {name:20s} {value}')
     return [
         *lines,
-        f'  {"root mean square":20s} {np.degrees(joint_rms):.4f} deg',
+        f'  {"root mean square":20s} {np.degrees(joint_rms):.4f} deg{slides_in_rms(chain)}',
         f'expected error of the predicted markers: {tool_rms * 1e3:.3f} mm (RMS)',
     ]
 
 
-def _degrees(joint_std: Mapping[str, float | None]) -> dict[str, float | None]:
-    return {
-        name: None if std is None else float(np.degrees(std)) for name, std in joint_std.items()
-    }
+def slides_in_rms(chain: SerialChain) -> str:
+    """Return how joints that slide count in a root mean square of degrees; '' for none."""
+    per_degree = 1e3 * np.radians(LEVER_M)
+    return f', where {per_degree:.2f} mm count as a degree' if chain.slides.any() else ''
+
+
+def _expected_std(
+    joint_std: Mapping[str, float | None], chain: SerialChain
+) -> dict[str, dict[str, float | None]]:
+    """Return them in degrees, and in mm where there are joints that slide."""
+    found: dict[str, dict[str, float | None]] = {'expected_std_deg': {}}
+    if chain.slides.any():
+        found['expected_std_mm'] = {}
+    for (name, std), slides in zip(joint_std.items(), chain.slides):
+        key, factor = ('mm', 1e3) if slides else ('deg', float(np.degrees(1.0)))
+        found[f'expected_std_{key}'][name] = None if std is None else factor * std
+    return found
 
 
 def _separated_text(design: SeparatingDesign) -> list[str]:

@@ -66,7 +66,8 @@ async function playPlan(plan) {
     const parts = [Math.floor(s / 60) % 60, s % 60].map((n) => String(n).padStart(2, '0'));
     return s >= 3600 ? `${Math.floor(s / 3600)}:${parts.join(':')}` : parts.join(':');
   };
-  const degrees = (angle) => ((angle * 180) / Math.PI).toFixed(1).replace('-', '\u2212');
+  // Degrees, or millimetres of a joint that slides.
+  const shown = (value, j) => (value * (plan.scene.slides[j] ? 1000 : 180 / Math.PI)).toFixed(1).replace('-', '\u2212');
 
   // One bar a joint, between its limits.
   const bars = plan.scene.joints.map((name, j) => {
@@ -82,7 +83,7 @@ async function playPlan(plan) {
     const high = plan.scene.upper[j] === null ? Math.PI : plan.scene.upper[j];
     return (q) => {
       bar.style.left = `${Math.min(Math.max((100 * (q[j] - low)) / (high - low), 0), 100)}%`;
-      angle.textContent = `${degrees(q[j])}°`;
+      angle.textContent = `${shown(q[j], j)}${plan.scene.slides[j] ? ' mm' : '°'}`;
     };
   });
 
@@ -159,7 +160,7 @@ async function playPlan(plan) {
       const q = visit.way[visit.way.length - 1];
       const cells = [
         words[visit.split], visit.pose + 1, clock(visit.arrive), (visit.arrive - visit.begin).toFixed(1),
-        visit.speed.toFixed(2), q.map(degrees).join(', '),
+        visit.speed.toFixed(2), q.map(shown).join(', '),
       ];
       cells.forEach((text, column) => {
         const cell = row.insertCell();

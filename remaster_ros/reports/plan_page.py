@@ -17,7 +17,7 @@ from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.motion.trajectory import RAMP_S, REST_S
 from remaster_ros.planning.collection_plan import FITTED, CollectionPlan
 from remaster_ros.planning.tour_order import REFERENCE, REGISTRATION
-from remaster_ros.reports.plan_json import HELD_OUT, minutes_text, missed_goal
+from remaster_ros.reports.plan_json import HELD_OUT, minutes_text, missed_goal, slides_in_rms
 from remaster_ros.reports.robot_scene import RobotScene, compressed, scene_to_dict, view_script
 from remaster_ros.session.files import make_folder, undone_on_failure, write_atomically
 from remaster_ros.version import __version__
@@ -95,6 +95,7 @@ def plan_page(
         dropped=_dropped(plan),
         joints=_joints(plan, scene.chain),
         rms_deg=float(np.degrees(plan.joint_rms)),
+        slides_in_rms=slides_in_rms(scene.chain),
         tool_mm=1e3 * plan.tool_rms,
         version=__version__,
         data=compressed(json.dumps(_played(plan, scene), separators=(',', ':'), allow_nan=False)),
@@ -187,28 +188,29 @@ def _dropped(plan: CollectionPlan) -> list[dict[str, Any]]:
 
 
 def _joints(plan: CollectionPlan, chain: SerialChain) -> list[dict[str, Any]]:
-    q = np.degrees([visit.q for visit in plan.visits])
+    factors = np.where(chain.slides, 1e3, np.degrees(1.0))
+    q = factors * np.array([visit.q for visit in plan.visits])
     return [
         {
-            'name': name,
-            'std': None if std is None else float(np.degrees(std)),
+            'name': f'{name} (mm)' if chain.slides[joint] else name,
+            'std': None if std is None else float(factors[joint] * std),
             'low': float(q[:, joint].min()),
             'high': float(q[:, joint].max()),
-            'limits': _limits(chain.lower[joint], chain.upper[joint]),
+            'limits': _limits(chain, joint),
         }
         for joint, name in enumerate(chain.joint_names)
         for std in (plan.joint_std.get(name),)
     ]
 
 
-def _limits(lower: float, upper: float) -> str:
-    if not np.isfinite([lower, upper]).all():
+def _limits(chain: SerialChain, joint: int) -> str:
+    if not np.isfinite([chain.lower[joint], chain.upper[joint]]).all():
         return 'none'
-    return f'{np.degrees(lower):.0f} to {np.degrees(upper):.0f}'.replace('-', '\N{MINUS SIGN}')
+    return chain.shown_limits(joint).replace('-', '\N{MINUS SIGN}')
 
 
 def _played(plan: CollectionPlan, scene: RobotScene) -> dict[str, Any]:
-    """Return what plan_page.js plays: angles in rad, times in s."""
+    """Return what plan_page.js plays: joint positions in rad and m, times in s."""
     return {
         'scene': scene_to_dict(scene),
         'start': _rounded(plan.visits[0].points[0]),

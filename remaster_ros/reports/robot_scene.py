@@ -255,6 +255,7 @@ def scene_to_dict(scene: RobotScene) -> dict[str, Any]:
         'upper': [_limit(angle) for angle in chain.upper],
         'T_fixed': np.round(chain.T_fixed.reshape(-1, 16), 7).tolist(),
         'axes': chain.axes.tolist(),
+        'slides': chain.slides.tolist(),
         'reach': float(reach),
         'floor_z': scene.floor_z,
         'sights': [

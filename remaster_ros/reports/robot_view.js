@@ -17,6 +17,7 @@ class RobotView {
     this.scene = scene;
     this.fixed = scene.T_fixed.map((values) => new THREE.Matrix4().set(...values));
     this.axes = scene.axes.map((axis) => new THREE.Vector3(...axis));
+    this.slides = scene.slides;
     this.markers = scene.sights.map((sight) => new THREE.Vector3(...sight.marker));
     this.sensors = scene.sights.map((sight) => new THREE.Vector3(...sight.place));
     this.themed = [];
@@ -62,9 +63,11 @@ class RobotView {
   frames(q) {
     const frames = [new THREE.Matrix4()];
     const T = new THREE.Matrix4();
-    const turn = new THREE.Matrix4();
+    const move = new THREE.Matrix4();
     this.axes.forEach((axis, i) => {
-      T.multiply(this.fixed[i]).multiply(turn.makeRotationAxis(axis, q[i]));
+      if (this.slides[i]) move.makeTranslation(axis.x * q[i], axis.y * q[i], axis.z * q[i]);
+      else move.makeRotationAxis(axis, q[i]);
+      T.multiply(this.fixed[i]).multiply(move);
       frames.push(T.clone());
     });
     frames.push(T.multiply(this.fixed[this.axes.length]));

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from textwrap import wrap
 
@@ -50,6 +50,8 @@ class CellProposal:
         Rough place of the sensors in the base, m, (3,).
     sensors
         Names among `SENSORS`.
+    max_angle_deg
+        Of each of them, between the tool's Z axis and the line to it.
     mesh_path
         Folders in which the meshes were found.
     missing_meshes
@@ -75,6 +77,7 @@ class CellProposal:
     link_radius: float
     sensor_R: Sequence[float]
     sensors: Sequence[str]
+    max_angle_deg: Mapping[str, float]
     mesh_path: Sequence[str]
     missing_meshes: Sequence[str]
     floor_z: float | None
@@ -93,8 +96,8 @@ def cell_text(p: CellProposal) -> str:
     chain, ranges = p.chain, p.ranges
     others = ', '.join(tip for tip in p.tips if tip != chain.tip_link)
     limits = ', '.join(
-        f'{name} {_limit(low)} to {_limit(high)}'
-        for name, low, high in zip(chain.joint_names, chain.lower, chain.upper)
+        f'{name} {chain.shown_limits(joint)}{" mm" if chain.slides[joint] else ""}'
+        for joint, name in enumerate(chain.joint_names)
     )
     azimuth = np.degrees(ranges.azimuth_rad)
     parts = [
@@ -131,7 +134,7 @@ def cell_text(p: CellProposal) -> str:
             f'front of the arm, which reaches {p.reach.reach_m:.2f} m.'
         ),
         'sensors:',
-        *(line for name in p.sensors for line in _sensor_lines(name, p.sensor_R)),
+        *(line for name in p.sensors for line in _sensor_lines(name, p)),
         '',
         *_comment("The tool's Z axis points at this sensor."),
         f'aim_at: {p.sensors[0]}',
@@ -183,6 +186,9 @@ def _held_lines(p: CellProposal) -> list[str]:
         f'{name} {count:.1f}' if isinstance(count, float) else f'{name} none ({count})'
         for name, count in held.tried.items()
     )
+    values = f'held_values_deg: [{", ".join(f"{np.degrees(v):.1f}" for v in held.values_held)}]'
+    if chain.slides[held.joint]:
+        values = f'held_values_m: [{", ".join(f"{value:.3f}" for value in held.values_held)}]'
     return [
         *_comment(
             'Seven joints leave one free: this one is held, which gives poses the most joint '
@@ -190,13 +196,15 @@ def _held_lines(p: CellProposal) -> list[str]:
             'poses, and determine the offset of this joint better. ' + held.kinematics.in_words()
         ),
         f'held_joint: {_value(chain.joint_names[held.joint])}',
-        f'held_values_deg: [{", ".join(f"{np.degrees(value):.1f}" for value in held.values_rad)}]',
+        values,
     ]
 
 
-def _sensor_lines(name: str, place: Sequence[float]) -> list[str]:
-    sensor = SENSORS[name]
+def _sensor_lines(name: str, p: CellProposal) -> list[str]:
+    sensor, place, angle = SENSORS[name], p.sensor_R, p.max_angle_deg[name]
     why = 'a retroreflector' if sensor.single_shot else 'a sphere is seen from far round'
+    if angle > sensor.max_angle_deg:
+        why = 'CHECK: the arm cannot turn its tool to the sensor; it is to see the marker so'
     service = [f'    measure_service: {sensor.measure_service}'] if sensor.measure_service else []
     return [
         f'  {name}:',
@@ -205,7 +213,7 @@ def _sensor_lines(name: str, place: Sequence[float]) -> list[str]:
         f'    single_shot: {_value(sensor.single_shot)}',
         *service,
         f'    rough_position_m: [{", ".join(f"{value:.1f}" for value in place)}]',
-        f'    max_angle_deg: {sensor.max_angle_deg}   # {why}',
+        f'    max_angle_deg: {angle}   # {why}',
     ]
 
 
@@ -223,10 +231,6 @@ def _mesh_lines(p: CellProposal) -> list[str]:
 
 def _comment(text: str) -> list[str]:
     return [f'# {line}' for line in wrap(text, 97, break_long_words=False)]
-
-
-def _limit(angle: float) -> str:
-    return f'{np.degrees(angle):.0f}' if np.isfinite(angle) else 'without end'
 
 
 def _value(value: str | float | bool | None) -> str:

@@ -152,8 +152,8 @@ def read_arm(
     try:
         model = parse_urdf(urdf)
         names = _words(tables)
-        base = likely_base(model, names, sliding=True) if base_link is None else base_link
-        tip = likely_tip(model, base, names, sliding=True) if tip_link is None else tip_link
+        base = likely_base(model, names) if base_link is None else base_link
+        tip = likely_tip(model, base, names) if tip_link is None else tip_link
         return urdf, SerialChain.from_urdf(urdf, base, tip, sliding=True)
     except InputError as error:
         raise InputError(f'{path}: {error}') from None

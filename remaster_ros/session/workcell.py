@@ -300,7 +300,7 @@ MARKER_STD = Bounds(0.0, 0.02, 'm', above=True)
 LINK_RADIUS_M = 0.075
 NO_MOTION = (
     'urdf_text', 'file', 'mesh_path', 'confirm', 'poses', 'aim_at', 'held_joint',
-    'held_values_deg', 'marker_std_m', 'sensors',
+    'held_values_deg', 'held_values_m', 'marker_std_m', 'sensors',
 )  # fmt: skip
 """What of a cell decides where an arm goes or where files lie, not whether it may go there."""
 CLEARANCE = Bounds(HALF_STEP_M, 1.0, 'm', remedy='; half the step of a path check is the least')
@@ -369,6 +369,7 @@ class Workcell(msgspec.Struct, forbid_unknown_fields=True):
     marker_std_m: Annotated[float, MARKER_STD] = 0.5e-3
     held_joint: str | None = ''
     held_values_deg: list[float] | None = []
+    held_values_m: list[float] | None = []  # In place of these where the joint slides
     poses: CellPoses = msgspec.field(default_factory=CellPoses)
     link_radius_m: Annotated[float, Bounds(0.0, 1.0, 'm', above=True)] = LINK_RADIUS_M
     obstacles: dict[str, CellBox] = {}
@@ -387,9 +388,10 @@ class Workcell(msgspec.Struct, forbid_unknown_fields=True):
     # Where it was read from; nothing a plan depends on.
     file: str = ''
 
-    def chain(self) -> SerialChain:
-        """Build the arm's kinematic chain."""
-        return SerialChain.from_urdf(self.urdf_text, self.robot.base_link, self.robot.tip_link)
+    def chain(self, *, sliding: bool = False) -> SerialChain:
+        """Build the arm's kinematic chain; ``sliding`` as of `SerialChain.from_urdf`."""
+        ends = self.robot.base_link, self.robot.tip_link
+        return SerialChain.from_urdf(self.urdf_text, *ends, sliding=sliding)
 
     def fingerprint(self) -> str:
         """Return a checksum of all that a plan depends on."""
@@ -417,16 +419,22 @@ class Workcell(msgspec.Struct, forbid_unknown_fields=True):
         )
 
     def held(self, chain: SerialChain) -> dict[int, tuple[float, ...]] | None:
-        """Return the held joint's index and values (rad), or None."""
+        """Return the held joint's index and values (rad or m), or None."""
         if not self.held_joint:
             return None
         index = chain.joint_names.index(self.held_joint)
+        if chain.slides[index]:
+            return {index: tuple(self.held_values_m or [])}
         return {index: tuple(np.deg2rad(self.held_values_deg or []))}
 
     def acceleration_limits(self, chain: SerialChain) -> FloatArray:
-        """Return each joint's acceleration limit, rad/s², (k,)."""
-        given = np.array(self.acceleration_limit_rad_s2, dtype=float)
-        return np.broadcast_to(given, (len(chain),)).copy()
+        """Return each joint's acceleration limit, rad/s² or m/s², (k,).
+
+        One number is for joints that turn; those that slide have `SerialChain.per_radian` times
+        as much.
+        """
+        given = self.acceleration_limit_rad_s2
+        return np.array(given) if isinstance(given, list) else given * chain.per_radian
 
     def collision_model(
         self,
@@ -568,7 +576,7 @@ def parse_cell(data: bytes, path: Path) -> Workcell:
 def _check(path: Path, cell: Workcell, text: str) -> None:
     """Refuse names that point nowhere and values that contradict each other."""
     try:
-        chain = cell.chain()
+        chain = cell.chain(sliding=True)
     except InputError as error:
         raise InputError(f'{path.parent / cell.robot.urdf}: {error}') from None
     if problem := _problem(cell, chain):
@@ -581,7 +589,14 @@ def _problem(cell: Workcell, chain: SerialChain) -> str:
         known = ', '.join(chain.joint_names)
         meant = did_you_mean(cell.held_joint, chain.joint_names)
         return f'held_joint {cell.held_joint!r} is none of {known}{meant}'
-    if cell.held_joint and not cell.held_values_deg:
+    slides = bool(cell.held_joint) and chain.slides[chain.joint_names.index(cell.held_joint)]
+    if cell.held_values_m and not slides:
+        return 'held_values_m is for a held_joint that slides; write held_values_deg'
+    if cell.held_values_deg and slides:
+        return f'held_values_deg are angles, and {cell.held_joint} slides; write held_values_m'
+    if slides and not cell.held_values_m:
+        return 'held_values_m is empty; give at least one place, m'
+    if cell.held_joint and not slides and not cell.held_values_deg:
         return 'held_values_deg is empty; give at least one angle'
     if not cell.sensors:
         return 'sensors is empty; name at least one'

@@ -15,6 +15,7 @@ from remaster_ros.cli.main import main
 from remaster_ros.cli.plan import free_start
 from remaster_ros.compensation.arm_model import Geometry
 from remaster_ros.compensation.export import calibrated_urdf
+from remaster_ros.errors import InputError
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.planning import planned_design, pose_design
 from remaster_ros.session.workcell import read_cell
@@ -294,16 +295,64 @@ def test_a_five_axis_arm_with_a_gripper_is_prepared_and_planned(do, tmp_path, ca
     assert read_cell(tmp_path / 'cell.yaml').link_radius_m < 0.04
 
 
-def test_a_rail_that_carries_the_arm_is_left_alone_and_said_so(do, tmp_path):
+@pytest.mark.skipif(not CASES.is_dir(), reason='the descriptions of ../shared/cases are not here')
+def test_a_scara_is_prepared_and_planned(do, tmp_path, capsys):
+    status, printed, _ = do(CASES / 'scara.urdf')
+    assert status == 0
+    assert '4 joints between base_link and tool0' in printed
+    text = (tmp_path / 'cell.yaml').read_text()
+    assert 'CHECK: the arm cannot turn its tool to the sensor' in text
+    assert 'j3 0 to 200 mm' in text.replace('\n# ', ' ')
+    capsys.readouterr()
+    assert main(['plan', str(tmp_path / 'cell.yaml'), '--json']) == 0
+    plan = json.loads(capsys.readouterr().out)
+    assert plan['splits']['optimization']['poses'] >= 10
+    # All of its axes are parallel: only the elbow's angle is seen by a marker.
+    assert plan['expected_std_mm'] == {'j3': None}
+    assert {name for name, std in plan['expected_std_deg'].items() if std} == {'j2'}
+
+
+def test_a_rail_is_planned_with_the_arm_where_the_base_link_says_so(do, tmp_path, capsys):
+    path = on_rail(tmp_path)
+    status, printed, _ = do(path, '--base-link', 'hall')
+    assert status == 0
+    assert 'rail is held at -500 mm, 0 mm, 500 mm' in printed
+    cell = read_cell(tmp_path / 'cell.yaml')
+    assert cell.held_values_m == [-0.5, 0.0, 0.5]
+    assert re.search(r'root mean square +[\d.]+ deg, where 4.36 mm count as a degree', printed)
+    # What moves an arm takes none yet, nor does a check.
+    for verb in (['plan', '--check', str(tmp_path / 'check.csv')], ['simulate']):
+        capsys.readouterr()
+        more = [str(tmp_path / 'session')] if verb == ['simulate'] else []
+        cell_args = ['--cell'] if verb == ['simulate'] else []
+        args = [verb[0], *more, *cell_args, str(tmp_path / 'cell.yaml'), *verb[1:]]
+        assert main(args) == 2
+        assert "joint 'rail' is prismatic" in capsys.readouterr().err
+    text = (tmp_path / 'cell.yaml').read_text()
+    for values, words in (
+        ('held_values_m: []', 'held_values_m is empty'),
+        ('held_values_deg: [0.0]', 'rail slides; write held_values_m'),
+    ):
+        wrong = re.sub('held_values_m: .*', values, text)
+        (tmp_path / 'wrong.yaml').write_text(wrong)
+        with pytest.raises(InputError, match=words):
+            read_cell(tmp_path / 'wrong.yaml')
+
+
+def on_rail(folder):
     text = ROBOTS['irb120']().urdf.replace(
         '</robot>',
         '<link name="hall"/><joint name="rail" type="prismatic"><parent link="hall"/>'
         '<child link="base_link"/><axis xyz="1 0 0"/>'
         '<limit lower="-1" upper="1" effort="1" velocity="1"/></joint></robot>',
     )
-    path = tmp_path / 'on_rail.urdf'
+    path = folder / 'on_rail.urdf'
     path.write_text(text)
-    status, printed, _ = do(path)
+    return path
+
+
+def test_a_rail_that_carries_the_arm_is_left_alone_and_said_so(do, tmp_path):
+    status, printed, _ = do(on_rail(tmp_path))
     assert status == 0
     assert '6 joints between base_link and tool0' in printed
     sentence = 'rail carries the whole arm, and is no joint of it here: leave it where it is'

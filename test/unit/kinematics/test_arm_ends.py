@@ -36,7 +36,7 @@ def test_a_base_without_an_arm_is_refused():
     model = parse_urdf(xarm7().urdf)
     with pytest.raises(InputError, match="there is no link 'nowhere'; it has link_base, link1"):
         likely_tips(model, 'nowhere')
-    with pytest.raises(InputError, match="no joint turns behind link 'link_eef'"):
+    with pytest.raises(InputError, match="no joint moves behind link 'link_eef'"):
         likely_tips(model, 'link_eef')
 
 
@@ -116,12 +116,35 @@ def test_the_arm_on_a_lift_of_a_mobile_base_starts_behind_the_lift():
     assert moving_before(model, 'torso') == ['lift']
 
 
-def test_an_arm_that_slides_in_its_midst_is_refused_by_the_joints_name():
-    model = tree(
-        ('j1', 'base', 'l1'),
-        ('j2', 'l1', 'l2'),
-        ('j3', 'l2', 'l3', 'prismatic'),
-        ('j4', 'l3', 'tool0'),
-    )
+SCARA = (
+    ('j1', 'base', 'l1'),
+    ('j2', 'l1', 'l2'),
+    ('j3', 'l2', 'l3', 'prismatic'),
+    ('j4', 'l3', 'tool0'),
+)
+
+
+def test_an_arm_that_slides_in_its_midst_goes_on_behind_it():
+    model = tree(*SCARA)
+    assert likely_base(model) == 'base'
+    assert likely_tip(model, 'base') == 'tool0'
+    assert likely_tip(model, 'base', ('j1', 'j2', 'j3', 'j4')) == 'tool0'
+    # A table that names the others only is of something else.
     with pytest.raises(InputError, match=r"joint 'j3' of the arm slides, .* with 'j4'"):
-        likely_tip(model, likely_base(model))
+        likely_tip(model, likely_base(model), ('j1', 'j2'))
+
+
+def test_a_rail_is_of_the_arm_where_what_it_carries_is_none_or_a_base_says_so():
+    gantry = (
+        ('x', 'hall', 'a', 'prismatic'),
+        ('y', 'a', 'b', 'prismatic'),
+        ('c', 'b', 'tool0'),
+    )
+    assert likely_base(tree(*gantry)) == 'hall'
+    assert likely_tips(tree(*gantry), 'hall') == ['tool0']
+    on_rail = tree(('rail', 'hall', 'l0', 'prismatic'), *FIVE)
+    assert likely_base(on_rail) == 'l0'
+    assert likely_tips(on_rail, 'hall') == ['l5']
+    # What slides behind a whole arm is its tool's.
+    pusher = tree(*FIVE, ('push', 'l5', 'plunger', 'prismatic'))
+    assert likely_tips(pusher, 'l0') == ['l5']

@@ -4,10 +4,12 @@ import numpy as np
 import pytest
 from arms import planar_arm
 from collision_scene import EXACT, at, capsules, distances
+from random_arm import random_arm_urdf
 
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.bodies import Body, box, cylinder, hull, obstacle, sphere
-from remaster_ros.kinematics.collision import HALF_STEP_M, CollisionModel
+from remaster_ros.kinematics.collision import HALF_STEP_M, CollisionModel, arm_bodies
+from remaster_ros.kinematics.serial_chain import SerialChain
 
 # Paths
 
@@ -57,6 +59,62 @@ def test_sweeps_agree_with_the_finest_sampling(lwr, seed):
         else:
             assert fine
     assert 0.1 < np.mean(outcomes) < 0.98
+
+
+def test_a_way_of_joints_that_slide_is_bounded_and_swept():
+    """Against dense sampling: no body moves further than `travel`, nothing is missed."""
+    seed = 3
+    print('seed', seed)
+    rng = np.random.default_rng(seed)
+    text = random_arm_urdf(rng, 5, slides=(0, 2)).replace('"-3" upper="3"', '"-0.8" upper="0.8"')
+    chain = SerialChain.from_urdf(text, tip_link='tool', sliding=True)
+    boxes = [obstacle(f'box {i}', rng.normal(0, 0.7, 3), [0.2, 0.3, 0.2]) for i in range(3)]
+    model = capsules(chain, 0.03, *boxes)
+    q = rng.uniform(chain.lower, chain.upper, (300, 5))
+    q = q[model.free_mask(q)]
+    outcomes = []
+    for start, goal in zip(q[::2], q[1::2]):
+        end = start + 0.5 * (goal - start)
+        way = start + np.linspace(0, 1, 400)[:, None] * (end - start)
+        # A point of the tool against the base, and against the link of the second joint.
+        frames, tip = chain.frames(way), chain.forward(way)[:, :3, 3]
+        behind = np.einsum('nji,nj->ni', frames[:, 1, :3, :3], tip - frames[:, 1, :3, 3])
+        for point in (tip, behind):
+            gone = np.sum(np.linalg.norm(np.diff(point, axis=0), axis=1))
+            assert gone <= model.travel(start, end) + 1e-9
+        trouble = model.path_trouble(np.array([start, end]))
+        outcomes.append(trouble == '')
+        fine = model.shortfalls(way)
+        if trouble == '':
+            assert all(s.distance > s.kept - HALF_STEP_M for s in fine)
+        else:
+            assert fine
+    assert 0.1 < np.mean(outcomes) < 0.98
+
+
+def test_what_leads_a_joint_that_slides_is_a_body():
+    """A rail along all of the way where the base has no shape; else a rod that slides along."""
+    text = random_arm_urdf(np.random.default_rng(4), 4, slides=(0, 2))
+    chain = SerialChain.from_urdf(text, tip_link='tool', sliding=True)
+    bodies = {body.name: body for body in arm_bodies(chain, [], 0.05)}
+    rail, rod = bodies['the rail'], bodies['the rod of joint_3']
+    assert (rail.link, rod.link) == (0, 3)
+    for q in np.random.default_rng(5).uniform(-3, 3, (20, 4)):
+        frames = chain.frames(q)
+        a, b, radius = rail.capsule
+        assert radius == pytest.approx(0.05)
+        # The carriage is on the rail.
+        along = (frames[0, :3, 3] - a) @ (b - a) / ((b - a) @ (b - a))
+        assert 0.0 <= along <= 1.0
+        np.testing.assert_allclose(frames[0, :3, 3], a + along * (b - a), atol=1e-9)
+        # The rod reaches from where the link would be at zero to where it is.
+        ends = [frames[2, :3, :3] @ end + frames[2, :3, 3] for end in rod.capsule[:2]]
+        zero = chain.frames(q * (1, 1, 0, 1))[2, :3, 3]
+        way = ends[1] - ends[0]
+        for place in (zero, frames[2, :3, 3]):
+            share = (place - ends[0]) @ way / (way @ way)
+            assert -1e-9 <= share <= 1 + 1e-9
+            np.testing.assert_allclose(place, ends[0] + share * way, atol=1e-9)
 
 
 def test_joint_limits_are_part_of_a_path(lwr):

@@ -28,6 +28,7 @@ CHAIN = Arm(
     lower=np.array([-1.0, -2.0, -np.inf]),
     upper=np.array([1.0, 2.0, np.inf]),
     velocity_limits=np.array([2.0, 4.0, np.inf]),
+    per_radian=np.ones(3),
 )
 
 
@@ -42,6 +43,14 @@ def test_the_limits_of_a_chain_and_a_share_of_its_speed():
     assert ACCELERATION == 5.0
     assert limits.tool_speed == np.inf
     assert limits.margin == 0.0
+
+
+def test_what_is_unknown_of_a_joint_that_slides_is_a_quarter_of_a_metre_for_a_radian():
+    rail = Arm(**{**vars(CHAIN), 'per_radian': np.array([0.25, 1.0, 0.25])})
+    limits = MotionLimits.of(rail, 0.5)
+    # What the model states is in m/s and stays.
+    np.testing.assert_allclose(limits.velocity, [1.0, 2.0, 0.125])
+    np.testing.assert_allclose(limits.acceleration, [1.25, 5.0, 1.25])
 
 
 def test_what_a_cell_sets_is_taken_as_it_is():

@@ -13,10 +13,17 @@ pin = pytest.importorskip('pinocchio', reason='a judge: pip install .[test]')
 URDF = Path(__file__).parents[3] / 'config' / 'robots' / 'iiwa7.urdf'
 
 
-@pytest.fixture(scope='module')
-def arm():
+@pytest.fixture(scope='module', params=['iiwa7', 'slides'])
+def arm(request):
+    """Return an arm whose joints all turn, and one of which the first and the fourth slide."""
     text = URDF.read_text(encoding='utf-8')
-    chain = SerialChain.from_urdf(text)
+    if request.param == 'slides':
+        for name in ('joint_1', 'joint_4'):
+            turns = f'<joint name="{name}" type="revolute">'
+            assert text.count(turns) == 1
+            text = text.replace(turns, turns.replace('revolute', 'prismatic'))
+    chain = SerialChain.from_urdf(text, sliding=True)
+    assert chain.slides.sum() == (2 if request.param == 'slides' else 0)
     rng = np.random.default_rng(4)
     # The third body has no points at all.
     extents = [rng.uniform(-0.2, 0.2, (n, 3)) for n in (3, 1, 0, 4, 2, 5, 8)]
@@ -86,12 +93,15 @@ def test_a_short_line_is_looked_at_its_ends_and_middle_and_a_long_one_often(arm)
     asked = Asked(chain, extents)
     asked.peak_m(np.zeros(7), np.zeros(7))
     assert len(asked.q) == 3
-    end = np.array([0.5, -1.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    end = np.array([0.2, -1.0, 0.0, 0.0, 0.0, 0.0, 0.0])
     asked.peak_m(np.zeros(7), end)
     assert len(asked.q) == 3 + 50
     np.testing.assert_array_equal(asked.q[0], 0.0)
     np.testing.assert_array_equal(asked.q[-1], end)
     assert np.max(np.abs(np.diff(asked.q, axis=0))) <= PEAK_STEP_RAD
+    # A quarter of a metre of a joint that slides is looked at as often as a radian.
+    asked.peak_m(np.zeros(7), 0.5 * np.eye(7)[0])
+    assert len(asked.q) == 3 + (100 if chain.slides[0] else 25)
 
 
 def test_an_arm_that_stands_has_no_fast_point_and_no_bodies_no_speed(arm):
@@ -102,6 +112,20 @@ def test_an_arm_that_stands_has_no_fast_point_and_no_bodies_no_speed(arm):
     np.testing.assert_array_equal(bare.fastest(q, np.ones((2, 7))), 0.0)
     with pytest.raises(ValueError, match='6 bodies for 7 joints'):
         PointSpeeds(chain, extents[:-1])
+
+
+def test_no_point_is_farther_from_a_joint_than_its_reach(arm):
+    """What a probe supposes: a point's speed is at most the sum of reach times joint speed."""
+    chain, _, speeds, _ = arm
+    rng = np.random.default_rng(8)
+    q = rng.uniform(chain.lower, chain.upper, (400, 7))
+    for joint in range(7):
+        unit = np.broadcast_to(np.eye(7)[joint], q.shape)
+        fastest = speeds.fastest(q, unit)
+        assert np.max(fastest) <= speeds.reach_m[joint] * (1 + 1e-12)
+        if chain.slides[joint]:
+            np.testing.assert_allclose(fastest, 1.0)
+            assert speeds.reach_m[joint] == 1.0
 
 
 # Paths

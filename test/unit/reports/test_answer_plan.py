@@ -105,7 +105,7 @@ def test_a_sensor_that_has_measured_nothing_is_in_no_picture(inputs):
     session = inputs.session
     sensors = {**session.sensors, 'unused': session.marker_names[0]}
     inputs = replace(inputs, session=replace(session, sensors=sensors))
-    subject = Subject(inputs, answer_of(inputs), inputs.plan.tour._chain)
+    subject = Subject(inputs, answer_of(inputs), inputs.plan.tour.chain)
     drawn = draw_answer(subject)
     assert {'workspace', 'plan', 'session'} <= drawn.keys()
     assert all('unused' not in drawn[name] for name in ('workspace', 'plan'))
@@ -113,7 +113,7 @@ def test_a_sensor_that_has_measured_nothing_is_in_no_picture(inputs):
 
 
 def test_the_page_has_the_plan_its_picture_and_a_link_where_it_was_drawn(inputs):
-    subject = Subject(expected(inputs, 3.0), answer_of(inputs), inputs.plan.tour._chain)
+    subject = Subject(expected(inputs, 3.0), answer_of(inputs), inputs.plan.tour.chain)
     html = answer_html(subject, {})
     assert '<a href="#plan">Plan</a>' in html
     assert '1 no free path, 1 rejected, 2 not visited' in html
