@@ -177,14 +177,13 @@ def _splits(plan: CollectionPlan) -> list[dict[str, Any]]:
     return rows
 
 
-def _dropped(plan: CollectionPlan) -> list[dict[str, Any]]:
+def _dropped(plan: CollectionPlan) -> dict[str, tuple[int, int]]:
     """Return why poses and configurations were dropped, the most frequent reason first."""
     poses, solutions = plan.tour.dropped, plan.dropped
-    rows = [
-        {'reason': reason, 'poses': poses.get(reason, 0), 'solutions': solutions.get(reason, 0)}
-        for reason in {**poses, **solutions}
-    ]
-    return sorted(rows, key=lambda row: -max(row['poses'], row['solutions']))
+    counts = {
+        name: (poses.get(name, 0), solutions.get(name, 0)) for name in {**poses, **solutions}
+    }
+    return dict(sorted(counts.items(), key=lambda item: -max(item[1])))
 
 
 def _joints(plan: CollectionPlan, chain: SerialChain) -> list[dict[str, Any]]:

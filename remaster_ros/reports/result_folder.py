@@ -34,7 +34,6 @@ from remaster_ros.reports.rows_csv import (
 from remaster_ros.session.files import cannot_write, make_folder, write_atomically, writing
 
 if TYPE_CHECKING:
-    from remaster_ros.calibration.predictions import Predictions
     from remaster_ros.calibration.result import FitResult
     from remaster_ros.discovery.confirmation import Confirmation
     from remaster_ros.discovery.decision import Decision
@@ -127,7 +126,6 @@ def save_discovery(
     folder: str | os.PathLike[str],
     confirmation: Confirmation | None = None,
     figures: bool = True,
-    predictions: Predictions | None = None,
     decided: Sequence[Decision] = (),
 ) -> Path:
     """Write discovery.json, predictions.csv, what to apply and, with figures, the report.
@@ -149,7 +147,7 @@ def save_discovery(
 
     folder = Path(folder)
     make_folder(folder)
-    predictions = predictions_of(discovery) if predictions is None else predictions
+    predictions = predictions_of(discovery)
     content = discovery_content(discovery, confirmation, predictions, decided)
     text = schemas.encode(content)
     write_atomically(folder / DISCOVERY_FILE, text)
