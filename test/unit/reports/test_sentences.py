@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 from dataclasses import replace
 
 import numpy as np
@@ -12,7 +13,14 @@ from remaster_ros.calibration.noise_check import NoiseCheck
 from remaster_ros.calibration.residual_structure import ResidualStructure, StructureTest
 from remaster_ros.reports.fit_json import fit_content
 from remaster_ros.reports.report import fit_html
-from remaster_ros.reports.sentences import fit_lines, verdict
+from remaster_ros.reports.sentences import (
+    METRICS,
+    as_drawn,
+    fit_lines,
+    load_words,
+    loadable_of_fit,
+    verdict,
+)
 
 
 def with_accuracy(result, split, before, after):
@@ -158,3 +166,20 @@ def test_a_marker_that_is_not_where_it_was_stated_to_be_is_named(fit_result):
     # Stated as well as it is known, the place contradicts nothing.
     known = replace(session, markers=stated, marker_std_m=5e-3)
     assert fit_session(known, rng=np.random.default_rng(0), draws=100).displaced_markers == ()
+
+
+def test_terminal_and_page_have_one_phrase_of_one_fact(fit_result):
+    content = fit_content(fit_result)
+    printed, page = '\n'.join(fit_lines(content)), html.unescape(fit_html(fit_result, {}))
+    title = METRICS['post_registration']
+    assert f'optimization, {title}: ' in printed
+    assert title[0].upper() + title[1:] in page
+    worst = max(content.geometry.imitations, key=lambda one: one.deg)
+    words = as_drawn(content.geometry, [worst])
+    assert words in printed
+    assert words.rpartition(' mm at ')[2] in page
+    for row in loadable_of_fit(content.geometry):
+        what, to_do = load_words(row)
+        assert what in page
+        assert to_do in page
+        assert (f'to load: {what}' in printed) == bool(content.geometry.file)
