@@ -65,6 +65,10 @@ def judged(hidden: HiddenSession, compensator: Compensator, tour: Visits) -> Jud
     error = (seen - wanted)[whole]
     spread = T[:3, :3].T @ compensator.spread(tour.q[whole])
     covariance = spread @ np.swapaxes(spread, 1, 2)
+    # What a command leaves near a singularity is stated beside it.
+    reached = apply(model.state(found.command, warm).tool, place)
+    stated = (apply(inverse(T), reached) - wanted)[whole]
+    covariance += stated[:, :, None] * stated[:, None, :]
     square = np.einsum('ni,ni->n', error, np.linalg.solve(covariance, error[..., None])[..., 0])
     own = np.zeros((len(error), 3, 9))
     own[:, :, :3] = np.eye(3)

@@ -193,6 +193,9 @@ class ArmModel:
     root: FloatArray  # U with U' U the covariance of `parameter_names`, (r, p)
     # How many times larger standard deviations were found on poses left out than in theory
     widening: float
+    # E with E' E the second moments of the true parameters about these, (e, p), where more is
+    # known to differ than the covariance says: what has no place in the correction
+    error_root: FloatArray | None = None
 
     @classmethod
     def nominal(cls, chain: SerialChain) -> ArmModel:

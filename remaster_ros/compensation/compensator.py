@@ -130,7 +130,8 @@ class Compensator:
 
         Of its place in the frame of the sensor, at wanted joint angles after correction, as the
         file's base frame and tool have it: uncertainty of offsets, causes, registration and marker
-        together, widened as poses that were left out have shown.
+        together, widened as poses that were left out have shown. Where zero-offsets alone are
+        corrected it is the mean square of the error: with the lengths and tilts left as drawn.
 
         Parameters
         ----------
@@ -156,13 +157,13 @@ class Compensator:
         rows = q.reshape(-1, model.joints)
         sensor = next(iter(model.T_R_N)) if sensor is None else sensor
         marker = next(iter(model.markers)) if marker is None else marker
+        root = model.widening * model.root if model.error_root is None else model.error_root
         parts = [
-            model.widening
-            * (model.derivative(model.state(rows[block]), sensor, marker) @ model.root.T)
+            model.derivative(model.state(rows[block]), sensor, marker) @ root.T
             for block in _blocks(len(rows))
         ]
-        found = np.concatenate(parts) if parts else np.zeros((0, 3, len(model.root)))
-        return found.reshape(*q.shape[:-1], 3, len(model.root))
+        found = np.concatenate(parts) if parts else np.zeros((0, 3, len(root)))
+        return found.reshape(*q.shape[:-1], 3, len(root))
 
     def _rows(
         self,

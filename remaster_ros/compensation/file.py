@@ -36,7 +36,7 @@ from remaster_ros.kinematics.transforms import (
     transform,
 )
 from remaster_ros.session.files import read_limited
-from remaster_ros.types import Controller, FloatArray
+from remaster_ros.types import Controller, FloatArray, IntArray
 from remaster_ros.version import __version__
 
 FORMAT = 'remaster-compensation/1'
@@ -129,6 +129,13 @@ class TemperaturePart(Struct):
     origins: list[OriginPart]
 
 
+class ErrorPart(Struct):
+    """Second moments E' E of the true parameters about those of the file; E as U."""
+
+    names: list[str]
+    root: list[list[float]]
+
+
 class ParametersPart(Struct):
     """Mean and covariance U' U; of U the rows of the upper triangle, from the diagonal on."""
 
@@ -137,6 +144,7 @@ class ParametersPart(Struct):
     mean: list[float]
     covariance_root: list[list[float]]
     widening: float
+    error: ErrorPart | UnsetType = UNSET
 
 
 class FramePart(Struct):
@@ -256,8 +264,11 @@ def written(
     assert joints == sorted(joints), 'parameters of terms are counted as they stand in the file'
     names = chain.joint_names
     std = np.linalg.norm(model.root, axis=0)
-    kept = np.flatnonzero(np.any(model.root != 0.0, axis=0))
-    root = np.asarray(np.linalg.qr(model.root[:, kept], 'r'))
+    kept, root = _triangle(model.root)
+    error: ErrorPart | UnsetType = UNSET
+    if model.error_root is not None:
+        apart, error_root = _triangle(model.error_root)
+        error = ErrorPart([model.parameter_names[i] for i in apart], error_root)
     content = CompensationPart(
         format=FORMAT,
         robot=RobotPart(
@@ -307,8 +318,9 @@ def written(
             [model.parameter_names[i] for i in kept],
             [model.parameter_units[i] for i in kept],
             model.parameter_means[kept].tolist(),
-            [[float(f'{v:.{DIGITS}g}') for v in row[i:]] for i, row in enumerate(root.tolist())],
+            root,
             model.widening,
+            error,
         ),
         base_frame={
             sensor: FramePart(
@@ -335,6 +347,13 @@ def written(
         for name, value in msgspec.structs.asdict(content).items()
     ]
     return '{\n' + ',\n'.join(lines) + '\n}\n'
+
+
+def _triangle(root: FloatArray) -> tuple[IntArray, list[list[float]]]:
+    """Return which parameters a root (r, p) has, and its rows from the diagonal on."""
+    kept = np.flatnonzero(np.any(root != 0.0, axis=0))
+    rows = np.asarray(np.linalg.qr(root[:, kept], 'r')).tolist()
+    return kept, [[float(f'{v:.{DIGITS}g}') for v in row[i:]] for i, row in enumerate(rows)]
 
 
 def _taken_at(driver: Driver) -> Literal['reported', 'with_offset']:
@@ -500,24 +519,32 @@ def _model(content: CompensationPart) -> ArmModel:
         raise _broken('base_frame and tool', 'are empty')
     if model.grows and warm is None:
         raise _broken('temperature', 'is missing, but something depends on it')
-    return _with_root(model, content.parameters)
+    found = content.parameters
+    root = _root(model, 'parameters', found.names, 'covariance_root', found.covariance_root)
+    error = found.error
+    if error is UNSET:
+        return replace(model, root=root)
+    error_root = _root(model, 'parameters.error', error.names, 'root', error.root)
+    return replace(model, root=root, error_root=error_root)
 
 
-def _with_root(model: ArmModel, part: ParametersPart) -> ArmModel:
+def _root(
+    model: ArmModel, part: str, names: Sequence[str], key: str, rows: Sequence[Sequence[float]]
+) -> FloatArray:
+    """Return an upper triangle of some parameters as one of all, (r, p)."""
     order = {name: i for i, name in enumerate(model.parameter_names)}
-    strangers = [name for name in part.names if name not in order]
-    count = len(part.names)
-    if strangers or len(set(part.names)) < count:
+    strangers = [name for name in names if name not in order]
+    count = len(names)
+    if strangers or len(set(names)) < count:
         what = f'{strangers[0]!r} is no parameter of it' if strangers else 'a name stands twice'
-        raise _broken('parameters.names', what)
-    rows = part.covariance_root
+        raise _broken(f'{part}.names', what)
     if len(rows) > count or any(len(row) != count - i for i, row in enumerate(rows)):
-        raise _broken('parameters.covariance_root', 'is no upper triangle of its parameters')
+        raise _broken(f'{part}.{key}', 'is no upper triangle of its parameters')
     root = np.zeros((len(rows), len(order)))
-    columns = np.array([order[name] for name in part.names], dtype=np.int64)
+    columns = np.array([order[name] for name in names], dtype=np.int64)
     for i, row in enumerate(rows):
         root[i, columns[i:]] = row
-    return replace(model, root=root)
+    return root
 
 
 def _function(

@@ -28,6 +28,7 @@ from remaster_ros.compensation.arm_model import (
     Geometry,
     JointTerm,
 )
+from remaster_ros.compensation.compensator import Compensator
 from remaster_ros.compensation.export import check_first
 from remaster_ros.discovery.effects.base import Cell
 from remaster_ros.discovery.effects.registry import EFFECTS
@@ -35,7 +36,7 @@ from remaster_ros.discovery.effects.splines import DEGREE, Curve
 from remaster_ros.discovery.geometry_model import GeometryModel
 from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.kinematics.serial_chain import SerialChain
-from remaster_ros.kinematics.transforms import inverse, matrix_to_rotation_vector
+from remaster_ros.kinematics.transforms import apply, inverse, matrix_to_rotation_vector
 from remaster_ros.types import FloatArray, Measurements
 
 # Each takes away all of the difference but for what is of its second order.
@@ -86,11 +87,16 @@ class Described:
     notes: tuple[str, ...] = field(default=())
 
 
-def offsets_alone(fit: FitResult, widening: float, notes: Sequence[str] = ()) -> Described:
+def offsets_alone(
+    fit: FitResult, widening: float, notes: Sequence[str] = (), geometry: Described | None = None
+) -> Described:
     """Return the arm of a fit's zero-offsets; those that are not identifiable stay as they are.
 
     Registrations and markers are the most likely ones with these offsets: where a prior alone
     tells an offset from a place of the marker, leaving out the one moves the other.
+
+    No arm is its drawing: where it stays so in the correction, the error to be expected is that
+    against the arm with all lengths and tilts, see `geometry_too`, of which ``geometry`` is.
     """
     described = _described(fit, [], np.zeros(0), None, widening)
     model = described.model
@@ -105,7 +111,23 @@ def offsets_alone(fit: FitResult, widening: float, notes: Sequence[str] = ()) ->
         if fit.found is not None:
             model = _as_predicted(model, fit, fit.found.problem, [])
         model = replace(model, root=root)
+    if geometry is not None:
+        model = replace(model, error_root=_about(model, geometry.model))
     return replace(described, model=model, notes=(*described.notes, *notes))
+
+
+def _about(loaded: ArmModel, known: ArmModel) -> FloatArray:
+    """Return E, (e, p), with E' E the second moments of an arm's parameters about those loaded.
+
+    Where ``known`` is their posterior, of mean m and covariance C, it is
+    C + (m - loaded) (m - loaded)'.
+    """
+    apart = known.parameter_means - loaded.parameter_means
+    for sensor, T_R_N in loaded.T_R_N.items():
+        step = known.T_R_N[sensor] @ inverse(T_R_N)
+        shift, turn = loaded.registration(sensor)
+        apart[shift], apart[turn] = step[:3, 3], matrix_to_rotation_vector(step[:3, :3])
+    return np.vstack((known.widening * known.root, apart))
 
 
 def geometry_too(
@@ -157,12 +179,32 @@ def everything(
     return _described(fit, cells, fit.theta, data, widening)
 
 
-def corrected_residuals(fit: FitResult, cells: Sequence[Cell]) -> FloatArray:
+def corrected_residuals(
+    fit: FitResult, cells: Sequence[Cell], model: ArmModel, measurements: Measurements
+) -> FloatArray:
     """Return the residuals of every row where `everything` is corrected that can be, m, (n, 3).
 
-    Those of the fit lack what no command corrects as well (backlash, say): that is put back.
-    Errors of the measurement stay taken out.
+    Those of the fit lack what no command corrects as well: backlash, say, and what remains near
+    singularities; that is put back. Errors of the measurement stay taken out. ``model`` is the arm
+    of `everything`, and ``measurements`` have its sensors and markers by their indices.
     """
+    return _with_what_remains(fit, cells) + _remaining(model, measurements)
+
+
+def _remaining(model: ArmModel, measurements: Measurements) -> FloatArray:
+    """Return by how much a commanded arm of the model misses, in frames N, m, (n, 3)."""
+    m = measurements
+    known = np.isfinite(m.temperature_c)
+    warm = np.where(known, m.temperature_c, model.reference_c)
+    command = Compensator(model).command(m.q, warm)
+    reached, wanted = model.state(command, warm).tool, model.chain.forward(m.q)
+    markers = np.stack(list(model.markers.values()))[m.marker]
+    turns = np.stack([T[:3, :3] for T in model.T_R_N.values()])[m.sensor]
+    off = apply(reached, markers) - apply(wanted, markers)
+    return np.einsum('nji,nj->ni', turns, off)
+
+
+def _with_what_remains(fit: FitResult, cells: Sequence[Cell]) -> FloatArray:
     core, start = fit.predictive.model.core, 0
     z = fit.predictive.after.copy()
     for cell in cells:

@@ -23,6 +23,7 @@ from remaster_ros.compensation.of_result import (
     NotCorrected,
     corrected_residuals,
     everything,
+    geometry_too,
     offsets_alone,
 )
 from remaster_ros.discovery.confirmation import Confirmation
@@ -200,14 +201,16 @@ def compensation_of(discovery: Discovery, widening: float) -> Described:
         fit, cells = discovery.fit, discovery.solution.cells
         return everything(fit, cells, discovery.residuals, widening)
     alone = discovery.alone
-    own = predict(alone, discovery.residuals.context.measurements).widening
+    rows = discovery.residuals.context.measurements
+    drawn = discovery.geometry
+    geometry = None if drawn is None else geometry_too(alone, drawn, rows)
     notes = []
     if discovery.solution.cells:
         notes.append(
             'zero-offsets alone: the model with everything that was found predicts held-out poses '
             'no better'
         )
-    described = offsets_alone(alone, own, notes)
+    described = offsets_alone(alone, predict(alone, rows).widening, notes, geometry)
     left = tuple(
         NotCorrected(e.name, e.joints, e.size_m, _ALONE, e.remedy) for e in discovery.effects
     )
@@ -224,7 +227,9 @@ def holds_everything(discovery: Discovery) -> bool:
 
 def _corrected(discovery: Discovery) -> FloatArray:
     """Return the residuals with what compensation.json corrects, where it holds everything."""
-    return corrected_residuals(discovery.fit, discovery.solution.cells)
+    fit, cells, data = discovery.fit, discovery.solution.cells, discovery.residuals
+    model = everything(fit, cells, data, 1.0).model
+    return corrected_residuals(fit, cells, model, data.context.measurements)
 
 
 def _held_out_mean(discovery: Discovery, errors: FloatArray) -> float:

@@ -146,10 +146,9 @@ def model_text(result: FitResult, geometry: GeometryModel) -> str:
 def compensation_text(result: FitResult, result_sha256: str) -> str:
     """Return the correction of a fit: with all lengths and tilts where they predict better."""
     geometry, rows = geometry_of(result), _rows_of(result)
-    if geometry is not None and geometry.is_better:
-        described = geometry_too(result, geometry, rows)
-    else:
-        described = offsets_alone(result, predict(result, rows).widening)
+    described = None if geometry is None else geometry_too(result, geometry, rows)
+    if described is None or geometry is None or not geometry.is_better:
+        described = offsets_alone(result, predict(result, rows).widening, geometry=described)
     return correction_text(described, result.session, 'fit', result_sha256)
 
 

@@ -15,9 +15,10 @@ from hidden_sessions import HiddenSession, Recipe, hidden_session, third_visits
 
 import remaster_ros
 from remaster_ros.compensation.compensator import Compensator
-from remaster_ros.compensation.of_result import offsets_alone
+from remaster_ros.compensation.of_result import geometry_too, offsets_alone
 from remaster_ros.errors import InputError
 from remaster_ros.reports.discovery_json import compensation_of, holds_everything, predictions_of
+from remaster_ros.reports.fit_json import correction_text, geometry_of
 from remaster_ros.reports.result_folder import save_discovery, save_fit
 from remaster_ros.types import Correction
 
@@ -81,8 +82,12 @@ def test_file_and_memory_are_one(found):
     np.testing.assert_allclose(seen, m.position - discovery.fit.residuals_after, atol=1e-5)
 
 
-def test_of_a_fit_the_file_has_its_offsets_and_nothing_else(hidden, tmp_path):
-    fit = remaster_ros.fit(replace(hidden.session, correction=Correction('urdf')))
+@pytest.fixture(scope='module')
+def fit(hidden):
+    return remaster_ros.fit(replace(hidden.session, correction=Correction('urdf')))
+
+
+def test_of_a_fit_the_file_has_its_offsets_and_nothing_else(fit, tmp_path):
     save_fit(fit, tmp_path, figures=False)
     file = remaster_ros.read_compensation(tmp_path / 'apply' / 'compensation.json')
     known = fit.identifiable
@@ -102,6 +107,31 @@ def test_of_a_fit_the_file_has_its_offsets_and_nothing_else(hidden, tmp_path):
     seen = alone.in_sensor(alone.state(m.q[rows]), 'mocap', 'sir')
     expected = (m.position - fit.residuals_after)[rows]
     np.testing.assert_allclose(seen, expected, atol=1e-5)
+
+
+def test_offsets_alone_err_by_what_the_arm_with_lengths_and_tilts_has_elsewhere(fit, tmp_path):
+    """Mean square: covariance there, and the square of what lies between the two predictions."""
+    rows = fit.found.problem.measurements
+    drawn = geometry_too(fit, geometry_of(fit), rows)
+    alone = offsets_alone(fit, 1.0, geometry=drawn)
+    q, sensor, marker = rows.q[:30], 'mocap', 'sir'
+    seen = [one.in_sensor(one.state(q), sensor, marker) for one in (drawn.model, alone.model)]
+    apart = (seen[0] - seen[1]) @ alone.model.T_R_N[sensor][:3, :3].T
+    expected = Compensator(drawn.model).uncertainty(q) + apart[:, :, None] * apart[:, None, :]
+    found = Compensator(alone.model).uncertainty(q)
+    scale = np.trace(expected, axis1=1, axis2=2).mean()
+    np.testing.assert_allclose(found, expected, atol=0.02 * scale)
+    bare = Compensator(offsets_alone(fit, 1.0).model).uncertainty(q)
+    assert np.trace(found, axis1=1, axis2=2).mean() > 1.2 * np.trace(bare, axis1=1, axis2=2).mean()
+    path = tmp_path / 'compensation.json'
+    path.write_text(correction_text(alone, fit.session, 'fit', ''), encoding='utf-8')
+    file = remaster_ros.read_compensation(path)
+    np.testing.assert_allclose(file.uncertainty(q), found, rtol=1e-4, atol=1e-18)
+    # Of the offsets themselves the covariance stays what it is.
+    std = np.linalg.norm(file.model.root, axis=0)[: file.model.joints]
+    np.testing.assert_allclose(
+        std, np.linalg.norm(alone.model.root, axis=0)[: len(std)], rtol=1e-4
+    )
 
 
 @pytest.mark.parametrize(

@@ -292,7 +292,7 @@ def test_where_no_joint_is_determined_and_no_cause_found_there_is_no_covariance(
     assert found == {'names': [], 'units': [], 'matrix': []}
 
 
-def test_what_is_no_better_in_the_figures_shown_is_not_to_be_loaded():
+def test_what_is_no_better_in_the_figures_shown_is_not_to_be_loaded(monkeypatch):
     """Everything that was found is in the robot model: no compensation is asked for."""
     rows = SimpleNamespace(
         is_validation=np.array([False, True, True]), observation=np.array([1, 2, 3])
@@ -303,14 +303,12 @@ def test_what_is_no_better_in_the_figures_shown_is_not_to_be_loaded():
         outliers=(),
         alone=SimpleNamespace(residuals_after=2.0 * errors),
         geometry=SimpleNamespace(errors=errors),
-        fit=SimpleNamespace(
-            residuals_after=0.9999 * errors,
-            predictive=SimpleNamespace(model=SimpleNamespace(core=0), after=np.zeros(1)),
-            found=None,
-        ),
+        fit=None,
         solution=SimpleNamespace(cells=(SimpleNamespace(of_measurement=True, size=1),)),
         loads_geometry=True,
     )
+    monkeypatch.setattr(discovery_json, 'everything', lambda *_: SimpleNamespace(model=None))
+    monkeypatch.setattr(discovery_json, 'corrected_residuals', lambda *_: 0.9999 * errors)
     results = loadable(found)
     assert [row.better for row in results] == [True, True, False]
     assert load_words(results[-1])[1].startswith('leave it')
