@@ -318,7 +318,8 @@ def fit_facts(folder: Path, offsets: Mapping[str, float]) -> FitFacts:
         return FitFacts()
     facts = {}
     for split, words in (('validation', 'held-out poses'), ('optimization', 'fitted poses')):
-        errors = (fit['accuracy'].get(split) or {}).get('theoretical')
+        # As measured: the theoretical error is what the posterior predicts.
+        errors = (fit['accuracy'].get(split) or {}).get('post_registration')
         if errors:
             before, after = (errors[when]['mean_mm'] for when in ('before', 'after'))
             facts[f'mean error, {words}'] = f'{before:.3f} mm → {after:.3f} mm'

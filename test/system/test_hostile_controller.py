@@ -1,7 +1,7 @@
 """A real bridge and an arm that obeys everything: nothing it commands may be what it must not be.
 
-The arm, the man in the middle and the judge are the tests' own: hostile_arm, hostile_bench,
-hostile_judge. Three hundred random injections take some ten minutes; HOSTILE_INJECTIONS=1000 makes
+The arm, the man in the middle and the judge are the tests' own, in test/hostile.
+Three hundred random injections take some ten minutes; HOSTILE_INJECTIONS=1000 makes
 as many.
 """
 

@@ -1,7 +1,7 @@
 """All real nodes, and a man in the middle between the bridge and the fake robot.
 
 The fake robot's topics are remapped away; what the bridge hears and what the robot obeys passes
-through the relay, which spoils it and keeps every command for the judge of hostile_judge.
+through the relay, which spoils it and keeps every command for the judge of `hostile.judge`.
 """
 
 import socket
