@@ -429,15 +429,19 @@ def _result(discovery: Discovery, confirmation: Confirmation | None, *, left: bo
             f'would decide.{change}'
         )
     change += _uncertain(discovery)
-    if confirmation is not None and not confirmation.confirmed:
-        change += f' The other session does not confirm {"it" if count == 1 else "them"}' + (
+    them = 'it' if count == 1 else 'them'
+    if confirmation is not None and not confirmation.why and confirmation.carried_over > 0.5:
+        if not confirmation.same_offsets:
+            change += f' The other session has {them} too, with other zero-offsets.'
+        elif confirmation.gone:
+            change += ' Not all of it is there in the other session.'
+    elif confirmation is not None:
+        change += f' The other session does not confirm {them}' + (
             '.'
             if confirmation.why
             else f': its error is {1e3 * confirmation.rms_after_m:.3f} mm RMS with and '
             f'{1e3 * confirmation.rms_before_m:.3f} mm without.'
         )
-    elif confirmation is not None and confirmation.gone:
-        change += ' Not all of it is there in the other session.'
     return f'Beyond the zero-offsets there {"is" if count == 1 else "are"} {causes}.{change}'
 
 

@@ -25,7 +25,8 @@ from remaster_ros.reports import discovery_json, figures
 from remaster_ros.reports.discovery_json import loadable, read_discovery
 from remaster_ros.reports.fit_json import model_text
 from remaster_ros.reports.result_folder import save_discovery
-from remaster_ros.reports.sentences import load_words
+from remaster_ros.reports.schemas import Discovered
+from remaster_ros.reports.sentences import judgement, load_words
 
 
 def bent(session):
@@ -33,19 +34,35 @@ def bent(session):
 
 
 @pytest.fixture(scope='module')
-def saved(tmp_path_factory):
+def confirmed():
+    """Return a discovery, and what another session of the arm says of it."""
     session = session_with(41, bent, poses=25, validation=15)
     found = discover_session(session, rng=np.random.default_rng(0))
-    folder = tmp_path_factory.mktemp('discovery')
     # Arm and poses are drawn from the seed, in turn: the same arm needs as many poses.
     again = session_with(41, bent, poses=25, validation=15, pose_sigma_m=0.3e-3)
+    return found, confirm(found, again, np.random.default_rng(0))
+
+
+@pytest.fixture(scope='module')
+def saved(confirmed, tmp_path_factory):
+    found, confirmation = confirmed
+    folder = tmp_path_factory.mktemp('discovery')
     pair = (Named('joint_compliance', (2,)), Named('encoder_eccentricity', (2,)))
     decided = decisions(found, [pair])
-    report = save_discovery(
-        found, folder, confirm(found, again, np.random.default_rng(0)), decided=decided
-    )
+    report = save_discovery(found, folder, confirmation, decided=decided)
     assert report == folder / 'report.html'
     return found, folder
+
+
+def test_a_cause_that_another_session_has_with_other_offsets_is_not_called_unconfirmed(
+    confirmed, saved
+):
+    found, confirmation = confirmed
+    content = msgspec.convert(read_discovery(saved[1] / 'discovery.json'), Discovered)
+    other = replace(confirmation, confirmed=False, same_offsets=False, other_joints=(3,))
+    said = judgement(found, other, content)
+    assert said.headline.endswith('The other session has it too, with other zero-offsets.')
+    assert said.mood == 'caution'
 
 
 def test_discovery_json_keeps_its_contract(saved):
