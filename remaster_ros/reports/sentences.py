@@ -531,10 +531,15 @@ def loadable_of_fit(geometry: FittedGeometry) -> list[Loadable]:
 
 def load_words(row: Loadable) -> tuple[str, str]:
     """Return what a result is, and what to do with it."""
-    if row.result != 'offsets' and row.held_out_mean_mm is not None and not row.better:
+    file = f'{row.file}{_MORE.get(row.result, "")}'
+    worse = row.result != 'offsets' and row.held_out_mean_mm is not None and not row.better
+    if worse and row.result == 'everything' and row.file:
+        # Better than the offsets alone, or the file would not hold it.
+        what_to_do = f'only where no robot model can be loaded: {file}'
+    elif worse:
         what_to_do = 'leave it: no better than what stands before it'
     elif row.file:
-        what_to_do = f'{row.file}{_MORE.get(row.result, "")}'
+        what_to_do = file
     elif row.held_out_mean_mm is None:
         what_to_do = 'leave it: no held-out poses show that it is better'
     else:
