@@ -328,4 +328,4 @@ def test_what_is_no_better_in_the_figures_shown_is_not_to_be_loaded(monkeypatch)
     monkeypatch.setattr(discovery_json, 'corrected_residuals', lambda *_: 0.9999 * errors)
     results = loadable(found)
     assert [row.better for row in results] == [True, True, False]
-    assert load_words(results[-1])[1].startswith('leave it')
+    assert load_words(results[-1])[1].startswith('only where no robot model can be loaded')
