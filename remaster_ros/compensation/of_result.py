@@ -188,10 +188,10 @@ def corrected_residuals(
     singularities; that is put back. Errors of the measurement stay taken out. ``model`` is the arm
     of `everything`, and ``measurements`` have its sensors and markers by their indices.
     """
-    return _with_what_remains(fit, cells) + _remaining(model, measurements)
+    return _with_what_remains(fit, cells) + remaining(model, measurements)
 
 
-def _remaining(model: ArmModel, measurements: Measurements) -> FloatArray:
+def remaining(model: ArmModel, measurements: Measurements) -> FloatArray:
     """Return by how much a commanded arm of the model misses, in frames N, m, (n, 3)."""
     m = measurements
     known = np.isfinite(m.temperature_c)

@@ -21,8 +21,13 @@ from remaster_ros.compensation.export import (
     calibrated_urdf,
 )
 from remaster_ros.compensation.file import Source, written
-from remaster_ros.compensation.of_result import Described, geometry_too, offsets_alone
-from remaster_ros.discovery.geometry_model import GeometryModel, geometry_model
+from remaster_ros.compensation.of_result import (
+    Described,
+    geometry_too,
+    offsets_alone,
+    remaining,
+)
+from remaster_ros.discovery.geometry_model import GeometryModel, geometry_model, mean_length
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.transforms import quaternion_xyzw
 from remaster_ros.reports import schemas
@@ -144,12 +149,20 @@ def model_text(result: FitResult, geometry: GeometryModel) -> str:
 
 
 def compensation_text(result: FitResult, result_sha256: str) -> str:
-    """Return the correction of a fit: with all lengths and tilts where they predict better."""
+    """Return the correction of a fit, with lengths and tilts where a commanded arm gains by them.
+
+    Near singularities no command reaches what they ask for; a robot model with them needs none.
+    """
     geometry, rows = geometry_of(result), _rows_of(result)
     described = None if geometry is None else geometry_too(result, geometry, rows)
-    if described is None or geometry is None or not geometry.is_better:
+    if described is None or geometry is None or not _reaches(described, geometry, rows):
         described = offsets_alone(result, predict(result, rows).widening, geometry=described)
     return correction_text(described, result.session, 'fit', result_sha256)
+
+
+def _reaches(described: Described, geometry: GeometryModel, rows: Measurements) -> bool:
+    errors = geometry.errors + remaining(described.model, rows)
+    return mean_length(errors[geometry.is_validation]) < geometry.drawing_held_out_m
 
 
 def correction_text(

@@ -20,6 +20,7 @@ from remaster_ros.reports.discovery_json import (
     predictions_of,
     read_discovery,
 )
+from remaster_ros.reports.fit_json import compensation_text, geometry_of
 from remaster_ros.reports.result_folder import save_discovery
 from remaster_ros.reports.schemas import Loadable
 from remaster_ros.reports.sentences import load_words
@@ -120,6 +121,17 @@ def test_what_can_be_loaded_of_a_panda(tmp_path: Path) -> None:
     assert abs(everything - np.hypot(0.27, missed_mm)) < 0.1
     row = read_discovery(tmp_path / 'discovery.json')['loadable'][2]
     assert load_words(msgspec.convert(row, Loadable))[1].startswith('only where no robot model')
+
+
+@pytest.mark.parametrize(
+    ('name', 'reached'), [('meca500_repeats', False), ('irb120_three_points', True)]
+)
+def test_a_fit_commands_lengths_and_tilts_only_where_the_arm_gets_there(name, reached):
+    """A robot model with them is better on both; on the small arm no pose is far from singular."""
+    fit = fit_session(real(name), rng=np.random.default_rng(0), draws=400)
+    assert geometry_of(fit).is_better
+    content = json.loads(compensation_text(fit, ''))
+    assert bool(content['geometry']['origins']) == reached
 
 
 @pytest.mark.qualify
