@@ -137,7 +137,7 @@ def test_an_init_that_was_refused_does_not_block_the_next(tmp_path: Path, capsys
     """The URDF that the xacro was made into lay there, and "with other content" was the answer."""
     robot, cell = tmp_path / 'arm.urdf.xacro', tmp_path / 'cell.yaml'
     good = ROBOTS['irb120']().urdf.replace('<robot ', XACRO, 1)
-    bad = good.replace('type="revolute"', 'type="fixed"', 1)
+    bad = good.replace('type="revolute"', 'type="fixed"', 4)
     assert bad != good
     robot.write_text(bad)
     assert main(['init', str(robot), '--out', str(cell), '--no-plan']) == 2
