@@ -55,7 +55,7 @@ from remaster_ros.collection.events import (
     decode,
     encode,
 )
-from remaster_ros.session.bridge_files import LastCommandFile
+from remaster_ros.session.bridge_files import HaltFile, LastCommandFile
 from remaster_ros.session.workcell import read_cell
 from remaster_ros.types import FloatArray
 
@@ -233,12 +233,16 @@ class Bench(BridgeProcess):
         self._solutions.publish(message)
         return f'{stamp.sec}.{stamp.nanosec:09d}'
 
+    def can_clear(self) -> bool:
+        """Whether the bridge's service for that is known here."""
+        return bool(self._clear.service_is_ready())
+
     def clear_halt(self, timeout_s: float = 5.0) -> bool | None:
         """Call the service as a person would; None where the bridge has none.
 
         Asked to compare the pad with what is reported, a person does, and calls again.
         """
-        if not self._clear.service_is_ready():
+        if not self.can_clear():
             return None
         for _ in range(2):
             future = self._clear.call_async(Trigger.Request())
@@ -246,7 +250,9 @@ class Bench(BridgeProcess):
                 return False
             if not future.result().message.startswith(ASKED):
                 break
-        return future.result().success
+        # It is kept by another thread of the bridge: not to be killed before that.
+        kept = HaltFile('/robot_bridge', self.environment).read
+        return future.result().success and self.until(lambda: not kept(), timeout_s)
 
     def set_parameter(self, name: str, value: float, timeout_s: float = 5.0) -> str:
         """Ask the bridge for another value; returns why it refuses, or is silent; ''."""
@@ -264,6 +270,17 @@ class Bench(BridgeProcess):
         begun = max(t for t, state in self.running_since if state == 'running')
         newest = self.commands_since(begun)[-1:]
         return bool(newest) and now < newest[0].end_s - 0.1 and self.arm.speed() > 0.05
+
+    @property
+    def up_since_s(self) -> float:
+        """Time of the first summary of this bridge's process, s; infinite before it."""
+        # What a process before it published may come after its start.
+        shown = (t for t, *_ in self.seen.summaries if t > self.started_s + 0.5)
+        return next(shown, np.inf)
+
+    def up_for(self, duration_s: float) -> None:
+        """Wait until the bridge and all around it have known each other for a while."""
+        self.until(lambda: time.monotonic() > self.up_since_s + duration_s, 30.0)
 
     def gap(self) -> float:
         """Longest time since the last call in which nothing was published here, s."""

@@ -266,9 +266,8 @@ def killed_while_halted(s: Scene) -> None:
 
 def restart(bench: Bench) -> None:
     """Start the bridge again and wait until it is there."""
-    since = time.monotonic()
     bench.start()
-    bench.until(lambda: bench.seen.summaries and bench.seen.summaries[-1][0] > since + 0.5, 15.0)
+    bench.until(lambda: np.isfinite(bench.up_since_s) and bench.can_clear(), 15.0)
 
 
 def late_states(s: Scene) -> None:

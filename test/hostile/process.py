@@ -6,9 +6,11 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from forked_nodes import NodeProcess
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -30,12 +32,14 @@ class BridgeProcess:
     def __init__(self, environment: dict[str, str], parameters: dict[str, Any], log: Path) -> None:
         self.environment, self.parameters, self.log = environment, parameters, log
         self.process: subprocess.Popen[bytes] | None = None
+        self.started_s = -np.inf
 
     def start(self) -> None:
         """Start the bridge."""
         command = [sys.executable, '-m', 'remaster_ros.nodes.robot_bridge', '--ros-args']
         for name, value in self.parameters.items():
             command += ['-p', f'{name}:={value}']
+        self.started_s = time.monotonic()
         with self.log.open('ab') as log:
             self.process = NodeProcess(
                 command, env=self.environment, stdout=log, stderr=log, cwd=ROOT
