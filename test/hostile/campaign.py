@@ -9,6 +9,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 from multiprocessing import Queue, get_context
 from pathlib import Path
 
@@ -236,6 +237,7 @@ class Campaign:
         rng, judge = self.rng, Judge(self.body, self.rules)
         outcome = Outcome(kind.name, kind.expected)
         began = time.monotonic()
+        begun = [began]
         bench.gap()
         bench.up_for(BEGUN_S)
         goals = [target(self.body, bench.arm.q, rng)]
@@ -245,6 +247,7 @@ class Campaign:
             # right again, and a bridge that has just been started may ask for another
             # /remaster/collect. A person does both.
             bench.up_for(BEGUN_S)
+            begun.append(time.monotonic())
             goals = [target(self.body, bench.arm.q, rng)]
             outcome.moved = begin(bench, goals)
         settled = len(bench.seen.settled)
@@ -271,8 +274,13 @@ class Campaign:
         outcome.latencies = scene.latencies
         outcome.gap_s = bench.gap()
         outcome.arm_share = bench.arm.fastest(began, self.rules.speed_share * self.body.velocity)
-        commands = bench.commands_since(began)
-        outcome.judgements = [judge.judge(c, bench.was_running(c.arrival_s)) for c in commands]
+        for since, until in pairwise([*begun, np.inf]):
+            # Of what was commanded before, a new beginning knows nothing.
+            judge.forget()
+            outcome.judgements += [
+                judge.judge(command, bench.was_running(command.arrival_s))
+                for command in after(bench.commands_since(began), since, until)
+            ]
         return outcome
 
     def _act(self, kind: Injection, scene: Scene, outcome: Outcome, settled: int) -> None:
