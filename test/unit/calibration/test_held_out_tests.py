@@ -11,13 +11,8 @@ from scipy.linalg import block_diag
 
 from remaster_ros.calibration.estimate import Estimate, Problem, estimate
 from remaster_ros.calibration.fit import fit_session
+from remaster_ros.calibration.left_out import Contrasts, held_out_tests, left_out_distances
 from remaster_ros.calibration.residual_structure import StructureTest
-from remaster_ros.calibration.result import (
-    Part,
-    held_out_tests,
-    left_out_distances,
-    parts_of,
-)
 from remaster_ros.calibration.smooth_functions import whitened
 from remaster_ros.reports.sentences import verdict
 from remaster_ros.types import FloatArray, Session
@@ -66,8 +61,10 @@ def test_a_pose_left_out_is_judged_as_by_a_fit_without_it():
     found = estimate(Problem.of(scene(3, poses=12, sensor_count=2)[0]))
     pose, sensor, X, e = dense(found)
     precision = np.linalg.inv(found.mode.covariance)
-    parts = parts_of(found.mode, found.problem.measurements, found.posterior.rows)
-    judged = left_out_distances(parts, precision)
+    rows, white = found.posterior.rows, whitened(found.mode, found.posterior.rows, {})
+    joined = np.concatenate((white['model'], white['errors']), axis=2)
+    fitted = Contrasts.of(rows, found.problem.measurements, joined)
+    judged = left_out_distances(fitted, found.mode.covariance)
     for number, chosen in enumerate(np.unique(pose)):
         out = pose == chosen
         P = np.linalg.inv(precision - X[out].T @ X[out])
@@ -85,7 +82,7 @@ def test_a_pose_left_out_is_judged_as_by_a_fit_without_it():
                 own = basis[chosen]
                 V, d = own @ X[rows[chosen]], own @ rest[rows[chosen]]
                 expected = d @ np.linalg.solve(np.eye(len(d)) + V @ P @ V.T, d) / len(d) / noise
-                assert judged[index, is_mean][number] == pytest.approx(expected, rel=1e-6)
+                assert judged[2 * index + is_mean][number] == pytest.approx(expected, rel=1e-6)
 
 
 def test_a_sensor_that_was_moved_is_named_and_the_page_is_not_green():
@@ -160,8 +157,9 @@ def test_poses_of_one_solution_are_judged_by_their_means():
 
 
 def test_a_pose_that_alone_determines_a_direction_is_not_left_out():
-    gram = np.tile(np.diag([1.0, 0.0, 1.0]), (9, 1, 1))
-    gram[4] = np.diag([0.0, 1.0, 1.0])
-    parts = {(0, True): Part(np.arange(9), np.full(9, 3), gram)}
-    judged = left_out_distances(parts, gram.sum(axis=0)[:2, :2])
-    assert len(judged[0, True]) == 8
+    derivative = np.zeros((9, 3, 2))
+    derivative[:, 0, 0] = 1.0
+    derivative[4] = np.diag([0.0, 1.0, 0.0])[:, :2]
+    fitted = Contrasts(np.arange(9), np.ones(9, np.int64), derivative, np.ones((9, 3)))
+    judged = left_out_distances(fitted, np.diag([1.0 / 8.0, 1.0]))
+    assert len(judged[1]) == 8

@@ -1,0 +1,179 @@
+"""Are held-out poses predicted as well as poses that are left out of the fit in turn?
+
+Parameters and noise of a fit take up a part of the model's errors on the poses fitted, and
+nothing of those on held-out ones: a sensor that was moved before them, or a model that does not
+hold where they lie, shows there. Each pose is judged in units of what is uncertain of its
+prediction, the parameters included, and by a noise estimated without it.
+
+In units of the noise a pose has the errors e and the derivative X, and the fit the covariance Σ.
+To first order, with the pose left out, its errors and their covariance are::
+
+    u = (I − X Σ X')⁻¹ e,    (I − X Σ X')⁻¹
+
+and the parameters move by Σ X' u. Errors that were not fitted have the covariance I + X Σ X'.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import scipy
+
+from remaster_ros.calibration.grouped_rows import Rows
+from remaster_ros.calibration.laplace import Mode
+from remaster_ros.calibration.residual_structure import LEAST_NOISE_M, StructureTest
+from remaster_ros.calibration.smooth_functions import spread_poses, whitened
+from remaster_ros.types import FloatArray, IntArray, Measurements
+
+# Fewer poses of a sensor say little, held out or fitted.
+FEWEST_HELD_OUT, FEWEST_FITTED = 4, 8
+# So many poses of the fit are left out, evenly spread.
+MOST_LEFT_OUT = 1_000
+# A pose is not left out where the others would know less than this share about a direction.
+LEAST_SHARE = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class Contrasts:
+    """Of each sensor's rows at a pose the mean, and deviations that are independent of it.
+
+    In units of the noise. The mean shows a sensor or base that was moved, deviations what differs
+    between joint solutions. (The rows of Helmert's matrix: the first is of equal numbers, all are
+    of length one.)
+    """
+
+    pose: IntArray  # Number of each one's pose in the session, (n,)
+    kind: IntArray  # Twice the sensor's number, and one more for a mean, (n,)
+    derivative: FloatArray  # (n, 3, f)
+    errors: FloatArray  # (n, 3)
+
+    @classmethod
+    def of(cls, rows: Rows, measurements: Measurements, white: FloatArray) -> Contrasts:
+        """Form them of the rows' [derivative | error] in units of the noise, (n, 3, f + 1)."""
+        formed = np.empty_like(white)
+        for size in np.unique(rows.group_size).tolist():
+            at = rows.group_start[rows.group_size == size][:, None] + np.arange(size)
+            formed[at] = np.einsum('ij,gj...->gi...', scipy.linalg.helmert(size, True), white[at])
+        kind = 2 * rows.group_sensor[rows.group_of_row]
+        kind[rows.group_start] += 1
+        return cls(measurements.pose[rows.source], kind, formed[..., :-1], formed[..., -1])
+
+    def gram(self, kind: int) -> FloatArray:
+        """Return the Gram matrix of [derivative | error] of one kind, (f + 1, f + 1)."""
+        mine = self.kind == kind
+        both = np.concatenate((self.derivative[mine], self.errors[mine][..., None]), axis=2)
+        flat = both.reshape(-1, both.shape[2])
+        gram: FloatArray = flat.T @ flat
+        return gram
+
+    def distances(self, kind: int, covariance: FloatArray) -> Iterator[float]:
+        """Give the squared distance over its size of each pose that was not fitted."""
+        for pose in np.unique(self.pose[self.kind == kind]):
+            mine = (self.kind == kind) & (self.pose == pose)
+            X, e = self.derivative[mine].reshape(-1, len(covariance)), self.errors[mine].ravel()
+            yield float(e @ np.linalg.solve(np.eye(len(e)) + X @ covariance @ X.T, e)) / len(e)
+
+
+def compared(
+    fitted: Contrasts, held_out: Contrasts, covariance: FloatArray
+) -> Iterator[tuple[int, float, float]]:
+    """Compare held-out poses with poses left out of the fit, kind by kind of contrasts.
+
+    By ranks (Mann and Whitney 1947, doi:10.1214/aoms/1177730491), which a few poses do not
+    decide, however far out.
+
+    Parameters
+    ----------
+    fitted, held_out
+        What the model leaves of either.
+    covariance
+        Of the parameters, (f, f).
+
+    Yields
+    ------
+    int, float, float
+        The kind, the probability of errors as large by chance, and the ratio of the typical
+        errors, each in units of what is uncertain of it; of each kind with enough poses of either.
+    """
+    expected = left_out_distances(fitted, covariance)
+    for kind in np.intersect1d(fitted.kind, held_out.kind).tolist():
+        size = 3 * int(np.sum(fitted.kind == kind))
+        noise = _variance(fitted.gram(kind), size, covariance)
+        found = np.array([*held_out.distances(kind, covariance)]) / noise
+        if len(found) < FEWEST_HELD_OUT or len(expected[kind]) < FEWEST_FITTED:
+            continue
+        p_value = scipy.stats.mannwhitneyu(found, expected[kind], alternative='greater').pvalue
+        ratio = float(np.sqrt(np.median(found) / np.median(expected[kind])))
+        yield kind, float(p_value), ratio
+
+
+def left_out_distances(fitted: Contrasts, covariance: FloatArray) -> dict[int, FloatArray]:
+    """Return squared distances of poses left out in turn, in units of the noise without them."""
+    kinds = np.unique(fitted.kind).tolist()
+    f = len(covariance)
+    distances: dict[int, list[float]] = {kind: [] for kind in kinds}
+    grams = {kind: fitted.gram(kind) for kind in kinds}
+    flat = fitted.derivative.reshape(-1, f)
+    spread = flat @ covariance
+    # What determines the noise of a kind, of each row: the change of its degrees of freedom.
+    by_kind = {kind: spread @ grams[kind][:f, :f] @ covariance for kind in kinds}
+    free = {kind: float(np.sum(grams[kind][:f, :f] * covariance)) for kind in kinds}
+    of_kind = np.repeat(fitted.kind, 3)
+    pose = np.repeat(fitted.pose, 3)
+    poses = np.unique(fitted.pose)
+    for out in poses[:: -(-len(poses) // MOST_LEFT_OUT)]:
+        rows = np.flatnonzero(pose == out)
+        X, e = flat[rows], fitted.errors.ravel()[rows]
+        known = np.eye(len(rows)) - spread[rows] @ X.T
+        if np.linalg.eigvalsh(known)[0] < LEAST_SHARE:
+            continue
+        without = np.linalg.inv(known)
+        u = without @ e
+        step = np.append(spread[rows].T @ u, 1.0)
+        for kind in np.unique(of_kind[rows]).tolist():
+            own = of_kind[rows] == kind
+            uncertain = without[np.ix_(own, own)]
+            square = step @ grams[kind] @ step - u[own] @ u[own]
+            spent = free[kind] + np.sum(without * (by_kind[kind][rows] @ X.T))
+            spent -= np.trace(uncertain) - own.sum()
+            freedom = np.sum(of_kind == kind) - own.sum() - spent
+            distance = u[own] @ np.linalg.solve(uncertain, u[own]) / own.sum()
+            distances[kind].append(distance * max(freedom, 1.0) / square)
+    return {kind: np.array(found) for kind, found in distances.items()}
+
+
+def _variance(gram: FloatArray, size: int, covariance: FloatArray) -> float:
+    """Return that of the noise, by ``size`` numbers that determined parameters."""
+    freedom = size - np.sum(gram[:-1, :-1] * covariance)
+    return float(gram[-1, -1] / max(freedom, 1.0))
+
+
+def held_out_tests(
+    mode: Mode, measurements: Measurements, gross: IntArray
+) -> tuple[StructureTest, ...]:
+    """Test for each sensor of a fit whether held-out poses are worse predicted.
+
+    ``mode``: of the posterior of the rows fitted; ``measurements``: that the rows were taken from;
+    ``gross``: ``observation`` of every held-out row that is a gross error.
+    """
+    posterior = mode.linearisation.posterior
+    kept = measurements.is_validation & ~np.isin(measurements.observation, gross)
+    if not kept.any() or np.all(posterior.noise(mode.eta).sigma < LEAST_NOISE_M):
+        return ()
+    held_out = Rows.of(measurements, np.flatnonzero(kept), posterior.model.reference)
+    fitted = _contrasts(mode, measurements, spread_poses(posterior.rows))
+    others = _contrasts(mode, measurements, spread_poses(held_out))
+    return tuple(
+        StructureTest(
+            'held_out', kind % 2 == 1, p_value, posterior.model.sensor_names[kind // 2], ratio
+        )
+        for kind, p_value, ratio in compared(fitted, others, mode.covariance)
+    )
+
+
+def _contrasts(mode: Mode, measurements: Measurements, rows: Rows) -> Contrasts:
+    white = whitened(mode, rows, {})
+    joined = np.concatenate((white['model'], white['errors']), axis=2)
+    return Contrasts.of(rows, measurements, joined)
