@@ -43,6 +43,7 @@ def fit_session(
     extension: Extension | None = None,
     priors: Priors | None = None,
     unmodelled: FloatArray | None = None,
+    found: Estimate | None = None,
 ) -> FitResult:
     """Fit a session's optimization rows.
 
@@ -73,6 +74,9 @@ def fit_session(
     unmodelled
         How c causes outside the model move its natural parameters, one standard deviation of
         each, (size, c): the posterior is widened by them. Not in paper mode.
+    found
+        The session's estimate, where it has been made with the same priors and without further
+        effects.
 
     Raises
     ------
@@ -115,7 +119,10 @@ def fit_session(
         )
     else:
         # With further effects the same model has been fitted to the same rows before.
-        found = estimate(problem, extension) if extension else sound_estimate(session, priors)
+        if extension is not None:
+            found = estimate(problem, extension)
+        elif found is None:
+            found = sound_estimate(session, priors)
         sampled = _fast(found, chains, draws, precision, rng, report)
         if unmodelled is not None:
             sampled = replace(sampled, unmodelled=unmodelled)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import compress
 
 import numpy as np
 
@@ -138,18 +139,14 @@ def listed(parts: Sequence[str]) -> str:
 
 
 def resolving_priors(
-    priors: Sequence[Prior], x: FloatArray, direction: FloatArray, model: Model
-) -> str:
-    """Name the priors that hold a direction: those that change along it."""
+    priors: Sequence[Prior], x: FloatArray, directions: FloatArray, model: Model
+) -> list[str]:
+    """Name the priors that hold each of d directions (size, d): those that change along it."""
     core = replace(model, extension=None)
-    pull = {
-        prior.description: float(
-            np.linalg.norm(
-                prior_rows(core, [prior], x[: model.core], natural=True)[1]
-                @ direction[: model.core]
-            )
-        )
-        for prior in priors
-    }
-    pull[EFFECTS_PRIOR] = float(np.linalg.norm(model.extension_root @ model.theta(direction)))
-    return listed([name for name, p in pull.items() if p > 1e-3 * max(pull.values())])
+    names = [*(prior.description for prior in priors), EFFECTS_PRIOR]
+    rows = [prior_rows(core, [prior], x[: model.core], natural=True)[1] for prior in priors]
+    pulls = [np.linalg.norm(one @ directions[: model.core], axis=0) for one in rows]
+    effects = model.extension_root @ model.theta(directions.T).T
+    holds = np.array([*pulls, np.linalg.norm(effects, axis=0)])
+    holds = holds > 1e-3 * holds.max(axis=0)
+    return [listed(list(dict.fromkeys(compress(names, one)))) for one in holds.T]

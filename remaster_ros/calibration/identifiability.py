@@ -98,17 +98,18 @@ def find_gauge(
     held = _unresolved(by_x @ null, pivots, model, scale)
 
     directions, why = [], [''] * model.joints
+    resolving = resolving_priors(priors, x, null, model)
     for column, pivot in enumerate(pivots):
-        combination = _about_origin(model, null[:, column], scale)
-        words = in_words(model, combination)
         if pivot in held:
             at = x[pivot] if pivot >= model.core else 0.0
             fixed_by = f'{model.names[pivot]} = {at:g}'
         else:
-            fixed_by = resolving_priors(priors, x, null[:, column], model)
+            fixed_by = resolving[column]
             if fixed_by == EFFECTS_PRIOR:
                 # How large such errors are is known: how well the offsets then are is in `weak`.
                 continue
+        combination = _about_origin(model, null[:, column], scale)
+        words = in_words(model, combination)
         directions.append(GaugeDirection(_entries(model, combination), words, fixed_by))
         for joint in np.flatnonzero(combination[: model.joints]):
             text = f'the data do not determine it: {words}; fixed by {fixed_by}'
@@ -196,7 +197,7 @@ def _null_space(
     triangle = triangle / scale
     _, singular, vectors = np.linalg.svd(triangle, full_matrices=True)
     rank = np.count_nonzero(singular >= ROUNDING * singular[0])
-    basis, pivots = _reduce(vectors[rank:].T, scale, _kinds(model))
+    basis, pivots = _reduce(vectors[rank:].T.copy(), scale, _kinds(model))
     # For what is badly determined a prior on effects counts as data: it separates them.
     root = np.zeros((len(model.extension_root), model.size))
     root[:, model.core :] = model.extension_root
@@ -313,7 +314,7 @@ def _reduce(
         work[:, column] /= work[pivot, column]
         others = work[pivot].copy()
         others[column] = 0.0
-        work = work - np.outer(work[:, column], others)
+        work -= np.outer(work[:, column], others)
     null = work / scale[:, None]
     null /= null[pivots, np.arange(len(pivots))]
     return null[:, np.argsort(pivots)], sorted(pivots)

@@ -35,6 +35,7 @@ BLOCK_ROWS = 5_000
 # So many poses determine the factor, with so many rows of each.
 MOST_POSES = 1_000
 MOST_ROWS = 60
+POSES_AT_A_TIME = 50
 # Fewer say nothing of one in twenty.
 FEWEST_ROWS = 20
 
@@ -152,6 +153,24 @@ class _Part:
         parts = [covariance(variances) for variances in _variances(fit)]
         return cls(rows, sensor, place, spread, *parts)
 
+    def left_out(self, mine: IntArray) -> FloatArray:
+        """Return the squared distances of the rows of one pose, left out together."""
+        n, rows = len(mine), self.rows
+        group = rows.group_of_row[mine]
+        # Rows of a pose share an error: their noise is one matrix of n × n blocks.
+        same = (group[:, None] == group).astype(float)
+        noise = np.einsum('nm,nij->nimj', same, self.pose_noise[mine])
+        if rows.frame is not None:
+            same = (rows.frame[mine][:, None] == rows.frame[mine]).astype(float)
+            noise += np.einsum('nm,nij->nimj', same, self.frame_noise[mine])
+        noise[np.arange(n), :, np.arange(n)] += self.own_noise[mine]
+        R = noise.reshape(3 * n, 3 * n)
+        root = self.spread[mine].reshape(3 * n, -1)
+        error = (rows.target - self.place)[mine].ravel()
+        out = R @ np.linalg.solve(R - root @ root.T, np.column_stack((error, R)))
+        blocks = out[:, 1:].reshape(n, 3, n, 3)[np.arange(n), :, np.arange(n)]
+        return squared_distances(out[:, 0].reshape(n, 3), blocks)
+
 
 def _variances(fit: FitResult) -> FloatArray:
     """Return the noise of a row, shared by a pose and by a frame, m², (3, sensors, 2).
@@ -182,25 +201,17 @@ def _left_out_distances(
     gross = [observation for observation, _ in fit.left_out]
     fitted = ~measurements.is_validation & ~np.isin(measurements.observation, gross)
     poses = np.unique(measurements.pose[fitted])
-    distances = []
-    for pose in poses[:: -(-len(poses) // MOST_POSES)]:
-        source = np.flatnonzero(fitted & (measurements.pose == pose))[:MOST_ROWS]
-        rows = Rows.of(measurements, source, fit.predictive.model.reference)
+    poses = poses[:: max(1, -(-len(poses) // MOST_POSES))]
+    distances = [np.zeros(0)]
+    for few in np.array_split(poses, -(-len(poses) // POSES_AT_A_TIME)) if len(poses) else ():
+        sources = [
+            np.flatnonzero(fitted & (measurements.pose == pose))[:MOST_ROWS] for pose in few
+        ]
+        rows = Rows.of(measurements, np.concatenate(sources), fit.predictive.model.reference)
         part = _Part.of(fit, rows, triangle)
-        n = len(rows)
-        same = rows.group_of_row[:, None] == rows.group_of_row
-        # Rows of a pose share an error: their noise is one matrix of n × n blocks.
-        noise = np.einsum('nm,nij->nimj', same.astype(float), part.pose_noise)
-        if rows.frame is not None:
-            same = rows.frame[:, None] == rows.frame
-            noise += np.einsum('nm,nij->nimj', same.astype(float), part.frame_noise)
-        noise[np.arange(n), :, np.arange(n)] += part.own_noise
-        R = noise.reshape(3 * n, 3 * n)
-        root = part.spread.reshape(3 * n, -1)
-        error = (rows.target - part.place).ravel()
-        out = R @ np.linalg.solve(R - root @ root.T, np.column_stack((error, R)))
-        blocks = out[:, 1:].reshape(n, 3, n, 3)[np.arange(n), :, np.arange(n)]
-        found = squared_distances(out[:, 0].reshape(n, 3), blocks)
-        # Of a pose that alone determines a parameter rounding is left, which says nothing.
-        distances.append(found[found >= 0.0])
-    return np.concatenate(distances) if distances else np.zeros(0)
+        for source in sources:
+            mine = np.flatnonzero(np.isin(rows.source, source))
+            found = part.left_out(mine)
+            # Of a pose that alone determines a parameter rounding is left, which says nothing.
+            distances.append(found[found >= 0.0])
+    return np.concatenate(distances)

@@ -252,6 +252,7 @@ def discover_session(
             priors=None if found is before else found.problem.priors,
             precision=PRECISION,
             extension=None if errors is None else extension_of(data, errors, found),
+            found=found,
         )
     geometry = geometry_model(found, causes=measured)
     thinning = None

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
+from remaster_ros.calibration.linearisation import log_determinant
 from remaster_ros.calibration.noise import Noise
 from remaster_ros.discovery.effects.base import Cell
 from remaster_ros.discovery.effects.registry import EFFECTS
@@ -148,7 +149,7 @@ class Products(NamedTuple):
     """Of the columns of a batch of cells, what the others explain taken out.
 
     ``norm`` (cells, m) before that, in units of which ``gram`` (cells, m, m) has their products
-    with each other, and ``pull`` (cells, m, 1) those with the residuals.
+    with each other, and ``pull`` (cells, m) those with the residuals.
     """
 
     norm: FloatArray
@@ -176,7 +177,7 @@ def screen(
     wanted = np.flatnonzero(others if chosen is None else others & chosen)
     for batch in catalogue.batches(wanted):
         products = _products(data, catalogue, batch, project, residual, given.noise)
-        scores[batch] = _scores([catalogue.cells[i] for i in batch], products, n_eff)[:, 0]
+        scores[batch] = _scores([catalogue.cells[i] for i in batch], products, n_eff)
     return scores
 
 
@@ -220,18 +221,17 @@ def _products(
         # The penalty compares neighbours: one unit for all of a cell's splines.
         norm = np.repeat(norm.max(axis=1, keepdims=True), m, axis=1)
     left = project.residual(white / np.where(norm > 0.0, norm, 1.0).ravel())
-    pull = (left.T @ residuals).reshape(count, m, -1)
+    pull = (left.T @ residuals).reshape(count, m)
     blocks = left.reshape(len(left), count, m).transpose(1, 2, 0)
     gram = np.asarray(blocks @ blocks.transpose(0, 2, 1), dtype=float)
     return Products(norm, gram, np.asarray(pull, dtype=float))
 
 
 def _scores(cells: Sequence[Cell], products: Products, n_eff: int) -> FloatArray:
-    """Return the score of each cell of a batch on each residual, (cells, residuals)."""
+    """Return the score of each cell of a batch, (cells,)."""
     norm, gram, pull = products
-    count, m = norm.shape
+    m = norm.shape[1]
     prior = np.array([np.log(cell.drawn_from) for cell in cells])
-    sign = np.array([cell.sign for cell in cells])
     if cells[0].penalty is None:
         values, vectors = np.linalg.eigh(gram)
         seen = values > ABSORBED
@@ -240,30 +240,29 @@ def _scores(cells: Sequence[Cell], products: Products, n_eff: int) -> FloatArray
         ridge = (largest**2 * np.mean(norm**2, axis=1) + np.finfo(float).tiny) ** -1.0
         ridge[np.isnan(largest)] = 0.0
         strength = np.maximum(values, ABSORBED) + ridge[:, None]
-        root = vectors * np.where(seen, strength**-0.5, 0.0)[:, None]
         if m == 1:
-            pull[sign[:, None, None] * pull < 0.0] = 0.0
-        gain = np.sum((root.transpose(0, 2, 1).astype(np.float32) @ pull) ** 2, axis=1)
+            sign = np.array([cell.sign for cell in cells])
+            pull[sign * pull[:, 0] < 0.0] = 0.0
+        along = np.einsum('cij,ci->cj', vectors, pull)
+        gain = np.sum(np.where(seen, along**2 / strength, 0.0), axis=1)
         rank = seen.sum(axis=1)
-        price = 0.5 * rank * np.log(n_eff) + prior
-        score = _explained(gain, n_eff) - price[:, None]
+        score = _explained(gain, n_eff) - 0.5 * rank * np.log(n_eff) - prior
         score[rank == 0] = -np.inf
         return score
-    score = np.full((count, pull.shape[2]), -np.inf)
-    for index, cell in enumerate(cells):
-        assert cell.penalty is not None
-        weight = np.trace(gram[index])
-        penalty = cell.penalty * weight / np.trace(cell.penalty)
-        jitter = SINGLE_ROUNDING * weight * np.eye(m)
-        for factor in SMOOTHNESS:
-            root = np.linalg.cholesky(gram[index] + factor * penalty + jitter)
-            shrink = np.linalg.inv(root).astype(np.float32)
-            gain = np.sum((shrink @ pull[index]) ** 2, axis=0)
-            volume = np.sum(np.log(np.diag(root))) - 0.5 * np.linalg.slogdet(factor * penalty)[1]
-            price = volume + prior[index] + np.log(len(SMOOTHNESS))
-            score[index] = np.maximum(score[index], _explained(gain, n_eff) - price)
+    weight = np.trace(gram, axis1=1, axis2=2)[:, None, None]
+    penalty = np.array([cell.penalty for cell in cells])
+    penalty *= weight / np.trace(penalty, axis1=1, axis2=2)[:, None, None]
+    jitter = SINGLE_ROUNDING * weight * np.eye(m)
+    flat = np.linalg.slogdet(penalty)[1]
+    score = np.full(len(cells), -np.inf)
+    for factor in SMOOTHNESS:
+        root = np.linalg.cholesky(gram + factor * penalty + jitter)
+        gain = np.sum(np.linalg.solve(root, pull[:, :, None])[:, :, 0] ** 2, axis=1)
+        price = log_determinant(root) - 0.5 * (flat + m * np.log(factor))
+        price += prior + np.log(len(SMOOTHNESS))
+        score = np.maximum(score, _explained(gain, n_eff) - price)
     return score
 
 
 def _explained(gain: FloatArray, n_eff: int) -> FloatArray:
-    return -0.5 * n_eff * np.log1p(-np.minimum(np.asarray(gain, dtype=float), 1.0 - 1e-9))
+    return -0.5 * n_eff * np.log1p(-np.minimum(gain, 1.0 - 1e-9))

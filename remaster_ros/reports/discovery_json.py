@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal
 
@@ -225,6 +226,7 @@ def holds_everything(discovery: Discovery) -> bool:
     return better and bool(discovery.solution.cells)
 
 
+@lru_cache(maxsize=1)
 def _corrected(discovery: Discovery) -> FloatArray:
     """Return the residuals with what compensation.json corrects, where it holds everything."""
     fit, cells, data = discovery.fit, discovery.solution.cells, discovery.residuals
