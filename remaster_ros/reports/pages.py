@@ -12,8 +12,10 @@ import msgspec
 from jinja2 import Environment, FunctionLoader, StrictUndefined
 from markupsafe import Markup
 
+from remaster_ros.calibration.predictions import Coverage
 from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.discovery.effects.unnamed import EFFECT as NO_NAME
+from remaster_ros.discovery.explain import LookAlike
 from remaster_ros.discovery.words import (
     p_value_text,
     percent,
@@ -21,7 +23,7 @@ from remaster_ros.discovery.words import (
 )
 from remaster_ros.reports.figures import GRID, INK, PAPER
 from remaster_ros.reports.fit_json import REPORT_FILE
-from remaster_ros.reports.schemas import Coverage, Effect, LookAlike, MeasuredSession
+from remaster_ros.reports.schemas import Effect, MeasuredSession
 from remaster_ros.reports.sentences import (
     METRICS,
     NO_TIMES,

@@ -15,6 +15,11 @@ import msgspec
 import numpy as np
 from msgspec import UNSET, Struct, UnsetType
 
+from remaster_ros.calibration.identifiability import GaugeDirection
+from remaster_ros.calibration.predictions import Coverage
+from remaster_ros.discovery.explain import LookAlike, Parameter
+from remaster_ros.discovery.thinning import Thinning
+
 FIT_FORMAT = 'remaster-fit/1'
 DISCOVERY_FORMAT = 'remaster-discovery/1'
 
@@ -85,14 +90,6 @@ class JointOffset(Struct):
             assert self.std_mm is not UNSET
             return 1e-3 * self.mean_mm, 1e-3 * self.std_mm
         return math.radians(self.mean_deg), math.radians(self.std_deg)
-
-
-class GaugeCombination(Struct):
-    """A combination of parameters that the data do not determine, and what fixes it."""
-
-    combination: dict[str, float]
-    why: str
-    fixed_by: str
 
 
 class Registration(Struct):
@@ -312,7 +309,7 @@ class Fit(Struct):
 
     format: str
     joint_offsets: list[JointOffset]
-    gauge: list[GaugeCombination]
+    gauge: list[GaugeDirection]
     registration: dict[str, Registration]
     markers: dict[str, Marker]
     noise: dict[str, Noise]
@@ -352,31 +349,6 @@ def encode(content: Struct) -> bytes:
 # Beside what it shares with fit.json: what discovery.json holds.
 
 
-class EffectParameter(Struct):
-    """A parameter of an effect, in its unit."""
-
-    name: str
-    value: float
-    std: float
-    unit: str
-
-
-class LookAlike(Struct):
-    """What could be mistaken for an effect, and what would separate the two.
-
-    ``same``: nothing can, the two displace every pose alike. ``general``: it is a free form, and
-    the effect one of the shapes that it can have.
-    """
-
-    name: str
-    joints: list[int]
-    log_evidence_gain: float
-    separate_by: str
-    same: bool = False
-    general: bool = False
-    title: str = ''
-
-
 class NamedCause(Struct):
     """A cause by name and joints."""
 
@@ -409,7 +381,7 @@ class Effect(Struct):
     place: str
     driver: str
     form: str
-    parameters: list[EffectParameter]
+    parameters: list[Parameter]
     p_value: float
     log_evidence_gain: float
     confusable_with: list[LookAlike]
@@ -469,15 +441,6 @@ class OffsetBefore(Struct):
     std_deg: float | None
 
 
-class SearchedRows(Struct):
-    """Of a session of which the search saw a part."""
-
-    searched: int
-    rows: int
-    others_rms_before_m: float | None
-    others_rms_after_m: float | None
-
-
 class Compared(Struct):
     """A parameter in both sessions, and by how many standard deviations of both they differ."""
 
@@ -528,15 +491,6 @@ class Confirmed(Struct):
     parameters_rms_sigmas: float | UnsetType | None = UNSET
     why: str | UnsetType = UNSET
     other_joints: list[int] | UnsetType = UNSET
-
-
-class Coverage(Struct):
-    """How many rows lie in their 95 % regions; the interval takes the rows as independent."""
-
-    rows: int
-    inside: int
-    share: float | None
-    interval95: tuple[float, float] | None
 
 
 class PredictedRegions(Struct):
@@ -593,7 +547,7 @@ class Discovered(Struct):
     covariance: JointCovariance | UnsetType = UNSET
     predicted_regions95: PredictedRegions | UnsetType = UNSET
     loadable: list[Loadable] | UnsetType = UNSET
-    rows_searched: SearchedRows | UnsetType = UNSET
+    rows_searched: Thinning | UnsetType = UNSET
     confirmation: Confirmed | UnsetType = UNSET
     decided: list[Decided] | UnsetType = UNSET
     judgement: Judgement | UnsetType = UNSET

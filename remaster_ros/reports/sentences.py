@@ -12,13 +12,15 @@ from msgspec import Struct
 from remaster_ros.calibration.gauge_words import listed
 from remaster_ros.calibration.measured_again import MeasuredAgain
 from remaster_ros.calibration.noise_check import SPOILT, NoiseCheck
+from remaster_ros.calibration.predictions import Coverage
 from remaster_ros.calibration.residual_structure import FEWEST_POSES
 from remaster_ros.collection.reference_watch import changes
 from remaster_ros.compensation.export import APPLY_FOLDER, LAYER_FILE, REMASTER_FILE, URDF_FILE
+from remaster_ros.discovery.explain import LookAlike
+from remaster_ros.discovery.thinning import Thinning
 from remaster_ros.discovery.words import called, part_words, percent, sentence_case, shown
 from remaster_ros.reports.schemas import (
     Confirmed,
-    Coverage,
     Discovered,
     Effect,
     Fit,
@@ -27,7 +29,6 @@ from remaster_ros.reports.schemas import (
     JointOffset,
     Judgement,
     Loadable,
-    LookAlike,
     MeasuredSession,
 )
 
@@ -633,15 +634,11 @@ def discovery_lines(found: Discovered) -> list[str]:
     regions = found.predicted_regions95
     if isinstance(regions, Struct) and (words := coverage_words(regions.held_out)):
         lines.append(words)
-    if isinstance(found.rows_searched, Struct):
-        part = found.rows_searched
-        before, after = (
-            np.nan if rms is None else 1e3 * rms
-            for rms in (part.others_rms_before_m, part.others_rms_after_m)
-        )
+    if isinstance(part := found.rows_searched, Thinning):
         lines.append(
             f'searched: {part.searched} of {part.rows} rows; the others fall from '
-            f'{before:.3f} to {after:.3f} mm RMS with the causes as found, frozen'
+            f'{1e3 * part.others_rms_before_m:.3f} to {1e3 * part.others_rms_after_m:.3f} mm RMS '
+            'with the causes as found, frozen'
         )
     lines += [f'not testable: {name}: {why}' for name, why in (found.untestable or {}).items()]
     lines += found.judgement.doubts
