@@ -309,13 +309,19 @@ def test_where_no_joint_is_determined_and_no_cause_found_there_is_no_covariance(
     assert found == {'names': [], 'units': [], 'matrix': []}
 
 
+class _Remembered(SimpleNamespace):
+    """Stands for a discovery, of which what was computed is remembered: it has a hash."""
+
+    __hash__ = object.__hash__
+
+
 def test_what_is_no_better_in_the_figures_shown_is_not_to_be_loaded(monkeypatch):
     """Everything that was found is in the robot model: no compensation is asked for."""
     rows = SimpleNamespace(
         is_validation=np.array([False, True, True]), observation=np.array([1, 2, 3])
     )
     errors = np.full((3, 3), 1e-3)
-    found = SimpleNamespace(
+    found = _Remembered(
         residuals=SimpleNamespace(context=SimpleNamespace(measurements=rows)),
         outliers=(),
         alone=SimpleNamespace(residuals_after=2.0 * errors),
