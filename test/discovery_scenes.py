@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 from calibration_scenes import CHAIN, scene
@@ -57,3 +58,15 @@ def at_joint(joint: int, values: FloatArray) -> FloatArray:
 def discovered(session: Session, seed: int = 0) -> Discovery:
     """Search a session for causes."""
     return discover_session(session, rng=np.random.default_rng(seed))
+
+
+def sagging(session: Session) -> FloatArray:
+    """Joints 2 and 4 give way: the pair that a greedy search takes for a coupling."""
+    tau = CHAIN.gravity_torque(session.measurements.q)
+    return at_joint(2, 4e-5 * tau[:, 1]) + at_joint(4, 6e-5 * tau[:, 3])
+
+
+@cache
+def sagging_arm() -> Discovery:
+    """Search the session of an arm that sags, once for all tests of a process."""
+    return discovered(session_with(21, sagging))

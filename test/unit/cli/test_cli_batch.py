@@ -35,8 +35,8 @@ def rows(folder: Path) -> dict[str, dict]:
 def sessions(tmp_path_factory):
     folder = tmp_path_factory.mktemp('sessions')
     for seed, hidden in ((1, ['--effect', 'joint_compliance@2:1.0']), (2, [])):
-        given = ['--poses', '12', '--validation', '6', '--seed', str(seed), '--quiet', *hidden]
-        assert main(['simulate', str(folder / f's{seed}'), *given]) == 0
+        given = ['--poses', '12', '--validation', '6', '--sensors', 'mocap', '--seed', str(seed)]
+        assert main(['simulate', str(folder / f's{seed}'), *given, '--quiet', *hidden]) == 0
     return folder
 
 
@@ -188,14 +188,14 @@ def square(job):
 
 def dies_once(job):
     number, mark = job
-    if number == 3 and not Path(mark).exists():
+    if number == 1 and not Path(mark).exists():
         Path(mark).touch()
         os.kill(os.getpid(), signal.SIGKILL)
     return {'status': 'done', 'square': number**2}
 
 
 def always_dies(job):
-    if job == 5:
+    if job == 2:
         os.kill(os.getpid(), signal.SIGKILL)
     return square(job)
 
@@ -213,18 +213,16 @@ def worked_off(jobs, work, workers=2):
 
 
 def test_what_was_under_way_when_a_worker_was_killed_is_done_again(tmp_path):
-    jobs = [(number, str(tmp_path / 'mark')) for number in range(8)]
+    jobs = [(number, str(tmp_path / 'mark')) for number in range(4)]
     done, pools = worked_off(jobs, dies_once)
-    assert {job[0]: row['square'] for job, row in done.items()} == {n: n * n for n in range(8)}
+    assert {job[0]: row['square'] for job, row in done.items()} == {n: n * n for n in range(4)}
     assert pools == 2
 
 
 def test_a_session_that_kills_its_worker_twice_has_that_in_its_row():
-    done, _ = worked_off(list(range(8)), always_dies)
-    assert done.pop(5)['status'] == 'killed'
-    assert {job: row['square'] for job, row in done.items()} == {
-        n: n * n for n in range(8) if n != 5
-    }
+    done, _ = worked_off(list(range(4)), always_dies)
+    assert done.pop(2)['status'] == 'killed'
+    assert {job: row['square'] for job, row in done.items()} == {0: 0, 1: 1, 3: 9}
 
 
 @pytest.mark.parametrize(
@@ -339,16 +337,16 @@ def test_who_differs_and_which_joint_changes_along_the_sessions():
 
 @pytest.mark.parametrize('arms', [5, 12])
 def test_arms_that_scatter_are_not_said_to_differ(arms):
-    """300 pages, any named on 1 % of them: more than 11 by chance once in 14,000."""
+    """100 pages, any named on 1 % of them: more than 6 by chance once in 14,000."""
     seed = 11
     print('seed', seed)
     rng = np.random.default_rng(seed)
     named = 0
-    for _ in range(300):
+    for _ in range(100):
         offsets = 0.3 * rng.standard_normal((arms, 6))
         found = summary_of([made_row(f's{i}', row) for i, row in enumerate(offsets.tolist())])
         named += any(one['differs'] for one in found['joints'])
-    assert named <= 11
+    assert named <= 6
 
 
 def test_two_that_differ_do_not_hide_each_other():

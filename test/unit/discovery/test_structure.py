@@ -13,6 +13,9 @@ from remaster_ros.discovery.evidence import solve
 from remaster_ros.reports.discovery_json import discovery_content
 from remaster_ros.types import FloatArray, Session
 
+# As many poses as these causes need to be located.
+SMALL = {'poses': 20, 'validation': 12, 'pose_sigma_m': 0.05e-3}
+
 
 def in_time(session: Session) -> np.ndarray:
     return np.argsort(session.measurements.stamp_s, kind='stable')
@@ -79,10 +82,10 @@ def slipped(moment: float):
 
 
 def test_a_slip_is_dated_between_the_two_configurations():
-    plain = residuals_of(session_with(32, pose_sigma_m=0.05e-3)).context
+    plain = residuals_of(session_with(32, **SMALL)).context
     moments = moments_of(plain)
     truth = float(moments[len(moments) // 3])
-    found = discovered(session_with(32, slipped(truth), pose_sigma_m=0.05e-3))
+    found = discovered(session_with(32, slipped(truth), **SMALL))
     (group,) = found.groups
     assert (group[0].name, group[0].joints) == ('step', (3,))
     (effect,) = found.effects
@@ -132,7 +135,7 @@ def test_a_step_is_dated_also_where_held_out_readings_lie_between():
 
 
 def test_a_marker_that_slips_on_the_tool_is_located():
-    plain = residuals_of(session_with(33, pose_sigma_m=0.05e-3)).context
+    plain = residuals_of(session_with(33, **SMALL)).context
     moment = float(np.quantile(moments_of(plain), 0.25))
 
     def shifted(session: Session) -> FloatArray:
@@ -142,7 +145,7 @@ def test_a_marker_that_slips_on_the_tool_is_located():
         slip *= (plain.elapsed_s > moment)[:, None]
         return np.einsum('nji,nj->ni', plain.sensor_turn, slip)
 
-    found = discovered(session_with(33, sensor=shifted, pose_sigma_m=0.05e-3))
+    found = discovered(session_with(33, sensor=shifted, **SMALL))
     places = [(group[0].name, group[0].place, group[0].subject) for group in found.groups]
     assert places == [('step', 'marker', plain.marker_names[0])]
 
@@ -229,7 +232,8 @@ def test_a_sensor_moved_while_the_held_out_poses_were_measured_is_dated(shift_m)
         assert m.stamp_s[m.is_validation].min() > m.stamp_s[~m.is_validation].max()
         return late[:, None] * np.array([shift_m, 0.0, 0.0])
 
-    found = discover_session(session_with(41, sensor=moved), rng=np.random.default_rng(0))
+    session = session_with(41, sensor=moved, poses=20)
+    found = discover_session(session, rng=np.random.default_rng(0))
     assert found.verdict == 'unexplained'
     assert found.effects == ()
     entry = next(entry for entry in found.unexplained if entry.where == 'held_out_poses')

@@ -132,22 +132,6 @@ def test_forgotten_displacements_are_computed_again(monkeypatch):
     assert forgotten.solution.log_evidence == kept.solution.log_evidence
 
 
-def test_columns_and_errors_of_a_part_are_those_of_the_whole():
-    """In the rows worked on everything is what it is among all rows."""
-    found = discovered(session_with(21, sagging))
-    data, solution = found.residuals, found.solution
-    rows = data.rows.source
-    wanted = [
-        cell.columns(data.context).displacement(data.context)[rows] for cell in solution.cells
-    ]
-    np.testing.assert_allclose(
-        data.columns(solution.cells), np.concatenate(wanted, axis=2), atol=1e-12
-    )
-    np.testing.assert_allclose(
-        data.left(solution), data.unexplained(solution)[rows], rtol=0.0, atol=1e-12
-    )
-
-
 @pytest.mark.qualify
 def test_what_a_fit_leaves_does_not_depend_on_blocks(monkeypatch):
     found = discovered(session_with(21, sagging))

@@ -100,7 +100,7 @@ def test_the_judge_finds_the_same_solutions_of_random_poses(robot, poses, held):
     q[:, 2] = held
     T = poses_of(arm, q)
     judged = arm.inverse(T[:, :3, :3], T[:, :3, 3], held)
-    found = [ik.solutions_of_each(pose[None])[0] for pose in T]
+    found = ik.solutions_of_each(T)
     for i, solutions in enumerate(found):
         expected = distinct(judged[i])
         assert len(solutions) == len(expected), f'seed {seed}, pose {i}'
@@ -119,9 +119,9 @@ def test_within_limits_are_the_judges_solutions_within_limits():
     q[:, 2] = 0
     T = poses_of(arm, q)
     judged = wrapped(arm.inverse(T[:, :3, :3], T[:, :3, 3], 0.0))
-    for i, pose in enumerate(T):
+    for i, found in enumerate(ik.solutions_of_each(T)):
         expected = judged[i][chain.within_limits(judged[i])]
-        solutions = usable(ik, pose)
+        solutions = ik.usable(found)
         assert len(solutions) == len(expected)
         assert np.all(chain.within_limits(solutions, 1e-9))
         assert np.max(np.min(distance(expected, solutions), axis=1)) < SAME_RAD
@@ -194,10 +194,9 @@ def test_singular_poses_keep_every_branch_and_no_junk(robot, make, determined):
     make(q, arm)
     T = poses_of(arm, q)
     judged = arm.inverse(T[:, :3, :3], T[:, :3, 3], 0.0)
-    for i, pose in enumerate(T):
-        solutions = ik.solutions_of_each(pose[None])[0]
+    for i, solutions in enumerate(ik.solutions_of_each(T)):
         assert 1 <= len(solutions) <= 8
-        assert_certified(chain, solutions, pose)
+        assert_certified(chain, solutions, T[i])
         ours, expected = determined(solutions), determined(distinct(judged[i]))
         # A double root is known to the square root of rounding.
         assert np.max(np.min(distance(expected, ours), axis=1)) < 1e-6
@@ -217,7 +216,7 @@ def test_poses_out_of_reach_have_no_solution():
     for gap in (1e-6, 1e-3, 0.1, 3.0):
         far = T.copy()
         far[:, :3, 3] += gap * beyond
-        assert sum(len(ik.solutions_of_each(pose[None])[0]) for pose in far) == 0
+        assert sum(map(len, ik.solutions_of_each(far))) == 0
 
 
 def test_screws_and_tool_are_those_of_the_chain():
@@ -271,10 +270,10 @@ def test_any_joint_but_the_elbow_can_be_held(joint):
     ik = InverseKinematics(chain, {joint: (0.4,)})
     q = np.random.default_rng(8).uniform(chain.lower, chain.upper, (50, 7))
     q[:, joint] = 0.4
-    for row in q:
-        T = chain.forward(row)
-        solutions = usable(ik, T)
-        assert_certified(chain, solutions, T)
+    T = chain.forward(q)
+    for row, pose, found in zip(q, T, ik.solutions_of_each(T), strict=True):
+        solutions = ik.usable(found)
+        assert_certified(chain, solutions, pose)
         assert np.min(distance(row, solutions)) < SAME_RAD
 
 
@@ -293,14 +292,13 @@ def test_every_seed_of_6r_arms_is_recovered_also_with_rounded_angles(folder, rig
     ik = InverseKinematics(chain)
     rng = np.random.default_rng(9)
     lost = 0
-    for q in rng.uniform(
-        np.maximum(chain.lower, -np.pi), np.minimum(chain.upper, np.pi), (300, 6)
-    ):
-        T = chain.forward(q)
-        solutions = usable(ik, T)
+    q = rng.uniform(np.maximum(chain.lower, -np.pi), np.minimum(chain.upper, np.pi), (300, 6))
+    T = chain.forward(q)
+    for row, pose, found in zip(q, T, ik.solutions_of_each(T), strict=True):
+        solutions = ik.usable(found)
         assert np.all(chain.within_limits(solutions, 1e-9))
-        assert_certified(chain, solutions, T)
-        lost += not len(solutions) or np.min(distance(q, solutions)) > SAME_RAD
+        assert_certified(chain, solutions, pose)
+        lost += not len(solutions) or np.min(distance(row, solutions)) > SAME_RAD
     # Rounding moves the folds of the workspace: there alone (about 3 poses in 1000 of the UR10)
     # the closed form of the unrounded arm has no answer to start from.
     allowed = 0 if right_angle == '1.57079632679' else 3
@@ -471,11 +469,11 @@ def test_an_arm_with_no_closed_form_near_is_solved_and_said_so(capfd):
     text = ik.in_words()
     assert text.startswith('No arm with a closed form is near this one')
     assert '160 starts a pose' in text
-    for q in np.random.default_rng(2).uniform(-np.pi, np.pi, (20, 6)):
-        T = chain.forward(q)
-        solutions = ik.solutions_of_each(T[None])[0]
-        assert_certified(chain, solutions, T)
-        assert np.min(distance(q, solutions)) < SAME_RAD
+    q = np.random.default_rng(2).uniform(-np.pi, np.pi, (20, 6))
+    T = chain.forward(q)
+    for row, pose, solutions in zip(q, T, ik.solutions_of_each(T), strict=True):
+        assert_certified(chain, solutions, pose)
+        assert np.min(distance(row, solutions)) < SAME_RAD
     far = transform(np.eye(3), np.array([0.0, 0.0, 20.0]))
     assert usable(ik, far).shape == (0, 6)
     assert capfd.readouterr() == ('', '')
