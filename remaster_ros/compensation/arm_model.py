@@ -36,6 +36,8 @@ Driver = Literal['none', 'angle', 'gravity_torque', 'gravity_moment', 'temperatu
 Form = Literal['constant', 'linear', 'quadratic', 'sin', 'cos', 'bspline']
 GRAVITY = (0.0, 0.0, -9.81)
 TURN = 2.0 * np.pi
+# Rows at which slopes are looked at, and by steps of how much, rad.
+SLOPES_AT, SLOPE_STEP = 500, 1e-6
 # Rows of a block: frames and derivatives of so many take some ten megabytes.
 BLOCK_ROWS = 2_000
 
@@ -263,6 +265,23 @@ class ArmModel:
             values = term.function.features(drivers.of(term.function))
             added[:, term.joint] += values @ term.coefficients
         return added
+
+    def steepest(self) -> float:
+        """Return by how much offsets and terms change with the reported angles at the most.
+
+        Largest sum of a joint's changes, rad per rad, at angles all over the limits. Below 1 there
+        is one command for each wanted angle, and the fixed point goes to it (Banach).
+        """
+        rng = np.random.default_rng(0)
+        k, warming = self.joints, np.zeros(SLOPES_AT)
+        low, high = (np.clip(end, -np.pi, np.pi) for end in (self.chain.lower, self.chain.upper))
+        q = rng.uniform(low, high, (SLOPES_AT, k))
+        here = self.added_angles(self.drivers(q, warming))
+        slopes = np.zeros((SLOPES_AT, k))
+        for j in range(k):
+            there = self.added_angles(self.drivers(q + SLOPE_STEP * np.eye(k)[j], warming))
+            slopes += np.abs(there - here) / SLOPE_STEP
+        return float(slopes.max())
 
     def state(self, q: FloatArray, temperature_c: FloatArray | float | None = None) -> State:
         """Return where the arm is at reported angles (n, k)."""

@@ -519,6 +519,10 @@ def _model(content: CompensationPart) -> ArmModel:
         raise _broken('base_frame and tool', 'are empty')
     if model.grows and warm is None:
         raise _broken('temperature', 'is missing, but something depends on it')
+    steepest = model.steepest()
+    if not steepest < 1.0:
+        what = f'change an angle by up to {steepest:.3g} rad per rad, which no command takes off'
+        raise _broken('joints', what)
     found = content.parameters
     root = _root(model, 'parameters', found.names, 'covariance_root', found.covariance_root)
     error = found.error

@@ -52,6 +52,18 @@ def configurations(count: int, seed: int) -> np.ndarray:
     return np.random.default_rng(seed).uniform(CHAIN.lower, CHAIN.upper, (count, len(CHAIN)))
 
 
+@pytest.mark.parametrize(('driver', 'size'), [('angle', 1.2), ('gravity_torque', 0.5)])
+def test_a_file_whose_terms_no_command_takes_off_is_refused(tmp_path, driver, size):
+    def read(coefficient):
+        form, order = ('sin', 1) if driver == 'angle' else ('linear', 0)
+        wave = JointTerm(1, 'x', Function(driver, form, 1, order), np.array([coefficient]))
+        return in_use(save(tmp_path, arm(URDF, joint_terms=(wave,)), URDF))
+
+    with pytest.raises(InputError, match=r'joints change an angle by up to .* rad per rad'):
+        read(size)
+    read(1e-3 * size)
+
+
 @pytest.mark.parametrize('seed', [1, 2, 3])
 def test_the_true_arm_is_within_the_clearance_of_the_one_that_is_checked(tmp_path, seed):
     """All links at fresh configurations, by the rule of the clearances: levers from the axes."""
