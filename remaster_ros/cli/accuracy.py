@@ -16,6 +16,7 @@ from remaster_ros.cli.console import progress_bar, show
 from remaster_ros.cli.sessions import read_to_fit
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.reports.fit_json import joint_offsets_rad, read_fit, require_own
+from remaster_ros.reports.schemas import Fit
 from remaster_ros.reports.sentences import METRICS
 from remaster_ros.session.files import make_folder, undone_on_failure, write_atomically
 from remaster_ros.types import Session
@@ -83,11 +84,9 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def warn_of_another_urdf(fit: dict[str, Any], session: Session, path: Path) -> None:
+def warn_of_another_urdf(fit: Fit, session: Session, path: Path) -> None:
     """Warn where the offsets were fitted on another model of the robot."""
-    robot = fit.get('robot')
-    fitted = robot.get('urdf_sha256') if isinstance(robot, dict) else None
-    if fitted is not None and fitted != session.urdf_sha256:
+    if fit.robot and fit.robot.urdf_sha256 != session.urdf_sha256:
         log.warning(
             "%s: fitted with another URDF than this session's; the joints have the same names, "
             'but the geometry may differ',

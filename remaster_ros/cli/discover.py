@@ -6,7 +6,6 @@ import argparse
 import time
 from pathlib import Path
 
-import msgspec
 import numpy as np
 
 from remaster_ros.cli.console import progress_bar, show, show_file
@@ -23,7 +22,6 @@ from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.reports.discovery_json import earlier_pairs, read_discovery
 from remaster_ros.reports.fit_json import DISCOVERY_FILE
 from remaster_ros.reports.result_folder import prepare_folder, save_discovery
-from remaster_ros.reports.schemas import Discovered
 from remaster_ros.reports.sentences import discovery_lines
 from remaster_ros.session.files import undone_on_failure
 from remaster_ros.session.reader import read_session
@@ -89,7 +87,7 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         show_file(args.out / DISCOVERY_FILE)
     else:
-        content = msgspec.convert(read_discovery(args.out / DISCOVERY_FILE), Discovered)
+        content = read_discovery(args.out / DISCOVERY_FILE)
         for line in (*named, *discovery_lines(content)):
             show(args.quiet, line)
         if session.measurements.orientation is not None:

@@ -54,14 +54,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Fit, write, and print a summary of a few lines."""
-    import msgspec
     import numpy as np
 
     from remaster_ros.calibration.fit import fit_session
     from remaster_ros.cli.sessions import read_together
     from remaster_ros.reports.fit_json import FIT_FILE, read_fit
     from remaster_ros.reports.result_folder import prepare_folder, save_fit
-    from remaster_ros.reports.schemas import Fit
     from remaster_ros.reports.sentences import fit_lines
     from remaster_ros.session.files import undone_on_failure
     from remaster_ros.session.session_yaml import read_priors
@@ -89,7 +87,7 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         show_file(args.out / FIT_FILE)
     else:
-        fit = msgspec.convert(read_fit(args.out / FIT_FILE), Fit)
+        fit = read_fit(args.out / FIT_FILE)
         for line in (*named, *fit_lines(fit), f'written: {report}'):
             show(args.quiet, line)
     return 0

@@ -59,7 +59,7 @@ from remaster_ros.nodes.runtime_files import opening_path, page_name
 from remaster_ros.nodes.status import listen
 from remaster_ros.reports.discovery_json import read_discovery
 from remaster_ros.reports.fit_json import read_fit
-from remaster_ros.reports.schemas import Discovered
+from remaster_ros.reports.schemas import Discovered, Effect, Fit
 from remaster_ros.reports.sentences import discovery_lines
 from remaster_ros.session.files import cannot_write, make_folder, undone_on_failure
 from remaster_ros.session.reader import HEADER, read_session
@@ -241,27 +241,26 @@ def print_times(console: Console, times: ConfigurationTimes) -> None:
     console.print(table)
 
 
-def print_offsets(console: Console, fit: dict[str, Any], truth: SessionTruth) -> None:
+def print_offsets(console: Console, fit: Fit, truth: SessionTruth) -> None:
     """Print the offsets beside the true ones, and the error on validation poses."""
     title = 'joint zero-offsets, degrees'
     table = _table(title, 'joint', 'estimate', 'std', 'hidden truth', 'off by, std')
-    for row, true in zip(fit['joint_offsets'], np.rad2deg(truth.joint_offsets)):
-        if row['identifiable']:
-            estimate, std = f'{row["mean_deg"]:.4f}', f'{row["std_deg"]:.4f}'
-            off = f'{(row["mean_deg"] - true) / row["std_deg"]:+.1f}'
+    for row, true in zip(fit.joint_offsets, np.rad2deg(truth.joint_offsets)):
+        mean, std = np.rad2deg(row.mean_and_std)
+        if row.identifiable:
+            estimate, spread, off = f'{mean:.4f}', f'{std:.4f}', f'{(mean - true) / std:+.1f}'
         else:
             # An offset that the data leave free has the spread of a whole turn: no useful figure.
-            std = f'{row["std_deg"]:.2f}' if row['std_deg'] < 90 else 'n/a'
-            estimate, off = 'not identifiable', ''
-        table.add_row(row['joint'], estimate, std, f'{true:.4f}', off)
+            estimate, spread, off = 'not identifiable', f'{std:.2f}' if std < 90 else 'n/a', ''
+        table.add_row(row.joint, estimate, spread, f'{true:.4f}', off)
     console.print(table)
-    for row in fit['joint_offsets']:
-        if not row['identifiable']:
-            console.print(f'{row["joint"]}: {row["why"]}')
+    for row in fit.joint_offsets:
+        if not row.identifiable:
+            console.print(f'{row.joint}: {row.why}')
     title = 'error on validation poses, which were never fitted, mm (mean)'
     accuracy = _table(title, 'metric', 'before', 'after')
     for metric in ('relative', 'post_registration'):
-        sides = (fit['accuracy']['validation'] or {}).get(metric) or {}
+        sides = (fit.accuracy.validation or {}).get(metric) or {}
         cells = [
             f'{sides[s]["mean_mm"]:.3f}' if sides.get(s) else '-' for s in ('before', 'after')
         ]
@@ -269,12 +268,12 @@ def print_offsets(console: Console, fit: dict[str, Any], truth: SessionTruth) ->
     console.print(accuracy)
 
 
-def print_hidden(console: Console, discovery: dict[str, Any], truth: SessionTruth) -> None:
+def print_hidden(console: Console, discovery: Discovered, truth: SessionTruth) -> None:
     """Print what was found beside what was hidden, and the gain."""
-    found: dict[Any, list[dict[str, Any]]] = {}
-    for effect in discovery['effects']:
-        for cause in named_cause(effect):
-            found.setdefault(cause, []).append(effect)
+    found: dict[Any, list[Effect]] = {}
+    for claim in discovery.effects:
+        for cause in named_cause(msgspec.to_builtins(claim)):
+            found.setdefault(cause, []).append(claim)
     hidden = [(cause, effect) for effect in truth.effects for cause in causes(effect)]
     headings = ('hidden truth', 'found', 'parameter', 'estimate', 'std', 'truth', 'unit')
     table = _table('beyond the zero-offsets', *headings, left=2)
@@ -282,16 +281,14 @@ def print_hidden(console: Console, discovery: dict[str, Any], truth: SessionTrut
         claims = found.pop(cause, [])
         table.add_row(describe(cause), 'yes' if claims else 'no')
         true = true_parameters(effect)
-        for row in (row for claim in claims for row in claim['parameters']):
-            if row['name'] in true:
-                figures = (f'{row[key]:.4g}' for key in ('value', 'std'))
-                table.add_row(
-                    '', '', row['name'], *figures, f'{true[row["name"]]:.4g}', row['unit']
-                )
+        for row in (row for claim in claims for row in claim.parameters):
+            if row.name in true:
+                figures = (f'{figure:.4g}' for figure in (row.value, row.std, true[row.name]))
+                table.add_row('', '', row.name, *figures, row.unit)
     for cause in found:
         table.add_row('nothing of the kind', describe(cause))
     console.print(table)
-    for line in discovery_lines(msgspec.convert(discovery, Discovered)):
+    for line in discovery_lines(discovery):
         console.print(line)
 
 

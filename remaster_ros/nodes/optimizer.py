@@ -285,15 +285,11 @@ class Optimizer(RemasterNode):
         if not path.exists():
             return
         try:
-            rows = read_fit(path)['joint_offsets']
+            rows = read_fit(path).joint_offsets
         except RemasterError as error:
             self.get_logger().warning(f'the last fit is not published: {error}')
             return
-        self._publish(
-            [row['joint'] for row in rows],
-            np.deg2rad([row['mean_deg'] for row in rows]),
-            np.deg2rad([row['std_deg'] for row in rows]),
-        )
+        self._publish([row.joint for row in rows], *np.array([row.mean_and_std for row in rows]).T)
 
     def _publish(self, names: Sequence[str], offsets: FloatArray, std: FloatArray) -> None:
         stamp = self.get_clock().now().to_msg()

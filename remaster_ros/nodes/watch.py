@@ -313,13 +313,13 @@ def fit_facts(folder: Path, offsets: Mapping[str, float]) -> FitFacts:
         fit = read_fit(folder / FIT_FILE)
     except RemasterError:
         return FitFacts()
-    of_file = {row['joint']: np.deg2rad(row['mean_deg']) for row in fit['joint_offsets']}
+    of_file = {row.joint: row.mean_and_std[0] for row in fit.joint_offsets}
     if not all(np.isclose(offsets.get(name, np.nan), mean) for name, mean in of_file.items()):
         return FitFacts()
     facts = {}
     for split, words in (('validation', 'held-out poses'), ('optimization', 'fitted poses')):
         # As measured: the theoretical error is what the posterior predicts.
-        errors = (fit['accuracy'].get(split) or {}).get('post_registration')
+        errors = (getattr(fit.accuracy, split) or {}).get('post_registration')
         if errors:
             before, after = (errors[when]['mean_mm'] for when in ('before', 'after'))
             facts[f'mean error, {words}'] = f'{before:.3f} mm → {after:.3f} mm'
@@ -327,8 +327,8 @@ def fit_facts(folder: Path, offsets: Mapping[str, float]) -> FitFacts:
     facts['files'] = str((report if report.exists() else folder).resolve())
     return FitFacts(
         facts,
-        frozenset(row['joint'] for row in fit['joint_offsets'] if not row['identifiable']),
-        {name: np.array(marker['position_m']) for name, marker in fit['markers'].items()},
+        frozenset(row.joint for row in fit.joint_offsets if not row.identifiable),
+        {name: np.array(marker.position_m) for name, marker in fit.markers.items()},
     )
 
 

@@ -148,14 +148,14 @@ def read_inputs(
     InputError
         One line naming file and remedy.
     """
-    fit = msgspec.convert(read_fit(fit_path), Fit)
+    fit = read_fit(fit_path)
     _require_same(session, fit, fit_path, 'fit')
     residuals = read_columns(fit_path.parent / RESIDUALS_FILE, session, BEFORE + AFTER, 'fit')
     before_mm, after_mm = _lengths_mm(residuals[:, :3]), _lengths_mm(residuals[:, 3:])
     if found_path is None:
         model, model_mm = _model(session, fit_path, _file_of(fit.geometry), 'fit')
         return Inputs(session, fit, None, before_mm, after_mm, None, model_mm, model, plan)
-    found = msgspec.convert(read_discovery(found_path), Discovered)
+    found = read_discovery(found_path)
     _require_same(session, found, found_path, 'discover')
     causes_mm = None
     if found.effects:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
@@ -30,7 +30,7 @@ from remaster_ros.compensation.of_result import (
 from remaster_ros.discovery.confirmation import Confirmation
 from remaster_ros.discovery.decision import Decision, Named
 from remaster_ros.discovery.discover import Discovery
-from remaster_ros.discovery.explain import FoundEffect
+from remaster_ros.discovery.explain import FoundEffect, LookAlike
 from remaster_ros.discovery.geometry_model import mean_length
 from remaster_ros.discovery.words import sentence_case
 from remaster_ros.errors import InputError
@@ -160,8 +160,8 @@ def _regions(discovery: Discovery, predictions: Predictions) -> dict[str, Any]:
     }
 
 
-def read_discovery(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """Read discovery.json and check it against the contract; further keys are kept as they are.
+def read_discovery(path: str | os.PathLike[str]) -> Discovered:
+    """Read discovery.json and check it against the contract; further keys are left out.
 
     Raises
     ------
@@ -317,7 +317,7 @@ def read_causes(
         look-alike.
     """
     found = _read(path, joint_names)
-    of = found.get('session', {}).get('observations_sha256')
+    of = found.session and found.session.observations_sha256
     if observations_sha256 and of != observations_sha256:
         raise InputError(
             f'{path} is not of the observations that the session has now; call /remaster/discover '
@@ -325,16 +325,13 @@ def read_causes(
         )
     causes = tuple(
         FoundCause(
-            effect['name'],
-            tuple(effect['joints']),
-            {parameter['name']: parameter['value'] for parameter in effect['parameters']},
-            tuple(
-                (other['name'], tuple(other['joints']), other['separate_by'])
-                for other in _separable(effect)
-            ),
-            effect['driver'],
+            effect.name,
+            tuple(effect.joints),
+            {parameter.name: parameter.value for parameter in effect.parameters},
+            tuple((other.name, other.joints, other.separate_by) for other in _separable(effect)),
+            effect.driver,
         )
-        for effect in found['effects']
+        for effect in found.effects
         if _separable(effect)
     )
     if not causes:
@@ -365,20 +362,18 @@ def earlier_pairs(
         It is no discovery.json, or is of another arm.
     """
     found = _read(path, joint_names)
-    if created and found.get('session', {}).get('created') != created:
+    if created and (not found.session or found.session.created != created):
         return ()
-    pairs = [(_named(one['cause']), _named(one['look_alike'])) for one in found.get('decided', ())]
+    pairs = [(_named(one.cause), _named(one.look_alike)) for one in found.decided or ()]
     pairs += [
-        (_named(effect), _named(other))
-        for effect in found['effects']
-        for other in _separable(effect)
+        (_named(effect), _named(other)) for effect in found.effects for other in _separable(effect)
     ]
     return tuple(pairs)
 
 
-def _read(path: str | os.PathLike[str], joint_names: Sequence[str]) -> dict[str, Any]:
+def _read(path: str | os.PathLike[str], joint_names: Sequence[str]) -> Discovered:
     found = read_discovery(path)
-    names = found.get('robot', {}).get('joint_names', joint_names)
+    names = found.robot.joint_names if found.robot else joint_names
     if joint_names and list(names) != list(joint_names):
         raise InputError(
             f'{path}: its causes are of an arm with the joints {", ".join(names)}, this one has '
@@ -387,14 +382,10 @@ def _read(path: str | os.PathLike[str], joint_names: Sequence[str]) -> dict[str,
     return found
 
 
-def _named(cause: Mapping[str, Any]) -> Named:
-    return Named(cause['name'], tuple(cause['joints']))
+def _named(cause: schemas.NamedCause | schemas.Effect | LookAlike) -> Named:
+    return Named(cause.name, tuple(cause.joints))
 
 
-def _separable(effect: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+def _separable(effect: schemas.Effect) -> list[LookAlike]:
     """Return the look-alikes of an effect that are neither another name nor a free form of it."""
-    return [
-        other
-        for other in effect['confusable_with']
-        if not other.get('same') and not other.get('general')
-    ]
+    return [other for other in effect.confusable_with if not other.same and not other.general]

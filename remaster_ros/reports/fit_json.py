@@ -32,7 +32,6 @@ from remaster_ros.errors import InputError
 from remaster_ros.kinematics.transforms import quaternion_xyzw
 from remaster_ros.reports import schemas
 from remaster_ros.reports.rows_csv import RESIDUALS_FILE
-from remaster_ros.reports.schemas import Discovered
 from remaster_ros.reports.sentences import verdict
 from remaster_ros.session.files import (
     make_folder,
@@ -352,8 +351,8 @@ def write_fit(result: FitResult, path: str | os.PathLike[str]) -> None:
     write_atomically(path, schemas.encode(fit_content(result)))
 
 
-def read_fit(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """Read fit.json and check it against the contract; further keys are kept as they are.
+def read_fit(path: str | os.PathLike[str]) -> schemas.Fit:
+    """Read fit.json and check it against the contract; further keys are left out.
 
     Raises
     ------
@@ -364,12 +363,8 @@ def read_fit(path: str | os.PathLike[str]) -> dict[str, Any]:
 
 
 def read_result(
-    path: Path,
-    schema: type[schemas.Fit | Discovered],
-    form: str,
-    name: str,
-    verb: str,
-) -> dict[str, Any]:
+    path: Path, schema: type[schemas.Content], form: str, name: str, verb: str
+) -> schemas.Content:
     """Read the file `name` that a verb wrote, and check it against its schema and format."""
     data = read_limited(path, FIT_LIMIT, f'give the {name} that "remaster {verb}" wrote')
     try:
@@ -378,16 +373,15 @@ def read_result(
         given = content.get('format', form) if isinstance(content, dict) else form
         if given != form:
             raise InputError(f'{path}: format is {str(given)[:60]!r}, not {form!r}; {verb} again')
-        msgspec.convert(content, schema)
+        return msgspec.convert(content, schema)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise InputError(
             f'{path}: {" ".join(str(error).split())}; give a {name} of format {form}'
         ) from None
-    return content
 
 
 def joint_offsets_rad(
-    fit: dict[str, Any], joint_names: Sequence[str]
+    fit: schemas.Fit, joint_names: Sequence[str]
 ) -> tuple[FloatArray, FloatArray]:
     """Return the offsets of a fit.json in the order of a robot's joints, with their std.
 
@@ -401,25 +395,21 @@ def joint_offsets_rad(
     InputError
         The offsets are for other joints, or are no angles.
     """
-    rows = {row['joint']: row for row in fit['joint_offsets']}
-    if set(rows) != set(joint_names) or len(rows) < len(fit['joint_offsets']):
+    rows = {row.joint: row for row in fit.joint_offsets}
+    if set(rows) != set(joint_names) or len(rows) < len(fit.joint_offsets):
         raise InputError(
             f'the offsets are for the joints {", ".join(rows)}, '
             f'the robot has {", ".join(joint_names)}; use the fit of this robot'
         )
     ordered = [rows[name] for name in joint_names]
     for row in ordered:
-        if row['mean_deg'] is None or row['std_deg'] is None:
-            raise InputError(
-                f'{row["joint"]} slides, its offset is in mm; this takes angles alone'
-            )
-        for key, low in (('mean_deg', -360.0), ('std_deg', 0.0)):
-            if not low <= row[key] <= 360.0:
-                raise InputError(
-                    f'{row["joint"]}: {key} is {row[key]:g}, not {low:g} to 360; fit again'
-                )
-    std = [row['std_deg'] if row['identifiable'] else 0.0 for row in ordered]
-    return np.radians([row['mean_deg'] for row in ordered]), np.radians(std)
+        if row.mean_deg is None or row.std_deg is None:
+            raise InputError(f'{row.joint} slides, its offset is in mm; this takes angles alone')
+        for key, value, low in (('mean_deg', row.mean_deg, -360.0), ('std_deg', row.std_deg, 0.0)):
+            if not low <= value <= 360.0:
+                raise InputError(f'{row.joint}: {key} is {value:g}, not {low:g} to 360; fit again')
+    means, stds = np.array([row.mean_and_std for row in ordered]).T
+    return means, np.where([row.identifiable for row in ordered], stds, 0.0)
 
 
 def require_own(path: Path, format_: str) -> None:

@@ -108,9 +108,9 @@ def before(request, tmp_path_factory):
     session = simulated(robot, seed=5)
     out = fitted(session, tmp_path_factory.mktemp(request.param))
     fit = read_fit(out / 'fit.json')
-    names = [row['joint'] for row in fit['joint_offsets']]
+    names = [row.joint for row in fit.joint_offsets]
     offsets, std = joint_offsets_rad(fit, names)
-    known = np.array([row['identifiable'] for row in fit['joint_offsets']])
+    known = np.array([row.identifiable for row in fit.joint_offsets])
     # What is to be corrected is there, and the outer two joints are not to be told.
     assert np.abs(offsets[known]).max() > 10 * std[known].max()
     assert not known[0]
@@ -133,7 +133,7 @@ COMBINATIONS = [
 def test_a_refit_after_applying_finds_nothing(before, form, tmp_path):
     session, out, _, known, std = before
     again = read_fit(fitted(FORMS[form](session, out / 'apply'), tmp_path) / 'fit.json')
-    names = [row['joint'] for row in again['joint_offsets']]
+    names = [row.joint for row in again.joint_offsets]
     left, _ = joint_offsets_rad(again, names)
     # The same measurements: what is left is the draws' error and the rounding of four digits.
     assert np.all(np.abs(left[known]) < 0.3 * std[known] + np.radians(1e-4)), np.degrees(left)
@@ -142,7 +142,7 @@ def test_a_refit_after_applying_finds_nothing(before, form, tmp_path):
 def test_joints_that_are_not_identifiable_are_named_in_each_file_and_corrected_in_none(before):
     session, out, fit, known, _ = before
     apply = out / 'apply'
-    unknown = {row['joint']: row['why'] for row in fit['joint_offsets'] if not row['identifiable']}
+    unknown = {row.joint: row.why for row in fit.joint_offsets if not row.identifiable}
     assert unknown
     nominal = SerialChain.from_urdf(session.urdf, session.base_link, session.tip_link)
     calibrated = through_the_urdf(session, apply)
@@ -182,10 +182,10 @@ def test_only_the_joints_of_the_arm_are_changed(before):
     new = {j.get('name'): j for j in ElementTree.fromstring(urdf).findall('joint')}
     assert list(new) == list(old)
     changed = {n for n in old if ElementTree.tostring(old[n]) != ElementTree.tostring(new[n])}
-    applied = {row['joint'] for row in fit['joint_offsets'] if row['identifiable']}
+    applied = {row.joint for row in fit.joint_offsets if row.identifiable}
     assert changed - {'joint_2_cover'} == applied
     if 'joint_2_cover' in old:
-        offset = next(r['mean_deg'] for r in fit['joint_offsets'] if r['joint'] == 'joint_2')
+        offset = next(r.mean_deg for r in fit.joint_offsets if r.joint == 'joint_2')
         mimic = new['joint_2_cover'].find('mimic')
         assert mimic is not None
         # Half the true angle of joint 2, backwards; what joint 2 reports lacks the offset.

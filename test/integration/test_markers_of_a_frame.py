@@ -132,10 +132,10 @@ def test_frames_of_four_markers_go_through_file_fit_and_search(configurations, t
     z = ((found.joint_offsets - offsets) / found.joint_offsets_std)[1:6]
     assert np.max(np.abs(z)) < 4.0
     save_fit(found, tmp_path / 'fit')
-    noise = read_fit(tmp_path / 'fit' / 'fit.json')['noise']['bar']
+    noise = read_fit(tmp_path / 'fit' / 'fit.json').noise['bar']
     for key, level in (('sigma_m', 1e-4), ('pose_sigma_m', 2e-4), ('frame_sigma_m', 2e-4)):
-        assert noise[key] == pytest.approx(level, rel=0.4), key
-    assert noise['frame_std_m'] < 0.5 * noise['frame_sigma_m']
+        assert getattr(noise, key) == pytest.approx(level, rel=0.4), key
+    assert noise.frame_std_m < 0.5 * noise.frame_sigma_m
     assert found.sampler.converged, found.sampler.message
     assert found.accuracy['validation']['relative']['after']['mean_mm'] < 0.6
     # Nothing is wrong with the arm: errors that four rows share are no cause.

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-import msgspec
 import numpy as np
 import pytest
 
@@ -22,7 +21,6 @@ from remaster_ros.reports.discovery_json import (
 )
 from remaster_ros.reports.fit_json import compensation_text, geometry_of
 from remaster_ros.reports.result_folder import save_discovery
-from remaster_ros.reports.schemas import Loadable
 from remaster_ros.reports.sentences import load_words
 from remaster_ros.session.reader import read_session
 from remaster_ros.types import Session
@@ -119,8 +117,8 @@ def test_what_can_be_loaded_of_a_panda(tmp_path: Path) -> None:
     missed_mm = 1e3 * np.linalg.norm(missed[m.is_validation, :3], axis=1).mean()
     assert missed_mm > 0.25
     assert abs(everything - np.hypot(0.27, missed_mm)) < 0.1
-    row = read_discovery(tmp_path / 'discovery.json')['loadable'][2]
-    assert load_words(msgspec.convert(row, Loadable))[1].startswith('only where no robot model')
+    row = read_discovery(tmp_path / 'discovery.json').loadable[2]
+    assert load_words(row)[1].startswith('only where no robot model')
 
 
 @pytest.mark.parametrize(

@@ -16,6 +16,7 @@ from remaster_ros.nodes import watch
 from remaster_ros.nodes.pose_planner import PosePublisher
 from remaster_ros.nodes.watch import fit_facts
 from remaster_ros.reports.live_view import FitFacts
+from remaster_ros.reports.schemas import Accuracy, JointOffset, Marker
 
 
 def errors(before, after):
@@ -26,15 +27,16 @@ def errors(before, after):
     }
 
 
-FIT = {
-    'joint_offsets': [
-        {'joint': 'joint_1', 'mean_deg': 0.0, 'identifiable': False},
-        {'joint': 'joint_2', 'mean_deg': 1.0, 'identifiable': True},
+FIT = SimpleNamespace(
+    joint_offsets=[
+        JointOffset('joint_1', 0.0, 90.0, None, False, 'nothing tells'),
+        JointOffset('joint_2', 1.0, 0.01, None, True, ''),
+        JointOffset('slide', None, None, None, True, '', unit='mm', mean_mm=2.0, std_mm=0.1),
     ],
-    'markers': {'sir': {'position_m': [0.1, 0.0, 0.001]}},
-    'accuracy': {'validation': errors(1.5, 0.1), 'optimization': {'post_registration': None}},
-}
-OFFSETS = {'joint_1': 0.0, 'joint_2': float(np.deg2rad(1.0))}
+    markers={'sir': Marker((0.1, 0.0, 0.001), (1e-4, 1e-4, 1e-4))},
+    accuracy=Accuracy(validation=errors(1.5, 0.1), optimization={'post_registration': None}),
+)
+OFFSETS = {'joint_1': 0.0, 'joint_2': float(np.deg2rad(1.0)), 'slide': 2e-3}
 
 
 def test_the_errors_of_the_same_fit_are_told(tmp_path, monkeypatch):
@@ -46,7 +48,8 @@ def test_the_errors_of_the_same_fit_are_told(tmp_path, monkeypatch):
     assert found.markers['sir'].tolist() == [0.1, 0.0, 0.001]
     (tmp_path / 'report.html').touch()
     assert fit_facts(tmp_path, OFFSETS).shown['files'] == str(tmp_path / 'report.html')
-    without = {**FIT, 'accuracy': {'validation': None, 'optimization': errors(2.0, 0.2)}}
+    accuracy = Accuracy(validation=None, optimization=errors(2.0, 0.2))
+    without = SimpleNamespace(**{**vars(FIT), 'accuracy': accuracy})
     monkeypatch.setattr(watch, 'read_fit', lambda path: without)
     assert 'mean error, held-out poses' not in fit_facts(tmp_path, OFFSETS).shown
 

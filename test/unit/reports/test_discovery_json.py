@@ -70,7 +70,7 @@ def test_a_cause_that_another_session_has_with_other_offsets_is_not_called_uncon
     confirmed, saved
 ):
     found, confirmation = confirmed
-    content = msgspec.convert(read_discovery(saved[1] / 'discovery.json'), Discovered)
+    content = read_discovery(saved[1] / 'discovery.json')
     other = replace(confirmation, confirmed=False, same_offsets=False, other_joints=(3,))
     said = judgement(found, other, content)
     assert said.headline.endswith('The other session has it too, with other zero-offsets.')
@@ -103,7 +103,7 @@ def test_discovery_json_keeps_its_contract(saved):
     assert decided['answer'] == 'look_alike'
     assert decided['cause'] == {'name': 'joint_compliance', 'joints': [2]}
     assert decided['log_evidence'] < -3.0
-    assert read_discovery(folder / 'discovery.json') == content
+    assert read_discovery(folder / 'discovery.json') == msgspec.convert(content, Discovered)
 
 
 def test_the_report_needs_nothing_else_and_names_the_cause(saved):
@@ -386,7 +386,7 @@ def shown(discovery, folder, figures=True):
     """Save it; return the page, its verdict's mood, and the names of its figures."""
     names = set()
     save_discovery(discovery, folder, figures=figures)
-    content = msgspec.convert(read_discovery(folder / 'discovery.json'), Discovered)
+    content = read_discovery(folder / 'discovery.json')
     if figures:
         page = (folder / 'report.html').read_text(encoding='utf-8')
         names = {path.stem for path in (folder / 'figures').glob('*.svg')}

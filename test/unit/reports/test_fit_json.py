@@ -30,34 +30,33 @@ from remaster_ros.reports.result_folder import prepare_folder, save_fit
 def test_fit_json_is_the_fit(fit_result, tmp_path):
     write_fit(fit_result, tmp_path / 'new' / 'fit.json')
     fit = read_fit(tmp_path / 'new' / 'fit.json')
-    assert fit == msgspec.json.decode(msgspec.json.encode(fit_content(fit_result)))
-    assert fit['format'] == 'remaster-fit/1'
-    assert [row['joint'] for row in fit['joint_offsets']] == list(fit_result.joint_names)
+    assert fit == fit_content(fit_result)
+    assert fit.format == 'remaster-fit/1'
+    assert [row.joint for row in fit.joint_offsets] == list(fit_result.joint_names)
     offsets, std = joint_offsets_rad(fit, fit_result.joint_names)
     np.testing.assert_allclose(offsets, fit_result.joint_offsets, atol=1e-14)
     known = np.where(fit_result.identifiable, fit_result.joint_offsets_std, 0.0)
     np.testing.assert_allclose(std, known, atol=1e-14)
-    for i, row in enumerate(fit['joint_offsets']):
-        assert row['identifiable'] == (row['why'] == '') == bool(fit_result.identifiable[i])
-        assert row['interval95_deg'][0] <= row['mean_deg'] <= row['interval95_deg'][1]
-    assert set(fit['registration']) == set(fit['noise']) == set(fit_result.session.sensors)
-    for sensor, frame in fit['registration'].items():
+    for i, row in enumerate(fit.joint_offsets):
+        assert row.identifiable == (row.why == '') == bool(fit_result.identifiable[i])
+        assert row.interval95_deg[0] <= row.mean_deg <= row.interval95_deg[1]
+    assert set(fit.registration) == set(fit.noise) == set(fit_result.session.sensors)
+    for sensor, frame in fit.registration.items():
         T_R_N = fit_result.T_R_N[sensor]
-        np.testing.assert_allclose(frame['translation_m'], T_R_N[:3, 3])
-        rotation = matrix_from_quaternion_xyzw(frame['rotation_xyzw'])
+        np.testing.assert_allclose(frame.translation_m, T_R_N[:3, 3])
+        rotation = matrix_from_quaternion_xyzw(frame.rotation_xyzw)
         np.testing.assert_allclose(rotation, T_R_N[:3, :3], atol=1e-12)
-    assert set(fit['markers']) == {'sir', 'smr'}
-    assert fit['sampler']['chains'] == 4
-    assert fit['sampler']['seconds'] is None  # no clock was given
-    assert set(fit['accuracy']) == {'optimization', 'validation'}
-    assert fit['gauge'][0]['fixed_by'] == f'{fit_result.joint_names[0]} = 0'
-    assert [row['observation'] for row in fit['left_out']] == [o for o, _ in fit_result.left_out]
-    assert fit['left_out']
-    assert len(fit['robot']['urdf_sha256']) == 64
+    assert set(fit.markers) == {'sir', 'smr'}
+    assert fit.sampler.chains == 4
+    assert fit.sampler.seconds is None  # no clock was given
+    assert fit.gauge[0].fixed_by == f'{fit_result.joint_names[0]} = 0'
+    assert [row.observation for row in fit.left_out] == [o for o, _ in fit_result.left_out]
+    assert fit.left_out
+    assert len(fit.robot.urdf_sha256) == 64
 
 
 def test_offsets_of_another_robot_are_refused(fit_result):
-    fit = msgspec.to_builtins(fit_content(fit_result))
+    fit = fit_content(fit_result)
     with pytest.raises(InputError, match='use the fit of this robot'):
         joint_offsets_rad(fit, ['joint_1', 'joint_2'])
 
@@ -66,8 +65,8 @@ def test_offsets_of_another_robot_are_refused(fit_result):
     ('key', 'value'), [('std_deg', -0.01), ('std_deg', 1e30), ('mean_deg', -1e300)]
 )
 def test_offsets_that_are_no_angles_are_refused(fit_result, key, value):
-    fit = msgspec.to_builtins(fit_content(fit_result))
-    fit['joint_offsets'][2][key] = value
+    fit = fit_content(fit_result)
+    setattr(fit.joint_offsets[2], key, value)
     with pytest.raises(InputError, match=f'joint_3: {key} is {value:g}, not '.replace('+', r'\+')):
         joint_offsets_rad(fit, fit_result.joint_names)
 
@@ -84,7 +83,7 @@ def test_offsets_that_are_no_angles_are_refused(fit_result, key, value):
 def test_a_wrong_fit_json_is_refused(fit_result, tmp_path, change, problem):
     path = tmp_path / 'fit.json'
     write_fit(fit_result, path)
-    fit = read_fit(path)
+    fit = json.loads(path.read_text())
     change(fit)
     path.write_text(json.dumps(fit))
     with pytest.raises(InputError, match=problem) as caught:
