@@ -119,10 +119,7 @@ def is_stream(stamps: FloatArray) -> bool:
 
 
 def joint_standstills(stream: Stream, fewest: int = 1) -> Standstills:
-    """Return when no joint, in rad, moved for longer than an arm may swing.
-
-    A standstill has `fewest` reports at least.
-    """
+    """Return when no joint, rad, moved for longer than an arm may swing, `fewest` reports."""
     rules = SettleRules()
     noise = min(_RANGE_STDS * _quietest(stream), 5.0 * rules.still_tolerance)
     return _standstills(stream, max(rules.still_tolerance, noise), fewest)

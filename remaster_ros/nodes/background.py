@@ -21,10 +21,7 @@ Then = Callable[[Any], object]
 
 
 class Background:
-    """One thread that does what it is given, one after the other.
-
-    ``node``: in whose callbacks the results are taken.
-    """
+    """One thread that does one thing after the other; a node's callbacks take the results."""
 
     def __init__(self, node: Node) -> None:
         self._work: SimpleQueue[tuple[Work, Then] | None] = SimpleQueue()

@@ -336,10 +336,7 @@ class CompensatorNode(RemasterNode):
     # What is passed on
 
     def _passed(self, message: JointTrajectory) -> Any:
-        """Return what is to be sent for a planner's trajectory.
-
-        Raises InputError: one line: why it is not sent.
-        """
+        """Return what is sent for a planner's trajectory; an `InputError` why nothing is."""
         why = self._trouble()
         if not why and self._on is None:
             why = self._moves() or 'the compensator has just been started'

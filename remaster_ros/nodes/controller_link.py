@@ -300,10 +300,7 @@ class ActionLink:
 
 
 def control_messages() -> tuple[Any, Any]:
-    """Return FollowJointTrajectory and JointTolerance.
-
-    Raises InputError: they are not installed.
-    """
+    """Return FollowJointTrajectory and JointTolerance; `InputError` if they are missing."""
     try:
         action = importlib.import_module('control_msgs.action').FollowJointTrajectory
         return action, importlib.import_module('control_msgs.msg').JointTolerance

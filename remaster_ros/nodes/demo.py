@@ -87,11 +87,7 @@ def _die_with_parent() -> None:
 
 
 class NodeProcesses:
-    """The node processes of a run.
-
-    ``log_folder``: each process writes its output to ``<name>.log`` there; ``environment``:
-    variables added to the processes' environment.
-    """
+    """The node processes of a run, each with its output in a file ``<name>.log``."""
 
     def __init__(self, log_folder: Path, environment: Mapping[str, str]) -> None:
         self._log_folder = log_folder
@@ -392,10 +388,7 @@ class Conductor(Node):
 
 
 class Demo:
-    """One run of the demo.
-
-    ``stopping``: filled by a signal; looked at between all steps.
-    """
+    """One run of the demo; `stopping`, filled by a signal, is looked at between all steps."""
 
     def __init__(self, node: Conductor, stopping: list[int]) -> None:
         self.node, self.p, self._stopping = node, node.p, stopping

@@ -63,10 +63,7 @@ def transform_array(message: TransformStamped) -> FloatArray:
 
 
 def message_class(type_name: str) -> Any:
-    """Return the class of a message type such as ``sensor_msgs/msg/JointState``.
-
-    Raises InputError: this machine has no such type.
-    """
+    """Return the class of a type, as ``sensor_msgs/msg/JointState``; `InputError` for none."""
     package, _, name = type_name.partition('/msg/')
     try:
         return getattr(importlib.import_module(f'{package}.msg'), name)

@@ -97,11 +97,7 @@ class Parameters:
 
 
 class PrecisionWatch:
-    """Fit the session after every few configurations and publish what is known.
-
-    ``goal``: what the cell file wants to be known at the end; ``every``: configurations between
-    two looks; 0 for none.
-    """
+    """Fit the session after `every` so many configurations, 0 never; publish what is known."""
 
     def __init__(
         self,

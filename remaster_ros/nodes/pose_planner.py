@@ -95,10 +95,7 @@ DISCOVER = '/remaster/discover'
 
 
 class FurtherMeasuring:
-    """Decides whether and what is measured further.
-
-    ``discovery``: folder of the optimizer's discovery; '' where nothing is measured further.
-    """
+    """Decides what is measured further, by the optimizer's discovery; nothing for folder ''."""
 
     def __init__(
         self, discovery: str, session: Path, journal: PlanJournal, tours: TourPlanner
@@ -446,10 +443,7 @@ EVERY_S = 20.0
 
 
 class ProgressLines:
-    """Logs the progress of a collection while it runs, and where it ends.
-
-    ``counts, state``: return the figures of `TourProgress.counts`, and the state of the run.
-    """
+    """Logs the progress of a collection while it runs, and where it ends."""
 
     def __init__(
         self,
@@ -482,10 +476,7 @@ class ProgressLines:
 
 
 class PlanPreview(PlanConfirmation):
-    """Draws the plan that is next, until it is confirmed.
-
-    ``session``: the session's folder; the page is beside it.
-    """
+    """Draws the plan that is next beside the session's folder, until it is confirmed."""
 
     def __init__(
         self,

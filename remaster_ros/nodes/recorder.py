@@ -84,10 +84,7 @@ class _Shot:
 
 
 class TriggeredSensors:
-    """The measurements that one configuration after the other needs.
-
-    ``clients``: client of the measure service (std_srvs/Trigger), per sensor.
-    """
+    """The measurements that one configuration after the other needs, by service clients."""
 
     def __init__(self, clients: Mapping[str, Client]) -> None:
         self._clients = clients
@@ -132,10 +129,7 @@ class TriggeredSensors:
 
 
 class CellSensors:
-    """Subscribe to the readings of all sensors, and find which sensors are missing.
-
-    Raises InputError: the parameter ``require`` names no sensor of the cell.
-    """
+    """Subscribe to all sensors and find which are missing; `InputError` for a wrong require."""
 
     def __init__(self, node: RemasterNode, p: Parameters, cell: Workcell) -> None:
         try:

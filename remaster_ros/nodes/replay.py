@@ -261,10 +261,7 @@ class Replay(RemasterNode):
             self._dropped[topic] += count
 
     def _require_all(self) -> None:
-        """Check that nothing was dropped.
-
-        Raises InsufficientDataError: something was; with the topics.
-        """
+        """Raise an `InsufficientDataError` with the topics of which something was dropped."""
         for topic in list(self._untaken):
             self._await_taken(topic)
         self._await_recorder()

@@ -99,10 +99,7 @@ class NameLock:
 
 
 def page_name(domain: int, node: str) -> str:
-    """Return what the files of the page are called that a node serves.
-
-    ``node``: the node's fully qualified name, such as ``/left/watch``.
-    """
+    """Return what the files of the page are called that ``/left/watch``, say, serves."""
     return f'domain_{domain}{node.replace("/", "%")}'
 
 

@@ -31,10 +31,7 @@ SENSOR_COLORS = ('#3b82c4', '#e07b39', '#2f9e78', '#a86bc0')
 
 
 class RvizMarkers:
-    """Publishes the markers and the sensors' frames.
-
-    ``publish_tf``: whether /tf_static is published.
-    """
+    """Publishes the markers and, with `publish_tf`, the sensors' frames on /tf_static."""
 
     def __init__(self, node: Node, scene: RobotScene, *, publish_tf: bool) -> None:
         self._node, self._scene, self._base = node, scene, scene.chain.base_link

@@ -217,10 +217,7 @@ ANY = QoSProfile(depth=200, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
 def subscribe_to_source(node: Node, driver: TopicDriver, sensor: CellSensor) -> None:
-    """Hand all messages of a sensor's source to its driver.
-
-    Raises InputError: the package of the message type is not installed.
-    """
+    """Hand all messages of a source to its driver; `InputError` for a type not installed."""
     try:
         kind = message_class(sensor.message_type)
     except InputError:

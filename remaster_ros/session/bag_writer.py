@@ -11,7 +11,6 @@ from __future__ import annotations
 import os
 from functools import cache
 from pathlib import Path
-from types import TracebackType
 
 from mcap.writer import CompressionType, Writer
 
@@ -186,12 +185,7 @@ class BagWriter:
     def __enter__(self) -> BagWriter:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *exception: object) -> None:
         self.close()
 
     def _add_topic(self, topic: str, msgtype: str) -> None:

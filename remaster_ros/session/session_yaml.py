@@ -85,10 +85,7 @@ class BaseFrame(msgspec.Struct):
 
 
 class SessionHeader(msgspec.Struct):
-    """session.yaml as validated; the fields are the keys of the file.
-
-    ``extra`` holds the keys that this version does not use, nested as they were.
-    """
+    """session.yaml as validated; the fields are the keys of the file."""
 
     format: str
     robot: _Robot
@@ -106,6 +103,7 @@ class SessionHeader(msgspec.Struct):
     controller: Controller | None = None
     correction: Correction | None = None
     accuracy_option: AccuracyOption = ''
+    # The keys that this version does not use, nested as they were.
     extra: dict[str, Any] = {}
 
     @property

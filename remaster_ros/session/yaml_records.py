@@ -262,10 +262,7 @@ class Bounds:
 
 
 def read_yaml(data: bytes, path: Path, record: type[Record], remedy: str = '') -> Record:
-    """Read the bytes of a YAML file into a struct, its numbers within their bounds.
-
-    The remedy is appended to what msgspec reports of missing keys and wrong types.
-    """
+    """Read a YAML file into a struct within its bounds; a remedy follows msgspec's messages."""
     text = decode_text(data, path)
     try:
         content = msgspec.convert(load_yaml(text), record)

@@ -540,15 +540,9 @@ class LaserTrackerClient:
         s = self.settings
         self._ask(Command.SET_SEARCH, s.search_radius_m, round(s.search_timeout_s * 1e3))
 
-    def find_reflector(self, distance_m: float | None = None) -> None:
-        """Search a spiral about the place the tracker points to, and lock the reflector.
-
-        ``distance_m``: approximate distance of the reflector; None takes that of the last reading
-        or position, or 3 m.
-        """
-        distance = (self._distance_m or 3.0) if distance_m is None else distance_m
-        if not 0 < distance < np.inf:
-            raise InputError(f'{self.name}: reflector distance {distance} m; it must be above 0')
+    def find_reflector(self) -> None:
+        """Search about where the tracker points, as far as it read last or 3 m, and lock."""
+        distance = self._distance_m or 3.0
         self._search(Command.FIND_REFLECTOR, distance, what='search for the reflector')
 
     def go_position(self, position: ArrayLike) -> None:

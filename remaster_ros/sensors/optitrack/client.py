@@ -56,11 +56,7 @@ _FRAME_ID = MessageId.FRAMEOFDATA.to_bytes(2, 'little')
 
 
 class NatNetClient(MarkerFollower):
-    """Follows one marker of an OptiTrack server, NatNet 2.6 to 4.3, multicast or unicast.
-
-    ``on_sample``: called in the client's thread with every reading; what it raises is logged;
-    ``clock``: gives the time at which a datagram arrived, s.
-    """
+    """Follows the markers by NatNet 2.6 to 4.3, multicast or unicast; see `MarkerFollower`."""
 
     def __init__(
         self,

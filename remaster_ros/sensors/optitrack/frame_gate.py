@@ -276,10 +276,7 @@ class GateCounts:
 
 
 class MarkerGate:
-    """Lets through the readings of one marker and counts everything else with its reason.
-
-    ``choice``: which marker; ``counts``: where to count.
-    """
+    """Lets through the readings of one marker and counts everything else with its reason."""
 
     def __init__(self, choice: MarkerChoice, counts: GateCounts) -> None:
         self._choice = choice
@@ -303,10 +300,7 @@ class MarkerGate:
         self.counts.problem = '' if self.resolved else 'the server has not named its rigid bodies'
 
     def name_assets(self, assets: Mapping[str, int]) -> None:
-        """Find the marker's id among the rigid bodies that the server streams.
-
-        ``assets``: asset id by name.
-        """
+        """Find the marker's id among the rigid bodies that the server streams, id by name."""
         self.forget_assets()
         if self.resolved:
             return

@@ -38,10 +38,7 @@ def resolve(host: str) -> str:
 
 
 def interface_towards(server_ip: str, port: int) -> str:
-    """Return the address of this machine's interface from which packets reach the server.
-
-    Raises DeviceError: if there is no route.
-    """
+    """Return this machine's address from which packets reach the server; `DeviceError`."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
             probe.connect((server_ip, port))
