@@ -23,10 +23,11 @@ import numpy as np
 
 from remaster_ros.calibration.estimate import Problem
 from remaster_ros.calibration.grouped_rows import Rows
-from remaster_ros.calibration.initial_guess import MEDIAN_CHI3, closest_start, robust_spread
+from remaster_ros.calibration.initial_guess import closest_start, robust_spread
 from remaster_ros.calibration.model import Model
+from remaster_ros.calibration.noise import MEDIAN_LENGTH
 from remaster_ros.calibration.outliers import LARGEST_SHARE
-from remaster_ros.calibration.priors import Prior, prior_rows
+from remaster_ros.calibration.priors import LARGEST_OFFSET, UNCALIBRATED_ERROR_M, Prior, prior_rows
 from remaster_ros.errors import InsufficientDataError
 from remaster_ros.kinematics.serial_chain import LIMIT_TOLERANCE_RAD, SerialChain
 from remaster_ros.kinematics.transforms import rotation_vector_to_matrix
@@ -42,10 +43,6 @@ _MOST_LINEAR = 40
 # errors is longer than so many standard deviations.
 _MOST = 1.0 - LARGEST_SHARE
 _MOST_CHI3 = 2.5003
-# A fit is gross from this distance on: an uncalibrated robot's own offsets leave less.
-GROSS_M = 5e-3
-# And from such a zero-offset on: a robot that is mastered at all has less.
-GROSS_OFFSET_RAD = np.deg2rad(5.0)
 # An arrangement is proposed if it fits so many times as well.
 CONVINCING = 5.0
 # Those whose errors are less than so many times those of the closest fit as well: the offsets that
@@ -150,8 +147,8 @@ class Fitted:
     @property
     def gross(self) -> bool:
         """Whether the table is hardly that of this robot."""
-        turned = np.abs(self.joint_offsets) > GROSS_OFFSET_RAD * self.per_radian
-        return bool(self.left_m > GROSS_M or turned.any())
+        turned = np.abs(self.joint_offsets) > LARGEST_OFFSET * self.per_radian
+        return bool(self.left_m > UNCALIBRATED_ERROR_M or turned.any())
 
     @property
     def left_m(self) -> float:
@@ -284,10 +281,10 @@ def fit_arrangement(session: Session, arrangement: Arrangement) -> Fitted:
     shift = np.linalg.norm(start.markers(z) - problem.markers, axis=1)
     return Fitted(
         arrangement,
-        MEDIAN_CHI3 * float(spread.max()),
+        MEDIAN_LENGTH * float(spread.max()),
         determined_offsets(start, z, rows, problem.marker_priors(start), float(spread.max())),
         float(shift.max()),
-        most * MEDIAN_CHI3 / _MOST_CHI3,
+        most * MEDIAN_LENGTH / _MOST_CHI3,
         start.chain.per_radian,
     )
 
@@ -307,7 +304,7 @@ def determined_offsets(
     H = derivative.T @ derivative + by_z.T @ by_z + 1e-2 * np.eye(len(z))
     std = np.sqrt(np.diag(np.linalg.inv(H)))
     offsets = model.offsets(z)
-    known = std[: len(offsets)] < GROSS_OFFSET_RAD * model.chain.per_radian
+    known = std[: len(offsets)] < LARGEST_OFFSET * model.chain.per_radian
     return np.where(known, offsets, 0.0)
 
 
@@ -395,7 +392,7 @@ def search(session: Session, given: Fitted, lengths: Sequence[float] = ()) -> li
     if len(session.measurements) < FEWEST_ROWS:
         return []
     chain = SerialChain.from_urdf(session.urdf, session.base_link, session.tip_link)
-    if given.left_m <= GROSS_M:
+    if given.left_m <= UNCALIBRATED_ERROR_M:
         turns = np.round(given.joint_offsets / _QUARTER).astype(int)
         if not np.any(turns % 4):
             return []
@@ -417,7 +414,8 @@ def search(session: Session, given: Fitted, lengths: Sequence[float] = ()) -> li
             fit = fit_arrangement(session, arrangement)
         except (InsufficientDataError, np.linalg.LinAlgError):
             continue
-        if not fit.gross and (given.left_m <= GROSS_M or fit.left_m * CONVINCING < given.left_m):
+        convincing = fit.left_m * CONVINCING < given.left_m
+        if not fit.gross and (given.left_m <= UNCALIBRATED_ERROR_M or convincing):
             found.append(fit)
     return closest(found)
 

@@ -15,19 +15,15 @@ from scipy.spatial.transform import Rotation
 from remaster_ros.calibration.extension import Start
 from remaster_ros.calibration.grouped_rows import Rows
 from remaster_ros.calibration.model import Model
-from remaster_ros.calibration.noise import RESOLUTION_M
-from remaster_ros.calibration.priors import TIGHTEST_PRIOR, Prior, prior_rows
+from remaster_ros.calibration.noise import MEDIAN_LENGTH, RESOLUTION_M
+from remaster_ros.calibration.priors import TIGHTEST_PRIOR, UNCALIBRATED_ERROR_M, Prior, prior_rows
 from remaster_ros.calibration.registration import register_points
 from remaster_ros.errors import InsufficientDataError, MisfitError
 from remaster_ros.kinematics.transforms import apply
 from remaster_ros.types import FloatArray, IntArray, Measurements
 
-# Median length of a standard normal vector in three dimensions.
-MEDIAN_CHI3 = 1.5382
 # Errors beyond this many robust standard deviations lose their weight in the start.
 CAUCHY_WIDTH = 2.5
-# Error of an uncalibrated robot, by which the linear start weighs the nominal marker positions.
-UNCALIBRATED_ERROR_M = 5e-3
 # Rows of a sensor that the start uses at most.
 LARGEST_START = 5000
 # With larger errors than this share of the points' extent, the model is that of another robot.
@@ -276,7 +272,7 @@ def _linear_markers(
         right = np.concatenate(((target * root[:, None]).ravel(), np.zeros(3 * markers)))
         solution = np.asarray(np.linalg.lstsq(matrix, right, rcond=None)[0], dtype=float)
         length = np.linalg.norm(design @ solution - target, axis=1)
-        scale = CAUCHY_WIDTH * (np.median(length) / MEDIAN_CHI3 + RESOLUTION_M)
+        scale = CAUCHY_WIDTH * (np.median(length) / MEDIAN_LENGTH + RESOLUTION_M)
         root = 1.0 / np.hypot(1.0, length / scale)
     return nominal + solution[12 * sensors :].reshape(-1, 3)
 
@@ -328,7 +324,7 @@ def _squares(errors: FloatArray) -> FloatArray:
 def robust_spread(errors: FloatArray, rows: Rows) -> FloatArray:
     """Return the robust standard deviation per axis of each sensor's errors, m, (sensors,)."""
     length = np.sqrt(_squares(errors))
-    return np.array([np.median(length[s]) / MEDIAN_CHI3 + RESOLUTION_M for _, s in rows.spans])
+    return np.array([np.median(length[s]) / MEDIAN_LENGTH + RESOLUTION_M for _, s in rows.spans])
 
 
 def _cost(errors: FloatArray, scale: FloatArray, prior_residual: FloatArray) -> float:

@@ -20,8 +20,6 @@ from remaster_ros.calibration.arrangement import (
     ALIKE,
     CONVINCING,
     FEWEST_ROWS,
-    GROSS_M,
-    GROSS_OFFSET_RAD,
     Arrangement,
     Fitted,
     arranged,
@@ -36,6 +34,7 @@ from remaster_ros.calibration.arrangement import (
 from remaster_ros.calibration.estimate import Estimate, Problem, estimate
 from remaster_ros.calibration.grouped_rows import Rows
 from remaster_ros.calibration.initial_guess import CAUCHY_WIDTH, robust_spread
+from remaster_ros.calibration.priors import DISPLACED, LARGEST_OFFSET, UNCALIBRATED_ERROR_M
 from remaster_ros.errors import (
     InputError,
     InsufficientDataError,
@@ -51,9 +50,8 @@ from remaster_ros.types import FloatArray, Measurements, Priors, Session
 
 # Where nothing is known of a marker's place (the session format's own advice).
 UNKNOWN_MARKER_STD_M = 0.3
-# A marker found so far from where it was said to be is on another link, or its place is wrong.
-MARKER_STDS = 5.0
-MARKER_SHIFT_M = 5e-3
+# A marker found at least so far from where it was said to be is on another link, m.
+MARKER_SHIFT_M = UNCALIBRATED_ERROR_M
 # Units that tables are in, m and rad.
 LENGTHS: Mapping[str, float] = {'m': 1.0, 'cm': 1e-2, 'mm': 1e-3, 'um': 1e-6, 'in': 0.0254}
 ANGLES: Mapping[str, float] = {'rad': 1.0, 'deg': np.pi / 180.0, 'gon': np.pi / 200.0}
@@ -121,8 +119,8 @@ def is_gross(found: Estimate) -> bool:
     """Return whether an estimate has larger offsets or errors than a mastered robot leaves."""
     offsets = found.mode.z[: found.model.joints]
     sigma = found.posterior.noise(found.mode.eta).sigma
-    limit = GROSS_OFFSET_RAD * found.model.chain.per_radian
-    return bool(np.any(np.abs(offsets) > limit) or np.any(sigma > GROSS_M))
+    limit = LARGEST_OFFSET * found.model.chain.per_radian
+    return bool(np.any(np.abs(offsets) > limit) or np.any(sigma > UNCALIBRATED_ERROR_M))
 
 
 @one_thread
@@ -177,7 +175,7 @@ def _of_the_tool(session: Session, given: Fitted) -> list[Fitted]:
 
     Where there are none, that the markers' places are wrong.
     """
-    allowed = max(MARKER_STDS * session.marker_std_m, MARKER_SHIFT_M)
+    allowed = max(DISPLACED * session.marker_std_m, MARKER_SHIFT_M)
     if given.marker_shift_m < allowed:
         return []
     plain = given.arrangement
@@ -292,7 +290,7 @@ def in_a_sentence(mistakes: Mistakes, session: Session, columns: Columns) -> tup
     words, options = in_words(found.arrangement, session, columns)
     sentence = f'with {words} the data fit to {shown_mm(found.error_m)}; without, to '
     # Where only a part of the rows is off, the median does not show it.
-    sentence += shown_mm(given.error_m if given.error_m > GROSS_M else given.left_m)
+    sentence += shown_mm(given.error_m if given.error_m > UNCALIBRATED_ERROR_M else given.left_m)
     if given.left_m < ALIKE * found.left_m:
         largest, least = (
             np.degrees(np.abs(np.angle(np.exp(1j * fit.joint_offsets))).max())

@@ -113,6 +113,8 @@ def error_groups(channels: Sequence[Channel], rows: Rows) -> tuple[ErrorGroup, .
 
 # No sensor of this kind resolves better than 0.1 µm; keeps noise-free (simulated) data proper.
 RESOLUTION_M = 1e-7
+# Median length of a standard normal vector in three dimensions.
+MEDIAN_LENGTH = 1.5381722545
 # Rows whose features are held in memory at once while their Gram matrix is summed up.
 GRAM_ROWS = 2_000
 

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from remaster_ros.calibration.noise import MEDIAN_LENGTH
 from remaster_ros.calibration.outliers import (
     CERTAIN,
     LARGEST_SHARE,
@@ -36,8 +37,6 @@ SPOILT = 1.5
 LISTED = 5
 MEAN_LENGTH = float(np.sqrt(8.0 / np.pi))
 """Mean length of a vector of three independent standard normal numbers."""
-MEDIAN_LENGTH = 1.5382
-"""Its median."""
 
 
 @dataclass(frozen=True)

@@ -9,8 +9,8 @@ The standard deviations are robust: the larger of those by the median and by the
 the errors, so that errors with more than Gaussian tails, which real robots have, are kept.
 The mixture's limit then comes to lie between 6 and 7 of them: of Gaussian errors of known size it
 calls fewer than one in 5 million gross. Their size is not known: errors are measured by it as by
-an estimate with the degrees of freedom that rows and poses leave (`as_of_known_size`), or in a
-session of eight poses one of fifty had a pose off by 7 standard deviations by chance.
+an estimate with the degrees of freedom that rows and poses leave (`as_of_known_size`), or of
+24 clean sessions of ten single readings one would lose a good one.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ import numpy as np
 from scipy.special import chdtri, fdtrc
 
 from remaster_ros.calibration.grouped_rows import Rows
-from remaster_ros.calibration.noise import RESOLUTION_M
+from remaster_ros.calibration.noise import MEDIAN_LENGTH, RESOLUTION_M
 from remaster_ros.errors import MisfitError
 from remaster_ros.types import BoolArray, FloatArray
 
@@ -37,7 +37,7 @@ NARROWEST = 20.0
 LARGEST_SHARE = 0.1
 _QUANTILES = (0.5, 0.8)
 # The same quantiles of the length of a standard normal vector in three dimensions.
-_EXPECTED = np.array([1.5381722545, 2.1544437046])
+_EXPECTED = np.array([MEDIAN_LENGTH, 2.1544437046])
 # The standard deviation by the 80 % quantile may be this many times that by the median; more than
 # a fifth of gross errors makes it larger.
 TAIL_LIMIT = 4.0
@@ -94,11 +94,7 @@ def find_outliers(
 
 
 def judge(rows: Rows, errors: FloatArray, gross: BoolArray) -> Judgement:
-    """Judge every row by the rows not yet called gross.
-
-    In each pose at most one row is called gross that was not before: a bad row makes its
-    neighbours look bad too, as long as it is among them.
-    """
+    """Judge every row by the rows not yet called gross."""
     group = rows.group_of_row
     sensor = rows.group_sensor[group]
     good = ~gross
@@ -120,10 +116,7 @@ def judge(rows: Rows, errors: FloatArray, gross: BoolArray) -> Judgement:
         poses = int(np.sum((rows.group_sensor == index) & (count > 0)))
         freedom = 3 * (int(good[span].sum()) - poses) or 3 * poses - UNKNOWNS
         probability[span] = gross_probability(as_of_known_size(sigmas[span], freedom))
-    new = probability > CERTAIN
-    worst = np.zeros(len(count))
-    np.maximum.at(worst, group, np.where(gross, 0.0, sigmas))
-    gross_now = new & (gross | (sigmas == worst[group]))
+    gross_now = probability > CERTAIN
     why = [
         f'residual {_size(d, i >= rows.points)}, {s:.0f} sigma; gross with probability '
         f'{_percent(p)}'

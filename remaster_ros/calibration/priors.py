@@ -24,6 +24,14 @@ TIGHTEST_PRIOR = 1e-6
 # Of a joint that slides it is as much as that at `LEVER_M`, 22 mm: a switch or stop that sets such
 # a zero is rarely off by more than a turn of the motor, some millimetres.
 OFFSET_STD = np.radians(5.0)
+# A larger offset is that of a joint that has lost its mastering, or joints, signs or the robot
+# model are not those of the arm that was measured.
+LARGEST_OFFSET = OFFSET_STD
+# Error of an arm that nobody has calibrated, m: larger ones are not of its offsets.
+UNCALIBRATED_ERROR_M = 5e-3
+# A marker where it was stated to be is that many times the stated std off in one of a million
+# sessions (square root of chi squared with three degrees of freedom).
+DISPLACED = 5.5
 # Standard deviation of a zero-offset's step beside effects, rad: a marker 1 m from the axis is
 # then 0.15 mm off the tangent, on which the effects were searched.
 STEP_STD = np.radians(1.0)

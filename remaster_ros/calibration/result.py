@@ -24,6 +24,7 @@ from remaster_ros.calibration.noise_estimate import NoiseEstimate, noise_estimat
 from remaster_ros.calibration.orientation_accuracy import TurnsTell, what_turns_tell
 from remaster_ros.calibration.posterior import Posterior
 from remaster_ros.calibration.predictive_accuracy import Predictive
+from remaster_ros.calibration.priors import DISPLACED, LARGEST_OFFSET
 from remaster_ros.calibration.residual_structure import (
     ResidualStructure,
     StructureTest,
@@ -132,12 +133,6 @@ def _unit(columns: FloatArray) -> FloatArray:
     return unit
 
 
-# A mastering is off by tenths of a degree. A larger offset is that of a joint that has lost its
-# mastering, or joints, signs or the robot model are not those of the arm that was measured.
-LARGEST_OFFSET = np.radians(5.0)
-# A marker where it was stated to be is that many times the stated std off in one of a million
-# sessions (square root of chi squared with three degrees of freedom).
-DISPLACED = 5.5
 # Of an unknown angle, uniform over the turn; an unknown length is as much at `LEVER_M`.
 UNKNOWN_STD = np.pi / np.sqrt(3.0)
 

@@ -11,8 +11,8 @@ import numpy as np
 
 from remaster_ros.calibration.estimate import Problem
 from remaster_ros.calibration.grouped_rows import Rows
-from remaster_ros.calibration.initial_guess import MEDIAN_CHI3, closest_start
-from remaster_ros.calibration.noise import RESOLUTION_M
+from remaster_ros.calibration.initial_guess import closest_start
+from remaster_ros.calibration.noise import MEDIAN_LENGTH, RESOLUTION_M
 from remaster_ros.calibration.outliers import (
     CERTAIN,
     LARGEST_SHARE,
@@ -63,7 +63,7 @@ def find_rows_off(session: Session, most: int) -> RowsOff:
     error, off, too_many = np.zeros(len(m)), np.zeros(len(m), bool), False
     for _, span in rows.spans:
         mine = length[span]
-        scale = float(np.median(mine)) / MEDIAN_CHI3 + RESOLUTION_M
+        scale = float(np.median(mine)) / MEDIAN_LENGTH + RESOLUTION_M
         # Wider tails are the arm's own; beyond this limit a fifth of the rows is off, which makes
         # the standard deviation by the tail that of the gross errors.
         scale = by_tail if (by_tail := robust_scale(mine)) < TAIL_LIMIT * scale else scale

@@ -11,8 +11,6 @@ import numpy as np
 from remaster_ros.calibration import estimate
 from remaster_ros.calibration.arrangement import (
     FEWEST_ROWS,
-    GROSS_M,
-    GROSS_OFFSET_RAD,
     MOST_ROWS,
     Arrangement,
     Fitted,
@@ -20,7 +18,6 @@ from remaster_ros.calibration.arrangement import (
 )
 from remaster_ros.calibration.mistakes import (
     MARKER_SHIFT_M,
-    MARKER_STDS,
     TRIED,
     UNKNOWN_MARKER_STD_M,
     Columns,
@@ -28,6 +25,7 @@ from remaster_ros.calibration.mistakes import (
     in_a_sentence,
     shown_mm,
 )
+from remaster_ros.calibration.priors import DISPLACED, LARGEST_OFFSET, UNCALIBRATED_ERROR_M
 from remaster_ros.calibration.rows_off import RowsOff, find_rows_off
 from remaster_ros.errors import InsufficientDataError
 from remaster_ros.importing.rows import RawRows
@@ -92,7 +90,7 @@ def check_sense(session: Session, rows: RawRows, progress: Callable[[str, float]
         return Sense(False, f'too little to try it against the robot: {error}')
     without = shown_mm(as_given.error_m)
     beside = _beside(session, off, rows)
-    allowed = max(MARKER_STDS * session.marker_std_m, MARKER_SHIFT_M)
+    allowed = max(DISPLACED * session.marker_std_m, MARKER_SHIFT_M)
     if not as_given.gross and not off.too_many and as_given.marker_shift_m < allowed:
         return Sense(
             True,
@@ -119,7 +117,7 @@ def check_sense(session: Session, rows: RawRows, progress: Callable[[str, float]
     if mistakes.fitting:
         sentence, options = in_a_sentence(mistakes, session, columns_of(rows, chain))
         return Sense(False, sentence, options, as_given.error_m)
-    if off.too_many and as_given.error_m <= GROSS_M:
+    if off.too_many and as_given.error_m <= UNCALIBRATED_ERROR_M:
         return _many_off(as_given, beside, rows)
     if not as_given.gross:
         return Sense(
@@ -251,7 +249,7 @@ def _nothing_found(given: Fitted, without: str, chain: SerialChain, oriented: bo
             error_m=given.error_m,
         )
     angle = given.joint_offsets[worst]
-    if given.error_m < 5e-3 and abs(angle) > GROSS_OFFSET_RAD:
+    if given.error_m < UNCALIBRATED_ERROR_M and abs(angle) > LARGEST_OFFSET:
         return Sense(
             False,
             f'the data fit to {without} with the zero of joint {worst + 1} off by '

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from remaster_ros.calibration.noise import MEDIAN_LENGTH
 from remaster_ros.calibration.noise_check import (
     MEAN_LENGTH,
-    MEDIAN_LENGTH,
     NoiseCheck,
     check_noise,
 )
