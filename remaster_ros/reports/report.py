@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import gzip
 import importlib.resources
 import json
 import logging
@@ -49,6 +48,7 @@ from remaster_ros.reports.figures import (
 from remaster_ros.reports.fit_json import REPORT_FILE, fit_content
 from remaster_ros.reports.pages import inlined, page, write_report
 from remaster_ros.reports.plan_page import WORDS, check_plan_page, read_plan_page
+from remaster_ros.reports.robot_scene import compressed
 from remaster_ros.reports.schemas import Accuracy, Discovered
 from remaster_ros.reports.sentences import (
     METRICS,
@@ -348,7 +348,7 @@ def fit_html(result: FitResult, drawings: dict[str, str]) -> str:
 def _plotly() -> str:
     """Return plotly.js, compressed and in base64: a third of its size in the page."""
     script = importlib.resources.files('plotly').joinpath('package_data', 'plotly.min.js')
-    return base64.b64encode(gzip.compress(script.read_bytes(), 9, mtime=0)).decode()
+    return compressed(script.read_text(encoding='utf-8'))
 
 
 def _json(content: Any) -> Markup:
