@@ -13,13 +13,14 @@ import numpy as np
 
 from remaster_ros.cli.console import progress_bar, show
 from remaster_ros.cli.options import CANDIDATES, add_description, names, number, xacro_arguments
+from remaster_ros.cli.plan import free_start
 from remaster_ros.errors import InputError, InsufficientDataError, did_you_mean
 from remaster_ros.kinematics.arm_ends import likely_base, likely_tips, moving_before
 from remaster_ros.kinematics.inverse_kinematics import FREE_JOINTS, InverseKinematics
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.urdf import parse_urdf
 from remaster_ros.kinematics.urdf_geometry import chain_bodies, mesh_names
-from remaster_ros.planning.candidates import candidate_poses, taken_poses
+from remaster_ros.planning.candidates import Plan, PlanningScene, candidate_poses, taken_poses
 from remaster_ros.planning.cell_proposal import (
     link_radius,
     marker_height,
@@ -29,7 +30,8 @@ from remaster_ros.planning.cell_proposal import (
     turned_to,
     widest_ranges,
 )
-from remaster_ros.planning.collection_plan import FITTED, outlook
+from remaster_ros.planning.collection_plan import FITTED, outlook, with_free_way
+from remaster_ros.planning.tour_order import Tour
 from remaster_ros.planning.tour_planner import TourPlanner
 from remaster_ros.reports.plan_json import outlook_text, outlook_to_dict
 from remaster_ros.session.cell_template import SENSORS, CellProposal, cell_text, left_alone
@@ -106,13 +108,17 @@ def run(args: argparse.Namespace) -> int:
         progress('trying', 0.1)
         widest = _propose(args, description, urdf, rng)
         progress('planning', 0.4)
-        proposal, planned_poses = _narrowed(widest, _cell(widest, args.out), rng)
+        proposal, tried = _narrowed(widest, _cell(widest, args.out), rng)
         write_atomically(args.out, cell_text(proposal))
         progress('planning', 0.7)
         cell, missing = _cell(proposal, args.out), bool(proposal.missing_meshes)
         planned: dict[str, Any] = {}
         text = ''
-        if not args.no_plan:
+        if args.no_plan:
+            scene = cell.planning_scene(cell.chain(sliding=True), without_meshes=missing)
+            tour = Tour(scene.model.chain, {FITTED: tried}, model=scene.model)
+            planned_poses = _reached(scene, tour, args.seed)
+        else:
             planned, text, planned_poses = _plan(cell, missing, args.seed)
     if args.json:
         print(json.dumps(_as_json(args.out, proposal) | planned))
@@ -123,11 +129,13 @@ def run(args: argparse.Namespace) -> int:
         show(args.quiet, f'written: {args.out}; look at its lines marked CHECK')
     if planned_poses < FEWEST_FITTED:
         # The file stays: what it states may be what is wrong.
+        geometry = ', or give what slides its collision geometry in the URDF'
         raise InsufficientDataError(
             f'{args.out}: {planned_poses} poses can be planned in this cell, and a calibration '
             f'needs {FEWEST_FITTED}; correct its lines marked CHECK (the place of the sensor, the '
-            'markers, the floor), and see whether they suffice: remaster plan '
-            f'{args.out}'
+            'markers, the floor, the thickness of links)'
+            f'{geometry * bool(proposal.chain.slides.any())}, and see whether they suffice: '
+            f'remaster plan {args.out}'
         )
     if not args.json:
         show(args.quiet, f'every way, in 3-D: remaster plan {args.out} --out plan.html')
@@ -231,22 +239,30 @@ def _cell(proposal: CellProposal, out: Path) -> Workcell:
 
 def _narrowed(
     p: CellProposal, cell: Workcell, rng: np.random.Generator
-) -> tuple[CellProposal, int]:
-    """Return the proposal with ranges around the poses that can be visited, and their number."""
+) -> tuple[CellProposal, Plan]:
+    """Return the proposal with ranges around the poses that can be visited, and these poses."""
     scene = cell.planning_scene(p.chain, without_meshes=bool(p.missing_meshes))
     plan = scene.plan(TRIED, scene.rough_R, rng)
     lost = ', '.join(f'{count} {why}' for why, count in plan.dropped.items())
     found = f'Of {TRIED} poses everywhere around the arm {len(plan.poses)} can be visited ({lost})'
     if len(plan.poses) < FEWEST:
         kept = f'{found}: too few to propose ranges.'
-        return replace(p, kept=kept), len(plan.poses)
+        return replace(p, kept=kept), plan
     places = np.array([pose.T_R_T[:3, 3] for pose in plan.poses])
     kept = f'{found}; these ranges are around them.'
-    return replace(p, ranges=ranges_around(places), kept=kept), len(plan.poses)
+    return replace(p, ranges=ranges_around(places), kept=kept), plan
+
+
+def _reached(scene: PlanningScene, tour: Tour, seed: int) -> int:
+    """Return to how many poses to fit a free way leads; no more than `FEWEST_FITTED`."""
+    return with_free_way(tour, scene.model, free_start(scene.model, seed), FEWEST_FITTED)
 
 
 def _plan(cell: Workcell, without_meshes: bool, seed: int) -> tuple[dict[str, Any], str, int]:
-    """Plan in the new cell as the nodes do, without the ways: as JSON, in words, poses to fit."""
+    """Plan in the new cell as the nodes do, with as few ways as tell whether there are any.
+
+    Returns it as JSON, in words, and how many poses to fit the arm gets to (as `_narrowed`).
+    """
     chain = cell.chain(sliding=True)
     scene = cell.planning_scene(chain, without_meshes=without_meshes)
     counts = {'optimization': CANDIDATES, 'validation': CANDIDATES}
@@ -255,7 +271,10 @@ def _plan(cell: Workcell, without_meshes: bool, seed: int) -> tuple[dict[str, An
     except InsufficientDataError as error:
         return {'plan': None, 'why': str(error)}, f'nothing can be measured like this: {error}', 0
     text = f'planned from {sum(counts.values())} candidate poses:\n{outlook_text(tour, expected)}'
-    return {'plan': outlook_to_dict(tour, expected)}, text, tour.poses[FITTED]
+    count = _reached(scene, tour, seed)
+    if count < FEWEST_FITTED:
+        text += f'\nof the poses to fit a free way leads to {count} only'
+    return {'plan': outlook_to_dict(tour, expected)}, text, count
 
 
 def _as_text(p: CellProposal) -> str:

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from remaster_ros.errors import InsufficientDataError, RemasterError
+from remaster_ros.kinematics.collision import CollisionModel
 from remaster_ros.motion.trajectory import Trajectory
 from remaster_ros.planning.candidates import PlannedPose
 from remaster_ros.planning.planned_design import NO_FREE_PATH, Designed
@@ -21,6 +22,8 @@ from remaster_ros.types import FloatArray
 
 REGISTERING = 3
 """Poses that register the sensors; the others of their plan are visited where one is not seen."""
+FEW_MISSED, MOST_MISSED = 4, 12
+"""A way that is not there takes seconds to look for: so many tell that others have none."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -233,7 +236,8 @@ def outlook(planner: TourPlanner) -> tuple[Tour, Expected]:
     """Return a collection with the sensors at their rough places, without its ways.
 
     These take nearly all of the time that `plan_collection` takes; without them it is not known
-    which configurations no free way leads to, nor how long it all takes.
+    which configurations no free way leads to (`with_free_way` counts poses), nor how long it all
+    takes.
 
     Raises
     ------
@@ -242,6 +246,41 @@ def outlook(planner: TourPlanner) -> tuple[Tour, Expected]:
     """
     tour = planner.collection(planner.rough_places)
     return tour, expected_precision(planner, planner.rough_places, tour.plans[FITTED].poses)
+
+
+def with_free_way(tour: Tour, model: CollisionModel, start: FloatArray, enough: int) -> int:
+    """Return how many poses to fit the arm gets to from where it stands, up to `enough`.
+
+    One joint solution of a pose is enough, so this takes a small part of what all ways take, but
+    where few are found so: then the whole tour is gone through, as a collection does it, up to
+    `MOST_MISSED` poses without a way.
+
+    Parameters
+    ----------
+    tour
+        Of poses that the arm can take.
+    model
+        The arm and all it can hit.
+    start
+        Where it stands, rad, (k,).
+    enough
+        Where to stop counting.
+    """
+    fitted = {FITTED: tour.plans[FITTED]}
+    quick = Tour(tour.chain, fitted, one_solution=True, model=model)
+    found = _reached(quick, start, enough, FEW_MISSED)
+    return found if found >= enough else _reached(tour.fork(), start, enough, MOST_MISSED)
+
+
+def _reached(tour: Tour, here: FloatArray, enough: int, most_missed: int) -> int:
+    """Go through a tour until so many poses to fit are reached, or so many poses are not."""
+    count = missed = 0
+    while count < enough and missed < most_missed and (stop := tour.next(here)) is not None:
+        if not len(stop.solutions):
+            missed += 1
+            continue
+        here, count = stop.solutions[-1], count + (stop.split == FITTED)
+    return count
 
 
 def with_expected(

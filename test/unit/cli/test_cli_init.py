@@ -11,6 +11,7 @@ import pytest
 from robot_descriptions import ROBOTS, Description, xarm7
 
 from remaster_ros.cli import init
+from remaster_ros.cli import plan as plan_verb
 from remaster_ros.cli.main import main
 from remaster_ros.cli.plan import free_start
 from remaster_ros.compensation.arm_model import Geometry
@@ -270,6 +271,76 @@ def test_a_cell_in_which_fewer_than_ten_poses_can_be_planned_ends_with_status_1(
     assert (tmp_path / 'cell.yaml').exists()
 
 
+def gantry(between: str = '') -> str:
+    """Return a URDF of three slides and three wrist axes, with something that the base carries."""
+    slides = [
+        (f'{axis}_axis', 'prismatic', unit, origin, travel)
+        for axis, unit, origin, travel in (
+            ('x', '1 0 0', '0 0 0', 0.6),
+            ('y', '0 1 0', '0 0 0', 0.5),
+            ('z', '0 0 1', '0 0 0.8', 0.3),
+        )
+    ]
+    wrist = [
+        (name, 'revolute', unit, '0 0 0.1', turn)
+        for name, unit, turn in (('a', '0 0 1', 2.9), ('b', '0 1 0', 1.9), ('c', '0 0 1', 2.9))
+    ]
+    small = '<collision><geometry><box size="0.04 0.04 0.04"/></geometry></collision>'
+    parts, parent = [f'<link name="base">{between}</link>'], 'base'
+    for name, kind, unit, origin, most in (*slides, *wrist):
+        child = 'tool0' if name == 'c' else f'{name}_link'
+        parts.append(
+            f'<link name="{child}">{small}</link><joint name="{name}" type="{kind}">'
+            f'<parent link="{parent}"/><child link="{child}"/><origin xyz="{origin}"/>'
+            f'<axis xyz="{unit}"/><limit lower="{-most}" upper="{most}" velocity="1" effort="1"/>'
+            '</joint>'
+        )
+        parent = child
+    return f'<robot name="gantry">{"".join(parts)}</robot>'
+
+
+WALLS = ''.join(
+    f'<collision><origin xyz="{x} 0 1.0"/><geometry><box size="0.02 3 3"/></geometry></collision>'
+    for x in (-0.15, 0.15)
+)
+
+
+@pytest.mark.qualify
+def test_a_gantry_between_walls_ends_with_status_1(do, tmp_path):
+    """It could stand beyond them, where all the poses are, and does not get there."""
+    robot = tmp_path / 'gantry.urdf'
+    robot.write_text(gantry(WALLS))
+    status, printed, error = do(robot)
+    assert int(re.search(r'to fit: .* at (\d+) poses', printed)[1]) >= 10
+    assert status == 1
+    assert error.count('\n') == 1
+    assert ': 0 poses can be planned in this cell, and a calibration needs 10; correct' in error
+    assert 'give what slides its collision geometry in the URDF' in error
+    assert 'of the poses to fit a free way leads to 0 only' in printed
+    assert 'every way, in 3-D' not in printed
+
+
+@pytest.mark.parametrize('options', [('--no-plan',), ()])
+def test_poses_that_no_free_way_leads_to_are_none_that_can_be_planned(
+    options, do, tmp_path, monkeypatch, capsys
+):
+    """The arm can stand nowhere else than it begins: deep in the floor, from where none leads."""
+    start = np.radians([0.0, 90.0, 60.0, 0.0, 0.0, 0.0])
+    for module in (init, plan_verb):
+        monkeypatch.setattr(module, 'free_start', lambda model, seed: start)
+    status, printed, error = do(written(tmp_path, ROBOTS['irb120']()), *options)
+    assert status == 1
+    assert error.count('\n') == 1
+    assert ': 0 poses can be planned in this cell, and a calibration needs 10; correct' in error
+    assert 'what slides' not in error
+    assert ('of the poses to fit a free way leads to 0 only' in printed) == (not options)
+    if not options:
+        # The verb that it names agrees.
+        capsys.readouterr()
+        assert main(['plan', str(tmp_path / 'cell.yaml')]) == 1
+        assert 'no configuration can be reached' in capsys.readouterr().err
+
+
 @pytest.mark.qualify
 def test_an_arm_of_five_axes_is_planned(do, tmp_path):
     status, printed, error = do(written(tmp_path, ROBOTS['irb120']()), '--tip-link', 'link_5')
@@ -312,7 +383,11 @@ def test_a_scara_is_prepared_and_planned(do, tmp_path, capsys):
     assert {name for name, std in plan['expected_std_deg'].items() if std} == {'j2'}
 
 
-def test_a_rail_is_planned_with_the_arm_where_the_base_link_says_so(do, tmp_path, capsys):
+def test_a_rail_is_planned_with_the_arm_where_the_base_link_says_so(
+    do, tmp_path, capsys, monkeypatch
+):
+    # To look for the ways of this one takes minutes, and is for another test.
+    monkeypatch.setattr(init, 'with_free_way', lambda tour, *_: tour.poses['optimization'])
     path = on_rail(tmp_path)
     status, printed, _ = do(path, '--base-link', 'hall')
     assert status == 0
