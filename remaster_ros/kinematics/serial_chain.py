@@ -406,8 +406,8 @@ def _require_kind(joint: UrdfJoint, sliding: bool) -> None:
         if not sliding:
             raise InputError(
                 f"URDF: joint '{joint.name}' is prismatic; an arm with a joint that slides can be "
-                'planned, imported and fitted, no more: this needs joints that turn, between '
-                'other links'
+                'planned, simulated, imported and fitted, no more: this needs joints that turn, '
+                'between other links'
             )
     elif joint.kind not in ('revolute', 'continuous'):
         raise InputError(

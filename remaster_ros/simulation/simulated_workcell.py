@@ -122,8 +122,9 @@ def simulate_session(
     validation_poses``: for each pose its joint solutions in the order visited, rad, (m, k);
     ``sensors``: by name; at every configuration each gives an observation of each of its markers,
     from one frame; ``markers``: nominal positions in the tool frame, m, (3,); the true ones lie
-    ``marker_std_m`` away; ``joint_offsets``: the true zero-offsets, rad, (k,); where None drawn
-    from N(0, ``joint_offset_std``²); ``outlier_share``: share of the observations moved by
+    ``marker_std_m`` away; ``joint_offsets``: the true zero-offsets, rad or m, (k,); where None
+    drawn from N(0, ``joint_offset_std``²), of a joint that slides times
+    `SerialChain.per_radian`; ``outlier_share``: share of the observations moved by
     ``outlier_m`` in a random direction; ``warming``: of the arm, measured as well; None where no
     temperature is measured; ``effects, effect_rng``: what else is wrong with the arm or the
     sensors, and the source of its randomness.
@@ -131,6 +132,11 @@ def simulate_session(
     Raises InputError: solutions of the wrong shape, no poses, a sensor that follows no known
     marker, or an effect that this arm cannot show.
     """
+    for joint in np.flatnonzero(chain.slides)[: len(effects)]:
+        raise InputError(
+            f"--effect: joint '{chain.joint_names[joint]}' slides, and of such an arm nothing but "
+            'zero-offsets is simulated, as remaster discover takes none; leave --effect out'
+        )
     for name, sensor in sensors.items():
         for marker in sensor.markers:
             if marker not in markers:
@@ -141,7 +147,7 @@ def simulate_session(
             f'nothing to simulate: at least one sensor and one pose with {len(chain)} joints each'
         )
     if joint_offsets is None:
-        joint_offsets = joint_offset_std * rng.standard_normal(len(chain))
+        joint_offsets = joint_offset_std * chain.per_radian * rng.standard_normal(len(chain))
     nominal = {name: np.asarray(position, dtype=float) for name, position in markers.items()}
     true_markers = {
         name: position + marker_std_m * rng.standard_normal(3)
@@ -331,7 +337,7 @@ def choose_robot(
     cell.robot.base_link = base_link or cell.robot.base_link
     cell.robot.tip_link = tip_link or cell.robot.tip_link
     try:
-        chain = cell.chain()
+        chain = cell.chain(sliding=True)
     except InputError as error:
         raise InputError(f'{cell.robot.urdf}: {error}') from None
     if robot is not None and (

@@ -72,7 +72,7 @@ class SimulatedSensor:
 class SessionTruth:
     """What a session was made from: everything that an estimate of it is to find."""
 
-    joint_offsets: FloatArray  # True joint angle minus reported one, rad, (k,)
+    joint_offsets: FloatArray  # True joint angle minus reported one, rad (m: slides), (k,)
     markers: Mapping[str, FloatArray]  # True positions in the tool frame, m, name -> (3,)
     sensors: Mapping[str, SimulatedSensor]
     warming: Warming = Warming()  # How the arm, and the air around it, warms up
@@ -122,8 +122,10 @@ def truth_to_dict(truth: SessionTruth, chain: SerialChain, seed: int) -> dict[st
         'seed': seed,
         'robot': chain.name,
         'joint_offsets': [
-            {'joint': name, 'offset_deg': float(np.rad2deg(offset))}
-            for name, offset in zip(chain.joint_names, truth.joint_offsets)
+            {'joint': name, 'offset_deg': None, 'unit': 'mm', 'offset_mm': 1e3 * float(offset)}
+            if slides
+            else {'joint': name, 'offset_deg': float(np.rad2deg(offset))}
+            for name, offset, slides in zip(chain.joint_names, truth.joint_offsets, chain.slides)
         ],
         'registration': {
             name: {

@@ -1,0 +1,155 @@
+"""Arms with a joint that slides, simulated by the command and fitted: what comes back."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from scipy.stats import binom
+
+from remaster_ros.calibration.fit import fit_session
+from remaster_ros.cli.main import main
+from remaster_ros.kinematics.serial_chain import LEVER_M, SerialChain
+from remaster_ros.kinematics.transforms import matrix_from_quaternion_xyzw
+from remaster_ros.session.reader import read_session
+from remaster_ros.simulation.simulated_workcell import simulate_session
+from remaster_ros.simulation.truth import SimulatedSensor, place_sensor
+
+ERROR_RATE = 1e-3
+STD_DEG = 0.3
+SLIDE = 2
+
+
+def stanford() -> str:
+    """Return a URDF of an arm whose third joint slides behind two that turn."""
+    joints = (
+        ('revolute', '0 0 1', '0 0 0.4', '0 0 0'),
+        ('revolute', '0 0 1', '0 0.15 0', '-1.5708 0 0'),
+        ('prismatic', '0 0 1', '0 0 0.1', '1.5708 0 0'),
+        ('revolute', '0 0 1', '0 0 0', '0 0 0'),
+        ('revolute', '0 0 1', '0 0.05 0', '-1.5708 0 0'),
+        ('revolute', '0 0 1', '0 0 0.1', '1.5708 0 0'),
+    )
+    parts, parent = ['<link name="base"/>'], 'base'
+    for i, (kind, axis, xyz, rpy) in enumerate(joints, start=1):
+        low, high = (0.1, 0.5) if kind == 'prismatic' else (-2.2, 2.2)
+        child = 'tool0' if i == len(joints) else f'l{i}'
+        parts.append(
+            f'<link name="{child}"/><joint name="j{i}" type="{kind}"><parent link="{parent}"/>'
+            f'<child link="{child}"/><origin xyz="{xyz}" rpy="{rpy}"/><axis xyz="{axis}"/>'
+            f'<limit lower="{low}" upper="{high}" velocity="1" effort="1"/></joint>'
+        )
+        parent = child
+    return f'<robot name="stanford">{"".join(parts)}</robot>'
+
+
+CELL = """\
+robot: {urdf: arm.urdf, base_link: base, tip_link: tool0}
+markers: {ball: [0.02, 0.0, 0.06]}
+sensors:
+  tracker: {marker: ball, topic: laser_tracker/marker, rough_position_m: [2.5, 0.0, 0.8]}
+aim_at: tracker
+poses: {azimuth_deg: [-90, 90], radius_m: [0.15, 0.5], height_m: [0.3, 0.9],
+        design: latin_hypercube}
+link_radius_m: 0.01
+floor_z_m: null
+"""
+
+
+@pytest.fixture(scope='module')
+def made(tmp_path_factory):
+    """The folder of a session that the command has made."""
+    folder = tmp_path_factory.mktemp('stanford')
+    (folder / 'arm.urdf').write_text(stanford())
+    (folder / 'cell.yaml').write_text(CELL)
+    size = ('--poses', '30', '--validation', '10', '--seed', '3', '--quiet')
+    assert main(['simulate', str(folder / 's'), '--cell', str(folder / 'cell.yaml'), *size]) == 0
+    return folder
+
+
+def test_the_truth_of_a_slide_is_in_mm_and_is_what_made_the_rows(made):
+    truth = json.loads((made / 's' / 'truth.json').read_text())
+    row = truth['joint_offsets'][SLIDE]
+    assert row['joint'] == 'j3'
+    assert (row['unit'], row['offset_deg']) == ('mm', None)
+    assert 0.01 < abs(row['offset_mm']) < 5.0 * 1e3 * LEVER_M * np.radians(STD_DEG)
+    assert all('offset_mm' not in other for other in truth['joint_offsets'] if other is not row)
+    assert ',q3_m,' in (made / 's' / 'observations.csv').read_text().partition('\n')[0]
+    session = read_session(made / 's')
+    chain = SerialChain.from_urdf(session.urdf, 'base', 'tool0', sliding=True)
+    m = session.measurements
+    # A pose is what all its solutions share, so the slide has more than one place.
+    assert np.ptp(m.q[:, SLIDE]) > 0.1
+    offsets = np.array(
+        [
+            1e-3 * row['offset_mm'] if row.get('unit') == 'mm' else np.radians(row['offset_deg'])
+            for row in truth['joint_offsets']
+        ]
+    )
+    T = truth['registration']['tracker']
+    points = chain.positions(m.q, truth['markers']['ball']['position_m'], offsets)
+    R = matrix_from_quaternion_xyzw(np.array(T['rotation_xyzw']))
+    expected = (points - T['translation_m']) @ R
+    # The noise of three axes of 0.22 mm each.
+    assert np.linalg.norm(m.position - expected, axis=1).max() < 1.5e-3
+
+
+def test_the_offset_is_recovered_by_the_command(made, tmp_path):
+    """Within 4.5 of its standard deviations: 1 of 100,000 tests fails."""
+    assert main(['fit', str(made / 's'), '--out', str(tmp_path), '--quiet', '--no-figures']) == 0
+    truth = json.loads((made / 's' / 'truth.json').read_text())['joint_offsets'][SLIDE]
+    found = json.loads((tmp_path / 'fit.json').read_text())['joint_offsets'][SLIDE]
+    assert found['identifiable']
+    assert found['unit'] == truth['unit'] == 'mm'
+    assert abs(found['mean_mm'] - truth['offset_mm']) < 4.5 * found['std_mm']
+
+
+@pytest.mark.timeout(3600)
+@pytest.mark.parametrize('sessions', [12, pytest.param(200, marks=pytest.mark.qualify)])
+def test_intervals_hold_as_often_as_they_say(made, sessions):
+    """Of four offsets of each session, as if half of them were independent."""
+    session = read_session(made / 's')
+    chain = SerialChain.from_urdf(session.urdf, 'base', 'tool0', sliding=True)
+    m = session.measurements
+    fitted = [m.q[(m.pose == pose) & ~m.is_validation] for pose in np.unique(m.pose)]
+    inside, slides, errors = [], [], []
+    print(f'session seeds 7000 to {6999 + sessions}')
+    for seed in range(7000, 7000 + sessions):
+        rng = np.random.default_rng(seed)
+        place = place_sensor((2.5, 0.0, 0.8), (0.0, 0.0, 0.6), 0.05, rng)
+        drawn, truth = simulate_session(
+            chain,
+            session.urdf,
+            rng,
+            poses=[q for q in fitted if len(q)],
+            sensors={'tracker': SimulatedSensor('ball', place)},
+            markers={'ball': np.array([0.02, 0.0, 0.06])},
+        )
+        fit = fit_session(drawn, rng=rng, draws=1000)
+        known = fit.identifiable
+        assert known.tolist() == [False, True, True, True, True, False]
+        low, high = fit.joint_offsets_interval95.T
+        holds = (low < truth.joint_offsets) & (truth.joint_offsets < high)
+        inside += holds[known].tolist()
+        slides.append(holds[SLIDE])
+        errors.append(1e3 * (fit.joint_offsets - truth.joint_offsets)[SLIDE])
+    print(f'held: {np.mean(inside):.4f}, of the slide {np.mean(slides):.4f}')
+    print(f'error of the slide, mm: {np.sqrt(np.mean(np.square(errors))):.4f}')
+    for held, count in ((inside, len(inside) // 2), (slides, sessions)):
+        low, high = binom.ppf((0.5 * ERROR_RATE, 1.0 - 0.5 * ERROR_RATE), count, 0.95) / count
+        assert low <= np.mean(held) <= high
+
+
+def test_nothing_else_is_hidden_in_such_an_arm_and_discover_says_why_not(made, tmp_path, capsys):
+    args = ['simulate', str(tmp_path / 'o'), '--cell', str(made / 'cell.yaml')]
+    assert main([*args, '--poses', '8', '--validation', '0', '--effect', 'backlash@2']) == 2
+    error = capsys.readouterr().err.strip().splitlines()[-1]
+    assert "joint 'j3' slides" in error
+    assert 'leave --effect out' in error
+    assert not (tmp_path / 'o').exists()
+    assert main(['discover', str(made / 's'), '--out', str(tmp_path / 'd')]) == 2
+    (error,) = capsys.readouterr().err.strip().splitlines()
+    assert "joint 'j3' is prismatic" in error
+    assert 'can be planned, simulated, imported and fitted, no more' in error
+    assert not (tmp_path / 'd').exists()
