@@ -70,7 +70,8 @@ def by_one(sessions, tmp_path_factory):
 def by_two(sessions, tmp_path_factory):
     """Return the folder that two workers filled."""
     out = tmp_path_factory.mktemp('two') / 'out'
-    both = [str(sessions / 's2'), str(sessions / 's1')]
+    (sessions / 'empty').mkdir()
+    both = [str(sessions / 'empty'), str(sessions / 's1')]
     assert main(['batch', *both, '--out', str(out), '--workers', '2', '--quiet']) == 0
     return out
 
@@ -201,6 +202,7 @@ def always_dies(job):
 
 
 def worked_off(jobs, work, workers=2):
+    """Work jobs off, two of them under way at a time; return the rows, and how many pools."""
     done, made = {}, []
 
     def make() -> Executor:
@@ -208,7 +210,7 @@ def worked_off(jobs, work, workers=2):
         assert isinstance(made[-1], ProcessPoolExecutor)
         return made[-1]
 
-    batch.work_off(jobs, work, make, workers, lambda job, row: done.update({job: row}))
+    batch.work_off(jobs, work, make, 2, lambda job, row: done.update({job: row}))
     return done, len(made)
 
 
@@ -220,7 +222,7 @@ def test_what_was_under_way_when_a_worker_was_killed_is_done_again(tmp_path):
 
 
 def test_a_session_that_kills_its_worker_twice_has_that_in_its_row():
-    done, _ = worked_off(list(range(4)), always_dies)
+    done, _ = worked_off(list(range(4)), always_dies, workers=1)
     assert done.pop(2)['status'] == 'killed'
     assert {job: row['square'] for job, row in done.items()} == {0: 0, 1: 1, 3: 9}
 
@@ -260,7 +262,7 @@ def scheduler():
 
 
 def test_a_scheduler_makes_the_same_rows(scheduler, sessions, by_two, tmp_path):
-    given = [str(sessions / 's1'), str(sessions / 's2'), '--quiet', '--out', str(tmp_path)]
+    given = [str(sessions / 's1'), str(sessions / 'empty'), '--quiet', '--out', str(tmp_path)]
     assert main(['batch', *given, '--scheduler', scheduler.scheduler_address]) == 0
     assert rows(tmp_path) == rows(by_two)
 

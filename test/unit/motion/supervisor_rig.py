@@ -168,6 +168,10 @@ class Rig:
         assert self.said(Drive)
         assert self.speed() > 0.1
 
+    def freeze(self):
+        """The safety circuit stops the arm where it is."""
+        self.arm = servo.Motion(self.t, self.arm.at(self.t)[0])
+
     def answer(self, solution):
         self.do(self.supervisor.answered(solution, self.wall))
 

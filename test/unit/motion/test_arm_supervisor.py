@@ -291,14 +291,17 @@ def test_raised_limits_ask_for_another_run():
     rig.run(1.0)
     assert not rig.supervisor.under_way
     rig.do(rig.supervisor.use_limits(LIMITS, rig.wall, raised=True))
+    waits = 'a limit was raised: /remaster/collect goes on'
+    assert rig.supervisor.asks_for_collect == waits
     rig.plan([0.3, 0.0])
     blocked = rig.supervisor.blocked(rig.wall)
     # The run that was paused is reported late: it begins nothing.
     rig.do(rig.supervisor.planner_is('running', rig.wall, f'run {rig.runs}'))
     assert blocked == 'planner is paused'
-    assert rig.supervisor.blocked(rig.wall) == 'a limit was raised: /remaster/collect goes on'
+    assert rig.supervisor.blocked(rig.wall) == waits
     rig.run(1.0)
     assert not rig.said(Drive)
     rig.state = 'running'
     rig.run(1.0)
     assert rig.said(Drive)
+    assert rig.supervisor.asks_for_collect == ''

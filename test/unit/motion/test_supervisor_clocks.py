@@ -9,7 +9,6 @@ from supervisor_rig import LIMITS, RULES, SPEED, Rig
 from remaster_ros.motion.actions import Drive, Failed, Halted, Settled, Stop, SupervisorRules
 from remaster_ros.motion.following import STANDING_S
 from remaster_ros.motion.joint_reports import JointReport
-from remaster_ros.simulation import arm_motion as servo
 
 
 def pause(rig):
@@ -240,7 +239,7 @@ def test_a_pause_of_this_process_with_an_emergency_stop_in_it(rig):
     commands = len(rig.commands)
     rig.alive.discard('bridge')
     rig.run(0.5)
-    rig.arm = servo.Motion(rig.t, rig.arm.at(rig.t)[0])
+    rig.freeze()
     rig.run(1.5)
     rig.alive.add('bridge')
     rig.run(5.0, lambda: rig.said(Halted))

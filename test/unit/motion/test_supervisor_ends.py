@@ -7,12 +7,6 @@ import pytest
 from supervisor_rig import LIMITS
 
 from remaster_ros.motion.actions import Drive, Failed, Halted, Settled, Stop
-from remaster_ros.simulation import arm_motion as servo
-
-
-def freeze(rig):
-    """The safety circuit stops the arm where it is."""
-    rig.arm = servo.Motion(rig.t, rig.arm.at(rig.t)[0])
 
 
 def test_an_emergency_stop_just_before_the_end_halts(rig):
@@ -20,7 +14,7 @@ def test_an_emergency_stop_just_before_the_end_halts(rig):
     target = np.array([0.9, -1.9])
     rig.plan(target)
     rig.run(5.0, lambda: np.max(np.abs(rig.arm.at(rig.t)[0] - target)) < 0.07)
-    freeze(rig)
+    rig.freeze()
     rig.run(5.0, lambda: rig.said(Halted))
     assert rig.last(Halted).reason.startswith('the robot stands 0.06')
     assert not rig.said(Failed, Stop)
@@ -32,7 +26,7 @@ def test_an_emergency_stop_in_a_stop_halts(rig):
     rig.state = 'paused'
     rig.do(rig.supervisor.planner_is('paused', rig.wall))
     rig.step()
-    freeze(rig)
+    rig.freeze()
     rig.run(2.0, lambda: rig.said(Halted))
     assert 'rad from where its stop led: an emergency stop?' in rig.last(Halted).reason
     assert len(rig.said(Stop)) == 1
@@ -97,7 +91,7 @@ def test_a_collection_that_is_begun_at_once_after_the_halt_was_cleared_goes_on(r
     planner('running', 'first')
     rig.plan([0.9, -1.9])
     rig.run(5.0, lambda: rig.speed() > 0.3)
-    freeze(rig)
+    rig.freeze()
     rig.run(2.0, lambda: rig.said(Halted))
     rig.run(0.5)
     if paused:
@@ -118,7 +112,7 @@ def test_a_collection_that_is_begun_at_once_after_the_halt_was_cleared_goes_on(r
 def test_a_pause_just_after_an_emergency_stop_commands_nothing(rig, later_s):
     """Its lag alone would not tell yet; 4 of 45 emergency stops of a campaign ended so."""
     rig.go([0.9, -1.9], 1.2)
-    freeze(rig)
+    rig.freeze()
     rig.run(later_s)
     rig.state = 'paused'
     rig.do(rig.supervisor.planner_is('paused', rig.wall))
@@ -194,6 +188,6 @@ def test_an_arm_whose_stop_was_refused_is_not_judged_by_that_stop(rig):
     rig.do(rig.supervisor.observe('rivals', 'another', rig.wall))
     assert rig.said(Stop)
     rig.do(rig.supervisor.given_up('the controller refuses a command'))
-    freeze(rig)
+    rig.freeze()
     rig.run(5.0)
     assert [halt.reason for halt in rig.said(Halted)] == ['another']

@@ -14,7 +14,6 @@ from remaster_ros.motion.actions import (
     SupervisorRules,
 )
 from remaster_ros.motion.trajectory import Line
-from remaster_ros.simulation import arm_motion as servo
 
 
 def test_three_failures_in_a_row_halt_and_the_third_is_not_lost(rig):
@@ -98,6 +97,7 @@ def test_a_recorder_that_does_not_answer_is_no_failure_of_the_robot(rig):
     rig.run(150.0, lambda: len(rig.said(Failed)) == 4)
     assert {f.reason for f in rig.said(Failed)} == {'the recorder did not answer in time'}
     assert [f.solution for f in rig.said(Failed)] == [0, 1, 2, 3]
+    assert len(rig.said(Settled)) > RULES.failures_in_a_row
     assert not rig.said(Halted)
 
 
@@ -108,17 +108,6 @@ def test_a_configuration_that_is_reached_ends_the_row_of_failures(rig):
     rig.answer(2)
     rig.run(60.0, lambda: len(rig.said(Settled)) == 2)
     assert [f.solution for f in rig.said(Failed)] == [0, 1, 3, 4]
-    assert not rig.said(Halted)
-
-
-def test_a_planner_that_is_begun_again_ends_the_row_of_failures_too(rig):
-    rig.alter = restless(rig)
-    rig.plan(*([0.1 * i, 0.3] for i in range(6)))
-    rig.run(60.0, lambda: len(rig.said(Failed)) == 2)
-    rig.state = 'paused'
-    rig.run(1.0)
-    rig.state = 'running'
-    rig.run(60.0, lambda: len(rig.said(Failed)) == 4)
     assert not rig.said(Halted)
 
 
@@ -189,7 +178,7 @@ def test_a_rival_always_halts_a_collection_and_otherwise_holds_it(rig):
 
 def test_a_rival_while_the_arm_does_not_follow_gets_no_answer(rig):
     rig.go([0.9, -1.9])
-    rig.arm = servo.Motion(rig.t, rig.arm.at(rig.t)[0])
+    rig.freeze()
     rig.run(0.5)
     rig.do(rig.supervisor.observe('rivals', 'another publisher', rig.wall))
     assert not rig.said(Stop)

@@ -9,7 +9,6 @@ from remaster_ros.motion.actions import (
     Settled,
     Stop,
 )
-from remaster_ros.simulation import arm_motion as servo
 
 # Emergency stops
 
@@ -17,8 +16,7 @@ from remaster_ros.simulation import arm_motion as servo
 def test_a_robot_that_stops_on_its_way(rig):
     """An emergency stop: released, the arm must not go on by itself."""
     rig.go([0.9, -1.9], 1.0)
-    # The safety circuit stops it where it is.
-    rig.arm = servo.Motion(rig.t, rig.arm.at(rig.t)[0])
+    rig.freeze()
     pressed = rig.t
     halted(rig, STOPPED)
     (when,) = (t for t, action in rig.actions if isinstance(action, Halted))
@@ -34,7 +32,7 @@ def test_a_stop_after_an_emergency_stop_commands_nothing(rig, when, stop):
     """The arm stands somewhere on its path; where a stop would lead it is not."""
     rig.plan([0.9, -1.9])
     rig.run(when)
-    rig.arm = servo.Motion(rig.t, rig.arm.at(rig.t)[0])
+    rig.freeze()
     rig.run(0.6)
     commands = len(rig.commands)
     if stop == 'plan':

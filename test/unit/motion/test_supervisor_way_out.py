@@ -116,7 +116,7 @@ def test_an_emergency_stop_on_a_way_out_halts(rig):
     rig.collect()
     rig.run(3.0)
     assert rig.last(Drive).solution == WAY_OUT
-    rig.arm = servo.Motion(rig.t, rig.arm.at(rig.t)[0])
+    rig.freeze()
     rig.run(3.0)
     assert rig.last(Halted).reason == STOPPED
     assert [d.solution for d in rig.said(Drive)] == [PROBE, WAY_OUT]

@@ -11,14 +11,8 @@ from remaster_ros.motion.following import allowed_lag_s
 from remaster_ros.motion.motion_gate import Cubic, MotionGate
 from remaster_ros.motion.move_queue import PROBE, probe_path
 from remaster_ros.motion.trajectory import Waypoint
-from remaster_ros.simulation import arm_motion as servo
 
 SEED = 34
-
-
-def freeze(rig):
-    """The safety circuit stops the arm where it is."""
-    rig.arm = servo.Motion(rig.t, rig.arm.at(rig.t)[0])
 
 
 @pytest.mark.parametrize('trial', range(12))
@@ -32,7 +26,7 @@ def test_an_emergency_stop_while_it_brakes_halts(trial):
     rig.do(rig.supervisor.recorder_waits('mocap', rig.wall))
     (stop,) = rig.said(Stop)
     rig.run(rng.uniform(0.02, stop.admitted.waypoints[0].time_s))
-    freeze(rig)
+    rig.freeze()
     rig.run(2.0)
     rig.waiting_for = ''
     rig.run(5.0)
@@ -47,7 +41,7 @@ def test_what_halts_an_arm_that_is_being_halted_does_not_hide_why_it_was():
     rig.do(rig.supervisor.observe('rivals', 'two publishers', rig.wall))
     assert rig.said(Stop)
     rig.run(0.1)
-    freeze(rig)
+    rig.freeze()
     rig.run(4.0)
     # Once more, as it does not come to where its stop leads.
     assert [halt.reason for halt in rig.said(Halted)] == 2 * ['two publishers']
@@ -194,7 +188,7 @@ def test_frozen_reports_and_a_person_who_clears_the_halt():
 def test_reports_that_move_on_after_the_question_are_not_what_was_confirmed():
     rig = Rig()
     rig.go([0.9, -1.9], 1.0)
-    freeze(rig)
+    rig.freeze()
     rig.run(5.0, lambda: rig.said(Halted))
     rig.run(0.5)
     first = rig.supervisor.clear_halt()
@@ -258,18 +252,3 @@ def test_a_slow_probe_that_was_interrupted_is_slow_again(pause_s):
         assert probe.admitted.waypoints[0].time_s > 3.0
     rig.run(20.0, lambda: rig.said(Settled))
     assert rig.supervisor.end is not None
-
-
-def test_raised_limits_ask_for_another_run():
-    rig = Rig()
-    assert rig.supervisor.under_way
-    rig.state = 'paused'
-    rig.run(1.0)
-    assert not rig.supervisor.under_way
-    rig.do(rig.supervisor.use_limits(LIMITS, rig.wall, raised=True))
-    assert rig.supervisor.asks_for_collect == 'a limit was raised: /remaster/collect goes on'
-    rig.state = 'running'
-    rig.plan([0.3, 0.0])
-    rig.run(1.0)
-    assert rig.supervisor.asks_for_collect == ''
-    assert RULES.resume_alone_s == 5.0
