@@ -1,4 +1,4 @@
-"""Small arms for the tests of collisions: planar ones, of links that are easy to reckon with."""
+"""Small arms: planar ones of links that are easy to reckon with, and any that joints make."""
 
 from __future__ import annotations
 
@@ -21,3 +21,18 @@ def planar_arm(links, axis='0 1 0', limit=None):
         '<child link="tool"/><origin xyz="0 0 0.3"/></joint>'
     )
     return SerialChain.from_urdf('<robot name="planar">' + ''.join(parts) + '</robot>')
+
+
+def jointed_arm(*joints: tuple[str, str, str, str]) -> str:
+    """Return a URDF of joints (kind, axis, xyz, rpy), base to tool."""
+    parts, parent = ['<link name="base"/>'], 'base'
+    for i, (kind, axis, xyz, rpy) in enumerate(joints, start=1):
+        low, high = (0.1, 0.5) if kind == 'prismatic' else (-2.2, 2.2)
+        child = 'tool0' if i == len(joints) else f'l{i}'
+        parts.append(
+            f'<link name="{child}"/><joint name="j{i}" type="{kind}"><parent link="{parent}"/>'
+            f'<child link="{child}"/><origin xyz="{xyz}" rpy="{rpy}"/><axis xyz="{axis}"/>'
+            f'<limit lower="{low}" upper="{high}" velocity="1" effort="1"/></joint>'
+        )
+        parent = child
+    return f'<robot name="slider">{"".join(parts)}</robot>'

@@ -117,9 +117,9 @@ def run(args: argparse.Namespace) -> int:
         if args.no_plan:
             scene = cell.planning_scene(cell.chain(sliding=True), without_meshes=missing)
             tour = Tour(scene.model.chain, {FITTED: tried}, model=scene.model)
-            planned_poses = _reached(scene, tour, args.seed)
+            reached, of = _reached(scene, tour, args.seed)
         else:
-            planned, text, planned_poses = _plan(cell, missing, args.seed)
+            planned, text, (reached, of) = _plan(cell, missing, args.seed)
     if args.json:
         print(json.dumps(_as_json(args.out, proposal) | planned))
     else:
@@ -127,13 +127,15 @@ def run(args: argparse.Namespace) -> int:
         if text:
             show(args.quiet, text)
         show(args.quiet, f'written: {args.out}; look at its lines marked CHECK')
-    if planned_poses < FEWEST_FITTED:
+    if reached < FEWEST_FITTED:
         # The file stays: what it states may be what is wrong.
+        found = f'{reached} poses can be planned in this cell'
+        if reached < of:
+            found = f'a free way leads to {reached} of the {of} poses that were tried in this cell'
         geometry = ', or give what slides its collision geometry in the URDF'
         raise InsufficientDataError(
-            f'{args.out}: {planned_poses} poses can be planned in this cell, and a calibration '
-            f'needs {FEWEST_FITTED}; correct its lines marked CHECK (the place of the sensor, the '
-            'markers, the floor, the thickness of links)'
+            f'{args.out}: {found}, and a calibration needs {FEWEST_FITTED}; correct its lines '
+            'marked CHECK (place of the sensor, markers, floor, thickness of links)'
             f'{geometry * bool(proposal.chain.slides.any())}, and see whether they suffice: '
             f'remaster plan {args.out}'
         )
@@ -253,15 +255,17 @@ def _narrowed(
     return replace(p, ranges=ranges_around(places), kept=kept), plan
 
 
-def _reached(scene: PlanningScene, tour: Tour, seed: int) -> int:
-    """Return to how many poses to fit a free way leads; no more than `FEWEST_FITTED`."""
+def _reached(scene: PlanningScene, tour: Tour, seed: int) -> tuple[int, int]:
+    """Return to how many poses to fit a free way leads, `FEWEST_FITTED` or fewer, of how many."""
     return with_free_way(tour, scene.model, free_start(scene.model, seed), FEWEST_FITTED)
 
 
-def _plan(cell: Workcell, without_meshes: bool, seed: int) -> tuple[dict[str, Any], str, int]:
+def _plan(
+    cell: Workcell, without_meshes: bool, seed: int
+) -> tuple[dict[str, Any], str, tuple[int, int]]:
     """Plan in the new cell as the nodes do, with as few ways as tell whether there are any.
 
-    Returns it as JSON, in words, and how many poses to fit the arm gets to (as `_narrowed`).
+    Returns it as JSON, in words, and what `with_free_way` does.
     """
     chain = cell.chain(sliding=True)
     scene = cell.planning_scene(chain, without_meshes=without_meshes)
@@ -269,12 +273,13 @@ def _plan(cell: Workcell, without_meshes: bool, seed: int) -> tuple[dict[str, An
     try:
         tour, expected = outlook(TourPlanner(scene, counts, seed, design=cell.design_settings()))
     except InsufficientDataError as error:
-        return {'plan': None, 'why': str(error)}, f'nothing can be measured like this: {error}', 0
+        return (
+            {'plan': None, 'why': str(error)},
+            f'nothing can be measured like this: {error}',
+            (0, 0),
+        )
     text = f'planned from {sum(counts.values())} candidate poses:\n{outlook_text(tour, expected)}'
-    count = _reached(scene, tour, seed)
-    if count < FEWEST_FITTED:
-        text += f'\nof the poses to fit a free way leads to {count} only'
-    return {'plan': outlook_to_dict(tour, expected)}, text, count
+    return {'plan': outlook_to_dict(tour, expected)}, text, _reached(scene, tour, seed)
 
 
 def _as_text(p: CellProposal) -> str:

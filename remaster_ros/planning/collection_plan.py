@@ -248,8 +248,10 @@ def outlook(planner: TourPlanner) -> tuple[Tour, Expected]:
     return tour, expected_precision(planner, planner.rough_places, tour.plans[FITTED].poses)
 
 
-def with_free_way(tour: Tour, model: CollisionModel, start: FloatArray, enough: int) -> int:
-    """Return how many poses to fit the arm gets to from where it stands, up to `enough`.
+def with_free_way(
+    tour: Tour, model: CollisionModel, start: FloatArray, enough: int
+) -> tuple[int, int]:
+    """Return how many poses to fit the arm gets to from where it stands, and of how many tried.
 
     One joint solution of a pose is enough, so this takes a small part of what all ways take, but
     where few are found so: then the whole tour is gone through, as a collection does it, up to
@@ -264,23 +266,24 @@ def with_free_way(tour: Tour, model: CollisionModel, start: FloatArray, enough: 
     start
         Where it stands, rad, (k,).
     enough
-        Where to stop counting.
+        So many that are reached are enough.
     """
     fitted = {FITTED: tour.plans[FITTED]}
     quick = Tour(tour.chain, fitted, one_solution=True, model=model)
     found = _reached(quick, start, enough, FEW_MISSED)
-    return found if found >= enough else _reached(tour.fork(), start, enough, MOST_MISSED)
+    return found if found[0] >= enough else _reached(tour.fork(), start, enough, MOST_MISSED)
 
 
-def _reached(tour: Tour, here: FloatArray, enough: int, most_missed: int) -> int:
+def _reached(tour: Tour, here: FloatArray, enough: int, most_missed: int) -> tuple[int, int]:
     """Go through a tour until so many poses to fit are reached, or so many poses are not."""
-    count = missed = 0
+    count = tried = missed = 0
     while count < enough and missed < most_missed and (stop := tour.next(here)) is not None:
+        tried += stop.split == FITTED
         if not len(stop.solutions):
             missed += 1
             continue
         here, count = stop.solutions[-1], count + (stop.split == FITTED)
-    return count
+    return count, tried
 
 
 def with_expected(

@@ -132,9 +132,10 @@ def simulate_session(
     Raises InputError: solutions of the wrong shape, no poses, a sensor that follows no known
     marker, or an effect that this arm cannot show.
     """
-    for joint in np.flatnonzero(chain.slides)[: len(effects)]:
+    if len(effects) and chain.slides.any():
+        sliding = chain.joint_names[int(np.argmax(chain.slides))]
         raise InputError(
-            f"--effect: joint '{chain.joint_names[joint]}' slides, and of such an arm nothing but "
+            f"--effect: joint '{sliding}' slides, and of such an arm nothing but "
             'zero-offsets is simulated, as remaster discover takes none; leave --effect out'
         )
     for name, sensor in sensors.items():

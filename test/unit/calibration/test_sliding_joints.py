@@ -7,6 +7,7 @@ import json
 import numpy as np
 import pinocchio as pin
 import pytest
+from arms import jointed_arm as arm
 
 from remaster_ros.calibration.fit import fit_session
 from remaster_ros.cli.main import main
@@ -19,21 +20,6 @@ from remaster_ros.session.reader import read_session
 
 MARKER = np.array([0.03, -0.02, 0.12])
 NOISE_M = 3e-5
-
-
-def arm(*joints: tuple[str, str, str, str]) -> str:
-    """Return a URDF of joints (kind, axis, xyz, rpy), base to tool."""
-    parts, parent = ['<link name="base"/>'], 'base'
-    for i, (kind, axis, xyz, rpy) in enumerate(joints, start=1):
-        low, high = (0.1, 0.5) if kind == 'prismatic' else (-2.2, 2.2)
-        child = 'tool0' if i == len(joints) else f'l{i}'
-        parts.append(
-            f'<link name="{child}"/><joint name="j{i}" type="{kind}"><parent link="{parent}"/>'
-            f'<child link="{child}"/><origin xyz="{xyz}" rpy="{rpy}"/><axis xyz="{axis}"/>'
-            f'<limit lower="{low}" upper="{high}" velocity="1" effort="1"/></joint>'
-        )
-        parent = child
-    return f'<robot name="slider">{"".join(parts)}</robot>'
 
 
 # A Stanford arm: the third joint slides behind two that turn.

@@ -314,9 +314,10 @@ def test_a_gantry_between_walls_ends_with_status_1(do, tmp_path):
     assert int(re.search(r'to fit: .* at (\d+) poses', printed)[1]) >= 10
     assert status == 1
     assert error.count('\n') == 1
-    assert ': 0 poses can be planned in this cell, and a calibration needs 10; correct' in error
+    assert re.search(
+        r': a free way leads to 0 of the \d+ poses that were tried in this cell, and', error
+    )
     assert 'give what slides its collision geometry in the URDF' in error
-    assert 'of the poses to fit a free way leads to 0 only' in printed
     assert 'every way, in 3-D' not in printed
 
 
@@ -328,12 +329,13 @@ def test_poses_that_no_free_way_leads_to_are_none_that_can_be_planned(
     start = np.radians([0.0, 90.0, 60.0, 0.0, 0.0, 0.0])
     for module in (init, plan_verb):
         monkeypatch.setattr(module, 'free_start', lambda model, seed: start)
-    status, printed, error = do(written(tmp_path, ROBOTS['irb120']()), *options)
+    status, _, error = do(written(tmp_path, ROBOTS['irb120']()), *options)
     assert status == 1
     assert error.count('\n') == 1
-    assert ': 0 poses can be planned in this cell, and a calibration needs 10; correct' in error
+    assert re.search(
+        r': a free way leads to 0 of the \d+ poses that were tried in this cell, and', error
+    )
     assert 'what slides' not in error
-    assert ('of the poses to fit a free way leads to 0 only' in printed) == (not options)
     if not options:
         # The verb that it names agrees.
         capsys.readouterr()
@@ -387,7 +389,7 @@ def test_a_rail_is_planned_with_the_arm_where_the_base_link_says_so(
     do, tmp_path, capsys, monkeypatch
 ):
     # To look for the ways of this one takes minutes, and is for another test.
-    monkeypatch.setattr(init, 'with_free_way', lambda tour, *_: tour.poses['optimization'])
+    monkeypatch.setattr(init, 'with_free_way', lambda *_: (10, 10))
     path = on_rail(tmp_path)
     status, printed, _ = do(path, '--base-link', 'hall')
     assert status == 0

@@ -6,6 +6,7 @@ import json
 
 import numpy as np
 import pytest
+from arms import jointed_arm
 from scipy.stats import binom
 
 from remaster_ros.calibration.fit import fit_session
@@ -21,29 +22,15 @@ STD_DEG = 0.3
 SLIDE = 2
 
 
-def stanford() -> str:
-    """Return a URDF of an arm whose third joint slides behind two that turn."""
-    joints = (
-        ('revolute', '0 0 1', '0 0 0.4', '0 0 0'),
-        ('revolute', '0 0 1', '0 0.15 0', '-1.5708 0 0'),
-        ('prismatic', '0 0 1', '0 0 0.1', '1.5708 0 0'),
-        ('revolute', '0 0 1', '0 0 0', '0 0 0'),
-        ('revolute', '0 0 1', '0 0.05 0', '-1.5708 0 0'),
-        ('revolute', '0 0 1', '0 0 0.1', '1.5708 0 0'),
-    )
-    parts, parent = ['<link name="base"/>'], 'base'
-    for i, (kind, axis, xyz, rpy) in enumerate(joints, start=1):
-        low, high = (0.1, 0.5) if kind == 'prismatic' else (-2.2, 2.2)
-        child = 'tool0' if i == len(joints) else f'l{i}'
-        parts.append(
-            f'<link name="{child}"/><joint name="j{i}" type="{kind}"><parent link="{parent}"/>'
-            f'<child link="{child}"/><origin xyz="{xyz}" rpy="{rpy}"/><axis xyz="{axis}"/>'
-            f'<limit lower="{low}" upper="{high}" velocity="1" effort="1"/></joint>'
-        )
-        parent = child
-    return f'<robot name="stanford">{"".join(parts)}</robot>'
-
-
+# Its third joint slides behind two that turn.
+STANFORD = jointed_arm(
+    ('revolute', '0 0 1', '0 0 0.4', '0 0 0'),
+    ('revolute', '0 0 1', '0 0.15 0', '-1.5708 0 0'),
+    ('prismatic', '0 0 1', '0 0 0.1', '1.5708 0 0'),
+    ('revolute', '0 0 1', '0 0 0', '0 0 0'),
+    ('revolute', '0 0 1', '0 0.05 0', '-1.5708 0 0'),
+    ('revolute', '0 0 1', '0 0 0.1', '1.5708 0 0'),
+)
 CELL = """\
 robot: {urdf: arm.urdf, base_link: base, tip_link: tool0}
 markers: {ball: [0.02, 0.0, 0.06]}
@@ -61,7 +48,7 @@ floor_z_m: null
 def made(tmp_path_factory):
     """The folder of a session that the command has made."""
     folder = tmp_path_factory.mktemp('stanford')
-    (folder / 'arm.urdf').write_text(stanford())
+    (folder / 'arm.urdf').write_text(STANFORD)
     (folder / 'cell.yaml').write_text(CELL)
     size = ('--poses', '30', '--validation', '10', '--seed', '3', '--quiet')
     assert main(['simulate', str(folder / 's'), '--cell', str(folder / 'cell.yaml'), *size]) == 0
