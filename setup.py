@@ -25,13 +25,14 @@ JAZZY = [
     )
 ]
 
-# What judges in the tests: clients and readers of others, and their distances between bodies.
+# What judges in the tests: clients and readers of others, their distances between bodies, and V8.
 JUDGES = [
     'NatNetClient==0.8.3',
     'natnet==0.3.0',
     'CESAPI==1.1.3',
     'mcap-ros2-support>=0.5',
     'python-fcl>=0.7',
+    'mini-racer>=0.12',
 ]
 
 

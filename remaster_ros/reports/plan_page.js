@@ -90,16 +90,16 @@ async function playPlan(plan) {
   const slider = element('time');
   slider.max = total;
   let time = 0;
-  let shown = -1;
+  let playedVisit = -1;
   let playing = false;
   const show = () => {
     const index = indexAt(time);
     const visit = visits[index];
     const q = anglesAt(visit, time);
     const measuring = time >= visit.arrive;
-    if (view && index !== shown) view.showWay(tips(visit));
+    if (view && index !== playedVisit) view.showWay(tips(visit));
     if (view) view.pose(q, measuring);
-    shown = index;
+    playedVisit = index;
     bars.forEach((update) => update(q));
     slider.value = time;
     const doing = measuring ? 'measured' : `on the way, at most ${visit.speed.toFixed(2)} m/s`;

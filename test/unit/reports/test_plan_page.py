@@ -124,7 +124,8 @@ def test_every_configuration_is_played_in_its_own_time(planned):
     )
     check_arm(q, found['arm'])
     count = plan['configurations']
-    assert found['first']['state'].startswith(f'1 of {count}: references, pose 1, measured')
+    begin = f'1 of {count}: for the registration, pose 1, measured'
+    assert found['first']['state'].startswith(begin)
     assert found['second']['state'].startswith(f'2 of {count}: ')
     assert found['first']['angles'] != found['second']['angles']
     rows = found['rows']
