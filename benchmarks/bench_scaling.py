@@ -5,8 +5,8 @@ in the noise): seconds of wall and of CPU of `fit_session`, and the largest memo
 interpreter and simulated session included. The poses of the larger sessions are random
 configurations in groups of five that share their pose-common error; nothing is planned for them.
 
-Then `remaster fit SESSION --out DIR --no-figures` on 173 + 156 configurations: CPU seconds of the
-process, start-up included, the best of three.
+Then `remaster fit SESSION --out DIR` on 173 + 156 configurations, two sensors, with figures and
+without: CPU seconds of the process, start-up included, the best of three.
 
     OMP_NUM_THREADS=1 python benchmarks/bench_scaling.py [--sizes 50 173 1000 10000 100000]
 """
@@ -66,18 +66,17 @@ def one_size(n: int) -> dict[str, float]:
     }
 
 
-def whole_command() -> list[float]:
-    """Return CPU seconds of `remaster fit --no-figures`, three times."""
-    session, _ = experiment(np.random.default_rng(0), {'mocap': NOISE_M})
+def whole_command(*options: str) -> list[float]:
+    """Return CPU seconds of `remaster fit` with those options, three times."""
+    noises = {'mocap': NOISE_M, 'tracker': (0.05e-3, 0.2e-3)}
+    session, _ = experiment(np.random.default_rng(0), noises)
     seconds = []
     with tempfile.TemporaryDirectory() as folder:
         write_session(Path(folder) / 'session', session)
         command = [sys.executable, '-m', 'remaster_ros.cli.main', 'fit', f'{folder}/session']
         for _ in range(3):
             before = resource.getrusage(resource.RUSAGE_CHILDREN)
-            subprocess.run(
-                [*command, '--out', f'{folder}/fit', '--no-figures', '--quiet'], check=True
-            )
+            subprocess.run([*command, '--out', f'{folder}/fit', '--quiet', *options], check=True)
             after = resource.getrusage(resource.RUSAGE_CHILDREN)
             seconds.append(after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime)
     return seconds
@@ -113,11 +112,13 @@ def main() -> None:
         print('  '.join(map(str, rows[-1])), file=sys.stderr, flush=True)
     print(table(header, rows))
     print(f'wanted at 100,000: {WANTED_SECONDS:.0f} s, {WANTED_GIB:g} GiB')
-    seconds = whole_command()
-    print(
-        f'`remaster fit --no-figures`, 173 + 156 configurations: {min(seconds):.2f} s of CPU '
-        f'(all: {", ".join(f"{value:.2f}" for value in seconds)}; wanted {WANTED_COMMAND:g})'
-    )
+    for options in ((), ('--no-figures',)):
+        seconds = whole_command(*options)
+        print(
+            f'`{" ".join(("remaster fit", *options))}`, 173 + 156 configurations, two sensors: '
+            f'{min(seconds):.2f} s of CPU (all: {", ".join(f"{value:.2f}" for value in seconds)}; '
+            f'wanted {WANTED_COMMAND:g})'
+        )
 
 
 if __name__ == '__main__':

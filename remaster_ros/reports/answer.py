@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import msgspec
 import numpy as np
@@ -60,8 +60,10 @@ from remaster_ros.reports.sentences import (
     times_smaller,
 )
 from remaster_ros.session.files import decode_text, read_limited
-from remaster_ros.session.plan_journal import RecordedPlan
 from remaster_ros.types import BoolArray, FloatArray, Session
+
+if TYPE_CHECKING:
+    from remaster_ros.session.plan_journal import RecordedPlan
 
 # What it is made of: a session, its fit, and its discovery if any.
 

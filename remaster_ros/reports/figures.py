@@ -61,6 +61,9 @@ STYLE: Any = {
     'axes.titlesize': 8.5,
     'axes.titleweight': 'bold',
     'axes.titlelocation': 'left',
+    # Given, as nothing stands above a panel: to find it lays out the labels of the axis once more.
+    'axes.titley': 1.0,
+    'axes.formatter.useoffset': False,
     'axes.labelsize': 8.0,
     'axes.spines.top': False,
     'axes.spines.right': False,
@@ -83,6 +86,8 @@ STYLE: Any = {
     'legend.fontsize': 7.5,
     'figure.facecolor': PAPER,
     'lines.linewidth': 0.6,
+    # Points: what moves a line by less than its own width is not seen.
+    'path.simplify_threshold': 0.5,
 }
 
 
@@ -131,7 +136,7 @@ def shown_scale(result: FitResult) -> FloatArray:
 
 def posteriors(result: FitResult) -> Figure:
     """Draw the marginal posterior of each joint's offset with mean and 95 % interval (Fig. 4)."""
-    figure, axes = _joint_panels(result, height_in=1.55)
+    figure, axes = _joint_panels(result, 1.55, left=0.1, top=0.3)
     scale = shown_scale(result)
     draws = scale * result.joint_offset_draws
     for i, ax in enumerate(axes):
@@ -163,7 +168,7 @@ def posteriors(result: FitResult) -> Figure:
 
 def traces(result: FitResult) -> Figure:
     """Draw the chains of each joint's offset from their first state (Fig. 3)."""
-    figure, axes = _joint_panels(result, height_in=1.35)
+    figure, axes = _joint_panels(result, 1.35, left=0.8, top=0.5)
     chains, records = result.trace.shape[:2]
     step = max(1, -(-records // TRACE_POINTS))
     x = np.arange(0, records, step)
@@ -183,7 +188,7 @@ def traces(result: FitResult) -> Figure:
         ax.yaxis.set_major_locator(MaxNLocator(4))
     if sampled := [ax for ax in axes if ax.lines]:
         handles, labels = sampled[0].get_legend_handles_labels()
-        legend = figure.legend(handles, labels, loc='outside upper right', ncols=min(chains, 8))
+        legend = figure.legend(handles, labels, loc='upper right', ncols=min(chains, 8))
         for line in legend.get_lines():
             line.set_linewidth(2.0)
     figure.supxlabel('recorded state of the chain, from its start', fontsize=8)
@@ -195,7 +200,7 @@ def errors_by_configuration(result: FitResult) -> Figure:
     m = result.session.measurements
     before, after = _norms_mm(result)
     splits = _splits(result)
-    figure, axes = _stacked(len(splits), height_in=2.5)
+    figure, axes = _stacked(len(splits), 2.5)
     for ax, (title, rows) in zip(axes, splits, strict=True):
         chosen = np.flatnonzero(rows)
         note = ''
@@ -233,7 +238,7 @@ def residual_distribution(result: FitResult) -> Figure:
     """Draw how large the errors are with and without the offsets."""
     before, after = _norms_mm(result)
     splits = _splits(result)
-    figure, axes = _stacked(len(splits), height_in=2.1)
+    figure, axes = _stacked(len(splits), 2.1)
     for ax, (title, rows) in zip(axes, splits, strict=True):
         error_histograms(ax, before[rows], after[rows])
         ax.set_title(title)
@@ -250,8 +255,8 @@ def tool_places_of_one(result: FitResult) -> Figure:
     row = int(fitted[np.argsort(lengths[fitted])[len(fitted) // 2]])
     places = tool_places(result.predictive, m, row, TOOL_DRAWS, np.random.default_rng(0))
     before, after, drawn, noisy = (1e3 * (place - places.after) for place in places)
-    figure = Figure(figsize=(WIDTH_IN, 3.2), layout='constrained')
-    for ax, (i, j) in zip(figure.subplots(1, 3), ((0, 1), (0, 2), (1, 2)), strict=True):
+    figure, axes = _panels(3.2, (1, 3), left=0.65, bottom=0.5, top=0.4)
+    for ax, (i, j) in zip(axes, ((0, 1), (0, 2), (1, 2)), strict=True):
         ax.plot(*noisy[:, [i, j]].T, '.', color=FAINT, markersize=2.0, alpha=0.5)
         ax.plot(*drawn[:, [i, j]].T, '.', color=AFTER, markersize=2.0, alpha=0.5)
         ax.plot(after[i], after[j], '+', color=INK, markersize=8, markeredgewidth=1.4)
@@ -269,7 +274,7 @@ def tool_places_of_one(result: FitResult) -> Figure:
     ]
     for handle in handles[:2]:
         handle.set_markeredgewidth(1.6)
-    figure.legend(handles=handles, loc='outside upper right', ncols=len(handles))
+    figure.legend(handles=handles, loc='upper right', ncols=len(handles))
     configuration = int(m.configuration[row])
     sensor = result.session.sensor_names[m.sensor[row]]
     figure.suptitle(f'configuration {configuration}, {sensor}', fontsize=8, ha='left', x=0.01)
@@ -285,7 +290,7 @@ def accuracy_map(result: FitResult) -> Figure:
     known = {**result.session.markers, **result.marker_positions}
     markers = np.array([known[name] for name in result.session.marker_names])
     measured = result.chain.positions(m.q, markers[m.marker], result.joint_offsets)
-    figure = Figure(figsize=(WIDTH_IN, 4.0), layout='constrained')
+    figure, axes = _panels(4.0, (1, 2), left=0.65, bottom=0.5, top=0.15, right=1.0)
     views: tuple[tuple[str, str, Callable[[FloatArray], FloatArray]], ...] = (
         (
             'distance from the axis of the base (m)',
@@ -295,11 +300,12 @@ def accuracy_map(result: FitResult) -> Figure:
         ('x (m)', 'y (m)', lambda p: p[:, :2]),
     )
     low, high = np.quantile(error_mm, (0.02, 0.98))
-    for ax, (across, up, seen) in zip(figure.subplots(1, 2), views, strict=True):
+    for ax, (across, up, seen) in zip(axes, views, strict=True):
         places = seen(found.place)
         across_tiles, up_tiles = MAP_TILES * np.ptp(places, axis=0) / np.ptp(found.place[:, 0])
         tiles = ax.hexbin(
-            *places.T,
+            places[:, 0],
+            places[:, 1],
             C=error_mm,
             reduce_C_function=np.mean,
             # Hexagons with sides of one length, in both views.
@@ -314,7 +320,8 @@ def accuracy_map(result: FitResult) -> Figure:
         ax.set_ylabel(up)
         ax.set_aspect('equal')
         ax.grid(False)
-    bar = figure.colorbar(tiles, ax=figure.axes, label='predicted error (mm)', shrink=0.85)
+    beside = figure.add_axes((1.0 - 0.85 / WIDTH_IN, 0.2, 0.15 / WIDTH_IN, 0.7))
+    bar = figure.colorbar(tiles, cax=beside, label='predicted error (mm)')
     # Drawn as a picture it would be the only one of a page that is not lines.
     if bar.solids is not None:
         bar.solids.set(rasterized=False, edgecolor='face')
@@ -338,13 +345,45 @@ def error_histograms(ax: Axes, before: FloatArray, after: FloatArray) -> None:
     ax.yaxis.set_major_locator(MaxNLocator(5, integer=True))
 
 
-def _joint_panels(result: FitResult, height_in: float) -> tuple[Figure, list[Axes]]:
+def _panels(
+    height_in: float,
+    shape: tuple[int, int],
+    *,
+    left: float,
+    bottom: float,
+    top: float,
+    right: float = 0.1,
+    down: float = 0.0,
+) -> tuple[Figure, list[Axes]]:
+    """Return a figure of panels (rows, columns), with margins and the space below a panel, inches.
+
+    They are given: to find them takes longer than to draw the figure.
+    """
+    rows, columns = shape
+    across = left + 0.1
+    width = (WIDTH_IN - left - right - (columns - 1) * across) / columns
+    height = (height_in - top - bottom - (rows - 1) * down) / rows
+    figure = Figure(figsize=(WIDTH_IN, height_in))
+    figure.subplots_adjust(
+        left=left / WIDTH_IN,
+        right=1.0 - right / WIDTH_IN,
+        bottom=bottom / height_in,
+        top=1.0 - top / height_in,
+        wspace=across / width,
+        hspace=down / height,
+    )
+    return figure, list(figure.subplots(rows, columns, squeeze=False).flat)
+
+
+def _joint_panels(
+    result: FitResult, height_in: float, left: float, top: float
+) -> tuple[Figure, list[Axes]]:
     """Return a figure with one titled panel per joint, two in a row."""
     joints = result.joint_names
     rows = -(-len(joints) // 2)
-    figure = Figure(figsize=(WIDTH_IN, height_in * rows + 0.5), layout='constrained')
-    grid = figure.subplots(rows, 2, squeeze=False)
-    axes = list(grid.flat)
+    figure, axes = _panels(
+        height_in * rows + 0.5, (rows, 2), left=left, bottom=0.55, top=top, down=0.5
+    )
     for spare in axes[len(joints) :]:
         spare.set_visible(False)
     for joint, ax in zip(joints, axes, strict=False):
@@ -353,8 +392,7 @@ def _joint_panels(result: FitResult, height_in: float) -> tuple[Figure, list[Axe
 
 
 def _stacked(count: int, height_in: float) -> tuple[Figure, list[Axes]]:
-    figure = Figure(figsize=(WIDTH_IN, height_in * count + 0.2), layout='constrained')
-    return figure, list(figure.subplots(count, 1, squeeze=False).flat)
+    return _panels(height_in * count + 0.2, (count, 1), left=0.65, bottom=0.5, top=0.3, down=0.8)
 
 
 def legend_above(ax: Axes, handles: list[Line2D] | None = None) -> None:
@@ -388,7 +426,7 @@ def legend_entry(marker: str, color: str, name: str) -> Line2D:
 def _write_instead(ax: Axes, text: str) -> None:
     """Write a text in a panel instead of a drawing."""
     ax.set_axis_off()
-    lines = textwrap.fill(text, 58)
+    lines = textwrap.fill(text, 50)
     ax.text(0.0, 0.8, lines, transform=ax.transAxes, va='top', linespacing=1.4)
 
 

@@ -24,7 +24,6 @@ from remaster_ros.collection.plan_confirmation import fingerprint
 from remaster_ros.compensation.export import APPLY_FOLDER, MODEL_FILE
 from remaster_ros.compensation.file import COMPENSATION_FILE
 from remaster_ros.compensation.file import FILE_LIMIT as COMPENSATION_BYTES
-from remaster_ros.discovery.discover import Discovery
 from remaster_ros.discovery.words import clock_time
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.serial_chain import SerialChain
@@ -59,11 +58,12 @@ from remaster_ros.reports.sentences import (
     references,
 )
 from remaster_ros.session.files import decode_text, make_folder, read_limited, write_atomically
-from remaster_ros.session.plan_journal import RecordedPlan
 from remaster_ros.types import FloatArray, IntArray, Session
 
 if TYPE_CHECKING:
     from remaster_ros.calibration.result import FitResult
+    from remaster_ros.discovery.discover import Discovery
+    from remaster_ros.session.plan_journal import RecordedPlan
 
 
 # The 3-D view of a fit: arm, measured markers, magnified error vectors, sensors (for plotly.js).

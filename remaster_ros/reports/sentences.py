@@ -14,7 +14,6 @@ from remaster_ros.calibration.measured_again import MeasuredAgain
 from remaster_ros.calibration.noise_check import SPOILT, NoiseCheck
 from remaster_ros.calibration.predictions import Coverage
 from remaster_ros.calibration.residual_structure import FEWEST_POSES
-from remaster_ros.collection.reference_watch import changes
 from remaster_ros.compensation.export import APPLY_FOLDER, LAYER_FILE, REMASTER_FILE, URDF_FILE
 from remaster_ros.discovery.explain import LookAlike
 from remaster_ros.discovery.thinning import Thinning
@@ -71,6 +70,11 @@ def times_smaller(before: float, after: float) -> str:
 
 def references(result: FitResult) -> tuple[int, list[str]]:
     """Return the rounds of the references, and what changed in the session, a sentence each."""
+    if result.session.references is None:
+        return 0, []
+    # What judges them plans as well; few sessions have any.
+    from remaster_ros.collection.reference_watch import changes
+
     rounds, found = changes(result.session, result.chain, result.T_R_N)
     return rounds, [f'While it was measured, {change.describe()}.' for change in found]
 
