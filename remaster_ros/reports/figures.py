@@ -25,7 +25,7 @@ from remaster_ros.discovery.effects.drivers import driver_named
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.transforms import apply
 from remaster_ros.planning.tour_order import FITTED, REFERENCE
-from remaster_ros.types import BoolArray, FloatArray
+from remaster_ros.types import BoolArray, FloatArray, IntArray
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
@@ -129,6 +129,18 @@ def as_svg(figures: dict[str, Callable[[Drawn], Figure]], subject: Drawn) -> dic
     return texts
 
 
+def evenly(count: int, most: int) -> IntArray:
+    """Return at most so many of the numbers 0 to count - 1, evenly spread, the ends among them."""
+    return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(np.int64))
+
+
+def arm_lines(chain: SerialChain, q: FloatArray, offsets: FloatArray | None = None) -> FloatArray:
+    """Return base, joints and tip of arms at n configurations, rad, m, (n, k + 2, 3)."""
+    joints = chain.frames(q, offsets)[..., :3, 3]
+    tips = chain.forward(q, offsets)[:, None, :3, 3]
+    return np.concatenate((np.zeros((len(q), 1, 3)), joints, tips), axis=1)
+
+
 def shown_scale(result: FitResult) -> FloatArray:
     """Return degrees per rad, or mm per m where a joint slides, (k,)."""
     return np.where(result.chain.slides, 1e3, 180.0 / np.pi)
@@ -205,9 +217,8 @@ def errors_by_configuration(result: FitResult) -> Figure:
         chosen = np.flatnonzero(rows)
         note = ''
         if len(chosen) > SCATTER_POINTS:
-            picked = np.linspace(0, len(chosen) - 1, SCATTER_POINTS).round().astype(int)
             note = f', {SCATTER_POINTS} of {len(chosen)} rows shown'
-            chosen = chosen[picked]
+            chosen = chosen[evenly(len(chosen), SCATTER_POINTS)]
         legend = [legend_entry('_', BEFORE, 'before'), legend_entry('_', AFTER, 'after')]
         for sensor, name in enumerate(result.session.sensor_names):
             mine = chosen[m.sensor[chosen] == sensor]
@@ -794,8 +805,7 @@ def _sides(
 
 MODEL, ALL_CAUSES = '#8a6fc4', '#2f9e78'
 # Narrower than the figures of many panels: to be read on a phone.
-NARROW_IN, WIDE_IN = 5.2, 8.4
-MOST_POINTS = 1500
+NARROW_IN = 5.2
 ARMS = 4
 NOT_MEASURED = 'not measured'
 # Marker, colour and words.
@@ -840,9 +850,7 @@ def stages(answer: Answer) -> Figure:
     colors = (BEFORE, AFTER, *((MODEL,) if len(shown) > 3 else ()), ALL_CAUSES)
     for row, (stage, color) in enumerate(zip(shown, colors, strict=False)):
         errors = np.maximum(np.sort(stage.errors), 1e-4)
-        if len(errors) > MOST_POINTS:
-            picked = np.linspace(0, len(errors) - 1, MOST_POINTS).round().astype(int)
-            errors = errors[picked]
+        errors = errors[evenly(len(errors), SCATTER_POINTS)]
         # Spread out evenly and without chance, so that no two figures of a session differ.
         height = row + 0.22 * np.sin(2.399963 * np.arange(len(errors)))
         ax.plot(errors, height, '.', color=color, markersize=3.0, alpha=0.55, markeredgewidth=0)
@@ -876,9 +884,9 @@ def over_session(subject: Subject) -> Figure:
     m = inputs.session.measurements
     timed = inputs.session.timed
     x = (m.stamp_s - m.stamp_s.min()) / 60.0 if timed else m.configuration.astype(float)
-    figure = Figure(figsize=(WIDE_IN, 2.5), layout='constrained')
+    figure = Figure(figsize=(WIDTH_IN, 2.5), layout='constrained')
     ax = figure.subplots()
-    shown = np.linspace(0, len(m) - 1, min(len(m), MOST_POINTS)).round().astype(int)
+    shown = evenly(len(m), SCATTER_POINTS)
     entries = [legend_entry('_', BEFORE, 'today'), legend_entry('_', AFTER, 'after')]
     for sensor, name in enumerate(inputs.session.sensor_names):
         mine = shown[m.sensor[shown] == sensor]
@@ -935,18 +943,15 @@ def workspace(subject: Subject) -> Figure:
     frames = inputs.T_R_N
     # A sensor that has measured nothing has no place, and no rows either.
     T_R_N = np.array([frames.get(name, np.eye(4)) for name in inputs.session.sensor_names])
-    shown = np.linspace(0, len(m) - 1, min(len(m), MOST_POINTS)).round().astype(int)
+    shown = evenly(len(m), SCATTER_POINTS)
     points = apply(T_R_N[m.sensor[shown]], m.position[shown])
     errors = subject.answer.final_mm[shown]
     order = np.argsort(errors)
     rows = inputs.fit.joint_offsets
     offsets = np.array([row.mean_and_std[0] if row.identifiable else 0.0 for row in rows])
-    chosen = m.q[np.linspace(0, len(m) - 1, min(len(m), ARMS)).round().astype(int)]
-    joints = chain.frames(chosen, offsets)[..., :3, 3]
-    tips = chain.forward(chosen, offsets)[:, None, :3, 3]
-    arms = np.concatenate((np.zeros((len(chosen), 1, 3)), joints, tips), axis=1)
+    arms = arm_lines(chain, m.q[evenly(len(m), ARMS)], offsets)
     everything = np.concatenate((points, arms.reshape(-1, 3)))
-    figure = Figure(figsize=(WIDE_IN, 4.0), layout=_with_room())
+    figure = Figure(figsize=(WIDTH_IN, 4.0), layout=_with_room())
     top = float(np.quantile(errors, 0.98))
     axes = two_views(figure, everything, frames)
     for ax, (a, b) in axes:
@@ -984,17 +989,9 @@ def planned(subject: Subject) -> Figure:
             lost = split != REFERENCE and not results & {'recorded', 'partial'}
             kinds.setdefault(NOT_MEASURED if lost else split, []).append(pose.T_R_T[:3, 3])
             solutions.append(pose.solutions[0])
-    chosen = np.array(solutions)[np.linspace(0, len(solutions) - 1, ARMS).round().astype(int)]
-    arms = np.concatenate(
-        (
-            np.zeros((len(chosen), 1, 3)),
-            chain.frames(chosen)[..., :3, 3],
-            chain.forward(chosen)[:, None, :3, 3],
-        ),
-        axis=1,
-    )
+    arms = arm_lines(chain, np.array(solutions)[evenly(len(solutions), ARMS)])
     frames = subject.inputs.T_R_N
-    figure = Figure(figsize=(WIDE_IN, 4.9), layout=_with_room())
+    figure = Figure(figsize=(WIDTH_IN, 4.9), layout=_with_room())
     everything = np.concatenate((*map(np.array, kinds.values()), arms.reshape(-1, 3)))
     for ax, (a, b) in two_views(figure, everything, frames):
         for arm in arms:

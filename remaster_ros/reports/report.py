@@ -39,10 +39,12 @@ from remaster_ros.reports.figures import (
     AFTER,
     BEFORE,
     Subject,
+    arm_lines,
     draw_answer,
     draw_discovery,
     draw_fit,
     draw_stages,
+    evenly,
 )
 from remaster_ros.reports.fit_json import REPORT_FILE, fit_content
 from remaster_ros.reports.pages import inlined, page, write_report
@@ -96,7 +98,7 @@ class View3D(NamedTuple):
 def draw_view(result: FitResult) -> View3D:
     """Return the 3-D view, everything in the robot base R, metres."""
     m = result.session.measurements
-    shown = _evenly(len(m), ROWS_SHOWN)
+    shown = evenly(len(m), ROWS_SHOWN)
     sensors = [result.session.sensor_names[i] for i in m.sensor[shown]]
     T_R_N = np.array([result.T_R_N[sensor] for sensor in sensors])
     T_before = np.array([result.T_R_N_before[sensor] for sensor in sensors])
@@ -148,14 +150,11 @@ def _trace(name: str, points: FloatArray, **rest: Any) -> dict[str, Any]:
 
 def _arms(result: FitResult) -> dict[str, Any]:
     m = result.session.measurements
-    chosen = m.q[_evenly(len(m), ARMS_SHOWN)]
-    joints = result.chain.frames(chosen, result.joint_offsets)[..., :3, 3]
-    tips = result.chain.forward(chosen, result.joint_offsets)[:, None, :3, 3]
-    base = np.zeros((len(chosen), 1, 3))
-    gap = np.full((len(chosen), 1, 3), np.nan)
+    chosen = m.q[evenly(len(m), ARMS_SHOWN)]
+    lines = arm_lines(result.chain, chosen, result.joint_offsets)
     return _trace(
         f'arm, {len(chosen)} of its configurations',
-        np.concatenate((base, joints, tips, gap), axis=1).reshape(-1, 3),
+        np.pad(lines, ((0, 0), (0, 1), (0, 0)), constant_values=np.nan).reshape(-1, 3),
         mode='lines+markers',
         line={'color': ARM, 'width': 6.0},
         marker={'size': 3, 'color': ARM},
@@ -242,10 +241,6 @@ def _segments(starts: FloatArray, ends: FloatArray) -> FloatArray:
     """Return start, end, gap, start, end, gap, … for one line trace."""
     gap = np.full_like(starts, np.nan)
     return np.stack((starts, ends, gap), axis=1).reshape(-1, 3)
-
-
-def _evenly(count: int, most: int) -> IntArray:
-    return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(np.int64))
 
 
 def _round_factor(factor: float) -> int:
