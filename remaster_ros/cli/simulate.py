@@ -55,6 +55,34 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='error common to all solutions of a pose, std per axis (default 0.2)',
     )
     parser.add_argument(
+        '--depth-noise-mm',
+        type=number(unit='mm'),
+        default=0.0,
+        metavar='S',
+        help='further noise along the line of sight, as of a camera: std at 1 m, growing with the '
+        'square of the distance (default 0)',
+    )
+    parser.add_argument(
+        '--orientation-noise-deg',
+        type=number(unit='deg'),
+        metavar='S',
+        help='the sensors measure full poses, with this noise of every orientation, std per axis '
+        '(default: positions alone)',
+    )
+    parser.add_argument(
+        '--pose-orientation-noise-deg',
+        type=number(unit='deg'),
+        default=0.0,
+        metavar='S',
+        help='error of orientations common to all solutions of a pose, std per axis (default 0)',
+    )
+    parser.add_argument(
+        '--on-tool',
+        action='store_true',
+        help='the sensors are on the tool, at their markers, and measure the pose of a board in '
+        'their place of the cell',
+    )
+    parser.add_argument(
         '--outliers',
         type=number(high=1.0),
         default=0.0,
@@ -86,6 +114,7 @@ def run(args: argparse.Namespace) -> int:
     cell = read_cell(args.cell)
     chain = choose_robot(cell, args.robot, args.base_link, args.tip_link)
     choose_sensors(cell, args.sensors)
+    turn_deg = args.orientation_noise_deg
     with progress_bar(args.quiet or args.json) as progress:
         progress('planning', 0.0)
         made = simulate_workcell(
@@ -96,6 +125,10 @@ def run(args: argparse.Namespace) -> int:
             validation_poses=args.validation,
             sigma_m=args.noise_mm * 1e-3,
             pose_sigma_m=args.pose_noise_mm * 1e-3,
+            depth_sigma_m=args.depth_noise_mm * 1e-3,
+            turn_sigma_rad=None if turn_deg is None else np.deg2rad(turn_deg),
+            pose_turn_sigma_rad=np.deg2rad(args.pose_orientation_noise_deg),
+            on_tool=args.on_tool,
             outlier_share=args.outliers,
             joint_offset_std=np.deg2rad(args.offset_std_deg),
             effects=args.effect,

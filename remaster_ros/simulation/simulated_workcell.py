@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.inverse_kinematics import FREE_JOINTS
@@ -19,7 +20,13 @@ from remaster_ros.session.reader import URDF_LIMIT
 from remaster_ros.session.workcell import CellRobot, Workcell, config_path
 from remaster_ros.simulation.effect_sampling import EffectSpec, with_effects
 from remaster_ros.simulation.hidden_arm import SECONDS_PER_CONFIGURATION, model_of_tour
-from remaster_ros.simulation.truth import SessionTruth, SimulatedSensor, Warming, place_sensor
+from remaster_ros.simulation.truth import (
+    SessionTruth,
+    SimulatedSensor,
+    Warming,
+    mount_body,
+    place_sensor,
+)
 from remaster_ros.types import FloatArray, Measurements, Session
 
 # A tour of a cell, planned and ordered as the planner node does it, all at once.
@@ -176,6 +183,29 @@ def simulate_session(
     gross = np.flatnonzero(rng.random(len(position)) < outlier_share)
     direction = rng.standard_normal((len(gross), 3))
     position[gross] += outlier_m * direction / np.linalg.norm(direction, axis=1, keepdims=True)
+    # Drawn last: sessions of sensors that have none of it stay as they were.
+    bodies = {
+        sensor.marker: mount_body(rng)
+        for sensor in sensors.values()
+        if sensor.turn_sigma_rad is not None
+    }
+    orientation = np.full((len(position), 4), np.nan)
+    for s, sensor in enumerate(sensors.values()):
+        if sensor.depth_sigma_m:
+            mine = np.tile(np.equal(seen_by, s), len(q))
+            distance = np.linalg.norm(position[mine], axis=1, keepdims=True)
+            error = sensor.depth_sigma_m * rng.standard_normal((len(distance), 1))
+            position[mine] += error * distance * position[mine]
+        if sensor.turn_sigma_rad is not None:
+            first = slice(seen_by.index(s), None, len(seen_by))
+            common = sensor.pose_turn_sigma_rad * rng.standard_normal((len(solutions), 3))
+            error = common[pose] + sensor.turn_sigma_rad * rng.standard_normal((len(q), 3))
+            turn = Rotation.from_rotvec(error)
+            true = model.tool_seen(truth.effects)[:, s] @ bodies[sensor.marker]
+            orientation[first] = (turn * Rotation.from_matrix(true)).as_quat()
+            if sensor.on_tool:
+                # It has measured the place of what stands in its own frame, which is turned.
+                position[first] = turn.apply(position[first])
 
     n, names = len(position), list(markers)
     row = np.repeat(np.arange(len(q)), len(seen_by))
@@ -204,6 +234,7 @@ def simulate_session(
             np.full(n, np.nan) if warming is None else AMBIENT_C + model.visited.warming_k[row]
         ),
         frame=frame if several else None,
+        orientation=orientation if bodies else None,
     )
     session = Session(
         urdf=urdf,
@@ -216,10 +247,12 @@ def simulate_session(
         },
         measurements=measurements,
         marker_std_m=marker_std_m,
+        oriented=frozenset(n for n, x in sensors.items() if x.turn_sigma_rad is not None),
+        on_tool=frozenset(n for n, x in sensors.items() if x.on_tool),
         exit_status='complete',
         notes='simulated',
     )
-    return session, replace(truth, outliers=tuple(gross.tolist()))
+    return session, replace(truth, outliers=tuple(gross.tolist()), bodies=bodies)
 
 
 PLACEMENT_STD_M = 0.05
@@ -246,6 +279,10 @@ def simulate_workcell(
     validation_poses: int = 60,
     sigma_m: float = 0.1e-3,
     pose_sigma_m: float = 0.2e-3,
+    depth_sigma_m: float = 0.0,
+    turn_sigma_rad: float | None = None,
+    pose_turn_sigma_rad: float = 0.0,
+    on_tool: bool = False,
     outlier_share: float = 0.0,
     joint_offset_std: float = DEFAULT_OFFSET_STD,
     effects: Sequence[EffectSpec] = (),
@@ -263,6 +300,12 @@ def simulate_workcell(
         Candidate poses; those that cannot be reached are dropped.
     sigma_m, pose_sigma_m
         Noise of every point, and error common to the solutions of a pose, m per axis.
+    depth_sigma_m
+        Noise along the line of sight at 1 m, which grows with the square of the distance, m.
+    turn_sigma_rad, pose_turn_sigma_rad
+        The same two of orientations, rad per axis; without the first one none are measured.
+    on_tool
+        Whether the sensors are on the tool and measure what stands in their places.
     outlier_share
         Share of the observations that are 20 mm off.
     joint_offset_std
@@ -275,8 +318,24 @@ def simulate_workcell(
     Raises
     ------
     InputError
-        No way to solve for the joints of this robot, or no pose that it can take.
+        No way to solve for the joints of this robot, no pose that it can take, or sensors that
+        cannot measure so.
     """
+    if turn_sigma_rad is None and (on_tool or pose_turn_sigma_rad):
+        option = '--on-tool' if on_tool else '--pose-orientation-noise-deg'
+        raise InputError(f'{option} is for sensors of poses; give --orientation-noise-deg as well')
+    if turn_sigma_rad is not None and chain.slides.any():
+        sliding = chain.joint_names[int(np.argmax(chain.slides))]
+        raise InputError(
+            f"--orientation-noise-deg: joint '{sliding}' slides, and remaster fit takes no "
+            'orientations of such an arm; leave it out'
+        )
+    own = [marker for sensor in cell.sensors.values() for marker in sensor.markers]
+    if on_tool and not len(cell.sensors) == len(own) == len(set(own)):
+        raise InputError(
+            '--on-tool: the marker of a sensor on the tool is its own origin, and it has no '
+            'other; choose such sensors by --sensors'
+        )
     # One stream each: other noise, for instance, leaves the poses and the offsets as they were.
     placement, planning, drawing, hiding = rng.spawn(4)
     middle = (0.0, 0.0, sum(cell.poses.height_m) / 2)
@@ -289,6 +348,10 @@ def simulate_workcell(
             further=sensor.further_markers,
             frame_sigma_m=sensor.frame_noise_m,
             single_shot=sensor.single_shot,
+            depth_sigma_m=depth_sigma_m,
+            turn_sigma_rad=turn_sigma_rad,
+            pose_turn_sigma_rad=pose_turn_sigma_rad,
+            on_tool=on_tool,
         )
         for name, sensor in cell.sensors.items()
     }

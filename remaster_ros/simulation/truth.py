@@ -14,12 +14,17 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from remaster_ros.kinematics.serial_chain import SerialChain
-from remaster_ros.kinematics.transforms import looking_at, quaternion_xyzw, transform
+from remaster_ros.kinematics.transforms import (
+    looking_at,
+    matrix_from_rpy,
+    quaternion_xyzw,
+    transform,
+)
 from remaster_ros.simulation.hidden_effects import HiddenEffect
 from remaster_ros.types import FloatArray
 
 ROLL_RAD = 0.2
-"""Largest roll of a sensor about its optical axis."""
+"""Largest roll of a sensor about its optical axis, and tilt of a body against the tool's axes."""
 
 Record = TypeVar('Record')
 
@@ -57,6 +62,14 @@ class SimulatedSensor:
     frame_sigma_m: float = 0.0
     # Whether it measures its markers one after another, in frames of their own
     single_shot: bool = False
+    # What the offline simulation alone has. Noise along the line of sight at 1 m, which grows with
+    # the square of the distance, m. Noise of how the body at `marker` stands, as `sigma_m` and
+    # `pose_sigma_m`, rad per axis; None where positions alone are measured. Whether it is on the
+    # tool, its origin at `marker`, and what it measures stands in the frame N
+    depth_sigma_m: float = 0.0
+    turn_sigma_rad: float | None = None
+    pose_turn_sigma_rad: float = 0.0
+    on_tool: bool = False
 
     @property
     def markers(self) -> tuple[str, ...]:
@@ -81,6 +94,8 @@ class SessionTruth:
     # error over all rows
     effect_sizes_m: tuple[float, ...] = ()
     outliers: tuple[int, ...] = ()  # ``observation`` of every gross error
+    # How the body at a marker stands on the tool where it is measured, R_T_B, name -> (3, 3)
+    bodies: Mapping[str, FloatArray] = field(default_factory=dict)
 
     def without_noise(
         self, chain: SerialChain, sensor: str, q: FloatArray, marker: str = ''
@@ -104,6 +119,12 @@ def place_sensor(
     return transform(turn, position)
 
 
+def mount_body(rng: np.random.Generator) -> FloatArray:
+    """Draw R_T_B (3, 3) of a camera, board or probe that looks along the tool's z axis, about."""
+    tilt = rng.uniform(-ROLL_RAD, ROLL_RAD, 2)
+    return matrix_from_rpy((*tilt, rng.uniform(-np.pi, np.pi)))
+
+
 def to_plain(record: Any) -> Any:
     """Return a record of this package's simulation as dicts, lists and numbers, for a file."""
     return msgspec.to_builtins(record, enc_hook=lambda array: array.tolist())
@@ -117,6 +138,10 @@ def from_plain(data: Any, kind: type[Record]) -> Record:
 def truth_to_dict(truth: SessionTruth, chain: SerialChain, seed: int) -> dict[str, Any]:
     """Return the content of truth.json (``remaster-truth/1``), in the units of fit.json."""
     sensors = truth.sensors
+    bodies = {
+        name: {'rotation_xyzw': quaternion_xyzw(R_T_B).tolist()}
+        for name, R_T_B in truth.bodies.items()
+    }
     return {
         'format': 'remaster-truth/1',
         'seed': seed,
@@ -137,13 +162,22 @@ def truth_to_dict(truth: SessionTruth, chain: SerialChain, seed: int) -> dict[st
         'markers': {
             name: {'position_m': position.tolist()} for name, position in truth.markers.items()
         },
-        'noise': {
-            name: {'sigma_m': sensor.sigma_m, 'pose_sigma_m': sensor.pose_sigma_m}
-            for name, sensor in sensors.items()
-        },
+        **({'bodies': bodies} if bodies else {}),
+        'noise': {name: _noise_to_dict(sensor) for name, sensor in sensors.items()},
         'outliers': list(truth.outliers),
         'effects': [
             {**to_plain(effect), 'size_mm': 1e3 * size}
             for effect, size in zip(truth.effects, truth.effect_sizes_m)
         ],
     }
+
+
+def _noise_to_dict(sensor: SimulatedSensor) -> dict[str, float]:
+    """Return a sensor's noise, that of a camera or of orientations where it has one."""
+    noise = {'sigma_m': sensor.sigma_m, 'pose_sigma_m': sensor.pose_sigma_m}
+    if sensor.depth_sigma_m:
+        noise['depth_sigma_m'] = sensor.depth_sigma_m
+    if sensor.turn_sigma_rad is not None:
+        noise['orientation_sigma_deg'] = float(np.rad2deg(sensor.turn_sigma_rad))
+        noise['pose_orientation_sigma_deg'] = float(np.rad2deg(sensor.pose_turn_sigma_rad))
+    return noise

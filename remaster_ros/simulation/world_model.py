@@ -171,18 +171,36 @@ class WorldModel:
 
         Rows as they are recorded: at every configuration one of each marker of each sensor.
         """
-        q, wrong = self.visited.q + self.joint_offsets, None
-        if effects:
-            names = tuple(self.sensors), tuple(self.markers)
-            wrong = deviation(effects, self.circumstances, *names)
-            q = q + wrong.angle
-        state = self.arm.state(q)
+        state, wrong = self._reached(effects)
         points = [
             measured(state, name, sensor, marker, self.markers[marker], wrong)
             for name, sensor in self.sensors.items()
             for marker in sensor.markers
         ]
         return np.stack(points, axis=1).reshape(-1, 3)
+
+    def tool_seen(self, effects: Sequence[HiddenEffect] = ()) -> FloatArray:
+        """How the tool stands before each sensor without noise, R_N_T, (n, sensors, 3, 3).
+
+        Of what a sensor does by itself only a turn turns it; the rest moves points.
+        """
+        state, wrong = self._reached(effects)
+        origin = placed(state, np.zeros(3), wrong)
+        tool = np.stack([placed(state, axis, wrong) - origin for axis in np.eye(3)], axis=-1)
+        seen = np.stack([x.T_R_N[:3, :3].T @ tool for x in self.sensors.values()], axis=1)
+        if wrong is None:
+            return seen
+        turn = Rotation.from_rotvec(wrong.turn.reshape(-1, 3)).as_matrix()
+        return np.asarray(turn.reshape(seen.shape) @ seen)
+
+    def _reached(self, effects: Sequence[HiddenEffect]) -> tuple[ArmState, Deviation | None]:
+        """Return where the arm truly is, and what else is wrong there."""
+        q = self.visited.q + self.joint_offsets
+        if not effects:
+            return self.arm.state(q), None
+        names = tuple(self.sensors), tuple(self.markers)
+        wrong = deviation(effects, self.circumstances, *names)
+        return self.arm.state(q + wrong.angle), wrong
 
     @cached_property
     def distance_m(self) -> dict[str, float]:

@@ -7,6 +7,7 @@ first read.
 
 from __future__ import annotations
 
+import csv
 import re
 import shutil
 from pathlib import Path
@@ -140,6 +141,14 @@ def supply(word: str, own: Path, here: Path) -> None:
         # The cell is of the same arm, also where the page has made one of another.
         (here / 'my_cell.yaml').unlink(missing_ok=True)
         supply('my_cell.yaml', own, here)
+    elif name == 'poses.csv':
+        # The columns of a reader's own table, and the arm that it is of.
+        size = '--sensors mocap --poses 24 --validation 0 --orientation-noise-deg 0.02 --on-tool'
+        assert main(['simulate', 'made', *size.split(), '--quiet']) == 0
+        shutil.move('made/robot.urdf', 'arm.urdf')
+        rows = list(csv.reader(Path('made/observations.csv').read_text('utf-8').splitlines()))
+        kept = [c for c in zip(*rows) if re.match('q[1-7]_|[xyz]_|orientation_', c[0])]
+        write(Path(), name, text([c[0] for c in kept], [c[1:] for c in kept]))
     elif name == 'my_cell.yaml':
         cell = (ROOT / 'config/cells/demo.yaml').read_text('utf-8')
         Path(name).write_text(cell.replace('../robots', str(ROOT / 'config/robots')), 'utf-8')
