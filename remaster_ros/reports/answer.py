@@ -28,7 +28,6 @@ from remaster_ros.discovery.words import clock_time
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.transforms import matrix_from_quaternion_xyzw, transform
-from remaster_ros.reports.discovery_json import read_discovery
 from remaster_ros.reports.fit_json import (
     DISCOVERY_FILE,
     FIT_FILE,
@@ -157,6 +156,8 @@ def read_inputs(
     if found_path is None:
         model, model_mm = _model(session, fit_path, _file_of(fit.geometry), 'fit')
         return Inputs(session, fit, None, before_mm, after_mm, None, model_mm, model, plan)
+    from remaster_ros.reports.discovery_json import read_discovery
+
     found = read_discovery(found_path)
     _require_same(session, found, found_path, 'discover')
     causes_mm = None

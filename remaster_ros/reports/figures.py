@@ -24,7 +24,6 @@ from remaster_ros.calibration.predictive_accuracy import predicted_accuracy, too
 from remaster_ros.discovery.effects.drivers import driver_named
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.transforms import apply
-from remaster_ros.planning.tour_order import FITTED, REFERENCE
 from remaster_ros.types import BoolArray, FloatArray, IntArray
 
 if TYPE_CHECKING:
@@ -807,14 +806,6 @@ MODEL, ALL_CAUSES = '#8a6fc4', '#2f9e78'
 # Narrower than the figures of many panels: to be read on a phone.
 NARROW_IN = 5.2
 ARMS = 4
-NOT_MEASURED = 'not measured'
-# Marker, colour and words.
-PLANNED_AS = {
-    FITTED: ('o', AFTER, 'poses to fit'),
-    'validation': ('s', BEFORE, 'held out'),
-    REFERENCE: ('D', INK, 'references'),
-    NOT_MEASURED: ('x', '#c0392b', NOT_MEASURED),
-}
 LETTERS = 'ABCDEFGHIJKLMNOPQRSTUVWXYZ'
 
 
@@ -979,15 +970,25 @@ def workspace(subject: Subject) -> Figure:
 
 def planned(subject: Subject) -> Figure:
     """Draw from above and from the side where the tool was to be, and what became of that."""
+    from remaster_ros.planning.tour_order import FITTED, REFERENCE
+
     plan, chain = subject.inputs.plan, subject.chain
     assert plan is not None
+    missing = 'not measured'
+    # Marker, colour and words.
+    shown_as = {
+        FITTED: ('o', AFTER, 'poses to fit'),
+        'validation': ('s', BEFORE, 'held out'),
+        REFERENCE: ('D', INK, 'references'),
+        missing: ('x', '#c0392b', missing),
+    }
     kinds: dict[str, list[FloatArray]] = {}
     solutions = []
     for split, poses in plan.tour.plans.items():
         for index, pose in enumerate(poses.poses):
             results = {plan.outcomes.get((split, index, i)) for i in range(len(pose.solutions))}
             lost = split != REFERENCE and not results & {'recorded', 'partial'}
-            kinds.setdefault(NOT_MEASURED if lost else split, []).append(pose.T_R_T[:3, 3])
+            kinds.setdefault(missing if lost else split, []).append(pose.T_R_T[:3, 3])
             solutions.append(pose.solutions[0])
     arms = arm_lines(chain, np.array(solutions)[evenly(len(solutions), ARMS)])
     frames = subject.inputs.T_R_N
@@ -996,12 +997,12 @@ def planned(subject: Subject) -> Figure:
     for ax, (a, b) in two_views(figure, everything, frames):
         for arm in arms:
             ax.plot(arm[:, a], arm[:, b], 'o-', color=FAINT, linewidth=2, markersize=3, alpha=0.5)
-        for kind, (marker, color, _) in PLANNED_AS.items():
+        for kind, (marker, color, _) in shown_as.items():
             at = np.array(kinds.get(kind, np.empty((0, 3))))
             ax.plot(at[:, a], at[:, b], marker, color=color, markersize=4.5, mew=1.3, mfc='none')
     entries = [
         Line2D([], [], marker=marker, color=color, ls='', mfc='none', mew=1.3, label=words)
-        for kind, (marker, color, words) in PLANNED_AS.items()
+        for kind, (marker, color, words) in shown_as.items()
         if kind in kinds
     ]
     figure.legend(handles=entries, loc='outside upper right', ncols=4, handletextpad=0.2)

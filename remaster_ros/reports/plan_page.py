@@ -18,7 +18,7 @@ from remaster_ros.motion.trajectory import RAMP_S, REST_S
 from remaster_ros.planning.collection_plan import FITTED, CollectionPlan
 from remaster_ros.planning.tour_order import REFERENCE, REGISTRATION
 from remaster_ros.reports.plan_json import HELD_OUT, minutes_text, missed_goal, slides_in_rms
-from remaster_ros.reports.robot_scene import RobotScene, compressed, scene_to_dict, view_script
+from remaster_ros.reports.robot_scene import RobotScene, scene_to_dict, view_script
 from remaster_ros.session.files import make_folder, undone_on_failure, write_atomically
 from remaster_ros.version import __version__
 
@@ -59,7 +59,7 @@ def plan_page(
         Name of the plan where the arm waits until it is confirmed.
     """
     # Only here: it brings the libraries of figures.
-    from remaster_ros.reports.pages import page
+    from remaster_ros.reports.pages import compressed, page
 
     minutes = minutes_text(plan.robot_time_s)
     poses = sum(count for split, count in plan.poses.items() if split != REFERENCE)

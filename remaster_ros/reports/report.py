@@ -20,7 +20,6 @@ from markupsafe import Markup
 from msgspec import UNSET
 
 from remaster_ros.calibration.orientation_accuracy import METRICS as ORIENTATION
-from remaster_ros.collection.plan_confirmation import fingerprint
 from remaster_ros.compensation.export import APPLY_FOLDER, MODEL_FILE
 from remaster_ros.compensation.file import COMPENSATION_FILE
 from remaster_ros.compensation.file import FILE_LIMIT as COMPENSATION_BYTES
@@ -47,9 +46,7 @@ from remaster_ros.reports.figures import (
     evenly,
 )
 from remaster_ros.reports.fit_json import REPORT_FILE, fit_content
-from remaster_ros.reports.pages import inlined, page, write_report
-from remaster_ros.reports.plan_page import WORDS, check_plan_page, read_plan_page
-from remaster_ros.reports.robot_scene import compressed
+from remaster_ros.reports.pages import compressed, inlined, page, write_report
 from remaster_ros.reports.schemas import Accuracy, Discovered
 from remaster_ros.reports.sentences import (
     METRICS,
@@ -444,6 +441,10 @@ def plan_facts(inputs: Inputs) -> PlanFacts | None:
     plan, session = inputs.plan, inputs.session
     if plan is None:
         return None
+    # What plans is imported where there is a plan.
+    from remaster_ros.collection.plan_confirmation import fingerprint
+    from remaster_ros.reports.plan_page import WORDS
+
     splits = [split for split in WORDS if split in plan.tour.configurations]
     stds = _stds(inputs, plan)
     ratios = [row.fit / row.expected for row in stds if row.fit and row.expected]
@@ -452,7 +453,7 @@ def plan_facts(inputs: Inputs) -> PlanFacts | None:
     tour = plan.tour
     return PlanFacts(
         fingerprint(tour),
-        tuple(_row(plan, split) for split in splits),
+        tuple(_row(plan, split, WORDS[split][0]) for split in splits),
         sum(plan.references[result] for result in RECORDED),
         float(np.ptp(np.concatenate(stamps))) / 60.0 if session.timed else None,
         {
@@ -467,7 +468,7 @@ def plan_facts(inputs: Inputs) -> PlanFacts | None:
     )
 
 
-def _row(plan: RecordedPlan, split: str) -> PlannedRow:
+def _row(plan: RecordedPlan, split: str, words: str) -> PlannedRow:
     poses = plan.tour.plans[split].poses
     ends = Counter(result for (own, *_), result in plan.outcomes.items() if own == split)
     recorded = sum(ends.pop(result, 0) for result in RECORDED)
@@ -475,7 +476,7 @@ def _row(plan: RecordedPlan, split: str) -> PlannedRow:
     left = planned - recorded - ends.total()
     lost = {result.replace('_', ' '): count for result, count in ends.most_common()}
     lost |= {NOT_VISITED: left} if left > 0 else {}
-    return PlannedRow(WORDS[split][0], len(poses), planned, recorded, lost)
+    return PlannedRow(words, len(poses), planned, recorded, lost)
 
 
 def _stds(inputs: Inputs, plan: RecordedPlan) -> tuple[StdRow, ...]:
@@ -494,6 +495,9 @@ def _stds(inputs: Inputs, plan: RecordedPlan) -> tuple[StdRow, ...]:
 
 def drawn_plan(plan: RecordedPlan) -> bytes:
     """Return the page that plays the plan, where the planner has left one beside the session."""
+    from remaster_ros.collection.plan_confirmation import fingerprint
+    from remaster_ros.reports.plan_page import read_plan_page
+
     try:
         return read_plan_page(plan.page, fingerprint(plan.tour))
     except InputError:
@@ -610,6 +614,8 @@ def require_ready(folder: Path, pdf: bool) -> Any:
     InputError
         One line with the remedy.
     """
+    from remaster_ros.reports.plan_page import check_plan_page
+
     path = folder / REPORT_FILE
     if path.exists():
         head = read_limited(path, FILE_LIMIT, 'it was there')[:2000]

@@ -8,7 +8,6 @@ all of a link's can be read, else with what stands for that link in the collisio
 from __future__ import annotations
 
 import base64
-import gzip
 import importlib.resources
 import importlib.util
 import zipfile
@@ -321,9 +320,3 @@ def view_script(*names: str) -> str:
     ours = importlib.resources.files(__package__)
     texts = [ours.joinpath(name).read_text(encoding='utf-8') for name in ('robot_view.js', *names)]
     return '\n'.join([three_js(), *texts])
-
-
-def compressed(text: str) -> str:
-    """Return text compressed and in base64, as the pages take it apart again."""
-    # The highest level takes twice as long, for a hundredth less.
-    return base64.b64encode(gzip.compress(text.encode(), 5, mtime=0)).decode()
