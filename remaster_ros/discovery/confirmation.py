@@ -536,7 +536,7 @@ def _by_itself(data: Residuals, causes: Sequence[Cell]) -> tuple[Noise, list[_We
     whole = solve(data, [*found.cells, *(one.cell for one in every)], found)
     if whole is None or whole.log_evidence < found.log_evidence + NAMED:
         return found.noise, []
-    weights = dict(zip(whole.cells, whole.smoothness, strict=True))
+    weights = whole.weight_precisions()
     return whole.noise, [
         (family.cell, weights[family.cell] * np.eye(family.cell.size))
         for family in every

@@ -429,7 +429,7 @@ def by_names(found: Estimate, search: Search, named: Solution) -> tuple[Solution
     others, beside = _beside(search, named)
     if beside is None:
         return members, np.zeros((found.model.size + len(members.parameters), 0))
-    weights = dict(zip(beside.cells, beside.smoothness, strict=True))
+    weights = beside.weight_precisions()
     unseen = np.concatenate(
         [data.columns([family.cell]) * weights[family.cell] ** -0.5 for family in others], axis=2
     )

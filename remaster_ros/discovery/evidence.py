@@ -28,7 +28,7 @@ from scipy.linalg.lapack import dpotrf, dpotri
 
 from remaster_ros.calibration.noise import RESOLUTION_M, Noise, NoiseModel
 from remaster_ros.discovery import packed
-from remaster_ros.discovery.effects.base import LARGEST_M, Cell
+from remaster_ros.discovery.effects.base import LARGEST_M, RANDOM, Cell
 from remaster_ros.discovery.residuals import Residuals, units
 from remaster_ros.discovery.solution import Covariances, Solution
 from remaster_ros.types import FloatArray
@@ -74,10 +74,11 @@ def solve(
     largest = np.array([cell.largest or np.nan for cell in cells for _ in cell.parameters])
     typical = LARGEST_M * np.sqrt(len(data)) / scale
     std = np.where(np.isnan(largest), typical, largest)
-    # Of free forms the heights of a curve have a plausible size, weights of kernels have none.
+    # Of free forms the heights of a curve and a kind's weights have a plausible size, weights of
+    # kernels have none.
     sized = np.array(
         [
-            cell.penalty is None or cell.curve is not None
+            cell.penalty is None or cell.curve is not None or cell.form == RANDOM
             for cell in cells
             for _ in cell.parameters
         ],

@@ -6,8 +6,10 @@ restricted likelihood gives (`evidence`; Patterson & Thompson 1971). A kind that
 show gets none, and costs the others nothing.
 
 The columns of a member are scaled so that its weight is the RMS displacement of the marker over
-the rows worked on, m: one variance then serves joints and links far from the marker and near it. A
-member with a smoothness penalty P enters by the columns of P^(−1/2).
+the rows worked on, m. An error of a joint's angle counts as if every joint moved the marker as
+much: joints of one arm err by angles of one size, and near the axis of its joint a marker would
+let degrees be as likely as minutes elsewhere. No kind is larger than its effect's plausible range.
+A member with a smoothness penalty P enters by the columns of P^(−1/2).
 """
 
 from __future__ import annotations
@@ -19,7 +21,7 @@ from functools import partial
 import numpy as np
 
 from remaster_ros.calibration.noise import Noise
-from remaster_ros.discovery.effects.base import Cell, Design
+from remaster_ros.discovery.effects.base import RANDOM, Cell, Design
 from remaster_ros.discovery.effects.context import Context
 from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.discovery.evidence import solve
@@ -35,7 +37,6 @@ LEAST_SHARE = 1e-7
 # Share of the offsets model's errors that is noise, where the rest is of the arm: a search for the
 # likelihood's maximum begins there as well as at one.
 SMALL_NOISE = 0.3
-RANDOM = 'random'
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,26 +65,34 @@ class Family:
 
         Its weights have a standard deviation of no less than ``least``, m.
         """
-        seen, maps, scales = [], [], []
+        seen, maps, scales, largest = [], [], [], []
+        lever = _lever(data, members)
         for member in members:
-            displaced = data.columns([member])
-            square = np.sum(displaced**2, axis=(0, 1)) / len(data)
+            moved = data.columns([member])
+            square = np.sum(moved**2, axis=(0, 1)) / len(data)
+            design = member.columns(data.part)
+            if design.at is not None:
+                moved = lever * design.values[:, None, :]
             if member.penalty is None:
                 parts = square > NOTHING**2
+                square = np.sum(moved**2, axis=(0, 1)) / len(data)
                 if parts.any():
                     unit = np.sqrt(np.where(parts, square, 1.0))
                     seen.append(member)
                     maps.append((np.eye(member.size) / unit)[:, parts])
                     scales.append(square)
+                    largest.append((member.largest or np.inf) * float(unit[parts].max()))
                 continue
             values, vectors = np.linalg.eigh(member.penalty)
             root = vectors / np.sqrt(np.maximum(values, np.finfo(float).eps * values[-1]))
-            share = np.sum((displaced @ root) ** 2, axis=(0, 1)) / len(data)
-            if share.sum() > NOTHING**2:
+            share = np.sum((moved @ root) ** 2, axis=(0, 1)) / len(data)
+            if np.any(square > NOTHING**2):
                 seen.append(member)
                 kept = share > LEAST_SHARE * share.max()
                 maps.append(root[:, kept] / np.sqrt(share.sum()))
                 scales.append(np.array([share.sum()]))
+                of_a_height = lever if design.at is not None else np.inf
+                largest.append((member.largest or np.inf) * of_a_height)
         if not seen:
             return None
         count = sum(one.shape[1] for one in maps)
@@ -98,8 +107,16 @@ class Family:
             drawn_from=1,
             penalty=np.eye(count),
             least=least,
+            largest=max(largest),
         )
         return cls(cell, tuple(seen), tuple(maps), tuple(scales))
+
+
+def _lever(data: Residuals, members: Sequence[Cell]) -> float:
+    """Return the RMS displacement of the marker by a radian of the joints of some cells, m."""
+    joints = sorted({member.joints[0] - 1 for member in members if member.place == 'joint_angle'})
+    jacobian = data.part.jacobian[:, :, joints]
+    return float(np.sqrt(np.sum(jacobian**2) / max(1, len(jacobian) * len(joints))))
 
 
 def _columns(context: Context, members: Sequence[Cell], maps: Sequence[FloatArray]) -> Design:
@@ -162,6 +179,7 @@ def by_members(solution: Solution, families: Sequence[Family]) -> Solution:
     maps: list[FloatArray] = []
     smoothness: list[float] = []
     ridge: list[FloatArray] = []
+    precisions = solution.weight_precisions()
     for cell, where, factor in zip(
         solution.cells, solution.slices(), solution.smoothness, strict=True
     ):
@@ -177,9 +195,9 @@ def by_members(solution: Solution, families: Sequence[Family]) -> Solution:
         for member, scale in zip(family.members, family.scales, strict=True):
             if member.penalty is None:
                 smoothness.append(np.nan)
-                ridge.append(factor * scale)
+                ridge.append(precisions[cell] * scale)
             else:
-                smoothness.append(float(factor * scale[0]))
+                smoothness.append(float(precisions[cell] * scale[0]))
                 ridge.append(np.zeros(member.size))
     together = _diagonal(maps)
     p = len(solution.base)

@@ -57,6 +57,11 @@ class Solution:
         edges = np.cumsum([0, *(cell.size for cell in self.cells)])
         return [slice(int(a), int(b)) for a, b in itertools.pairwise(edges)]
 
+    def weight_precisions(self) -> dict[Cell, float]:
+        """Return the prior precision that all weights of a cell have; of those of a kind alone."""
+        first = [where.start for where in self.slices()]
+        return dict(zip(self.cells, self.smoothness + self.ridge[first], strict=True))
+
     def evidence_without(self, index: int, rows: int) -> float:
         """Return the log evidence without one cell, with noise and smoothness as they are.
 

@@ -221,17 +221,22 @@ def compensation_of(discovery: Discovery, widening: float) -> Described:
 def holds_everything(discovery: Discovery) -> bool:
     """Whether compensation.json holds everything in the model, and not the offsets alone."""
     alone = _held_out_mean(discovery, discovery.alone.residuals_after)
-    every = _held_out_mean(discovery, _corrected(discovery))
+    errors, can_be_commanded = _corrected(discovery)
+    every = _held_out_mean(discovery, errors)
     better = bool(np.isnan(alone)) or round(every, 3) < round(alone, 3)
-    return better and bool(discovery.solution.cells)
+    return better and can_be_commanded and bool(discovery.solution.cells)
 
 
 @lru_cache(maxsize=1)
-def _corrected(discovery: Discovery) -> FloatArray:
-    """Return the residuals with what compensation.json corrects, where it holds everything."""
+def _corrected(discovery: Discovery) -> tuple[FloatArray, bool]:
+    """Return the residuals with what compensation.json corrects, where it holds everything.
+
+    And whether there is a command for each wanted angle: without it the file is not read.
+    """
     fit, cells, data = discovery.fit, discovery.solution.cells, discovery.residuals
     model = everything(fit, cells, data, 1.0).model
-    return corrected_residuals(fit, cells, model, data.context.measurements)
+    errors = corrected_residuals(fit, cells, model, data.context.measurements)
+    return errors, model.steepest() < 1.0
 
 
 def _held_out_mean(discovery: Discovery, errors: FloatArray) -> float:
@@ -250,7 +255,7 @@ def loadable(discovery: Discovery) -> list[Loadable]:
         file = f'{APPLY_FOLDER}/{MODEL_FILE}' if discovery.loads_geometry else ''
         results.append(('geometry', discovery.geometry.errors, file))
     file = f'{APPLY_FOLDER}/{COMPENSATION_FILE}' if holds_everything(discovery) else ''
-    results.append(('everything', _corrected(discovery), file))
+    results.append(('everything', _corrected(discovery)[0], file))
     rows: list[Loadable] = []
     # To what is shown: a difference in the fourth figure is no reason to load anything else.
     least = np.inf

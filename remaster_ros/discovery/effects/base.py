@@ -23,6 +23,8 @@ Place = Literal[
 PLACES: tuple[Place, ...] = get_args(Place)
 # RMS displacement of the marker that a cause without a plausible range is taken to have at most.
 LARGEST_M = 10e-3
+# Form of a cell that is all members of a kind of error.
+RANDOM = 'random'
 NO_TIMES = 'the session has no times (times: none), only the order of its rows'
 
 

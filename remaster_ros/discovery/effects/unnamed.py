@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 
+from remaster_ros.discovery.effects import joint_error_curve
 from remaster_ros.discovery.effects.base import (
     Cell,
     Design,
@@ -33,6 +35,8 @@ from remaster_ros.types import BoolArray, FloatArray
 
 # All causes without a name together are this many times less likely than one that has a name.
 RARITY = 3
+# What an angle errs by is no larger without a name than with one, rad.
+LARGEST_RAD = max(joint_error_curve.EFFECT.plausible or ())
 # Knots of a free form over the range of its driver.
 FREE_KNOTS = 10
 
@@ -105,6 +109,7 @@ def _cell(
     columns: Callable[[Context], Design],
     joints: tuple[int, ...] = (),
     subject: str = '',
+    **more: Any,
 ) -> Cell:
     return EFFECT.cell(
         columns,
@@ -118,6 +123,7 @@ def _cell(
         curve=form.curve,
         sign=form.sign,
         subject=subject,
+        **more,
     )
 
 
@@ -160,7 +166,14 @@ def _joint_angles(context: Context) -> Iterator[Cell]:
         for joints, form in _joint_forms(context, joint):
             stem = f'joint_{joint}_by_{form.driver}'
             columns = partial(_at, joint=joint, form=form)
-            yield _cell('joint_angle', form, [stem], 'rad', columns, joints)
+            unit = 1.0 if form.curve is not None else _rms(form.features(context))
+            yield _cell(
+                'joint_angle', form, [stem], 'rad', columns, joints, largest=LARGEST_RAD / unit
+            )
+
+
+def _rms(values: FloatArray) -> float:
+    return float(np.sqrt(np.mean(values**2))) or 1.0
 
 
 def _at(context: Context, joint: int, form: _Form) -> Design:

@@ -342,11 +342,17 @@ def test_what_is_no_better_in_the_figures_shown_is_not_to_be_loaded(monkeypatch)
         solution=SimpleNamespace(cells=(SimpleNamespace(of_measurement=True, size=1),)),
         loads_geometry=True,
     )
-    monkeypatch.setattr(discovery_json, 'everything', lambda *_: SimpleNamespace(model=None))
+    model = SimpleNamespace(steepest=lambda: 0.1)
+    monkeypatch.setattr(discovery_json, 'everything', lambda *_: SimpleNamespace(model=model))
     monkeypatch.setattr(discovery_json, 'corrected_residuals', lambda *_: 0.9999 * errors)
     results = loadable(found)
     assert [row.better for row in results] == [True, True, False]
     assert load_words(results[-1])[1].startswith('only where no robot model can be loaded')
+    # What the reader of the file refuses is not offered, however well it predicts.
+    assert results[-1].file.endswith('compensation.json')
+    model.steepest = lambda: 1.5
+    discovery_json._corrected.cache_clear()
+    assert loadable(found)[-1].file == ''
 
 
 # Every verdict, with and without causes
