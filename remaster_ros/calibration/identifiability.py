@@ -105,7 +105,7 @@ def find_gauge(
             fixed_by = f'{model.names[pivot]} = {at:g}'
         else:
             fixed_by = resolving[column]
-            if fixed_by == EFFECTS_PRIOR:
+            if EFFECTS_PRIOR in fixed_by:
                 # How large such errors are is known: how well the offsets then are is in `weak`.
                 continue
         combination = _about_origin(model, null[:, column], scale)

@@ -128,7 +128,7 @@ def geometry_model(found: Estimate, causes: Sequence[Cell] = ()) -> GeometryMode
     solution = solve(data, cells) if families else None
     if drawing is None or solution is None:
         return None
-    factors = solution.weight_precisions()
+    factors = dict(zip(solution.cells, solution.smoothness, strict=True))
     std_m = np.concatenate(
         [np.full(len(one.members), factors[one.cell] ** -0.5) for one in families]
     )
