@@ -172,9 +172,10 @@ class Browser:
 
 
 def seen(page, script, *flags):
-    """Return what an asynchronous script returns in a file that was opened without a network.
+    """Return what an asynchronous script returns in a page that was opened without a network.
 
-    The test is skipped where there is no Chromium.
+    It runs once the page says that it is no longer loading. The test is skipped where there is no
+    Chromium.
     """
     profile = Path(tempfile.mkdtemp(dir=page.parent))
     tab = Browser(profile, '--host-resolver-rules=MAP * ~NOTFOUND', *flags)
@@ -182,7 +183,9 @@ def seen(page, script, *flags):
         tab.open(page.as_uri())
         loaded = f'document.readyState == "complete" && location.href == {page.as_uri()!r}'
         tab.until(lambda: tab.value(loaded), 'the page')
-        wait = 'const wait = (ms) => new Promise((done) => setTimeout(done, ms)); await wait(500);'
+        played = 'document.getElementById("loading").hidden'
+        tab.until(lambda: tab.value(played), 'what the page shows', timeout_s=120.0)
+        wait = 'const wait = (ms) => new Promise((done) => setTimeout(done, ms));'
         found = tab.value(f'(async () => {{ {wait} {script} }})()')
         assert tab.errors == []
         return found

