@@ -266,16 +266,19 @@ class ArmModel:
             added[:, term.joint] += values @ term.coefficients
         return added
 
+    def somewhere(self, count: int) -> FloatArray:
+        """Return angles all over the limits, the same each time, rad, (count, k)."""
+        low, high = (np.clip(end, -np.pi, np.pi) for end in (self.chain.lower, self.chain.upper))
+        return np.random.default_rng(0).uniform(low, high, (count, self.joints))
+
     def steepest(self) -> float:
         """Return by how much offsets and terms change with the reported angles at the most.
 
         Largest sum of a joint's changes, rad per rad, at angles all over the limits. Below 1 there
         is one command for each wanted angle, and the fixed point goes to it (Banach).
         """
-        rng = np.random.default_rng(0)
         k, warming = self.joints, np.zeros(SLOPES_AT)
-        low, high = (np.clip(end, -np.pi, np.pi) for end in (self.chain.lower, self.chain.upper))
-        q = rng.uniform(low, high, (SLOPES_AT, k))
+        q = self.somewhere(SLOPES_AT)
         here = self.added_angles(self.drivers(q, warming))
         slopes = np.zeros((SLOPES_AT, k))
         for j in range(k):

@@ -4,14 +4,21 @@ The tool pose that is wanted is that of the *nominal* robot at the wanted joints
 of the joint angles are taken off, by fixed point; what lengths and tilts leave is taken off by
 Newton steps on the full pose, with the nominal Jacobian. Near a singularity a pose is corrected
 only along the directions in which the arm can move: each of them fades smoothly to nothing where
-it needs more than ``1 / FADES_BELOW`` of joint motion. There the errors of the joint angles are
-still taken off.
+it needs too much joint motion. There the errors of the joint angles are still taken off.
+
+A shift counts in levers of the arm: a small arm is no nearer to its singularities than a large one
+of its shape. A direction of size s that fades below b takes off the share 3 u² − 2 u³ of an error
+ε, u = s / b: its motion (3 u − 2 u²) ε / b has the curvature 4 ε / b³ over s, and s changes by no
+more than one a radian of all k joints together. So what is added to an acceleration stays within
+that of joints that go over a radian for b³ = 4 k ε: where errors are small, directions fade later.
+In no case before `FADES_BELOW`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -20,8 +27,12 @@ from remaster_ros.compensation.arm_model import BLOCK_ROWS, ArmModel
 from remaster_ros.kinematics.transforms import matrix_to_rotation_vector
 from remaster_ros.types import BoolArray, FloatArray
 
-# Singular values of the Jacobian, m/rad and rad/rad, below which a direction fades.
+# Shift of the tool for a radian below which a direction fades at the most, m/rad.
 FADES_BELOW = 0.2
+# The same of what seven joints do without their tool, in levers for a radian.
+KEPT_BELOW = 0.2
+# Configurations at which an arm's longest lever and the size of its errors are looked at.
+LOOKED_AT = 500
 # The fixed point converges by the largest slope of the terms, some hundredths; the pose by the
 # square of the errors.
 FIXED_POINT_STEPS = 2
@@ -55,6 +66,36 @@ class Compensator:
 
     def __init__(self, model: ArmModel) -> None:
         self.model = model
+
+    @cached_property
+    def _fade(self) -> tuple[float, float]:
+        """The longest lever, m, and the size of a direction below which it fades."""
+        model = self.model
+        q = model.somewhere(LOOKED_AT)
+        warming = np.zeros(len(q))
+        target, jacobian = self._nominal(q)
+        lever = float(np.linalg.norm(jacobian[:, :3], axis=1).max())
+        command = self._angles_taken_off(q, warming)
+        error = _pose_error(target, model._state(model.drivers(command, warming)).tool)
+        error[:, :3] /= lever
+        typical = float(np.sqrt(np.mean(np.sum(error**2, axis=1))))
+        return lever, min(FADES_BELOW / lever, (4.0 * model.joints * typical) ** (1.0 / 3.0))
+
+    def _nominal(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the nominal tool poses, (n, 4, 4), and Jacobians in R, m and rad, (n, 6, k)."""
+        chain = self.model.chain
+        frames = chain.frames(q)
+        target = frames[:, -1] @ chain.T_fixed[-1]
+        axes = chain.axes_in_base(frames)
+        arms = target[:, None, :3, 3] - frames[..., :3, 3]
+        both = np.concatenate((np.cross(axes, arms), axes), axis=2)
+        return target, both.swapaxes(1, 2)
+
+    def _angles_taken_off(self, wanted: FloatArray, warming: FloatArray) -> FloatArray:
+        model, command = self.model, wanted.copy()
+        for _ in range(FIXED_POINT_STEPS):
+            command = wanted - model.added_angles(model.drivers(command, warming))
+        return command
 
     @property
     def joint_names(self) -> tuple[str, ...]:
@@ -197,26 +238,23 @@ class Compensator:
     ) -> tuple[FloatArray, FloatArray, BoolArray]:
         """Return commands (n, k), what is left of each pose (n, 6), and which rows are faded."""
         model, k = self.model, self.model.joints
-        command = wanted.copy()
-        for _ in range(FIXED_POINT_STEPS):
-            command = wanted - model.added_angles(model.drivers(command, warming))
-        frames = model.chain.frames(wanted)
-        target = frames[:, -1] @ model.chain.T_fixed[-1]
-        axes = model.chain.axes_in_base(frames)
-        arms = target[:, None, :3, 3] - frames[..., :3, 3]
-        jacobian = np.concatenate((np.cross(axes, arms), axes), axis=2).swapaxes(1, 2)
-        left, sizes, right = np.linalg.svd(jacobian, full_matrices=False)
-        share = np.minimum(sizes / FADES_BELOW, 1.0)
-        fade = share**2 * (3.0 - 2.0 * share)
+        lever, below = self._fade
+        in_levers = np.repeat((1.0 / lever, 1.0), 3)
+        command = self._angles_taken_off(wanted, warming)
+        target, jacobian = self._nominal(wanted)
+        left, sizes, right = np.linalg.svd(in_levers[:, None] * jacobian, full_matrices=False)
+        fade = _faded(sizes, below)
         # A direction of no size has nothing to divide by, and fades to nothing.
         factor = np.divide(fade, sizes, out=np.zeros_like(sizes), where=sizes > 0.0)
         if k > 6:
-            command = wanted + self._smallest(command - wanted, right, fade)
+            # It acts on all of the change, whose size is another than that of what it leaves.
+            kept = _faded(sizes, KEPT_BELOW)
+            command = wanted + self._smallest(command - wanted, right, kept)
         for step in range(NEWTON_STEPS + 1):
             error = _pose_error(target, model._state(model.drivers(command, warming)).tool)
             if step == NEWTON_STEPS:
                 break
-            along = np.einsum('nij,ni->nj', left, error) * factor
+            along = np.einsum('nij,ni->nj', left, in_levers * error) * factor
             command = command - np.einsum('nij,ni->nj', right, along)
         return command, error, np.asarray(fade.min(axis=1) < 1.0)
 
@@ -239,6 +277,13 @@ def _pose_error(target: FloatArray, reached: FloatArray) -> FloatArray:
     turn = reached[:, :3, :3] @ np.swapaxes(target[:, :3, :3], 1, 2)
     shift = reached[:, :3, 3] - target[:, :3, 3]
     return np.concatenate((shift, matrix_to_rotation_vector(turn)), axis=1)
+
+
+def _faded(sizes: FloatArray, below: float) -> FloatArray:
+    """Return the share of each direction that is taken off, by its size."""
+    # Where there is nothing to take off nothing fades either.
+    share = np.minimum(sizes / below, 1.0) if below > 0.0 else np.ones_like(sizes)
+    return np.asarray(share**2 * (3.0 - 2.0 * share))
 
 
 def _blocks(rows: int) -> list[slice]:

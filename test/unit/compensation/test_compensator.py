@@ -258,3 +258,24 @@ def test_any_shape_and_no_rows():
         compensator.command(np.zeros(6))
     with pytest.raises(ValueError, match='finite'):
         compensator.command(np.full(7, np.nan))
+
+
+@pytest.mark.parametrize('name', ['six', 'lwr4plus'])
+def test_a_quarter_of_an_arm_is_commanded_as_the_whole_one(name):
+    """Singularities are those of an arm's shape, whatever its size; errors a tenth of a degree."""
+    model = replace(erring(name, 4), joint_terms=())
+    slight = Geometry(0.1 * model.geometry.shifts, 0.1 * model.geometry.turns)
+    origins = model.chain.T_fixed.copy()
+    origins[:, :3, 3] *= 0.25
+    small = replace(
+        model,
+        chain=replace(model.chain, T_fixed=origins),
+        geometry=Geometry(0.25 * slight.shifts, slight.turns),
+    )
+    q = configurations(model, 200, 5)
+    whole = Compensator(replace(model, geometry=slight)).correct(q)
+    part = Compensator(small).correct(q)
+    np.testing.assert_allclose(part.command, whole.command, atol=1e-12)
+    np.testing.assert_allclose(part.residual_m, 0.25 * whole.residual_m, atol=1e-12)
+    # Most directions are those of a tool that goes where it is wanted.
+    assert np.median(whole.residual_m) < 1e-5
