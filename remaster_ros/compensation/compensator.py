@@ -11,7 +11,7 @@ of its shape. A direction of size s that fades below b takes off the share 3 u²
 ε, u = s / b: its motion (3 u − 2 u²) ε / b has the curvature 4 ε / b³ over s, and s changes by no
 more than one a radian of all k joints together. So what is added to an acceleration stays within
 that of joints that go over a radian for b³ = 4 k ε: where errors are small, directions fade later.
-In no case before `FADES_BELOW`.
+None fades above `FADES_BELOW`, whatever the errors: a trajectory makes up for the rest by time.
 """
 
 from __future__ import annotations
