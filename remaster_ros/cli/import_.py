@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import logging
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -291,7 +292,7 @@ def run(args: argparse.Namespace) -> int:
         session = replace(session, accuracy_option=args.accuracy_option)
         sense = check_sense(session, rows, progress)
     session, turned = without_whole_turns(session, chain)
-    how += [*counted, *filter(None, [turned])]
+    how += [*counted, *filter(None, [turned]), *_names_not_used(args, rows)]
     # RAPID is written by others than ABB too: such targets do not tell the maker.
     if rows.maker == 'KUKA' and not args.accuracy_option:
         how.append(
@@ -412,6 +413,14 @@ def _session_options(args: argparse.Namespace, cell: Workcell | None) -> Session
         visited_in_order=args.visited_in_order,
         on_tool=args.on_tool,
     )
+
+
+def _names_not_used(args: argparse.Namespace, rows: RawRows) -> Iterator[str]:
+    """Say which names were given for rows that the table itself names otherwise."""
+    for what, given in (('sensor', args.sensor), ('marker', args.marker)):
+        named = sorted(set(rows.labels.get(what, ())))
+        if given and named and given not in named:
+            yield f'--{what} {given} is not used: the table names its {what}s ({", ".join(named)})'
 
 
 def _as_text(rows: RawRows, session: Session, how: list[str]) -> str:

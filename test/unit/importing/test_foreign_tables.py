@@ -150,6 +150,19 @@ def test_a_wrong_tip_is_named_by_the_marker(arm, do, tmp_path):
     assert_fits(session, arm)
 
 
+def test_a_name_that_the_table_has_otherwise_is_said_not_to_be_used(arm, do, tmp_path):
+    header = [*(f'{name} [deg]' for name in joint_names(arm)), 'x [mm]', 'y [mm]', 'z [mm]']
+    columns = [*degrees(arm), *(1e3 * arm.points.T)]
+    own = write(tmp_path, 'own.csv', text([*header, 'sensor'], [*columns, ['lt'] * 40], ',', '.'))
+    status, out, _, session = do(own, '--sensor', 'camera', '--marker', 'ball')
+    assert status == 0
+    assert '--sensor camera is not used: the table names its sensors (lt)' in out
+    assert session.sensors == {'lt': 'ball'}
+    assert '--marker' not in out
+    _, out, _, _ = do(own, '--sensor', 'lt')
+    assert 'not used' not in out
+
+
 def test_a_cell_file_has_robot_sensor_and_marker(arm, tmp_path, capsys):
     (tmp_path / 'arm.urdf').write_text(arm.urdf)
     cell = tmp_path / 'cell.yaml'
