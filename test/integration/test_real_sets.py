@@ -120,15 +120,13 @@ def test_what_can_be_loaded_of_a_panda(tmp_path: Path) -> None:
     assert load_words(row)[1].startswith('only where no robot model')
 
 
-@pytest.mark.parametrize(
-    ('name', 'reached'), [('meca500_repeats', False), ('irb120_three_points', True)]
-)
-def test_a_fit_commands_lengths_and_tilts_only_where_the_arm_gets_there(name, reached):
-    """A robot model with them is better on both; on the small arm no pose is far from singular."""
+@pytest.mark.parametrize('name', ['meca500_repeats', 'irb120_three_points'])
+def test_a_fit_commands_lengths_and_tilts_of_a_small_arm_as_of_a_large_one(name):
+    """A robot model with them is better on both, and a command gets there on both."""
     fit = fit_session(real(name), rng=np.random.default_rng(0), draws=400)
     assert geometry_of(fit).is_better
     content = json.loads(compensation_text(fit, ''))
-    assert bool(content['geometry']['origins']) == reached
+    assert content['geometry']['origins']
 
 
 @pytest.mark.qualify
