@@ -36,8 +36,8 @@ Driver = Literal['none', 'angle', 'gravity_torque', 'gravity_moment', 'temperatu
 Form = Literal['constant', 'linear', 'quadratic', 'sin', 'cos', 'bspline']
 GRAVITY = (0.0, 0.0, -9.81)
 TURN = 2.0 * np.pi
-# Rows at which slopes are looked at, and by steps of how much, rad.
-SLOPES_AT, SLOPE_STEP = 500, 1e-6
+# Rows at which slopes and errors are looked at, and slopes by steps of how much, rad.
+LOOKED_AT, SLOPE_STEP = 500, 1e-6
 # Rows of a block: frames and derivatives of so many take some ten megabytes.
 BLOCK_ROWS = 2_000
 
@@ -266,10 +266,10 @@ class ArmModel:
             added[:, term.joint] += values @ term.coefficients
         return added
 
-    def somewhere(self, count: int) -> FloatArray:
-        """Return angles all over the limits, the same each time, rad, (count, k)."""
+    def somewhere(self) -> FloatArray:
+        """Return angles all over the limits, the same each time, rad, (n, k)."""
         low, high = (np.clip(end, -np.pi, np.pi) for end in (self.chain.lower, self.chain.upper))
-        return np.random.default_rng(0).uniform(low, high, (count, self.joints))
+        return np.random.default_rng(0).uniform(low, high, (LOOKED_AT, self.joints))
 
     def steepest(self) -> float:
         """Return by how much offsets and terms change with the reported angles at the most.
@@ -277,10 +277,10 @@ class ArmModel:
         Largest sum of a joint's changes, rad per rad, at angles all over the limits. Below 1 there
         is one command for each wanted angle, and the fixed point goes to it (Banach).
         """
-        k, warming = self.joints, np.zeros(SLOPES_AT)
-        q = self.somewhere(SLOPES_AT)
+        k, warming = self.joints, np.zeros(LOOKED_AT)
+        q = self.somewhere()
         here = self.added_angles(self.drivers(q, warming))
-        slopes = np.zeros((SLOPES_AT, k))
+        slopes = np.zeros((LOOKED_AT, k))
         for j in range(k):
             there = self.added_angles(self.drivers(q + SLOPE_STEP * np.eye(k)[j], warming))
             slopes += np.abs(there - here) / SLOPE_STEP

@@ -31,8 +31,6 @@ from remaster_ros.types import BoolArray, FloatArray
 FADES_BELOW = 0.2
 # The same of what seven joints do without their tool, in levers for a radian.
 KEPT_BELOW = 0.2
-# Configurations at which an arm's longest lever and the size of its errors are looked at.
-LOOKED_AT = 500
 # The fixed point converges by the largest slope of the terms, some hundredths; the pose by the
 # square of the errors.
 FIXED_POINT_STEPS = 2
@@ -68,18 +66,34 @@ class Compensator:
         self.model = model
 
     @cached_property
-    def _fade(self) -> tuple[float, float]:
-        """The longest lever, m, and the size of a direction below which it fades."""
+    def _typical(self) -> tuple[float, FloatArray, FloatArray]:
+        """The longest lever, m; errors left by the joints all over the limits, and by a kelvin.
+
+        In levers and rad, (n, 6).
+        """
         model = self.model
-        q = model.somewhere(LOOKED_AT)
-        warming = np.zeros(len(q))
+        q = model.somewhere()
         target, jacobian = self._nominal(q)
         lever = float(np.linalg.norm(jacobian[:, :3], axis=1).max())
-        command = self._angles_taken_off(q, warming)
-        error = _pose_error(target, model._state(model.drivers(command, warming)).tool)
-        error[:, :3] /= lever
-        typical = float(np.sqrt(np.mean(np.sum(error**2, axis=1))))
-        return lever, min(FADES_BELOW / lever, (4.0 * model.joints * typical) ** (1.0 / 3.0))
+        errors = []
+        for kelvin in (0.0, 1.0):
+            warming = np.full(len(q), kelvin)
+            command = self._angles_taken_off(q, warming)
+            error = _pose_error(target, model._state(model.drivers(command, warming)).tool)
+            errors.append(error / np.repeat((lever, 1.0), 3))
+        return lever, errors[0], errors[1] - errors[0]
+
+    def _fades_below(self, warming: FloatArray) -> FloatArray:
+        """Return the size of a direction below which it fades, in levers and rad, (n, 1)."""
+        lever, cold, a_kelvin = self._typical
+        # The mean square over the limits, of errors that grow with the temperature.
+        parts = ((cold, cold), (cold, a_kelvin), (a_kelvin, a_kelvin))
+        still, mixed, grown = (float(np.mean(np.sum(a * b, axis=1))) for a, b in parts)
+        square = still + 2.0 * warming * mixed + warming**2 * grown
+        # No error is known to be smaller than what rounding leaves.
+        typical = np.sqrt(np.maximum(square, np.finfo(float).eps ** 2))
+        wide = np.cbrt(4.0 * self.model.joints * typical)
+        return np.minimum(FADES_BELOW / lever, wide)[:, None]
 
     def _nominal(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the nominal tool poses, (n, 4, 4), and Jacobians in R, m and rad, (n, 6, k)."""
@@ -238,12 +252,11 @@ class Compensator:
     ) -> tuple[FloatArray, FloatArray, BoolArray]:
         """Return commands (n, k), what is left of each pose (n, 6), and which rows are faded."""
         model, k = self.model, self.model.joints
-        lever, below = self._fade
-        in_levers = np.repeat((1.0 / lever, 1.0), 3)
+        in_levers = np.repeat((1.0 / self._typical[0], 1.0), 3)
         command = self._angles_taken_off(wanted, warming)
         target, jacobian = self._nominal(wanted)
         left, sizes, right = np.linalg.svd(in_levers[:, None] * jacobian, full_matrices=False)
-        fade = _faded(sizes, below)
+        fade = _faded(sizes, self._fades_below(warming))
         # A direction of no size has nothing to divide by, and fades to nothing.
         factor = np.divide(fade, sizes, out=np.zeros_like(sizes), where=sizes > 0.0)
         if k > 6:
@@ -279,10 +292,9 @@ def _pose_error(target: FloatArray, reached: FloatArray) -> FloatArray:
     return np.concatenate((shift, matrix_to_rotation_vector(turn)), axis=1)
 
 
-def _faded(sizes: FloatArray, below: float) -> FloatArray:
+def _faded(sizes: FloatArray, below: FloatArray | float) -> FloatArray:
     """Return the share of each direction that is taken off, by its size."""
-    # Where there is nothing to take off nothing fades either.
-    share = np.minimum(sizes / below, 1.0) if below > 0.0 else np.ones_like(sizes)
+    share = np.minimum(sizes / below, 1.0)
     return np.asarray(share**2 * (3.0 - 2.0 * share))
 
 

@@ -279,3 +279,23 @@ def test_a_quarter_of_an_arm_is_commanded_as_the_whole_one(name):
     np.testing.assert_allclose(part.residual_m, 0.25 * whole.residual_m, atol=1e-12)
     # Most directions are those of a tool that goes where it is wanted.
     assert np.median(whole.residual_m) < 1e-5
+
+
+@pytest.mark.parametrize(('name', 'wrist'), [('six', 4), ('lwr4plus', 5)])
+@pytest.mark.parametrize('warmer_k', [0.0, 40.0])
+def test_an_arm_that_only_grows_is_not_sent_astray_at_a_singularity(name, wrist, warmer_k):
+    """Cold it has no error at all: what fades must not follow from that when it is warm."""
+    model = arm(name)
+    turns = np.zeros((model.joints + 1, 3))
+    share = np.random.default_rng(1).uniform(0.0, 2.4e-5, (model.joints + 1, 1))
+    model = replace(model, growth=Geometry(share * model.chain.T_fixed[:, :3, 3], turns))
+    q = configurations(model, 2000, 2)
+    q[:1000, wrist] *= 1e-4
+    q[0, wrist] = 0.0
+    compensator, warm = Compensator(model), model.reference_c + warmer_k
+    found = compensator.correct(q, warm)
+    before = compensator.tool(q, warm)[:, :3, 3] - model.chain.forward(q)[:, :3, 3]
+    assert np.abs(found.command - q).max() < np.radians(0.5 if warmer_k else 1e-6)
+    assert found.residual_m.max() < 1e-9 + np.linalg.norm(before, axis=1).max()
+    if warmer_k:
+        assert np.median(found.residual_m) < 0.5 * np.median(np.linalg.norm(before, axis=1))
