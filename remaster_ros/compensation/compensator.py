@@ -66,10 +66,10 @@ class Compensator:
         self.model = model
 
     @cached_property
-    def _typical(self) -> tuple[float, FloatArray, FloatArray]:
-        """The longest lever, m; errors left by the joints all over the limits, and by a kelvin.
+    def _typical(self) -> tuple[float, tuple[float, ...]]:
+        """The longest lever, m, and how large errors are that joints leave all over the limits.
 
-        In levers and rad, (n, 6).
+        Their mean square as a polynomial of the warming, three coefficients, levers² and rad².
         """
         model = self.model
         q = model.somewhere()
@@ -81,15 +81,14 @@ class Compensator:
             command = self._angles_taken_off(q, warming)
             error = _pose_error(target, model._state(model.drivers(command, warming)).tool)
             errors.append(error / np.repeat((lever, 1.0), 3))
-        return lever, errors[0], errors[1] - errors[0]
+        cold, a_kelvin = errors[0], errors[1] - errors[0]
+        parts = ((1.0, cold, cold), (2.0, cold, a_kelvin), (1.0, a_kelvin, a_kelvin))
+        return lever, tuple(float(c * np.mean(np.sum(a * b, axis=1))) for c, a, b in parts)
 
     def _fades_below(self, warming: FloatArray) -> FloatArray:
         """Return the size of a direction below which it fades, in levers and rad, (n, 1)."""
-        lever, cold, a_kelvin = self._typical
-        # The mean square over the limits, of errors that grow with the temperature.
-        parts = ((cold, cold), (cold, a_kelvin), (a_kelvin, a_kelvin))
-        still, mixed, grown = (float(np.mean(np.sum(a * b, axis=1))) for a, b in parts)
-        square = still + 2.0 * warming * mixed + warming**2 * grown
+        lever, parts = self._typical
+        square = parts[0] + warming * (parts[1] + warming * parts[2])
         # No error is known to be smaller than what rounding leaves.
         typical = np.sqrt(np.maximum(square, np.finfo(float).eps ** 2))
         wide = np.cbrt(4.0 * self.model.joints * typical)

@@ -69,30 +69,28 @@ class Family:
         lever = _lever(data, members)
         for member in members:
             moved = data.columns([member])
-            square = np.sum(moved**2, axis=(0, 1)) / len(data)
+            parts = np.sum(moved**2, axis=(0, 1)) / len(data) > NOTHING**2
+            if not parts.any():
+                continue
+            seen.append(member)
             design = member.columns(data.part)
+            of_a_height = np.inf
             if design.at is not None:
-                moved = lever * design.values[:, None, :]
+                moved, of_a_height = lever * design.values[:, None, :], lever
             if member.penalty is None:
-                parts = square > NOTHING**2
                 square = np.sum(moved**2, axis=(0, 1)) / len(data)
-                if parts.any():
-                    unit = np.sqrt(np.where(parts, square, 1.0))
-                    seen.append(member)
-                    maps.append((np.eye(member.size) / unit)[:, parts])
-                    scales.append(square)
-                    largest.append((member.largest or np.inf) * float(unit[parts].max()))
+                unit = np.sqrt(np.where(parts, square, 1.0))
+                maps.append((np.eye(member.size) / unit)[:, parts])
+                scales.append(square)
+                largest.append((member.largest or np.inf) * float(unit[parts].max()))
                 continue
             values, vectors = np.linalg.eigh(member.penalty)
             root = vectors / np.sqrt(np.maximum(values, np.finfo(float).eps * values[-1]))
             share = np.sum((moved @ root) ** 2, axis=(0, 1)) / len(data)
-            if np.any(square > NOTHING**2):
-                seen.append(member)
-                kept = share > LEAST_SHARE * share.max()
-                maps.append(root[:, kept] / np.sqrt(share.sum()))
-                scales.append(np.array([share.sum()]))
-                of_a_height = lever if design.at is not None else np.inf
-                largest.append((member.largest or np.inf) * of_a_height)
+            kept = share > LEAST_SHARE * share.max()
+            maps.append(root[:, kept] / np.sqrt(share.sum()))
+            scales.append(np.array([share.sum()]))
+            largest.append((member.largest or np.inf) * of_a_height)
         if not seen:
             return None
         count = sum(one.shape[1] for one in maps)
