@@ -5,6 +5,7 @@ import json
 
 import numpy as np
 import pytest
+import scipy.stats
 from collection_rig import SEED, Cell
 from command_line import remaster
 from compensation_files import save
@@ -20,6 +21,9 @@ from remaster_ros.simulation.setup import make_world
 from remaster_ros.types import Correction
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(900)]
+
+# Sessions of nothing wrong in which a joint's offset is outside its interval.
+WRONG = 1.0 / 500.0
 
 
 def true_correction(folder, share=1.0):
@@ -38,7 +42,7 @@ def true_correction(folder, share=1.0):
 
 
 def test_offsets_fitted_through_the_bridge_are_zero(start, client, tmp_path):
-    """A fixed seed: of 99 % intervals of five joints one would be outside in a session of twenty.
+    """Of all joints together one is outside in a session of 500: seeds are fixed, moments not.
 
     At the reported angles the same rows have the hidden offsets again.
     """
@@ -61,10 +65,15 @@ def test_offsets_fitted_through_the_bridge_are_zero(start, client, tmp_path):
     raw = fit_session(session, rng=np.random.default_rng(1), draws=400)
     known = raw.identifiable
     assert known.sum() >= 5
-    assert np.all(np.abs((raw.joint_offsets - hidden) / raw.joint_offsets_std)[known] < 2.58)
+    # The noise is estimated from few poses, and what is left of them after base and marker.
+    freedom = 3 * len(np.unique(m.pose[~m.is_validation])) - 9
+    limit = scipy.stats.t.ppf(1.0 - 0.5 * WRONG / known.sum(), freedom)
+    assert np.all(np.abs((raw.joint_offsets - hidden) / raw.joint_offsets_std)[known] < limit)
     assert np.max(np.abs(raw.joint_offsets / raw.joint_offsets_std)[known]) > 10.0
     left = fit_session(session.through_correction(), rng=np.random.default_rng(1), draws=400)
-    assert np.all(np.abs(left.joint_offsets / left.joint_offsets_std)[known] < 2.58)
+    assert np.all(np.abs(left.joint_offsets / left.joint_offsets_std)[known] < limit)
+    # Hundredths of a degree would show: the offsets that are hidden are tenths.
+    assert limit * np.max(left.joint_offsets_std[known]) < np.deg2rad(0.05)
 
     assert verify(compensator, visits(session, cell.session)).verdict == 'in_use'
     done = remaster('replay', cell.session, '--out', tmp_path / 'again')
