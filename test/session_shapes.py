@@ -16,6 +16,7 @@ from remaster_ros.simulation.truth import SimulatedSensor
 from remaster_ros.types import Observation, Session
 
 SHARED = Path(__file__).parents[2] / 'shared'
+LAST_ALONE = 'the first sensor and the first marker measured nothing'
 
 
 def simulated(
@@ -111,6 +112,12 @@ def three_sensors(seed: int) -> Session:
     return simulated(random_poses(10, rng), seed, random_poses(3, rng), count=3)
 
 
+def last_alone(seed: int) -> Session:
+    """Return a session whose first sensor, with the first marker, measured nothing."""
+    session = three_sensors(seed)
+    return session.select(np.flatnonzero(session.measurements.sensor == 1))
+
+
 def many_rows(seed: int, rows: int) -> Session:
     """Return that many configurations, of one solution each."""
     rng = np.random.default_rng(seed)
@@ -161,6 +168,7 @@ CHEAP: dict[str, Shape] = {
     'read twice, a pose for every reading': lambda: own_poses(repeats(4, 2)),
     'one pose of forty held out': lambda: one_pose_held_out(5),
     'no times': lambda: without_times(6),
+    LAST_ALONE: lambda: last_alone(10),
     'three sensors': lambda: three_sensors(7),
     'a real arm, each read twice': lambda: every_third(real('meca500_repeats')),
 }

@@ -241,6 +241,9 @@ class FitResult:
     """
 
     session: Session
+    # All its rows, ``sensor`` and ``marker`` counted among those that have any, as in `T_R_N` and
+    # `marker_positions`
+    measurements: Measurements
     chain: SerialChain
     joint_names: tuple[str, ...]
     parameter_names: tuple[str, ...]
@@ -494,6 +497,7 @@ def build_result(
 
     return FitResult(
         session=problem.session,
+        measurements=measurements,
         chain=problem.chain,
         joint_names=problem.chain.joint_names,
         parameter_names=names,

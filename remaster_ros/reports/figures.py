@@ -258,7 +258,7 @@ def residual_distribution(result: FitResult) -> Figure:
 
 def tool_places_of_one(result: FitResult) -> Figure:
     """Draw where the marker may be at one configuration, from three sides (Fig. 5)."""
-    m = result.session.measurements
+    m = result.measurements
     lengths = np.linalg.norm(result.residuals_before, axis=1)
     fitted = np.flatnonzero(~m.is_validation)
     # The one whose error before is the median.
@@ -286,19 +286,17 @@ def tool_places_of_one(result: FitResult) -> Figure:
         handle.set_markeredgewidth(1.6)
     figure.legend(handles=handles, loc='upper right', ncols=len(handles))
     configuration = int(m.configuration[row])
-    sensor = result.session.sensor_names[m.sensor[row]]
+    sensor = list(result.T_R_N)[m.sensor[row]]
     figure.suptitle(f'configuration {configuration}, {sensor}', fontsize=8, ha='left', x=0.01)
     return figure
 
 
 def accuracy_map(result: FitResult) -> Figure:
     """Draw the predicted error over the workspace: from the side and from above."""
-    m = result.session.measurements
+    m = result.measurements
     found = predicted_accuracy(result.predictive, m, MAP_POINTS, np.random.default_rng(0))
     error_mm = 1e3 * found.error
-    # A marker of the cell that nothing measured has no row.
-    known = {**result.session.markers, **result.marker_positions}
-    markers = np.array([known[name] for name in result.session.marker_names])
+    markers = np.array(list(result.marker_positions.values()))
     measured = result.chain.positions(m.q, markers[m.marker], result.joint_offsets)
     figure, axes = _panels(4.0, (1, 2), left=0.65, bottom=0.5, top=0.15, right=1.0)
     views: tuple[tuple[str, str, Callable[[FloatArray], FloatArray]], ...] = (

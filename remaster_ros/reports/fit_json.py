@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 import numpy as np
 
-from remaster_ros.calibration.estimate import Problem
 from remaster_ros.calibration.predictions import predict
 from remaster_ros.compensation.arm_model import Geometry
 from remaster_ros.compensation.export import (
@@ -152,7 +151,7 @@ def compensation_text(result: FitResult, result_sha256: str) -> str:
 
     Near singularities no command reaches what they ask for; a robot model with them needs none.
     """
-    geometry, rows = geometry_of(result), _rows_of(result)
+    geometry, rows = geometry_of(result), result.measurements
     described = None if geometry is None else geometry_too(result, geometry, rows)
     if described is None or geometry is None or not _reaches(described, geometry, rows):
         described = offsets_alone(result, predict(result, rows).widening, geometry=described)
@@ -171,13 +170,6 @@ def correction_text(
     state = {'correction': session.correction, 'accuracy_option': session.accuracy_option}
     hashes = (result_sha256, session.observations_sha256)
     return written(described, session.urdf, made_by, hashes, state, session.controller)
-
-
-def _rows_of(result: FitResult) -> Measurements:
-    """Return the rows with the indices of the sensors and markers that occur in them."""
-    if result.found is not None:
-        return result.found.problem.measurements
-    return Problem.of(result.session).measurements
 
 
 def _geometry(result: FitResult, geometry: GeometryModel) -> dict[str, Any]:
