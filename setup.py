@@ -33,6 +33,7 @@ JUDGES = [
     'mcap-ros2-support>=0.5',
     'python-fcl>=0.7',
     'mini-racer>=0.12',
+    'arviz-stats>=0.4',
 ]
 
 
@@ -76,7 +77,6 @@ setup(
         'numpy>=1.26',
         'scipy>=1.11',
         'argcomplete>=3',
-        'arviz-stats>=0.4',
         'PyYAML>=6',
         'EAIK>=1.2',
         # Brings coal, which measures distances between bodies; on NumPy 1, which ROS 2 Jazzy's

@@ -11,7 +11,6 @@ from hypothesis import HealthCheck, settings
 # Distribution -> module, of what package.xml cannot name: rosdep has no Debian package for these.
 PIP_ONLY = {
     'EAIK': 'eaik',
-    'arviz-stats': 'arviz_stats',
     'mcap': 'mcap',
     'msgspec': 'msgspec',
     'plotly': 'plotly',

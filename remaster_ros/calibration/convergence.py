@@ -2,18 +2,17 @@
 
 Rank-normalised split R-hat and effective sample sizes of Vehtari, Gelman, Simpson, Carpenter and
 Bürkner (2021), "Rank-normalization, folding, and localization", Bayesian Analysis 16(2),
-doi:10.1214/20-BA1221, as arviz-stats computes them. ``draws`` has the shape (chains, draws, ...)
-everywhere; every further index is a quantity of its own. The figures of a quantity
-that never moves are NaN.
+doi:10.1214/20-BA1221. ``draws`` has the shape (chains, draws, ...) everywhere; every further index
+is a quantity of its own. The figures of a quantity that never moves are NaN.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
+import scipy
 
 from remaster_ros.calibration.metropolis import Chains, Method
 from remaster_ros.errors import InsufficientDataError
@@ -23,6 +22,8 @@ MINIMUM_DRAWS = 8
 R_HAT_LIMIT = 1.01
 # Effective draws enough for two digits of a 95 % interval.
 ESS_LIMIT = 400.0
+# The quantiles by which the tails are judged.
+TAILS = (0.05, 0.95)
 
 
 def r_hat(draws: FloatArray) -> FloatArray:
@@ -32,33 +33,99 @@ def r_hat(draws: FloatArray) -> FloatArray:
     Returns (...); near 1 when the chains agree, 1.01 is the usual limit.
     Raises InsufficientDataError: with fewer than 8 draws in a chain.
     """
-    return _figures('rhat', draws)
+
+    def of(flat: FloatArray) -> FloatArray:
+        halves = _halves(flat)
+        folded = np.abs(halves - np.median(halves, axis=(0, 1)))
+        return np.maximum(*(_split_r_hat(_normal_scores(x)) for x in (halves, folded)))
+
+    return _figures(of, draws)
 
 
 def ess_bulk(draws: FloatArray) -> FloatArray:
     """Return the effective sample size of the centre of the distribution, (...); see `r_hat`."""
-    return _figures('ess', draws, method='bulk')
+    return _figures(lambda flat: _effective(_normal_scores(_halves(flat))), draws)
 
 
 def ess_tail(draws: FloatArray) -> FloatArray:
     """Return the effective sample size of the tails, (...): the smaller of the 5 % and 95 %."""
-    return _figures('ess', draws, method='tail', prob=0.05)
+
+    def of(flat: FloatArray) -> FloatArray:
+        quantiles = np.quantile(flat, TAILS, axis=(0, 1))
+        return np.minimum(*(_effective(_halves((flat <= at).astype(float))) for at in quantiles))
+
+    return _figures(of, draws)
 
 
-def _figures(statistic: str, draws: FloatArray, **options: Any) -> FloatArray:
-    """Return a statistic of arviz-stats for every quantity, (...)."""
-    # It brings SciPy, which takes half a second: imported only where something was sampled.
-    from arviz_stats.base import array_stats
-
+def _figures(of: Callable[[FloatArray], FloatArray], draws: FloatArray) -> FloatArray:
+    """Return a figure of draws (chains, draws, quantities) for every quantity, (...)."""
     length = draws.shape[1]
     if length < MINIMUM_DRAWS:
         raise InsufficientDataError(
             f'chains of {length} draws are too short to judge convergence; '
             f'draw at least {MINIMUM_DRAWS}'
         )
-    with np.errstate(invalid='ignore', divide='ignore'):
-        figures = getattr(array_stats, statistic)(draws, chain_axis=0, draw_axis=1, **options)
-    return np.where(np.ptp(draws, axis=(0, 1)) > 0.0, figures, np.nan)
+    flat = draws.reshape(*draws.shape[:2], -1)
+    figures = np.full(flat.shape[2], np.nan)
+    moves = np.ptp(flat, axis=(0, 1)) > 0.0
+    if moves.any():
+        figures[moves] = of(flat[..., moves])
+    return figures.reshape(draws.shape[2:])
+
+
+def _halves(draws: FloatArray) -> FloatArray:
+    """Count the halves of chains (c, n, p) as chains of their own, (2 c, n // 2, p)."""
+    half = draws.shape[1] // 2
+    return np.concatenate((draws[:, :half], draws[:, -half:]))
+
+
+def _normal_scores(draws: FloatArray) -> FloatArray:
+    """Return the normal quantiles of the ranks (eq. 14); equal draws share the mean of theirs."""
+    columns = draws.reshape(-1, draws.shape[2]).T
+    rank = np.empty_like(columns)
+    for of_one, column in zip(rank, columns, strict=True):
+        _, which, count = np.unique(column, return_inverse=True, return_counts=True)
+        of_one[:] = (np.cumsum(count) - 0.5 * (count - 1))[which]
+    scores: FloatArray = scipy.special.ndtri((rank - 0.375) / (rank.shape[1] + 0.25))
+    return scores.T.reshape(draws.shape)
+
+
+def _split_r_hat(draws: FloatArray) -> FloatArray:
+    """Return R-hat (eq. 1 to 4) of chains (c, n, p), (p,)."""
+    n = draws.shape[1]
+    within = np.var(draws, axis=1, ddof=1).mean(axis=0)
+    between = np.var(draws.mean(axis=1), axis=0, ddof=1)
+    ratio: FloatArray = np.sqrt(between / within + (n - 1.0) / n)
+    return ratio
+
+
+def _effective(draws: FloatArray) -> FloatArray:
+    """Return the effective sample size (eq. 10 to 13) of chains (c, n, p), (p,).
+
+    Correlations of later and later draws are added in pairs while these are positive, none larger
+    than the one before it (Geyer 1992, doi:10.1214/ss/1177011137).
+    """
+    c, n, p = draws.shape
+    apart = draws - draws.mean(axis=1, keepdims=True)
+    # Padded, so that the end of a chain is not correlated with its beginning.
+    size = scipy.fft.next_fast_len(2 * n, real=True)
+    spectrum = np.abs(scipy.fft.rfft(apart, size, axis=1)) ** 2
+    covariance = scipy.fft.irfft(spectrum.mean(axis=0), size, axis=0)[:n] / n
+    within = covariance[0] * n / (n - 1.0)
+    total = covariance[0] + np.var(draws.mean(axis=1), axis=0, ddof=1)
+    moves = total > 0.0
+    correlation = 1.0 - (within - covariance) / np.where(moves, total, 1.0)
+    correlation[0] = 1.0
+    last = (n - 3) // 2
+    even, odd = correlation[: 2 * last + 1 : 2], correlation[1 : 2 * last + 2 : 2]
+    pairs = even + odd
+    # The first pair that is not positive; of it the even one counts once.
+    end = np.where(np.all(pairs > 0.0, axis=0), last, np.argmax(pairs <= 0.0, axis=0))
+    before = np.arange(last + 1)[:, None] < end
+    time = -1.0 + 2.0 * np.sum(np.minimum.accumulate(pairs) * before, axis=0)
+    time += np.maximum(even[end, np.arange(p)], 0.0)
+    time = np.maximum(time, 1.0 / np.log10(c * n))
+    return np.where(moves, c * n / time, float(c * n))
 
 
 @dataclass(frozen=True, eq=False)

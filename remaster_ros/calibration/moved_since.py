@@ -55,9 +55,8 @@ def moved_since(measurements: Measurements, rows: IntArray, errors: FloatArray) 
     at = int(np.argmax(explained))
     left = float(np.sum((means - means.mean(axis=0)) ** 2) - explained[at])
     freedom = 3 * (poses - 2)
-    p_value = scipy.stats.f.sf(
-        explained[at] / 3.0 / (max(left, 1e-30) / freedom), 3, freedom
-    ) * len(step)
+    ratio = explained[at] / 3.0 / (max(left, 1e-30) / freedom)
+    p_value = scipy.special.fdtrc(3, freedom, ratio) * len(step)
     if p_value > SIGNIFICANCE:
         return None
     return Moved(int(measurements.observation[rows[place > at][0]]), step[at])

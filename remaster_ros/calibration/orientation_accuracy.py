@@ -83,7 +83,7 @@ def what_turns_tell(mode: Mode) -> TurnsTell | None:
     values, vectors = np.linalg.eigh(added)
     kept = values > LEAST_ADDED
     square = np.sum((vectors.T @ (inner @ shift[where]))[kept] ** 2 / values[kept])
-    return TurnsTell(std, shift, float(scipy.stats.chi2.sf(square, max(int(kept.sum()), 1))))
+    return TurnsTell(std, shift, float(scipy.special.chdtrc(max(int(kept.sum()), 1), square)))
 
 
 class ToolOrientations(NamedTuple):

@@ -66,8 +66,12 @@ class Coverage:
         rows, count = len(inside), int(inside.sum())
         if rows == 0:
             return cls(0, 0, None, None)
-        interval = scipy.stats.binomtest(count, rows).proportion_ci(0.95)
-        return cls(rows, count, count / rows, (float(interval.low), float(interval.high)))
+        low, high = (
+            scipy.special.betaincinv(count + more, rows - count + 1 - more, quantile)
+            for more, quantile in ((0, 0.025), (1, 0.975))
+        )
+        interval = (float(low) if count else 0.0, float(high) if count < rows else 1.0)
+        return cls(rows, count, count / rows, interval)
 
 
 def predict(
@@ -101,7 +105,7 @@ def predict(
         turn = to_sensor[:, :3, :3]
         position[source] = apply(to_sensor, part.place)
         covariance[source] = turn @ found @ np.swapaxes(turn, 1, 2)
-    limit = float(scipy.stats.chi2.ppf(REGION, 3))
+    limit = float(scipy.special.chdtri(3, 1.0 - REGION))
     if widening is None:
         left_out = _left_out_distances(fit, measurements, triangle)
         widening = 1.0

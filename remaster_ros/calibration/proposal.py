@@ -5,7 +5,7 @@ whatever the proposal, if the weights have a variance. Where it is poor its mean
 moved to those of the weighted draws (population Monte Carlo; Cappé, Guillin, Marin and Robert
 2004, doi:10.1198/106186004X12803). The largest weights are smoothed by a Pareto distribution,
 whose shape k tells whether they can be relied on (Vehtari, Simpson, Gelman, Yao and Gabry 2024,
-"Pareto smoothed importance sampling", JMLR 25(72); as arviz-stats has it).
+"Pareto smoothed importance sampling", JMLR 25(72)).
 """
 
 from __future__ import annotations
@@ -42,6 +42,9 @@ BLOCK_ENTRIES = 1_000_000
 # weights are raised to a power below 1, which leads part of the way.
 DRAWS_PER_DIMENSION = 5.0
 POWERS = 0.7 ** np.arange(1.0, 25.0)
+# Fewer weights determine no tail.
+FEWEST_OF_A_TAIL = 5
+TINIEST = np.finfo(float).tiny
 
 
 @dataclass(frozen=True, eq=False)
@@ -205,16 +208,12 @@ class Weighted(NamedTuple):
     @classmethod
     def of(cls, points: FloatArray, log_weight: FloatArray) -> Weighted:
         """Smooth the weights."""
-        from arviz_stats.base import array_stats
-
         finite = np.isfinite(log_weight)
         # Draws where there is no density count for nothing.
         least = np.min(log_weight[finite], initial=0.0) - 100.0
         log_weight = np.where(finite, log_weight, least)
-        # arviz-stats smooths the weights 1 / likelihood of a left-out observation: the sign turns.
-        smoothed, pareto_k = array_stats.psislw(-log_weight)
-        weight = np.exp(smoothed - np.max(smoothed))
-        return cls(points, log_weight, weight / weight.sum(), float(pareto_k))
+        weight, pareto_k = _smoothed(np.exp(log_weight - np.max(log_weight)))
+        return cls(points, log_weight, weight / weight.sum(), pareto_k)
 
     @property
     def effective(self) -> float:
@@ -230,6 +229,46 @@ class Weighted(NamedTuple):
             weight = np.exp(power * (self.log_weight - np.max(self.log_weight)))
             weight /= weight.sum()
         return weight
+
+
+def _smoothed(weight: FloatArray) -> tuple[FloatArray, float]:
+    """Return weights (n,) of which the largest is 1, smoothed, and the shape of their tail.
+
+    The largest become the expected order statistics of the Pareto distribution that fits them,
+    none larger than the largest was. Where they are all the same nothing is to be smoothed.
+    """
+    count = int(min(0.2 * len(weight), 3.0 * math.sqrt(len(weight))))
+    order = np.argsort(weight)
+    tail, limit = order[-count:], weight[order[-count - 1]]
+    if count < FEWEST_OF_A_TAIL or weight[order[-1]] - weight[order[-count]] < TINIEST:
+        return weight, float('nan')
+    # Zero among them is rounding.
+    above = np.maximum(weight[tail] - limit, TINIEST)
+    shape, scale = _pareto(above)
+    share = (np.arange(count) + 0.5) / count
+    # (1 - share)^-k - 1, over k, also where k is nearly 0.
+    expected = scale * np.expm1(-shape * np.log1p(-share)) / shape
+    smoothed = weight.copy()
+    smoothed[tail] = np.minimum(limit + expected, 1.0)
+    return smoothed, shape
+
+
+def _pareto(above: FloatArray) -> tuple[float, float]:
+    """Fit a generalised Pareto distribution to sorted excesses (n,): shape and scale.
+
+    The mean of its posterior by quadrature (Zhang and Stephens 2009, doi:10.1198/tech.2009.08017);
+    the shape is drawn towards 0.5 as by ten observations more (Vehtari et al., appendix C).
+    """
+    n = len(above)
+    grid = np.arange(1, 31 + int(math.sqrt(n))) - 0.5
+    quarter = above[int(n / 4.0 + 0.5) - 1]
+    theta = 1.0 / above[-1] + (1.0 - np.sqrt((30 + int(math.sqrt(n))) / grid)) / (3.0 * quarter)
+    shape = np.mean(np.log1p(-theta[:, None] * above), axis=1)
+    log_likelihood = n * (np.log(-theta / shape) - shape - 1.0)
+    weight = np.exp(log_likelihood - np.max(log_likelihood))
+    best = float(theta @ weight / weight.sum())
+    fitted = float(np.mean(np.log1p(-best * above)))
+    return (n * fitted + 10.0 * 0.5) / (n + 10.0), -fitted / best
 
 
 def _effective(weight: FloatArray) -> float:

@@ -297,7 +297,7 @@ def _f_test(
     ratio = explained / own.shape[1] / variance
     concerned = float(np.sum(rest[np.any(family != 0.0, axis=1)] ** 2))
     share = max(0.0, explained - own.shape[1] * variance) / concerned
-    return Explained(float(scipy.stats.f.sf(ratio, own.shape[1], freedom)), share)
+    return Explained(float(scipy.special.fdtrc(own.shape[1], freedom, ratio)), share)
 
 
 def _from_pose_to_pose(
@@ -334,8 +334,8 @@ def _from_pose_to_pose(
     # From -1 to 1.
     middle = 0.5 * (mean + 1.0)
     precision = middle * (1.0 - middle) / (0.25 * variance) - 1.0
-    p_value = scipy.stats.beta.sf(
-        0.5 * (ratio + 1.0), middle * precision, (1.0 - middle) * precision
+    p_value = scipy.special.betainc(
+        (1.0 - middle) * precision, middle * precision, 0.5 * (1.0 - ratio)
     )
     return StructureTest('reading_before', True, float(p_value))
 
@@ -357,4 +357,5 @@ def _within_poses(errors: FloatArray, rows: Rows, seconds: FloatArray) -> Struct
         return None
     excess = (chained + squares / rows.group_size)[several]
     score = excess.mean() / (excess.std(ddof=1) / np.sqrt(len(excess)))
-    return StructureTest('reading_before', False, float(scipy.stats.t.sf(score, len(excess) - 1)))
+    p_value = float(scipy.special.stdtr(len(excess) - 1, -score))
+    return StructureTest('reading_before', False, p_value)

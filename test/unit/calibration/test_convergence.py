@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from arviz_stats.base import array_stats
 from scipy.signal import lfilter
 
 from remaster_ros.calibration.convergence import ess_bulk, ess_tail, r_hat
+from remaster_ros.calibration.proposal import Weighted
 from remaster_ros.errors import InsufficientDataError
 
 
@@ -28,6 +30,41 @@ def test_figures_are_those_of_another_implementation(correlation, chains, draws,
     """Written from the equations of Vehtari et al. (2021), without arviz-stats."""
     x = autoregressive(correlation, chains, draws, seed=17)
     assert (r_hat(x), ess_bulk(x), ess_tail(x)) == pytest.approx(expected, rel=1e-9)
+
+
+def test_figures_are_those_of_arviz() -> None:
+    rng = np.random.default_rng(23)
+    for trial in range(40):
+        chains, length = rng.integers(2, 6), rng.integers(8, 900)
+        x = rng.standard_normal((chains, length, 3))
+        x = lfilter([1.0], [1.0, -rng.uniform(-0.9, 0.98)], x, axis=1)
+        if trial % 3 == 0:
+            x = np.round(x, 1)  # Draws that repeat themselves, as where proposals are refused.
+        if trial % 5 == 0:
+            x[0] += rng.standard_normal()
+        axes = {'chain_axis': 0, 'draw_axis': 1}
+        np.testing.assert_allclose(r_hat(x), array_stats.rhat(x, **axes), rtol=1e-8)
+        bulk = array_stats.ess(x, method='bulk', **axes)
+        np.testing.assert_allclose(ess_bulk(x), bulk, rtol=1e-8)
+        tail = array_stats.ess(x, method='tail', prob=0.05, **axes)
+        np.testing.assert_allclose(ess_tail(x), tail, rtol=1e-8)
+
+
+def test_weights_are_smoothed_as_by_arviz() -> None:
+    rng = np.random.default_rng(24)
+    for trial in range(40):
+        count = rng.integers(30, 5000)
+        log_weight = rng.uniform(0.01, 4.0) * rng.standard_normal(count)
+        if trial % 2:
+            log_weight = np.log(rng.standard_t(rng.uniform(0.7, 20.0), count) ** 2 + 1e-9)
+        # It smooths the weights 1 / likelihood of a left-out observation: the sign turns.
+        smoothed, pareto_k = array_stats.psislw(-log_weight)
+        expected = np.exp(smoothed - np.max(smoothed))
+        drawn = Weighted.of(np.zeros((count, 1)), log_weight)
+        np.testing.assert_allclose(drawn.weight, expected / expected.sum(), rtol=1e-7)
+        assert drawn.pareto_k == pytest.approx(pareto_k, abs=1e-9)
+    alike = Weighted.of(np.zeros((100, 1)), np.zeros(100))
+    np.testing.assert_allclose(alike.weight, 0.01)
 
 
 def test_every_quantity_is_judged_on_its_own() -> None:
