@@ -253,6 +253,15 @@ def simulate(
     validation_poses: int = 60,
     effects: Sequence[str] = (),
     seed: int = 0,
+    sensors: Sequence[str] | None = None,
+    noise_m: float = 1e-4,
+    pose_noise_m: float = 2e-4,
+    depth_noise_m: float = 0.0,
+    orientation_noise_rad: float | None = None,
+    pose_orientation_noise_rad: float = 0.0,
+    on_tool: bool = False,
+    outlier_share: float = 0.0,
+    offset_std_rad: float | None = None,
 ) -> SimulatedRun:
     """Measure an arm whose truth is drawn.
 
@@ -269,11 +278,27 @@ def simulate(
         offsets, registration and marker are fitted.
     seed
         Of everything that is drawn.
+    sensors
+        Names of those of the workcell that measure; None for all.
+    noise_m, pose_noise_m
+        Noise of every point, and error common to all solutions of a pose, m per axis.
+    depth_noise_m
+        Further noise along the line of sight, m at 1 m; it grows with the square of the distance.
+    orientation_noise_rad, pose_orientation_noise_rad
+        The same two of orientations, rad per axis; without the first one none are measured.
+    on_tool
+        Whether the sensors are on the tool, at their markers, and measure boards in their places.
+    outlier_share
+        Share of the observations that are 20 mm off.
+    offset_std_rad
+        Of the true zero-offsets, rad; None for 0.3 degrees. A joint that slides has a metre for
+        each 1.2 rad.
 
     Raises
     ------
     InputError
-        No such workcell, robot or effect, or no pose that the arm can take.
+        No such workcell, robot, effect or sensor, no pose that the arm can take, or sensors that
+        cannot measure so.
 
     Examples
     --------
@@ -286,17 +311,46 @@ def simulate(
     """
     import numpy as np
 
+    from remaster_ros.errors import InputError
     from remaster_ros.session.workcell import read_cell
     from remaster_ros.simulation.effect_sampling import EffectSpec
-    from remaster_ros.simulation.simulated_workcell import choose_robot, simulate_workcell
+    from remaster_ros.simulation.simulated_workcell import (
+        DEFAULT_OFFSET_STD,
+        choose_robot,
+        choose_sensors,
+        simulate_workcell,
+    )
 
+    sizes = {
+        'noise_m': noise_m,
+        'pose_noise_m': pose_noise_m,
+        'depth_noise_m': depth_noise_m,
+        'orientation_noise_rad': orientation_noise_rad,
+        'pose_orientation_noise_rad': pose_orientation_noise_rad,
+        'outlier_share': outlier_share,
+        'offset_std_rad': offset_std_rad,
+    }
+    for name, size in sizes.items():
+        most = 1.0 if name == 'outlier_share' else np.inf
+        if size is not None and not (0.0 <= size <= most and np.isfinite(size)):
+            raise InputError(f'{name}: {size:g} is no number from 0 to {most:g}')
     workcell = read_cell(os.fspath(cell))
+    chain = choose_robot(workcell, robot)
+    choose_sensors(workcell, None if sensors is None else tuple(sensors))
     return simulate_workcell(
         workcell,
-        choose_robot(workcell, robot),
+        chain,
         np.random.default_rng(seed),
         poses=poses,
         validation_poses=validation_poses,
+        sigma_m=noise_m,
+        pose_sigma_m=pose_noise_m,
+        depth_sigma_m=depth_noise_m,
+        turn_sigma_rad=orientation_noise_rad,
+        pose_turn_sigma_rad=pose_orientation_noise_rad,
+        on_tool=on_tool,
+        outlier_share=outlier_share,
+        joint_offset_std=DEFAULT_OFFSET_STD if offset_std_rad is None else offset_std_rad,
         effects=[EffectSpec.parse(effect) for effect in effects],
     )
 

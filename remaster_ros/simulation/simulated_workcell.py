@@ -322,19 +322,22 @@ def simulate_workcell(
         cannot measure so.
     """
     if turn_sigma_rad is None and (on_tool or pose_turn_sigma_rad):
-        option = '--on-tool' if on_tool else '--pose-orientation-noise-deg'
-        raise InputError(f'{option} is for sensors of poses; give --orientation-noise-deg as well')
+        what = 'on the tool' if on_tool else 'with noise of pose orientations'
+        raise InputError(
+            f'sensors {what} measure poses; state the noise of an orientation as well '
+            '(--orientation-noise-deg, in Python orientation_noise_rad)'
+        )
     if turn_sigma_rad is not None and chain.slides.any():
         sliding = chain.joint_names[int(np.argmax(chain.slides))]
         raise InputError(
-            f"--orientation-noise-deg: joint '{sliding}' slides, and remaster fit takes no "
-            'orientations of such an arm; leave it out'
+            f"joint '{sliding}' slides, and no fit takes orientations of such an arm; leave their "
+            'noise out (--orientation-noise-deg, in Python orientation_noise_rad)'
         )
     own = [marker for sensor in cell.sensors.values() for marker in sensor.markers]
     if on_tool and not len(cell.sensors) == len(own) == len(set(own)):
         raise InputError(
-            '--on-tool: the marker of a sensor on the tool is its own origin, and it has no '
-            'other; choose such sensors by --sensors'
+            'the marker of a sensor on the tool is its own origin, and it has no other; choose '
+            'such sensors (--sensors, in Python sensors)'
         )
     # One stream each: other noise, for instance, leaves the poses and the offsets as they were.
     placement, planning, drawing, hiding = rng.spawn(4)

@@ -12,8 +12,10 @@ from parallel import in_parallel
 from scipy.spatial.transform import Rotation
 from scipy.stats import binom
 
+import remaster_ros
 from remaster_ros.calibration.fit import fit_session
 from remaster_ros.cli.main import main
+from remaster_ros.errors import InputError
 from remaster_ros.kinematics.transforms import inverse, inverse_poses, transform
 from remaster_ros.session.reader import read_session
 from remaster_ros.simulation.effect_sampling import EffectSpec
@@ -229,14 +231,14 @@ def test_without_the_options_the_files_of_a_seed_are_the_same_to_the_byte(tmp_pa
 @pytest.mark.parametrize(
     ('options', 'words'),
     [
-        (('--on-tool',), '--on-tool is for sensors of poses; give --orientation-noise-deg'),
+        (('--on-tool',), 'sensors on the tool measure poses; state the noise of an orientation'),
         (
             ('--pose-orientation-noise-deg', '1'),
-            '-deg is for sensors of poses; give --orientation',
+            'orientations measure poses; state the noise of an orientation',
         ),
         (
             ('--on-tool', '--orientation-noise-deg', '0.1', '--cell', 'quick'),
-            '--on-tool: the marker of a sensor on the tool is its own origin',
+            'the marker of a sensor on the tool is its own origin',
         ),
         (('--orientation-noise-deg', '-1'), '--orientation-noise-deg: -1 is less than 0'),
     ],
@@ -250,3 +252,47 @@ def test_what_does_not_go_together_ends_in_one_line(options, words, tmp_path, ca
     (line,) = capsys.readouterr().err.strip().splitlines()
     assert words in line
     assert not (tmp_path / 'o').exists()
+
+
+def test_a_program_simulates_what_the_command_does(tmp_path):
+    options = (
+        *('--sensors', 'mocap', '--poses', '8', '--validation', '2', '--seed', '7', '--on-tool'),
+        *('--noise-mm', '0.2', '--pose-noise-mm', '0.1', '--depth-noise-mm', '0.3'),
+        *('--orientation-noise-deg', '0.05', '--pose-orientation-noise-deg', '0.1'),
+        *('--outliers', '0.1', '--offset-std-deg', '0.5', '--quiet'),
+    )
+    assert main(['simulate', str(tmp_path / 's'), *options]) == 0
+    session = read_session(tmp_path / 's')
+    made = remaster_ros.simulate(
+        poses=8,
+        validation_poses=2,
+        seed=7,
+        sensors=('mocap',),
+        noise_m=0.2e-3,
+        pose_noise_m=0.1e-3,
+        depth_noise_m=0.3e-3,
+        orientation_noise_rad=np.radians(0.05),
+        pose_orientation_noise_rad=np.radians(0.1),
+        on_tool=True,
+        outlier_share=0.1,
+        offset_std_rad=np.radians(0.5),
+    )
+    for name in ('q', 'position', 'orientation'):
+        read = getattr(session.measurements, name)
+        np.testing.assert_allclose(getattr(made.session.measurements, name), read, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ('options', 'words'),
+    [
+        ({'noise_m': -1e-3}, 'noise_m: -0.001 is no number from 0'),
+        ({'outlier_share': 2.0}, 'outlier_share: 2 is no number from 0 to 1'),
+        ({'offset_std_rad': np.nan}, 'offset_std_rad: nan is no number'),
+        ({'on_tool': True}, 'in Python orientation_noise_rad'),
+        ({'sensors': ('tracer',)}, "no sensor 'tracer' in the cell (mocap, tracker)"),
+    ],
+)
+def test_a_program_is_told_what_is_wrong(options, words):
+    with pytest.raises(InputError) as refused:
+        remaster_ros.simulate(poses=8, validation_poses=2, **options)
+    assert words in str(refused.value)

@@ -137,7 +137,7 @@ def test_nothing_else_is_hidden_in_such_an_arm_and_discover_says_why_not(made, t
     assert main([*args, '--poses', '8', '--orientation-noise-deg', '0.1']) == 2
     error = capsys.readouterr().err.strip().splitlines()[-1]
     assert "joint 'j3' slides" in error
-    assert 'no orientations of such an arm; leave it out' in error
+    assert 'no fit takes orientations of such an arm; leave their noise out' in error
     assert not (tmp_path / 'o').exists()
     assert main(['discover', str(made / 's'), '--out', str(tmp_path / 'd')]) == 2
     (error,) = capsys.readouterr().err.strip().splitlines()
