@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from remaster_ros.motion.joint_units import JointUnits
 from remaster_ros.motion.motion_gate import Admitted
 from remaster_ros.motion.path_check import FreePath
 from remaster_ros.motion.settling import SettleRules
@@ -15,10 +16,10 @@ class CheckPath:
     """Find out whether the way to a target is free; answer with `ArmSupervisor.path_found`."""
 
     number: int  # Names the request
-    # rad, (k,)
+    # rad or m, (k,)
     start: FloatArray
     target: FloatArray
-    waypoints: FloatArray  # What the planner would go through, rad, (n, k)
+    waypoints: FloatArray  # What the planner would go through, (n, k)
 
 
 @dataclass(frozen=True)
@@ -55,7 +56,7 @@ class Settled:
 
     solution: int
     stamp_s: float  # Stamp of the report that completed the settling, s
-    q: FloatArray  # Mean reported joint positions since it stands still, rad, (k,)
+    q: FloatArray  # Mean reported joint positions since it stands still, rad or m, (k,)
     # How long it moved and how long it stood, s
     motion_s: float
     settle_s: float
@@ -99,3 +100,8 @@ class SupervisorRules:
     # After a longer interruption only a person goes on, unless the robot's safety circuit was
     # known to be released all the time (wall time)
     resume_alone_s: float = 5.0
+
+    @property
+    def units(self) -> JointUnits:
+        """Those of the arm's joints."""
+        return self.settle.units

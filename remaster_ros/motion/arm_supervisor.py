@@ -67,8 +67,8 @@ class ArmSupervisor:
     halted
         Why the arm was halted already before this process started; ''.
     end
-        Where the last command led before this process started, rad, (k,); None where that is not
-        known.
+        Where the last command led before this process started, rad or m, (k,); None where that
+        is not known.
 
     Attributes
     ----------
@@ -84,6 +84,8 @@ class ArmSupervisor:
         halted: str = '',
         end: FloatArray | None = None,
     ) -> None:
+        if not gate.limits.units == reports.units == rules.units:
+            raise ValueError('gate, reports and rules are not of the same joints')
         self.gate, self.reports, self.rules = gate, reports, rules
         self.halted = halted
         self._interlocks = Interlocks(rules.heartbeat_s, rules.resume_alone_s)
@@ -130,9 +132,9 @@ class ArmSupervisor:
         waypoints: Mapping[int, FloatArray] = NO_WAYPOINTS,
         refused: Mapping[int, str] = NO_REFUSALS,
     ) -> list[Action]:
-        """Begin to visit the solutions of a pose, rad, (m, k), in this order; none: stop.
+        """Begin to visit the solutions of a pose, rad or m, (m, k), in this order; none: stop.
 
-        ``waypoints`` has configurations on the way to a solution, rad, (n, k), by its number;
+        ``waypoints`` has configurations on the way to a solution, (n, k), by its number;
         ``refused`` why one of them must not be commanded.
         """
         actions = self._stop('another pose' if len(solutions) else 'stopped', wall_s)
@@ -221,7 +223,7 @@ class ArmSupervisor:
             return []
         solution = request[1]
         if answer.path is None and answer.at_start:
-            return self._halt(self._queue.offer(answer, self.gate.limits.names))
+            return self._halt(self._queue.offer(answer, self.gate.limits))
         if solution == STANDING and answer.path is not None:
             self._queue.must_look = False
             return self.tick(wall_s)
@@ -328,7 +330,7 @@ class ArmSupervisor:
 
     @property
     def end(self) -> FloatArray | None:
-        """Where the last command led, rad, (k,); None before it is sure that the arm is there."""
+        """Where the last command led, (k,); None before it is sure that the arm is there."""
         return None if self._unsure else self._motion.end
 
     @property
@@ -382,27 +384,27 @@ class ArmSupervisor:
     # Inside: where the arm is
 
     def _differs(self, q: FloatArray, other: FloatArray) -> bool:
-        return bool(np.max(np.abs(q - other)) > self.rules.settle.arrive_tolerance)
+        return self.rules.units.largest(q - other) > self.rules.settle.arrive_tolerance
 
     def _elsewhere(self, q: FloatArray) -> str:
         """Return that the arm is reported elsewhere than the last command led, and what to do; ''.
 
-        ``q``: where it is reported, rad, (k,).
+        ``q``: where it is reported, rad or m, (k,).
         """
-        end = self._motion.end
+        end, units = self._motion.end, self.rules.units
         if end is None or not self._differs(q, end):
             return ''
-        off = np.abs(q - end) > self.rules.settle.arrive_tolerance
+        off = np.abs(q - end) > self.rules.settle.arrive_tolerance * units.per_radian
         joints = ', '.join(
-            f'{name} at {is_at:.2f} deg, {is_at - led:+.2f} deg from there'
-            for name, is_at, led, differs in zip(
-                self.gate.limits.names, np.rad2deg(q), np.rad2deg(end), off
-            )
-            if differs
+            f'{name} at {units.in_degrees(i, q[i])}, '
+            f'{units.in_degrees(i, q[i] - end[i], sign="+")} from there'
+            for i, name in enumerate(self.gate.limits.names)
+            if off[i]
         )
+        shown = 'positions' if any(units.slides) else 'angles'
         return (
             f'the arm is not reported where the last command led: {joints}; compare with the '
-            "robot's own display: where it shows the same angles, /remaster/clear_halt confirms "
+            f"robot's own display: where it shows the same {shown}, /remaster/clear_halt confirms "
             'them; where it does not, joint_states are wrong: see to the driver first'
         )
 

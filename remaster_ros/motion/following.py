@@ -24,8 +24,11 @@ JITTER_S = 0.02
 """By so much a command's way to the robot may differ from another's, s of wall time."""
 EARLY_S = 0.1
 """An arm may be so far ahead of its path, s of robot time; `LATENCY_S` comes on top."""
+# Of a joint that slides these angles are 0.25 m times as much in m (`JointUnits`).
 ON_PATH_RAD = 0.02
-"""An arm is on its path that is no further from it, rad: its servo overshoots."""
+"""An arm is on its path that is no further from it, rad: its servo overshoots, by as much more as
+it is faster. A slide is by 5 mm: at 0.25 m/s, the default limit of the fastest point, that is the
+way of 20 ms, as 20 mrad are of a joint at 1 rad/s."""
 SLOWED_S, SLOWED_LONGEST_S = 0.1, 0.3
 """Loss of speed is judged over a time between these two, s."""
 SLOWED_RAD = 5e-3
@@ -44,12 +47,12 @@ STOPPED_ON_ITS_WAY = 'the robot stopped on its way: an emergency or protective s
 class Seen:
     """The last report that was believed."""
 
-    q: FloatArray  # Joint positions, rad, (k,)
+    q: FloatArray  # Joint positions, rad or m, (k,)
     # Its stamp, wall time and robot time, s
     stamp: float
     wall: float
     time: float
-    # Where (rad, (k,)) and since when (robot time, s) the arm has been standing
+    # Where (rad or m, (k,)) and since when (robot time, s) the arm has been standing
     stands_at: FloatArray
     stands_since: float
     late_s: float  # How much later than usual it came, s: the arm has gone on meanwhile
@@ -67,7 +70,7 @@ class Seen:
             return cls(q, stamp, wall, stamp, q, stamp, late_s, np.full(len(q), -np.inf), stamp)
         time = last.time + stamp - last.stamp
         changed = np.where(q != last.q, time, last.changed)
-        moved = np.any(np.abs(q - last.stands_at) > rules.settle.still_tolerance)
+        moved = rules.units.largest(q - last.stands_at) > rules.settle.still_tolerance
         is_gap = stamp - last.stamp > rules.settle.max_gap_s
         resumed = time if is_gap else last.resumed
         if moved or is_gap:
@@ -108,7 +111,7 @@ class Following:
         self._sent, self._sent_wall = sent, sent_wall
         self.reacted = False
         self._lag_s = 0.0
-        # The last moments: time since it was sent (s), where the arm was (rad), its lag (s).
+        # The last moments: time since it was sent (s), where the arm was, its lag (s).
         self._trail: deque[tuple[float, FloatArray, float]] = deque()
         self._allowed_s, self._early_s = rules.lag_s, EARLY_S + LATENCY_S
         self._astray = ''
@@ -176,12 +179,16 @@ class Following:
             self.reacted = True
         lag, off, is_near = self._lag(elapsed, seen.q)
         self._lag_s = float(np.clip(lag, 0.0, self._allowed_s))
-        if off <= ON_PATH_RAD and (is_near or -self._early_s <= lag <= self._allowed_s):
+        units = self._rules.units
+        is_beside = units.largest(off) > ON_PATH_RAD
+        if not is_beside and (is_near or -self._early_s <= lag <= self._allowed_s):
             return ''
         if seen.time - seen.stands_since >= STANDING_S:
             return STOPPED_ON_ITS_WAY
-        if off > ON_PATH_RAD:
-            return f'the robot does not follow its path: {np.rad2deg(off):.1f} deg beside it'
+        if is_beside:
+            joint = units.farthest(off)
+            text = units.in_degrees(joint, abs(off[joint]), 1)
+            return f'the robot does not follow its path: {text} beside it'
         if lag < 0.0:
             return (
                 f'the robot does not follow its path: {-lag:.2f} s ahead of it; does something '
@@ -207,55 +214,57 @@ class Following:
         passed_s = now - before
         if since_s < least_s or not SLOWED_S <= passed_s <= SLOWED_LONGEST_S:
             return False
-        expected = float(np.max(np.abs(line.way))) * min(
+        units = self._rules.units
+        expected = units.largest(line.way) * min(
             line.share(since_s + passed_s + change)[0] - line.share(since_s + change)[0]
             for change in (-LAG_CHANGES_S, 0.0, LAG_CHANGES_S)
         )
-        moved = float(np.max(np.abs(q - q_before)))
+        moved = units.largest(q - q_before)
         return expected > SLOWED_RAD and moved < SLOWED_SHARE * expected
 
     def _is_still_at_start(self, seen: Seen) -> bool:
         """Whether nothing of a move has been seen yet; the probe is too short to be seen."""
-        start = self.trajectory.start
-        longest = np.max(np.abs(self.trajectory.points - start))
-        away = np.max(np.abs(seen.q - start))
-        return bool(longest > ON_PATH_RAD and away <= self._rules.settle.arrive_tolerance)
+        start, units = self.trajectory.start, self._rules.units
+        longest = units.largest(self.trajectory.points - start)
+        away = units.largest(seen.q - start)
+        return longest > ON_PATH_RAD and away <= self._rules.settle.arrive_tolerance
 
-    def _lag(self, elapsed: float, q: FloatArray) -> tuple[float, float, bool]:
-        """Return how far `q` is behind the trajectory, s, how far off it, rad, and if it is near.
+    def _lag(self, elapsed: float, q: FloatArray) -> tuple[float, FloatArray, bool]:
+        """Return how far `q` is behind the trajectory, s, its way off it, (k,), and if it is near.
 
         Near is what is within `ON_PATH_RAD` of where it should be: at the ends of a line a small
         distance is a long time.
         """
-        trajectory = self.trajectory
+        trajectory, units = self.trajectory, self._rules.units
         index, since_s = trajectory.line_at(elapsed)
-        found = []
+        found: list[tuple[float, float, bool, FloatArray]] = []
         # Just after a rest an arm that lags may still be on the line before it.
         for number in {index, max(index - 1, 0)} if since_s < self._allowed_s else {index}:
             line = trajectory.lines[number]
-            share, off = line.project(q)
+            share, off = line.project(q, units)
             begun_s = trajectory.starts_s[number]
             expected, _ = line.share(elapsed - begun_s)
             lag = min(elapsed - begun_s, line.duration_s) - line.time_s(share)
-            slack = ON_PATH_RAD / max(float(np.max(np.abs(line.way))), ON_PATH_RAD)
-            found.append((off, lag, abs(expected - share) <= slack))
-        off, lag, is_near = min(found)
-        return lag, off, is_near
+            slack = ON_PATH_RAD / max(units.largest(line.way), ON_PATH_RAD)
+            beside = q - line.start - share * line.way
+            found.append((off, lag, abs(expected - share) <= slack, beside))
+        _, lag, is_near, beside = min(found, key=lambda one: one[:3])
+        return lag, beside, is_near
 
 
 def path_tolerance(speeds: FloatArray, rules: SupervisorRules) -> FloatArray:
-    """Return how far joints may be from where they should be at a time, rad, (k,).
+    """Return how far joints may be from where they should be at a time, rad or m, (k,).
 
     The same as of `Following`, for a controller that follows too: beside the path and behind it.
 
     Parameters
     ----------
     speeds
-        The largest of the move, rad/s, (k,).
+        The largest of the move, rad/s or m/s, (k,).
     rules
         How far the arm may lag.
     """
-    return ON_PATH_RAD + allowed_lag_s(rules, 1.0) * speeds
+    return ON_PATH_RAD * rules.units.per_radian + allowed_lag_s(rules, 1.0) * speeds
 
 
 def allowed_lag_s(rules: SupervisorRules, rate: float) -> float:

@@ -16,10 +16,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from remaster_ros.motion.joint_units import TURNING, JointUnits
 from remaster_ros.types import FloatArray
 
 LIMIT_TOLERANCE_RAD = 0.05
-"""A joint may be reported so far outside its limits."""
+"""A joint may be reported so far outside its limits, rad; one that slides by 12.5 mm."""
 SPEED_TOLERANCE = 1.5
 """A joint may be reported so many times as fast as its limit."""
 JITTER_S = 0.02
@@ -48,7 +49,8 @@ RATE_WINDOW_S = 2.0
 RATE_LEAST_S = 0.3
 """And over so much at least, s."""
 UNKNOWN_SPEED = 4.0
-"""Where a robot model has no velocity limit an arm may be reported so fast, rad/s."""
+"""Where a robot model has no velocity limit an arm may be reported so fast, rad/s. One that slides
+at 1 m/s: by default no point of an arm is commanded at more than a quarter of that."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +58,7 @@ class JointReport:
     """The content of a message on joint_states, and its times."""
 
     stamp_s: float  # Its stamp, s
-    q: FloatArray  # Joint positions, rad, (k,)
+    q: FloatArray  # Joint positions, rad or m, (k,)
     clock_s: float  # The node's time at its arrival, s
     wall_s: float  # Wall time at its arrival, s
 
@@ -93,9 +95,11 @@ class JointReports:
     Parameters
     ----------
     lower, upper
-        Joint limits, rad, (k,); infinite where there is none.
+        Joint limits, rad or m, (k,); infinite where there is none.
     velocity
-        Velocity limits of the robot itself, rad/s, (k,); infinite where unknown.
+        Velocity limits of the robot itself, rad/s or m/s, (k,); infinite where unknown.
+    units
+        Those of the joints.
 
     Attributes
     ----------
@@ -110,9 +114,17 @@ class JointReports:
         The rate of the node's clock.
     """
 
-    def __init__(self, lower: FloatArray, upper: FloatArray, velocity: FloatArray) -> None:
-        self._lower, self._upper = lower - LIMIT_TOLERANCE_RAD, upper + LIMIT_TOLERANCE_RAD
-        speed = np.where(np.isfinite(velocity), velocity, UNKNOWN_SPEED)
+    def __init__(
+        self,
+        lower: FloatArray,
+        upper: FloatArray,
+        velocity: FloatArray,
+        units: JointUnits = TURNING,
+    ) -> None:
+        self.units = units
+        tolerance = LIMIT_TOLERANCE_RAD * units.per_radian
+        self._lower, self._upper = lower - tolerance, upper + tolerance
+        speed = np.where(np.isfinite(velocity), velocity, UNKNOWN_SPEED * units.per_radian)
         self._speed = SPEED_TOLERANCE * speed
         self.refused: Counter[str] = Counter()
         self.trouble = self.kind = ''
@@ -145,21 +157,20 @@ class JointReports:
         if not np.all(np.isfinite(q)):
             return 'not_finite', 'joint_states are not finite'
         if np.any((q < self._lower) | (q > self._upper)):
-            joint = int(np.argmax(np.maximum(self._lower - q, q - self._upper)))
-            return 'outside_limits', (
-                f'joint {joint + 1} is reported at {np.rad2deg(q[joint]):.1f} deg, outside its '
-                'limits'
-            )
+            beyond = np.maximum(self._lower - q, q - self._upper)
+            joint = int(np.argmax(beyond / self.units.per_radian))
+            at = self.units.in_degrees(joint, q[joint], 1)
+            return 'outside_limits', f'joint {joint + 1} is reported at {at}, outside its limits'
         if last is not None:
             passed = report.stamp_s - last.stamp_s
             if passed <= 0.0:
                 return 'stamp', 'the stamps of joint_states do not advance'
             moved = np.abs(q - last.q) - self._speed * (passed + JITTER_S)
             if np.any(moved > 0.0):
-                joint = int(np.argmax(moved))
-                jump = np.rad2deg(abs(q[joint] - last.q[joint]))
+                joint = int(np.argmax(moved / self.units.per_radian))
+                jump = self.units.in_degrees(joint, abs(q[joint] - last.q[joint]), 1)
                 return 'too_fast', (
-                    f'joint {joint + 1} is reported {jump:.1f} deg away after {passed:.3f} s'
+                    f'joint {joint + 1} is reported {jump} away after {passed:.3f} s'
                 )
         return self._doubt_time(report)
 

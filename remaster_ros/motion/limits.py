@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from remaster_ros.kinematics.serial_chain import SerialChain
+from remaster_ros.motion.joint_units import TURNING, JointUnits
 from remaster_ros.types import FloatArray
 
 UNKNOWN_VELOCITY = 1.0
@@ -25,7 +26,7 @@ class MotionLimits:
     """Limits of commanded joint positions, speeds and accelerations."""
 
     names: Sequence[str]  # Joint names, base to tip
-    # Position limits in reported angles, rad, (k,)
+    # Position limits as reported, rad or m, (k,)
     lower: FloatArray
     upper: FloatArray
     # Largest commanded joint velocities (the share of the robot's limits), rad/s or m/s, (k,)
@@ -34,7 +35,9 @@ class MotionLimits:
     acceleration: FloatArray
     # Largest speed of the fastest point of arm and tool, m/s; infinite for none
     tool_speed: float = np.inf
-    margin: float = 0.0  # Distance kept from the position limits, rad
+    # Distance kept from the position limits, rad; `JointUnits` has what it is where a joint slides
+    margin: float = 0.0
+    units: JointUnits = TURNING
 
     @classmethod
     def of(
@@ -59,8 +62,8 @@ class MotionLimits:
         speed_share
             Share (0 to 1) of its velocity limits that is used.
         offsets
-            What true angles have on top of reported ones, rad: zero-offsets in use, (k,), or the
-            least and the largest of what is in use, (2, k); None for none.
+            What true angles have on top of reported ones, rad or m: zero-offsets in use, (k,), or
+            the least and the largest of what is in use, (2, k); None for none.
         acceleration
             rad/s² or m/s², one number for all joints or (k,); None for `ACCELERATION`.
         tool_speed, margin
@@ -81,15 +84,28 @@ class MotionLimits:
             ),
             tool_speed,
             margin,
+            JointUnits.of(chain),
         )
 
+    @property
+    def margins(self) -> FloatArray:
+        """Distance kept from the limits of each joint, rad or m, (k,); (1,) where all turn."""
+        return self.margin * self.units.per_radian
+
+    def shown(self, joint: int, low: float, high: float) -> str:
+        """Return limits of a joint as people read them."""
+        first, last = (self.units.in_degrees(joint, value) for value in (low, high))
+        return f'[{first.split()[0]}, {last.split()[0]}] {last.split()[1]}'
+
     def outside(self, q: FloatArray) -> str:
-        """Return which joint of `q` (rad, (k,)) lies outside, as text; '' if none does."""
-        for name, value, low, high in zip(self.names, q, self.lower, self.upper):
-            if not low + self.margin <= value <= high - self.margin:
-                kept = f' less {np.rad2deg(self.margin):.2f} deg' if self.margin else ''
-                return (
-                    f'{name} at {np.rad2deg(value):.2f} deg is outside its limits '
-                    f'[{np.rad2deg(low):.2f}, {np.rad2deg(high):.2f}] deg{kept}'
-                )
-        return ''
+        """Return which joint of `q` (rad or m, (k,)) lies outside, as text; '' if none does."""
+        bad = ~((self.lower + self.margins <= q) & (q <= self.upper - self.margins))
+        if not np.any(bad):
+            return ''
+        joint, units = int(np.argmax(bad)), self.units
+        margin = float(np.broadcast_to(self.margins, bad.shape)[joint])
+        kept = f' less {units.in_degrees(joint, margin)}' if margin else ''
+        return (
+            f'{self.names[joint]} at {units.in_degrees(joint, q[joint])} is outside its limits '
+            f'{self.shown(joint, self.lower[joint], self.upper[joint])}{kept}'
+        )

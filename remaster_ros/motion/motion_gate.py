@@ -29,8 +29,11 @@ from remaster_ros.motion.trajectory import (
 )
 from remaster_ros.types import BoolArray, FloatArray
 
+# Of a joint that slides each of these angles is `SerialChain.per_radian` (0.25 m) times as much in
+# m, for the reason in `joint_units`. What the limits state is in each joint's own unit.
 START_RAD = 2e-3
-"""A move begins so near to where the arm stands, rad: the way between is not checked."""
+"""A move begins so near to where the arm stands, rad: the way between is not checked. At the end
+of an arm of a metre that is 2 mm; a slide, 0.5 mm off, has nothing further off than that."""
 SLOW_RAD_S = START_RAD / 0.1
 """An arm that is no faster has hardly moved when it begins, rad/s: a tenth of a second may be
 between a report of it and the command (as much as a busy machine may add to its lag)."""
@@ -41,14 +44,15 @@ BETWEEN = 9
 TOLERANCE = 1e-3
 """Share by which speeds and accelerations may exceed their limits: noise of the present state."""
 SAMPLE_RAD = 0.05
-"""The speed of the fastest point is looked at every so many radians of the fastest joint."""
+"""The speed of the fastest point is looked at every so many radians of the fastest joint, and
+every 12.5 mm of a slide. That speed changes with the directions of the links, so with angles."""
 CUBIC_PEAK, CUBIC_BEND = 1.5, 6.0
 """A cubic from rest to rest over a way d in a time T has at most the speed 1.5 d/T and the
 acceleration 6 d/T²."""
 PROBE_S = 2 * RAMP_S
 """A probe takes so long at least, s."""
 FULL_TURN = 2 * np.pi
-"""Taken for the range of a joint without limits, rad."""
+"""Taken for the range of a joint without limits, rad. One that slides has limits in every URDF."""
 WAY_OUT_SPEED = 0.1
 """Share of the joint speeds on a way out of a contact or a margin."""
 WAY_OUT_TOOL_SPEED = 0.05
@@ -106,7 +110,7 @@ class MotionGate:
         path
             The path.
         q
-            Where the arm stands, rad, (k,).
+            Where the arm stands, rad or m, (k,).
 
         Raises
         ------
@@ -114,10 +118,11 @@ class MotionGate:
             With the limit, the value and the joint.
         """
         limits = _way_out_limits(self.limits) if path.way_out else self.limits
+        off = path.points[0] - q
         try:
-            if not np.max(np.abs(path.points[0] - q)) <= START_RAD:
-                off = float(np.max(np.abs(path.points[0] - q)))
-                raise StartMovedError(f'the arm stands {off:.4f} rad from the start of the path')
+            if not limits.units.largest(off) <= START_RAD:
+                text = limits.units.in_radians(off, 4)
+                raise StartMovedError(f'the arm stands {text} from the start of the path')
             trajectory = plan_trajectory(limits, path.points, path.peaks_m)
             waypoints = trajectory.waypoints()
             self._check(waypoints, q, path, limits)
@@ -134,14 +139,15 @@ class MotionGate:
         time that from anywhere within the limits of the doubtful joints no speed and no
         acceleration is above its limit.
 
-        ``path``: from `q` to a place next to it; ``q``: where the arm is reported, rad, (k,);
+        ``path``: from `q` to a place next to it; ``q``: where the arm is reported, rad or m, (k,);
         ``doubtful``: which joints may be elsewhere, (k,).
         Raises MotionRefusedError: as of `admit`.
         """
         limits = self.limits
         farthest = np.maximum(q - limits.lower, limits.upper - q)
         farthest = np.where(np.isfinite(farthest), farthest, FULL_TURN)
-        way = np.where(doubtful, np.maximum(farthest, START_RAD), START_RAD)
+        near = START_RAD * limits.units.per_radian
+        way = np.where(doubtful, np.maximum(farthest, near), near)
         times = [
             PROBE_S,
             *(CUBIC_PEAK * way / limits.velocity),
@@ -192,8 +198,9 @@ class MotionGate:
         self, waypoints: Sequence[Waypoint], q: FloatArray, path: FreePath, limits: MotionLimits
     ) -> None:
         """Look at each cubic from the present state on."""
-        low = np.minimum(limits.lower + limits.margin, q)
-        high = np.maximum(limits.upper - limits.margin, q)
+        units = limits.units
+        low = np.minimum(limits.lower + limits.margins, q)
+        high = np.maximum(limits.upper - limits.margins, q)
         points = [Waypoint(0.0, q, np.zeros_like(q)), *waypoints]
         if np.any(points[-1].velocity != 0.0):
             raise MotionRefusedError('the move does not end at rest')
@@ -202,26 +209,29 @@ class MotionGate:
             if not piece.duration_s > 0.0 or not np.all(np.isfinite(piece.coefficients)):
                 raise MotionRefusedError('the times of the move do not increase')
             _check_range(*piece.range(), low, high, limits)
-            _check_rate('speed', piece.largest_speed(), limits.velocity, 'rad/s', limits)
+            _check_rate('speed', piece.largest_speed(), limits.velocity, 's', limits)
             largest = piece.largest_acceleration()
-            _check_rate('acceleration', largest, limits.acceleration, 'rad/s2', limits)
+            _check_rate('acceleration', largest, limits.acceleration, 's2', limits)
             self._check_point_speed(piece, limits)
-            off = path.distance(after.q)
-            if not off <= ON_PATH_RAD:
-                raise MotionRefusedError(f'a waypoint lies {off:.6f} rad off the path found free')
+            off = path.off(after.q, units)
+            if not units.largest(off) <= ON_PATH_RAD:
+                text = units.in_radians(off, 6)
+                raise MotionRefusedError(f'a waypoint lies {text} off the path found free')
             # What the arm stands off the start of the path is lost on the first piece.
             allowed = START_RAD * np.sqrt(len(q)) if before is points[0] else 0.0
             between = np.linspace(0.0, piece.duration_s, BETWEEN)
-            off = max(path.distance(place) for place in piece.at(between))
-            if not off <= allowed + ON_PATH_RAD:
+            off = max((path.off(place, units) for place in piece.at(between)), key=units.largest)
+            if not units.largest(off) <= allowed + ON_PATH_RAD:
+                text = units.in_radians(off, 6)
                 raise MotionRefusedError(
-                    f'the move leaves the path found free by {off:.6f} rad between two waypoints'
+                    f'the move leaves the path found free by {text} between two waypoints'
                 )
 
     def _check_point_speed(self, piece: Cubic, limits: MotionLimits) -> None:
         if self._speeds is None or not np.isfinite(limits.tool_speed):
             return
-        count = 5 + int(np.max(np.abs(piece.at(piece.duration_s) - piece.at(0.0))) / SAMPLE_RAD)
+        way = piece.at(piece.duration_s) - piece.at(0.0)
+        count = 5 + int(limits.units.largest(way) / SAMPLE_RAD)
         times = np.linspace(0.0, piece.duration_s, count)
         fastest = float(np.max(self._speeds.fastest(piece.at(times), piece.velocity(times))))
         if not fastest <= limits.tool_speed * (1.0 + TOLERANCE):
@@ -262,7 +272,7 @@ class ForeignGate:
         waypoints
             At times that ascend; none for a controller that is to hold the arm.
         q, velocity
-            Where the arm is, rad and rad/s, (k,); no velocity at all where it stands.
+            Where the arm is, rad or m, and how fast, (k,); no velocity at all where it stands.
         is_straight
             Whether the controller is given no velocities.
 
@@ -297,19 +307,19 @@ class ForeignGate:
         least, most = pieces.range()
         _check_range(least.min(axis=0), most.max(axis=0), low, high, limits)
         largest = pieces.largest_speed().max(axis=0)
-        _check_rate('speed', largest, limits.velocity, 'rad/s', limits)
+        _check_rate('speed', largest, limits.velocity, 's', limits)
         largest = pieces.largest_acceleration().max(axis=0)
-        _check_rate('acceleration', largest, limits.acceleration, 'rad/s2', limits)
+        _check_rate('acceleration', largest, limits.acceleration, 's2', limits)
         return Admitted(tuple(waypoints), None, is_straight)
 
     def _check_start(self, first: Waypoint, q: FloatArray, velocity: FloatArray) -> None:
         """Look whether the controller could begin there at once: it would jump there."""
-        off = np.abs(first.q - q)
-        if not np.max(off) <= START_RAD:
-            joint = int(np.argmax(off))
-            name, deg = self.limits.names[joint], float(np.rad2deg(off[joint]))
-            raise StartMovedError(f'it begins {deg:.2f} deg from where {name} is')
-        if not np.all(np.abs(velocity) <= SLOW_RAD_S):
+        off, units = np.abs(first.q - q), self.limits.units
+        if not units.largest(off) <= START_RAD:
+            joint = units.farthest(off)
+            text = units.in_degrees(joint, float(off[joint]))
+            raise StartMovedError(f'it begins {text} from where {self.limits.names[joint]} is')
+        if not units.largest(velocity) <= SLOW_RAD_S:
             raise StartMovedError('it begins at once while the arm moves')
 
 
@@ -330,20 +340,21 @@ def _check_range(
         joint = int(np.argmax(bad))
         value = least[joint] if least[joint] < low[joint] else most[joint]
         raise MotionRefusedError(
-            f'{limits.names[joint]} would go to {np.rad2deg(value):.2f} deg; its limits less the '
-            f'margin are [{np.rad2deg(low[joint]):.2f}, {np.rad2deg(high[joint]):.2f}] deg'
+            f'{limits.names[joint]} would go to {limits.units.in_degrees(joint, value)}; its '
+            f'limits less the margin are {limits.shown(joint, low[joint], high[joint])}'
         )
 
 
 def _check_rate(
-    what: str, largest: FloatArray, allowed: FloatArray, unit: str, limits: MotionLimits
+    what: str, largest: FloatArray, allowed: FloatArray, per: str, limits: MotionLimits
 ) -> None:
     bad = ~(largest <= allowed * (1.0 + TOLERANCE))
     if np.any(bad):
         joint = int(np.argmax(largest / allowed))
+        value, unit = limits.units.rate(joint, largest[joint], per)
+        most, _ = limits.units.rate(joint, allowed[joint], per)
         raise MotionRefusedError(
-            f'{limits.names[joint]} would have a {what} of {largest[joint]:.3f} {unit}; '
-            f'{allowed[joint]:.3f} are allowed'
+            f'{limits.names[joint]} would have a {what} of {value} {unit}; {most} are allowed'
         )
 
 
@@ -378,17 +389,17 @@ class Cubic:
         return cls(duration_s, np.array([q, velocity, second, third]))
 
     def at(self, time_s: float | FloatArray) -> FloatArray:
-        """Return positions, rad, (k,) or (n, k) for times (n,)."""
+        """Return positions, rad or m, (k,) or (n, k) for times (n,)."""
         powers = np.power.outer(time_s, np.arange(4))
         return powers @ self.coefficients
 
     def velocity(self, time_s: float | FloatArray) -> FloatArray:
-        """Return velocities, rad/s, (k,) or (n, k)."""
+        """Return velocities, rad/s or m/s, (k,) or (n, k)."""
         powers = np.power.outer(time_s, np.arange(3))
         return powers @ (self.coefficients[1:] * np.array([[1.0], [2.0], [3.0]]))
 
     def range(self) -> tuple[FloatArray, FloatArray]:
-        """Return the smallest and the largest position of each joint, rad, (k,) or (n, k) each."""
+        """Return the smallest and the largest position of each joint, (k,) or (n, k) each."""
         _, velocity, second, third = self.coefficients
         # Where the velocity v + 2 c t + 3 d t^2 is zero, and at both ends.
         root = np.sqrt(np.maximum(second**2 - 3 * third * velocity, 0.0))
@@ -404,7 +415,7 @@ class Cubic:
         return np.min(values, axis=0), np.max(values, axis=0)
 
     def largest_speed(self) -> FloatArray:
-        """Return the largest absolute velocity of each joint, rad/s, (k,) or (n, k)."""
+        """Return the largest absolute velocity of each joint, its unit/s, (k,) or (n, k)."""
         _, velocity, second, third = self.coefficients
         with np.errstate(divide='ignore', invalid='ignore'):
             middle = np.nan_to_num(-second / (3 * third))
@@ -413,7 +424,7 @@ class Cubic:
         return np.max(np.abs(velocity + 2 * second * times + 3 * third * times**2), axis=0)
 
     def largest_acceleration(self) -> FloatArray:
-        """Return the largest absolute acceleration of each joint, rad/s², (k,) or (n, k)."""
+        """Return the largest absolute acceleration of each joint, its unit/s², (k,) or (n, k)."""
         _, _, second, third = self.coefficients
         ends = np.array([2 * second, 2 * second + 6 * third * self.duration_s])
         return np.max(np.abs(ends), axis=0)

@@ -16,6 +16,7 @@ from remaster_ros.motion.following import (
     Seen,
     allowed_lag_s,
 )
+from remaster_ros.motion.joint_units import TURNING, JointUnits
 from remaster_ros.motion.motion_gate import MotionGate
 from remaster_ros.motion.move_queue import PROBE
 from remaster_ros.motion.path_check import FreePath
@@ -26,7 +27,7 @@ from remaster_ros.types import BoolArray, FloatArray
 PROBE_WAIT_S = 0.5
 """After its end a robot that copies commands has copied this one, s."""
 MOVED_RAD = 0.02
-"""An arm at rest that has moved by so much was not moved by a command, rad."""
+"""An arm at rest that has moved by so much was not moved by a command, rad; a slide by 5 mm."""
 ELSEWHERE = 'an emergency stop, or an arm less precise than arrive_tolerance?'
 
 Outcome = tuple[Literal['', 'over', 'settled', 'failed', 'halted'], str]
@@ -71,11 +72,13 @@ class Visit:
         if not self.following.reacted:
             # On a simulated clock that runs fast its time is over before a command is seen.
             return UNDER_WAY
-        distance = float(np.max(np.abs(seen.q - trajectory.end)))
+        off = seen.q - trajectory.end
         stood_s = min(seen.time - seen.stands_since, elapsed - trajectory.duration_s)
-        if distance > rules.settle.arrive_tolerance and stood_s >= rules.stall_s:
+        is_there = rules.units.largest(off) <= rules.settle.arrive_tolerance
+        if not is_there and stood_s >= rules.stall_s:
             # However near: an emergency stop in the last moment of a move looks like this.
-            return 'halted', f'the robot stands {distance:.4f} rad from its target: {ELSEWHERE}'
+            text = rules.units.in_radians(off, 4)
+            return 'halted', f'the robot stands {text} from its target: {ELSEWHERE}'
         if seen.time > self.deadline:
             return 'failed', 'did not come to rest at its target in time'
         return UNDER_WAY
@@ -89,11 +92,11 @@ class Visit:
 
     def judge_settled(self, seen: Seen, *, recorder_waits: bool) -> Outcome:
         """Return the outcome for an arm that must stand until the recorder answers."""
-        moved = float(np.max(np.abs(seen.q - self.trajectory.end)))
-        if moved > MOVED_RAD:
-            return 'halted', (
-                f'the arm was moved by {np.rad2deg(moved):.1f} deg, and not by a command'
-            )
+        moved, units = np.abs(seen.q - self.trajectory.end), self.rules.units
+        if units.largest(moved) > MOVED_RAD:
+            joint = units.farthest(moved)
+            text = units.in_degrees(joint, float(moved[joint]), 1)
+            return 'halted', f'the arm was moved by {text}, and not by a command'
         if recorder_waits:
             self.deadline = seen.time + self.rules.answer_timeout_s
         elif seen.time > self.deadline:
@@ -105,7 +108,7 @@ class Visit:
 class Braking:
     """A stop under way."""
 
-    end: FloatArray  # Where it leads, rad, (k,)
+    end: FloatArray  # Where it leads, rad or m, (k,)
     # Robot time at which the arm has begun it, however late it reacts, s. Before that an arm may
     # stand where its move ended.
     begins: float
@@ -113,11 +116,13 @@ class Braking:
     deadline: float  # Robot time until which it must stand there, s
     near: float  # How far from the end it may stand: what this arm was seen to stand off, rad
     patience_s: float  # `ASTRAY_S`, s of robot time
+    units: JointUnits = TURNING
 
     def judge(self, seen: Seen) -> Outcome:
         """Return whether the arm has come to rest where its stop ends, by a report."""
-        stands, off = seen.stands(seen.wall), float(np.max(np.abs(seen.q - self.end)))
-        elsewhere = f'the arm stands {off:.4f} rad from where its stop led: an emergency stop?'
+        stands, way = seen.stands(seen.wall), seen.q - self.end
+        off, text = self.units.largest(way), self.units.in_radians(way, 4)
+        elsewhere = f'the arm stands {text} from where its stop led: an emergency stop?'
         if seen.time < self.over:
             stood_s = seen.time - max(seen.stands_since, self.begins)
             # Nearer to its end it comes to rest.
@@ -142,8 +147,8 @@ class MotionUnderWay:
     """What the arm does by the last command.
 
     ``gate``: every command comes from it; ``end``: where the last command led that was sent before
-    this process was started, rad, (k,); None where that is not known.
-    Attributes: ``end``: where the last command led, rad, (k,); ``visit``: the configuration under
+    this process was started, rad or m, (k,); None where that is not known.
+    Attributes: ``end``: where the last command led, (k,); ``visit``: the configuration under
     way, to its end; None where none is; ``braking``: the stop under way, until the arm stands.
     """
 
@@ -248,7 +253,8 @@ class MotionUnderWay:
         begins = seen.now(wall_s, rate) + allowed_lag_s(self.rules, rate)
         over, patience_s = begins + stop.time_s, ASTRAY_S * max(rate, 1.0)
         deadline = over + max(STOPPED_S, patience_s)
-        self.braking = Braking(stop.q, begins, over, deadline, self.near, patience_s)
+        units = self.rules.units
+        self.braking = Braking(stop.q, begins, over, deadline, self.near, patience_s, units)
         self._lead_to(stop.q)
         return [Stop(admitted, reason, wall_s)]
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -19,7 +19,8 @@ WAY_OUT = -2
 STANDING = -3
 """The number of a question about where the arm stands, before it is moved at all."""
 PROBE_RAD = 1e-6
-"""How far the probe goes, rad: less than the arm repeats, more than the last bit."""
+"""How far the probe goes, rad, a slide a quarter of a micrometre: less than the arm repeats, more
+than the last bit."""
 NO_WAYPOINTS: Mapping[int, FloatArray] = {}
 NO_REFUSALS: Mapping[int, str] = {}
 
@@ -67,7 +68,7 @@ class MoveQueue:
 
     @property
     def target(self) -> FloatArray | None:
-        """The next configuration, rad, (k,); None where none is left."""
+        """The next configuration, rad or m, (k,); None where none is left."""
         return self._solutions[self.next] if self.next < len(self._solutions) else None
 
     @property
@@ -82,17 +83,17 @@ class MoveQueue:
         return self.must_probe and (has_move or self.way_out is not None)
 
     def ask(self, solution: int, start: FloatArray, target: FloatArray) -> CheckPath:
-        """Return the question whether the way to a solution is free, rad, (k,) each."""
+        """Return the question whether the way to a solution is free, (k,) each."""
         self._requests += 1
         self.pending = self._requests, solution
         none = np.empty((0, len(target)))
         return CheckPath(self._requests, start, target, self._waypoints.get(solution, none))
 
-    def offer(self, answer: PathAnswer, names: Sequence[str]) -> str:
+    def offer(self, answer: PathAnswer, limits: MotionLimits) -> str:
         """Keep a way out for the person who clears the halt; return what to tell that person.
 
         ``answer``: that the arm stands where it must not, and the way out, if one is known;
-        ``names``: of the joints.
+        ``limits``: of the arm, for the names and the units of its joints.
         """
         self._offered = answer.way_out
         stands = f'the arm stands where it must not: {answer.why}'
@@ -100,7 +101,9 @@ class MoveQueue:
             return f'{stands}; no way out is known: move it by hand, then /remaster/clear_halt'
         way = np.max(np.abs(np.diff(answer.way_out.points, axis=0)), axis=0)
         joints = ', '.join(
-            f'{name} by {np.rad2deg(angle):.1f} deg' for name, angle in zip(names, way) if angle
+            f'{name} by {limits.units.in_degrees(joint, way[joint], 1)}'
+            for joint, name in enumerate(limits.names)
+            if way[joint]
         )
         return (
             f'{stands}; /remaster/clear_halt and /remaster/collect let it leave slowly '
@@ -109,9 +112,10 @@ class MoveQueue:
 
 
 def probe_path(q: FloatArray, limits: MotionLimits) -> FreePath:
-    """Return the way to a place a microradian from `q`, where the arm stands (rad, (k,)).
+    """Return the way to a place `PROBE_RAD` from `q`, where the arm stands (rad or m, (k,)).
 
     A measurement does not agree with it to the last bit.
     """
     low, high = np.clip((limits.lower, limits.upper), -1e3, 1e3)
-    return FreePath(np.array([q, q + np.where(2 * q > low + high, -PROBE_RAD, PROBE_RAD)]))
+    step = PROBE_RAD * limits.units.per_radian
+    return FreePath(np.array([q, q + np.where(2 * q > low + high, -step, step)]))

@@ -13,6 +13,7 @@ import numpy as np
 
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.transforms import with_z_along
+from remaster_ros.motion.joint_units import JointUnits
 from remaster_ros.types import FloatArray
 
 PEAK_STEP_RAD = 0.02
@@ -121,16 +122,18 @@ def _velocities(points: FloatArray) -> FloatArray:
 class FreePath:
     """A polyline in joint space that was found free."""
 
-    points: FloatArray  # From where the arm stands to the target, rad, (n, k)
+    points: FloatArray  # From where the arm stands to the target, rad or m, (n, k)
     # For each line the peak speed of the fastest point where it takes a second, m/s, (n - 1,);
     # none where no such limit is kept
     peaks_m: tuple[float, ...] = ()
     way_out: bool = False  # It leads out of a contact or a margin, and is gone slowly
 
-    def distance(self, q: FloatArray) -> float:
-        """Return how far a configuration (rad, (k,)) lies off the polyline, rad."""
-        starts, ways = self.points[:-1], np.diff(self.points, axis=0)
+    def off(self, q: FloatArray, units: JointUnits) -> FloatArray:
+        """Return the way to a configuration (rad or m, (k,)) from the nearest of the polyline."""
+        points = self.points / units.per_radian
+        starts, ways, here = points[:-1], np.diff(points, axis=0), q / units.per_radian
         lengths = np.sum(ways**2, axis=1)
-        shares = np.sum((q - starts) * ways, axis=1) / np.where(lengths > 0.0, lengths, 1.0)
-        nearest = starts + np.clip(shares, 0.0, 1.0)[:, None] * ways
-        return float(np.min(np.max(np.abs(nearest - q), axis=1)))
+        shares = np.sum((here - starts) * ways, axis=1) / np.where(lengths > 0.0, lengths, 1.0)
+        off = here - (starts + np.clip(shares, 0.0, 1.0)[:, None] * ways)
+        nearest = off[int(np.argmin(np.max(np.abs(off), axis=1)))]
+        return np.asarray(nearest * units.per_radian)

@@ -7,6 +7,7 @@ from typing import Literal
 
 import numpy as np
 
+from remaster_ros.motion.joint_units import TURNING, JointUnits
 from remaster_ros.types import FloatArray
 
 SettleState = Literal['moving', 'elsewhere', 'settling', 'settled']
@@ -14,7 +15,11 @@ SettleState = Literal['moving', 'elsewhere', 'settling', 'settled']
 
 @dataclass(frozen=True)
 class SettleRules:
-    """What counts as arrived and as still."""
+    """What counts as arrived and as still.
+
+    Of a joint that slides the tolerances are 0.25 m times as much (`JointUnits`), by default 0.5
+    and 0.05 mm: as near as that at which a joint that turns has a point 0.25 m from its axis.
+    """
 
     # How long the arm must have stood still, s (3 s in Van Wyk et al., section III-A)
     settle_s: float = 3.0
@@ -23,11 +28,12 @@ class SettleRules:
     still_tolerance: float = 2e-4
     # A longer gap in joint_states starts the waiting again: the arm was not observed then, s
     max_gap_s: float = 0.5
+    units: JointUnits = TURNING
 
 
 @dataclass(frozen=True)
 class _Standstill:
-    """Reports between which no joint moved: first and last stamp (s), range and sum (rad)."""
+    """Reports between which no joint moved: first and last stamp (s), range and sum."""
 
     since: float
     last: float
@@ -44,7 +50,7 @@ class SettleDetector:
     ``still_tolerance``; it has *settled* when that has lasted ``settle_s`` at the target.
     A slow drift breaks the spread and starts the waiting anew, unlike a velocity threshold.
 
-    ``target``: commanded joint positions, rad, shape (k,).
+    ``target``: commanded joint positions, rad or m, shape (k,).
     """
 
     def __init__(self, target: FloatArray, rules: SettleRules) -> None:
@@ -55,14 +61,14 @@ class SettleDetector:
         """Take one report and return the state.
 
         ``stamp``: time of the report, s; ``q``: reported joint positions in the order of the
-        target, rad, (k,).
+        target, rad or m, (k,).
         """
         if not np.all(np.isfinite(q)):
             self._still = None
             return 'moving'
         still = self._still = self._goes_on(stamp, q) or _Standstill(stamp, stamp, q, q, q, 1)
         waited = stamp - still.since >= self.rules.settle_s
-        if np.max(np.abs(q - self.target)) > self.rules.arrive_tolerance:
+        if self.rules.units.largest(q - self.target) > self.rules.arrive_tolerance:
             return 'elsewhere' if waited else 'moving'
         return 'settled' if waited else 'settling'
 
@@ -72,7 +78,7 @@ class SettleDetector:
         if still is None or not 0.0 <= stamp - still.last <= self.rules.max_gap_s:
             return None
         low, high = np.minimum(still.low, q), np.maximum(still.high, q)
-        if np.any(high - low > self.rules.still_tolerance):
+        if self.rules.units.largest(high - low) > self.rules.still_tolerance:
             return None
         return _Standstill(still.since, stamp, low, high, still.total + q, still.count + 1)
 
@@ -86,10 +92,10 @@ class SettleDetector:
         """Largest distance of a report from the target since the arm stands still, rad."""
         assert self._still is not None
         ends = np.array([self._still.low, self._still.high])
-        return float(np.max(np.abs(ends - self.target)))
+        return self.rules.units.largest(ends - self.target)
 
     @property
     def mean(self) -> FloatArray:
-        """Mean reported position since the arm stands still, rad, (k,)."""
+        """Mean reported position since the arm stands still, rad or m, (k,)."""
         assert self._still is not None
         return self._still.total / self._still.count

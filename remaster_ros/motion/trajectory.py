@@ -13,6 +13,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from remaster_ros.motion.joint_units import TURNING, JointUnits
 from remaster_ros.motion.limits import MotionLimits
 from remaster_ros.types import FloatArray
 
@@ -33,7 +34,7 @@ NO_CRUISE = 1.0 - 2.0**-20
 
 @dataclass(frozen=True)
 class Waypoint:
-    """A point of a trajectory: time from its start (s), positions (rad), velocities (rad/s)."""
+    """A point of a trajectory: time from its start (s), positions, velocities (per s)."""
 
     time_s: float
     q: FloatArray
@@ -44,7 +45,7 @@ class Waypoint:
 class Line:
     """A straight line in joint space: ramp up, cruise, ramp down; all joints arrive together."""
 
-    # Joint positions at rest, rad, (k,)
+    # Joint positions at rest, rad or m, (k,)
     start: FloatArray
     end: FloatArray
     rate: float  # Share of the way per second while cruising, 1/s; at most 1/`RAMP_S`
@@ -113,11 +114,12 @@ class Line:
             return self.duration_s - float(np.sqrt(2 * RAMP_S * (1.0 - share) / self.rate))
         return 0.5 * RAMP_S + share / self.rate
 
-    def project(self, q: FloatArray) -> tuple[float, float]:
-        """Return the share of the way nearest to `q` (rad, (k,)), and how far `q` is off, rad."""
-        length = float(self.way @ self.way)
-        share = float(np.clip(self.way @ (q - self.start) / length, 0.0, 1.0)) if length else 1.0
-        return share, float(np.max(np.abs(q - self.start - share * self.way)))
+    def project(self, q: FloatArray, units: JointUnits = TURNING) -> tuple[float, float]:
+        """Return the share of the way nearest to `q` (k,), and how far `q` is off, rad."""
+        way, gone = self.way / units.per_radian, (q - self.start) / units.per_radian
+        length = float(way @ way)
+        share = float(np.clip(way @ gone / length, 0.0, 1.0)) if length else 1.0
+        return share, float(np.max(np.abs(gone - share * way)))
 
 
 def _ramp(time_s: float) -> tuple[float, float]:

@@ -1,5 +1,7 @@
 """The supervisor with an arm in stepped time: a servo that lags and overshoots behind cubics."""
 
+import dataclasses
+
 import numpy as np
 
 from remaster_ros.motion.actions import (
@@ -13,6 +15,7 @@ from remaster_ros.motion.actions import (
 )
 from remaster_ros.motion.arm_supervisor import ArmSupervisor
 from remaster_ros.motion.joint_reports import JointReport, JointReports
+from remaster_ros.motion.joint_units import TURNING
 from remaster_ros.motion.limits import MotionLimits
 from remaster_ros.motion.motion_gate import Cubic, MotionGate
 from remaster_ros.motion.move_queue import PROBE
@@ -39,14 +42,33 @@ class Rig:
 
     `alter` changes what the arm reports, `obey` what becomes of a trajectory, `answer_path` what
     is found out about a path, `delay_s` how long a report takes, `stop_s` a stop to the arm.
+
+    With `units` of joints that slide the supervisor has metres for the radians that the rig and
+    its arm count in, a quarter of them; all of the rig is in radians.
     """
 
-    def __init__(self, rules=RULES, wall_s=1000.0, begun=True, halted='', rate=1.0, end=HOME):
-        gate = MotionGate(LIMITS)
+    def __init__(
+        self,
+        rules=RULES,
+        wall_s=1000.0,
+        begun=True,
+        halted='',
+        rate=1.0,
+        end=HOME,
+        units=TURNING,
+    ):
+        self.unit = unit = units.per_radian
+        ways = {
+            name: getattr(LIMITS, name) * unit
+            for name in ('lower', 'upper', 'velocity', 'acceleration')
+        }
+        limits = dataclasses.replace(LIMITS, units=units, **ways)
+        rules = dataclasses.replace(rules, settle=dataclasses.replace(rules.settle, units=units))
         # The robot itself may be three times as fast.
-        reports = JointReports(LIMITS.lower, LIMITS.upper, 3 * SPEED)
+        reports = JointReports(limits.lower, limits.upper, 3 * SPEED * unit, units)
         # By default it is known from before where the last command led.
-        self.supervisor = ArmSupervisor(gate, reports, rules, halted, end)
+        end = None if end is None else end * unit
+        self.supervisor = ArmSupervisor(MotionGate(limits), reports, rules, halted, end)
         self.t, self.wall = 50.0, wall_s
         self.arm = servo.Motion(self.t, HOME)
         self.rng = np.random.default_rng(2)
@@ -80,15 +102,35 @@ class Rig:
         for action in actions:
             self.actions.append((self.t, action))
             if isinstance(action, CheckPath):
-                answer = self.answer_path(action)
+                answer = self._answered(action)
                 if answer is not None:
                     self.do(self.supervisor.path_found(action.number, answer, self.wall))
             elif isinstance(action, Drive | Stop):
-                points = self.obey(action.admitted.waypoints)
+                points = self.obey(
+                    tuple(
+                        dataclasses.replace(p, q=p.q / self.unit, velocity=p.velocity / self.unit)
+                        for p in action.admitted.waypoints
+                    )
+                )
                 if isinstance(action, Stop) and self.stop_s:
                     self.on_its_way = self.t + self.stop_s, points
                 else:
                     self._command(points)
+
+    def _answered(self, request):
+        """Ask for a path in radians, and give it in the units of the supervisor."""
+        ways = {
+            name: getattr(request, name) / self.unit for name in ('start', 'target', 'waypoints')
+        }
+        answer = self.answer_path(dataclasses.replace(request, **ways))
+        if answer is None:
+            return None
+        paths = {
+            name: dataclasses.replace(path, points=path.points * self.unit)
+            for name in ('path', 'way_out')
+            if (path := getattr(answer, name)) is not None
+        }
+        return dataclasses.replace(answer, **paths)
 
     def _command(self, points):
         if not points:
@@ -122,6 +164,7 @@ class Rig:
         while self.under_way and self.under_way[0][0] <= self.t - self.delay_s + 1e-9:
             stamp, q = self.under_way.pop(0)
             if 'robot' in self.alive and q is not None:
+                q = np.asarray(q) * self.unit
                 self.do(
                     self.supervisor.report(
                         JointReport(stamp + self.stamp_shift, q, self.t, self.wall)
@@ -149,8 +192,9 @@ class Rig:
         assert until is None, f'waited {seconds} s in vain'
 
     def plan(self, *solutions, waypoints=None):
-        targets = np.reshape(np.array(solutions, float), (-1, 2))
-        self.do(self.supervisor.plan(targets, self.wall, waypoints or {}))
+        targets = np.reshape(np.array(solutions, float), (-1, 2)) * self.unit
+        between = {number: way * self.unit for number, way in (waypoints or {}).items()}
+        self.do(self.supervisor.plan(targets, self.wall, between))
 
     def said(self, *kinds):
         return [action for _, action in self.actions if isinstance(action, kinds)]

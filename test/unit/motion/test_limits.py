@@ -29,6 +29,7 @@ CHAIN = Arm(
     upper=np.array([1.0, 2.0, np.inf]),
     velocity_limits=np.array([2.0, 4.0, np.inf]),
     per_radian=np.ones(3),
+    slides=np.zeros(3, bool),
 )
 
 
@@ -46,8 +47,12 @@ def test_the_limits_of_a_chain_and_a_share_of_its_speed():
 
 
 def test_what_is_unknown_of_a_joint_that_slides_is_a_quarter_of_a_metre_for_a_radian():
-    rail = Arm(**{**vars(CHAIN), 'per_radian': np.array([0.25, 1.0, 0.25])})
-    limits = MotionLimits.of(rail, 0.5)
+    slides = np.array([True, False, True])
+    per_radian = np.where(slides, 0.25, 1.0)
+    rail = Arm(**{**vars(CHAIN), 'per_radian': per_radian, 'slides': slides})
+    limits = MotionLimits.of(rail, 0.5, margin=0.02)
+    assert limits.units.slides == (True, False, True)
+    np.testing.assert_allclose(limits.margins, [0.005, 0.02, 0.005])
     # What the model states is in m/s and stays.
     np.testing.assert_allclose(limits.velocity, [1.0, 2.0, 0.125])
     np.testing.assert_allclose(limits.acceleration, [1.25, 5.0, 1.25])

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from remaster_ros.kinematics.serial_chain import SerialChain
+from remaster_ros.motion.joint_units import TURNING, JointUnits
 from remaster_ros.motion.path_check import PEAK_STEP_RAD, FreePath, PointSpeeds
 
 pin = pytest.importorskip('pinocchio', reason='a judge: pip install .[test]')
@@ -156,10 +157,19 @@ def test_the_peaks_of_a_polyline_are_those_of_its_lines(arm):
 )
 def test_the_distance_from_a_polyline(q, distance):
     free = FreePath(np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 2.0]]))
-    np.testing.assert_equal(free.distance(np.array(q)), distance)
+    np.testing.assert_equal(TURNING.largest(free.off(np.array(q), TURNING)), distance)
 
 
 def test_the_distance_from_a_path_of_no_length():
     free = FreePath(np.array([[1.0, 1.0], [1.0, 1.0]]))
-    assert free.distance(np.array([1.0, 1.5])) == 0.5
-    assert free.distance(np.array([1.0, 1.0])) == 0.0
+    np.testing.assert_array_equal(free.off(np.array([1.0, 1.5]), TURNING), [0.0, 0.5])
+    np.testing.assert_array_equal(free.off(np.array([1.0, 1.0]), TURNING), [0.0, 0.0])
+
+
+def test_the_nearest_place_of_a_path_is_nearest_for_joints_of_both_kinds():
+    """A quarter of a metre of a slide is as far as a radian: the corner is cut evenly."""
+    free = FreePath(np.array([[0.0, 0.0], [0.25, 1.0]]))
+    units = JointUnits((True, False))
+    off = free.off(np.array([0.25, 0.0]), units)
+    np.testing.assert_allclose(off, [0.125, -0.5])
+    assert units.largest(off) == 0.5

@@ -1,0 +1,73 @@
+"""The units of joints: rad of those that turn, m of those that slide.
+
+Tolerances and steps of motion are stated as angles. An angle moves what is at a distance from its
+axis by the angle times the distance; a slide moves all that it carries by its own way. So a joint
+that slides has `LEVER_M` (0.25 m) times as much in m, `SerialChain.per_radian`. That distance is
+on the short side of an arm's reach: a slide may be off by less than a joint that turns may bring
+the tool to be, and what is done at every so many radians is done as often for it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from remaster_ros.kinematics.serial_chain import LEVER_M, SerialChain
+from remaster_ros.types import FloatArray
+
+
+@dataclass(frozen=True)
+class JointUnits:
+    """Which joints of an arm slide, and how far each is off."""
+
+    slides: tuple[bool, ...] = ()  # Base to tip; empty where all joints turn
+
+    @classmethod
+    def of(cls, chain: SerialChain) -> JointUnits:
+        """Return those of an arm."""
+        return cls(tuple(chain.slides.tolist()) if chain.slides.any() else ())
+
+    @cached_property
+    def per_radian(self) -> FloatArray:
+        """How much of each joint's own unit counts as a radian, (k,); (1,) where all turn."""
+        return np.where(self.slides, LEVER_M, 1.0) if self.slides else np.ones(1)
+
+    def slide(self, joint: int) -> bool:
+        """Tell whether a joint slides."""
+        return bool(self.slides) and self.slides[joint]
+
+    def largest(self, ways: FloatArray) -> float:
+        """Return the largest of ways (..., k), as an angle, rad."""
+        return float(np.max(np.abs(ways) / self.per_radian))
+
+    def farthest(self, way: FloatArray) -> int:
+        """Return which joint has the largest of a way (k,)."""
+        return int(np.argmax(np.abs(way) / self.per_radian))
+
+    # As people read them
+
+    def in_degrees(self, joint: int, value: float, digits: int = 2, sign: str = '') -> str:
+        """Return a joint's position or way in degrees, or in mm where it slides."""
+        shown, unit = (1e3 * value, 'mm') if self.slide(joint) else (np.rad2deg(value), 'deg')
+        return f'{shown:{sign}.{digits}f} {unit}'
+
+    def in_radians(self, way: FloatArray, digits: int) -> str:
+        """Return the largest of a way (k,) without its sign, in rad or in mm."""
+        joint = self.farthest(way)
+        value = abs(float(way[joint]))
+        if self.slide(joint):
+            # A tenth of a millirad is a fortieth of a millimetre.
+            return f'{1e3 * value:.{digits - 2}f} mm'
+        return f'{value:.{digits}f} rad'
+
+    def rate(self, joint: int, value: float, per: str) -> tuple[str, str]:
+        """Return a joint's speed (`per` s) or acceleration (s2) as a number, and its unit."""
+        if self.slide(joint):
+            return f'{1e3 * value:.1f}', f'mm/{per}'
+        return f'{value:.3f}', f'rad/{per}'
+
+
+TURNING = JointUnits()
+"""Those of an arm whose joints all turn."""
