@@ -63,6 +63,7 @@ class Precision:
     tool: FloatArray | None
     prior: FloatArray  # Information of the priors, (f, f)
     freedom: int  # Numbers measured, less the free parameters
+    per_radian: FloatArray  # Of `SerialChain`, (k,)
 
     @classmethod
     def of(cls, found: Estimate, counting: BoolArray, rng: np.random.Generator) -> Precision:
@@ -94,6 +95,7 @@ class Precision:
             tool,
             found.mode.linearisation.prior[:-1, :-1],
             int(posterior.noise_model.freedom.sum()) - len(free),
+            found.problem.chain.per_radian,
         )
 
     @property
@@ -103,13 +105,16 @@ class Precision:
 
     @property
     def joint_std(self) -> tuple[float | None, ...]:
-        """Standard deviation of each joint's offset, rad, k; None where it is not identifiable."""
+        """Standard deviation of each joint's offset, rad or m, k; None if not identifiable."""
         std = np.sqrt(np.diag(self.covariance))
         return tuple(float(std[i]) if i >= 0 else None for i in self.joints)
 
     @property
     def joint_rms(self) -> float:
-        """Root mean square over the identifiable joints, rad; infinite where there is none."""
+        """Root mean square over the identifiable joints, rad; infinite where there is none.
+
+        That of a joint that slides is divided by `SerialChain.per_radian`.
+        """
         return self._joint_rms(self.covariance)
 
     @property
@@ -118,7 +123,11 @@ class Precision:
         return self._tool_rms(self.covariance)
 
     def _joint_rms(self, covariance: FloatArray) -> float:
-        variances = [covariance[i, i] for i in self.joints if i >= 0]
+        variances = [
+            covariance[i, i] / unit**2
+            for i, unit in zip(self.joints, self.per_radian, strict=True)
+            if i >= 0
+        ]
         return float(np.sqrt(np.mean(variances))) if variances else np.inf
 
     def _tool_rms(self, covariance: FloatArray) -> float:

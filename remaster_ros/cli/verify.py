@@ -16,6 +16,7 @@ from remaster_ros.compensation.file import Compensation, read_compensation
 from remaster_ros.compensation.verification import Estimate, Verdict, Verified, Visits, verify
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.serial_chain import SerialChain
+from remaster_ros.motion.joint_units import TURNING
 from remaster_ros.planning.tour_order import nearest_solution
 from remaster_ros.session.reader import HEADER, ROWS, read_session
 from remaster_ros.types import BoolArray, Correction, FloatArray, IntArray, Session
@@ -90,7 +91,7 @@ def _together(configuration: IntArray, wanted: FloatArray) -> IntArray:
     for one in dict.fromkeys(configuration.tolist()):
         mine = configuration == one
         q = wanted[mine][0]
-        near = nearest_solution(np.array(list(firsts.values())), q) if firsts else None
+        near = nearest_solution(np.array(list(firsts.values())), q, TURNING) if firsts else None
         same = one if near is None else list(firsts)[near]
         found[mine], firsts[same] = same, firsts.get(same, q)
     return found

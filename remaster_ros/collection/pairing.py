@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from remaster_ros.kinematics.transforms import mean_quaternion_xyzw
+from remaster_ros.motion.joint_units import TURNING, JointUnits
 from remaster_ros.types import FloatArray, MarkerReading
 
 # Which frames of a marker that stands still are measurements of it.
@@ -92,7 +93,7 @@ class PairedReading:
     sensor: str
     marker: str
     stamp_s: float  # End of the dwell, or the time of the single shot, s
-    q: FloatArray  # Mean reported joint positions from settling to `stamp_s`, rad, (k,)
+    q: FloatArray  # Mean reported joint positions from settling to `stamp_s`, rad or m, (k,)
     # Mean marker position and sample standard deviation (None for a single shot), m, (3,)
     position: FloatArray
     std: FloatArray | None = None
@@ -130,7 +131,7 @@ class Pairing:
     settled_stamp_s
         When the arm was judged settled, s. Nothing captured before it is ever used.
     q_settled
-        Reported joint positions then, rad, (k,).
+        Reported joint positions then, rad or m, (k,).
     sensors
         The rules, one per sensor.
     motion_tolerance
@@ -138,6 +139,8 @@ class Pairing:
     require
         What the arm waits for: ``all`` sensors, ``any`` of them, or one by its name. A sensor
         that is not required and has no reading by then is left out.
+    units
+        Those of the joints.
     patient
         Whether nothing is late before `end_as_recorded`: how long a sensor was silent is in no
         message.
@@ -160,9 +163,10 @@ class Pairing:
         motion_tolerance: float = 5e-4,
         require: str = 'all',
         *,
+        units: JointUnits = TURNING,
         patient: bool = False,
     ) -> None:
-        self._patient = patient
+        self._units, self._patient = units, patient
         self.settled_stamp_s = settled_stamp_s
         self.q_settled = np.asarray(q_settled, float)
         self.rules = {rules.sensor: rules for rules in sensors}
@@ -413,9 +417,9 @@ class Pairing:
         q = np.array([joints for _, joints in self._joints])
         # The first report at or after the end is part of the proof of stillness, not of the mean.
         until = int(np.searchsorted(stamps, end)) + 1
-        moved = np.max(np.abs(q[:until] - self.q_settled))
-        if not moved <= self.motion_tolerance:
-            detail = f'a joint moved {moved:.2e} rad (allowed {self.motion_tolerance:.1e})'
+        moved = np.max(np.abs(q[:until] - self.q_settled), axis=0)
+        if not self._units.largest(moved) <= self.motion_tolerance:
+            detail = self._moved_text(moved)
             return Rejection(rules.sensor, 'moving', detail)
         gap = float(np.max(np.diff(stamps[:until], prepend=self.settled_stamp_s)))
         if gap > LONGEST_GAP_S:
@@ -447,6 +451,14 @@ class Pairing:
         turn = mean_quaternion_xyzw(turns) if turns else None
         mean, count = positions.mean(axis=0), len(used)
         return PairedReading(rules.sensor, marker, end, q_mean, mean, std, count, turn, dropped)
+
+    def _moved_text(self, moved: FloatArray) -> str:
+        """Return which way of a joint, (k,), is too far."""
+        joint, allowed = self._units.farthest(moved), self.motion_tolerance
+        if self._units.slide(joint):
+            allowed *= self._units.per_radian[joint]
+            return f'a joint moved {1e3 * moved[joint]:.3f} mm (allowed {1e3 * allowed:.3f})'
+        return f'a joint moved {moved[joint]:.2e} rad (allowed {allowed:.1e})'
 
 
 def _seen(readings: list[MarkerReading]) -> list[MarkerReading]:

@@ -31,7 +31,8 @@ MOVED_M = 1e-3
 """A marker that should have moved further than this cannot have the same reading, m."""
 TURNED_RAD = 0.01
 """Nor one of an arm whose joints have turned by more: all solutions of a pose have their marker at
-one place of the model, and none of the real arm at the same one to the last bit."""
+one place of the model, and none of the real arm at the same one to the last bit. A slide by 0.25 m
+for each radian."""
 
 
 class Plausibility:
@@ -113,7 +114,7 @@ class Plausibility:
             if moved > MOVED_M:
                 detail = f'the same to the last bit, though the arm moved it {1e3 * moved:.0f} mm'
                 return Rejection(name, 'frozen', detail)
-            if np.max(np.abs(reading.q - last.q)) > TURNED_RAD:
+            if np.max(np.abs(reading.q - last.q) / self._chain.per_radian) > TURNED_RAD:
                 detail = 'the same to the last bit as at the configuration before'
                 return Rejection(name, 'frozen', detail)
         if T_R_N is not None:

@@ -10,11 +10,10 @@ from collections import Counter, deque
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
-import numpy as np
-
 from remaster_ros.collection.events import ConfigurationEnded, Outcome, PoseAnnounced
 from remaster_ros.collection.pairing import PairedReading, Pairing, Rejection, SensorRules
 from remaster_ros.collection.plausibility import Plausibility
+from remaster_ros.motion.joint_units import TURNING, JointUnits
 from remaster_ros.planning.tour_order import REFERENCE, REGISTRATION, nearest_solution
 from remaster_ros.types import FloatArray, MarkerReading
 
@@ -106,11 +105,13 @@ class Recording:
     rules
         How each sensor is read.
     motion_tolerance
-        Largest joint movement during a reading, rad.
+        Largest joint movement during a reading, rad; of one that slides as `JointUnits` has it.
     require
         ``all``, ``any``, or the name of the sensor that the arm waits for.
     plausibility
         Judges readings by where the robot has the marker.
+    units
+        Those of the arm's joints.
     patient
         Whether the messages are those of a bag; see `Pairing`.
 
@@ -131,9 +132,10 @@ class Recording:
         require: str,
         plausibility: Plausibility,
         *,
+        units: JointUnits = TURNING,
         patient: bool = False,
     ) -> None:
-        self._patient = patient
+        self._units, self._patient = units, patient
         self._rules, self._tolerance, self._require = rules, motion_tolerance, require
         self._plausibility = plausibility
         self.announced: PoseAnnounced | None = None
@@ -222,7 +224,8 @@ class Recording:
         pose = self.pose
         if pose is None or self._solutions is None:
             return False
-        solution = nearest_solution(self._solutions, q if change is None else q - change)
+        wanted = q if change is None else q - change
+        solution = nearest_solution(self._solutions, wanted, self._units)
         if solution is None:
             return False
         self._due.append(SettledArm(q, stamp_s, pose, solution, change))
@@ -236,7 +239,7 @@ class Recording:
             return
         q, settled_s, change = self._unknown
         since = [joints for stamp_s, joints in self._joints if stamp_s > settled_s]
-        stands = all(np.max(np.abs(joints - q)) <= self._tolerance for joints in since)
+        stands = all(self._units.largest(joints - q) <= self._tolerance for joints in since)
         if not stands or self._queue(q, settled_s, change):
             self._unknown = None
 
@@ -261,6 +264,7 @@ class Recording:
             self._rules,
             self._tolerance,
             self._require,
+            units=self._units,
             patient=self._patient,
         )
         for stamp_s, joints in self._joints:

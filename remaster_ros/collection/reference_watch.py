@@ -19,6 +19,7 @@ from remaster_ros.collection.events import SetupChanged
 from remaster_ros.collection.pairing import PairedReading
 from remaster_ros.kinematics import transforms
 from remaster_ros.kinematics.serial_chain import SerialChain
+from remaster_ros.motion.joint_units import JointUnits
 from remaster_ros.planning.reference_choice import Cause, Place, causes
 from remaster_ros.planning.tour_order import nearest_solution
 from remaster_ros.types import FloatArray, IntArray, Session
@@ -96,7 +97,7 @@ class SetupChange:
     subject: str  # For people
     drifts: bool  # Whether it grows with time; else it came at once
     size_m: float  # Largest displacement of a marker at a reference
-    turn_rad: float | None  # Of the sensor, base, tool or joint; None where nothing turns
+    turn_rad: float | None  # Of the sensor, base, tool or joint; None where nothing turns: a slide
     # Configurations that it happened between: the last one that was as at first (None where it was
     # so from the first) and the first one that was not
     after: int | None
@@ -214,7 +215,8 @@ class ReferenceWatch:
     def _key(self, reading: ReferenceReading) -> tuple[int, str]:
         known = None
         if self._references:
-            known = nearest_solution(np.array(self._references), reading.q)
+            units = JointUnits.of(self._chain)
+            known = nearest_solution(np.array(self._references), reading.q, units)
         return len(self._references) if known is None else known, reading.sensor
 
     def end_round(self) -> None:

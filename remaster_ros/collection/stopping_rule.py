@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from itertools import compress
 
 import numpy as np
 
@@ -27,6 +28,7 @@ from remaster_ros.calibration.group_sequential import p_value_limits
 from remaster_ros.calibration.precision import Precision
 from remaster_ros.calibration.residual_structure import StructureTest, residual_structure
 from remaster_ros.errors import InsufficientDataError
+from remaster_ros.kinematics.serial_chain import LEVER_M
 from remaster_ros.planning.expected_sensors import ToolBox
 from remaster_ros.planning.pose_design import Floors
 from remaster_ros.types import IntArray, Priors, Session
@@ -64,7 +66,7 @@ class Look:
     # From the first reading of the session to the last one by then, s; NaN where nothing is known
     # of the times
     elapsed_s: float
-    # Of each joint, rad; None where it is not identifiable. Empty where there is no fit.
+    # Of each joint, rad or m; None where it is not identifiable. Empty where there is no fit.
     joint_std: Mapping[str, float | None] = field(default_factory=dict)
     # As in `StoppingGoal`, rad and m; infinite where unknown
     joint_rms: float = np.inf
@@ -78,6 +80,7 @@ class Look:
     # number does or none is known
     more: int | None = None
     more_s: float = np.nan  # How long they take at the pace so far, s; NaN where unknown
+    sliding: tuple[str, ...] = ()  # The joints that slide
 
 
 @dataclass(frozen=True)
@@ -147,6 +150,7 @@ class StoppingRule:
         if not structure:
             structure = self._structure(found, count)
         lacking = self._lacking(found, precision, structure)
+        chain = found.problem.chain
         more: int | None = None
         if goal.stated:
             times = precision.times_the_data(goal.joint_std_rad, goal.tool_std_m)
@@ -154,7 +158,7 @@ class StoppingRule:
         return Look(
             count,
             elapsed_s,
-            dict(zip(found.problem.chain.joint_names, precision.joint_std, strict=True)),
+            dict(zip(chain.joint_names, precision.joint_std, strict=True)),
             precision.joint_rms,
             precision.tool_rms,
             precision.freedom,
@@ -163,6 +167,7 @@ class StoppingRule:
             lacking,
             more,
             np.nan if more is None else more * pace_s,
+            tuple(compress(chain.joint_names, chain.slides)),
         )
 
     def is_enough(self, look: Look) -> bool:
@@ -171,9 +176,10 @@ class StoppingRule:
 
     def describe(self, look: Look) -> str:
         """Return what a look has found, and what more would cost, for people."""
+        counted = f' ({1e3 * np.radians(LEVER_M):.2f} mm count as one)' * bool(look.sliding)
         known = (
-            f'std of the offsets {np.degrees(look.joint_rms):.4f} deg, error of the predicted '
-            f'markers {look.tool_rms * 1e3:.3f} mm (RMS)'
+            f'std of the offsets {np.degrees(look.joint_rms):.4f} deg{counted}, error of the '
+            f'predicted markers {look.tool_rms * 1e3:.3f} mm (RMS)'
         )
         after = f'after {look.configurations} configurations'
         if look.structure:

@@ -2,7 +2,9 @@
 
 A description on ``/robot_description`` may be written otherwise than the URDF of the cell: made
 from xacro, with other digits or frames of its links, with a gripper behind the tip, on a table.
-What counts is where the axes of the joints lie at zero, and how far and how fast they may turn.
+What counts is where the axes of the joints lie at zero, and how far and how fast they may turn or
+slide. Of a joint that slides the direction alone counts: it carries what is beyond it wherever its
+axis lies.
 """
 
 from __future__ import annotations
@@ -18,7 +20,7 @@ from remaster_ros.types import FloatArray
 PLACE_M = 1e-4
 """Two axes are the same up to this distance, m: descriptions give four digits at least."""
 TURN_RAD = 1e-4
-"""And up to this angle, rad; limits too, in rad and rad/s."""
+"""And up to this angle, rad; limits too, in rad and rad/s, or m and m/s."""
 
 
 def difference(chain: SerialChain, description: str) -> str:
@@ -39,6 +41,9 @@ def difference(chain: SerialChain, description: str) -> str:
     if isinstance(read, str):
         return read
     other, has_base, has_tip = read
+    for i, name in enumerate(chain.joint_names):
+        if chain.slides[i] != other.slides[i]:
+            return f'{name} {"slides" if other.slides[i] else "turns"} there'
     # A place and a direction of each axis.
     (places, own), (others, theirs) = _axes(chain, has_base), _axes(other, has_base)
     apart = places - others
@@ -49,14 +54,16 @@ def difference(chain: SerialChain, description: str) -> str:
             return (
                 f'the axis of {name} is turned there by {_degrees(2 * np.arcsin(turned[i] / 2))}'
             )
-        if far[i] > PLACE_M:
+        if far[i] > PLACE_M and not chain.slides[i]:
             return f'the axis of {name} lies {1e3 * far[i]:.1f} mm elsewhere there'
     for i, name in enumerate(chain.joint_names):
         low, high, fast = other.lower[i], other.upper[i], other.velocity_limits[i]
+        text = _millimetres if chain.slides[i] else _degrees
         if chain.lower[i] < low - TURN_RAD or chain.upper[i] > high + TURN_RAD:
-            return f'{name} may go from {_degrees(low)} to {_degrees(high)} only there'
+            return f'{name} may go from {text(low)} to {text(high)} only there'
         if chain.velocity_limits[i] > fast + TURN_RAD:
-            return f'{name} may turn at {_degrees(fast)}/s only there'
+            verb = 'slide' if chain.slides[i] else 'turn'
+            return f'{name} may {verb} at {text(fast)}/s only there'
     if has_tip:
         T = inverse(_tip(chain, has_base)) @ _tip(other, has_base)
         if np.linalg.norm(T[:3, 3]) > PLACE_M or np.max(np.abs(T[:3, :3] - np.eye(3))) > TURN_RAD:
@@ -89,7 +96,8 @@ def _read(chain: SerialChain, description: str) -> tuple[SerialChain, bool, bool
         # A gripper or a tool changer behind the tip does not matter, nor that there is none.
         last = links[chain.joint_names[-1]]
         has_tip = model.carrier(chain.tip_link, [last])[0] == last
-        other = SerialChain.from_urdf(description, base, chain.tip_link if has_tip else last)
+        tip = chain.tip_link if has_tip else last
+        other = SerialChain.from_urdf(description, base, tip, sliding=True)
     except InputError as error:
         return str(error)
     if other.joint_names != chain.joint_names:
@@ -118,3 +126,7 @@ def _from(chain: SerialChain, base: bool) -> FloatArray:
 
 def _degrees(angle_rad: float) -> str:
     return f'{np.rad2deg(angle_rad):.2f} deg'
+
+
+def _millimetres(way_m: float) -> str:
+    return f'{1e3 * way_m:.2f} mm'

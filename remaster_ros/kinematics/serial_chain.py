@@ -3,8 +3,8 @@
 The true joint angle is the reported one plus the zero-offset, everywhere. All methods take any
 number of leading dimensions in ``q``, ``points`` and ``joint_offsets``, and broadcast them.
 
-A joint that slides (prismatic) has metres where others have radians, in all of these arrays. Much
-of what takes a chain supposes angles (what moves an arm, causes of errors), so
+A joint that slides (prismatic) has metres where others have radians, in all of these arrays. Some
+of what takes a chain supposes angles (causes of errors, their correction), so
 `SerialChain.from_urdf` refuses such a joint unless its caller states that it takes them.
 """
 
@@ -406,8 +406,8 @@ def _require_kind(joint: UrdfJoint, sliding: bool) -> None:
         if not sliding:
             raise InputError(
                 f"URDF: joint '{joint.name}' is prismatic; an arm with a joint that slides can be "
-                'planned, simulated, imported and fitted, no more: this needs joints that turn, '
-                'between other links'
+                'planned, measured by the nodes, simulated, imported and fitted, no more: this '
+                'needs joints that turn, between other links'
             )
     elif joint.kind not in ('revolute', 'continuous'):
         raise InputError(

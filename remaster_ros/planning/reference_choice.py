@@ -84,9 +84,10 @@ def causes(chain: SerialChain, places: Sequence[Place]) -> list[Cause]:
         tool = turned @ rigid(markers_T, on_tool.mean(axis=0))
         found.append(Cause('tool', 'the tool slipped on the flange', tool, 3))
     jacobian = chain.position_jacobian(q, markers_T)
+    # A joint that slides slips by a shift.
     found += [
-        Cause('joint', f'the encoder of {name} slipped', jacobian[:, :, i : i + 1], 0)
-        for i, name in enumerate(chain.joint_names)
+        Cause('joint', f'the encoder of {name} slipped', jacobian[:, :, i : i + 1], int(slides))
+        for i, (name, slides) in enumerate(zip(chain.joint_names, chain.slides, strict=True))
     ]
     return found
 

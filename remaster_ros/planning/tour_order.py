@@ -14,6 +14,7 @@ import numpy as np
 from remaster_ros.kinematics.collision import CollisionModel
 from remaster_ros.kinematics.free_paths import free_path, is_straight_free
 from remaster_ros.kinematics.serial_chain import SerialChain
+from remaster_ros.motion.joint_units import JointUnits
 from remaster_ros.planning.candidates import Plan, order_solutions
 from remaster_ros.types import FloatArray
 
@@ -246,7 +247,7 @@ class Tour:
         goal, before = goals[index], goals[index - 1]
         last = free_way(self._model, before, goal, self.chain.velocity_limits, index)
         if last is not None:
-            if nearest_solution(before[None], q) is not None:
+            if nearest_solution(before[None], q, JointUnits.of(self.chain)) is not None:
                 return last
             first = free_way(self._model, q, before, self.chain.velocity_limits, index)
             if first is not None:
@@ -363,14 +364,14 @@ class Tour:
 
 
 def nearest_solution(
-    solutions: FloatArray, q: FloatArray, tolerance_rad: float = 0.02
+    solutions: FloatArray, q: FloatArray, units: JointUnits, tolerance_rad: float = 0.02
 ) -> int | None:
     """Return which solution (m, k) the arm stands at, rad; None if no joint-wise match is near.
 
     The tolerance is far above what an arm that arrived is off by, and far below what tells two
-    solutions of a pose apart.
+    solutions of a pose apart: ten times what the bridge takes for arrived by default.
     """
-    distance = np.max(np.abs(solutions - q), axis=1)
+    distance = np.max(np.abs(solutions - q) / units.per_radian, axis=1)
     nearest = int(np.argmin(distance))
     return nearest if distance[nearest] <= tolerance_rad else None
 

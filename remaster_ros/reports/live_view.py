@@ -95,7 +95,8 @@ MOST_MESSAGES = 40
 MOST_POINTS = 400
 LONGEST_WAY = 200
 UNDETERMINED_RAD = 0.0873
-"""5 degrees: what the fit assumes of a zero-offset before it has seen anything."""
+"""5 degrees, 22 mm of a slide: what the fit assumes of a zero-offset before it has seen anything.
+"""
 SHOWN_COUNTS = ('phase', 'poses_done', 'poses', 'configurations_done', 'configurations')
 SHOWN_PLAN = ('plan_page', 'plan_shown', 'confirmed')
 _PLAN_NAME = re.compile('[0-9a-f]{8}')
@@ -239,7 +240,7 @@ class LiveView:
             self.registration[sensor] = T_R_N
 
     def take_offsets(self, means: Mapping[str, float], stds: Mapping[str, float]) -> None:
-        """Take the zero-offsets of a fit and their standard deviations, joint -> rad."""
+        """Take the zero-offsets of a fit and their standard deviations, joint -> rad or m."""
         names = self._chain.joint_names
         values = [by_name.get(name, np.nan) for by_name in (means, stds) for name in names]
         if np.all(np.isfinite(values)):
@@ -370,14 +371,24 @@ class LiveView:
     def _result(self) -> dict[str, Any]:
         return {
             'joints': [
-                {
-                    'joint': name,
-                    'mean_deg': _degrees(mean),
-                    'std_deg': None if name in self._fit.unidentifiable else _determined(std),
-                }
-                for name, (mean, std) in self._offsets.items()
+                self._offset_row(joint, name, *self._offsets[name])
+                for joint, name in enumerate(self._chain.joint_names)
+                if name in self._offsets
             ],
             'fit': dict(self._fit.shown),
+        }
+
+    def _offset_row(self, joint: int, name: str, mean: float, std: float) -> dict[str, Any]:
+        """Return an offset and its standard deviation, None as long as nearly nothing is known."""
+        as_angle = std / float(self._chain.per_radian[joint])
+        known = name not in self._fit.unidentifiable and as_angle < UNDETERMINED_RAD
+        if self._chain.slides[joint]:
+            shown = {'unit': 'mm', 'mean_mm': round(1e3 * mean, 6)}
+            return {'joint': name, **shown, 'std_mm': round(1e3 * std, 6) if known else None}
+        return {
+            'joint': name,
+            'mean_deg': _degrees(mean),
+            'std_deg': _degrees(std) if known else None,
         }
 
     def _confirmation(self) -> dict[str, Any] | None:
@@ -434,13 +445,8 @@ def _clip(text: str) -> str:
     return text if len(text) <= LONGEST_TEXT else f'{text[: LONGEST_TEXT - 1]}…'
 
 
-def _determined(std: float | None) -> float | None:
-    """Return a standard deviation in degrees; None as long as nearly nothing is known."""
-    return _degrees(std) if std is not None and std < UNDETERMINED_RAD else None
-
-
-def _degrees(radians: float | None) -> float | None:
-    return None if radians is None else round(float(np.degrees(radians)), 6)
+def _degrees(radians: float) -> float:
+    return round(float(np.degrees(radians)), 6)
 
 
 def _rounded(values: FloatArray | Sequence[float], digits: int) -> Any:

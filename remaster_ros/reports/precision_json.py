@@ -24,6 +24,7 @@ class Known(Struct):
     tool_rms_mm: float | None = None
     degrees_of_freedom: int = 0
     parameters: int = 0
+    joint_std_mm: dict[str, float | None] = {}  # Of joints that slide, which are not in `…_deg`
 
 
 class Precision(Struct):
@@ -66,11 +67,16 @@ def precision_json(rule: StoppingRule, looks: Sequence[Look]) -> str:
             Known(
                 look.configurations,
                 _scaled(look.elapsed_s, 1.0 / 60.0),
-                {name: _scaled(std, np.degrees(1.0)) for name, std in look.joint_std.items()},
+                {
+                    name: _scaled(std, np.degrees(1.0))
+                    for name, std in look.joint_std.items()
+                    if name not in look.sliding
+                },
                 _scaled(look.joint_rms, np.degrees(1.0)),
                 _scaled(look.tool_rms, 1e3),
                 look.freedom,
                 look.parameters,
+                {name: _scaled(look.joint_std.get(name), 1e3) for name in look.sliding},
             )
             for look in looks
         ],

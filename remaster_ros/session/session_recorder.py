@@ -34,6 +34,7 @@ from remaster_ros.collection.plausibility import Plausibility
 from remaster_ros.collection.recording import BY_HAND, EndedReading, Recording
 from remaster_ros.collection.reference_watch import SetupChanges
 from remaster_ros.errors import InputError
+from remaster_ros.motion.joint_units import JointUnits
 from remaster_ros.parameters import SimulationParameters, parameter
 from remaster_ros.planning.tour_order import REFERENCE, REGISTRATION
 from remaster_ros.session.session_journal import SessionJournal
@@ -67,7 +68,11 @@ class Parameters(SimulationParameters):
         0.5e-3, 'largest standard deviation over the dwell', unit='m', low=1e-6, high=0.1
     )
     motion_tolerance: float = parameter(
-        5e-4, 'largest joint movement during a reading', unit='rad', low=1e-7, high=0.01
+        5e-4,
+        'largest joint movement during a reading; of one that slides 0.25 m for each rad',
+        unit='rad',
+        low=1e-7,
+        high=0.01,
     )
     stream_timeout_s: float = parameter(
         3.0, 'how long after the dwell a stream may stay out', unit='s', low=0.1, high=600.0
@@ -120,7 +125,7 @@ def sensor_rules(cell: Workcell, p: Parameters) -> tuple[SensorRules, ...]:
 
 def session_header(cell: Workcell, settle_s: float) -> Session:
     """Return a session of this cell without observations."""
-    chain = cell.chain()
+    chain = cell.chain(sliding=True)
     return Session(
         urdf=cell.urdf_text,
         base_link=chain.base_link,
@@ -217,7 +222,7 @@ class SessionRecorder:
 
     def __init__(self, cell: Workcell, p: Parameters, keeper: Keeper, outlet: Outlet) -> None:
         self.cell, self.keeper, self._outlet = cell, keeper, outlet
-        self.chain = cell.chain()
+        self.chain = cell.chain(sliding=True)
         self._order = JointOrder(self.chain.joint_names)
         self.required = RequiredSensors(cell.sensors, p.require)
         self.counts: Counter[str] = Counter()
@@ -245,6 +250,7 @@ class SessionRecorder:
             p.motion_tolerance,
             p.require,
             Plausibility(self.chain, markers, p.max_deviation_m, cell.marker_std_m),
+            units=JointUnits.of(self.chain),
             patient=self.from_bag,
         )
         self.registration = FirstRegistration(

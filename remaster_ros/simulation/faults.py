@@ -11,7 +11,7 @@ The robot:
 ``dropped``        takes no command
 ``estop``          stands still at once and takes no command
 ``estop_reported`` the same, and its safety circuit reports it
-``elsewhere``      goes so many rad beside its target, at every joint
+``elsewhere``      goes so many rad beside its target, at every joint (a slide 0.25 m for each)
 ``slow``           needs so many times as long
 ``late``           reports what was so many seconds ago
 ``intermittent``   is off every other period of so many seconds

@@ -17,7 +17,8 @@ from remaster_ros.simulation.world import World
 from remaster_ros.types import FloatArray
 
 REPEATABILITY_RAD = 2e-5
-"""Standard deviation with which a joint comes back to a commanded position."""
+"""Standard deviation with which a joint comes back to a commanded position. Here and below a joint
+that slides has `SerialChain.per_radian` (0.25 m) times as much: 5 and 0.5 micrometres."""
 ENCODER_RAD = 2e-6
 """Standard deviation of the noise of a reported joint position."""
 
@@ -69,9 +70,10 @@ class FakeArm:
             return reason
         columns = [list(names).index(name) for name in self.names]
         # The arm does not come back to quite the same place twice.
-        stray = self._rng.normal(0.0, REPEATABILITY_RAD, len(columns))
+        per_radian = self.world.chain.per_radian
+        stray = self._rng.normal(0.0, REPEATABILITY_RAD, len(columns)) * per_radian
         # Faults: beside the target, or slowly.
-        slow, beside = faults.get('slow', 1.0), faults.get('elsewhere', 0.0)
+        slow, beside = faults.get('slow', 1.0), faults.get('elsewhere', 0.0) * per_radian
         waypoints = [
             ServoPoint(
                 slow * point.time_s,
@@ -112,7 +114,7 @@ class FakeArm:
         return None
 
     def joint_state(self) -> tuple[float, list[str], FloatArray, FloatArray] | None:
-        """Report now: time (s), names, positions (rad), velocities (rad/s), in its own order.
+        """Report now: time (s), names, positions, velocities, in its own order.
 
         None where nothing is reported: a robot that is off, or a report that is lost.
         """
@@ -129,11 +131,12 @@ class FakeArm:
             return self._last
         now -= faults.get('late', 0.0)
         q, velocity = self.world.reported(now)
-        q = q + self._rng.normal(0.0, ENCODER_RAD, len(q))
+        per_radian = self.world.chain.per_radian
+        q = q + self._rng.normal(0.0, ENCODER_RAD, len(q)) * per_radian
         if 'copy' in faults and self._commanded is not None and now >= self._commanded[0]:
             q = self._commanded[1]
         if 'drift' in faults:
-            q = q + faults['drift'] * np.arcsin(np.sin(now))
+            q = q + faults['drift'] * np.arcsin(np.sin(now)) * per_radian
         if 'nan' in faults:
             q = np.where(np.arange(len(q)) == 2, np.nan, q)
         if 'reordered' in faults:

@@ -13,6 +13,7 @@ import numpy as np
 import yaml
 
 from remaster_ros.errors import InputError
+from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.session.workcell import Workcell, config_path
 from remaster_ros.simulation.effect_sampling import EffectSpec, with_effects
 from remaster_ros.simulation.hidden_arm import model_of_tour
@@ -111,7 +112,12 @@ def make_world(
         on them.
     """
     settings = yaml.safe_load(config_path('fake_world.yaml').read_text())
-    chain = cell.chain()
+    chain = cell.chain(sliding=True)
+    if hidden and chain.slides.any():
+        raise InputError(
+            f"joint '{chain.joint_names[int(np.argmax(chain.slides))]}' slides, and of such an "
+            'arm nothing but zero-offsets is hidden: remaster discover takes none'
+        )
     missing = sorted(set(cell.sensors) - set(settings['sensors']))
     if missing:
         raise InputError(f'fake_world.yaml places no sensor {", ".join(missing)}')
@@ -129,7 +135,8 @@ def make_world(
         sensors[name] = SimulatedSensor(
             sensor.marker, T_R_N, acceptance_rad=acceptance, further=sensor.further_markers
         )
-    joint_offsets = rng.normal(0, np.deg2rad(settings['offset_std_deg']), len(chain))
+    offset_std = np.deg2rad(settings['offset_std_deg'])
+    joint_offsets = rng.normal(0, offset_std, len(chain)) * chain.per_radian
     warming = Warming(rng.uniform(2.0, 6.0), rng.uniform(300.0, 1500.0), START_S)
     truth = SessionTruth(joint_offsets, markers, sensors, warming)
     if hidden:
@@ -152,10 +159,19 @@ def make_world(
             cell.urdf_text,
             cell.robot.base_link,
             cell.robot.tip_link,
-            np.deg2rad(settings['start_q_deg'])[: len(chain)],
+            _start(chain, np.deg2rad(settings['start_q_deg'])),
             cell.link_radius_m,
         ),
     )
+
+
+def _start(chain: SerialChain, angles: FloatArray) -> FloatArray:
+    """Return where a fake arm begins, (k,): at these angles, and what slides amid its way."""
+    q = np.zeros(len(chain))
+    known = min(len(chain), len(angles))
+    q[:known] = angles[:known]
+    q[chain.slides] = 0.5 * (chain.lower + chain.upper)[chain.slides]
+    return q
 
 
 def open_world(folder: str, namespace: str = '/', timeout_s: float = 20.0) -> World:

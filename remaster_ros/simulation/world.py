@@ -51,7 +51,7 @@ class WorldContent:
     urdf: str
     base_link: str | None
     tip_link: str | None
-    start_q: FloatArray  # Reported joint positions at the beginning, rad, (k,)
+    start_q: FloatArray  # Reported joint positions at the beginning, rad or m, (k,)
     link_radius_m: float  # Of the links that can stand between sensor and marker
 
 
@@ -67,7 +67,9 @@ class World:
         self.folder = folder
         self.truth, self.seed, self.rate = content.truth, content.seed, content.rate
         self.clock = WorldClock(folder, content.rate)
-        self.chain = SerialChain.from_urdf(content.urdf, content.base_link, content.tip_link)
+        self.chain = SerialChain.from_urdf(
+            content.urdf, content.base_link, content.tip_link, sliding=True
+        )
         self._capsules = LinkCapsules(self.chain, content.link_radius_m)
         self.start_q = content.start_q
         self._motion = Motion(START_S, self.start_q)
@@ -154,14 +156,14 @@ class World:
                 self._motion.follow(start_s, waypoints)
 
     def reported(self, t: float) -> tuple[FloatArray, FloatArray]:
-        """Joint positions (rad) and velocities (rad/s) as the encoders have them, each (k,)."""
+        """Joint positions (rad or m) and velocities (per s) as the encoders have them, (k,)."""
         with self._lock:
             self._read_motions()
             return self._motion.at(t)
 
     def joint_speed(self, t: float) -> float:
-        """Largest joint speed at time t, rad/s."""
-        return float(np.max(np.abs(self.reported(t)[1])))
+        """Largest joint speed at time t, rad/s; of a slide 0.25 m/s count as that."""
+        return float(np.max(np.abs(self.reported(t)[1]) / self.chain.per_radian))
 
     def is_moving(self, t: float) -> bool:
         """Whether any joint moves faster than 0.1 mrad/s at time t."""

@@ -153,11 +153,11 @@ function sensorState(sensor) {
 
 function showResult(result) {
   get('result').hidden = result.joints.length === 0;
-  fill('offsets', result.joints.map((j) => [
-    j.joint,
-    [j.std_deg === null ? 'not identifiable' : number(j.mean_deg, 4, ''), 'n'],
-    [number(j.std_deg, 4, ''), 'n'],
-  ]));
+  fill('offsets', result.joints.map((j) => {
+    // Degrees, or millimetres of a joint that slides.
+    const [mean, std, unit] = j.unit === 'mm' ? [j.mean_mm, j.std_mm, 'mm'] : [j.mean_deg, j.std_deg, ''];
+    return [j.joint, [std === null ? 'not identifiable' : number(mean, 4, unit), 'n'], [number(std, 4, unit), 'n']];
+  }));
   const key = JSON.stringify(result.fit);
   const list = get('fit-facts');
   if (list.dataset.key === key) return;

@@ -10,6 +10,7 @@ from remaster_ros.kinematics.body_pairs import RESERVE_M
 from remaster_ros.kinematics.collision import CollisionModel, arm_bodies
 from remaster_ros.kinematics.inverse_kinematics import InverseKinematics
 from remaster_ros.kinematics.transforms import transform
+from remaster_ros.motion.joint_units import TURNING, JointUnits
 from remaster_ros.planning.candidates import (
     Plan,
     PlannedPose,
@@ -104,8 +105,13 @@ def test_two_poses_are_too_few_to_register():
 
 def test_the_arm_stands_at_the_solution_it_is_near_or_at_none():
     solutions = random_joints(6, 5)
-    assert nearest_solution(solutions, solutions[3] + 0.01) == 3
-    assert nearest_solution(solutions, solutions[3] + 0.03) is None
+    assert nearest_solution(solutions, solutions[3] + 0.01, TURNING) == 3
+    assert nearest_solution(solutions, solutions[3] + 0.03, TURNING) is None
+    # 20 mrad, and 5 mm of a slide.
+    slides = JointUnits((True, *(False,) * (solutions.shape[1] - 1)))
+    first = np.eye(solutions.shape[1])[0]
+    assert nearest_solution(solutions, solutions[3] + 4e-3 * first, slides) == 3
+    assert nearest_solution(solutions, solutions[3] + 6e-3 * first, slides) is None
 
 
 def test_the_pose_is_where_the_plan_has_it():

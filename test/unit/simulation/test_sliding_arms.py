@@ -142,5 +142,7 @@ def test_nothing_else_is_hidden_in_such_an_arm_and_discover_says_why_not(made, t
     assert main(['discover', str(made / 's'), '--out', str(tmp_path / 'd')]) == 2
     (error,) = capsys.readouterr().err.strip().splitlines()
     assert "joint 'j3' is prismatic" in error
-    assert 'can be planned, simulated, imported and fitted, no more' in error
+    assert (
+        'can be planned, measured by the nodes, simulated, imported and fitted, no more' in error
+    )
     assert not (tmp_path / 'd').exists()
