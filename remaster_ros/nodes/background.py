@@ -13,6 +13,7 @@ import numpy as np
 from rclpy.exceptions import InvalidHandle
 from rclpy.node import Node
 
+from remaster_ros.motion.joint_units import TURNING, JointUnits
 from remaster_ros.types import FloatArray
 
 Result = TypeVar('Result')
@@ -61,14 +62,15 @@ class Background:
 
 
 MOVED_RAD = 0.005
-"""An arm this far from where a way begins, in any joint, gets another one."""
+"""An arm this far from where a way begins, in any joint, gets another one (a slide 1.25 mm off).
+"""
 
 
 class PlanningThread:
     """Does one thing at a time in the background: a stop must not wait for the planning."""
 
-    def __init__(self, background: Background) -> None:
-        self._background = background
+    def __init__(self, background: Background, units: JointUnits = TURNING) -> None:
+        self._background, self._units = background, units
         self._q: FloatArray = np.empty(0)
         self._what: object = None
         self._works = False
@@ -79,12 +81,16 @@ class PlanningThread:
         """Return what a job found, in a tuple, or raise what it raised; None while it works.
 
         `what` names the job: the result of another one, or for an arm that has moved since from
-        `q`, rad, (k,), is forgotten.
+        `q`, rad or m, (k,), is forgotten.
         """
         if self._works:
             return None
         found, self._found = self._found, None
-        if found is None or self._what != what or not np.max(np.abs(self._q - q)) <= MOVED_RAD:
+        if (
+            found is None
+            or self._what != what
+            or not self._units.largest(self._q - q) <= MOVED_RAD
+        ):
             self._what, self._q, self._works = what, q, True
             self._background.submit(job, self._take)
             return None

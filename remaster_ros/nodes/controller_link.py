@@ -206,7 +206,8 @@ class ActionLink:
     def send(self, message: JointTrajectory, *, stop: bool = False) -> None:
         """Send a trajectory that the motion gate has admitted, in place of the one under way."""
         names, rules = message.joint_names, self._rules
-        end = np.full(len(names), rules.settle.arrive_tolerance)
+        # rad or m, as the positions.
+        end = np.full(len(names), rules.settle.arrive_tolerance) * rules.units.per_radian
         if stop:
             # No target: where on its line the arm comes to rest is enough.
             end = path_tolerance(np.zeros(len(names)), rules)

@@ -395,13 +395,16 @@ class Demo:
         self.console = Console(quiet=self.p.quiet)
         # Refused before anything is written.
         self.requests = [EffectSpec.parse(text) for text in self.p.hide.split(',') if text]
+        cell = read_cell(self.p.cell)
+        # No joint may slide: what is printed are degrees, and causes are looked for.
+        cell.chain()
         self.hidden = Path(tempfile.mkdtemp(prefix='remaster_world_'))
         try:
             with undone_on_failure():
                 self.out = output_folder(Path(self.p.out))
                 self.world = make_world(
                     self.hidden,
-                    read_cell(self.p.cell),
+                    cell,
                     self.p.seed,
                     self.p.rate,
                     self.requests,

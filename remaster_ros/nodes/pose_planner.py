@@ -52,6 +52,7 @@ from remaster_ros.collection.plan_confirmation import PlanConfirmation, fingerpr
 from remaster_ros.collection.tour_progress import PlanMemory, TourProgress
 from remaster_ros.errors import InputError, RemasterError
 from remaster_ros.kinematics.serial_chain import SerialChain
+from remaster_ros.motion.joint_units import JointUnits
 from remaster_ros.motion.preflight import preflight
 from remaster_ros.nodes.background import Background, PlanningThread
 from remaster_ros.nodes.judging import KINDS, Judging, JudgingParameters, Kind
@@ -220,7 +221,11 @@ class Parameters(JudgingParameters):
         high=3600.0,
     )
     limit_margin_deg: float = parameter(
-        1.0, 'distance kept from the joint limits', unit='deg', low=0.0, high=45.0
+        1.0,
+        'distance kept from the joint limits; of a joint that slides 4.36 mm for each degree',
+        unit='deg',
+        low=0.0,
+        high=45.0,
     )
     speed_share: float = parameter(
         SPEED_SHARE,
@@ -251,6 +256,16 @@ class Parameters(JudgingParameters):
         )
         design = cell.design_settings()
         return TourPlanner(scene, counts, self.seed, self.reference_every, design, travel, causes)
+
+    def refuse_what_supposes_angles(self, chain: SerialChain) -> None:
+        """Raise `InputError` for a parameter that is for arms alone whose joints all turn."""
+        for name in ('separate', 'compensation'):
+            if getattr(self, name) and chain.slides.any():
+                sliding = chain.joint_names[int(np.argmax(chain.slides))]
+                raise InputError(
+                    f"pose_planner: joint '{sliding}' slides, and {name} is for arms whose joints "
+                    'all turn; leave that parameter empty'
+                )
 
     def causes(self, joint_names: Sequence[str]) -> tuple[FoundCause, ...]:
         """Return the causes that the plan is to separate; errors as of `read_causes`."""
@@ -491,7 +506,7 @@ class PlanPreview(PlanConfirmation):
         super().__init__(cell.confirm, str(self.page))
         self._cell, self._tours = cell, tours
         self._memory, self._progress = memory, progress
-        self._thread = PlanningThread(background)
+        self._thread = PlanningThread(background, JointUnits.of(tours.model.chain))
         self._drawn: object = None
 
     def withdraw(self) -> None:
@@ -609,15 +624,17 @@ class PosePlanner(RemasterNode):
         super().__init__('pose_planner')
         self.p = declare(self, Parameters)
         self.cell = read_cell(self.p.cell)
-        self.chain = self.cell.chain()
+        self.chain = self.cell.chain(sliding=True)
         self._order = JointOrder(self.chain.joint_names)
         self._q: FloatArray | None = None
+        self.p.refuse_what_supposes_angles(self.chain)
         causes = self.p.causes(self.chain.joint_names)
         self._tours = self.p.tour_planner(self.cell, self.chain, causes)
         settings = self.p.plan_settings(self.cell, causes)
         folder = Path(self.p.session)
         self.journal = PlanJournal(folder, settings, self.chain, self._tours.model)
-        self.progress = TourProgress(self.journal, self._tours, PlanningThread(Background(self)))
+        planning = PlanningThread(Background(self), JointUnits.of(self.chain))
+        self.progress = TourProgress(self.journal, self._tours, planning)
         # Of the run, and of what may be published only while it is running.
         self._lock = threading.RLock()
         self.run = CollectionRun(self.p.resume_within_s)

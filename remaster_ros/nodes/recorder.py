@@ -292,7 +292,8 @@ class Recorder(RemasterNode):
         super().__init__('recorder')
         self.p = declare(self, Parameters)
         self.cell = read_cell(self.p.cell)
-        self.base_link = self.cell.chain().base_link
+        chain = self.cell.chain(sliding=True)
+        self.base_link = chain.base_link
         self._was_waiting = False
         self._records: Counter[str] = Counter()
         self.sensors = CellSensors(self, self.p, self.cell)
@@ -310,7 +311,7 @@ class Recorder(RemasterNode):
         )
         self.journal = self.keeper.journal
         self._taken = ReportsTaken(self, self.p.simulated_clock_rate)
-        self._states = ArmStates(self, self.cell.chain().joint_names, self.p.heartbeat_s)
+        self._states = ArmStates(self, chain.joint_names, self.p.heartbeat_s)
         self.recorder = SessionRecorder(self.cell, self.p, self.keeper, _Outlet(self))
         self._subscribe()
         # A group of its own: while it waits for the reading, what makes the reading goes on.

@@ -50,6 +50,7 @@ from remaster_ros.motion.actions import (
 )
 from remaster_ros.motion.arm_supervisor import ArmSupervisor
 from remaster_ros.motion.joint_reports import JointReport, JointReports
+from remaster_ros.motion.joint_units import JointUnits
 from remaster_ros.motion.limits import MotionLimits
 from remaster_ros.motion.motion_gate import PROBE_S, Admitted, MotionGate
 from remaster_ros.motion.move_queue import PROBE
@@ -125,7 +126,11 @@ class Parameters(SimulationParameters):
         live=True,
     )
     limit_margin_deg: float = parameter(
-        0.5, 'distance kept from the joint limits', unit='deg', low=0.0, high=45.0
+        0.5,
+        'distance kept from the joint limits; of a joint that slides 4.36 mm for each degree',
+        unit='deg',
+        low=0.0,
+        high=45.0,
     )
     compensation: str = parameter(
         '',
@@ -136,10 +141,18 @@ class Parameters(SimulationParameters):
         3.0, 'how long the arm must stand still before a reading', unit='s', low=0.1, high=60.0
     )
     arrive_tolerance: float = parameter(
-        2e-3, 'largest distance of a joint from its target', unit='rad', low=1e-6, high=0.1
+        2e-3,
+        'largest distance of a joint from its target; of one that slides 0.25 m for each rad',
+        unit='rad',
+        low=1e-6,
+        high=0.1,
     )
     still_tolerance: float = parameter(
-        2e-4, 'largest spread of a joint position while still', unit='rad', low=1e-7, high=0.01
+        2e-4,
+        'largest spread of a joint position while still; of one that slides 0.25 m for each rad',
+        unit='rad',
+        low=1e-7,
+        high=0.01,
     )
     arrive_timeout_s: float = parameter(
         10.0, 'beyond the expected motion and settle: not arrived', unit='s', low=1.0, high=600.0
@@ -197,10 +210,12 @@ class Parameters(SimulationParameters):
         high=60.0,
     )
 
-    def rules(self) -> SupervisorRules:
-        """Return what of them the supervisor keeps."""
+    def rules(self, units: JointUnits) -> SupervisorRules:
+        """Return what of them the supervisor keeps, of an arm with joints of these units."""
         return SupervisorRules(
-            settle=SettleRules(self.settle_s, self.arrive_tolerance, self.still_tolerance),
+            settle=SettleRules(
+                self.settle_s, self.arrive_tolerance, self.still_tolerance, units=units
+            ),
             arrive_timeout_s=self.arrive_timeout_s,
             answer_timeout_s=self.answer_timeout_s,
             heartbeat_s=self.heartbeat_s,
@@ -221,6 +236,12 @@ class Parameters(SimulationParameters):
         """Return the correction in use; `InputError` where it is not of this arm, or too large."""
         if not self.compensation:
             return None
+        if chain.slides.any():
+            raise InputError(
+                f"robot_bridge: joint '{chain.joint_names[int(np.argmax(chain.slides))]}' slides, "
+                'and of such an arm there is no compensation.json; leave the parameter '
+                'compensation empty, and set the offsets in the controller (remaster export)'
+            )
         # It loads SciPy, which a bridge without a correction needs not.
         from remaster_ros.compensation.in_use import CorrectionInUse
 
@@ -232,7 +253,7 @@ class Parameters(SimulationParameters):
         """Return the limits of every motion.
 
         ``shifts``: least and largest that a correction adds to reported angles, rad, (2, k); None
-        without; ``acceleration``: rad/s², (k,) or for all.
+        without; ``acceleration``: rad/s² or m/s², (k,) or for all.
         """
         return MotionLimits.of(
             chain,
@@ -308,7 +329,7 @@ class RobotBridge(RemasterNode):
                 'shipped one, is for the fakes)'
             )
         cell = read_cell(self.p.cell)
-        self.chain = cell.chain()
+        self.chain = cell.chain(sliding=True)
         self._correction = correction = self.p.correction(cell, self.chain)
         true_arm, unknown_rad, self._shifts = self.chain, None, None
         if correction is not None:
@@ -327,10 +348,11 @@ class RobotBridge(RemasterNode):
         # A simulated arm begins anew with each World: nothing holds from the one before.
         is_kept = not self.p.simulated_clock_rate
         last = self._command_file.read(time.time_ns()) if is_kept else None
+        units, robot = JointUnits.of(self.chain), self.chain
         self.supervisor = ArmSupervisor(
             MotionGate(self.p.limits(self.chain, self._shifts, self._acceleration), speeds),
-            JointReports(self.chain.lower, self.chain.upper, self.chain.velocity_limits),
-            self.p.rules(),
+            JointReports(robot.lower, robot.upper, robot.velocity_limits, units),
+            self.p.rules(units),
             self._halt_file.read(),
             None if last is None else last.end,
         )

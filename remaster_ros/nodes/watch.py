@@ -101,7 +101,7 @@ class Watch(RemasterNode):
         super().__init__('watch')
         self.p = declare(self, Parameters)
         cell = read_cell(self.p.cell)
-        self.chain = cell.chain()
+        self.chain = cell.chain(sliding=True)
         self._order = JointOrder(self.chain.joint_names)
         markers = {
             name: {marker: np.array(cell.markers[marker]) for marker in sensor.markers}
@@ -307,7 +307,7 @@ def fit_facts(folder: Path, offsets: Mapping[str, float]) -> FitFacts:
     """Return what the page shows of a fit beside its offsets.
 
     ``folder``: the optimizer's, on this computer; where it is elsewhere there is nothing to show;
-    ``offsets``: as published, joint -> rad: the file has to be that of the same fit.
+    ``offsets``: as published, joint -> rad or m: the file has to be that of the same fit.
     """
     try:
         fit = read_fit(folder / FIT_FILE)

@@ -5,11 +5,10 @@ import subprocess
 import sys
 
 import pytest
-import yaml
 from ros_rig import node_arguments
+from sliding_cells import sliding_cell, telescope
 
 from remaster_ros.errors import InputError
-from remaster_ros.session.workcell import config_path
 
 pytestmark = [pytest.mark.ros, pytest.mark.timeout(900)]
 
@@ -40,20 +39,22 @@ def test_a_missing_cell_file(start, tmp_path):
     assert 'nowhere.yaml' in refuse(start, 'pose_planner', cell=tmp_path / 'nowhere.yaml')
 
 
-@pytest.mark.parametrize('node', ['robot_bridge', 'pose_planner', 'recorder'])
-def test_an_arm_with_a_joint_that_slides(node, start, tmp_path):
-    """It can be planned and fitted; nothing moves it."""
-    demo = config_path('cells/demo.yaml')
-    cell = yaml.safe_load(demo.read_text())
-    urdf = (demo.parent / cell['robot']['urdf']).read_text()
-    slides = urdf.replace('joint_4" type="revolute', 'joint_4" type="prismatic')
-    assert slides != urdf
-    (tmp_path / 'arm.urdf').write_text(slides)
-    cell['robot']['urdf'] = 'arm.urdf'
-    (tmp_path / 'cell.yaml').write_text(yaml.safe_dump(cell))
-    line = refuse(start, node, cell=tmp_path / 'cell.yaml')
-    assert "joint 'joint_4' is prismatic" in line
-    assert 'can be planned, simulated, imported and fitted, no more' in line
+@pytest.mark.parametrize(
+    ('node', 'parameters', 'why'),
+    [
+        ('demo', {}, 'can be planned, measured by the nodes, simulated, imported and fitted'),
+        ('robot_bridge', {'compensation': 'c.json'}, 'leave the parameter compensation empty'),
+        ('pose_planner', {'compensation': 'c.json'}, 'compensation is for arms whose joints all'),
+        ('pose_planner', {'separate': 'd.json'}, 'separate is for arms whose joints all turn'),
+    ],
+)
+def test_what_an_arm_with_a_joint_that_slides_is_not_for(node, parameters, why, start, tmp_path):
+    cell = sliding_cell(tmp_path, telescope(), held_joint='joint_3', held_values_m=[0.0])
+    given = {'out': tmp_path / 'out'} if node == 'demo' else {}
+    line = refuse(start, node, cell=cell, **parameters, **given)
+    assert "joint 'joint_3'" in line
+    assert why in line
+    assert not (tmp_path / 'out').exists()
 
 
 def test_a_session_folder_that_is_in_use(start, tmp_path):

@@ -115,6 +115,8 @@ def test_a_target_beyond_the_end_of_a_slide_and_its_margin():
         'a at 57.01 deg is outside its limits [-57.30, 57.30] deg less 0.50 deg'
     )
     assert limits.outside(np.array([1.997, 0.9])) == ''
+    assert limits.outside(np.array([0.003, -0.9])) == ''
+    assert limits.outside(np.array([0.002, 0.0])).startswith('rail at 2.00 mm is outside')
 
 
 def test_a_start_elsewhere():
@@ -134,8 +136,8 @@ def test_a_start_elsewhere():
 
 def test_a_waypoint_beside_the_path(judged):
     along = ((0.5, 0.0), (0.5, 0.8))
-    beside = judged((4.0, [0.5 + 1e-6, 0.8], [0.0, 0.0]), along=along)
-    assert beside == 'a waypoint lies 0.0010 mm off the path found free'
+    beside = judged((4.0, [0.5 + 6e-7, 0.8], [0.0, 0.0]), along=along)
+    assert beside == 'a waypoint lies 0.0006 mm off the path found free'
     assert judged((4.0, [0.5 + 2e-7, 0.8], [0.0, 0.0]), along=along) == ''
     # A corner that is cut.
     corner = ((0.5, 0.0), (0.6, 0.0), (0.6, 0.4))
@@ -238,10 +240,16 @@ def test_reports_of_a_slide():
     assert reports.believes(JointReport(0.0, np.array([2.012, 1.04]), 0.0, 0.0))
     assert not reports.believes(JointReport(1.0, np.array([2.013, 0.0]), 1.0, 1.0))
     assert reports.trouble == 'joint 1 is reported at 2013.0 mm, outside its limits'
+    # 17.5 mm beyond what is tolerated are more than 50 mrad.
+    assert not reports.believes(JointReport(1.0, np.array([2.03, 1.1]), 1.0, 1.0))
+    assert reports.trouble == 'joint 1 is reported at 2030.0 mm, outside its limits'
     # 1 m/s where the model has no limit, and half as much again.
     assert reports.believes(JointReport(1.0, np.array([0.6, 1.04]), 1.0, 1.0))
     assert not reports.believes(JointReport(1.1, np.array([0.4, 1.04]), 1.1, 1.1))
     assert reports.trouble == 'joint 1 is reported 200.0 mm away after 0.100 s'
+    # Of two that are too fast the one is named that is so by more for its kind.
+    assert not reports.believes(JointReport(1.1, np.array([0.3, 0.3]), 1.1, 1.1))
+    assert reports.trouble == 'joint 1 is reported 300.0 mm away after 0.100 s'
     assert reports.believes(JointReport(1.1, np.array([0.43, 1.04]), 1.1, 1.1))
 
 

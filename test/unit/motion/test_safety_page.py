@@ -8,6 +8,7 @@ import pytest
 
 from remaster_ros.compensation import in_use
 from remaster_ros.kinematics import collision
+from remaster_ros.kinematics.serial_chain import LEVER_M
 from remaster_ros.motion import (
     arm_supervisor,
     following,
@@ -77,6 +78,39 @@ SAID = [
     ),
     (r'and at most (\S+) m/s, and on it', [motion_gate.WAY_OUT_TOOL_SPEED]),
 ]
+# Of joints that slide: an angle in rad, and how both are written.
+SLIDES = [
+    (r'for each degree \| (\S+)° \| (\S+) mm', np.deg2rad(1.0), np.degrees(1.0), 1e3),
+    (r'the URDF has none \| (\S+) rad/s \| (\S+) m/s', limits.UNKNOWN_VELOCITY, 1.0, 1.0),
+    (r'or missing \| (\S+) rad/s² \| (\S+) m/s²', limits.ACCELERATION, 1.0, 1.0),
+    (r'\(`arrive_tolerance`\) \| (\S+) mrad \| (\S+) mm', motion_gate.START_RAD, 1e3, 1e3),
+    (r'\(`arrive_tolerance`\) \| (\S+) mrad \| (\S+) mm', DEFAULT.arrive_tolerance, 1e3, 1e3),
+    (r'\(`still_tolerance`\) \| (\S+) mrad \| (\S+) mm', DEFAULT.still_tolerance, 1e3, 1e3),
+    (r'while it is measured \| (\S+) mrad \| (\S+) mm', following.ON_PATH_RAD, 1e3, 1e3),
+    (r'while it is measured \| (\S+) mrad \| (\S+) mm', motion_under_way.MOVED_RAD, 1e3, 1e3),
+    (
+        r'beyond its limits \| (\S+) mrad \| (\S+) mm',
+        joint_reports.LIMIT_TOLERANCE_RAD, 1e3, 1e3,
+    ),
+    (r'times this\) \| (\S+) rad/s \| (\S+) m/s', joint_reports.UNKNOWN_SPEED, 1.0, 1.0),
+    (r'the probe \| (\S+) µrad \| (\S+) µm', move_queue.PROBE_RAD, 1e6, 1e6),
+    (
+        r'noticed below \| (\S+) rad/s \| (\S+) mm/s',
+        following.SLOWED_RAD / following.SLOWED_S, 1.0, 1e3,
+    ),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(('text', 'angle', 'shown', 'length'), SLIDES)
+def test_a_figure_of_joints_that_slide_is_a_quarter_of_a_metre_for_a_radian(
+    text, angle, shown, length
+):
+    found = re.search(text, PAGE)
+    assert found, f'docs/safety.md has no sentence {text}'
+    turning, sliding = (float(number) for number in found.groups())
+    assert turning == pytest.approx(shown * angle)
+    # With as many digits as are written.
+    assert sliding == pytest.approx(length * angle * LEVER_M, abs=0.005)
 
 
 @pytest.mark.parametrize(('text', 'values'), SAID, ids=[text[:30] for text, _ in SAID])

@@ -162,7 +162,60 @@ def is_asked_for_what_is_outside(rig):
     rig.run(20.0, lambda: rig.said(Settled))
 
 
+def is_elsewhere_by_a_little(rig):
+    rig.alter = lambda t, q: np.add(q, [0.0, 0.003])
+    rig.run(1.0)
+    rig.plan([0.5, 0.5])
+    rig.run(3.0)
+
+
+def is_stopped_on_a_short_way(rig):
+    rig.plan([0.16, 0.26])
+    rig.run(0.5)
+    rig.freeze()
+    rig.run(0.1)
+    rig.state = 'paused'
+    rig.run(1.0)
+
+
+def does_not_move_a_short_way(rig):
+    rig.obey = lambda waypoints: ()
+    rig.plan([0.13, 0.23])
+    rig.run(5.0)
+
+
+def moves_a_little_and_stops(rig):
+    rig.obey = lambda waypoints: [
+        dataclasses.replace(waypoints[0], q=rig.arm.at(rig.t)[0] + 0.005, velocity=np.zeros(2))
+    ]
+    rig.plan([0.5, 0.6])
+    rig.run(5.0)
+
+
+def is_slow_on_a_short_way(rig):
+    rig.obey = lambda waypoints: [
+        dataclasses.replace(p, time_s=3 * p.time_s, velocity=p.velocity / 3) for p in waypoints
+    ]
+    rig.plan([0.2, 0.3])
+    rig.run(10.0)
+
+
+def stands_beside_the_end_of_its_stop(rig):
+    rig.go([0.9, -1.9])
+    rig.state = 'paused'
+    rig.run(0.3)
+    begun = rig.t
+    rig.alter = lambda t, q: q + np.array([0.003, -0.003]) * np.clip(t - begun, 0, 1)
+    rig.run(5.0)
+
+
 CASES = [
+    stands_beside_the_end_of_its_stop,
+    is_elsewhere_by_a_little,
+    is_stopped_on_a_short_way,
+    does_not_move_a_short_way,
+    moves_a_little_and_stops,
+    is_slow_on_a_short_way,
     settles,
     is_stopped_and_goes_on,
     is_stopped_by_an_emergency,

@@ -134,13 +134,24 @@ class Rig:
         The joints' names, and in which order joint_states has them.
     first
         Whether no bridge before this one has led the arm to its home.
+    chain
+        The arm, where it is not the demo's.
     alter
         Changes a message of joint_states before it is published.
     commands, events, summaries, settled
         What came from the bridge; summaries as (level, message, values).
     """
 
-    def __init__(self, monkeypatch, folder, home=HOME, controller=True, first=False, **parameters):
+    def __init__(
+        self,
+        monkeypatch,
+        folder,
+        home=HOME,
+        controller=True,
+        first=False,
+        chain=CHAIN,
+        **parameters,
+    ):
         self.wall = 1000.0
         clock = SimpleNamespace(monotonic=lambda: self.wall, time_ns=time.time_ns)
         for module in (simulated_clock, status, rivals):
@@ -150,10 +161,10 @@ class Rig:
         monkeypatch.setattr(robot_bridge, 'time', dated)
         monkeypatch.setenv('ROS_HOME', str(folder))
         monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
-        self.names = list(CHAIN.joint_names)
+        self.names = list(chain.joint_names)
         if not first:
             LastCommandFile('/robot_bridge', self.names).write(home, self.time_ns())
-        self.order = np.random.default_rng(3).permutation(len(HOME))
+        self.order = np.random.default_rng(3).permutation(len(home))
         self.arm = HostileArm(home, self.wall)
         self.rng = np.random.default_rng(4)
         self.alive = {'planner', 'recorder', 'robot'}

@@ -15,6 +15,7 @@ from remaster_ros.collection.events import (
     ArmStopped,
 )
 from remaster_ros.errors import InputError
+from remaster_ros.motion.joint_units import TURNING
 from remaster_ros.motion.limits import MotionLimits
 from remaster_ros.motion.path_check import PointSpeeds
 from remaster_ros.session.workcell import read_cell
@@ -45,7 +46,7 @@ def test_parameters_reach_the_limits_and_the_rules(rig, tmp_path):
     for name in ('lower', 'upper', 'velocity', 'acceleration', 'tool_speed', 'margin'):
         np.testing.assert_array_equal(getattr(limits, name), getattr(wanted, name), name)
     assert limits.names == CHAIN.joint_names
-    assert bridge.supervisor.rules == bridge.p.rules()
+    assert bridge.supervisor.rules == bridge.p.rules(TURNING)
     assert bridge.supervisor.rules.settle.settle_s == 0.7
     assert bridge._emergency._silence_s == 4.0
     assert bridge._emergency.topic == ''

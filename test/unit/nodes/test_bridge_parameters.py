@@ -7,6 +7,7 @@ import pytest
 pytest.importorskip('rclpy', reason='needs ROS 2 Jazzy or its wheels')
 
 from remaster_ros.motion.actions import SupervisorRules
+from remaster_ros.motion.joint_units import JointUnits
 from remaster_ros.motion.settling import SettleRules
 from remaster_ros.nodes.robot_bridge import Parameters
 
@@ -63,8 +64,9 @@ def test_every_rule_comes_from_its_own_parameter():
         reaction_s=15.0,
         lag_s=1.25,
     )
-    assert parameters.rules() == SupervisorRules(
-        SettleRules(1.5, 0.01, 0.001), 11.0, 12.0, 13.0, 14.0, 15.0, 1.25
+    units = JointUnits((False, True))
+    assert parameters.rules(units) == SupervisorRules(
+        SettleRules(1.5, 0.01, 0.001, units=units), 11.0, 12.0, 13.0, 14.0, 15.0, 1.25
     )
 
 
