@@ -8,11 +8,11 @@ from functools import cached_property
 
 import numpy as np
 
-from remaster_ros.calibration.extension import Extension
+from remaster_ros.calibration.extension import Extension, Start
 from remaster_ros.calibration.grouped_rows import Rows
 from remaster_ros.calibration.identifiability import WEAK_ANGLE, Gauge, find_gauge
 from remaster_ros.calibration.initial_guess import given_start, robust_start, with_bodies
-from remaster_ros.calibration.laplace import Mode, find_mode
+from remaster_ros.calibration.laplace import Mode, find_mode, noise_mode
 from remaster_ros.calibration.model import Model
 from remaster_ros.calibration.moved_since import moved_since
 from remaster_ros.calibration.noise import NoiseModel
@@ -237,8 +237,9 @@ def estimate(problem: Problem, extension: Extension | None = None) -> Estimate:
     """
     measurements = problem.measurements
     empty = problem.empty_model(extension)
-    if extension is not None and extension.start is not None:
-        model, z = given_start(empty, measurements, problem.fitted, extension.start)
+    start = None if extension is None else extension.start
+    if start is not None:
+        model, z = given_start(empty, measurements, problem.fitted, start)
     else:
         model, z = robust_start(
             empty,
@@ -251,17 +252,17 @@ def estimate(problem: Problem, extension: Extension | None = None) -> Estimate:
         )
     model, z, without_turns = with_bodies(model, z, measurements, problem.fitted)
     try:
-        found = _estimated(problem, model, z)
+        found = _estimated(problem, model, z, start)
     except MisfitError as error:
         if not model.bodies:
             raise
         # Where the positions are those of another robot, too, this is refused by them.
-        found = _estimated(problem, replace(model, bodies=()), z[: model.markers_end])
+        found = _estimated(problem, replace(model, bodies=()), z[: model.markers_end], start)
         without_turns = NOT_FITTED.format(error.what)
     return replace(found, without_turns=without_turns)
 
 
-def _estimated(problem: Problem, model: Model, z: FloatArray) -> Estimate:
+def _estimated(problem: Problem, model: Model, z: FloatArray, start: Start | None) -> Estimate:
     """Find the mode from a solution near it; errors as of `estimate`."""
     measurements = problem.measurements
     priors = problem.marker_priors(model) + problem.other_priors(model)
@@ -272,23 +273,26 @@ def _estimated(problem: Problem, model: Model, z: FloatArray) -> Estimate:
     priors += problem.plausibility(model, free)
     z[gauge.held[gauge.held < model.joints]] = 0.0
 
-    start = z
+    found: tuple[BoolArray, Mode] | None = None
 
     def fitted(keep: BoolArray) -> Mode:
+        nonlocal found
+        if found is not None and np.array_equal(found[0], keep):
+            return found[1]
         # From the mode of the rows kept before: only the first search has far to go.
-        nonlocal start
+        near = z if found is None else found[1].z
         # Of a reading, position and orientation are kept or neither.
         kept = model.rows(measurements, np.setdiff1d(rows.source, rows.source[~keep]))
-        mode = find_mode(Posterior.of(model, kept, priors, free, start))
-        start = mode.z
-        return mode
+        found = keep, find_mode(Posterior.of(model, kept, priors, free, near))
+        return found[1]
 
     def refit(keep: BoolArray) -> FloatArray:
         return rows.target - model.predict(fitted(keep).z, rows)
 
     errors = rows.target - model.predict(z, rows)
+    gross = np.isin(rows.source, () if start is None else start.gross)
     try:
-        judgement = find_outliers(rows, refit, errors, model.sensor_names)
+        judgement = find_outliers(rows, refit, errors, model.sensor_names, gross)
     except MisfitError as error:
         remedy = f'{error.remedy}{_moved(problem, rows, errors)}'
         raise MisfitError(error.what, remedy) from None
@@ -332,14 +336,14 @@ def with_directions(mode: Mode) -> Mode:
         noise_model = NoiseModel.of(posterior.rows, posterior.model.reference, [*split, sensor])
         tried = replace(posterior, reference=mode.z, noise_model=noise_model)
         try:
-            other = find_mode(tried)
+            other = noise_mode(tried)
         except InsufficientDataError:
             continue
         # Twice the likelihood ratio is chi-squared, with as many degrees of freedom as the noise
         # has more parameters.
         more = tried.size - mode.linearisation.posterior.size
         if 2.0 * (other.log_evidence - mode.log_evidence) > DIRECTION_LIMITS[more]:
-            mode, split = other, [*split, sensor]
+            mode, split = find_mode(tried, other.eta), [*split, sensor]
     return mode
 
 

@@ -33,6 +33,7 @@ class Start:
     joint_offsets: FloatArray  # rad, (k,)
     T_R_N: FloatArray  # Registration of each sensor, (sensors, 4, 4)
     markers: FloatArray  # In T, m, (markers, 3)
+    gross: IntArray  # Indices of the rows of the measurements that were left out
 
 
 @dataclass(frozen=True, eq=False)

@@ -41,6 +41,8 @@ _EXPECTED = np.array([MEDIAN_LENGTH, 2.1544437046])
 # The standard deviation by the 80 % quantile may be this many times that by the median; more than
 # a fifth of gross errors makes it larger.
 TAIL_LIMIT = 4.0
+# Fits of other rows, until the same stay out.
+MOST_REFITS = 20
 # Of a sensor: its registration, its marker, a part of the offsets.
 UNKNOWNS = 10
 # With fewer rows the robust fit follows half of them closely, whatever they are, and their errors
@@ -61,8 +63,11 @@ def find_outliers(
     refit: Callable[[BoolArray], FloatArray],
     errors: FloatArray,
     sensor_names: Sequence[str],
+    gross: BoolArray | None = None,
 ) -> Judgement:
     """Leave gross rows out and fit again until the same rows stay out.
+
+    Where some look good once they are left out, and gross once they are not, they stay out.
 
     Parameters
     ----------
@@ -74,6 +79,8 @@ def find_outliers(
         Errors of a first, robust fit, m, (n, 3).
     sensor_names
         For the messages.
+    gross
+        Which rows are gross to begin with, (n,); None where it is not known of any.
 
     Raises
     ------
@@ -82,12 +89,16 @@ def find_outliers(
         identify them.
     """
     _require_majority(rows, errors, sensor_names)
-    gross = np.zeros(len(rows), dtype=bool)
+    gross = np.zeros(len(rows), dtype=bool) if gross is None else gross
     judgement = judge(rows, errors, gross)
-    for _ in range(20):
-        if np.array_equal(judgement.gross, gross):
-            break
+    tried: list[Judgement] = []
+    while not np.array_equal(judgement.gross, gross) and len(tried) < MOST_REFITS:
         gross = judgement.gross
+        again = [np.array_equal(before.gross, gross) for before in tried]
+        if any(again):
+            judgement = max(tried[again.index(True) :], key=lambda before: before.gross.sum())
+            break
+        tried.append(judgement)
         judgement = judge(rows, refit(~gross), gross)
     _guard(rows, judgement.gross, sensor_names)
     return judgement

@@ -45,7 +45,12 @@ def extension_of(residuals: Residuals, solution: Solution, found: Estimate) -> E
         solution.prior_precision(),
         offsets_of(found)[0],
         STEP_STD,
-        Start(model.offsets(x), model.T_R_N(x), model.markers(x)),
+        Start(
+            model.offsets(x),
+            model.T_R_N(x),
+            model.markers(x),
+            np.setdiff1d(found.problem.fitted, np.union1d(found.kept, residuals.rows.source)),
+        ),
     )
 
 

@@ -78,7 +78,7 @@ def test_the_mode_is_the_same_from_where_the_effects_were_searched(sagging) -> N
     offsets = found.model.offsets(x) + np.radians(0.3) * np.array([0.0, 1, -1, 1, -1, 1, 0.0])
     T_R_N = found.model.T_R_N(x).copy()
     T_R_N[:, :3, 3] += 0.03
-    start = Start(offsets, T_R_N, found.model.markers(x) + 5e-3)
+    start = Start(offsets, T_R_N, found.model.markers(x) + 5e-3, np.zeros(0, np.int64))
     again = estimate(problem, replace(given, start=start))
     std = np.sqrt(np.diag(found.mode.covariance))
     free = found.posterior.free

@@ -161,3 +161,35 @@ def test_two_thirds_of_a_pose_masked_by_each_other() -> None:
     errors[[30, 31]] += [0.02, 0.0, 0.0]
     found = np.flatnonzero(find(rows, errors).gross)
     assert {30, 31} <= set(found.tolist()) <= {30, 31, 32}
+
+
+def test_rows_that_come_and_go_stay_out_at_once() -> None:
+    """A fit without them calls them good, one with them gross: here a whole pose of five."""
+    pose = [15, 16, 17, 18, 19]
+    rows = rows_of(40, 5)
+    errors = errors_of(rows, 12)
+    off = errors.copy()
+    off[17] = [0.012, 0.0, 0.0]
+    fits = []
+
+    def refit(keep: np.ndarray) -> np.ndarray:
+        fits.append(np.flatnonzero(~keep).tolist())
+        return off if keep.all() else errors
+
+    found = find_outliers(rows, refit, off, ('mocap',))
+    assert np.flatnonzero(found.gross).tolist() == pose
+    assert all(found.why[row] for row in pose)
+    assert fits == [pose, []]
+
+
+def test_what_is_known_to_be_gross_is_not_sought_again() -> None:
+    rows = rows_of(40, 5)
+    errors = errors_of(rows, 13)
+    errors[17] = [0.012, 0.0, 0.0]
+    known = np.arange(len(rows)) == 17
+
+    def never(keep: np.ndarray) -> np.ndarray:
+        raise AssertionError('nothing is to be fitted')
+
+    found = find_outliers(rows, never, errors, ('mocap',), known)
+    np.testing.assert_array_equal(found.gross, known)
