@@ -58,11 +58,13 @@ check: $(VENV)/installed
 
 # Small sizes, some ten minutes on two idle cores; FULL=1 takes those of benchmarks/RESULTS.md,
 # hours for the hidden world of bench_discovery. BENCH='bench_speed …' chooses.
-BENCH ?= bench_real_data bench_discovery bench_exactness bench_calibration bench_speed \
-	bench_scaling bench_peers paper_tables
+BENCH ?= bench_real_data bench_discovery bench_halves bench_exactness bench_calibration \
+	bench_speed bench_scaling bench_peers paper_tables
 SMALL_bench_discovery := --only null pair --count 4 --results build/discovery_small.jsonl
+SMALL_bench_halves := --only panda_left --splits 2 --results build/halves_small.jsonl
 SMALL_paper_tables := --steps 10000
 FULL_bench_discovery := --results build/discovery.jsonl
+FULL_bench_halves := --results build/halves.jsonl
 FULL_bench_calibration := --sessions 1000 --record build/calibration.jsonl
 FULL_bench_exactness := --gold 1300000 --draws 60000
 FULL_bench_speed := --full
