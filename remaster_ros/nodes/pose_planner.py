@@ -114,6 +114,8 @@ class FurtherMeasuring:
             return '' if under_way else None, None
         if self._journal.tour is not None and self._journal.tour.judges:
             return 'it was no calibration; name a new session folder', None
+        if self._tours.model.chain.slides.any():
+            return 'causes of an arm with a joint that slides are not looked for', None
         # Imported when it is needed, as it takes a while.
         from remaster_ros.reports.discovery_json import read_causes
         from remaster_ros.reports.fit_json import DISCOVERY_FILE
