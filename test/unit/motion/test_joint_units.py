@@ -143,6 +143,11 @@ def test_a_waypoint_beside_the_path(judged):
     corner = ((0.5, 0.0), (0.6, 0.0), (0.6, 0.4))
     cut = judged((4.0, [0.6, 0.4], [0.0, 0.0]), along=corner)
     assert cut.startswith('the move leaves the path found free by ')
+    # By half a micrometre of the slide, which counts as two microradians.
+    late = ((4.0, [0.6 - 6e-7, 0.0], [0.0, 0.0]), (8.0, [0.6, 1e-4], [0.0, 0.0]))
+    assert judged(*late, along=corner) == (
+        'the move leaves the path found free by 0.0006 mm between two waypoints'
+    )
 
 
 class Fastest:
