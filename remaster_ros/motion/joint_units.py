@@ -3,8 +3,8 @@
 Tolerances and steps of motion are stated as angles. An angle moves what is at a distance from its
 axis by the angle times the distance; a slide moves all that it carries by its own way. So a joint
 that slides has `LEVER_M` (0.25 m) times as much in m, `SerialChain.per_radian`. That distance is
-on the short side of an arm's reach: a slide may be off by less than a joint that turns may bring
-the tool to be, and what is done at every so many radians is done as often for it.
+on the short side of an arm's reach: a slide is held nearer to where it should be than a joint that
+turns holds the end of the arm, and is looked at more often on a way of the same length.
 """
 
 from __future__ import annotations

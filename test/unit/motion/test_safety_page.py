@@ -24,6 +24,7 @@ from remaster_ros.motion.motion_gate import MotionGate
 from remaster_ros.motion.path_check import PointSpeeds
 from remaster_ros.nodes import robot_bridge
 from remaster_ros.nodes.robot_bridge import Parameters
+from remaster_ros.session import session_recorder
 from remaster_ros.session.workcell import read_cell
 
 PAGE = ' '.join(
@@ -86,6 +87,10 @@ SLIDES = [
     (r'\(`arrive_tolerance`\) \| (\S+) mrad \| (\S+) mm', motion_gate.START_RAD, 1e3, 1e3),
     (r'\(`arrive_tolerance`\) \| (\S+) mrad \| (\S+) mm', DEFAULT.arrive_tolerance, 1e3, 1e3),
     (r'\(`still_tolerance`\) \| (\S+) mrad \| (\S+) mm', DEFAULT.still_tolerance, 1e3, 1e3),
+    (
+        r'of the recorder\) \| (\S+) mrad \| (\S+) mm',
+        session_recorder.Parameters().motion_tolerance, 1e3, 1e3,
+    ),
     (r'while it is measured \| (\S+) mrad \| (\S+) mm', following.ON_PATH_RAD, 1e3, 1e3),
     (r'while it is measured \| (\S+) mrad \| (\S+) mm', motion_under_way.MOVED_RAD, 1e3, 1e3),
     (
