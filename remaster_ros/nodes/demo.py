@@ -241,14 +241,18 @@ def print_offsets(console: Console, fit: Fit, truth: SessionTruth) -> None:
     """Print the offsets beside the true ones, and the error on validation poses."""
     title = 'joint zero-offsets, degrees'
     table = _table(title, 'joint', 'estimate', 'std', 'hidden truth', 'off by, std')
-    for row, true in zip(fit.joint_offsets, np.rad2deg(truth.joint_offsets)):
-        mean, std = np.rad2deg(row.mean_and_std)
+    for row, hidden in zip(fit.joint_offsets, truth.joint_offsets):
+        slides = row.unit == 'mm'
+        mean, std, true = (1e3 if slides else np.degrees(1.0)) * np.array(
+            [*row.mean_and_std, hidden]
+        )
         if row.identifiable:
             estimate, spread, off = f'{mean:.4f}', f'{std:.4f}', f'{(mean - true) / std:+.1f}'
         else:
             # An offset that the data leave free has the spread of a whole turn: no useful figure.
             estimate, spread, off = 'not identifiable', f'{std:.2f}' if std < 90 else 'n/a', ''
-        table.add_row(row.joint, estimate, spread, f'{true:.4f}', off)
+        name = f'{row.joint}, mm' if slides else row.joint
+        table.add_row(name, estimate, spread, f'{true:.4f}', off)
     console.print(table)
     for row in fit.joint_offsets:
         if not row.identifiable:
@@ -396,8 +400,9 @@ class Demo:
         # Refused before anything is written.
         self.requests = [EffectSpec.parse(text) for text in self.p.hide.split(',') if text]
         cell = read_cell(self.p.cell)
-        # No joint may slide: what is printed are degrees, and causes are looked for.
-        cell.chain()
+        if self.p.apply:
+            # No joint may slide: what is corrected are angles.
+            cell.chain()
         self.hidden = Path(tempfile.mkdtemp(prefix='remaster_world_'))
         try:
             with undone_on_failure():

@@ -42,7 +42,12 @@ def test_a_missing_cell_file(start, tmp_path):
 @pytest.mark.parametrize(
     ('node', 'parameters', 'why'),
     [
-        ('demo', {}, 'can be planned, measured by the nodes, simulated, imported and fitted'),
+        (
+            'demo',
+            {'apply': True},
+            'can be planned, measured by the nodes, simulated, imported and fitted',
+        ),
+        ('demo', {'hide': 'backlash@2'}, 'of such an arm nothing but zero-offsets is hidden'),
         ('robot_bridge', {'compensation': 'c.json'}, 'leave the parameter compensation empty'),
         ('pose_planner', {'compensation': 'c.json'}, 'compensation is for arms whose joints all'),
         ('pose_planner', {'separate': 'd.json'}, 'separate is for arms whose joints all turn'),
