@@ -67,7 +67,8 @@ def find_outliers(
 ) -> Judgement:
     """Leave gross rows out and fit again until the same rows stay out.
 
-    Where some look good once they are left out, and gross once they are not, they stay out.
+    Where some look good once they are left out, and gross once they are not, they stay in: rows
+    are judged by the others.
 
     Parameters
     ----------
@@ -96,7 +97,7 @@ def find_outliers(
         gross = judgement.gross
         again = [np.array_equal(before.gross, gross) for before in tried]
         if any(again):
-            judgement = max(tried[again.index(True) :], key=lambda before: before.gross.sum())
+            judgement = min(tried[again.index(True) :], key=lambda before: before.gross.sum())
             break
         tried.append(judgement)
         judgement = judge(rows, refit(~gross), gross)

@@ -86,16 +86,19 @@ class Search:
             if best is None or best.log_evidence < solution.log_evidence + NAMED:
                 break
             solution = self._exchanged(self.pruned(self._split(best)))
-            solution = refine_moments(solution, self.catalogue.cells, self.data.part, self.fit)
+            solution = self._dated(solution)
         return solution
 
     def again(self, data: Residuals, solution: Solution) -> tuple[Search, Solution]:
-        """Return the search on other rows, and the same causes there as far as they are needed."""
+        """Return the search on other rows, and the same causes there as far as they are needed.
+
+        What happened at one moment is dated again: the rows beside it may have been left out.
+        """
         search = Search(data, self.catalogue.cells, self.progress)
         families = {family.cell.name: family.cell for family in search.families}
         cells = [families.get(cell.name, cell) for cell in solution.cells]
         fitted = search.fit(cells, solution)
-        return (search, search.pruned(fitted)) if fitted is not None else (self, solution)
+        return (search, search._dated(search.pruned(fitted))) if fitted else (self, solution)
 
     def fit(self, cells: Sequence[Cell], start: Solution | None = None) -> Solution | None:
         """Fit a set; None for two cells of the same parameters, or of a sign physics excludes."""
@@ -142,6 +145,15 @@ class Search:
         """Return the fit without a cell, with noise and variances as they are."""
         index = solution.cells.index(cell)
         return solution.less(index, solution.evidence_without(index, len(self.data)))
+
+    def _dated(self, solution: Solution) -> Solution:
+        """Return the fit with moments that none nearby is better than."""
+        for _ in range(MOST_STEPS):
+            before = [cell.moment for cell in solution.cells]
+            solution = refine_moments(solution, self.catalogue.cells, self.data.part, self.fit)
+            if np.array_equal(before, [cell.moment for cell in solution.cells], equal_nan=True):
+                break
+        return solution
 
     def _best(self, solution: Solution) -> Solution | None:
         """Return the best fit with one cell or family more."""

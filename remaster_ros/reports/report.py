@@ -655,6 +655,7 @@ def answer_html(subject: Subject, drawings: dict[str, Markup], printing: bool = 
         accuracy=accuracy_rows(inputs.fit.accuracy),
         markers=marker_rows(source, inputs.session),
         worst=worst_rows(inputs, answer),
+        left_out=_fitted_left_out(inputs, answer),
         plan=plan_facts(inputs),
         measured=measured_when(inputs),
         drawings=drawings,
@@ -685,6 +686,13 @@ def measured_when(inputs: Inputs) -> str:
         last = clock_time(float(stamps.max()))
         return f'{first} to {last.removesuffix(first[8:])}'.strip()
     return inputs.session.created
+
+
+def _fitted_left_out(inputs: Inputs, answer: Answer) -> int:
+    """Return how many readings to fit were gross errors: beside causes, or for the offsets."""
+    m = inputs.session.measurements
+    left_out = inputs.gross if answer.uses_causes else list(inputs.fit_left_out)
+    return int(np.sum(~m.is_validation & np.isin(m.observation, left_out)))
 
 
 def worst_rows(inputs: Inputs, answer: Answer) -> list[WorstRow]:
