@@ -36,7 +36,7 @@ from remaster_ros.discovery.gain import (
 from remaster_ros.discovery.geometry_model import GeometryModel, geometry_model
 from remaster_ros.discovery.guard import Unexplained, harm_of, is_harmful, nameless, unfitted
 from remaster_ros.discovery.marker_offsets import loosened, moved_markers
-from remaster_ros.discovery.omnibus import structure_left
+from remaster_ros.discovery.omnibus import beyond_noise, structure_left
 from remaster_ros.discovery.random_effects import Family, by_members, fit_kinds, kinds
 from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.discovery.solution import Solution
@@ -234,6 +234,8 @@ def discover_session(
     if not effects and not sampled.by_name:
         gain_of_kinds = solution.log_evidence - empty.log_evidence
         unexplained += (nameless(data, solution, p_value(gain_of_kinds)),)
+    if not effects and not unexplained:
+        unexplained = tuple(beyond_noise(data, fit))
     verdict: Verdict = 'effects' if effects else 'unexplained' if unexplained else 'none'
     # A tie over a small remainder does not put the rest in doubt. The largest leads in any case:
     # where held-out poses gain nothing no share is known.

@@ -21,7 +21,11 @@ from remaster_ros.calibration.gauge_words import the
 from remaster_ros.calibration.left_out import Contrasts, compared
 from remaster_ros.calibration.moved_since import moved_since
 from remaster_ros.calibration.outliers import LARGEST_SHARE
-from remaster_ros.calibration.residual_structure import LEAST_NOISE_M, explained_of_poses
+from remaster_ros.calibration.residual_structure import (
+    FEWEST_POSES,
+    LEAST_NOISE_M,
+    explained_of_poses,
+)
 from remaster_ros.calibration.result import FitResult
 from remaster_ros.calibration.smooth_functions import of_position
 from remaster_ros.discovery.effects.sensor_field import EFFECT as SENSOR_FIELD
@@ -271,6 +275,32 @@ class _Checks:
                     'each time.'
                 ),
             )
+
+
+def beyond_noise(data: Residuals, fit: FitResult) -> Iterator[Unexplained]:
+    """Give an entry for each sensor whose error is more than its noise, if nothing else is found.
+
+    What all readings of a pose share counts as noise in the model, and takes up what moved between
+    few poses: the scatter within poses does not. With more poses the search tells the two apart.
+    """
+    if len(np.unique(data.context.measurements.pose[data.rows.source])) >= FEWEST_POSES:
+        return
+    for check in fit.noise_checks:
+        if check.explained is not False or check.noise_error_m is None:
+            continue
+        error_mm, noise_mm = 1e3 * check.error_m, 1e3 * check.noise_error_m
+        yield Unexplained(
+            where='noise',
+            driver='pose',
+            size_m=check.error_m,
+            p_value=np.nan,
+            next=(
+                f'The mean error of {the("sensor", check.sensor)} is {error_mm:.3f} mm, and what '
+                f'readings of one pose differ by explains {noise_mm:.3f} mm of it. So few poses '
+                f'do not show what changes from one to the next: measure at least {FEWEST_POSES}, '
+                'with references in between, and search again.'
+            ),
+        )
 
 
 def errors_by_place(

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from discovery_scenes import at_joint, discovered, residuals_of, session_with
 
+import remaster_ros
 from remaster_ros.discovery.discover import discover_session
 from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.discovery.effects.step import moments_of
@@ -240,3 +241,17 @@ def test_a_sensor_moved_while_the_held_out_poses_were_measured_is_dated(shift_m)
     assert entry.driver == 'time'
     assert f'are off by ({1e3 * shift_m:+.0f}'[:-1] in entry.next or '(+0.9' in entry.next
     assert 'was moved then' in entry.next
+
+
+def test_few_poses_with_more_than_noise_are_not_called_without_findings():
+    """A marker slipped by 3 mm amid nine poses: what it leaves looks like noise of the poses."""
+    made = remaster_ros.simulate(
+        poses=16, validation_poses=5, effects=['slipped_marker:1'], seed=322
+    )
+    found = discover_session(made.session, rng=np.random.default_rng(0))
+    assert found.verdict == 'unexplained'
+    (entry,) = found.unexplained
+    assert (entry.where, entry.driver) == ('noise', 'pose')
+    assert entry.size_m > 1e-3
+    assert 'the sensor mocap' in entry.next
+    assert 'measure at least 12, with references in between' in entry.next
