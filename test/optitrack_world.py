@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import gc
 import socket
+import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -69,7 +71,21 @@ def eventually(condition: Callable[[], object], within_s: float = 20.0) -> bool:
     return True
 
 
-def open_descriptors() -> int:
-    """Count this process's open files and sockets, none of them of objects that are no more."""
+def _descriptors() -> set[str]:
+    """Return this process's open files and sockets, none of them of objects that are no more."""
     gc.collect()
-    return len(list(Path('/proc/self/fd').iterdir()))
+    found = set()
+    for link in Path('/proc/self/fd').iterdir():
+        # The folder itself was open to be listed.
+        with contextlib.suppress(FileNotFoundError):
+            found.add(f'{link.name} {link.readlink()}')
+    return found
+
+
+@contextlib.contextmanager
+def nothing_left() -> Iterator[None]:
+    """Fail where a thread, file or socket is left; what another test left may end meanwhile."""
+    threads, descriptors = set(threading.enumerate()), _descriptors()
+    yield
+    assert set(threading.enumerate()) <= threads
+    assert _descriptors() <= descriptors

@@ -12,13 +12,12 @@ import re
 import socket
 import subprocess
 import sys
-import threading
 import time
 from contextlib import contextmanager
 
 import numpy as np
 import pytest
-from optitrack_world import SENSOR, MarkerWorld, eventually, free_port, open_descriptors
+from optitrack_world import SENSOR, MarkerWorld, eventually, free_port, nothing_left
 
 from remaster_ros.errors import DeviceError, InputError
 from remaster_ros.sensors.driver import SensorClock
@@ -226,17 +225,18 @@ def test_the_natnetclient_backend_gives_readings_and_drops_hidden_ones():
     samples = []
     data_port = free_port()
     hides = OptiTrackBehaviour(occlusions_per_s=2.0, occlusion_s=0.3, guess_error_m=0.5)
-    before = threading.active_count(), open_descriptors()
-    with fake_server(
-        version=(2, 10), transport='unicast', unicast_port=data_port, behaviour=hides
-    ) as server:
+    with (
+        nothing_left(),
+        fake_server(
+            version=(2, 10), transport='unicast', unicast_port=data_port, behaviour=hides
+        ) as server,
+    ):
         client = NatNetClientBackend(backend_settings(server, data_port), samples.append)
         client.start()
         assert eventually(lambda: len(samples) > 100)
         assert eventually(lambda: client.status().dropped[Dropped.OCCLUDED] > 10)
         status = client.status()
         client.stop()
-    assert (threading.active_count(), open_descriptors()) == before
     positions = [sample.position for sample in samples]
     np.testing.assert_allclose(positions, np.tile(MARKER, (len(positions), 1)), atol=TOLERANCE_M)
     assert status.dropped[Dropped.DISAGREEMENT] == 0

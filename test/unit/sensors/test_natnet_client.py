@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import socket
 import struct
-import threading
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from natnet_rig import LOCAL, NOISELESS, client_of, fake_server
-from optitrack_world import RATE, MarkerWorld, eventually, free_port, open_descriptors
+from optitrack_world import RATE, MarkerWorld, eventually, free_port, nothing_left
 
 from remaster_ros.errors import DeviceError, InputError
 from remaster_ros.sensors.optitrack.client import NatNetClient
@@ -187,13 +186,12 @@ def test_a_server_that_never_answers_is_named_in_time():
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as deaf:
         deaf.bind((LOCAL, 0))
         port = deaf.getsockname()[1]
-        before = threading.active_count(), open_descriptors()
         with (
+            nothing_left(),
             pytest.raises(DeviceError, match=f'no answer from 127.0.0.1:{port}'),
             client_of(port, free_port(), wait_s=1.0),
         ):
             pass
-        assert (threading.active_count(), open_descriptors()) == before
     with (
         pytest.raises(DeviceError, match=f'nothing listens on UDP port {port}'),
         client_of(port, free_port(), wait_s=1.0),
@@ -217,10 +215,9 @@ def test_ports_in_use_are_named(data_port):
     group = natnet.DEFAULT_MULTICAST_GROUP
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as selfish:
         selfish.bind((group, data_port))
-        before = open_descriptors()
-        with pytest.raises(DeviceError, match=f'UDP port {data_port} .* is in use'):
+        in_use = pytest.raises(DeviceError, match=f'UDP port {data_port} .* is in use')
+        with nothing_left(), in_use:
             NatNetClient(NatNetSettings(data_port=data_port), print).start()
-        assert open_descriptors() == before
     with (
         fake_server(data_port) as server,
         pytest.raises(DeviceError, match=f'UDP port {server.command_port} .* set command_port'),
@@ -230,15 +227,14 @@ def test_ports_in_use_are_named(data_port):
 
 
 def test_stopping_leaves_nothing_behind(data_port):
-    before = threading.active_count(), open_descriptors()
-    for _ in range(3):
-        with (
-            fake_server(data_port) as server,
-            client_of(server.command_port, data_port) as client,
-        ):
-            pass
-        client.stop()  # a second time
-    assert (threading.active_count(), open_descriptors()) == before
+    with nothing_left():
+        for _ in range(3):
+            with (
+                fake_server(data_port) as server,
+                client_of(server.command_port, data_port) as client,
+            ):
+                pass
+            client.stop()  # a second time
 
 
 class BodyWorld(MarkerWorld):
