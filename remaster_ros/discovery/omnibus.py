@@ -221,11 +221,21 @@ class _Checks:
         if moved is None:
             return ''
         x, y, z = 1e3 * moved.shift
+        off = (
+            f'the readings of {context.sensor_names[sensor]} are off by ({x:+.2f}, {y:+.2f}, '
+            f'{z:+.2f}) mm in its frame: the sensor or its marker was moved'
+        )
+        m = context.measurements.select(rows)
+        before = m.observation < moved.observation
+        if m.is_validation[~before].all() and len(np.unique(m.pose[before & m.is_validation])) < 2:
+            # A fit takes up a part of what happens amid its own rows, and one pose dates nothing.
+            return (
+                f'At all held-out poses {off} before them, or earlier, amid the fitted ones. '
+                'Fasten both, and measure the session again.'
+            )
         return (
-            f'From about observation {moved.observation} on, the readings of '
-            f'{context.sensor_names[sensor]} are off by ({x:+.2f}, {y:+.2f}, {z:+.2f}) mm in its '
-            'frame: the sensor or its marker was moved then. Fasten both, and measure the session '
-            'again, or remove what was measured from there on.'
+            f'From about observation {moved.observation} on, {off} then. Fasten both, and measure '
+            'the session again, or remove what was measured from there on.'
         )
 
     def held_out(self) -> Iterator[Unexplained]:
