@@ -69,7 +69,9 @@ def _figures(of: Callable[[FloatArray], FloatArray], draws: FloatArray) -> Float
     figures = np.full(flat.shape[2], np.nan)
     moves = np.ptp(flat, axis=(0, 1)) > 0.0
     if moves.any():
-        figures[moves] = of(flat[..., moves])
+        # Chains that stay each in a place of its own have an R-hat of infinity.
+        with np.errstate(invalid='ignore', divide='ignore'):
+            figures[moves] = of(flat[..., moves])
     return figures.reshape(draws.shape[2:])
 
 

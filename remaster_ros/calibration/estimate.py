@@ -335,15 +335,15 @@ def with_directions(mode: Mode) -> Mode:
     for sensor in range(len(posterior.noise_names)):
         noise_model = NoiseModel.of(posterior.rows, posterior.model.reference, [*split, sensor])
         tried = replace(posterior, reference=mode.z, noise_model=noise_model)
-        try:
-            other = noise_mode(tried)
-        except InsufficientDataError:
-            continue
         # Twice the likelihood ratio is chi-squared, with as many degrees of freedom as the noise
         # has more parameters.
         more = tried.size - mode.linearisation.posterior.size
-        if 2.0 * (other.log_evidence - mode.log_evidence) > DIRECTION_LIMITS[more]:
-            mode, split = find_mode(tried, other.eta), [*split, sensor]
+        try:
+            other = noise_mode(tried)
+            if 2.0 * (other.log_evidence - mode.log_evidence) > DIRECTION_LIMITS[more]:
+                mode, split = find_mode(tried, other.eta), [*split, sensor]
+        except InsufficientDataError:
+            continue
     return mode
 
 

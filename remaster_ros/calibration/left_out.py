@@ -29,7 +29,7 @@ from remaster_ros.types import FloatArray, IntArray, Measurements
 
 # Fewer poses of a sensor say little, held out or fitted.
 FEWEST_HELD_OUT, FEWEST_FITTED = 4, 8
-# Beyond, ranks are as good as normal.
+# Beyond, their ranks are as good as normal: SciPy's own limit, for the same p-values.
 FEW = 8
 # So many poses of the fit are left out, evenly spread.
 MOST_LEFT_OUT = 1_000
@@ -115,8 +115,7 @@ def _p_value_larger(found: FloatArray, expected: FloatArray) -> float:
     n, m = len(found), len(expected)
     if min(n, m) <= FEW:
         # All orders are counted. SciPy's statistics take half a second to import.
-        exact = scipy.stats.mannwhitneyu(found, expected, alternative='greater', method='exact')
-        return float(exact.pvalue)
+        return float(scipy.stats.mannwhitneyu(found, expected, alternative='greater').pvalue)
     larger = int(np.searchsorted(np.sort(expected), found).sum())
     std = np.sqrt(n * m * (n + m + 1) / 12.0)
     return float(scipy.special.ndtr(-(larger - 0.5 * n * m - 0.5) / std))

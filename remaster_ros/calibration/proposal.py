@@ -42,9 +42,10 @@ BLOCK_ENTRIES = 1_000_000
 # weights are raised to a power below 1, which leads part of the way.
 DRAWS_PER_DIMENSION = 5.0
 POWERS = 0.7 ** np.arange(1.0, 25.0)
-# Fewer weights determine no tail.
+# Fewer weights determine no tail (Vehtari et al., section 6).
 FEWEST_OF_A_TAIL = 5
-TINIEST = np.finfo(float).tiny
+# Zero beside a weight of 1; its inverse is still a number.
+TINIEST = 1e-300
 
 
 @dataclass(frozen=True, eq=False)
@@ -235,7 +236,8 @@ def _smoothed(weight: FloatArray) -> tuple[FloatArray, float]:
     """Return weights (n,) of which the largest is 1, smoothed, and the shape of their tail.
 
     The largest become the expected order statistics of the Pareto distribution that fits them,
-    none larger than the largest was. Where they are all the same nothing is to be smoothed.
+    none larger than the largest was. Where they are all the same nothing is to be smoothed, and
+    nothing can be where a quarter of the tail is no more than what is beside it.
     """
     count = int(min(0.2 * len(weight), 3.0 * math.sqrt(len(weight))))
     order = np.argsort(weight)
@@ -244,6 +246,9 @@ def _smoothed(weight: FloatArray) -> tuple[FloatArray, float]:
         return weight, float('nan')
     # Zero among them is rounding.
     above = np.maximum(weight[tail] - limit, TINIEST)
+    if above[count // 4] <= TINIEST:
+        # One of them is all there is: the worst tail, and no fit to it.
+        return weight, float('inf')
     shape, scale = _pareto(above)
     share = (np.arange(count) + 0.5) / count
     # (1 - share)^-k - 1, over k, also where k is nearly 0.

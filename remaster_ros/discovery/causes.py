@@ -86,7 +86,7 @@ class Search:
             if best is None or best.log_evidence < solution.log_evidence + NAMED:
                 break
             solution = self._exchanged(self.pruned(self._split(best)))
-            solution = self._dated(solution)
+            solution = self.dated(solution)
         return solution
 
     def again(self, data: Residuals, solution: Solution) -> tuple[Search, Solution]:
@@ -98,7 +98,9 @@ class Search:
         families = {family.cell.name: family.cell for family in search.families}
         cells = [families.get(cell.name, cell) for cell in solution.cells]
         fitted = search.fit(cells, solution)
-        return (search, search._dated(search.pruned(fitted))) if fitted else (self, solution)
+        if fitted is None:
+            return self, solution
+        return search, search.dated(search.pruned(fitted))
 
     def fit(self, cells: Sequence[Cell], start: Solution | None = None) -> Solution | None:
         """Fit a set; None for two cells of the same parameters, or of a sign physics excludes."""
@@ -146,7 +148,7 @@ class Search:
         index = solution.cells.index(cell)
         return solution.less(index, solution.evidence_without(index, len(self.data)))
 
-    def _dated(self, solution: Solution) -> Solution:
+    def dated(self, solution: Solution) -> Solution:
         """Return the fit with moments that none nearby is better than."""
         for _ in range(MOST_STEPS):
             before = [cell.moment for cell in solution.cells]

@@ -390,7 +390,7 @@ def _joint_panels(
     joints = result.joint_names
     rows = -(-len(joints) // 2)
     figure, axes = _panels(
-        height_in * rows + 0.5, (rows, 2), left=left, bottom=0.55, top=top, down=0.5
+        height_in * rows + 0.5, (rows, 2), left=left, bottom=0.55, top=top, right=0.25, down=0.5
     )
     for spare in axes[len(joints) :]:
         spare.set_visible(False)

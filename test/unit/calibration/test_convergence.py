@@ -67,6 +67,20 @@ def test_weights_are_smoothed_as_by_arviz() -> None:
     np.testing.assert_allclose(alike.weight, 0.01)
 
 
+@pytest.mark.parametrize('others', [-800.0, -700.0, -300.0, -np.inf])
+def test_one_weight_that_is_all_of_them_stays_a_number(others: float) -> None:
+    log_weight = np.append(0.0, np.full(999, others) + 1e-3 * np.arange(999))
+    drawn = Weighted.of(np.zeros((1000, 1)), log_weight)
+    assert np.isfinite(drawn.weight).all()
+    assert drawn.effective == pytest.approx(1.0, abs=0.02)
+    assert drawn.pareto_k > 0.7
+
+
+def test_chains_that_stay_apart_have_no_finite_r_hat() -> None:
+    x = np.repeat(np.arange(4.0)[:, None], 100, axis=1)
+    assert not r_hat(x) < 10.0
+
+
 def test_every_quantity_is_judged_on_its_own() -> None:
     first, second = (autoregressive(c, 4, 300, seed=1) for c in (0.0, 0.8))
     both = np.stack((first, second), axis=-1)

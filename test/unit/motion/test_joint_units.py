@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from gate_rig import judge
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.interpolate import CubicHermiteSpline
@@ -40,31 +41,14 @@ LIMITS = MotionLimits(
 AT = np.array([0.5, 0.0])
 
 
-class Planned:
-    """Stands where `plan_trajectory` does: whatever waypoints a test wants to see judged."""
-
-    def __init__(self, *waypoints):
-        self._waypoints = tuple(
-            Waypoint(time_s, np.array(q, float), np.array(v, float)) for time_s, q, v in waypoints
-        )
-
-    def waypoints(self):
-        return self._waypoints
-
-
 @pytest.fixture
 def judged(monkeypatch):
     """Return what the gate makes of given waypoints, planned by whomever."""
 
-    def judge(*waypoints, along=((0.5, 0.0), (2.0, 0.0)), start=AT, limits=LIMITS, speeds=None):
-        monkeypatch.setattr(motion_gate, 'plan_trajectory', lambda *_: Planned(*waypoints))
-        try:
-            MotionGate(limits, speeds).admit(FreePath(np.array(along)), np.asarray(start, float))
-        except MotionRefusedError as error:
-            return str(error)
-        return ''
+    def of(*waypoints, along=((0.5, 0.0), (2.0, 0.0)), start=AT, limits=LIMITS, speeds=None):
+        return judge(monkeypatch, waypoints, along, start, limits, speeds)
 
-    return judge
+    return of
 
 
 def test_a_slide_that_is_too_fast(judged):

@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from gate_rig import judge
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.interpolate import CubicHermiteSpline
@@ -35,34 +36,14 @@ def path(*points):
     return FreePath(np.array(points, float))
 
 
-class Planned:
-    """Stands where `plan_trajectory` does: whatever waypoints a test wants to see judged."""
-
-    def __init__(self, *waypoints):
-        self._waypoints = tuple(
-            Waypoint(time_s, np.array(q, float), np.array(v, float)) for time_s, q, v in waypoints
-        )
-
-    def waypoints(self):
-        return self._waypoints
-
-
 @pytest.fixture
 def judged(monkeypatch):
     """Return what the gate makes of given waypoints, planned by whomever."""
 
-    def judge(*waypoints, along=((0.0, 0.0), (1.0, 0.0)), start=ZERO, limits=LIMITS, speeds=None):
-        monkeypatch.setattr(motion_gate, 'plan_trajectory', lambda *_: Planned(*waypoints))
-        gate = MotionGate(limits, speeds)
-        try:
-            gate.admit(path(*along), np.asarray(start, float))
-        except MotionRefusedError as error:
-            assert gate.refused == 1
-            return str(error)
-        assert gate.refused == 0
-        return ''
+    def of(*waypoints, along=((0.0, 0.0), (1.0, 0.0)), start=ZERO, limits=LIMITS, speeds=None):
+        return judge(monkeypatch, waypoints, along, start, limits, speeds)
 
-    return judge
+    return of
 
 
 GOOD = ((2.0, [0.5, 0.0], [0.25, 0.0]), (4.0, [0.8, 0.0], [0.0, 0.0]))
