@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 import re
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar, get_type_hints
 
@@ -275,6 +276,11 @@ def read_yaml(data: bytes, path: Path, record: type[Record], remedy: str = '') -
     return content
 
 
+@cache
+def _hints(record: type) -> dict[str, Any]:
+    return get_type_hints(record, include_extras=True)
+
+
 def out_of_bounds(value: Any, key: str = '', bounds: Bounds = Bounds()) -> str:
     """Return what is wrong with the first number that its bounds refuse; '' where none is.
 
@@ -284,7 +290,7 @@ def out_of_bounds(value: Any, key: str = '', bounds: Bounds = Bounds()) -> str:
         return bounds.problem(key, value)
     parts: list[tuple[str, Any, Bounds]] = []
     if isinstance(value, msgspec.Struct):
-        for name, hint in get_type_hints(type(value), include_extras=True).items():
+        for name, hint in _hints(type(value)).items():
             (declared,) = getattr(hint, '__metadata__', (Bounds(),))
             parts.append((name, getattr(value, name), declared))
     elif isinstance(value, dict):
