@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import importlib.util
 import signal
 
@@ -35,3 +36,9 @@ settings.load_profile('busy')
 # nodes of its tests. Either signal ends a run as Ctrl-C does: with the processes that it started.
 for _number in (signal.SIGINT, signal.SIGTERM):
     signal.signal(_number, signal.default_int_handler)
+
+
+def pytest_collection_finish():
+    """Let the collector of garbage leave alone what stays to the end: all tests and libraries."""
+    gc.collect()
+    gc.freeze()

@@ -10,10 +10,11 @@ import signal
 import subprocess
 import sys
 import time
-from concurrent.futures import Executor, ProcessPoolExecutor
+from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
 from contextlib import redirect_stdout
 from pathlib import Path
 
+import batch_jobs
 import numpy as np
 import pytest
 
@@ -44,7 +45,8 @@ def sessions(tmp_path_factory):
 def by_one(sessions, tmp_path_factory):
     """Return the folder that one worker filled, of s1, a copy of it and a broken one.
 
-    And the rows that the calls printed: at the first two something lay where s1 is written.
+    And the rows that the calls printed: at the first two something lay where s1 is written. The
+    worker is a thread: a process of its own is what `by_two` has.
     """
     folder = tmp_path_factory.mktemp('one')
     (folder / 'empty').mkdir()
@@ -55,14 +57,16 @@ def by_one(sessions, tmp_path_factory):
     Path(job.out).write_text('in the way', encoding='utf-8')
     given = [str(sessions / 's1'), str(folder / 'copy'), str(folder / 'empty')]
     printed = []
-    for sessions_given in (given[:1], given[:1], given):
-        if sessions_given == given:
-            Path(job.out).unlink()
-        with io.StringIO() as text, redirect_stdout(text):
-            status = main(
-                ['batch', *sessions_given, '--out', str(out), '--workers', '1', '--json']
-            )
-            printed.append((status, json.loads(text.getvalue())['rows']))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(batch, '_pool', ThreadPoolExecutor)
+        for sessions_given in (given[:1], given[:1], given):
+            if sessions_given == given:
+                Path(job.out).unlink()
+            with io.StringIO() as text, redirect_stdout(text):
+                status = main(
+                    ['batch', *sessions_given, '--out', str(out), '--workers', '1', '--json']
+                )
+                printed.append((status, json.loads(text.getvalue())['rows']))
     return out, printed
 
 
@@ -77,7 +81,7 @@ def by_two(sessions, tmp_path_factory):
 
 
 def test_rows_do_not_depend_on_the_workers_and_are_not_made_again(
-    sessions, by_one, by_two, capsys
+    sessions, by_one, by_two, capsys, monkeypatch
 ):
     """A broken session has its error and stops nobody."""
     out, (*_, (status, printed)) = by_one
@@ -96,6 +100,7 @@ def test_rows_do_not_depend_on_the_workers_and_are_not_made_again(
         assert (folder / file).read_bytes() == (other / file).read_bytes()
     before = (out / batch.ROWS).read_bytes()
     (out / batch.PAGE).unlink()
+    monkeypatch.setattr(batch, '_pool', ThreadPoolExecutor)
     assert main(['batch', s1, str(out.parent / 'empty'), '--out', str(out)]) == 0
     assert '1 done, 1 error' in capsys.readouterr().out
     assert (out / batch.ROWS).read_bytes() == before, 'made again'
@@ -180,27 +185,6 @@ def test_workers_end_with_a_batch_that_is_killed(tmp_path):
     pytest.fail('a worker stays')
 
 
-# Stand-ins for the work, which a worker can import.
-
-
-def square(job):
-    return {'status': 'done', 'square': job * job}
-
-
-def dies_once(job):
-    number, mark = job
-    if number == 1 and not Path(mark).exists():
-        Path(mark).touch()
-        os.kill(os.getpid(), signal.SIGKILL)
-    return {'status': 'done', 'square': number**2}
-
-
-def always_dies(job):
-    if job == 2:
-        os.kill(os.getpid(), signal.SIGKILL)
-    return square(job)
-
-
 def worked_off(jobs, work, workers=2):
     """Work jobs off, two of them under way at a time; return the rows, and how many pools."""
     done, made = {}, []
@@ -216,13 +200,13 @@ def worked_off(jobs, work, workers=2):
 
 def test_what_was_under_way_when_a_worker_was_killed_is_done_again(tmp_path):
     jobs = [(number, str(tmp_path / 'mark')) for number in range(4)]
-    done, pools = worked_off(jobs, dies_once)
+    done, pools = worked_off(jobs, batch_jobs.dies_once)
     assert {job[0]: row['square'] for job, row in done.items()} == {n: n * n for n in range(4)}
     assert pools == 2
 
 
 def test_a_session_that_kills_its_worker_twice_has_that_in_its_row():
-    done, _ = worked_off(list(range(4)), always_dies, workers=1)
+    done, _ = worked_off(list(range(4)), batch_jobs.always_dies, workers=1)
     assert done.pop(2)['status'] == 'killed'
     assert {job: row['square'] for job, row in done.items()} == {0: 0, 1: 1, 3: 9}
 

@@ -5,6 +5,8 @@ import re
 import types
 from dataclasses import replace
 
+import msgspec
+
 from remaster_ros.cli.main import main
 from remaster_ros.discovery.confirmation import Compared, Confirmation, ConfirmedCause, in_words
 from remaster_ros.discovery.explain import FoundEffect, LookAlike
@@ -56,6 +58,10 @@ TO_LOAD = (
 
 
 def summary(session, confirmation=None, to_load=()):
+    return '\n'.join(discovery_lines(content_of(session, confirmation, to_load)))
+
+
+def content_of(session, confirmation=None, to_load=()):
     points = in_words(session, confirmation) if confirmation else []
     content = {
         'format': 'remaster-discovery/1',
@@ -72,7 +78,7 @@ def summary(session, confirmation=None, to_load=()):
         content['rows_searched'] = session.thinning
     if confirmation is not None:
         content['confirmation'] = confirmation_content(session.effects, confirmation)
-    return '\n'.join(discovery_lines(checked(content, Discovered)))
+    return checked(content, Discovered)
 
 
 def test_causes_look_alikes_and_gain_are_said():
@@ -167,6 +173,11 @@ def test_why_nothing_can_be_compared_is_said():
 
 def test_what_was_left_open_before_is_decided(tmp_path, capsys):
     simulated, out = tmp_path / 'session', tmp_path / 'causes'
+    rival = LookAlike('base_compliance', (), 1.0, 'poses', title='Base compliance')
+    open_one = replace(EFFECT, joints=(2,), confusable_with=(rival,))
+    earlier = tmp_path / 'earlier.json'
+    content = content_of(found((open_one,), Gain(None, None, 1e-4, {}), {}))
+    earlier.write_bytes(msgspec.json.encode(content))
     options = (
         '--poses',
         '20',
@@ -180,15 +191,6 @@ def test_what_was_left_open_before_is_decided(tmp_path, capsys):
     )
     assert main(['simulate', str(simulated), *options, '--effect', 'joint_compliance@2:1']) == 0
     quick = ('--no-figures', '--seed', '1')
-    assert main(['discover', str(simulated), '--out', str(out), *quick, '--quiet']) == 0
-    content = json.loads((out / 'discovery.json').read_text())
-    assert 'decided' not in content
-    (effect,) = content['effects']
-    effect['confusable_with'] = [
-        {'name': 'base_compliance', 'joints': [], 'log_evidence_gain': 1.0, 'separate_by': 'poses'}
-    ]
-    earlier = tmp_path / 'earlier.json'
-    earlier.write_text(json.dumps(content))
     capsys.readouterr()
     again = ['discover', str(simulated), '--out', str(out), *quick, '--decide', str(earlier)]
     assert main(again) == 0

@@ -119,19 +119,21 @@ def test_a_large_change_asks_for_another_check_at_once(days):
     assert found.again or found.changed == (2,)
 
 
-def test_nothing_is_found_where_nothing_is():
-    """40 arms, 12 checks each, every one of which is judged: the bound is 0.4 alarms of 40."""
+@pytest.mark.parametrize('arms', [10, pytest.param(40, marks=pytest.mark.qualify)])
+def test_nothing_is_found_where_nothing_is(arms):
+    """12 checks each, every one of which is judged: the bound is 0.4 alarms of 40."""
     seed = 10
     print('seed', seed)
     alarms = again = 0
-    for one in range(40):
+    for one in range(arms):
         arm = CheckedArm(1000 * seed + one)
         days = arm.days(12)
         found = [judge(arm.found, days[:count]) for count in (1, 2, 3, 4, 6, 9, 12)]
         alarms += any(each.verdict in ('changed', 'setup_moved') for each in found)
         again += sum(each.again for each in found)
-    assert alarms <= 2
-    assert again <= 14, 'one in twenty checks at most'
+    print(alarms, again)
+    assert alarms <= arms / 20
+    assert again <= 7 * arms / 20, 'one in twenty checks at most'
 
 
 def test_several_readings_of_a_pose_are_one():

@@ -123,15 +123,21 @@ def columns(arm):
     return [*np.rad2deg(arm.q).T, *(1e3 * arm.points.T)]
 
 
+def twice(arm):
+    """Return the columns of the first 24 rows, each of them two times."""
+    return [np.repeat(column[:24], 2) for column in columns(arm)]
+
+
 HEADER = ['A1', 'A2', 'A3', 'A4', 'A5', 'A6', 'X', 'Y', 'Z']
 
 
 def test_equal_goals_are_one_pose_and_every_run_of_poses_holds_one_out(do):
     arm, run = do
     # Every second row returns to a goal before it, a little off, as a controller reports it.
-    q = arm.q.copy()
+    q, points = arm.q.copy(), arm.points.copy()
     q[1::2] = q[0::2] + 1e-5
-    made = run(HEADER, [*np.rad2deg(q).T, *(1e3 * arm.points.T)], '--unchecked').measurements
+    points[1::2] = points[0::2]
+    made = run(HEADER, [*np.rad2deg(q).T, *(1e3 * points.T)]).measurements
     assert made.pose.tolist() == [i // 2 for i in range(48)]
     assert made.configuration.tolist() == list(range(48))
     held = np.unique(made.pose[made.is_validation])
@@ -181,12 +187,7 @@ def test_an_unknown_split_is_named(do):
 
 def test_two_markers_at_one_stop_are_one_configuration(do):
     arm, run = do
-    q = np.repeat(arm.q[:24], 2, axis=0)
-    made = run(
-        ['marker', *HEADER],
-        [['a', 'b'] * 24, *np.rad2deg(q).T, *(1e3 * arm.points.T)],
-        '--unchecked',
-    ).measurements
+    made = run(['marker', *HEADER], [['a', 'b'] * 24, *twice(arm)]).measurements
     assert made.configuration.tolist() == [i // 2 for i in range(48)]
     assert made.frame is None
 
@@ -194,14 +195,9 @@ def test_two_markers_at_one_stop_are_one_configuration(do):
 def test_two_markers_at_one_moment_are_one_frame(do):
     """Measured one after the other, as the last two are, they share no error."""
     arm, run = do
-    q = np.repeat(arm.q[:24], 2, axis=0)
     time = np.repeat(10.0 * np.arange(24), 2)
     time[-1] += 2.0
-    made = run(
-        ['marker', 'time', *HEADER],
-        [['a', 'b'] * 24, time, *np.rad2deg(q).T, *(1e3 * arm.points.T)],
-        '--unchecked',
-    ).measurements
+    made = run(['marker', 'time', *HEADER], [['a', 'b'] * 24, time, *twice(arm)]).measurements
     assert made.frame.tolist() == [*np.repeat(np.arange(23), 2).tolist(), -1, -1]
 
 

@@ -37,7 +37,7 @@ def do(arm, tmp_path, capsys):
 
 def assert_fits(session, arm):
     """Assert that the offsets of the inner joints are found, and that some poses are held out."""
-    result = fit_session(session, rng=np.random.default_rng(0))
+    result = fit_session(session, rng=np.random.default_rng(0), draws=300)
     off = (result.joint_offsets - arm.offsets)[1:-1] / result.joint_offsets_std[1:-1]
     assert np.all(np.abs(off) < 5.0), off
     after = result.accuracy['validation']['post_registration']['after']['mean_mm']

@@ -229,6 +229,9 @@ class Rig:
             self.bridge = None
             self.close()
             raise
+        # All nodes are started with the bridge's cell, where a test has them no other.
+        cell = self.bridge.p.cell
+        self.model = MODEL if cell == 'demo' else read_cell(cell).model()
         self.executor = SingleThreadedExecutor()
         self.executor.add_node(self.bridge)
         if not parameters.get('use_sim_time'):
@@ -367,9 +370,7 @@ class Rig:
     def say(self, body):
         """Publish a state or an event in the name of the node that publishes it."""
         node = f'/{body.sender or "optimizer"}'
-        # All nodes are started with the bridge's cell, where a test has them no other.
-        mine = read_cell(self.bridge.p.cell).model()
-        record = EventRecord(node=node, body=body, model=self.models.get(node, mine))
+        record = EventRecord(node=node, body=body, model=self.models.get(node, self.model))
         self.taken(self.said, String(data=encode(record)), 'records')
 
     def say_planner(self, state=None):
