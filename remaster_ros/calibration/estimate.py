@@ -9,6 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from remaster_ros.calibration.extension import Extension, Start
+from remaster_ros.calibration.gauge_words import counted
 from remaster_ros.calibration.grouped_rows import Rows
 from remaster_ros.calibration.identifiability import WEAK_ANGLE, Gauge, find_gauge
 from remaster_ros.calibration.initial_guess import given_start, robust_start, with_bodies
@@ -111,8 +112,9 @@ class Problem:
             poses = len(np.unique(given.pose[rows]))
             if poses < FEWEST_POSES:
                 raise InsufficientDataError(
-                    f"sensor '{name}' saw {poses} poses to fit; at least {FEWEST_POSES} are "
-                    'needed to register it, and some thirty for good zero-offsets'
+                    f"sensor '{name}' saw {counted(poses, 'pose')} to fit; at least "
+                    f'{FEWEST_POSES} are needed to register it, and some thirty for good '
+                    'zero-offsets'
                 )
             if len(rows) < FEWEST_ROWS:
                 raise InsufficientDataError(

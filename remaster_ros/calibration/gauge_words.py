@@ -19,6 +19,11 @@ LEAST_SHARE = 0.2
 EFFECTS_PRIOR = 'the prior on the effects'
 
 
+def counted(number: int, what: str) -> str:
+    """Return '1 pose', '2 poses'."""
+    return f'{number} {what}{"" if number == 1 else "s"}'
+
+
 def in_words(model: Model, direction: FloatArray) -> str:
     """Return which parameters change together without any effect, and what would separate them."""
     joints = np.flatnonzero(direction[: model.joints])

@@ -41,7 +41,8 @@ class MeasuredAgain:
         if not self.again:
             return ''
         return (
-            f'{self.again} of {self.held_out} held-out configurations were fitted as well (joint '
-            f'angles within {np.degrees(SAME_RAD):.2g} degrees): they prove nothing of others'
+            f'{self.again} of {self.held_out} held-out configurations '
+            f'{"was" if self.again == 1 else "were"} fitted as well (joint angles within '
+            f'{np.degrees(SAME_RAD):.2g} degrees): that proves nothing of others'
             + ('; measure others and fit again.' if self.most else '.')
         )

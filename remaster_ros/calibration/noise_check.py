@@ -67,13 +67,18 @@ class NoiseCheck:
         if not self.gross or self.mean_m <= SPOILT * self.error_m:
             return ''
         listed = ', '.join(map(str, self.gross[:LISTED]))
+        listed += ' …' if len(self.gross) > LISTED else ''
+        are = (
+            f'1 held-out reading of {self.sensor} is a gross error (observation {listed}) and '
+            'makes up'
+            if len(self.gross) == 1
+            else f'{len(self.gross)} held-out readings of {self.sensor} are gross errors '
+            f'(observation {listed}) and make up'
+        )
         return (
-            f'{len(self.gross)} held-out readings of {self.sensor} are gross errors (observation '
-            f'{listed}{" …" if len(self.gross) > LISTED else ""}) and make up most of its mean '
-            f'error of {1e3 * self.mean_m:.3f} mm; without them it is '
+            f'{are} most of its mean error of {1e3 * self.mean_m:.3f} mm; without them it is '
             f'{1e3 * self.error_m:.3f} mm. Compare the clocks of sensor and robot, and what was '
-            'hidden or moved then; "remaster discover" tests whether they belong to another '
-            'configuration.'
+            'hidden or moved then.'
         )
 
     @property

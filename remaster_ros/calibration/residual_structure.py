@@ -78,9 +78,8 @@ class StructureTest:
         """How probable so much is by chance, for people."""
         return 'p < 0.0001' if self.p_value < 1e-4 else f'p = {self.p_value:.4f}'
 
-    @property
-    def words(self) -> str:
-        """What the residuals follow, for people."""
+    def words(self, timed: bool = True) -> str:
+        """Return what the residuals follow, for people; ``timed``: whether there are times."""
         where = 'from pose to pose' if self.between_poses else 'within the poses'
         whose = f' of {self.sensor}' if self.sensor else ''
         if self.driver == 'held_out':
@@ -89,11 +88,12 @@ class StructureTest:
                 'as large as on poses left out of the fit: something changed between them, or the '
                 'model does not hold where they lie'
             )
+        time = 'time' if timed else 'the order of the rows'
         what = {
             'position': 'follows the position in front of the sensor',
-            'time': 'follows time',
+            'time': f'follows {time}',
             'joint_angle': "follows the joints' angles",
-            'joint_time': 'looks like that of zero-offsets that change with time',
+            'joint_time': f'looks like that of zero-offsets that change with {time}',
             'link': 'looks like that of links of other lengths',
             'axis': 'looks like that of tilted axes',
             'reading_before': 'resembles that of the reading before',

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from remaster_ros.calibration.gauge_words import counted
 from remaster_ros.cli.console import show
 from remaster_ros.cli.options import names, number
 from remaster_ros.compensation.compensator import Compensator, Correction
@@ -195,14 +196,15 @@ def _summary(facts: dict[str, Any], out: Path) -> str:
     most = max(facts['change_deg'], key=lambda joint: facts['change_deg'][joint])
     residual = facts['residual_mm']
     lines = [
-        f'{facts["rows"]} rows; {most} changes most, by {facts["change_deg"][most]:.3f} deg',
+        f'{counted(facts["rows"], "row")}; {most} changes most, by '
+        f'{facts["change_deg"][most]:.3f} deg',
         f'left of the correction: {residual["rms"]:.3f} mm RMS, {residual["max"]:.3f} mm at most; '
         f'expected error of the marker {facts["expected_error_mm"]:.3f} mm RMS',
     ]
     for key, what in (
-        ('faded_rows', 'are near a singularity, where not all of the pose is corrected'),
-        ('outside_range_rows', 'are beyond the angles at which a curve was measured'),
+        ('faded_rows', 'near a singularity, where not all of the pose is corrected'),
+        ('outside_range_rows', 'beyond the angles at which a curve was measured'),
     ):
         if facts[key]:
-            lines.append(f'{len(facts[key])} rows {what} (--json lists them)')
+            lines.append(f'{counted(len(facts[key]), "row")} {what} (--json lists them)')
     return '\n'.join([*lines, f'written: {out}'])

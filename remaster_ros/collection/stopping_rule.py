@@ -185,7 +185,7 @@ class StoppingRule:
         if look.structure:
             test = look.structure[0]
             return (
-                f'{after}: {test.words} ({test.chance}), which zero-offsets do not explain; all '
+                f'{after}: {test.words()} ({test.chance}), which zero-offsets do not explain; all '
                 'that is planned is measured, and discover looks for the cause'
             )
         if not self.goal.stated:
@@ -238,7 +238,7 @@ class StoppingRule:
                 'them in two solutions'
             )
         if structure:
-            return f'{structure[0].words}, and the std is that of an arm without such errors'
+            return f'{structure[0].words()}, and the std is that of an arm without such errors'
         return ''
 
 

@@ -26,6 +26,7 @@ from typing import Literal
 import numpy as np
 from scipy.special import erfc, fdtri, stdtrit
 
+from remaster_ros.calibration.gauge_words import counted
 from remaster_ros.calibration.registration import register_points
 from remaster_ros.compensation.arm_model import ArmModel
 from remaster_ros.errors import InputError, InsufficientDataError
@@ -152,8 +153,8 @@ def seen(model: ArmModel, measured: Measured) -> Seen:
     freedom = 3 * n - taken.shape[1]
     if freedom < k:
         raise InsufficientDataError(
-            f'{n} readings do not tell where the sensors stand and what has changed; measure '
-            'eight poses'
+            f'{counted(n, "reading")}: too few to tell where the sensors stand and what has '
+            'changed; measure eight poses'
         )
 
     def rest_of(columns: FloatArray) -> FloatArray:

@@ -20,6 +20,7 @@ from typing import Literal
 
 import numpy as np
 
+from remaster_ros.calibration.gauge_words import counted
 from remaster_ros.calibration.registration import register_points
 from remaster_ros.compensation.compensator import Compensator
 from remaster_ros.errors import InsufficientDataError
@@ -112,8 +113,8 @@ def verify(compensator: Compensator, visits: Visits) -> Verified:
     spread = 3 * len(visits.on[visits.on]) - on.base_columns
     if spread <= 3:
         raise InsufficientDataError(
-            f'{int(visits.on.sum())} rows with the correction on do not tell base, marker and '
-            'what acts of the correction; measure ten poses'
+            f'{counted(int(visits.on.sum()), "row")} with the correction on: too few to tell '
+            'base, marker and what acts of the correction; measure ten poses'
         )
     absolute, joints, rivals = _absolute(on)
     toggle, noise = _toggle(compensator, visits)

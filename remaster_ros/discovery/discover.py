@@ -136,7 +136,7 @@ class Discovery:
         """
         if self.geometry is None:
             return False
-        if self.geometry.is_validation.any():
+        if self.geometry.judged.any():
             return self.geometry.is_better
         return any(effect.in_robot_model for effect in self.effects)
 
@@ -256,7 +256,10 @@ def discover_session(
             extension=None if errors is None else extension_of(data, errors, found),
             found=found,
         )
+    outliers = fit.left_out + gross
     geometry = geometry_model(found, causes=measured)
+    if geometry is not None:
+        geometry = geometry.beside(alone, [observation for observation, _ in outliers])
     thinning = None
     if len(pool) < len(found.problem.fitted):
         thinning = judge_by_others(data, found.kept, data.rows.source, empty, solution)
@@ -266,7 +269,7 @@ def discover_session(
         gain=gain,
         pose_common_fraction=pose_common_fraction(data, solution),
         noise_by_range=noise_by_range(data, solution),
-        outliers=fit.left_out + gross,
+        outliers=outliers,
         untestable=untestable,
         offsets_before=offsets_of(before),
         groups=groups,

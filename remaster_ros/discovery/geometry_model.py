@@ -25,6 +25,7 @@ from remaster_ros.calibration.estimate import Estimate, estimate, of_positions_a
 from remaster_ros.calibration.identifiability import OPEN_ANGLE
 from remaster_ros.calibration.laplace import Mode
 from remaster_ros.calibration.priors import TIGHTEST_PRIOR, prior_rows
+from remaster_ros.calibration.result import FitResult
 from remaster_ros.discovery.effects import joint_axis_tilt, link_length
 from remaster_ros.discovery.effects.base import Cell
 from remaster_ros.discovery.effects.context import Context
@@ -61,24 +62,37 @@ class GeometryModel:
     # and on the drawing
     errors: FloatArray
     drawing_errors: FloatArray
-    is_validation: BoolArray  # Which of them were held out, (n,)
+    judged: BoolArray  # By which of them it is judged: those held out, (n,)
     # Of the fit of the members beside the offsets: ``members`` are its first further parameters
     mode: Mode
 
     @property
     def held_out_m(self) -> float:
-        """Mean 3-D error over the validation rows with this geometry, m; NaN without any."""
-        return mean_length(self.errors[self.is_validation])
+        """Mean 3-D error over the rows judged with this geometry, m; NaN without any."""
+        return mean_length(self.errors[self.judged])
 
     @property
     def drawing_held_out_m(self) -> float:
         """The same on the drawing."""
-        return mean_length(self.drawing_errors[self.is_validation])
+        return mean_length(self.drawing_errors[self.judged])
 
     @property
     def is_better(self) -> bool:
         """Whether held-out poses are predicted better with it than on the drawing."""
         return self.held_out_m < self.drawing_held_out_m
+
+    def beside(self, alone: FitResult, gross: Sequence[int]) -> GeometryModel:
+        """Return it judged beside the zero-offsets that can be loaded in place of it.
+
+        Parameters
+        ----------
+        alone
+            Their fit.
+        gross
+            ``observation`` of the gross errors, which do not count.
+        """
+        counts = ~np.isin(alone.measurements.observation, gross)
+        return replace(self, drawing_errors=alone.residuals_after, judged=self.judged & counts)
 
     def offsets_std(self, std: FloatArray) -> FloatArray:
         """Return stds of offsets, given the drawing (k,), as they are if it is not exact, rad."""

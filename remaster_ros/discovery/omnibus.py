@@ -205,9 +205,10 @@ class _Checks:
                 p_value=float(scipy.stats.binom.sf(count - 1, total, USUAL_GROSS)),
                 next=moved
                 or (
-                    f'{count} of the {total} held-out readings of {sensor} are off by '
-                    f'{1e3 * size:.1f} mm (RMS): too many to be single gross errors. Compare '
-                    'where and how they were measured with the others.'
+                    f'{f"All {total}" if count == total else f"{count} of the {total}"} held-out '
+                    f'readings of {sensor} are off by {1e3 * size:.1f} mm (RMS): too many to be '
+                    'single gross errors. Compare where and how they were measured with the '
+                    'others.'
                 ),
             )
 

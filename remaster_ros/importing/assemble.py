@@ -11,6 +11,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from remaster_ros.calibration.arrangement import FEWEST_ROWS, linear_fit
+from remaster_ros.calibration.gauge_words import counted
 from remaster_ros.calibration.mistakes import UNKNOWN_MARKER_STD_M
 from remaster_ros.errors import InputError
 from remaster_ros.importing.rows import RawRows
@@ -279,7 +280,7 @@ def _poses(rows: RawRows, chain: SerialChain, q: FloatArray) -> tuple[IntArray, 
     """Return the pose of each row, (n,), and how it was found."""
     if 'pose' in rows.labels:
         pose, names = _numbered(rows.labels['pose'])
-        return pose, f'{len(names)} poses, as the table numbers them'
+        return pose, f'{counted(len(names), "pose")}, as the table numbers them'
     T = chain.forward(q)
     # A rotation by a small angle a moves the columns of its matrix by a * sqrt(2) in all.
     scale = SAME_POSE_M / (SAME_POSE_RAD * np.sqrt(2.0))
@@ -294,8 +295,8 @@ def _poses(rows: RawRows, chain: SerialChain, q: FloatArray) -> tuple[IntArray, 
             pose[alike] = count
             count += 1
     return pose, (
-        f'{count} poses: rows whose tool poses agree within {1e3 * SAME_POSE_M:g} mm and '
-        f'{np.degrees(SAME_POSE_RAD):.1f} degrees are one'
+        f'{counted(count, "pose")}: rows whose tool poses agree within {1e3 * SAME_POSE_M:g} mm '
+        f'and {np.degrees(SAME_POSE_RAD):.1f} degrees are one'
     )
 
 
@@ -356,21 +357,22 @@ def _splits(
                     f'{rows.where[other]}: another split than {rows.where[mine[0]]}, which has '
                     'the same pose; give a pose one split'
                 )
-        return splits == 1, f'{int(splits.sum())} rows held out, as the table has them'
+        return splits == 1, f'{counted(int(splits.sum()), "row")} held out, as the table has them'
     poses, first = np.unique(pose, return_index=True)
     order = poses[np.argsort(first)]
     if share == 0.0:
         return np.zeros(len(pose), bool), 'no pose held out, as told'
     if len(order) < FEWEST_POSES:
         return np.zeros(len(pose), bool), (
-            f'no pose held out: with less than {FEWEST_POSES} poses the fit needs all'
+            f'no pose held out: with fewer than {FEWEST_POSES} poses the fit needs all'
         )
     # One of each run of poses: the held-out ones meet all of the session, and so does any drift.
     runs = np.array_split(order, max(1, round(share * len(order))))
     held = [rng.choice(run) for run in runs]
+    sizes = sorted({len(run) for run in runs})
     return np.isin(pose, held), (
         f'{len(held)} of {len(order)} poses held out: one, drawn at random, of every '
-        f'{len(order) / len(runs):.3g} in the order measured'
+        f'{" or ".join(map(str, sizes))} in the order measured'
     )
 
 

@@ -186,7 +186,7 @@ def _by_time(points: Table, joints: Table, within_s: float) -> Pairs | None:
     ):
         if len(rows):
             lines = some([str(table.lines[row]) for row in rows])
-            left_out.append(f'{table.path}, line {lines}: {why}, left out')
+            left_out.append(f'{table.path}, line{"s" * (len(rows) > 1)} {lines}: {why}, left out')
     if not kept.any():
         raise InputError(f'{table.path}: every point was measured while the arm moved')
     return Pairs(np.flatnonzero(kept), order[nearer[kept]], 'by time', tuple(left_out))

@@ -16,6 +16,7 @@ from remaster_ros.calibration.arrangement import (
     Fitted,
     fit_arrangement,
 )
+from remaster_ros.calibration.gauge_words import counted
 from remaster_ros.calibration.mistakes import (
     MARKER_SHIFT_M,
     TRIED,
@@ -158,7 +159,8 @@ def _too_few(session: Session, joints: int) -> str:
     each = 3 * len(np.unique(seen[:, joints:], axis=0))
     needed = max(unknowns // each + 1, estimate.FEWEST_ROWS)
     return (
-        f'{count} different configurations to fit are too few: a fit of this arm has {unknowns} '
+        f'{counted(count, "different configuration")} to fit {"is" if count == 1 else "are"} too '
+        f'few: a fit of this arm has {unknowns} '
         f'unknowns ({max(joints - 2, 0)} zero-offsets, 6 of each sensor, 3 of each marker), and '
         f'each configuration gives {each} numbers, so it takes at least {needed}, and some forty '
         'for a good result; measure more (of a stream only standstills of half a second and '

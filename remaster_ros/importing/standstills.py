@@ -537,7 +537,8 @@ def _unpaired(
     ):
         if len(rows):
             lines = some([str(points[0].lines[row]) for row in rows])
-            notes.append(f'{points[0].path}, line {lines}: {why}, left out')
+            some_lines = f'line{"s" * (len(rows) > 1)} {lines}'
+            notes.append(f'{points[0].path}, {some_lines}: {why}, left out')
     return tuple(notes)
 
 

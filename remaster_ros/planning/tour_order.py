@@ -11,6 +11,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
+from remaster_ros.calibration.gauge_words import counted
 from remaster_ros.kinematics.collision import CollisionModel
 from remaster_ros.kinematics.free_paths import free_path, is_straight_free
 from remaster_ros.kinematics.serial_chain import SerialChain
@@ -352,7 +353,8 @@ class Tour:
     def describe(self) -> str:
         """Return what was planned and dropped, in a line."""
         kept = ', '.join(
-            f'{count} {split} poses with {self.configurations[split]} configurations'
+            f'{counted(count, f"{split} pose")} with '
+            f'{counted(self.configurations[split], "configuration")}'
             for split, count in self.poses.items()
         )
         reasons = ', '.join(f'{count} {reason}' for reason, count in self.dropped.most_common())

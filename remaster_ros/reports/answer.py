@@ -241,8 +241,10 @@ def parts(paths: Sequence[Path]) -> tuple[Path | None, Path | None]:
     found: dict[str, Path] = {}
     for path in map(located, paths):
         if path.name not in (FIT_FILE, DISCOVERY_FILE):
+            missing = '' if path.exists() else 'there is no such file or folder; '
             raise InputError(
-                f'{path}: give {FIT_FILE} or {DISCOVERY_FILE}, or the folder of one of them'
+                f'{path}: {missing}give {FIT_FILE} or {DISCOVERY_FILE}, or the folder of '
+                'one of them'
             )
         if path.name in found:
             raise InputError(f'{path}: two files {path.name}; give one of each')
@@ -353,6 +355,8 @@ def answer_of(inputs: Inputs) -> Answer:
     loads_model = (
         inputs.model_mm is not None
         and not uses_causes
+        # Where other causes are there and no length or tilt is, they imitate those.
+        and (not effects or any(effect.in_robot_model for effect in effects))
         and stages[1].mean > NOTICEABLE_GAIN * stages[2].mean
     )
     brings = 2 if uses_causes or loads_model else 1
@@ -362,12 +366,19 @@ def answer_of(inputs: Inputs) -> Answer:
     )
     known = sum(row.identifiable for row in offsets)
     pad = inputs.session.controller
-    measured = [e.title for e in effects if uses_causes]
+    measured = [e.title for e in effects if e.of_measurement]
     return Answer(
         mood=_mood(inputs, loads_model, held_out and action != 'wait'),
         headline=reason
         or _headline(
-            known, stages, brings, held_out, measured, loads_model, gross if held_out else 0
+            known,
+            stages,
+            brings,
+            held_out,
+            measured,
+            uses_causes,
+            loads_model,
+            gross if held_out else 0,
         ),
         action=action,
         uses_causes=uses_causes,
@@ -494,6 +505,7 @@ def _headline(
     brings: int,
     held_out: bool,
     measured: Sequence[str],
+    uses_causes: bool,
     loads_model: bool,
     gross: int,
 ) -> str:
@@ -505,16 +517,17 @@ def _headline(
     where = 'poses that were never fitted' if held_out else 'the fitted poses'
     if gross:
         where += f' ({not_counted(gross)})'
-    if measured:
+    if uses_causes:
         # That part of the errors was never the arm's.
         return (
             f'{deed}: with them the mean error on {where} is {after.mean:.3f} mm, once the '
             f'measuring error ({listed(measured)}) is taken out; the {before.mean:.3f} mm of '
             'today contain it.'
         )
+    both = f' Both contain what the measurement errs by ({listed(measured)}).' if measured else ''
     return (
         f'{deed}: the mean error on {where} falls from {before.mean:.3f} mm to {after.mean:.3f} '
-        f'mm, {times_smaller(before.mean, after.mean)}.'
+        f'mm, {times_smaller(before.mean, after.mean)}.{both}'
     )
 
 
@@ -582,7 +595,7 @@ def what_remains(inputs: Inputs, loads_model: bool, held_out: bool) -> list[Rema
         )
     if not rows:
         words = (
-            'every cause was tried, and none explains more of what is left than chance does'
+            'no cause that this session can show explains more of what is left than chance does'
             if found is not None
             else 'what is left is what noise explains'
         )
@@ -597,7 +610,7 @@ def _of_discovery(found: Discovered, loads_model: bool) -> list[Remaining]:
     for effect in stay[:MOST_NAMED]:
         sizes = effect.sizes if isinstance(effect.sizes, list) else []
         size = '; '.join(sizes)
-        if len(sizes) > MOST_SIZES and isinstance(effect.size_m, float):
+        if not 0 < len(sizes) <= MOST_SIZES and isinstance(effect.size_m, float):
             size = at_marker(effect.size_m)
         remedy = effect.remedy if isinstance(effect.remedy, str) else ''
         remedy = NO_FILE if effect.in_robot_model else remedy

@@ -151,12 +151,13 @@ def _covariance(discovery: Discovery) -> dict[str, Any]:
 
 def _regions(discovery: Discovery, predictions: Predictions) -> dict[str, Any]:
     measurements = discovery.residuals.context.measurements
-    gross = [observation for observation, _ in discovery.fit.left_out]
-    fitted = ~measurements.is_validation & ~np.isin(measurements.observation, gross)
+    gross = [observation for observation, _ in discovery.outliers]
+    kept = ~np.isin(measurements.observation, gross)
+    held_out = measurements.is_validation
     return {
         'widening': predictions.widening,
-        'held_out': Coverage.of(predictions.inside[measurements.is_validation]),
-        'fitted': Coverage.of(predictions.inside[fitted]),
+        'held_out': Coverage.of(predictions.inside[kept & held_out]),
+        'fitted': Coverage.of(predictions.inside[kept & ~held_out]),
     }
 
 

@@ -122,7 +122,9 @@ def geometry_of(result: FitResult) -> GeometryModel | None:
     """
     if result.found is None or result.chain.slides.any():
         return None
-    return geometry_model(result.found)
+    geometry = geometry_model(result.found)
+    gross = [row for check in result.noise_checks for row in check.gross]
+    return None if geometry is None else geometry.beside(result, gross)
 
 
 def model_text(result: FitResult, geometry: GeometryModel) -> str:
@@ -131,7 +133,7 @@ def model_text(result: FitResult, geometry: GeometryModel) -> str:
         f'Load this model in place of {URDF_FILE}, never beside another correction: lengths, '
         'tilts and zero-offsets were fitted together.'
     )
-    if geometry.is_validation.any():
+    if geometry.judged.any():
         remark += (
             f' Mean error on held-out poses: {1e3 * geometry.held_out_m:.3f} mm, with the '
             f'zero-offsets alone {1e3 * geometry.drawing_held_out_m:.3f} mm.'
@@ -160,7 +162,7 @@ def compensation_text(result: FitResult, result_sha256: str) -> str:
 
 def _reaches(described: Described, geometry: GeometryModel, rows: Measurements) -> bool:
     errors = geometry.errors + remaining(described.model, rows)
-    return mean_length(errors[geometry.is_validation]) < geometry.drawing_held_out_m
+    return mean_length(errors[geometry.judged]) < geometry.drawing_held_out_m
 
 
 def correction_text(

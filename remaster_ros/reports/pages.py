@@ -66,7 +66,10 @@ def page(template: str, **content: Any) -> str:
         'metric': METRICS.__getitem__,
         'not_counted': not_counted,
         'counts': lambda session: counts_words(msgspec.convert(session, MeasuredSession)),
-        'coverage': lambda rows: coverage_words(msgspec.convert(rows, Coverage)),
+        'coverage': lambda found: coverage_words(
+            msgspec.convert(found['predicted_regions95']['held_out'], Coverage),
+            found['gain']['held_out_gross'],
+        ),
         'summarized': summarized,
         'size': lambda effect: size_words(msgspec.convert(effect, Effect)),
         'look_alike': lambda other, of: look_alike_name(

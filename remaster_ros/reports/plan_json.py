@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from remaster_ros.calibration.gauge_words import counted
 from remaster_ros.kinematics.serial_chain import LEVER_M, SerialChain
 from remaster_ros.planning.collection_plan import FITTED, CollectionPlan, Expected
 from remaster_ros.planning.planned_design import DesignSettings
@@ -72,20 +73,25 @@ def _separated(design: SeparatingDesign) -> dict[str, Any]:
     }
 
 
+def _at_poses(configurations: int, poses: int) -> str:
+    return f'{counted(configurations, "configuration")} at {counted(poses, "pose")}'
+
+
 def plan_text(plan: CollectionPlan, settings: DesignSettings) -> str:
     """Return the same for people, one subject a line."""
     visits = Counter(visit.split for visit in plan.visits)
     poses = plan.poses
     lines = [
-        f'to fit: {visits[FITTED]} configurations at {poses.get(FITTED, 0)} poses'
+        f'to fit: {_at_poses(visits[FITTED], poses.get(FITTED, 0))}'
         + (', chosen for what they tell' if settings.optimal else ' of a Latin hypercube'),
-        f'held out: {visits[HELD_OUT]} configurations at {poses.get(HELD_OUT, 0)} poses',
+        f'held out: {_at_poses(visits[HELD_OUT], poses.get(HELD_OUT, 0))}',
     ]
     if visits[REGISTRATION]:
-        lines.append(f'registration: {visits[REGISTRATION]} configurations')
+        lines.append(f'registration: {counted(visits[REGISTRATION], "configuration")}')
     if plan.tour.references:
         lines.append(
-            f'references: {plan.tour.references} configurations, {visits[REFERENCE]} visits'
+            f'references: {counted(plan.tour.references, "configuration")}, '
+            f'{counted(visits[REFERENCE], "visit")}'
         )
     lines += [
         f'dropped poses: {_counts(plan.tour.dropped)}',
@@ -122,8 +128,8 @@ def outlook_text(tour: Tour, expected: Expected) -> str:
     counts = {split: (tour.configurations[split], poses) for split, poses in tour.poses.items()}
     fitted, held_out = counts[FITTED], counts.get(HELD_OUT, (0, 0))
     lines = [
-        f'to fit: {fitted[0]} configurations at {fitted[1]} poses',
-        f'held out: {held_out[0]} configurations at {held_out[1]} poses',
+        f'to fit: {_at_poses(*fitted)}',
+        f'held out: {_at_poses(*held_out)}',
         f'dropped poses: {_counts(tour.dropped)}',
     ]
     return '\n'.join([*lines, *_expected_lines(tour.chain, *expected)])
@@ -164,7 +170,7 @@ def _expected_std(
 
 def _separated_text(design: SeparatingDesign) -> list[str]:
     count = sum(len(pose.solutions) for pose in design.poses)
-    lines = [f'of these to separate causes: {count} configurations at {len(design.poses)} poses']
+    lines = [f'of these to separate causes: {_at_poses(count, len(design.poses))}']
     for pair in design.pairs:
         verdict = 'decided' if pair.after >= DECIDED else 'may stay open'
         lines.append(

@@ -59,7 +59,7 @@ def precision_json(rule: StoppingRule, looks: Sequence[Look]) -> str:
                 'driver': test.driver,
                 'between_poses': test.between_poses,
                 'p_value': test.p_value,
-                'message': test.words,
+                'message': test.words(),
             }
             for test in last.structure
         ],

@@ -176,7 +176,7 @@ def verdict(result: FitResult) -> Judgement:
     if unknown:
         points.append(
             f'{count - len(unknown)} of {count} zero-offsets are measured; the data do not '
-            f'distinguish {listed(unknown)} from what the table names.'
+            f'distinguish {listed(unknown)} from what stands beside them.'
         )
     else:
         points.append(f'All {count} zero-offsets are measured.')
@@ -211,7 +211,8 @@ def _mean_errors_mm(result: FitResult, validated: bool) -> tuple[float, float]:
 def _structure(result: FitResult) -> list[str]:
     """Return what the residuals follow."""
     found = result.structure.found if result.structure is not None else ()
-    return [f'{test.words[0].upper()}{test.words[1:]} ({test.chance}).' for test in found]
+    told = [(test.words(result.session.timed), test.chance) for test in found]
+    return [f'{words[0].upper()}{words[1:]} ({chance}).' for words, chance in told]
 
 
 def _widening(result: FitResult) -> list[str]:
@@ -234,6 +235,8 @@ def _dominated(result: FitResult, unexplained: Sequence[NoiseCheck]) -> str:
     """Return why the error after is no success, and what to do."""
     if not result.other_errors:
         return 'Whether noise explains what is left, this session cannot show.'
+    if result.structure is not None and result.structure.too_few:
+        return 'Noise does not explain what is left; so few poses do not show what does.'
     deed = 'run "remaster discover".'
     if result.chain.slides.any():
         deed = '"remaster discover" does not take an arm with a joint that slides.'
@@ -260,11 +263,13 @@ def _compared(check: NoiseCheck) -> str:
         )
         if std is not None
     ]
+    if len(sources) > 1 and check.noise_m is not None and check.noise_m != check.within_m:
+        sources.append(f'of which {1e3 * check.noise_m:.3f} mm count')
     return (
-        f'{check.sensor}: the error after is {1e3 * check.error_m:.3f} mm; noise '
-        f'({", ".join(sources)}) makes {1e3 * check.noise_error_m:.3f} mm. A sensor or base that '
-        'was moved during the session, a soft joint or a worn gear leave such errors, and the '
-        'offsets take up a part of them.'
+        f'{check.sensor}: without its largest errors the mean after is '
+        f'{1e3 * check.error_m:.3f} mm; noise ({", ".join(sources)}) makes '
+        f'{1e3 * check.noise_error_m:.3f} mm. A sensor or base that was moved during the session, '
+        'a soft joint or a worn gear leave such errors, and the offsets take up a part of them.'
     )
 
 
@@ -412,7 +417,9 @@ def _result(discovery: Discovery, confirmation: Confirmation | None, *, left: bo
                 'Nothing was found beyond the zero-offsets and the noise, but no poses were held '
                 f'out to check it: measure some and search again.{doubt}'
             )
-        seen = f'that moves the marker by less than {1e3 * least_seen_m(discovery):.2f} mm RMS'
+        least_mm = 1e3 * least_seen_m(discovery)
+        digits = max(2, 1 - int(np.floor(np.log10(least_mm))))
+        seen = f'that moves the marker by less than {least_mm:.{digits}f} mm RMS'
         if not _would_show(discovery):
             return (
                 'Nothing was found beyond the zero-offsets and the noise, but '
@@ -501,13 +508,16 @@ def look_alike_name(effect: Effect, other: LookAlike) -> str:
     return fewer or sentence_case(other.title or called(other.name, other.joints))
 
 
-def coverage_words(held_out: Coverage) -> str:
-    """Return how many held-out rows lie where they were predicted; '' where there are none."""
+def coverage_words(held_out: Coverage, gross: int) -> str:
+    """Return how many held-out rows lie where they were predicted; '' where there are none.
+
+    ``gross``: how many held-out rows are gross errors.
+    """
     if held_out.share is None:
         return ''
     return (
         f'{held_out.inside} of {held_out.rows} held-out rows ({percent(held_out.share)}) lie in '
-        'the regions predicted for them with 95 %'
+        'the regions predicted for them with 95 %' + (f'; {not_counted(gross)}' if gross else '')
     )
 
 
@@ -542,7 +552,7 @@ def load_words(row: Loadable) -> tuple[str, str]:
         # Better than the offsets alone, or the file would not hold it.
         what_to_do = f'only where no robot model can be loaded: {file}'
     elif worse:
-        what_to_do = 'leave it: no better than what stands before it'
+        what_to_do = 'leave it: no better than a plainer one'
     elif row.file:
         what_to_do = file
     elif row.held_out_mean_mm is None:
@@ -569,7 +579,8 @@ _MORE = {
 def fit_lines(fit: Fit) -> list[str]:
     """Return offsets, errors and verdict, a line each."""
     assert isinstance(fit.judgement, Judgement)
-    lines = [f'{row.joint:12s} {_offset(row)}' for row in fit.joint_offsets]
+    width = max(len(row.joint) for row in fit.joint_offsets)
+    lines = [f'{row.joint:{width}s} {_offset(row)}' for row in fit.joint_offsets]
     for split in ('optimization', 'validation'):
         metrics = getattr(fit.accuracy, split)
         if metrics is None:
@@ -636,7 +647,9 @@ def discovery_lines(found: Discovered) -> list[str]:
     measured = any(effect.of_measurement for effect in found.effects)
     lines += _to_load(found.loadable or (), ' (measuring errors taken out)' if measured else '')
     regions = found.predicted_regions95
-    if isinstance(regions, Struct) and (words := coverage_words(regions.held_out)):
+    if isinstance(regions, Struct) and (
+        words := coverage_words(regions.held_out, found.gain.held_out_gross)
+    ):
         lines.append(words)
     if isinstance(part := found.rows_searched, Thinning):
         lines.append(

@@ -98,4 +98,4 @@ def test_forty_rows_of_one_pose_are_too_little_and_it_is_said(tmp_path, capsys):
     for verb in ('fit', 'discover'):
         out = str(tmp_path / verb)
         assert main([verb, str(tmp_path / 'session'), '--out', out, '--no-figures']) == 1
-        assert 'saw 1 poses to fit; at least 3 are needed' in capsys.readouterr().err
+        assert 'saw 1 pose to fit; at least 3 are needed' in capsys.readouterr().err

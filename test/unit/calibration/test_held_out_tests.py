@@ -108,7 +108,7 @@ def test_errors_that_differ_between_the_joint_solutions_are_seen_within_the_pose
     wrong = 0.8e-3 * np.random.default_rng(6).standard_normal((len(m), 3))
     tests = by_sensor(with_held_out_errors(session, wrong))
     assert tests['mocap', False].p_value < 1e-4
-    assert 'within the poses is' in tests['mocap', False].words
+    assert 'within the poses is' in tests['mocap', False].words()
     assert tests['tracker', False].p_value > 1e-3
 
 

@@ -74,7 +74,7 @@ def test_structure_is_found_and_named(errors, driver, words) -> None:
     found = structure_of(with_errors(51, errors)).found
     named = {(test.driver, test.between_poses): test for test in found}
     assert driver in named
-    assert words in named[driver].words
+    assert words in named[driver].words()
     assert [test.p_value for test in found] == sorted(test.p_value for test in found)
 
 
@@ -109,7 +109,7 @@ def test_a_slip_of_a_joint_is_found_before_it_passes_for_an_offset() -> None:
     """What the sensor sees of it turns with the pose: its own position and time show little."""
     found = structure_of(session_with(87, slipped, poses=20, validation=0)).found
     assert [test.driver for test in found] == ['joint_time']
-    assert found[0].words == (
+    assert found[0].words() == (
         'the error looks like that of zero-offsets that change with time within the poses'
     )
 
@@ -125,7 +125,7 @@ def test_errors_of_links_and_axes_are_found_before_they_pass_for_offsets(kind: s
     )
     found = structure_of(session).found
     assert {test.driver for test in found} & {'axis', 'link'}
-    assert all(test.words.startswith('the error ') for test in found)
+    assert all(test.words().startswith('the error ') for test in found)
 
 
 def test_one_of_two_sensors_is_named_also_where_few_poses_allow_only_simple_functions() -> None:

@@ -119,7 +119,7 @@ def test_easy_goals_wait_for_poses_repeats_and_degrees_of_freedom():
     session, _ = drawn(4)
     rule = StoppingRule(StoppingGoal(joint_std_rad=0.1), PLANNED, 6)
     early = rule.look(session, 2, None, np.random.default_rng(0))
-    assert 'saw 1 poses to fit' in early.lacking
+    assert 'saw 1 pose to fit' in early.lacking
     assert early.joint_std == {}
     assert json.loads(precision_json(rule, [early]))['more'] is None
     found = looks(rule, session)

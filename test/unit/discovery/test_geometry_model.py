@@ -163,3 +163,14 @@ def test_each_result_that_can_be_loaded_has_its_own_held_out_error(tmp_path: Pat
     assert means[0] == pytest.approx(
         1e3 * np.linalg.norm(apart.residuals_after[held_out], axis=1).mean(), rel=0.01
     )
+
+
+def test_gross_errors_decide_over_no_robot_model() -> None:
+    """Of one fit the error with the zero-offsets is one number, wherever it stands."""
+    made = remaster_ros.simulate(poses=16, validation_poses=12, seed=8, outlier_share=0.08)
+    content = fit_content(remaster_ros.fit(made.session))
+    gross = sum(len(check.gross) for check in content.explained_by_noise.values())
+    assert gross
+    shown = f'{content.geometry.drawing_held_out_mean_mm:.3f} mm on poses it never fitted'
+    assert shown in content.judgement.headline
+    assert abs(content.geometry.held_out_mean_mm - content.geometry.drawing_held_out_mean_mm) < 0.1

@@ -497,3 +497,27 @@ def test_what_held_out_rows_show_to_be_more_than_noise(fit, rows, inside, after_
     content.predicted_regions95 = msgspec.convert(regions, kind)
     found = more_than_noise(content)
     assert (says in found) if says else not found
+
+
+@pytest.mark.parametrize('effects', [[BACKLASH], [SOFT]], ids=['backlash', 'soft'])
+def test_no_robot_model_is_loaded_that_imitates_what_is_no_length_and_no_tilt(inputs, effects):
+    """Of backlash lengths and tilts take up a tenth, on held-out poses too."""
+    answer = answer_of(inputs(effects, model=0.3))
+    assert not answer.loads_model
+    assert answer.headline.startswith('Set the zero-offsets')
+    assert 'robot_model.urdf' not in answer.files
+
+
+def test_what_the_measurement_errs_by_is_said_where_it_stays_in_both_errors(inputs):
+    told = answer_of(inputs([LENGTH, {**BUMP, 'sizes': []}], model=0.4))
+    assert told.loads_model
+    title = told.remains[0].what
+    assert told.headline.endswith(f'Both contain what the measurement errs by ({title}).')
+    # A cause without sizes of its own has that at the marker.
+    assert told.remains[0].size == '1.000 mm RMS at the marker'
+    assert 'Both contain' not in answer_of(inputs([LENGTH], model=0.4)).headline
+
+
+def test_a_folder_that_is_not_there_is_not_said_to_be_another_file(tmp_path):
+    with pytest.raises(InputError, match='there is no such file or folder; give'):
+        parts([tmp_path / 'fitt'])

@@ -411,7 +411,9 @@ def shown(discovery, folder, figures=True):
     assert html.escape(content.judgement.headline) in words
     # One phrase of one fact.
     facts = [size_words(effect) for effect in content.effects]
-    facts += filter(None, [coverage_words(content.predicted_regions95.held_out)])
+    facts += filter(
+        None, [coverage_words(content.predicted_regions95.held_out, content.gain.held_out_gross)]
+    )
     for fact in facts:
         assert fact in '\n'.join(printed)
         assert html.escape(fact) in words
@@ -458,6 +460,20 @@ def test_what_held_out_poses_show_is_not_said_to_be_nothing(scenes, tmp_path):
     assert 'Nothing was found beyond' in page
     assert 'Nothing is there' not in page
     assert '2.0 times that of the noise alone' in page
+
+
+def test_gross_errors_do_not_count_among_the_rows_that_lie_where_they_were_predicted(scenes):
+    """They made 88 % of 95 %, and a finding of what was noise and gross errors alone."""
+    healthy = scenes['healthy']
+    m = healthy.residuals.context.measurements
+    before = discovery_json.discovery_content(healthy).predicted_regions95.held_out
+    gross = tuple((int(row), 'gross') for row in m.observation[m.is_validation][:3])
+    content = discovery_json.discovery_content(
+        replace(healthy, outliers=gross, gain=replace(healthy.gain, held_out_gross=3))
+    )
+    held_out = content.predicted_regions95.held_out
+    assert held_out.rows == before.rows - 3
+    assert '; 3 gross errors not counted' in '\n'.join(discovery_lines(content))
 
 
 @pytest.mark.parametrize('scene', ['bent', 'scale', 'unproven'])

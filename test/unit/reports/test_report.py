@@ -222,6 +222,7 @@ def test_a_session_without_validation_has_a_report(fit_result):
         residuals_after=fit_result.residuals_after[optimization],
         compare=lambda: comparison,
         left_out=(),
+        found=None,
     )
     html = fit_html(result, {})
     assert 'not proven' in html

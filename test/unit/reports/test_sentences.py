@@ -183,3 +183,33 @@ def test_terminal_and_page_have_one_phrase_of_one_fact(fit_result):
         assert what in page
         assert to_do in page
         assert (f'to load: {what}' in printed) == bool(content.geometry.file)
+
+
+def test_the_order_of_rows_is_not_called_time_where_there_are_no_times(fit_result):
+    structure = ResidualStructure(
+        (StructureTest('joint_time', False, 1e-9), StructureTest('time', True, 1e-9))
+    )
+    timed = replace(with_accuracy(fit_result, 'validation', 4.0, 0.5), structure=structure)
+    assert 'change with time within the poses' in ' '.join(verdict(timed).findings)
+    ordered = replace(timed, session=replace(fit_result.session, timed=False))
+    told = ' '.join(verdict(ordered).findings)
+    assert 'change with the order of the rows within the poses' in told
+    assert 'follows the order of the rows from pose to pose' in told
+    assert 'time' not in told
+
+
+def test_where_poses_are_too_few_no_other_errors_are_said_to_dominate(fit_result):
+    result = replace(with_accuracy(fit_result, 'validation', 4.0, 2.3), noise_checks=(MOVED,))
+    judged = verdict(replace(result, structure=ResidualStructure((), too_few=True)))
+    assert 'other errors dominate' not in judged.headline
+    assert 'so few poses do not show what does' in judged.headline
+    assert any('measure at least 12 and fit again' in doubt for doubt in judged.doubts)
+
+
+def test_the_mean_without_the_largest_errors_is_said_to_be_that(fit_result):
+    """It stands beside the mean of all; and of scatter within poses not all counts as noise."""
+    check = NoiseCheck('tracker', 0.934e-3, 6e-6, 0.89e-3, poses=200)
+    result = replace(with_accuracy(fit_result, 'validation', 1.0, 0.979), noise_checks=(check,))
+    told = verdict(result).findings[0]
+    assert 'without its largest errors the mean after is 0.934 mm' in told
+    assert '0.890 mm per axis within a pose, of which 0.030 mm count) makes 0.048 mm' in told
