@@ -61,7 +61,7 @@ def moved_markers(found: Estimate, data: Residuals, solution: Solution) -> tuple
         u = axes[:, seen].T @ pull
         noise = np.diag(values[seen])
         square = float(u @ np.linalg.solve(noise + np.diag((values[seen] * std) ** 2), u))
-        p_value = float(scipy.stats.chi2.sf(square, seen.sum()))
+        p_value = float(scipy.special.chdtrc(seen.sum(), square))
         if p_value * len(problem.marker_names) > SIGNIFICANCE:
             continue
         inverse = axes[:, seen] / values[seen]

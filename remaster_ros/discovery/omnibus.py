@@ -139,7 +139,7 @@ class _Checks:
         # lies within it of the places of other poses.
         some = gross[:: 1 + len(gross) // MOST_COMPARED].tolist()
         chance = min(1.0, 2.0 * np.mean([self._share_near(row) for row in some]))
-        p_value = float(scipy.stats.binom.sf(count - 1, len(gross), chance))
+        p_value = float(scipy.special.bdtrc(count - 1, len(gross), chance))
         if p_value > SIGNIFICANCE:
             return
         listed = ', '.join(map(str, measurements.observation[self.mispaired][:LISTED]))
@@ -202,7 +202,7 @@ class _Checks:
                 where='held_out_poses',
                 driver='time' if moved else 'unknown',
                 size_m=size,
-                p_value=float(scipy.stats.binom.sf(count - 1, total, USUAL_GROSS)),
+                p_value=float(scipy.special.bdtrc(count - 1, total, USUAL_GROSS)),
                 next=moved
                 or (
                     f'{f"All {total}" if count == total else f"{count} of the {total}"} held-out '

@@ -17,7 +17,7 @@ from discovery_scenes import (
     sagging_arm,
     session_with,
 )
-from scipy.stats import norm
+from scipy.stats import norm, spearmanr
 
 from remaster_ros.calibration.fit import fit_session
 from remaster_ros.calibration.noise import NoiseModel
@@ -566,6 +566,15 @@ def test_the_cause_that_is_there_wins_whichever_way_it_is_asked():
     assert second.describe() == first.describe()
     # Of two joints of which one gives way.
     assert fourth.log_evidence > 0.0
+
+
+def test_errors_and_range_are_correlated_as_scipy_has_it():
+    data, solution = soft_joint().residuals, soft_joint().solution
+    length = np.linalg.norm(data.left(solution), axis=1)
+    for sensor, span in data.rows.spans:
+        wanted = spearmanr(data.part.range_m[span], length[span]).pvalue
+        found = soft_joint().noise_by_range[data.context.sensor_names[sensor]]['p_value']
+        assert found == pytest.approx(wanted, rel=1e-9)
 
 
 def test_what_the_search_has_not_found_is_not_decided():
