@@ -87,8 +87,8 @@ def own_poses(session: Session) -> Session:
 
 
 def one_pose_held_out(seed: int) -> Session:
-    """Return forty poses of one solution, of which one is held out."""
-    return simulated(one_solution(39, seed), seed, one_solution(1, seed + 1))
+    """Return twenty poses of one solution, of which one is held out."""
+    return simulated(one_solution(19, seed), seed, one_solution(1, seed + 1))
 
 
 def one_pose_for_all(seed: int) -> Session:
@@ -166,7 +166,7 @@ CHEAP: dict[str, Shape] = {
     'each read three times, none held out': lambda: repeats(2, 3, 0),
     'some read twice': lambda: repeats_of_some(3),
     'read twice, a pose for every reading': lambda: own_poses(repeats(4, 2)),
-    'one pose of forty held out': lambda: one_pose_held_out(5),
+    'one pose of twenty held out': lambda: one_pose_held_out(5),
     'no times': lambda: without_times(6),
     LAST_ALONE: lambda: last_alone(10),
     'three sensors': lambda: three_sensors(7),

@@ -30,12 +30,11 @@ from foreign_tables import measured, text, write
 
 from remaster_ros.cli.main import VERBS, main
 
-# Together some 15 s; the others are run by `make qualify`.
+# Together a few seconds; the others are run by `make qualify`.
 CHEAP = {
     'apply',
     'import',
     'quick-start-real-hardware',
-    'tutorial-demo',
 }
 
 

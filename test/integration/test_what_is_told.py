@@ -100,7 +100,7 @@ def paired_wrongly(session: Session, share: float) -> Session:
 
 def test_a_few_readings_paired_wrongly_do_not_decide_and_are_told(tmp_path: Path) -> None:
     """5 % of the rows, which make the error on held-out poses hundreds of times the noise."""
-    options = ('--poses', 30, '--validation', 15, '--seed', 7)
+    options = ('--poses', 22, '--validation', 12, '--seed', 7)
     session = read_session(simulated(tmp_path / 'clean', *options))
     write_session(tmp_path / 'session', paired_wrongly(session, 0.05))
     text, fit, found, answer = told(tmp_path / 'session', tmp_path)
@@ -122,7 +122,7 @@ def test_a_few_readings_paired_wrongly_do_not_decide_and_are_told(tmp_path: Path
 
 def test_backlash_is_no_slip(tmp_path: Path) -> None:
     """Its form is a step, over the side of approach: the zero-offsets hold all the time."""
-    options = ('--poses', 40, '--validation', 20, '--sensors', 'mocap', '--seed', 5)
+    options = ('--poses', 30, '--validation', 15, '--sensors', 'mocap', '--seed', 5)
     session = simulated(tmp_path / 'session', *options, '--effect', 'backlash@4:0.5')
     text, _, found, answer = told(session, tmp_path)
     (effect,) = found['effects']

@@ -11,7 +11,6 @@ from parallel import in_parallel
 from scipy.spatial.transform import Rotation
 from scipy.stats import binom
 
-import remaster_ros
 from remaster_ros.calibration.fit import fit_session
 from remaster_ros.reports.fit_json import fit_content
 from remaster_ros.reports.sentences import fit_lines
@@ -105,12 +104,16 @@ def test_gross_orientations_take_their_reading_along():
     assert not np.isin(wrong, found.kept).any()
 
 
+def fitted(session):
+    return fit_session(session, rng=np.random.default_rng(0), draws=400)
+
+
 def test_another_order_of_the_quaternion_is_named_and_the_positions_are_fitted():
     session = make_session('tracker', np.random.default_rng(6)).session
     m = session.measurements
     mixed = replace(session, measurements=replace(m, orientation=m.orientation[:, [3, 0, 1, 2]]))
-    fit = remaster_ros.fit(mixed)
-    alone = remaster_ros.fit(session.positions_alone())
+    fit = fitted(mixed)
+    alone = fitted(session.positions_alone())
     assert 'order x, y, z, w' in fit.orientations_in_words
     np.testing.assert_array_equal(fit.joint_offsets, alone.joint_offsets)
     content = fit_content(fit)
@@ -131,18 +134,18 @@ def test_orientations_that_ask_for_other_offsets_widen_the_intervals():
     body = Rotation.from_matrix(made.R_T_B)
     moved = body.inv() * here.inv() * there * body
     turned = (Rotation.from_quat(m.orientation) * moved).as_quat()
-    fit = remaster_ros.fit(replace(made.session, measurements=replace(m, orientation=turned)))
+    fit = fitted(replace(made.session, measurements=replace(m, orientation=turned)))
     (test,) = (test for test in fit.structure.tests if test.driver == 'orientation')
     assert test in fit.structure.found
     assert fit.other_errors
     low, high = fit.joint_offsets_interval95[3]
     assert low < made.joint_offsets[3] < high
-    assert not remaster_ros.fit(made.session).other_errors
+    assert not fitted(made.session).other_errors
 
 
 def test_report_and_file_tell_that_they_were_used_and_how_sure():
     made = make_session('tracker', np.random.default_rng(8))
-    fit = remaster_ros.fit(made.session)
+    fit = fitted(made.session)
     content = fit_content(fit)
     found = content.orientation
     assert found.fitted
