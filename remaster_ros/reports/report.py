@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import importlib.resources
 import json
 import logging
 import re
@@ -47,6 +46,7 @@ from remaster_ros.reports.figures import (
 )
 from remaster_ros.reports.fit_json import REPORT_FILE, fit_content
 from remaster_ros.reports.pages import compressed, inlined, page, write_report
+from remaster_ros.reports.robot_scene import RobotScene, scene_to_dict, view_script
 from remaster_ros.reports.schemas import Accuracy, Discovered
 from remaster_ros.reports.sentences import (
     METRICS,
@@ -65,12 +65,9 @@ if TYPE_CHECKING:
     from remaster_ros.session.plan_journal import RecordedPlan
 
 
-# The 3-D view of a fit: arm, measured markers, magnified error vectors, sensors (for plotly.js).
-#
-# Only the description is made here, as plain data; the page brings the script.
+# The 3-D view of a fit: arm, measured markers, magnified error vectors, sensors.
 
 
-ARM, SENSOR, TEXT = '#7d8896', '#2f9e78', '#808a96'
 ARMS_SHOWN = 5
 ROWS_SHOWN = 600
 # A sensor farther from the middle of the data than so many times their extent is not at its place.
@@ -78,11 +75,12 @@ FAR = 1.0
 
 
 class View3D(NamedTuple):
-    """A plotly figure as plain data, and the figures of its caption."""
+    """What fit_page.js shows, and the figures of its caption."""
 
-    # For Plotly.newPlot
-    data: list[dict[str, Any]]
-    layout: dict[str, Any]
+    # Everything in the robot base R, m: `scene` (`scene_to_dict`), `arms` (a, k + 2, 3), `points`
+    # (n, 3) with `text`, where the errors at them end (`before` and `after`, (n, 3)), `sensors`
+    # with `text` and `line` (from, to), and the `legend`
+    picture: dict[str, Any]
     magnification: int  # By what the error vectors are drawn too long
     # How many observations are drawn, of how many
     rows_shown: int
@@ -91,10 +89,20 @@ class View3D(NamedTuple):
     # tiny
     far_sensors: list[str]
 
+    @property
+    def data(self) -> str:
+        """The picture as the page unpacks it."""
+        return compressed(json.dumps(self.picture, separators=(',', ':'), allow_nan=False))
+
+    @property
+    def code(self) -> str:
+        """The scripts as the page unpacks them."""
+        return compressed(view_script('fit_page.js'))
+
 
 def draw_view(result: FitResult) -> View3D:
-    """Return the 3-D view, everything in the robot base R, metres."""
-    m = result.session.measurements
+    """Return the 3-D view."""
+    m, chain = result.session.measurements, result.chain
     shown = evenly(len(m), ROWS_SHOWN)
     sensors = [result.session.sensor_names[i] for i in m.sensor[shown]]
     T_R_N = np.array([result.T_R_N[sensor] for sensor in sensors])
@@ -110,134 +118,59 @@ def draw_view(result: FitResult) -> View3D:
     }
     extent = float(np.linalg.norm(np.ptp(points, axis=0)))
     typical = float(np.median(np.linalg.norm(vectors['before'], axis=1)))
-    magnification = _round_factor(0.07 * extent / max(typical, 1e-9))
-
-    data = [_arms(result), _points(result, points, shown)]
-    for when, color, width in (('before', BEFORE, 2.0), ('after', AFTER, 3.0)):
-        data.append(
-            _trace(
-                f'error {when}, {magnification}\N{MULTIPLICATION SIGN}',
-                _segments(points, points + magnification * vectors[when]),
-                mode='lines',
-                line={'color': color, 'width': width},
-                hoverinfo='skip',
-            )
-        )
+    times = _round_factor(0.07 * extent / max(typical, 1e-9))
+    arms = arm_lines(chain, m.q[evenly(len(m), ARMS_SHOWN)], result.joint_offsets)
+    far: list[str] = []
+    marked = []
     centre = points.mean(axis=0)
     nearest = FAR * max(extent, 0.5)
-    far = []
     for sensor, T in result.T_R_N.items():
-        way = T[:3, 3] - centre
-        if np.linalg.norm(way) > nearest:
+        place, text = T[:3, 3], sensor
+        line = place, place
+        distance = np.linalg.norm(place - centre)
+        if distance > nearest:
             far.append(sensor)
-            data.append(_direction(sensor, T, centre, way * nearest / np.linalg.norm(way)))
-        else:
-            data.append(_sensor(sensor, T))
-    return View3D(data, _layout(), magnification, len(shown), len(m), far)
-
-
-def _trace(name: str, points: FloatArray, **rest: Any) -> dict[str, Any]:
-    """Return a trace of points (n, 3) to the hundredth of a millimetre, gaps (NaN) as None."""
-    columns = {
-        axis: [None if np.isnan(value) else value for value in column]
-        for axis, column in zip('xyz', np.round(points, 5).T.tolist(), strict=True)
+            # From the middle of the data towards it.
+            way = (place - centre) * nearest / distance
+            line = centre + 0.5 * way, centre + 0.65 * way
+            text = f'to {sensor}, {np.linalg.norm(place):.1f} m from the base'
+        marked.append({'text': text, 'line': _rounded(np.array(line))})
+    picture = {
+        'scene': scene_to_dict(RobotScene(chain, (), (), 0.0, ())),
+        'arms': _rounded(arms),
+        'points': _rounded(points),
+        'text': _told(result, shown),
+        'errors': {when: _rounded(points + times * of) for when, of in vectors.items()},
+        'sensors': marked,
+        'legend': {
+            'arm': f'arm, {len(arms)} of its configurations',
+            'soft': 'markers as measured',
+            'before': f'error before, {times}\N{MULTIPLICATION SIGN}',
+            'after': f'error after, {times}\N{MULTIPLICATION SIGN}',
+            'sight': 'sensors',
+        },
     }
-    return {'type': 'scatter3d', 'name': name, **columns, **rest}
+    return View3D(picture, times, len(shown), len(m), far)
 
 
-def _arms(result: FitResult) -> dict[str, Any]:
-    m = result.session.measurements
-    chosen = m.q[evenly(len(m), ARMS_SHOWN)]
-    lines = arm_lines(result.chain, chosen, result.joint_offsets)
-    return _trace(
-        f'arm, {len(chosen)} of its configurations',
-        np.pad(lines, ((0, 0), (0, 1), (0, 0)), constant_values=np.nan).reshape(-1, 3),
-        mode='lines+markers',
-        line={'color': ARM, 'width': 6.0},
-        marker={'size': 3, 'color': ARM},
-        opacity=0.75,
-        hoverinfo='skip',
-    )
+def _rounded(points: FloatArray) -> Any:
+    """Return points as lists, to the hundredth of a millimetre."""
+    return np.round(points, 5).tolist()
 
 
-def _points(result: FitResult, points: FloatArray, shown: IntArray) -> dict[str, Any]:
+def _told(result: FitResult, shown: IntArray) -> list[str]:
+    """Return what each point is."""
     m = result.session.measurements
     before, after = (
         1e3 * np.linalg.norm(residuals[shown], axis=1)
         for residuals in (result.residuals_before, result.residuals_after)
     )
-    text = [
+    return [
         f'observation {m.observation[row]}, pose {m.pose[row]}, '
-        f'{_plain(result.session.sensor_names[m.sensor[row]])}'
-        f'<br>error {b:.3f} mm before, {a:.3f} mm after'
+        f'{result.session.sensor_names[m.sensor[row]]}\n'
+        f'error {b:.3f} mm before, {a:.3f} mm after'
         for row, b, a in zip(shown, before, after, strict=True)
     ]
-    marker = {'size': 2.5, 'color': TEXT}
-    return _trace(
-        'markers as measured', points, mode='markers', marker=marker, text=text, hoverinfo='text'
-    )
-
-
-def _sensor(name: str, T_R_N: FloatArray) -> dict[str, Any]:
-    name = _plain(name)
-    marker = {'size': 6, 'symbol': 'diamond', 'color': SENSOR}
-    return _labelled(name, name, T_R_N[None, :3, 3], mode='markers+text', marker=marker)
-
-
-def _direction(name: str, T_R_N: FloatArray, start: FloatArray, way: FloatArray) -> dict[str, Any]:
-    """Return a line from the middle of the data towards a sensor that is farther off."""
-    name = _plain(name)
-    text = f'to {name}, {np.linalg.norm(T_R_N[:3, 3]):.1f} m from the base'
-    line = {'color': SENSOR, 'width': 3}
-    points = start + np.array((0.5, 0.65))[:, None] * way
-    return _labelled(name, text, points, mode='lines+text', line=line)
-
-
-def _labelled(name: str, text: str, points: FloatArray, **rest: Any) -> dict[str, Any]:
-    return _trace(
-        f'sensor {name}',
-        points,
-        text=[*[''] * (len(points) - 1), text],
-        textposition='top center',
-        textfont={'color': SENSOR},
-        hoverinfo='text',
-        **rest,
-    )
-
-
-def _layout() -> dict[str, Any]:
-    def axis(name: str) -> dict[str, Any]:
-        return {
-            'title': {'text': f'{name} (m)'},
-            'color': TEXT,
-            'gridcolor': 'rgba(128,138,150,0.35)',
-            'zerolinecolor': 'rgba(128,138,150,0.7)',
-            'showbackground': False,
-        }
-
-    return {
-        'scene': {
-            'xaxis': axis('x'),
-            'yaxis': axis('y'),
-            'zaxis': axis('z'),
-            'aspectmode': 'data',
-            'camera': {
-                'eye': {'x': 1.45, 'y': 1.45, 'z': 0.85},
-                'center': {'x': 0, 'y': 0, 'z': -0.1},
-            },
-        },
-        'paper_bgcolor': 'rgba(0,0,0,0)',
-        'font': {'color': TEXT},
-        'modebar': {'bgcolor': 'rgba(0,0,0,0)', 'color': TEXT, 'activecolor': AFTER},
-        'margin': {'l': 0, 'r': 0, 't': 0, 'b': 0},
-        'legend': {'orientation': 'h', 'y': 0, 'yanchor': 'top'},
-    }
-
-
-def _segments(starts: FloatArray, ends: FloatArray) -> FloatArray:
-    """Return start, end, gap, start, end, gap, … for one line trace."""
-    gap = np.full_like(starts, np.nan)
-    return np.stack((starts, ends, gap), axis=1).reshape(-1, 3)
 
 
 def _round_factor(factor: float) -> int:
@@ -246,11 +179,6 @@ def _round_factor(factor: float) -> int:
         return 1
     power = 10 ** int(np.floor(np.log10(factor)))
     return int(power * max(step for step in (1, 2, 5) if step * power <= factor))
-
-
-def _plain(text: str) -> str:
-    """Plotly reads labels as a kind of HTML, and entities in some places only."""
-    return text.replace('<', '‹').replace('>', '›')
 
 
 def accuracy_rows(accuracy: Accuracy) -> list[dict[str, Any]]:
@@ -332,21 +260,9 @@ def fit_html(result: FitResult, drawings: dict[str, str]) -> str:
         session=result.session,
         drawings={name: inlined(name, text) for name, text in drawings.items()},
         scene=scene,
-        scene_json=_json({'data': scene.data, 'layout': scene.layout}) if scene else '',
-        plotly=_plotly() if scene else '',
+        before=BEFORE,
+        after=AFTER,
     )
-
-
-def _plotly() -> str:
-    """Return plotly.js, compressed and in base64: a third of its size in the page."""
-    script = importlib.resources.files('plotly').joinpath('package_data', 'plotly.min.js')
-    return compressed(script.read_text(encoding='utf-8'))
-
-
-def _json(content: Any) -> Markup:
-    """Return JSON that no script element can be left with."""
-    text = json.dumps(content, separators=(',', ':'), allow_nan=False)
-    return Markup(text.replace('<', '\\u003c'))
 
 
 # The page of a discovery.

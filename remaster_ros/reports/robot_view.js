@@ -316,12 +316,16 @@ class RobotView {
       // Its base, through which it looks, towards the arm.
       body.quaternion.setFromUnitVectors(new THREE.Vector3(0, 1, 0), place.clone().normalize());
       this.world.add(body);
-      const label = document.createElement('span');
-      label.textContent = this.scene.sights[i].sensor;
-      label.className = 'label';
-      this.place.append(label);
-      this.labels.push({label, place});
+      this._addLabel(this.scene.sights[i].sensor, place);
     });
+  }
+
+  _addLabel(text, place) {
+    const label = document.createElement('span');
+    label.textContent = text;
+    label.className = 'label';
+    this.place.append(label);
+    this.labels.push({label, place});
   }
 
   _placeLabels() {

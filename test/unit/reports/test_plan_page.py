@@ -108,7 +108,7 @@ def test_every_configuration_is_played_in_its_own_time(planned):
         key('play');
         for (const button of document.querySelectorAll('#views button')) button.click();
         const canvas = document.querySelector('#scene canvas');
-        const plan = JSON.parse(await unpacked('plan-gzip'));
+        const plan = JSON.parse(await unpacked('data-gzip'));
         const view = new RobotView(document.createElement('div'), plan.scene);
         const arm = ANGLES.map((q) => ({
             tip: view.tip(q).toArray(), frames: view.frames(q).map((T) => T.toArray())}));

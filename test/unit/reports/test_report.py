@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 import subprocess
 import sys
@@ -12,11 +11,12 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+from browser import seen
 
 from remaster_ros.calibration.noise_estimate import NoiseEstimate
 from remaster_ros.kinematics import transforms
 from remaster_ros.kinematics.transforms import apply
-from remaster_ros.reports.report import _round_factor, draw_view, fit_html
+from remaster_ros.reports.report import _round_factor, draw_view, fit_html, write_fit_report
 from remaster_ros.reports.result_folder import save_fit
 from remaster_ros.reports.sentences import verdict
 
@@ -242,19 +242,58 @@ def test_noise_along_the_line_of_sight_has_rows_of_its_own(fit_result):
 
 def test_error_vectors_lead_from_the_measured_to_the_modelled_marker(fit_result):
     """After, magnified once, every vector ends where the calibrated arm has the marker."""
-    scene = draw_view(fit_result)
+    view = draw_view(fit_result)
     m = fit_result.session.measurements
-    by_name = {trace['name'].split(',')[0]: trace for trace in scene.data}
-    json.dumps(scene.data, allow_nan=False)
-    assert scene.rows_shown == scene.rows == len(m)
-    after = by_name['error after']
-    lines = np.array([after['x'], after['y'], after['z']], dtype=float).T.reshape(-1, 3, 3)
-    starts, ends = lines[:, 0], lines[:, 1]
+    assert view.rows_shown == view.rows == len(m) == len(view.picture['text'])
+    starts, ends = np.array(view.picture['points']), np.array(view.picture['errors']['after'])
     markers = np.array([fit_result.marker_positions[n] for n in fit_result.session.markers])
     modelled = fit_result.chain.positions(m.q, markers[m.marker], fit_result.joint_offsets)
     T_R_N = np.array([fit_result.T_R_N[n] for n in fit_result.session.sensors])[m.sensor]
     np.testing.assert_allclose(starts, apply(T_R_N, m.position), atol=1e-5)
-    np.testing.assert_allclose(starts + (ends - starts) / scene.magnification, modelled, atol=3e-5)
+    np.testing.assert_allclose(starts + (ends - starts) / view.magnification, modelled, atol=3e-5)
+
+
+def test_the_picture_of_a_fit_is_drawn_and_explained(fit_result, tmp_path):
+    path = write_fit_report(fit_result, tmp_path)
+    found = seen(
+        path,
+        """
+        const place = document.getElementById('scene');
+        place.scrollIntoView();
+        await wait(500);
+        const view = JSON.parse(await unpacked('data-gzip'));
+        const names = [...document.querySelectorAll('#legend label')].map((l) => l.textContent);
+        const labels = [...place.querySelectorAll('.label')].map((l) => l.textContent);
+        // A pointer that goes over all of the picture finds a point.
+        const canvas = place.querySelector('canvas');
+        const note = place.querySelector('.note');
+        const told = new Set();
+        const go = () => {
+            for (let x = 0; x < canvas.clientWidth; x += 12)
+                for (let y = 0; y < canvas.clientHeight; y += 12) {
+                    const box = canvas.getBoundingClientRect();
+                    canvas.dispatchEvent(new PointerEvent('pointermove', {
+                        clientX: box.x + x, clientY: box.y + y}));
+                    if (!note.hidden) told.add(note.textContent);
+                }
+        };
+        go();
+        const seen = [...told];
+        told.clear();
+        document.querySelectorAll('#legend input')[1].click();
+        go();
+        return {names, labels, seen, text: view.text, hidden: told.size,
+                size: [canvas.clientWidth, canvas.clientHeight],
+                missing: !document.getElementById('no-webgl').hidden};
+        """,
+    )
+    assert found['names'][:2] == ['arm, 5 of its configurations', 'markers as measured']
+    assert {'x', 'y', 'z'} < set(found['labels'])
+    assert len(found['seen']) > 10
+    assert set(found['seen']) <= set(found['text'])
+    assert found['hidden'] == 0
+    assert min(found['size']) > 200
+    assert not found['missing']
 
 
 @pytest.mark.parametrize(
@@ -315,12 +354,11 @@ def test_a_far_sensor_leaves_the_arm_as_large_as_it_is(fit_result):
     session = replace(fit_result.session, measurements=replace(m, position=position))
     view = draw_view(replace(fit_result, session=session, T_R_N={**fit_result.T_R_N, name: far}))
     assert name in view.far_sensors
-    largest = max(abs(x) for trace in view.data for x in trace['x'] if x is not None)
-    assert largest < 5.0
-    labels = [text for trace in view.data for text in trace.get('text', [])]
-    assert any('m from the base' in text for text in labels)
+    drawn = view.picture['sensors']
+    assert np.abs([sensor['line'] for sensor in drawn]).max() < 5.0
+    assert any('m from the base' in sensor['text'] for sensor in drawn)
 
 
 def test_a_page_without_3d_says_what_is_missing(html):
     assert 'needs WebGL, which this browser does not have' in html
-    assert '<noscript>The 3-D view needs JavaScript' in html
+    assert '<noscript><p>The 3-D view needs JavaScript' in html
