@@ -56,7 +56,8 @@ def register_points(points_R: ArrayLike, points_N: ArrayLike) -> tuple[FloatArra
         raise InputError('registration: a point has a coordinate that is not a finite number')
     if len(points_R) < MINIMUM_POINTS:
         raise InsufficientDataError(
-            f'registration: {len(points_R)} points do not fix a frame; measure at least '
+            f'registration: {len(points_R)} {"point does" if len(points_R) == 1 else "points do"} '
+            'not fix a frame; measure at least '
             f'{MINIMUM_POINTS} that are not on one line'
         )
     _require_width(points_R, 'robot')

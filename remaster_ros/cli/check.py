@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from remaster_ros.calibration.gauge_words import listed
 from remaster_ros.cli.console import show
 from remaster_ros.cli.options import number
 from remaster_ros.cli.verify import require_same_arm
@@ -270,6 +271,17 @@ def in_words(found: Checked, joint_names: tuple[str, ...], names: list[str]) -> 
         )
     if found.verdict == 'unclear':
         return 'Something may have changed: check again at once.'
+    beyond = [
+        name
+        for name, one in zip(joint_names, found.joints, strict=True)
+        if len(names) > 1 and abs(one.change_rad) * one.lever_m > one.detectable_m
+    ]
+    if beyond:
+        return (
+            f'No change is certain yet, but {listed(beyond)} '
+            f'{"is" if len(beyond) == 1 else "are"} further from the checks before than what '
+            'would be seen: check again.'
+        )
     return 'No joint has changed by more than a check can see.'
 
 

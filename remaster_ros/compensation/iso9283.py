@@ -45,7 +45,8 @@ class Visited:
             )
         return (
             f'No figures of ISO 9283: it asks for {CYCLES} visits of each of {POSES} poses, and '
-            f'here {len(self.visits)} were visited, {self.visits[0]} times at most, '
+            f'here {len(self.visits)} were visited, {self.visits[0]} '
+            f'{"time" if self.visits[0] == 1 else "times"} at most, '
             f'{sum(count >= CYCLES for count in self.visits)} of them {CYCLES} times.'
         )
 

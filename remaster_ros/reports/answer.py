@@ -52,6 +52,7 @@ from remaster_ros.reports.schemas import (
     Loadable,
 )
 from remaster_ros.reports.sentences import (
+    FEW_POSES,
     NOTICEABLE_GAIN,
     at_marker,
     more_than_noise,
@@ -563,12 +564,16 @@ def what_remains(inputs: Inputs, loads_model: bool, held_out: bool) -> list[Rema
     found, judgement = inputs.found, inputs.judgement
     rows = [] if found is None else _of_discovery(found, loads_model)
     if found is None and (lines := judgement.findings or judgement.doubts):
+        few = any(line.startswith(FEW_POSES) for line in judgement.doubts)
+        search = (
+            'Search for its cause: remaster discover SESSION --out DIR, then give DIR to '
+            'remaster report.'
+        )
         rows.append(
             Remaining(
                 'More than noise' if judgement.findings else 'Not shown to be noise',
                 lines[0],
-                'Search for its cause: remaster discover SESSION --out DIR, then give DIR to '
-                'remaster report.'
+                ('Measure more poses first, and fit again.' if few else search)
                 if judgement.findings
                 else '',
             )

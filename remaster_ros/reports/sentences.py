@@ -40,6 +40,7 @@ if TYPE_CHECKING:
 
 # Less than this is no gain a user would notice.
 NOTICEABLE_GAIN = 1.1
+FEW_POSES = 'So few poses do not show'
 NOT_PROVEN = 'No poses were held out, so the gain is not proven: measure some, and run this again.'
 NO_TIMES = 'without times, so nothing that changes with time can be seen'
 # Of accuracy in fit.json.
@@ -102,8 +103,8 @@ def verdict(result: FitResult) -> Judgement:
     few = result.structure is not None and result.structure.too_few
     if few:
         doubts.append(
-            'So few poses do not show whether other errors than noise are left, which the offsets '
-            f'would take up: measure at least {FEWEST_POSES} and fit again.'
+            f'{FEW_POSES} whether other errors than noise are left, which the offsets would '
+            f'take up: measure at least {FEWEST_POSES} and fit again.'
         )
     disagreements = changes + spoilt + displaced
     points = findings + doubts + _widening(result) + disagreements
@@ -266,10 +267,10 @@ def _compared(check: NoiseCheck) -> str:
     if len(sources) > 1 and check.noise_m is not None and check.noise_m != check.within_m:
         sources.append(f'of which {1e3 * check.noise_m:.3f} mm count')
     return (
-        f'{check.sensor}: without its largest errors the mean after is '
-        f'{1e3 * check.error_m:.3f} mm; noise ({", ".join(sources)}) makes '
-        f'{1e3 * check.noise_error_m:.3f} mm. A sensor or base that was moved during the session, '
-        'a soft joint or a worn gear leave such errors, and the offsets take up a part of them.'
+        f'{check.sensor}: the error after is {1e3 * check.error_m:.3f} mm without its largest '
+        f'values; noise ({", ".join(sources)}) makes {1e3 * check.noise_error_m:.3f} mm. A '
+        'sensor or base that was moved during the session, a soft joint or a worn gear leave such '
+        'errors, and the offsets take up a part of them.'
     )
 
 

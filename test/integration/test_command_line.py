@@ -320,6 +320,6 @@ def test_an_interrupt_stops_in_one_line(made: Path, tmp_path: Path) -> None:
 def test_too_little_data_for_the_offsets_ends_with_1(tmp_path: Path) -> None:
     out = tmp_path / 's'
     assert remaster('simulate', out, '--poses', 2, '--validation', 0).returncode == 0
-    assert 'poses to fit; at least 3 are needed' in refusal(
+    assert 'saw 1 pose to fit; at least 3 are needed' in refusal(
         'fit', out, '--out', tmp_path / 'fit', status=1
     )

@@ -92,6 +92,24 @@ def test_day_by_day_until_a_joint_has_changed(run, arm, tmp_path, capsys):
     assert 'joint_1: looks like a sensor that was moved' in text
 
 
+def test_no_check_that_shows_a_change_says_that_none_has_changed(run, arm, tmp_path):
+    """A short history takes some checks to be sure; until then what it shows is not denied."""
+    changed = arm.joint(3, 8e-4)
+    for day in range(6):
+        page = tmp_path / 'check.html'
+        one = arm.check(changed) if day > 1 else arm.check()
+        found = run(write(tmp_path / f'day{day}', one), '--out', str(page))
+        beyond = [
+            row['joint']
+            for row in found['joints']
+            if row['detectable_mm'] and abs(row['change_mm']) > row['detectable_mm']
+        ]
+        denied = 'No joint has changed by more than a check can see' in found['text']
+        assert not (denied and beyond)
+        assert denied == (found['verdict'] == 'unchanged' and not beyond)
+        assert 'Nothing has changed' not in page.read_text(encoding='utf-8')
+
+
 def test_a_torn_line_is_dropped_and_said(run, arm, tmp_path, caplog):
     run(write(tmp_path / 'day0', arm.check()))
     history = tmp_path / 'arm.jsonl'
@@ -165,6 +183,6 @@ def test_figures_of_iso_9283_need_its_visits(run, arm, tmp_path):
         write(tmp_path / 'standing', standing), '--out', str(page), history='another.jsonl'
     )['iso9283']
     assert none['accuracy_mm'] == []
-    missing = 'it asks for 30 visits of each of 5 poses, and here 5 were visited, 1 times at most'
+    missing = 'it asks for 30 visits of each of 5 poses, and here 5 were visited, 1 time at most'
     assert missing in none['text']
     assert missing in page.read_text(encoding='utf-8')

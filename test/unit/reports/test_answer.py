@@ -521,3 +521,10 @@ def test_what_the_measurement_errs_by_is_said_where_it_stays_in_both_errors(inpu
 def test_a_folder_that_is_not_there_is_not_said_to_be_another_file(tmp_path):
     with pytest.raises(InputError, match='there is no such file or folder; give'):
         parts([tmp_path / 'fitt'])
+
+
+def test_so_few_poses_are_not_sent_to_a_search(inputs, fit):
+    fit.judgement.findings = ['tracker: the error after is 3.2 mm; noise makes 0.3 mm.']
+    assert 'remaster discover' in answer_of(inputs()).remains[0].remedy
+    fit.judgement.doubts = ['So few poses do not show whether other errors are left.']
+    assert answer_of(inputs()).remains[0].remedy == 'Measure more poses first, and fit again.'
