@@ -8,6 +8,7 @@ import logging
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from shlex import quote
 from typing import Any, Literal
 
 import numpy as np
@@ -317,7 +318,10 @@ def run(args: argparse.Namespace) -> int:
         log.warning('%s', sense.warning)
     if not args.json:
         show(args.quiet, sense.sentence)
-        show(args.quiet, f'written: {args.out}; go on with: remaster fit {args.out} --out …')
+        show(
+            args.quiet,
+            f'written: {args.out}; go on with: remaster fit {quote(str(args.out))} --out …',
+        )
     return 0
 
 
@@ -366,7 +370,9 @@ def _mend(args: argparse.Namespace) -> int:
     if args.json:
         print(json.dumps({'session': str(args.out), 'columns': {}, 'warnings': [], 'hint': ''}))
         return 0
-    show(args.quiet, f'written: {args.out}; go on with: remaster fit {args.out} --out …')
+    show(
+        args.quiet, f'written: {args.out}; go on with: remaster fit {quote(str(args.out))} --out …'
+    )
     return 0
 
 

@@ -7,6 +7,7 @@ import json
 import os
 from dataclasses import replace
 from pathlib import Path
+from shlex import quote
 from typing import Any
 
 import numpy as np
@@ -137,10 +138,12 @@ def run(args: argparse.Namespace) -> int:
             f'{args.out}: {found}, and a calibration needs {FEWEST_FITTED}; correct its lines '
             'marked CHECK (place of the sensor, markers, floor, thickness of links)'
             f'{geometry * bool(proposal.chain.slides.any())}, and see whether they suffice: '
-            f'remaster plan {args.out}'
+            f'remaster plan {quote(str(args.out))}'
         )
     if not args.json:
-        show(args.quiet, f'every way, in 3-D: remaster plan {args.out} --out plan.html')
+        show(
+            args.quiet, f'every way, in 3-D: remaster plan {quote(str(args.out))} --out plan.html'
+        )
     return 0
 
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from remaster_ros.calibration.comparison import predicted_rows
 from remaster_ros.calibration.estimate import Problem, estimate
-from remaster_ros.calibration.gauge_words import listed
+from remaster_ros.calibration.gauge_words import counted, listed
 from remaster_ros.calibration.noise_check import MEAN_LENGTH
 from remaster_ros.calibration.outliers import LARGEST_SHARE
 from remaster_ros.compensation.export import (
@@ -52,6 +52,7 @@ from remaster_ros.reports.schemas import (
     Loadable,
 )
 from remaster_ros.reports.sentences import (
+    FEW_HELD_OUT,
     FEW_POSES,
     NOTICEABLE_GAIN,
     at_marker,
@@ -512,7 +513,7 @@ def _headline(
 ) -> str:
     """Return the deed and its gain; ``measured`` is what was found of the measurement."""
     before, after = stages[0], stages[brings]
-    deed = f'Set the zero-offsets of {joints} joint{"s" if joints > 1 else ""}'
+    deed = f'Set the zero-offset{"s" if joints > 1 else ""} of {counted(joints, "joint")}'
     if loads_model:
         deed = 'Load the robot model with all lengths, tilts and zero-offsets'
     where = 'poses that were never fitted' if held_out else 'the fitted poses'
@@ -586,7 +587,7 @@ def what_remains(inputs: Inputs, loads_model: bool, held_out: bool) -> list[Rema
         if left:
             rows.append(
                 Remaining(
-                    'More than noise',
+                    'Not shown to be noise' if FEW_HELD_OUT in left else 'More than noise',
                     f'{left.rstrip(".")}. No cause that was tried explains it',
                     'Look at the largest errors below; measure again, with references in between.',
                 )

@@ -176,7 +176,8 @@ def verdict(result: FitResult) -> Judgement:
     count = len(result.joint_names)
     if unknown:
         points.append(
-            f'{count - len(unknown)} of {count} zero-offsets are measured; the data do not '
+            f'{count - len(unknown)} of {count} zero-offsets '
+            f'{"is" if count - len(unknown) == 1 else "are"} measured; the data do not '
             f'distinguish {listed(unknown)} from what stands beside them.'
         )
     else:
@@ -280,6 +281,9 @@ def _compared(check: NoiseCheck) -> str:
 FEWEST_INSIDE = 0.92
 # So many times the noise the error on held-out poses may be, and more by chance with few rows.
 MOST_OVER_NOISE = 1.25
+# Fewer held-out poses than this show nothing by themselves.
+FEWEST_HELD_OUT = 5
+FEW_HELD_OUT = 'by chance, as so few poses were held out'
 # Where a cause could move the marker by more than this share of the noise and not be found, it
 # proves nothing that none is.
 MOST_UNSEEN = 0.5
@@ -312,14 +316,15 @@ def judgement(
 
 def more_than_noise(content: Discovered) -> str:
     """Return in what held-out rows show that the model does not have something; ''."""
+    left = 'something is left that the model does not have.'
+    if isinstance(content.session, Struct) and content.session.validation.poses < FEWEST_HELD_OUT:
+        # The rows of a pose share its error, which may be large by chance.
+        left = f'{FEW_HELD_OUT}, or {left}'
     regions, gain = content.predicted_regions95, content.gain
     if isinstance(regions, msgspec.UnsetType) or regions.held_out.interval95 is None:
         return ''
     if regions.held_out.interval95[1] < FEWEST_INSIDE:
-        return (
-            'Fewer held-out rows than should lie where they were predicted: something is left '
-            'that the model does not have.'
-        )
+        return f'Fewer held-out rows than should lie where they were predicted: {left}'
     after = gain.held_out_kept_after_m
     if isinstance(after, msgspec.UnsetType):
         after = gain.held_out_rms_after_m
@@ -327,7 +332,7 @@ def more_than_noise(content: Discovered) -> str:
     if after is not None and after > most * gain.noise_floor_m:
         return (
             f'The error on held-out poses is {after / gain.noise_floor_m:.1f} times that of the '
-            'noise alone: something is left that the model does not have.'
+            f'noise alone: {left}'
         )
     return ''
 

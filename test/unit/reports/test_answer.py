@@ -24,7 +24,13 @@ from remaster_ros.reports.fit_json import fit_content
 from remaster_ros.reports.pages import law
 from remaster_ros.reports.report import answer_html, checked_svg, require_ready, worst_rows
 from remaster_ros.reports.result_folder import save_fit
-from remaster_ros.reports.schemas import Discovered, Fit, Judgement, PredictedRegions
+from remaster_ros.reports.schemas import (
+    Discovered,
+    Fit,
+    Judgement,
+    MeasuredSession,
+    PredictedRegions,
+)
 from remaster_ros.reports.sentences import more_than_noise
 
 STEP = {'driver': 'time', 'form': 'step', 'name': 'unnamed', 'moment_s': 455.0}
@@ -495,8 +501,15 @@ def test_what_held_out_rows_show_to_be_more_than_noise(fit, rows, inside, after_
     kind = msgspec.structs.fields(Discovered)
     kind = next(field.type for field in kind if field.name == 'predicted_regions95')
     content.predicted_regions95 = msgspec.convert(regions, kind)
+    content.session = msgspec.convert(msgspec.to_builtins(fit.session), MeasuredSession)
     found = more_than_noise(content)
     assert (says in found) if says else not found
+    assert 'by chance' not in found
+    # The rows of a pose share its error: one pose that is far off proves nothing.
+    content.session.validation.poses = 1
+    assert ('by chance, as so few poses were held out, or' in more_than_noise(content)) == bool(
+        says
+    )
 
 
 @pytest.mark.parametrize('effects', [[BACKLASH], [SOFT]], ids=['backlash', 'soft'])
