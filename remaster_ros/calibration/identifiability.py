@@ -303,9 +303,11 @@ def _reduce(
     """
     pivots: list[int] = []
     for column in range(work.shape[1]):
+        size = np.abs(work[:, column:])
+        least = NEGLIGIBLE * size.max()
         for kind in kinds:
-            part = np.abs(work[kind][:, column:])
-            if part.max(initial=0.0) > NEGLIGIBLE * np.abs(work[:, column:]).max():
+            part = size[kind]
+            if part.max(initial=0.0) > least:
                 break
         row, offset = divmod(int(np.argmax(part)), part.shape[1])
         pivot = int(kind[row])

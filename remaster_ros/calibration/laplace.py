@@ -291,12 +291,14 @@ def _noise_covariance(linearisation: Linearisation, peak: FloatArray) -> FloatAr
     spread = {}
     for index in range(count, len(peak)):
         if peak[index] < 2.0 * std[index]:
-            # From a thousandth of a sigma to as much as matters, evenly in the logarithm.
-            ratio = np.geomspace(1e-3, 5.0, 100)
+            # From a thousandth of a sigma to as much as matters, evenly in the logarithm: of what
+            # is smooth over a factor of two, a sum of steps of a quarter of it is the integral.
+            ratio = np.geomspace(1e-3, 5.0, 40)
             points = np.repeat(peak[None], len(ratio), axis=0)
             points[:, index] = ratio
             log_weight = linearisation.whitened(points)[2]
             weight = np.exp(log_weight - log_weight.max()) * ratio
+            weight[[0, -1]] *= 0.5
             spread[index] = float(np.average((ratio - peak[index]) ** 2, weights=weight))
     values, vectors = np.linalg.eigh(precision)
     covariance: FloatArray = (vectors / np.maximum(values, 0.45)) @ vectors.T
