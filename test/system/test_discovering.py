@@ -43,6 +43,7 @@ def test_the_optimizer_discovers_on_request(start, client, tmp_path):
     wait_until(lambda: node.poll() is None, 1.0, 'the optimizer to live on')
 
 
+@pytest.mark.qualify
 def test_a_healthy_arm_is_answered_with_figures_and_again(start, client, tmp_path):
     """Nothing is there to be drawn as a cause, and the optimizer is there for the next call."""
     session, out = tmp_path / 'session', tmp_path / 'discovery'

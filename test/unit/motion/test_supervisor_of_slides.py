@@ -7,6 +7,7 @@ the wrong unit anywhere between reports and commands decides otherwise.
 
 import dataclasses
 import re
+from functools import cache
 
 import numpy as np
 import pytest
@@ -256,6 +257,11 @@ def course(rig, case):
     return found, words(rig.supervisor.halted), words(getattr(rig, 'told', ''))
 
 
+@cache
+def of_turning_joints(case):
+    return course(Rig(), case)
+
+
 def words(text):
     """Return a text without its lengths and angles, and without what they are called."""
     text = re.sub(r'\[[-\d.]+, [-\d.]+\] (deg|mm)', 'so much', text)
@@ -265,14 +271,14 @@ def words(text):
 @pytest.mark.parametrize('case', CASES, ids=lambda case: case.__name__)
 @pytest.mark.parametrize('slides', [(False, True), (True, True)], ids=str)
 def test_an_arm_with_a_slide_is_judged_as_one_whose_joints_turn(case, slides):
-    turning = course(Rig(), case)
+    turning = of_turning_joints(case)
     assert turning[0]
     assert course(Rig(units=JointUnits(slides)), case) == turning
 
 
 def test_the_cases_end_in_every_way():
     """What is compared above are moves, stops and halts of many kinds."""
-    ends = [course(Rig(), case) for case in CASES]
+    ends = [of_turning_joints(case) for case in CASES]
     kinds = {action[1] for actions, *_ in ends for action in actions}
     assert {'Drive', 'Stop', 'Settled', 'Halted', 'Failed', 'CheckPath'} <= kinds
     assert len({halted for _, halted, _ in ends}) > 9

@@ -81,7 +81,8 @@ def test_fit_takes_several_sessions(halves, tmp_path) -> None:
         write_session(tmp_path / name, half)
     out = tmp_path / 'fit'
     sessions = [str(tmp_path / name) for name in 'ab']
-    done = remaster('fit', *sessions, '--out', out, '--no-figures')
+    few = ('--draws', 200, '--chains', 2, '--no-figures')
+    done = remaster('fit', *sessions, '--out', out, *few)
     assert 'its sensors and markers are mocap_2' in done.stdout
     content = json.loads((out / 'fit.json').read_text())
     assert {'mocap', 'mocap_2'} <= set(content['registration'])

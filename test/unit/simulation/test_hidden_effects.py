@@ -30,9 +30,9 @@ WARMING = Warming(5.0, 100.0, 0.0)
 
 @pytest.fixture(scope='module')
 def stage():
-    """An LWR 4+ before a sensor, on a round of 40 poses."""
+    """An LWR 4+ before a sensor, on a round of 12 poses."""
     rng = np.random.default_rng(SEED)
-    q = np.concatenate(random_poses(40, rng))
+    q = np.concatenate(random_poses(12, rng))
     time_s = 12.0 * np.arange(1, len(q) + 1)
     sensor = SimulatedSensor('sir', transform(np.eye(3), (0.1, 0.2, -2.0)))
     return WorldModel(
