@@ -160,11 +160,9 @@ DISCOVER = {
 }
 
 
-# Of every verdict the page: test_discovery_verdicts.
-@pytest.mark.parametrize(
-    'case',
-    [pytest.param(c, marks=() if c == 'effects' else pytest.mark.qualify) for c in DISCOVER],
-)
+# Of every verdict the page: test_discovery_json. Effects are discovered below, too.
+@pytest.mark.qualify
+@pytest.mark.parametrize('case', DISCOVER)
 def test_discover(case: str, tmp_path: Path) -> None:
     options, verdict, mood, words = DISCOVER[case]
     session = simulated(tmp_path / 'session', '--seed', 3, *options)
@@ -251,8 +249,17 @@ def test_causes_that_another_session_does_not_have_are_not_green(tmp_path: Path)
     session = simulated(tmp_path / 'session', '--seed', 3, *DISCOVER['effects'][0])
     healthy = simulated(tmp_path / 'healthy', '--seed', 3)
     out = tmp_path / 'causes'
-    assert remaster('discover', session, '--out', out, '--confirm', healthy).returncode == 0
-    page, mood, _ = page_of(out)
+    process = remaster('discover', session, '--out', out, '--confirm', healthy)
+    assert process.returncode == 0, process.stderr
+    assert 'verdict: effects' in process.stdout
+    found = json.loads((out / 'discovery.json').read_text(encoding='utf-8'))
+    assert found['verdict'] == 'effects'
+    assert found['confirmation']['confirmed'] is False
+    page, mood, names = page_of(out)
+    assert names == {'gain', 'drivers', 'causes'}
+    for effect in found['effects']:
+        for other in effect['confusable_with']:
+            assert other['separate_by'] in page
     assert mood == 'caution'
     assert 'The other session does not confirm it: its error is ' in page
 

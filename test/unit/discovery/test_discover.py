@@ -102,7 +102,7 @@ def test_an_error_of_any_shape_is_a_curve_of_its_joint():
     found = discover_session(session, rng=np.random.default_rng(0))
     assert ('joint_error_curve', (2,)) in {(e.name, e.joints) for e in found.effects}
     # The curve is no constant: the zero-offset beside it stays measured.
-    plain = fit_session(session, rng=np.random.default_rng(0))
+    plain = fit_session(session, rng=np.random.default_rng(0), draws=300)
     np.testing.assert_array_equal(found.fit.identifiable, plain.identifiable)
     assert found.fit.identifiable[1]
     assert found.fit.joint_offsets_std[1] < 2.0 * plain.joint_offsets_std[1]
