@@ -56,6 +56,7 @@ from remaster_ros.reports.sentences import (
     FEW_POSES,
     NOTICEABLE_GAIN,
     at_marker,
+    hardly_proven,
     more_than_noise,
     not_counted,
     times_smaller,
@@ -599,6 +600,10 @@ def what_remains(inputs: Inputs, loads_model: bool, held_out: bool) -> list[Rema
         rows.append(
             Remaining('Not proven', 'no poses were held out', 'Measure some more, and fit again.')
         )
+    elif isinstance(inputs.fit.session, msgspec.Struct) and (
+        words := hardly_proven(inputs.fit.session.validation.poses)
+    ):
+        rows.append(Remaining('Hardly proven', words, ''))
     if not rows:
         words = (
             'no cause that this session can show explains more of what is left than chance does'

@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 from msgspec import Struct
 
-from remaster_ros.calibration.gauge_words import listed
+from remaster_ros.calibration.gauge_words import counted, listed
 from remaster_ros.calibration.measured_again import MeasuredAgain
 from remaster_ros.calibration.noise_check import SPOILT, NoiseCheck
 from remaster_ros.calibration.predictions import Coverage
@@ -36,10 +36,13 @@ if TYPE_CHECKING:
     from remaster_ros.discovery.confirmation import Confirmation
     from remaster_ros.discovery.discover import Discovery
     from remaster_ros.discovery.gain import Gain
+    from remaster_ros.types import Session
 
 
 # Less than this is no gain a user would notice.
 NOTICEABLE_GAIN = 1.1
+# Fewer held-out poses than this show nothing by themselves.
+FEWEST_HELD_OUT = 3
 FEW_POSES = 'So few poses do not show'
 NOT_PROVEN = 'No poses were held out, so the gain is not proven: measure some, and run this again.'
 NO_TIMES = 'without times, so nothing that changes with time can be seen'
@@ -56,6 +59,21 @@ METRICS = {
 }
 # Of a curve's hundred values a table has one line; discovery.json has them all.
 MOST_PARAMETERS = 8
+
+
+def hardly_proven(held_out_poses: int) -> str:
+    """Return that few poses were held out, a sentence; '' of none or enough."""
+    if not 0 < held_out_poses < FEWEST_HELD_OUT:
+        return ''
+    return (
+        f'Only {counted(held_out_poses, "pose")} {"was" if held_out_poses == 1 else "were"} held '
+        'out, which proves little: hold out some ten.'
+    )
+
+
+def _held_out_poses(session: Session) -> int:
+    m = session.measurements
+    return len(np.unique(m.pose[m.is_validation]))
 
 
 def not_counted(gross: int) -> str:
@@ -109,7 +127,8 @@ def verdict(result: FitResult) -> Judgement:
     disagreements = changes + spoilt + displaced
     points = findings + doubts + _widening(result) + disagreements
     doubtful = bool(unexplained or untold) or result.other_errors
-    unproven = disagreements or few or again.most or not validated
+    hardly = hardly_proven(_held_out_poses(result.session))
+    unproven = disagreements or few or again.most or not validated or hardly
     mood: Literal['good', 'caution', 'bad'] = 'caution'
     if result.sampler.wandering and not result.sampler.converged:
         mood = 'bad'
@@ -151,6 +170,8 @@ def verdict(result: FitResult) -> Judgement:
         points.append(note)
     if not validated:
         points.append(NOT_PROVEN)
+    elif hardly:
+        points.append(hardly)
     sampler = result.sampler
     if sampler.converged and sampler.method == 'metropolis':
         points.append(f'The chains agree with each other ({sampler.message}).')
@@ -281,8 +302,6 @@ def _compared(check: NoiseCheck) -> str:
 FEWEST_INSIDE = 0.92
 # So many times the noise the error on held-out poses may be, and more by chance with few rows.
 MOST_OVER_NOISE = 1.25
-# Fewer held-out poses than this show nothing by themselves.
-FEWEST_HELD_OUT = 5
 FEW_HELD_OUT = 'by chance, as so few poses were held out'
 # Where a cause could move the marker by more than this share of the noise and not be found, it
 # proves nothing that none is.
@@ -310,7 +329,15 @@ def judgement(
         mood='good' if proven else 'caution',
         headline=headline(discovery, confirmation, more),
         points=points,
-        doubts=[words for words in (again.words if again.again else '', note) if words],
+        doubts=[
+            words
+            for words in (
+                again.words if again.again else '',
+                hardly_proven(_held_out_poses(discovery.fit.session)),
+                note,
+            )
+            if words
+        ],
     )
 
 
@@ -355,7 +382,7 @@ def _is_proven(discovery: Discovery, confirmation: Confirmation | None) -> bool:
     before, after = discovery.gain.held_out_kept_before_m, discovery.gain.held_out_kept_after_m
     if before is None or after is None:
         return False
-    if _spoilt(discovery):
+    if _spoilt(discovery) or hardly_proven(_held_out_poses(discovery.fit.session)):
         return False
     if discovery.verdict == 'none':
         return _would_show(discovery)

@@ -541,3 +541,9 @@ def test_so_few_poses_are_not_sent_to_a_search(inputs, fit):
     assert 'remaster discover' in answer_of(inputs()).remains[0].remedy
     fit.judgement.doubts = ['So few poses do not show whether other errors are left.']
     assert answer_of(inputs()).remains[0].remedy == 'Measure more poses first, and fit again.'
+
+
+def test_one_held_out_pose_is_said_to_prove_little(inputs, fit):
+    fit.session.validation.poses = 1
+    told = {row.what: row.size for row in answer_of(inputs()).remains}
+    assert 'Only 1 pose was held out' in told['Hardly proven']

@@ -213,3 +213,13 @@ def test_the_mean_without_the_largest_errors_is_said_to_be_that(fit_result):
     told = verdict(result).findings[0]
     assert 'the error after is 0.934 mm without its largest values' in told
     assert '0.890 mm per axis within a pose, of which 0.030 mm count) makes 0.048 mm' in told
+
+
+def test_one_held_out_pose_is_never_green(fit_result):
+    proven = replace(with_accuracy(fit_result, 'validation', 4.0, 0.5), noise_checks=())
+    assert verdict(proven).mood == 'good'
+    m = proven.session.measurements
+    one = ~m.is_validation | (m.pose == m.pose[m.is_validation][0])
+    judged = verdict(replace(proven, session=proven.session.select(one)))
+    assert judged.mood == 'caution'
+    assert any('Only 1 pose was held out' in point for point in judged.points)
