@@ -119,7 +119,7 @@ class Held:
             return f' of joint{several} {", ".join(map(str, joints))}' if joints else ''
 
         never = [
-            f'Corrected in no form: {left.effect}'
+            f'Corrected in no form: {left.effect.replace("_", " ")}'
             f'{of_joints(left.joints)}, {left.size_mm:.3f} mm RMS: {left.instead}'
             for left in self.never
         ]
@@ -215,7 +215,9 @@ def _without(model: ArmModel, form: Form) -> list[tuple[str, ArmModel]]:
     found = []
     for effect, joint in dict.fromkeys((term.effect, term.joint) for term in model.joint_terms):
         rest = tuple(t for t in model.joint_terms if (t.effect, t.joint) != (effect, joint))
-        found.append((f'{effect} of {names[joint]}', replace(model, joint_terms=rest)))
+        found.append(
+            (f'{effect.replace("_", " ")} of {names[joint]}', replace(model, joint_terms=rest))
+        )
     for effect in dict.fromkeys(term.effect for term in model.base_terms):
         terms = tuple(term for term in model.base_terms if term.effect != effect)
         found.append((f'{effect} of the base', replace(model, base_terms=terms)))

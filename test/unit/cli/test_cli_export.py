@@ -376,7 +376,7 @@ def test_what_is_left_out_is_stated_and_no_offset_without_its_cause(tmp_path, ca
 
     assert left['rms_mm'] == pytest.approx(remains(rising), rel=0.1)
     assert 0.1 < left['rms_mm'] < 0.9 * remains(model.joint_offsets)
-    assert [part['what'] for part in left['parts']] == ['joint_compliance of shoulder_lift_joint']
+    assert [part['what'] for part in left['parts']] == ['joint compliance of shoulder_lift_joint']
     assert left['parts'][0]['rms_mm'] > left['rms_mm']
 
 
