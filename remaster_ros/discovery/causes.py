@@ -87,7 +87,7 @@ class Search:
                 break
             solution = self._exchanged(self.pruned(self._split(best)))
             solution = self.dated(solution)
-        return solution
+        return self._specific(solution)
 
     def again(self, data: Residuals, solution: Solution) -> tuple[Search, Solution]:
         """Return the search on other rows, and the same causes there as far as they are needed.
@@ -128,15 +128,20 @@ class Search:
         return solution
 
     def in_place(
-        self, rest: Solution, least: float = -np.inf, chosen: BoolArray | None = None
+        self,
+        rest: Solution,
+        least: float,
+        chosen: BoolArray | None = None,
+        *,
+        known_noise: bool = True,
     ) -> Iterator[Solution]:
         """Give fits of a set with one more cell, for the best by the screening.
 
         Only where the screening promises a log evidence of no less than `least`, to within what
-        noise and variances that settle again may add.
+        noise and variances that settle again may add. ``known_noise``: see `screen`.
         """
         chosen = self.catalogue.cheap if chosen is None else chosen
-        score = screen(self.data, self.catalogue, rest, chosen=chosen)
+        score = screen(self.data, self.catalogue, rest, chosen=chosen, known_noise=known_noise)
         for index in np.argsort(-score)[:SHORTLIST]:
             if np.isfinite(score[index]) and rest.log_evidence + score[index] > least - NEEDED:
                 found = self.fit((*rest.cells, self.catalogue.cells[index]), rest)
@@ -146,7 +151,8 @@ class Search:
     def without(self, solution: Solution, cell: Cell) -> Solution:
         """Return the fit without a cell, with noise and variances as they are."""
         index = solution.cells.index(cell)
-        return solution.less(index, solution.evidence_without(index, len(self.data)))
+        evidence = solution.evidence_without(index, len(self.data)) + np.log(cell.drawn_from)
+        return solution.less(index, float(evidence))
 
     def dated(self, solution: Solution) -> Solution:
         """Return the fit with moments that none nearby is better than."""
@@ -185,10 +191,28 @@ class Search:
     def _grown(self, solution: Solution, chosen: BoolArray) -> Solution:
         """Return a set with more of some cells, as long as the evidence rises."""
         while True:
-            more = _best(self.in_place(solution, solution.log_evidence, chosen))
+            found = self.in_place(solution, solution.log_evidence, chosen, known_noise=False)
+            more = _best(found)
             if more is None or more.log_evidence <= solution.log_evidence:
                 return solution
             solution = more
+
+    def _specific(self, solution: Solution) -> Solution:
+        """Replace free forms by a shape of them that the evidence does not miss at these odds.
+
+        A shape, such as that of an eccentric encoder, tells what to look for; the free form has
+        it, too, and both explain the same errors.
+        """
+        for cell in solution.cells:
+            shapes = self.catalogue.cheap & [
+                is_special_case(other, cell) for other in self.catalogue.cells
+            ]
+            if shapes.any():
+                least = solution.log_evidence - NEEDED
+                best = _best(self.in_place(self.without(solution, cell), least, shapes))
+                if best is not None and best.log_evidence > least:
+                    solution = best
+        return solution
 
     def _exchanged(self, solution: Solution) -> Solution:
         """Replace cells by what explains more in their place."""
@@ -209,6 +233,16 @@ class Search:
 def _best(fits: Iterable[Solution | None]) -> Solution | None:
     found = [fit for fit in fits if fit is not None]
     return max(found, key=lambda fit: fit.log_evidence, default=None)
+
+
+def is_special_case(cell: Cell, form: Cell) -> bool:
+    """Return whether a cell is one of the shapes that a free form can have."""
+    return (
+        form.penalty is not None
+        and cell.penalty is None
+        and (cell.place, cell.driver, cell.joints, cell.subject)
+        == (form.place, form.driver, form.joints, form.subject)
+    )
 
 
 def refine_moments(

@@ -4,13 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import reduce
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
 from remaster_ros.calibration.gauge_words import the
 from remaster_ros.calibration.result import FitResult
-from remaster_ros.discovery.causes import FEWEST_MEMBERS, NEEDED, Search, grouped, p_value
+from remaster_ros.discovery.causes import (
+    FEWEST_MEMBERS,
+    NEEDED,
+    Search,
+    grouped,
+    is_special_case,
+    p_value,
+)
 from remaster_ros.discovery.effects.base import Cell
 from remaster_ros.discovery.effects.context import Context
 from remaster_ros.discovery.effects.registry import EFFECTS
@@ -221,13 +229,13 @@ def _described(
         parameters += (Parameter('moment', first.moment, std, 's'),)
     # A family is one cell of the search, whichever of its kinds this is.
     families = {family.cell for family in search.families if set(group) & set(family.members)}
-    mine = {cell for cell in solution.cells if cell in group or cell in families}
+    mine = [cell for cell in solution.cells if cell in group or cell in families]
     without = search.fit([cell for cell in solution.cells if cell not in mine], solution)
     # What cannot be fitted without it is there by all that is known.
     gain = np.inf if without is None else solution.log_evidence - without.log_evidence
     alike: tuple[LookAlike, ...] = ()
-    if without is not None and len(mine) < FEWEST_MEMBERS and not mine & families:
-        alike = _look_alikes(search, solution, without, group)
+    if without is not None and len(mine) < FEWEST_MEMBERS and families.isdisjoint(mine):
+        alike = _look_alikes(search, solution, without, mine, group)
     return FoundEffect(
         name=EFFECTS[first.name].reported_as or first.name,
         joints=_joints(group),
@@ -271,15 +279,19 @@ def _joints(group: Sequence[Cell]) -> tuple[int, ...]:
 
 
 def _look_alikes(
-    search: Search, solution: Solution, without: Solution, group: tuple[Cell, ...]
+    search: Search,
+    solution: Solution,
+    without: Solution,
+    mine: Sequence[Cell],
+    group: tuple[Cell, ...],
 ) -> tuple[LookAlike, ...]:
-    """Return the other causes that explain nearly as much in a group's place.
+    """Return the other causes that explain nearly as much in the place of ``mine``, a group.
 
     Of one cell; those of two cells may be one of the two alone.
     """
     data, cell = search.data, group[0]
     best: dict[tuple[str, tuple[int, ...]], LookAlike] = {}
-    rest = replace(without, noise=solution.noise)
+    rest = reduce(search.without, mine, solution)
     least = solution.log_evidence - CONFUSABLE
     for found in search.in_place(rest, least):
         other = next(one for one in found.cells if one not in without.cells)
@@ -302,16 +314,6 @@ def _look_alikes(
             titled(other, other.joints),
         )
     return tuple(sorted(best.values(), key=lambda alike: -alike.log_evidence_gain))
-
-
-def is_special_case(cell: Cell, form: Cell) -> bool:
-    """Return whether a cell is one of the shapes that a free form can have."""
-    return (
-        form.penalty is not None
-        and cell.penalty is None
-        and (cell.place, cell.driver, cell.joints, cell.subject)
-        == (form.place, form.driver, form.joints, form.subject)
-    )
 
 
 def _same(data: Residuals, solution: Solution, cell: Cell, other: Cell) -> bool:

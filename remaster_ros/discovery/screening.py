@@ -5,12 +5,14 @@ evidence with the noise's scale integrated out::
 
     S = −½ N log(1 − gain / total) − ½ k log N − log(cells of its kind)
 
+Where the noise is known, as of a set with a cell taken out, the first term is ½ gain.
+
 It chooses which cells are fitted; the evidence of the fits decides.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -158,31 +160,48 @@ class Products(NamedTuple):
 
 
 def screen(
-    data: Residuals, catalogue: Catalogue, given: Solution, *, chosen: BoolArray | None = None
+    data: Residuals,
+    catalogue: Catalogue,
+    given: Solution,
+    *,
+    chosen: BoolArray | None = None,
+    known_noise: bool = False,
 ) -> FloatArray:
     """Score all cells beside the given ones, under their noise.
 
     ``data, catalogue``: the residuals and the cells; ``given``: the set already found: projected
-    out, with its penalties; ``chosen``: which cells to score; all by default.
+    out, with its penalties; ``chosen``: which cells to score; all by default; ``known_noise``:
+    whether its noise is not to be estimated again.
     Returns log evidence gained, with the prior probability of each cell, (cells,); -inf where it
     adds nothing to the set.
     """
     project = _Projection(data, given)
     white = data.noise_model.whitened(data.errors, given.noise).reshape(-1, 1)
-    residual = project.residual(white).astype(np.float32)
-    residual /= np.linalg.norm(residual)
+    residual = project.residual(white)
+    total = float(np.sum(residual**2))
+    residual = (residual / np.sqrt(total)).astype(np.float32)
     n_eff = 3 * len(data) - data.base.shape[2]
+
+    def explained(gain: FloatArray) -> FloatArray:
+        if known_noise:
+            return 0.5 * total * gain
+        return -0.5 * n_eff * np.log1p(-np.minimum(gain, 1.0 - 1e-9))
+
     scores = np.full(len(catalogue.cells), -np.inf)
     others = ~catalogue.which(given.cells)
     wanted = np.flatnonzero(others if chosen is None else others & chosen)
     for batch in catalogue.batches(wanted):
         products = _products(data, catalogue, batch, project, residual, given.noise)
-        scores[batch] = _scores([catalogue.cells[i] for i in batch], products, n_eff)
+        cells = [catalogue.cells[i] for i in batch]
+        scores[batch] = _scores(cells, products, n_eff, explained)
     return scores
 
 
 class _Projection:
-    """Takes out what base and given cells explain, in units of the noise."""
+    """Takes out what base and given cells explain, in units of the noise.
+
+    Z has their columns, Λ their prior precision.
+    """
 
     def __init__(self, data: Residuals, given: Solution) -> None:
         columns = data.columns(given.cells)
@@ -195,13 +214,21 @@ class _Projection:
         H[p:, p:] += given.prior_precision()
         scale = np.sqrt(np.diag(H))
         root = np.linalg.cholesky(H / np.outer(scale, scale))
-        self.top = solve_triangular(root, (white / scale).T, lower=True, check_finite=False).T
-        self.single = self.top.astype(np.float32)
+        top = solve_triangular(root, (white / scale).T, lower=True, check_finite=False).T
+        # What the priors hold back.
+        values, vectors = np.linalg.eigh(np.eye(len(H)) - top.T @ top)
+        self.top, self.held = top, (vectors * np.sqrt(np.maximum(values, 0.0))).T
+        self.single = top.astype(np.float32), self.held.astype(np.float32)
 
     def residual(self, values: NDArray[Any]) -> NDArray[Any]:
-        """Return (M v) of values (3n, c), M = I − Z (Z'Z + Λ)⁻¹ Z' restricted to the rows."""
-        top = self.single if values.dtype == np.float32 else self.top
-        return values - top @ (top.T @ values)
+        """Return what is left of values (3n, c), (3n + p, c).
+
+        Its products are v'M w with M = I − Z (Z'Z + Λ)⁻¹ Z', the precision of the rows with what
+        has a prior integrated out.
+        """
+        top, held = self.single if values.dtype == np.float32 else (self.top, self.held)
+        taken = top.T @ values
+        return np.concatenate((values - top @ taken, held @ taken))
 
 
 def _products(
@@ -227,7 +254,12 @@ def _products(
     return Products(norm, gram, np.asarray(pull, dtype=float))
 
 
-def _scores(cells: Sequence[Cell], products: Products, n_eff: int) -> FloatArray:
+def _scores(
+    cells: Sequence[Cell],
+    products: Products,
+    n_eff: int,
+    explained: Callable[[FloatArray], FloatArray],
+) -> FloatArray:
     """Return the score of each cell of a batch, (cells,)."""
     norm, gram, pull = products
     m = norm.shape[1]
@@ -246,7 +278,7 @@ def _scores(cells: Sequence[Cell], products: Products, n_eff: int) -> FloatArray
         along = np.einsum('cij,ci->cj', vectors, pull)
         gain = np.sum(np.where(seen, along**2 / strength, 0.0), axis=1)
         rank = seen.sum(axis=1)
-        score = _explained(gain, n_eff) - 0.5 * rank * np.log(n_eff) - prior
+        score = explained(gain) - 0.5 * rank * np.log(n_eff) - prior
         score[rank == 0] = -np.inf
         return score
     weight = np.trace(gram, axis1=1, axis2=2)[:, None, None]
@@ -260,9 +292,5 @@ def _scores(cells: Sequence[Cell], products: Products, n_eff: int) -> FloatArray
         gain = np.sum(np.linalg.solve(root, pull[:, :, None])[:, :, 0] ** 2, axis=1)
         price = log_determinant(root) - 0.5 * (flat + m * np.log(factor))
         price += prior + np.log(len(SMOOTHNESS))
-        score = np.maximum(score, _explained(gain, n_eff) - price)
+        score = np.maximum(score, explained(gain) - price)
     return score
-
-
-def _explained(gain: FloatArray, n_eff: int) -> FloatArray:
-    return -0.5 * n_eff * np.log1p(-np.minimum(gain, 1.0 - 1e-9))

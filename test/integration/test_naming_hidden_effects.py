@@ -7,6 +7,8 @@ sessions, and small sizes too. Seeds are fixed, so that a failure is the same fo
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -44,6 +46,32 @@ def discovered(recipe: Recipe) -> tuple[Discovery, object]:
     for effect in found.effects:
         print('found:', effect.name, effect.joints, effect.parameters, effect.confusable_with)
     return found, hidden
+
+
+@pytest.mark.parametrize(
+    'recipe',
+    [
+        pytest.param(
+            Recipe(4125604570, ('encoder_eccentricity', 'marker_offset'), 4.58, noise='range'),
+            id='a free form explains no more than a shape of it',
+        ),
+        pytest.param(
+            Recipe(818186293, ('encoder_eccentricity', 'sensor_scale'), 4.466, noise='depth'),
+            id='a link length imitates it until the scale is there',
+            marks=pytest.mark.qualify,
+        ),
+        pytest.param(
+            Recipe(2240630357, ('gear_periodic', 'joint_compliance'), 6.469, noise='pose_common'),
+            id='two free forms stand for two soft joints',
+            marks=pytest.mark.qualify,
+        ),
+    ],
+)
+def test_what_explains_more_takes_the_place_of_what_was_found_first(recipe: Recipe) -> None:
+    robot = 'six' if 'gear_periodic' in recipe.kinds else 'iiwa7'
+    recipe = replace(recipe, robot=robot, sensors=('mocap', 'tracker'), outliers=True)
+    found, hidden = discovered(recipe)
+    assert judge(hidden.world, hidden.truth, found).named_right
 
 
 @pytest.mark.qualify

@@ -8,21 +8,22 @@ import pytest
 from discovery_scenes import at_joint, discovered, residuals_of, session_with
 
 from remaster_ros.discovery import discover
-from remaster_ros.discovery.causes import Search
+from remaster_ros.discovery.causes import Search, is_special_case
 from remaster_ros.discovery.effects.base import Cell
 from remaster_ros.discovery.effects.registry import EFFECTS
-from remaster_ros.discovery.explain import describe, is_special_case
+from remaster_ros.discovery.explain import describe
 from remaster_ros.discovery.residuals import Residuals
+from remaster_ros.discovery.screening import screen
 from remaster_ros.discovery.solution import Solution
 from remaster_ros.types import Session
 
 ARC_MINUTE = np.radians(1.0 / 60.0)
 
 
-def wavy(seed: int) -> Session:
-    """Return a session with an eccentric encoder of joint 2."""
+def wavy(seed: int, minutes: float = 3.0) -> Session:
+    """Return a session with an eccentric encoder of joint 2, by so many minutes of arc."""
     return session_with(
-        seed, lambda s: at_joint(2, 3 * ARC_MINUTE * np.sin(s.measurements.q[:, 1]))
+        seed, lambda s: at_joint(2, minutes * ARC_MINUTE * np.sin(s.measurements.q[:, 1]))
     )
 
 
@@ -87,6 +88,27 @@ def test_what_two_cells_explain_may_be_one_other_or_one_of_them():
     listed = {(other.name, other.joints) for other in effect.confusable_with}
     assert ('encoder_eccentricity', (2,)) in listed
     assert effect.tied
+
+
+def test_what_is_taken_out_of_a_set_is_promised_as_much_as_it_brings():
+    """Else strong causes are never exchanged for what explains more in their place."""
+    data = residuals_of(wavy(41, 30.0))
+    cells = [
+        *cells_of(data, 'encoder_eccentricity', 2)[:1],
+        *cells_of(data, 'encoder_scale', 4, 6),
+    ]
+    search = Search(data, cells)
+    whole = fitted(search, cells)
+    scores = []
+    for cell in cells:
+        rest = search.without(whole, cell)
+        scores.append(screen(data, search.catalogue, rest, known_noise=True))
+        assert rest.log_evidence + scores[-1][cells.index(cell)] == pytest.approx(
+            whole.log_evidence, abs=1.0
+        )
+    # It is strong: with the noise estimated again without it the score would be too low by far.
+    rest = search.without(whole, cells[0])
+    assert screen(data, search.catalogue, rest)[0] < scores[0][0] - 20.0
 
 
 def test_a_curve_is_not_fitted_beside_a_family_that_has_it():
