@@ -299,7 +299,8 @@ def _estimated(problem: Problem, model: Model, z: FloatArray, start: Start | Non
         remedy = f'{error.remedy}{_moved(problem, rows, errors)}'
         raise MisfitError(error.what, remedy) from None
     _require_information(int(np.sum(~judgement.gross[: rows.points])), free, model)
-    mode = with_directions(fitted(~judgement.gross))
+    kept = np.setdiff1d(rows.source, rows.source[judgement.gross])
+    mode = with_directions(fitted(~judgement.gross), stating_directions(measurements, kept))
     gauge = _judged_at(mode, gauge, known)
     why: dict[int, str] = {}
     for row in np.flatnonzero(judgement.gross):
@@ -312,7 +313,7 @@ def _estimated(problem: Problem, model: Model, z: FloatArray, start: Start | Non
         gauge,
         mode,
         tuple(sorted(why.items())),
-        np.setdiff1d(rows.source, rows.source[judgement.gross]),
+        kept,
     )
 
 
@@ -325,12 +326,39 @@ def of_positions_alone(found: Estimate) -> Estimate:
     return estimate(replace(found.problem, session=session, measurements=without))
 
 
-def with_directions(mode: Mode) -> Mode:
+def stating_directions(measurements: Measurements, rows: IntArray) -> list[int]:
+    """Return the sensors whose samples vary otherwise along their line of sight than across it.
+
+    In the frame of the sensor each axis has the variance across, and its share of what that along
+    the line has more or less. The samples of a few readings tell what their means do not.
+    """
+    found = []
+    for sensor in np.unique(measurements.sensor[rows]).tolist():
+        mine = rows[(measurements.sensor[rows] == sensor) & (measurements.samples[rows] > 1)]
+        mine = mine[(measurements.std[mine] > 0.0).all(axis=1)]
+        if len(mine) < FEWEST_ROWS:
+            continue
+        sight = measurements.position[mine]
+        share = (sight**2 / np.sum(sight**2, axis=1, keepdims=True)).ravel()
+        variance = (measurements.std[mine] ** 2).ravel()
+        weight = np.repeat(measurements.samples[mine] - 1.0, 3)
+        share -= np.average(share, weights=weight)
+        variance -= np.average(variance, weights=weight)
+        square = weight @ share**2
+        slope = weight @ (share * variance) / max(square, np.finfo(float).tiny)
+        # Samples that follow one another may be alike: their scatter shows how much they tell.
+        scatter = weight @ (variance - slope * share) ** 2 / (len(share) - 2)
+        if slope**2 * square > DIRECTION_LIMITS[1] * scatter:
+            found.append(sensor)
+    return found
+
+
+def with_directions(mode: Mode, stating: Sequence[int] = ()) -> Mode:
     """Return the mode with a noise along the line of sight of every sensor that shows one.
 
     One sensor after the other, by a likelihood-ratio test of the noise with the parameters
     integrated out. Where there is no difference it finds one in 1 of 1,000 cases, less often where
-    a pose_sigma is zero.
+    a pose_sigma is zero. ``stating``: sensors whose readings state it themselves.
     """
     posterior = mode.linearisation.posterior
     split: list[int] = []
@@ -342,7 +370,8 @@ def with_directions(mode: Mode) -> Mode:
         more = tried.size - mode.linearisation.posterior.size
         try:
             other = noise_mode(tried)
-            if 2.0 * (other.log_evidence - mode.log_evidence) > DIRECTION_LIMITS[more]:
+            ratio = 2.0 * (other.log_evidence - mode.log_evidence)
+            if sensor in stating or ratio > DIRECTION_LIMITS[more]:
                 mode, split = find_mode(tried, other.eta), [*split, sensor]
         except InsufficientDataError:
             continue
