@@ -127,14 +127,17 @@ class FoundEffect:
             )
             size_m = _size(data, group, [result.theta[where] for where in wheres])
             if round(1e3 * size_m, 3) == 0.0:
-                # Its own size is that of the search, where it stands alone.
+                # Its size is that of the search, where it stands alone: all of that, or nothing.
                 elsewhere = (
                     'In the model of all kinds of errors another kind has all of it: these poses '
                     'do not tell which of them it is. Measure more poses before it is acted on.'
                 )
                 return replace(
                     self,
-                    parameters=parameters,
+                    parameters=tuple(
+                        replace(one, std=float(np.hypot(one.std, one.value)))
+                        for one in self.parameters
+                    ),
                     cause=f'{self.cause} {elsewhere}',
                     remedy=_later(self.remedy),
                 )

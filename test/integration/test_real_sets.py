@@ -145,8 +145,10 @@ def test_everything_can_be_loaded_where_the_reflector_is_near_an_axis(
     file = read_compensation(tmp_path / 'apply/compensation.json')
     q = found.residuals.context.measurements.q
     assert np.abs(file.compensator.command(q) - q).max() < np.deg2rad(2.0)
-    # In one of them the model of all kinds leaves nothing to a cause that the search has named.
+    # In one of them the model of all kinds leaves nothing to what the search has named.
     told = [effect for effect in found.effects if 'another kind has all of it' in effect.cause]
-    assert [effect.name for effect in told] == ['sensor_scale'] * (name == 'ur10_two_solutions')
+    assert bool(told) == (name == 'ur10_two_solutions')
     assert all(effect.size_m >= 0.5e-6 for effect in found.effects)
     assert all(effect.remedy.startswith('Measure more poses first') for effect in told)
+    # It may be all of what the search found, or nothing.
+    assert all(one.std >= abs(one.value) for effect in told for one in effect.parameters)
