@@ -104,22 +104,24 @@ class FoundEffect:
     ) -> FoundEffect:
         """Return the effect with its parameters as the extended model's posterior has them.
 
-        With its cells and the rows that they were fitted to, its sizes as well.
+        With its cells and the rows that they were fitted to, its sizes as well. Another kind may
+        have a part of it there: by what the search has it otherwise it is uncertain as well.
         """
         found = self
         index = {name: i for i, name in enumerate(result.theta_names)}
+        theta, std = result.theta, result.theta_std.copy()
+        for one in self.parameters:
+            if (i := index.get(one.name)) is not None:
+                std[i] = np.hypot(std[i], one.value - theta[i])
         parameters = tuple(
-            replace(
-                parameter,
-                value=float(result.theta[index[parameter.name]]),
-                std=float(result.theta_std[index[parameter.name]]),
-            )
-            if parameter.name in index
-            else parameter
-            for parameter in self.parameters
+            replace(one, value=float(theta[index[one.name]]), std=float(std[index[one.name]]))
+            if one.name in index
+            else one
+            for one in self.parameters
         )
         if data is not None and group:
-            draws = result.theta_draws.reshape(-1, len(index))
+            wider = std / np.where(result.theta_std > 0.0, result.theta_std, 1.0)
+            draws = theta + wider * (result.theta_draws.reshape(-1, len(index)) - theta)
             wheres = [[index[name] for name in cell.parameters] for cell in group]
             sizes = tuple(
                 EFFECTS[cell.name].size(data.part, cell, draws[:, where])
@@ -127,17 +129,14 @@ class FoundEffect:
             )
             size_m = _size(data, group, [result.theta[where] for where in wheres])
             if round(1e3 * size_m, 3) == 0.0:
-                # Its size is that of the search, where it stands alone: all of that, or nothing.
+                # Its size is that of the search, where it stands alone.
                 elsewhere = (
                     'In the model of all kinds of errors another kind has all of it: these poses '
                     'do not tell which of them it is. Measure more poses before it is acted on.'
                 )
                 return replace(
                     self,
-                    parameters=tuple(
-                        replace(one, std=float(np.hypot(one.std, one.value)))
-                        for one in self.parameters
-                    ),
+                    parameters=parameters,
                     cause=f'{self.cause} {elsewhere}',
                     remedy=_later(self.remedy),
                 )

@@ -190,7 +190,9 @@ def test_the_extended_model_is_sampled_and_gains_on_held_out_poses():
     for parameter, mean, std in zip(
         found.effects[0].parameters, found.fit.theta, found.fit.theta_std, strict=True
     ):
-        assert (parameter.value, parameter.std) == (mean, std)
+        assert parameter.value == mean
+        # With what the search has it otherwise.
+        assert std <= parameter.std < 1.1 * std
     assert [e.share for e in found.effects] == [pytest.approx(1.0)]
 
 
