@@ -338,17 +338,19 @@ def stating_directions(measurements: Measurements, rows: IntArray) -> list[int]:
         mine = mine[(measurements.std[mine] > 0.0).all(axis=1)]
         if len(mine) < FEWEST_ROWS:
             continue
-        sight = measurements.position[mine]
-        share = (sight**2 / np.sum(sight**2, axis=1, keepdims=True)).ravel()
+        square = measurements.position[mine] ** 2
+        # A point at the origin of the sensor's frame has no line of sight.
+        length = np.maximum(square.sum(axis=1, keepdims=True), np.finfo(float).tiny)
+        share = (square / length).ravel()
         variance = (measurements.std[mine] ** 2).ravel()
         weight = np.repeat(measurements.samples[mine] - 1.0, 3)
         share -= np.average(share, weights=weight)
         variance -= np.average(variance, weights=weight)
-        square = weight @ share**2
-        slope = weight @ (share * variance) / max(square, np.finfo(float).tiny)
+        spread = weight @ share**2
+        slope = weight @ (share * variance) / max(spread, np.finfo(float).tiny)
         # Samples that follow one another may be alike: their scatter shows how much they tell.
         scatter = weight @ (variance - slope * share) ** 2 / (len(share) - 2)
-        if slope**2 * square > DIRECTION_LIMITS[1] * scatter:
+        if slope**2 * spread > DIRECTION_LIMITS[1] * scatter:
             found.append(sensor)
     return found
 

@@ -76,6 +76,16 @@ def test_few_readings_have_the_directions_that_their_samples_state() -> None:
     assert [channel.direction for channel in found.channels] == ['along', 'across']
 
 
+def test_a_point_at_the_origin_of_the_sensor_does_no_harm() -> None:
+    session, _ = scene(61, poses=4)
+    measured = stated(session, 0.1e-3, 0.025e-3, 1).measurements
+    position = measured.position.copy()
+    position[0] = 0.0
+    spoilt = replace(measured, position=position)
+    with np.errstate(all='raise'):
+        assert stating_directions(spoilt, np.arange(len(spoilt))) == [0]
+
+
 def test_samples_that_vary_alike_state_no_directions() -> None:
     """200 sessions at an error rate of 1 in 1,000: two or more with 2 % of seeds."""
     session, _ = scene(61, poses=4)
