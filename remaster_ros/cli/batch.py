@@ -34,7 +34,7 @@ from typing import Any
 from remaster_ros.cli.console import progress_bar, show
 from remaster_ros.cli.options import integer
 from remaster_ros.errors import InputError, InsufficientDataError, RemasterError
-from remaster_ros.session.files import make_folder
+from remaster_ros.session.files import make_folder, writing
 from remaster_ros.session.journal import Journal
 from remaster_ros.session.manifest import MANIFEST
 from remaster_ros.version import __version__
@@ -110,6 +110,7 @@ def run(args: argparse.Namespace) -> int:
     baseline = '' if args.baseline is None else str(args.baseline.resolve())
     folders = list(dict.fromkeys(folder.resolve() for folder in args.session))
     make_folder(args.out)
+    _refuse_foreign(args.out)
     jobs = [_job(folder, args.out.resolve(), args.seed, baseline) for folder in folders]
     rows = Journal(args.out / ROWS)
     try:
@@ -152,6 +153,21 @@ def run(args: argparse.Namespace) -> int:
             show(args.quiet, line)
         show(args.quiet, f'written: {args.out / PAGE}')
     return 0 if any(row['status'] == 'done' for row in found) else 1
+
+
+def _refuse_foreign(folder: Path) -> None:
+    """Refuse a folder in which another command has put its results, or a session its rows."""
+    from remaster_ros.reports.fit_json import DISCOVERY_FILE, FIT_FILE, WRITTEN
+    from remaster_ros.session.reader import HEADER
+
+    with writing(folder):
+        there = sorted(path.name for path in folder.iterdir())
+    foreign = {FIT_FILE, DISCOVERY_FILE, HEADER, *WRITTEN}.intersection(there)
+    if foreign and ROWS not in there:
+        raise InputError(
+            f'{folder}: holds {", ".join(sorted(foreign))}, not written by this command; name '
+            'another folder'
+        )
 
 
 def _job(folder: Path, out: Path, seed: int, baseline: str) -> Job:

@@ -12,6 +12,7 @@ from scipy.special import stdtrit
 
 from remaster_ros.compensation.checking import ALARM, change
 from remaster_ros.reports.pages import page
+from remaster_ros.reports.sentences import without_search
 from remaster_ros.session.files import write_atomically
 from remaster_ros.types import FloatArray
 
@@ -124,6 +125,14 @@ def _joint(
     return found
 
 
+def _fit_shown(row: Mapping[str, Any]) -> dict[str, Any] | None:
+    """Return the fit of a row, without the advice to look for causes where that was done."""
+    fit = row.get('fit')
+    if not fit or 'discovery' not in row:
+        return fit
+    return {**fit, 'headline': without_search(fit['headline'])}
+
+
 def write_batch_page(
     path: Path, rows: Sequence[Mapping[str, Any]], over_all: Mapping[str, Any]
 ) -> None:
@@ -133,7 +142,7 @@ def write_batch_page(
             'name': Path(row['session']).name,
             'folder': row['session'],
             'status': row['status'],
-            'fit': row.get('fit'),
+            'fit': _fit_shown(row),
             'discovery': row.get('discovery'),
             'check': row.get('check'),
             'error': row.get('error', ''),

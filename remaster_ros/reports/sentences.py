@@ -254,13 +254,21 @@ def _widening(result: FitResult) -> list[str]:
     return lines
 
 
+SEARCH = 'run "remaster discover"'
+
+
+def without_search(headline: str) -> str:
+    """Return the headline of a fit whose causes were looked for already."""
+    return headline.replace(f'; {SEARCH}', '')
+
+
 def _dominated(result: FitResult, unexplained: Sequence[NoiseCheck]) -> str:
     """Return why the error after is no success, and what to do."""
     if not result.other_errors:
         return 'Whether noise explains what is left, this session cannot show.'
     if result.structure is not None and result.structure.too_few:
         return 'Noise does not explain what is left; so few poses do not show what does.'
-    deed = 'run "remaster discover".'
+    deed = f'{SEARCH}.'
     if result.chain.slides.any():
         deed = '"remaster discover" does not take an arm with a joint that slides.'
     if not any(check.noise_m is not None for check in unexplained):

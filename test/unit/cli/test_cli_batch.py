@@ -21,7 +21,7 @@ import pytest
 from remaster_ros.cli import batch
 from remaster_ros.cli.main import main
 from remaster_ros.errors import InputError
-from remaster_ros.reports.batch_page import summary_of
+from remaster_ros.reports.batch_page import summary_of, write_batch_page
 from remaster_ros.session.journal import read_journal
 from remaster_ros.session.reader import read_session
 
@@ -105,6 +105,31 @@ def test_rows_do_not_depend_on_the_workers_and_are_not_made_again(
     assert '1 done, 1 error' in capsys.readouterr().out
     assert (out / batch.ROWS).read_bytes() == before, 'made again'
     assert 's1' in (out / batch.PAGE).read_text(encoding='utf-8')
+
+
+def test_a_page_does_not_advise_what_was_done(tmp_path):
+    fit = {
+        'headline': 'The mean falls. But what is left has structure, which noise has not: other '
+        'errors dominate; run "remaster discover".',
+        'held_out_mm': {'before': 1.0, 'after': 0.5},
+    }
+    row = {'session': 's', 'status': 'done', 'fit': fit, 'discovery': {'headline': 'A cause.'}}
+    over_all = {'lines': [], 'joints': []}
+    write_batch_page(tmp_path / 'batch.html', [row], over_all)
+    text = (tmp_path / 'batch.html').read_text(encoding='utf-8')
+    assert 'other errors dominate.</td>' in text
+    assert 'remaster discover' not in text
+
+
+@pytest.mark.parametrize('file', ['fit.json', 'discovery.json', 'session.yaml', 'report.html'])
+def test_a_folder_of_another_command_is_refused(file, sessions, tmp_path, capsys):
+    (tmp_path / file).write_text('{}', encoding='utf-8')
+    assert main(['batch', str(sessions / 's1'), '--out', str(tmp_path)]) == 2
+    error = capsys.readouterr().err
+    assert error == (
+        f'error: {tmp_path}: holds {file}, not written by this command; name another folder\n'
+    )
+    assert [path.name for path in tmp_path.iterdir()] == [file]
 
 
 def test_a_row_is_of_the_files_the_seed_and_the_baseline(sessions, tmp_path):
