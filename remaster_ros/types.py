@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from math import nan
 from typing import Any, Literal
+from xml.etree import ElementTree
 
 import numpy as np
 from numpy.typing import NDArray
@@ -315,6 +316,12 @@ class Correction:
         return self.form + (f', checksum {self.sha256[:8]}' if self.sha256 else '')
 
 
+def _end(joint: ElementTree.Element, end: str) -> str:
+    """Return the link at an end of a joint, ``parent`` or ``child``."""
+    found = joint.find(end)
+    return '' if found is None else found.get('link', '')
+
+
 @dataclass(frozen=True, repr=False)
 class Session:
     """A session: the robot, the markers and sensors, and what was measured.
@@ -394,6 +401,17 @@ class Session:
         """SHA-256 of the URDF's text, which identifies the robot that a result belongs to."""
         return hashlib.sha256(self.urdf.encode()).hexdigest()
 
+    @property
+    def slides(self) -> tuple[bool, ...]:
+        """Which joints slide, base to tip: their positions are in m."""
+        joints = ElementTree.fromstring(self.urdf).findall('joint')
+        carrying = {_end(joint, 'child'): joint for joint in joints}
+        kinds, link = list[str | None](), self.tip_link
+        while link != self.base_link:
+            kinds.insert(0, carrying[link].get('type'))
+            link = _end(carrying[link], 'parent')
+        return tuple(kind == 'prismatic' for kind in kinds if kind != 'fixed')
+
     def __repr__(self) -> str:
         m = self.measurements
         sensors = ', '.join(f'{name} (marker {marker})' for name, marker in self.sensors.items())
@@ -411,9 +429,13 @@ class Session:
         Returns
         -------
         dict of (n,) arrays
-            In s, rad, m, degrees Celsius and N m, as the names say.
+            In s, rad, m, degrees Celsius, N m and N, as the names say.
         """
-        m, joints = self.measurements, range(1, len(self.measurements.q[0]) + 1)
+        m = self.measurements
+        joints = [
+            (i, *(('m', 'n') if slides else ('rad', 'nm')))
+            for i, slides in enumerate(self.slides, start=1)
+        ]
         found: dict[str, NDArray[Any]] = {
             'observation': m.observation,
             'pose': m.pose,
@@ -424,13 +446,13 @@ class Session:
             'marker': np.array(self.marker_names)[m.marker],
         }
         for names, values in (
-            ([f'q{i}_rad' for i in joints], m.q),
-            ([f'from_q{i}_rad' for i in joints], m.from_q),
+            ([f'q{i}_{unit}' for i, unit, _ in joints], m.q),
+            ([f'from_q{i}_{unit}' for i, unit, _ in joints], m.from_q),
             (['x_m', 'y_m', 'z_m'], m.position),
             (['std_x_m', 'std_y_m', 'std_z_m'], m.std),
             ([f'orientation_{axis}' for axis in 'xyzw'], m.orientation),
-            ([f'effort{i}_nm' for i in joints], m.effort),
-            ([f'wanted{i}_rad' for i in joints], m.wanted),
+            ([f'effort{i}_{unit}' for i, _, unit in joints], m.effort),
+            ([f'wanted{i}_{unit}' for i, unit, _ in joints], m.wanted),
         ):
             if values is not None and not np.isnan(values).all():
                 found |= dict(zip(names, values.T, strict=True))

@@ -6,9 +6,11 @@ import html
 import json
 import pickle
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from arms import jointed_arm
 
 import remaster_ros
 from remaster_ros.errors import MisfitError, MistakeFoundError
@@ -112,6 +114,18 @@ def test_columns_are_those_of_the_file(notebook, tmp_path):
     columns = session.columns()
     assert {len(values) for values in columns.values()} == {len(session.measurements)}
     assert set(columns) < {name for names in column_names(7).values() for name in names}
+
+
+def test_columns_of_a_joint_that_slides_are_in_m(session):
+    arm = jointed_arm(
+        ('revolute', '0 0 1', '0 0 0.4', '0 0 0'), ('prismatic', '0 0 1', *2 * ['0 0 0'])
+    )
+    rows = replace(session.measurements, wanted=session.measurements.q)
+    session = replace(session, urdf=arm, base_link='base', tip_link='tool0', measurements=rows)
+    assert session.slides == (False, True)
+    expected = column_names(2, [False, True])
+    for field in ('q', 'from_q', 'effort', 'wanted'):
+        assert set(expected[field]) < set(session.columns())
 
 
 @pytest.mark.parametrize('made', [MisfitError('what', 'remedy'), MistakeFoundError('it', '--x')])
