@@ -75,12 +75,43 @@ import os
 from collections.abc import Mapping
 from pathlib import Path
 
+from remaster_ros.errors import InputError, did_you_mean
+
 Numbers = Mapping[str, float]
 FILE = 'faults.json'
+OF_ROBOT = (
+    *('off', 'dropped', 'estop', 'estop_reported', 'elsewhere', 'slow', 'late', 'intermittent'),
+    *('nan', 'renamed', 'reordered', 'drift', 'copy', 'clock', 'lost', 'doubled', 'repeated'),
+    *('frozen', 'wrapped', 'wrapped_once'),
+)
+OF_OPTITRACK = (
+    *('off', 'stopped', 'frozen', 'swapped', 'jumping', 'occluded', 'hidden', 'exchanged'),
+    *('filled', 'slow', 'late', 'intermittent', 'garbage', 'duplicate', 'reordered'),
+    *('renumbered', 'bumped'),
+)
+OF_TRACKER = (
+    *('off', 'stuck', 'swapped', 'slow', 'garbage', 'cut', 'intermittent', 'occluded', 'hidden'),
+    *('renumbered', 'bumped'),
+)
+"""What the fakes know, as above."""
 
 
 def inject(folder: Path, faults: Mapping[str, Numbers]) -> None:
-    """Replace the faults of the World in `folder`; with none, all end."""
+    """Replace the faults of the World in `folder`; with none, all end.
+
+    Raises
+    ------
+    InputError
+        A fault that neither the robot nor, of another device, any sensor has.
+    """
+    for device, numbers in faults.items():
+        known = OF_ROBOT if device == 'robot' else dict.fromkeys((*OF_OPTITRACK, *OF_TRACKER))
+        for name in numbers:
+            if name not in known:
+                raise InputError(
+                    f"there is no fault '{name}' of {device}; there are {', '.join(known)}"
+                    f'{did_you_mean(name, known)}'
+                )
     temporary = folder / f'{FILE}.new'
     temporary.write_text(json.dumps(faults))
     os.replace(temporary, folder / FILE)
