@@ -57,6 +57,7 @@ from remaster_ros.nodes.parameters import declare, parameter
 from remaster_ros.nodes.running import report
 from remaster_ros.nodes.runtime_files import opening_path, page_name
 from remaster_ros.nodes.status import listen
+from remaster_ros.planning.tour_planner import TourPlanner
 from remaster_ros.reports.discovery_json import read_discovery
 from remaster_ros.reports.fit_json import read_fit
 from remaster_ros.reports.schemas import Discovered, Effect, Fit
@@ -64,7 +65,7 @@ from remaster_ros.reports.sentences import discovery_lines
 from remaster_ros.session.files import cannot_write, make_folder, undone_on_failure
 from remaster_ros.session.reader import HEADER, read_session
 from remaster_ros.session.session_journal import is_complete
-from remaster_ros.session.workcell import config_path, read_cell
+from remaster_ros.session.workcell import Workcell, config_path, read_cell
 from remaster_ros.simulation.effect_sampling import EffectSpec
 from remaster_ros.simulation.expected_findings import causes, describe, named_cause
 from remaster_ros.simulation.hidden_arm import tool_points
@@ -295,6 +296,9 @@ def print_hidden(console: Console, discovery: Discovered, truth: SessionTruth) -
 AFTERWARDS = 5
 """Candidate poses, each, that are visited with the correction on: with all their solutions a dozen
 or two of configurations, and `remaster verify` asks for ten."""
+TO_FIT, MOST_CANDIDATES = 4, 60
+"""Poses to fit of a demo, and candidates up to which they are looked for: a fit takes three, and
+where the sensors really stand one less may be seen than at the rough places."""
 LAST_MESSAGES = 50
 """So many messages of nodes that have ended may still be on their way to this one."""
 BEFORE_SESSION = {'log', 'ros_home', 'session'}
@@ -363,6 +367,18 @@ def true_errors(
     return found.error_off.mean_mm, found.error_on.mean_mm
 
 
+def enough_candidates(cell: Workcell, seed: int, asked: int) -> int:
+    """Return how many candidates of each split leave `TO_FIT` poses to fit, `asked` at the least.
+
+    `asked` as well where `MOST_CANDIDATES` do not leave so many: then the planner says why.
+    """
+    scene = cell.planning_scene(cell.chain(sliding=True))
+    for count in range(asked, MOST_CANDIDATES + 1):
+        if TourPlanner(scene, {'optimization': count}, seed).left_to_fit >= TO_FIT:
+            return count
+    return asked
+
+
 class Conductor(Node):
     """Calls the services and follows the status of the nodes."""
 
@@ -403,6 +419,12 @@ class Demo:
         if self.p.apply:
             # No joint may slide: what is corrected are angles.
             cell.chain()
+        self.candidates = enough_candidates(cell, self.p.seed, self.p.candidates)
+        if self.candidates > self.p.candidates:
+            self.console.print(
+                f'{self.candidates} candidate poses in place of {self.p.candidates}, of which too '
+                f'few can be reached with seed {self.p.seed}'
+            )
         self.hidden = Path(tempfile.mkdtemp(prefix='remaster_world_'))
         try:
             with undone_on_failure():
@@ -413,7 +435,7 @@ class Demo:
                     self.p.seed,
                     self.p.rate,
                     self.requests,
-                    self.p.candidates,
+                    self.candidates,
                 )
         except BaseException:
             shutil.rmtree(self.hidden, ignore_errors=True)
@@ -524,7 +546,7 @@ class Demo:
         }
         for name, values in own.items():
             self.processes.start(name, common, values)
-        size = self.p.candidates
+        size = self.candidates
         held_out = self.p.held_out_candidates or size
         self._start_core(self.session, self.p.seed, size, held_out)
         if self.p.watch:

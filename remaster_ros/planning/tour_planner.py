@@ -170,6 +170,11 @@ class TourPlanner:
         markers = [sight.marker_T for sight in self.scene.sights]
         return registration_tour(self._chain, plan, markers, self.model)
 
+    @property
+    def left_to_fit(self) -> int:
+        """How many poses to fit the arm can take, before sensors at their rough places."""
+        return len(self._plan('optimization', self.scene.rough_R).poses)
+
     def collection(self, T_R_N: Mapping[str, FloatArray]) -> Tour:
         """Plan the poses to fit and to validate, before sensors with these registrations.
 
