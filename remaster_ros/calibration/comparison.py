@@ -10,7 +10,6 @@ import numpy as np
 
 from remaster_ros.calibration.accuracy import accuracy_of
 from remaster_ros.calibration.estimate import Problem
-from remaster_ros.calibration.grouped_rows import Rows
 from remaster_ros.calibration.model import Model
 from remaster_ros.calibration.orientation_accuracy import tool_orientations
 from remaster_ros.calibration.predictive_accuracy import Predictive
@@ -63,7 +62,7 @@ def compared(
 def predicted_rows(problem: Problem, model: Model, z: FloatArray) -> FloatArray:
     """Return where the sensors should see the markers of all rows by pinned z, (n, 3)."""
     measurements = problem.measurements
-    rows = Rows.of(measurements, np.arange(len(measurements)), model.reference)
+    rows = model.rows(measurements, np.arange(len(measurements))).of_points
     predicted = np.empty((len(measurements), 3))
-    predicted[rows.source] = model.predict(z, rows)
+    predicted[rows.source] = model.seen(z, rows)
     return apply(inverse(model.reference)[measurements.sensor], predicted)

@@ -164,6 +164,11 @@ class Rows:
         """Number of positions, which are the first of the rows."""
         return len(self) - (0 if self.turned is None else len(self.turned))
 
+    @property
+    def measured(self) -> FloatArray:
+        """Where the positions were measured, in the base coordinates of the reference, (n, 3)."""
+        return self.target if self.place is None else self.place
+
     def whole(self, rows: BoolArray) -> BoolArray:
         """Return the same with the other half of each reading: its position or orientation."""
         if self.turned is None:

@@ -302,6 +302,16 @@ class Model:
             return points
         return np.concatenate((points, self._turns(z, offsets, rows, corrections)), axis=-2)
 
+    def seen(self, z: FloatArray, rows: Rows) -> FloatArray:
+        """Return where the sensors should see the markers, as `predict`, of positions alone.
+
+        A sensor on the tool: as far from its measured place in front of what it measures as that
+        is from where it should be in the sensor's frame. Its own place by the readings has the
+        noise of the orientation at the distance's lever, which is no error of the arm.
+        """
+        predicted = self.predict(z, rows)
+        return predicted if rows.lever is None else predicted + (rows.measured - rows.target)
+
     def _places(self, z: FloatArray, rows: Rows) -> FloatArray:
         """Return where on the tool the points of the rows are, m, (..., n, 3)."""
         places = self.markers(z)[..., rows.marker, :]

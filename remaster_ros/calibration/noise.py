@@ -417,8 +417,7 @@ class NoiseModel:
 
 def _frames(rows: Rows, reference: FloatArray) -> FloatArray:
     """Return the line of sight of each row's group, and two directions across it, (n, 3, 3)."""
-    measured = rows.target if rows.place is None else rows.place
-    middle = rows.group_sum(measured) / rows.group_size[:, None]
+    middle = rows.group_sum(rows.measured) / rows.group_size[:, None]
     sensor = np.array([*range(len(reference)), *rows.turning])[rows.group_sensor]
     sight = middle - reference[sensor, :3, 3]
     sight /= np.maximum(np.linalg.norm(sight, axis=1), np.finfo(float).tiny)[:, None]

@@ -94,7 +94,7 @@ def predict(
     root = (draws - draws.mean(axis=0)) / np.sqrt(max(1, len(draws) - 1))
     # Σ = L' L with the triangle L of the draws: rounding leaves it positive.
     triangle = np.asarray(np.linalg.qr(root, 'r'))
-    every = Rows.of(measurements, np.arange(len(measurements)), model.reference)
+    every = model.rows(measurements, np.arange(len(measurements))).of_points
     position = np.empty((len(measurements), 3))
     covariance = np.empty((len(measurements), 3, 3))
     for first, last in every.blocks(BLOCK_ROWS):
@@ -143,7 +143,7 @@ class _Part:
         predictive = fit.predictive
         model = predictive.model
         sensor = rows.group_sensor[rows.group_of_row]
-        place = model.predict(predictive.after, rows)
+        place = model.seen(predictive.after, rows)
         spread = model.jacobian(predictive.after, rows) @ triangle.T
         sight = place - model.reference[sensor, :3, 3]
         sight /= np.linalg.norm(sight, axis=1)[:, None]
@@ -170,7 +170,7 @@ class _Part:
         noise[np.arange(n), :, np.arange(n)] += self.own_noise[mine]
         R = noise.reshape(3 * n, 3 * n)
         root = self.spread[mine].reshape(3 * n, -1)
-        error = (rows.target - self.place)[mine].ravel()
+        error = (rows.measured - self.place)[mine].ravel()
         out = R @ np.linalg.solve(R - root @ root.T, np.column_stack((error, R)))
         blocks = out[:, 1:].reshape(n, 3, n, 3)[np.arange(n), :, np.arange(n)]
         return squared_distances(out[:, 0].reshape(n, 3), blocks)
@@ -211,7 +211,7 @@ def _left_out_distances(
         sources = [
             np.flatnonzero(fitted & (measurements.pose == pose))[:MOST_ROWS] for pose in few
         ]
-        rows = Rows.of(measurements, np.concatenate(sources), fit.predictive.model.reference)
+        rows = fit.predictive.model.rows(measurements, np.concatenate(sources)).of_points
         part = _Part.of(fit, rows, triangle)
         for source in sources:
             mine = np.flatnonzero(np.isin(rows.source, source))

@@ -91,6 +91,8 @@ def random_configurations(
         sensor=np.unique(seen.sensor)[sensor],
         marker=np.array(followed)[sensor],
         q=rng.uniform(chain.lower, chain.upper, (count, len(chain))),
+        # Of the marker's own place: a sensor on the tool has measured nothing from there.
+        orientation=None,
     )
 
 
@@ -179,7 +181,7 @@ def theoretical_distances(
     for index, block in enumerate(blocks):
         # Every block of rows takes other draws, so that all draws are used.
         taken = order[(index * per_block + np.arange(per_block)) % draws]
-        seen = Rows.of(measurements, block, predictive.model.reference)
+        seen = predictive.model.rows(measurements, block).of_points
         parts.append(_block(predictive, before, seen, taken, rng))
     invariant, paper = np.concatenate(parts, axis=-1)
     return Distances(*invariant), Distances(*paper)
@@ -195,14 +197,14 @@ def _block(
     """Return both versions of the four `Distances` of some rows and draws, (2, 4, pairs)."""
     model, draws = predictive.model, predictive.draws[taken]
     sensor = rows.group_sensor[rows.group_of_row]
-    predicted = model.predict(predictive.after, rows)
+    predicted = model.seen(predictive.after, rows)
     sight = predicted - model.reference[sensor, :3, 3]
     sight /= np.linalg.norm(sight, axis=1)[:, None]
     along, across = np.moveaxis(predictive.sigma[taken][:, sensor], -1, 0)
     raw = rng.standard_normal((len(taken), len(rows), 3))
     deeper = (along - across) * np.einsum('dni,ni->dn', raw, sight)
     noise = across[..., None] * raw + deeper[..., None] * sight
-    in_sensor = model.predict(before, rows), predicted, model.predict(draws, rows)
+    in_sensor = model.seen(before, rows), predicted, model.seen(draws, rows)
     markers = model.markers(model.natural(predictive.after))[rows.marker]
     in_base = (
         model.chain.positions(rows.q, markers, offsets)

@@ -64,7 +64,7 @@ def of_position(rows: Rows, degree: int = POSITION_DEGREE) -> FloatArray:
 
     Without the constant: (n, 3, 9 sensors) or (n, 3, 27 sensors), as `by_sensor` splits them.
     """
-    measured = rows.target if rows.place is None else rows.place
+    measured = rows.measured
     place = np.empty_like(measured)
     for _, span in rows.spans:
         centred = measured[span] - measured[span].mean(axis=0)
