@@ -84,6 +84,7 @@ $(VENV)/bench-installed: $(VENV)/installed
 docs: $(VENV)/docs-installed
 	$(BIN)/python docs/make_parameters.py
 	$(BIN)/python docs/make_command_line.py
+	$(BIN)/python docs/make_states.py
 	$(BIN)/python -m sphinx -q -W --keep-going docs build/docs
 	@echo "the site: build/docs/index.html"
 

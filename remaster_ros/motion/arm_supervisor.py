@@ -1,8 +1,9 @@
 """Which joint configuration an arm is sent to, when it may move at all, and when it is halted.
 
 This is the state machine of the robot bridge: reports and their times are its input, actions are
-its output. *Wall* time is when something arrived; silence is judged by it. *Robot* time is what
-has passed according to the stamps of joint_states.
+its output; the states and all ways between them stand in `states`. *Wall* time is when something
+arrived; silence is judged by it. *Robot* time is what has passed according to the stamps of
+joint_states.
 
 A motion ends in one of three ways. It reaches its end. A *stop* brakes the arm along the line
 that it is on, and the configuration is commanded again later. After a *halt* the arm stays where
@@ -31,7 +32,7 @@ from remaster_ros.motion.interlocks import Interlocks
 from remaster_ros.motion.joint_reports import JointReport, JointReports
 from remaster_ros.motion.limits import MotionLimits
 from remaster_ros.motion.motion_gate import MotionGate, MotionRefusedError, StartMovedError
-from remaster_ros.motion.motion_under_way import MotionUnderWay, Visit
+from remaster_ros.motion.motion_under_way import MotionUnderWay
 from remaster_ros.motion.move_queue import (
     NO_REFUSALS,
     NO_WAYPOINTS,
@@ -42,6 +43,14 @@ from remaster_ros.motion.move_queue import (
     probe_path,
 )
 from remaster_ros.motion.path_check import FreePath
+from remaster_ros.motion.states import (
+    ARM,
+    HAS_VISIT,
+    Arm,
+    Event,
+    Finding,
+    Place,
+)
 from remaster_ros.types import FloatArray
 
 DOUBT_S = 0.5
@@ -49,6 +58,8 @@ DOUBT_S = 0.5
 REFUSED_IN_A_ROW = 12
 """The arm is halted if so many configurations could not be commanded and none between them was
 reached: planner and bridge then have different models of the arm."""
+BEGINS = {PROBE: Event.PROBE, WAY_OUT: Event.LEAVE}
+"""What a move is by its number; the others lead to a configuration."""
 
 
 class ArmSupervisor:
@@ -90,14 +101,13 @@ class ArmSupervisor:
         self.halted = halted
         self._interlocks = Interlocks(rules.heartbeat_s, rules.resume_alone_s)
         self._queue = MoveQueue()
-        self._motion = MotionUnderWay(gate, rules, end)
+        self._motion = MotionUnderWay(gate, rules, end, Arm.HALTED if halted else Arm.STANDS)
         # Where the arm is reported, which a person was asked to compare with the pad.
         self._asked: FloatArray | None = None
         # Whether it may be elsewhere than reported, until a probe has led it there to its end.
         self._unsure = end is None
         self._wall = -np.inf
         self._failures = self._refusals = 0
-        self._paused = False
         self._seen: Seen | None = None
         self._doubted_wall: float | None = None
         # What else came on joint_states, and when (wall time, s).
@@ -111,12 +121,10 @@ class ArmSupervisor:
         ``run`` identifies the run of a collection: a new one shows that a person has called
         /remaster/collect.
         """
-        reason = '' if state == 'running' else f'planner is {state}'
-        self._paused = state == 'paused'
-        if self._interlocks.planner(reason, run, wall_s):
+        if self._interlocks.planner(state, run, wall_s):
             self._failures = self._refusals = 0
             # A person may have moved the arm meanwhile.
-            self._queue.begin_anew()
+            self._queue.found(Finding.DOUBT)
         return self.tick(wall_s)
 
     def recorder_waits(self, waiting_for: str, wall_s: float) -> list[Action]:
@@ -138,16 +146,19 @@ class ArmSupervisor:
         ``refused`` why one of them must not be commanded.
         """
         actions = self._stop('another pose' if len(solutions) else 'stopped', wall_s)
-        self._motion.visit = None
+        actions += self._step(Event.NEW_POSE)
         self._queue.begin(solutions, waypoints, refused)
         return actions + self.tick(wall_s)
 
     def answered(self, solution: int, wall_s: float) -> list[Action]:
         """Process the recorder's answer that it is done with a settled configuration."""
+        actions: list[Action] = []
         visit = self._motion.visit
-        if visit is not None and visit.settled and visit.solution == solution:
-            self._leave(visit)
-        return self.tick(wall_s)
+        measures = self.state is Arm.MEASURES
+        if visit is not None and measures and visit.solution == solution:
+            self._queue.next = solution + 1
+            actions = self._step(Event.ANSWERED)
+        return actions + self.tick(wall_s)
 
     def emergency(self, stopped: bool, wall_s: float) -> list[Action]:
         """Process the state of the robot's own safety circuit."""
@@ -164,7 +175,7 @@ class ArmSupervisor:
         halts = name == 'rivals' or self._interlocks.was_right(name)
         self._interlocks.set(name, trouble)
         if trouble and halts and self._engaged and not self.halted:
-            return self._halt(trouble, stop_wall_s=wall_s)
+            return self._halt_braking(trouble, wall_s)
         return self.tick(wall_s)
 
     def report(self, report: JointReport) -> list[Action]:
@@ -205,27 +216,30 @@ class ArmSupervisor:
         self._interlocks.set('robot', why)
         if (self._engaged or jumped) and not self.halted:
             return self._halt(why)
-        if not self._paused:
+        if not self._interlocks.paused:
             # Nothing moves, so that what is usual can be learned again: a driver was restarted, a
             # clock was set. In a pause it is not, or late reports would be usual afterwards.
             self.reports.forget()
             self._seen = None
-            self._queue.begin_anew()
+            self._queue.found(Finding.DOUBT)
         return self.tick(wall_s)
 
     def path_found(self, number: int, answer: PathAnswer, wall_s: float) -> list[Action]:
         """Process the answer to the last `CheckPath`; an answer to an earlier one is ignored."""
-        request, seen = self._queue.pending, self._seen
-        if request is None or request[0] != number:
+        asked, seen = self._queue.asked(number), self._seen
+        if self.state is not Arm.ASKS or asked is None:
             return []
-        self._queue.pending = None
+        solution, start = asked
+        actions = self._step(Event.CHECKED)
         if seen is None or self.blocked(wall_s) or not seen.stands(wall_s):
+            return actions
+        if self._differs(start, seen.q):
+            # It was moved since: it is asked again.
             return []
-        solution = request[1]
         if answer.path is None and answer.at_start:
             return self._halt(self._queue.offer(answer, self.gate.limits))
         if solution == STANDING and answer.path is not None:
-            self._queue.must_look = False
+            self._queue.found(Finding.FREE)
             return self.tick(wall_s)
         if answer.path is None:
             return self._give_up(solution, f'no free path: {answer.why}', wall_s)
@@ -250,12 +264,13 @@ class ArmSupervisor:
             self._motion.end, self._unsure = seen.q, True
         self._asked = None
         self.halted = ''
-        self._interlocks.must_collect = 'the halt was cleared'
-        self._queue.start_over()
+        self._step(Event.CLEARED)
+        self._interlocks.revoke('the halt was cleared')
+        self._queue.clear_halt()
         # Reports that were not believed may be right now: the robot was mastered, its clock was
         # set. What is usual is learned again while the arm stands.
         self.reports.forget()
-        self._seen, self._doubted_wall, self._motion.braking = None, None, None
+        self._seen, self._doubted_wall = None, None
         self._interlocks.set('robot', '')
         return ''
 
@@ -269,14 +284,13 @@ class ArmSupervisor:
         actions = self._stop('other limits', wall_s)
         self.gate.limits = limits
         if raised:
-            self._interlocks.must_collect = 'a limit was raised'
+            self._interlocks.revoke('a limit was raised')
         return actions + self.tick(wall_s)
 
     def given_up(self, why: str) -> list[Action]:
         """Process that the controller refuses the newest command, or does not go on with it."""
         # Where a stop was refused the arm is not judged by it any more.
-        self._motion.braking = None
-        return [] if self.halted else self._halt(why)
+        return self._step(Event.GIVEN_UP) if self.halted else self._halt(why, Event.GIVEN_UP)
 
     def interrupted(self, since_wall_s: float) -> None:
         """Process since when a bridge before this one has been gone, s of wall time."""
@@ -290,11 +304,12 @@ class ArmSupervisor:
         """
         self._motion.take_back()
         if isinstance(command, Drive):
-            return []
+            return self._step(Event.MOVE_NOT_SENT)
         late_s = wall_s - command.wall_s
         return self._halt(
             f'{command.reason}; this process was paused for {late_s:.2f} s just then: nothing is '
-            'commanded'
+            'commanded',
+            Event.STOP_NOT_SENT,
         )
 
     def tick(self, wall_s: float) -> list[Action]:
@@ -309,7 +324,7 @@ class ArmSupervisor:
             return self._halt(emergency)
         silent = self._interlocks.fell_silent('robot', wall_s)
         if silent:
-            self._queue.begin_anew()
+            self._queue.found(Finding.DOUBT)
         if silent and self._engaged:
             return self._halt('; '.join(filter(None, (silent, self.trouble))))
         blocked = self.blocked(wall_s)
@@ -318,10 +333,15 @@ class ArmSupervisor:
     # What is reported
 
     @property
+    def state(self) -> Arm:
+        """What the arm does by this program."""
+        return self._motion.state
+
+    @property
     def under_way(self) -> bool:
         """Whether a collection runs, or the arm may still move by a command of this program."""
-        running = self._interlocks.was_right('planner')
-        return running or not self._motion.is_idle or self._queue.pending is not None
+        idle = self.state in (Arm.STANDS, Arm.HALTED)
+        return self._interlocks.was_right('planner') or not idle
 
     @property
     def asks_for_collect(self) -> str:
@@ -336,7 +356,7 @@ class ArmSupervisor:
     @property
     def busy(self) -> bool:
         """Whether a configuration is under way."""
-        return self._motion.visit is not None
+        return self.state in HAS_VISIT
 
     @property
     def trouble(self) -> str:
@@ -413,25 +433,26 @@ class ArmSupervisor:
     def _go_on(self, wall_s: float) -> list[Action]:
         """Ask for the way to the next solution of the pose, if the arm stands."""
         seen, queue = self._seen, self._queue
-        idle = self._motion.is_idle and queue.pending is None
-        if seen is None or not idle or not seen.stands(wall_s):
+        if seen is None or self.state is not Arm.STANDS or not seen.stands(wall_s):
             return []
         elsewhere = self._elsewhere(seen.q)
         if elsewhere:
             self._asked = seen.q
             return self._halt(elsewhere)
-        if queue.probe_is_next:
+        if queue.place in (Place.UNKNOWN, Place.PROBED):
+            return self._step(Event.ASK, queue.ask(STANDING, seen.q, seen.q))
+        if queue.place is Place.MAY_LEAVE or (
+            queue.place is Place.FREE and queue.target is not None
+        ):
             return self._drive(PROBE, probe_path(seen.q, self.gate.limits), seen, wall_s)
-        if queue.way_out is not None:
-            path, queue.way_out = queue.way_out, None
-            return self._drive(WAY_OUT, path, seen, wall_s)
-        if queue.must_look:
-            return [queue.ask(STANDING, seen.q, seen.q)]
+        if queue.place is Place.LEAVES_NEXT:
+            return self._drive(WAY_OUT, queue.take_way_out(), seen, wall_s)
         actions: list[Action] = []
         while (target := queue.target) is not None and not self.halted:
             outside = queue.refused or self.gate.limits.outside(target)
             if not outside:
-                return [*actions, queue.ask(queue.next, seen.q, target)]
+                ask = queue.ask(queue.next, seen.q, target)
+                return [*actions, *self._step(Event.ASK, ask)]
             actions += self._refuse(queue.next, outside)
         return actions
 
@@ -441,13 +462,13 @@ class ArmSupervisor:
             doubtful = np.logical_or(seen.frozen(), self._unsure)
         try:
             drive = self._motion.begin(solution, path, seen, wall_s, self._rate, doubtful)
-            self._interlocks.note_moved()
-            return [drive]
         except StartMovedError:
             # The arm has moved since the path was asked for: it is asked for again.
             return []
         except MotionRefusedError as error:
             return self._give_up(solution, str(error), wall_s)
+        self._interlocks.note_moved()
+        return self._step(BEGINS.get(solution, Event.MOVE), drive)
 
     def _give_up(self, solution: int, reason: str, wall_s: float) -> list[Action]:
         """Go on with the next solution where the gate or the path refuses one."""
@@ -460,10 +481,10 @@ class ArmSupervisor:
         """Give up a configuration that is not commanded; halt after too many of them."""
         self._queue.next = solution + 1
         self._refusals += 1
-        failed = Failed(solution, reason)
+        failed = self._step(Event.REFUSED, Failed(solution, reason))
         if self._refusals < REFUSED_IN_A_ROW:
-            return [failed]
-        return [failed, *self._halt(f'{self._refusals} configurations refused in a row: {reason}')]
+            return failed
+        return failed + self._halt(f'{self._refusals} configurations refused in a row: {reason}')
 
     # Inside: what becomes of the motion under way
 
@@ -471,59 +492,70 @@ class ArmSupervisor:
         """Decide what follows from the outcome of a configuration or of a stop."""
         visit = self._motion.visit
         if outcome == 'halted':
-            return self._halt(why)
-        if visit is None:
-            return []
+            return self._halt(why, Event.ASTRAY)
         if outcome == 'over':
-            self._motion.visit, self._queue.must_probe = None, False
-            self._unsure = False
-        if outcome == 'settled':
+            if visit is not None:
+                self._queue.found(Finding.ENDED)
+                self._unsure = False
+            return self._step(Event.ENDED)
+        if outcome == 'settled' and visit is not None:
             self._failures = self._refusals = 0
-            return [visit.settled_at(seen)]
-        return self._fail(visit, why) if outcome == 'failed' else []
+            return self._step(Event.SETTLED, visit.settled_at(seen))
+        return self._fail(visit.solution, why) if outcome == 'failed' and visit is not None else []
 
-    def _fail(self, visit: Visit, reason: str) -> list[Action]:
+    def _fail(self, solution: int, reason: str) -> list[Action]:
         """Give a configuration up; halt where too many in a row were not reached.
 
         The arm has settled there or its trajectory has ended, so that no stop is needed.
         """
-        if not visit.settled:
+        if self.state is Arm.MOVES:
             self._failures += 1
             if self._failures >= self.rules.failures_in_a_row:
                 return self._halt(f'{self._failures} configurations not reached: {reason}')
-        self._leave(visit)
-        return [Failed(visit.solution, reason)]
+        self._queue.next = solution + 1
+        return self._step(Event.FAILED, Failed(solution, reason))
 
-    def _leave(self, visit: Visit) -> None:
-        """End the visit of a configuration: the next one follows."""
-        self._motion.visit, self._queue.next = None, visit.solution + 1
-
-    def _halt(self, reason: str, stop_wall_s: float | None = None) -> list[Action]:
-        """Halt; with a time the arm is stopped first, where it is known to follow its path."""
-        stops: list[Stop] = []
-        seen = self._seen
-        moving = self._motion.is_moving and not self._motion.is_probing
-        if stop_wall_s is not None and seen is not None and moving:
-            known = not self._motion.lost(seen, stop_wall_s)
-            stops = self._motion.stop(reason, seen, stop_wall_s, self._rate) if known else []
-        # Why it was halted first is what a person has to see to. An arm that does not brake after
-        # that is halted once more all the same: a controller by action is cancelled then.
+    def _halt(self, reason: str, event: Event = Event.HALT) -> list[Action]:
+        # Why it was halted first is what a person has to see to.
         self.halted = self.halted or reason
-        self._motion.visit, self._queue.pending = None, None
-        return [*stops, Halted(self.halted)]
+        return self._step(event, Halted(self.halted))
+
+    def _halt_braking(self, reason: str, wall_s: float) -> list[Action]:
+        """Halt an arm; it is stopped first where it is known to follow its path."""
+        seen = self._seen
+        if seen is not None and self.state in (Arm.LEAVES, Arm.MOVES):
+            known = not self._motion.lost(seen, wall_s)
+            stop = self._motion.stop(reason, seen, wall_s, self._rate) if known else None
+            if stop is not None:
+                self.halted = reason
+                return self._step(Event.HALT_BRAKING, stop, Halted(reason))
+        return self._halt(reason)
 
     def _stop(self, reason: str, wall_s: float) -> list[Action]:
-        """Stop an arm that is on its way; the configuration is commanded again later.
-
-        An arm that has settled stands already: its reading goes on, only no command follows it.
-        """
-        if self._seen is None or not self._motion.is_moving:
-            return []
-        if self._motion.is_probing:
-            # A micrometre needs no stop; one would be fast for an arm that is not as reported.
-            self._motion.visit = None
-            return []
-        lost = self._motion.lost(self._seen, wall_s)
+        """Stop an arm that is on its way; the configuration is commanded again later."""
+        seen = self._seen
+        if seen is None or self.state not in (Arm.LEAVES, Arm.MOVES):
+            return self._step(Event.STOP)
+        lost = self._motion.lost(seen, wall_s)
         if lost:
             return self._halt(f'{reason}; {lost}: nothing is commanded')
-        return [*self._motion.stop(reason, self._seen, wall_s, self._rate)]
+        stop = self._motion.stop(reason, seen, wall_s, self._rate)
+        if stop is None:
+            return self._step(Event.STOP_AT_END)
+        return self._step(Event.STOP, stop)
+
+    def _step(self, event: Event, *actions: Action) -> list[Action]:
+        """Enter the state that `states.ARM` has for an event, and return its actions.
+
+        What is not in the table is a fault of this program: nothing is commanded, and it halts.
+        """
+        state = self.state
+        then = ARM[state].get(event)
+        if then is not None and tuple(map(type, actions)) == then.actions:
+            self._motion.enter(then.state)
+            return list(actions)
+        if any(isinstance(action, Drive | Stop) for action in actions):
+            self._motion.take_back()
+        self.halted = self.halted or f'a fault of this program: "{event}" while the arm {state}'
+        self._motion.enter(Arm.HALTED)
+        return [Halted(self.halted)]

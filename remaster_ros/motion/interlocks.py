@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from remaster_ros.motion.states import CONSENT, Consent, Word, after
+
 NAMES = ('planner', 'recorder', 'robot')
 """The nodes that must be live; their reasons not to move count in this order."""
 OBSERVED = ('safety_link', 'model', 'controller', 'clock', 'rivals')
@@ -20,18 +22,20 @@ class Interlocks:
 
     ``heartbeat_s``: longest silence of those in `NAMES`, s of wall time; ``resume_alone_s``: after
     a longer interruption of a run only a person goes on, s of wall time.
-    Attributes: ``must_collect``: why nothing moves before a person begins a collection (again);
-    ''; ``run``: the run of a collection that was reported last; '' before the first.
+    Attributes: ``consent``: see `states.CONSENT`; ``paused``: whether the planner was paused, by
+    its last record; ``run``: the run of a collection that was reported last; '' before the first.
     """
 
     def __init__(self, heartbeat_s: float, resume_alone_s: float) -> None:
-        self.must_collect = self.run = ''
+        self.consent, self.paused, self.run = Consent.GIVEN, False, ''
+        # Where it is asked for: why.
+        self._must_collect = ''
         self._resume_alone_s = resume_alone_s
         # Whether the arm was moved in this run: what is waited for before is no interruption.
         self._moved = False
-        # Since when nothing may move, and whether the robot reported all the time since that it
+        # Where it is held: since when, and whether the robot reported all the time since that it
         # is not stopped.
-        self._blocked_since_wall: float | None = None
+        self._held_since_wall = np.inf
         self._released = False
         self._planner_since_wall = -np.inf
         self._heartbeat_s = heartbeat_s
@@ -43,16 +47,16 @@ class Interlocks:
         """Process a sign of life, and why the arm must not move; '' if it may."""
         self._seen[name], self._reasons[name] = wall_s, reason
 
-    def planner(self, reason: str, run: str, wall_s: float) -> bool:
+    def planner(self, state: str, run: str, wall_s: float) -> bool:
         """Process the planner's state; return whether another collection was begun.
 
-        What `must_collect` waits for is another run than the last one, not a pause: a summary from
-        before may come late.
+        Consent is given by another run than the last one, not by a pause: a summary from before
+        may come late.
 
-        ``reason``: why the arm must not move; '' while a collection runs; ``run``: names the run,
-        '' where none is under way; another one than before was begun by a person since;
-        ``wall_s``: now, s.
+        ``state``: anything but ``running`` is in the way; ``run``: names the run, '' where none is
+        under way; another one than before was begun by a person since; ``wall_s``: now, s.
         """
+        self.paused = state == 'paused'
         if self.silence_s('planner', wall_s) > self._heartbeat_s:
             self._planner_since_wall = wall_s
         is_new = bool(run) and run != self.run
@@ -60,8 +64,8 @@ class Interlocks:
         if is_new:
             self.run, self._moved = run, False
             if wall_s - self._planner_since_wall >= KNOWN_S:
-                self.must_collect, self._blocked_since_wall = '', None
-        self.note_alive('planner', reason, wall_s)
+                self.say(Word.BEGUN)
+        self.note_alive('planner', '' if state == 'running' else f'planner is {state}', wall_s)
         return began_another
 
     def set(self, name: str, reason: str) -> None:
@@ -98,7 +102,8 @@ class Interlocks:
     @property
     def collecting(self) -> bool:
         """Whether the planner runs a collection that a person began."""
-        return 'planner' in self._seen and not self.reason('planner') and not self.must_collect
+        runs = 'planner' in self._seen and not self.reason('planner')
+        return runs and self.consent is not Consent.ASKED
 
     def note_moved(self) -> None:
         """Process that the arm is moved."""
@@ -106,7 +111,17 @@ class Interlocks:
 
     def interrupted(self, since_wall_s: float) -> None:
         """Process that nobody has looked at the arm since then, s: this process was not there."""
-        self._blocked_since_wall, self._released = since_wall_s, False
+        self._held_since_wall, self._released = since_wall_s, False
+        self.say(Word.HINDERED)
+
+    def revoke(self, why: str) -> None:
+        """Process that a person has changed what consent was given for."""
+        self._must_collect = why
+        self.say(Word.REVOKED)
+
+    def say(self, word: Word) -> None:
+        """Process what is said about the run."""
+        self.consent = after(CONSENT, self.consent, word)
 
     def look_at_interruption(self, wall_s: float) -> None:
         """After a long interruption let a person go on, who may stand beside the arm meanwhile.
@@ -115,19 +130,21 @@ class Interlocks:
         """
         released = self.was_right('safety') and not self.reason('safety_link')
         reason = self._hindrance(wall_s)
-        if self._blocked_since_wall is None:
-            if not reason or not self._moved:
-                return
-            self._blocked_since_wall, self._released = wall_s, released
+        if self.consent is Consent.GIVEN and reason and self._moved:
+            self._held_since_wall, self._released = wall_s, released
+            self.say(Word.HINDERED)
+        if self.consent is not Consent.HELD:
+            return
         self._released &= released
-        lasted_s = wall_s - self._blocked_since_wall
+        lasted_s = wall_s - self._held_since_wall
         if self.run and not self._released and lasted_s > self._resume_alone_s:
-            self.must_collect = self.must_collect or (
+            self._must_collect = (
                 f'the collection was interrupted for more than {self._resume_alone_s:g} s'
                 f'{f" ({reason})" if reason else ""}'
             )
-        if not reason:
-            self._blocked_since_wall = None
+            self.say(Word.TOO_LONG)
+        elif not reason:
+            self.say(Word.FREE)
 
     def blocked(self, wall_s: float) -> str:
         """Return why the arm must not move; '' if it may."""
@@ -136,7 +153,8 @@ class Interlocks:
     @property
     def asks_for_collect(self) -> str:
         """Why nothing moves before a person begins a collection, and what to call; ''."""
-        return f'{self.must_collect}: /remaster/collect goes on' if self.must_collect else ''
+        asked = self.consent is Consent.ASKED
+        return f'{self._must_collect}: /remaster/collect goes on' if asked else ''
 
     def _hindrance(self, wall_s: float) -> str:
         limit = self._heartbeat_s

@@ -18,9 +18,9 @@ from remaster_ros.motion.following import (
 )
 from remaster_ros.motion.joint_units import TURNING, JointUnits
 from remaster_ros.motion.motion_gate import MotionGate
-from remaster_ros.motion.move_queue import PROBE
 from remaster_ros.motion.path_check import FreePath
 from remaster_ros.motion.settling import SettleDetector
+from remaster_ros.motion.states import HAS_STOP, HAS_VISIT, Arm
 from remaster_ros.motion.trajectory import Trajectory
 from remaster_ros.types import BoolArray, FloatArray
 
@@ -45,7 +45,6 @@ class Visit:
     rules: SupervisorRules
     sent_stamp: float
     deadline: float
-    settled: bool = False
 
     @property
     def trajectory(self) -> Trajectory:
@@ -67,7 +66,7 @@ class Visit:
         if self.solution < 0:
             return ('over', '') if arrived else UNDER_WAY
         if settled:
-            self.settled, self.deadline = True, seen.time + rules.answer_timeout_s
+            self.deadline = seen.time + rules.answer_timeout_s
             return 'settled', ''
         if not self.following.reacted:
             # On a simulated clock that runs fast its time is over before a command is seen.
@@ -147,33 +146,26 @@ class MotionUnderWay:
     """What the arm does by the last command.
 
     ``gate``: every command comes from it; ``end``: where the last command led that was sent before
-    this process was started, rad or m, (k,); None where that is not known.
-    Attributes: ``end``: where the last command led, (k,); ``visit``: the configuration under
-    way, to its end; None where none is; ``braking``: the stop under way, until the arm stands.
+    this process was started, rad or m, (k,); None where that is not known; ``state``: to begin in.
+    Attributes: ``state``: see `states.ARM`; ``end``: where the last command led, (k,); ``visit``:
+    the configuration under way, ``braking``: the stop under way; None in the states without one.
     """
 
-    def __init__(self, gate: MotionGate, rules: SupervisorRules, end: FloatArray | None) -> None:
-        self.gate, self.rules = gate, rules
+    def __init__(
+        self, gate: MotionGate, rules: SupervisorRules, end: FloatArray | None, state: Arm
+    ) -> None:
+        self.gate, self.rules, self.state = gate, rules, state
         self.end = self._end_before = end
         # The farthest that the arm was reported from an end while it stood there, rad.
         self._stood_off = -np.inf
         self.visit: Visit | None = None
         self.braking: Braking | None = None
 
-    @property
-    def is_idle(self) -> bool:
-        """Whether neither a move nor a stop is under way."""
-        return self.visit is None and self.braking is None
-
-    @property
-    def is_moving(self) -> bool:
-        """Whether the arm is on its way to a configuration, and could be stopped."""
-        return self.visit is not None and not self.visit.settled
-
-    @property
-    def is_probing(self) -> bool:
-        """Whether the move under way is the probe."""
-        return self.visit is not None and self.visit.solution == PROBE
+    def enter(self, state: Arm) -> None:
+        """Be in this state from now on; what does not belong to it is over."""
+        self.state = state
+        self.visit = self.visit if state in HAS_VISIT else None
+        self.braking = self.braking if state in HAS_STOP else None
 
     @property
     def near(self) -> float:
@@ -197,7 +189,7 @@ class MotionUnderWay:
         rate: float,
         doubtful: BoolArray | None = None,
     ) -> Drive:
-        """Return the move along a free path, which is under way from now on.
+        """Return the move along a free path, which is under way in the state that follows.
 
         ``solution``: its number; ``path``: from where the arm stands; ``seen``: the last report;
         ``wall_s``: now, s; ``rate``: seconds of the robot per second of wall time; ``doubtful``:
@@ -220,18 +212,15 @@ class MotionUnderWay:
 
     def judge(self, seen: Seen, rate: float, *, recorder_waits: bool) -> Outcome:
         """Return what becomes of the move or the stop by a report; see `Visit` and `Braking`."""
-        if self.visit is not None and self.visit.settled:
-            return self.visit.judge_settled(seen, recorder_waits=recorder_waits)
-        if self.visit is not None:
-            outcome = self.visit.judge(seen, rate)
-            if outcome[0] == 'settled':
-                self._stood_off = max(self._stood_off, self.visit.detector.farthest)
-            return outcome
-        if self.braking is None:
+        if self.braking is not None:
+            return self.braking.judge(seen)
+        if self.visit is None:
             return UNDER_WAY
-        outcome = self.braking.judge(seen)
-        if outcome != UNDER_WAY:
-            self.braking = None
+        if self.state is Arm.MEASURES:
+            return self.visit.judge_settled(seen, recorder_waits=recorder_waits)
+        outcome = self.visit.judge(seen, rate)
+        if outcome[0] == 'settled':
+            self._stood_off = max(self._stood_off, self.visit.detector.farthest)
         return outcome
 
     def lost(self, seen: Seen, wall_s: float) -> str:
@@ -239,15 +228,16 @@ class MotionUnderWay:
         assert self.visit is not None
         return self.visit.following.lost(seen, wall_s)
 
-    def stop(self, reason: str, seen: Seen, wall_s: float, rate: float) -> list[Stop]:
+    def stop(self, reason: str, seen: Seen, wall_s: float, rate: float) -> Stop | None:
         """Return the stop of a moving arm that is not `lost`, along the rest of its line.
 
-        None is needed where the arm is at its end, or will be without any command.
+        It is under way in the state that follows. None is needed where the arm is at its end, or
+        will be without any command.
         """
         assert self.visit is not None
-        following, self.visit = self.visit.following, None
+        following = self.visit.following
         if following.has_ended(seen, wall_s, rate):
-            return []
+            return None
         admitted = self.gate.stop(*following.window(seen, wall_s, rate))
         (stop,) = admitted.waypoints
         begins = seen.now(wall_s, rate) + allowed_lag_s(self.rules, rate)
@@ -256,11 +246,11 @@ class MotionUnderWay:
         units = self.rules.units
         self.braking = Braking(stop.q, begins, over, deadline, self.near, patience_s, units)
         self._lead_to(stop.q)
-        return [Stop(admitted, reason, wall_s)]
+        return Stop(admitted, reason, wall_s)
 
     def take_back(self) -> None:
         """Process that the last command was not sent."""
-        self.visit, self.braking, self.end = None, None, self._end_before
+        self.end = self._end_before
 
     def _lead_to(self, end: FloatArray) -> None:
         self._end_before, self.end = self.end, end

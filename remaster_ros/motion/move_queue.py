@@ -10,6 +10,7 @@ from remaster_ros.motion.actions import CheckPath, PathAnswer
 from remaster_ros.motion.limits import MotionLimits
 from remaster_ros.motion.motion_gate import WAY_OUT_TOOL_SPEED
 from remaster_ros.motion.path_check import FreePath
+from remaster_ros.motion.states import PLACE, Finding, Place, after
 from remaster_ros.types import FloatArray
 
 PROBE = -1
@@ -28,11 +29,8 @@ NO_REFUSALS: Mapping[int, str] = {}
 class MoveQueue:
     """The configurations of a pose in the order of visiting, and the path that is asked for.
 
-    Attributes: ``next``: the number of the next solution; ``pending``: the number of the path that
-    is asked for, and of the solution that it leads to; ``must_look``: whether it must be found out
-    first that the arm stands where it may; ``must_probe``: whether the probe must be commanded
-    first: it shows that reports are measured; ``way_out``: the way out of a contact or a margin
-    that a person has allowed by clearing the halt.
+    Attributes: ``next``: the number of the next solution; ``place``: see `states.PLACE`; it says
+    what must come before any solution.
     """
 
     def __init__(self) -> None:
@@ -41,10 +39,12 @@ class MoveQueue:
         self._refused = NO_REFUSALS
         self.next = 0
         self._requests = 0
-        self.pending: tuple[int, int] | None = None
-        self.must_look = self.must_probe = True
-        self.way_out: FreePath | None = None
+        self.place = Place.UNKNOWN
+        # The solution whose path is asked for, and the question.
+        self._asked: tuple[int, CheckPath] | None = None
+        # Out of a contact or a margin: offered to the person who clears the halt, then allowed.
         self._offered: FreePath | None = None
+        self._way_out: FreePath | None = None
 
     def begin(
         self,
@@ -55,16 +55,22 @@ class MoveQueue:
         """Begin another pose; see `ArmSupervisor.plan`."""
         self._solutions, self._waypoints, self.next = solutions, waypoints, 0
         self._refused = refused
-        self.pending = None
 
-    def begin_anew(self) -> None:
-        """Begin as at the start: where the arm is may be other than it is reported."""
-        self.must_look = self.must_probe = True
+    def found(self, finding: Finding) -> None:
+        """Process what is found out about where the arm is."""
+        self.place = after(PLACE, self.place, finding)
 
-    def start_over(self) -> None:
-        """Begin anew: a person has cleared the halt, and so allowed the way out."""
-        self.begin_anew()
-        self.way_out, self._offered = self._offered, None
+    def clear_halt(self) -> None:
+        """Process that a person has cleared a halt, and so allowed the way out that it offered."""
+        self._way_out, self._offered = self._offered, None
+        self.found(Finding.CLEARED if self._way_out is None else Finding.ALLOWED)
+
+    def take_way_out(self) -> FreePath:
+        """Return the way out that is allowed, once."""
+        path, self._way_out = self._way_out, None
+        assert path is not None
+        self.found(Finding.LEFT)
+        return path
 
     @property
     def target(self) -> FloatArray | None:
@@ -76,18 +82,19 @@ class MoveQueue:
         """Why the next configuration must not be commanded; ''."""
         return self._refused.get(self.next, '')
 
-    @property
-    def probe_is_next(self) -> bool:
-        """Whether the probe comes before the move that is to be made."""
-        has_move = not self.must_look and self.target is not None
-        return self.must_probe and (has_move or self.way_out is not None)
-
     def ask(self, solution: int, start: FloatArray, target: FloatArray) -> CheckPath:
         """Return the question whether the way to a solution is free, (k,) each."""
         self._requests += 1
-        self.pending = self._requests, solution
         none = np.empty((0, len(target)))
-        return CheckPath(self._requests, start, target, self._waypoints.get(solution, none))
+        asked = CheckPath(self._requests, start, target, self._waypoints.get(solution, none))
+        self._asked = solution, asked
+        return asked
+
+    def asked(self, number: int) -> tuple[int, FloatArray] | None:
+        """Return the solution and the start, (k,), of the last question if it has this number."""
+        if self._asked is None or self._asked[1].number != number:
+            return None
+        return self._asked[0], self._asked[1].start
 
     def offer(self, answer: PathAnswer, limits: MotionLimits) -> str:
         """Keep a way out for the person who clears the halt; return what to tell that person.

@@ -21,6 +21,7 @@ from remaster_ros.motion.motion_gate import Cubic, MotionGate
 from remaster_ros.motion.move_queue import PROBE
 from remaster_ros.motion.path_check import FreePath
 from remaster_ros.motion.settling import SettleRules
+from remaster_ros.motion.states import Arm
 from remaster_ros.motion.trajectory import Waypoint
 from remaster_ros.simulation import arm_motion as servo
 
@@ -289,7 +290,7 @@ def goes_on(rig):
     drives = len(rig.said(Drive))
     rig.run(30.0, lambda: rig.said(Drive)[drives:] and rig.said(Settled))
     assert rig.said(Drive)[drives].solution == PROBE
-    rig.run(30.0, lambda: rig.supervisor.busy and not rig.supervisor._motion.is_moving)
+    rig.run(30.0, lambda: rig.supervisor.state is Arm.MEASURES)
     np.testing.assert_allclose(rig.last(Settled).q, [0.2, 0.1], atol=1e-4)
 
 

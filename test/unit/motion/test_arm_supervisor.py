@@ -17,6 +17,7 @@ from remaster_ros.motion.actions import (
 from remaster_ros.motion.following import STANDING_S
 from remaster_ros.motion.move_queue import PROBE
 from remaster_ros.motion.path_check import FreePath
+from remaster_ros.motion.states import Arm
 from remaster_ros.motion.trajectory import Line
 
 # One after the other
@@ -35,12 +36,11 @@ def test_every_solution_is_visited_once_and_in_order(rig):
         line = Line.within(LIMITS, HOME if not solution else targets[solution - 1], target)
         assert line.duration_s - 0.1 < settled.motion_s < line.duration_s + 1.0
         assert 1.0 <= settled.settle_s < 1.05
-        assert rig.supervisor.busy
-        assert not rig.supervisor._motion.is_moving
+        assert rig.supervisor.state is Arm.MEASURES
         rig.run(3.0)
         assert len(rig.said(Drive)) == solution + 1, 'it went on without the recorder'
         rig.answer(solution)
-        assert rig.supervisor._motion.is_moving == (solution < 2)
+        assert rig.supervisor.state is (Arm.MOVES if solution < 2 else Arm.STANDS)
     assert [drive.solution for drive in rig.said(Drive)] == [0, 1, 2]
     rig.run(5.0)
     assert not rig.supervisor.busy

@@ -14,6 +14,7 @@ from remaster_ros.motion.actions import (
 )
 from remaster_ros.motion.move_queue import PROBE
 from remaster_ros.motion.path_check import FreePath
+from remaster_ros.motion.states import Arm
 
 
 def test_the_way_is_asked_for_and_a_slow_answer_waited_for(rig):
@@ -44,7 +45,7 @@ def test_an_answer_to_another_pose_counts_nothing(rig):
     assert rig.supervisor.path_found(first.number, Rig._free(first), rig.wall) == []
     assert not rig.supervisor.busy
     rig.do(rig.supervisor.path_found(second.number, Rig._free(second), rig.wall))
-    assert rig.supervisor._motion.is_moving
+    assert rig.supervisor.state is Arm.MOVES
 
 
 def test_the_way_to_the_next_solution_goes_through_its_own_waypoints(rig):

@@ -36,14 +36,14 @@ def visit(solution=0, rules=RULES, **changes):
 
 @pytest.mark.parametrize(('moved', 'outcome'), [(MOVED_RAD, ''), (MOVED_RAD + 1e-12, 'halted')])
 def test_how_far_an_arm_may_move_while_it_is_measured(moved, outcome):
-    settled = visit(settled=True, deadline=SENT_S + 100.0)
+    settled = visit(deadline=SENT_S + 100.0)
     for q in ([moved, 0.0], [0.0, -moved]):
         assert settled.judge_settled(at(q, SENT_S), recorder_waits=False)[0] == outcome
 
 
 @pytest.mark.parametrize(('late', 'outcome'), [(0.0, ''), (2.0**-30, 'failed')])
 def test_how_long_the_recorder_may_take(late, outcome):
-    settled = visit(settled=True, deadline=SENT_S + 16.0)
+    settled = visit(deadline=SENT_S + 16.0)
     seen = at(LINE.end + 1e-6, SENT_S + 16.0 + late)
     assert settled.judge_settled(seen, recorder_waits=False)[0] == outcome
     assert settled.judge_settled(seen, recorder_waits=True)[0] == ''
@@ -86,7 +86,6 @@ def test_an_arm_that_has_stood_for_long_enough_has_settled():
     made = visit()
     outcomes = [made.judge(at([1e-5, 0.0], SENT_S + 2.5 + t, t), 1.0) for t in (0.0, 0.5, 1.0)]
     assert outcomes == [('', ''), ('', ''), ('settled', '')]
-    assert made.settled
     assert made.deadline == SENT_S + 3.5 + 16.0
 
 

@@ -31,6 +31,7 @@ from remaster_ros.collection.events import (
     encode,
 )
 from remaster_ros.collection.message_fields import seconds
+from remaster_ros.motion.states import Arm
 from remaster_ros.nodes import (
     rivals,
     robot_bridge,
@@ -316,7 +317,7 @@ class Rig:
 
     def flush(self):
         """Wait for the path that is looked for, and for what the bridge has published."""
-        self.wait(lambda: self.bridge.supervisor._queue.pending is None, 'a path')
+        self.wait(lambda: self.bridge.supervisor.state is not Arm.ASKS, 'a path')
         self.wait(self._has_come, 'what the bridge has published')
 
     def _has_come(self):
