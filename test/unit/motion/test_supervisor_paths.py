@@ -119,3 +119,20 @@ def test_an_answer_to_an_arm_that_must_not_move_counts_nothing(rig, what):
     rig.state, rig.alter, rig.answer_path = 'running', lambda t, q: q, Rig._free
     rig.run(3.0)
     assert [d.solution for d in rig.said(Drive) if d.solution != PROBE] == [0]
+
+
+def test_a_place_that_the_arm_has_left_since_is_looked_at_again():
+    rig = Rig(begun=False)
+    rig.answer_path = lambda request: None
+    rig.alter = lambda t, q: np.add(q, [-1.5e-3, 0.0])
+    rig.plan([0.3, 0.0])
+    rig.run(2.0, lambda: rig.said(CheckPath))
+    (look,) = rig.said(CheckPath)
+    rig.alter = lambda t, q: np.add(q, [1.5e-3, 0.0])
+    rig.run(1.0)
+    assert rig.supervisor.path_found(look.number, Rig._free(look), rig.wall) == []
+    rig.run(0.1)
+    again = rig.last(CheckPath)
+    assert again.number != look.number
+    np.testing.assert_array_equal(again.start, again.target)
+    assert not rig.said(Drive)
