@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -195,9 +196,10 @@ def discover_session(
     sampled: _Sampled | None = None
     # Kinds that nobody named may be what does harm, or what the poses do not determine. Where
     # their model does not hold on held-out poses, these decide between it and the names alone.
+    beside = _Beside(search, named)
     for every in (True, False):
         try:
-            tried = _sampled(session, before, found, search, named, every, rng, report, clock)
+            tried = _sampled(session, before, found, beside, every, rng, report, clock)
         except InsufficientDataError as error:
             if described and not every and sampled is None:
                 unexplained = (unfitted(residuals.errors, described, error),)
@@ -215,7 +217,8 @@ def discover_session(
         empty = search.fit(())
         assert empty is not None
         named, groups, described = empty, (), ()
-        sampled = _sampled(session, before, found, search, named, False, rng, report, clock)
+        beside = _Beside(search, named)
+        sampled = _sampled(session, before, found, beside, False, rng, report, clock)
     data, solution, fit, gain = search.data, sampled.solution, sampled.fit, sampled.gain
     is_cause = [EFFECTS[group[0].name].is_cause for group in groups]
     structure = tuple(e for e, cause in zip(described, is_cause, strict=True) if not cause)
@@ -354,19 +357,18 @@ def _sampled(
     session: Session,
     before: Estimate,
     found: Estimate,
-    search: Search,
-    named: Solution,
+    beside: _Beside,
     every: bool,
     rng: np.random.Generator,
     report: Progress,
     clock: Callable[[], float] | None,
 ) -> _Sampled:
     """Sample the model of the causes, or of all kinds of errors, and measure its gain."""
-    data = search.data
-    solution = of_all_kinds(search, named) if every else None
+    data = beside.search.data
+    solution = of_all_kinds(beside) if every else None
     by_name = solution is None
     if solution is None:
-        solution, unmodelled = by_names(found, search, named)
+        solution, unmodelled = by_names(found, beside)
     else:
         unmodelled = np.zeros((found.model.size + len(solution.parameters), 0))
     if solution.cells:
@@ -387,7 +389,28 @@ def _sampled(
     return _Sampled(solution, fit, gain_of(before, data, solution, fit, rng), by_name)
 
 
-def of_all_kinds(search: Search, named: Solution) -> Solution | None:
+@dataclass(frozen=True, eq=False)
+class _Beside:
+    """The causes that have a name, and all other kinds of errors beside them."""
+
+    search: Search
+    named: Solution
+
+    @cached_property
+    def kinds(self) -> list[Family]:
+        """All kinds of errors without the members that have a name."""
+        search = self.search
+        members = by_members(self.named, search.families).cells
+        return kinds(search.data, search.catalogue.cells, members)
+
+    @cached_property
+    def fit(self) -> Solution | None:
+        """The fit of causes and kinds; None without kinds, or where they agree with a cause."""
+        every = (*self.named.cells, *(family.cell for family in self.kinds))
+        return solve(self.search.data, every, self.named) if self.kinds else None
+
+
+def of_all_kinds(beside: _Beside) -> Solution | None:
     """Return the model of all kinds of errors, by members; None where the causes say more.
 
     A name is a choice among thousands: two halves of one session are not given the same names.
@@ -395,6 +418,7 @@ def of_all_kinds(search: Search, named: Solution) -> Solution | None:
     its members, named or not. Not where so many members explain less than the few causes and
     nothing is beside these (one joint errs and no other), or where nothing is there at all.
     """
+    search, named = beside.search, beside.named
     data, cells = search.data, search.catalogue.cells
     of_a_kind = {name for family in kinds(data, cells) for name in family.parameters}
     # A curve has a smoothness of its own: that of all together fits none of them.
@@ -409,34 +433,26 @@ def of_all_kinds(search: Search, named: Solution) -> Solution | None:
     if whole is None or nothing is None or whole.log_evidence < nothing.log_evidence + NAMED:
         return None
     if whole.log_evidence < named.log_evidence:
-        beside = _beside(search, named)[1]
-        if beside is None or beside.log_evidence < named.log_evidence + NEEDED:
+        both = beside.fit
+        if both is None or both.log_evidence < named.log_evidence + NEEDED:
             return None
     return by_members(whole, every)
 
 
-def _beside(search: Search, named: Solution) -> tuple[list[Family], Solution | None]:
-    """Return all other kinds of errors, and the fit of the causes with them beside."""
-    members = by_members(named, search.families).cells
-    others = kinds(search.data, search.catalogue.cells, members)
-    every = (*named.cells, *(family.cell for family in others))
-    return others, solve(search.data, every, named) if others else None
-
-
-def by_names(found: Estimate, search: Search, named: Solution) -> tuple[Solution, FloatArray]:
+def by_names(found: Estimate, beside: _Beside) -> tuple[Solution, FloatArray]:
     """Return the model of the causes alone, by members, and how all other kinds would move it.
 
     That of all its natural parameters and those of the solution, one standard deviation of each
     weight of a kind that is not in it, (size + m, c).
     """
-    data = search.data
-    members = by_members(named, search.families)
-    others, beside = _beside(search, named)
-    if beside is None:
+    data = beside.search.data
+    members = by_members(beside.named, beside.search.families)
+    if beside.fit is None:
         return members, np.zeros((found.model.size + len(members.parameters), 0))
-    weights = beside.weight_precisions()
+    weights = beside.fit.weight_precisions()
     unseen = np.concatenate(
-        [data.columns([family.cell]) * weights[family.cell] ** -0.5 for family in others], axis=2
+        [data.columns([family.cell]) * weights[family.cell] ** -0.5 for family in beside.kinds],
+        axis=2,
     )
     return members, moved_by(found, data, members, unseen)
 
