@@ -6,7 +6,10 @@ from collections.abc import Callable
 
 from remaster_ros.importing.makers import (
     fanuc,
+    gsi,
+    inform,
     kuka,
+    listed,
     motive,
     rapid,
     ros_echo,
@@ -20,8 +23,12 @@ READERS: tuple[Callable[[str], Named | None], ...] = (
     motive.read,
     fanuc.read,
     kuka.read,
+    inform.read,
+    ur_script.read,
+    # Before RAPID, whose logs have two lists in brackets.
+    listed.read,
     rapid.read,
     staubli.read,
-    ur_script.read,
+    gsi.read,
     ros_echo.read,
 )

@@ -12,7 +12,8 @@ from remaster_ros.importing.makers.named import NUMBER, Named, axes_in_order, un
 
 _OPEN = re.compile(r'\s*(PR?\[\d+)(?:\s*:\s*"[^"]*")?\]\s*\{\s*')
 _CLOSE = re.compile(r'\s*\}\s*;?\s*')
-_IGNORED = re.compile(r"\s*(?:GP\d+\s*:|U[FT]\s*:\s*\w+|CONFIG\s*:\s*'[^']*')\s*,?\s*")
+_GROUP = re.compile(r'\s*GP(\d+)\s*:')
+_IGNORED = re.compile(r"\s*(?:U[FT]\s*:\s*\w+|CONFIG\s*:\s*'[^']*')\s*,?\s*")
 _JOINT = re.compile(rf'\s*(J\d|E\d)\s*=\s*({NUMBER.pattern})\s+(deg|mm)\s*,?\s*')
 _PLACE = re.compile(rf'\s*[XYZWPR]\s*=\s*{NUMBER.pattern}\s*(?:mm|deg)\s*,?\s*')
 
@@ -24,6 +25,8 @@ def read(text: str) -> Named | None:
     found: list[tuple[int, str, dict[str, str]]] = []
     name, opened, place, places = '', 0, False, 0
     values: dict[str, str] = {}
+    # Of a motion group, such as a positioner, beside that of the arm.
+    group, other, others = '', False, set[str]()
     for number, line in enumerate(text.splitlines(), 1):
         at = 0
         while at < len(line):
@@ -34,8 +37,15 @@ def read(text: str) -> Named | None:
                         raise unexpected(number, line, 'P[1]{ before it')
                     break
                 name, opened, values, place, at = f'{begin[1]}]', number, {}, False, begin.end()
+                group, other = '', False
+            elif of := _GROUP.match(line, at):
+                group = group or of[1]
+                other, at = of[1] != group, of.end()
             elif ignored := _IGNORED.match(line, at):
                 at = ignored.end()
+            elif other and (joint := _JOINT.match(line, at)):
+                others.add(joint[1])
+                at = joint.end()
             elif joint := _JOINT.match(line, at):
                 if joint[1] in values or (joint[1][0] == 'J' and joint[3] != 'deg'):
                     raise unexpected(number, line, 'each axis once, in deg,')
@@ -58,6 +68,7 @@ def read(text: str) -> Named | None:
     if not found:
         raise InputError('line 1: there is no position of joints in it (P[1]{ … J1= … deg … };)')
     notes = (f'{places} Cartesian positions were left out',) * bool(places)
+    notes += ('the axes of other motion groups were left out',) * bool(others)
     return axes_in_order(
         'positions of a FANUC program',
         found,

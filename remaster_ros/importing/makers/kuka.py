@@ -13,8 +13,11 @@ _PLACE = re.compile(r'\bE6POS\b|\bPOS\b|\bFRAME\b|[{:,]\s*X\s+[-+.\d]', re.IGNOR
 _ENTRY = re.compile(rf'\s*(?:(?:E6)?AXIS\s*:)?\s*([AE]\d)\s+({NUMBER.pattern})\s*', re.IGNORECASE)
 _AXIS = re.compile(r'\bA\d\s+[-+.\d]')
 _MOVE_TO = re.compile(r'\bS?PTP\s*\{', re.IGNORECASE)
+_NO_NAMES = ('AXIS_ACT', 'PTP', 'SPTP')
 _MOVE = re.compile(r'\s*S?(?:PTP|LIN)\s+([A-Za-z]\w*)', re.IGNORECASE)
-_NAME = re.compile(r'([A-Za-z]\w*)\s*=\s*$')
+# Of a variable, also of an array; and what stands before a position in a log.
+_NAME = re.compile(r'([A-Za-z]\w*(?:\[\d+\])?)\s*=\s*$')
+_LABEL = re.compile(r'\s*([A-Za-z]\w*)\s*[:;,]?\s*$')
 _PROGRAM = re.compile(r'\s*(?:&[A-Z]|;\s*FOLD|DEF(?:DAT)?\s+\w[^:\n]*(?:\n|$))', re.IGNORECASE)
 _EXPECTED = '{E6AXIS: A1 …, A2 …} with a number for each axis'
 
@@ -75,6 +78,7 @@ def _position(
         if entry is None or entry[1].upper() in values:
             raise unexpected(number, line, _EXPECTED)
         values[entry[1].upper()] = entry[2]
-    named = _NAME.search(code[: aggregate.start()])
-    name = '' if named is None or named[1].upper() == 'AXIS_ACT' else named[1]
+    before = code[: aggregate.start()]
+    named = _NAME.search(before) or _LABEL.fullmatch(before)
+    name = '' if named is None or named[1].upper() in _NO_NAMES else named[1]
     return _point(name), values

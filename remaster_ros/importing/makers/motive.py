@@ -9,6 +9,7 @@ from __future__ import annotations
 import csv
 import re
 from collections import defaultdict
+from collections.abc import Mapping, Sequence
 
 from remaster_ros.importing.makers.named import Named, unexpected
 
@@ -19,15 +20,24 @@ _UNITS = {
     **dict.fromkeys(('inches', 'in'), 'in'),
 }
 _START = re.compile(r'\s*"?Format Version"?([,;\t])')
+_KIND_NAMES = ('Rigid Body', 'Rigid Body Marker', 'Marker', 'Bone', 'Bone Marker', 'Skeleton')
+# A take that was written without its first line.
+_HEADLESS = re.compile(
+    rf'\s*([,;\t])"?(?:Type)?"?\1+"?(?:{"|".join(_KIND_NAMES)})"?(?:\1|\r?\n)', re.ASCII
+)
 _NUMBER = re.compile(r'[+-]?\d+(?:[.,]\d+)?(?:[eE][+-]?\d+)?', re.ASCII)
 _MOST_HEAD_LINES = 12
 # What a tool carries, the likeliest kind first: the points of a body are of one solution.
 _KINDS = ('Rigid Body', 'Marker', 'Rigid Body Marker')
 
 
+def _likeliness(kind: str) -> int:
+    return _KINDS.index(kind) if kind in _KINDS else len(_KINDS)
+
+
 def read(text: str) -> Named | None:
     """Return the columns of a take; None for anything else."""
-    start = _START.match(text)
+    start = _START.match(text) or _HEADLESS.match(text)
     if start is None:
         return None
     lines = [(i, line) for i, line in enumerate(text.splitlines(), 1) if line.strip(' \t,;')]
@@ -37,11 +47,17 @@ def read(text: str) -> Named | None:
     )
     if at is None:
         raise unexpected(*lines[min(len(lines), _MOST_HEAD_LINES) - 1], 'the line Frame, Time, …')
-    take = dict(zip(rows[0][::2], rows[0][1::2]))
-    unit = _UNITS.get(take.get('Length Units', '').strip().lower())
-    if unit is None:
-        raise unexpected(*lines[0], 'a Length Units such as Millimeters')
-    head = {row[1].strip(): row for row in rows[1 : at - 1] if len(row) > 1}
+    take, above = {}, rows[: at - 1]
+    unit = ''
+    if _START.match(text):
+        take, above = dict(zip(rows[0][::2], rows[0][1::2])), rows[1 : at - 1]
+        unit = _UNITS.get(take.get('Length Units', '').strip().lower(), '')
+        if not unit:
+            raise unexpected(*lines[0], 'a Length Units such as Millimeters')
+    head = {row[1].strip(): row for row in above if len(row) > 1}
+    if 'Type' not in head and len(above) > 1 and {*_KIND_NAMES} & {*above[0]}:
+        # Some versions leave the words for these lines out.
+        head |= {'Type': above[0], 'Name': above[1]}
     axes, quantities = [cell.strip() for cell in rows[at]], rows[at - 1]
     width = len(axes)
     for what, row in (
@@ -65,13 +81,13 @@ def read(text: str) -> Named | None:
             raise unexpected(*lines[at], f'X, Y and Z once for {" ".join(asset)}')
     names, used = ['Frame', 'Time [s]'], [0, 1]
     groups, quaternions = {}, {}
-    alone = [name for _, name in places]
     kinds: dict[str, str] = {}
     for (kind, name), columns in places.items():
-        label = name if alone.count(name) == 1 else f'{kind} {name}'
+        likeliest = min((k for k, other in places if other == name), key=_likeliness)
+        label = name if kind == likeliest else f'{kind} {name}'
         kinds[label] = kind
         groups[label] = tuple(range(len(used), len(used) + 3))
-        names += [f'{label} {axis} [{unit}]' for axis in 'XYZ']
+        names += [f'{label} {axis} [{unit}]' if unit else f'{label} {axis}' for axis in 'XYZ']
         used += [columns[axis] for axis in 'XYZ']
         turned = turns[kind, name]
         if len(turned) == 4:
@@ -94,13 +110,36 @@ def read(text: str) -> Named | None:
     )
     frames = rows[at + 1 :]
     commas = start[1] != ',' and any(',' in cell for row in frames[:100] for cell in row)
+    table = [tuple(row[i].strip() for i in used) for row in frames]
+    notes: tuple[str, ...] = ()
+    if not labelled and (one := _one_of(groups, table)):
+        # Whoever loses sight of a marker without a label sees another one afterwards.
+        where = groups[one[0]]
+        for i, cells in enumerate(table):
+            seen = next((groups[label] for label in one if cells[groups[label][0]]), where)
+            moved = dict(zip(where, seen, strict=True))
+            table[i] = tuple(cells[moved.get(c, c)] for c in range(len(cells)))
+        chosen = [one[0]]
+        notes = (f'{len(one)} markers without a label, of which never two are seen, are one',)
+    version = (
+        f'format {take.get("Format Version", "?").strip()}' if take else 'without its first line'
+    )
     return Named(
-        kind=f'a take of Motive (format {take.get("Format Version", "?").strip()}), {unit}',
+        kind=f'a take of Motive ({version}){", " if unit else ""}{unit}',
         names=tuple(names),
-        rows=tuple(tuple(row[i].strip() for i in used) for row in frames),
+        notes=notes,
+        rows=tuple(table),
         lines=tuple(number for number, _ in lines[at + 1 :]),
         decimal=',' if commas else '.',
         groups=groups,
         turns=quaternions,
         points=tuple(chosen),
     )
+
+
+def _one_of(groups: Mapping[str, tuple[int, ...]], table: Sequence[tuple[str, ...]]) -> list[str]:
+    """Return the markers of which each frame has one at most; [] where there are no such two."""
+    columns = [places[0] for places in groups.values()]
+    if len(columns) < 2 or any(sum(bool(row[i]) for i in columns) > 1 for row in table):
+        return []
+    return list(groups)

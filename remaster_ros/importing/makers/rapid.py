@@ -7,6 +7,17 @@ import re
 from remaster_ros.errors import InputError
 from remaster_ros.importing.makers.named import NUMBER, Named, axes_in_order, unexpected
 
+_MODULE = re.compile(
+    r'^\s*MODULE\s+\w+|^[^!\n]*\brobtarget\s+\w+\s*:=', re.IGNORECASE | re.MULTILINE
+)
+# Lines that end without a semicolon.
+_LINE = re.compile(
+    r'\s*(?:%%%|VERSION:|LANGUAGE:|(?:LOCAL\s+)?(?:MODULE|PROC|FUNC|TRAP|RECORD)\b|END\w+\s*$|ELSE\s*$'
+    r'|(?:ELSEIF|IF)\b.*\bTHEN\s*$|(?:FOR|WHILE)\b.*\bDO\s*$|ERROR\s*$|BACKWARD\s*$|UNDO\s*$)',
+    re.IGNORECASE,
+)
+# An array of targets: its name, and how many there are.
+_ARRAY = re.compile(r'\s*([A-Za-z]\w*)\s*\{\s*\d+\s*\}\s*:=\s*\[')
 _TARGET = re.compile(r'\bjointtarget\b', re.IGNORECASE)
 _LISTED = re.compile(r'^\s*\[\s*\[', re.MULTILINE)
 _MOVE = re.compile(r'\bMoveAbsJ\s*\[', re.IGNORECASE)
@@ -14,6 +25,8 @@ _ASSIGNED = re.compile(r'\s*([A-Za-z]\w*)\s*:?=\s*')
 _VALUE = re.compile(
     r'\s*(?:[A-Za-z]\w*\s*:)?\s*[\[{]?\s*[\[{]([^\[\]{}]*)[\]}]\s*,?\s*(?:(?:[A-Za-z]\w*\s*:)?\s*[\[{]([^\[\]{}]*)[\]}])?\s*[\]}]?'
 )
+_LISTED_AXES = re.compile(r'\[\s*\[([^\[\]]*)\]\s*,\s*\[([^\[\]]*)\]\s*\]')
+_ELEMENT = re.compile(r'\s*([A-Za-z]\w*(?:\s*\{\s*\d+\s*\})?)\s*:=\s*')
 # Nothing else in RAPID begins with six numbers.
 _SIX = re.compile(r'(?:=|^)\s*(?:[A-Za-z]\w*\s*:)?[\s\[{}]*(?:[-+.\deE]+\s*,\s*){5}')
 _UNUSED = 9e9
@@ -22,13 +35,21 @@ _EXPECTED = '[[…,…],[…]] with a number for each axis'
 
 def read(text: str) -> Named | None:
     """Return the joint targets of a module; None for anything else."""
-    if not (_TARGET.search(text) or _MOVE.search(text) or _LISTED.search(text)):
+    known = _TARGET.search(text) or _MOVE.search(text) or _MODULE.search(text)
+    if not (known or _LISTED.search(text)):
         return None
     found: list[tuple[int, str, dict[str, str]]] = []
     places = 0
     for number, statement in _statements(text):
         target, move = _TARGET.search(statement), _MOVE.search(statement)
         name = ''
+        if target and (array := _ARRAY.match(statement, target.end())):
+            listed = [*_LISTED_AXES.finditer(statement, array.end())]
+            if _LISTED_AXES.sub('', statement[array.end() :]).strip(' \t\r\n,]'):
+                raise unexpected(number, statement, f'jointtarget NAME{{…}}:=[{_EXPECTED},…]')
+            for i, one in enumerate(listed, 1):
+                found.append((number, f'{array[1]}{{{i}}}', _axes(number, statement, one)))
+            continue
         if target:
             assigned = _ASSIGNED.match(statement, target.end())
             if assigned is None:
@@ -37,12 +58,15 @@ def read(text: str) -> Named | None:
                     continue
                 raise unexpected(number, statement, f'jointtarget NAME:={_EXPECTED}')
             name, start = assigned[1], assigned.end()
+        elif (assigned := _ELEMENT.match(statement)) and _SIX.search(statement):
+            # Of a target, or of one in an array, that was declared without a value.
+            name, start = re.sub(r'\s', '', assigned[1]), assigned.end()
         elif move:
             start = move.end() - 1
         elif _LISTED.match(statement):
             start = 0
         else:
-            if _SIX.search(statement) or (not _TARGET.search(text) and not _MOVE.search(text)):
+            if _SIX.search(statement) or not known:
                 raise unexpected(number, statement, f'jointtarget NAME:={_EXPECTED}')
             places += bool(re.search(r'\brobtarget\b[^;]*:?=', statement, re.IGNORECASE))
             continue
@@ -63,6 +87,8 @@ def _statements(text: str) -> list[tuple[int, str]]:
     start = 0
     for number, line in enumerate(text.splitlines(), 1):
         code = line.partition('!')[0]
+        if not parts and _LINE.match(code):
+            continue
         listed = bool(_LISTED.match(code)) and not parts
         for i, piece in enumerate(code.split(';')):
             if i and parts:

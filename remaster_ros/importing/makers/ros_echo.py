@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 
+from remaster_ros.errors import InputError
 from remaster_ros.importing.makers.named import NUMBER, Named, unexpected
 
 _FIELD = re.compile(r'field\.(name|position)\[?(\d+)\]?')
@@ -21,7 +22,13 @@ def read(text: str) -> Named | None:
     head = [cell.strip() for cell in lines[0][1].split(',')]
     if any(_FIELD.fullmatch(cell) for cell in head):
         return _with_header(head, lines[1:])
-    return _without(lines) if _names(head) else None
+    if re.search(r'^position:', text, re.MULTILINE) and re.search(r'^---\s*$', text, re.MULTILINE):
+        raise InputError(
+            'line 1: messages as YAML; record them with ros2 topic echo --csv or rostopic echo -p'
+        )
+    if _names(head):
+        return _without(lines)
+    return _places(lines) if _is_place(head) else None
 
 
 def _with_header(head: list[str], lines: list[tuple[int, str]]) -> Named | None:
@@ -79,6 +86,36 @@ def _without(lines: list[tuple[int, str]]) -> Named:
         stamp = f'{cells[0]}.{int(cells[1]):09d}'
         rows.append((stamp, *cells[start : start + len(first)]))
     return _named(first, rows, lines, 's')
+
+
+def _is_place(cells: list[str]) -> bool:
+    """Return whether a line is a point or pose: second, nanosecond, frame, 3 or 7 numbers."""
+    return (
+        len(cells) - 3 in (len('xyz'), len('xyz') + len('xyzw'))
+        and cells[0].isdigit()
+        and cells[1].isdigit()
+        and int(cells[1]) < 1e9
+        and not NUMBER.fullmatch(cells[2])
+        and all(map(NUMBER.fullmatch, cells[3:]))
+    )
+
+
+def _places(lines: list[tuple[int, str]]) -> Named:
+    """Return the points of ``ros2 topic echo --csv``, with orientations where it has them."""
+    rows = []
+    width = len(lines[0][1].split(','))
+    for number, line in lines:
+        cells = [cell.strip() for cell in line.split(',')]
+        if len(cells) != width or not _is_place(cells):
+            raise unexpected(number, line, f'second, nanosecond, frame and {width - 3} numbers')
+        rows.append((f'{cells[0]}.{int(cells[1]):09d}', *cells[3:]))
+    axes = [*(f'{axis} [m]' for axis in 'xyz'), *(f'q{axis}' for axis in 'xyzw')]
+    return Named(
+        kind='points as ROS prints them',
+        names=('time [s]', *axes[: width - 3]),
+        rows=tuple(rows),
+        lines=tuple(number for number, _ in lines),
+    )
 
 
 def _named(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 
 from remaster_ros.importing.makers.named import NUMBER, Named, axes_in_order, unexpected
 
@@ -17,6 +18,7 @@ def read(text: str) -> Named | None:
         return None
     found: list[tuple[int, str, dict[str, str]]] = []
     name, several = '', False
+    without_key: list[tuple[int, str]] = []
     for tag in _TAG.finditer(text):
         number = text.count('\n', 0, tag.start()) + 1
         attributes = dict(_ATTRIBUTE.findall(tag[0]))
@@ -29,7 +31,15 @@ def read(text: str) -> Named | None:
         if not all(NUMBER.fullmatch(cell.strip()) for cell in joints.values()):
             raise unexpected(number, tag[0], 'j1="…" j2="…" with a number each')
         key = attributes.get('key', '') if several else ''
+        if 'key' not in attributes and 'name' not in attributes:
+            without_key.append((len(found), name))
         found.append((number, f'{name}[{key}]' if key else name, joints))
+    # Elements of an array, where no keys are written.
+    repeated, count = Counter(name for _, name in without_key), Counter[str]()
+    for i, name in without_key:
+        if repeated[name] > 1:
+            found[i] = found[i][0], f'{name}[{count[name]}]', found[i][2]
+            count[name] += 1
     for line, piece in enumerate(
         _TAG.sub(lambda tag: '\n' * tag[0].count('\n'), text).split('\n'), 1
     ):

@@ -11,6 +11,8 @@ from remaster_ros.importing.makers.named import NUMBER, Named, axes_in_order, un
 _MOVE = re.compile(r'\b(?:movej|servoj)\s*\(\s*')
 _LIST = re.compile(r'\[([^\[\]]*)\]')
 _ASSIGNED = re.compile(r'\s*(?:global\s+|local\s+)?([A-Za-z]\w*)\s*=\s*')
+# A list of positions.
+_SEVERAL = re.compile(rf'{_ASSIGNED.pattern}\[((?:\s*\[[^\[\]]*\]\s*,?)+)\]\s*')
 _LISTED = re.compile(rf'{_ASSIGNED.pattern}\[')
 _DEGREES = re.compile(rf'd2r\(\s*({NUMBER.pattern})\s*\)')
 # Six numbers in a list, and what takes such beside movej.
@@ -29,6 +31,11 @@ def read(text: str) -> Named | None:
     places = 0
     for number, line in enumerate(text.splitlines(), 1):
         code = line.partition('#')[0]
+        if len(_SIX.findall(code)) > 1 and (several := _SEVERAL.fullmatch(code)):
+            for i, one in enumerate(_LIST.finditer(several[2])):
+                found.append((number, f'{several[1]}[{i}]', _joints(number, line, one[1])))
+            defined.add(several[1])
+            continue
         if len(_SIX.findall(code)) > 1:
             raise unexpected(number, line, 'one move or waypoint a line')
         assigned, move = _ASSIGNED.match(code), _MOVE.search(code)
@@ -45,7 +52,11 @@ def read(text: str) -> Named | None:
         if re.match(r'p\[|pose_|get_inverse_kin', code[start:]):
             places += 1
             continue
-        if move and not assigned and re.match(r'[A-Za-z]\w*\s*[,)]', code[start:]):
+        if (
+            move
+            and not assigned
+            and re.match(r'[A-Za-z]\w*(?:\[[^\[\]]*\])?\s*[,)]', code[start:])
+        ):
             # A waypoint, which stands above.
             continue
         listed = _LIST.match(code, start)

@@ -1,0 +1,50 @@
+"""Logs in which each line has the joints in brackets, as programs print a list: `P1: [0, 1]`."""
+
+from __future__ import annotations
+
+import re
+
+from remaster_ros.importing.makers.named import NUMBER, Named, unexpected
+
+_LINE = re.compile(r'([^\[\]]*?)[\[(]{1,2}\s*([^\[\]()]*?)\s*[\])]{1,2}\s*[,;]?\s*')
+_BETWEEN = re.compile(r'\s*[,;]\s*|\s+')
+_TIME = re.compile(r'\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d(?:[.,]\d+)?|\d{5,}\.\d+')
+# What a name is set apart by, and what it is set before.
+_APART = ' \t:;,="\''
+_FEWEST, _MOST = 2, 12
+
+
+def read(text: str) -> Named | None:
+    """Return the lists of a log, with their names or times; None for anything else."""
+    lines = [(i, line) for i, line in enumerate(text.splitlines(), 1) if line.strip()]
+    found = [(number, line, _LINE.fullmatch(line)) for number, line in lines]
+    if not found or not all(match for *_, match in found[:2]):
+        return None
+    rows: list[list[str]] = []
+    before: list[str] = []
+    for number, line, match in found:
+        cells = [] if match is None else _BETWEEN.split(match[2])
+        if not rows and not (_FEWEST < len(cells) <= _MOST and all(map(NUMBER.fullmatch, cells))):
+            return None
+        if (
+            match is None
+            or (rows and len(cells) != len(rows[0]))
+            or not all(map(NUMBER.fullmatch, cells))
+        ):
+            raise unexpected(number, line, f'a list of {len(rows[0])} numbers in brackets')
+        rows.append(cells)
+        before.append(match[1].strip(_APART))
+    stamps = [_TIME.search(words) for words in before]
+    lead: list[str] = []
+    if all(stamps):
+        lead, before = ['time'], [stamp[0].replace(',', '.') for stamp in stamps if stamp]
+    elif all(before) and len({*before}) == len(before):
+        lead = ['name']
+    return Named(
+        kind='lists of joints',
+        names=(*lead, *(f'J{i}' for i in range(1, len(rows[0]) + 1))),
+        rows=tuple(
+            (*([words] if lead else []), *cells) for words, cells in zip(before, rows, strict=True)
+        ),
+        lines=tuple(number for number, _ in lines),
+    )
