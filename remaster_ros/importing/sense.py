@@ -36,6 +36,8 @@ from remaster_ros.types import FloatArray, Session
 
 # Angles that agree so well are one configuration, measured again: a pendant's last digits.
 SAME_JOINTS_RAD = 1e-3
+# Points that agree so well with the nominal arm are computed from its joints, m.
+COMPUTED_M = 2e-5
 # Rows that a sentence names.
 SHOWN_ROWS = 5
 
@@ -90,6 +92,13 @@ def check_sense(session: Session, rows: RawRows, progress: Callable[[str, float]
     except InsufficientDataError as error:
         return Sense(False, f'too little to try it against the robot: {error}')
     without = shown_mm(as_given.error_m)
+    if not session.on_tool and _is_of_the_robot(part, chain):
+        return Sense(
+            False,
+            'the points are where the robot itself believes its tool to be, none that was '
+            'measured; name the columns of the measured point with --points',
+            error_m=as_given.error_m,
+        )
     beside = _beside(session, off, rows)
     allowed = max(DISPLACED * session.marker_std_m, MARKER_SHIFT_M)
     if not as_given.gross and not off.too_many and as_given.marker_shift_m < allowed:
@@ -130,6 +139,22 @@ def check_sense(session: Session, rows: RawRows, progress: Callable[[str, float]
         )
     measured = session.measurements.orientation is not None and not session.on_tool
     return _nothing_found(as_given, without, chain, measured)
+
+
+def _is_of_the_robot(session: Session, chain: SerialChain) -> bool:
+    """Return whether the points are computed from the joints, by the nominal arm in its base.
+
+    No sensor sees an arm without an error, and none has the frame of its base that well.
+    """
+    m = session.measurements
+    for marker in range(len(session.markers)):
+        rows = m.marker == marker
+        T = chain.forward(m.q[rows])
+        # The place in the tool that explains the points best, with the base as their frame.
+        local = np.einsum('nji,nj->ni', T[:, :3, :3], m.position[rows] - T[:, :3, 3])
+        if np.median(np.linalg.norm(local - np.median(local, axis=0), axis=1)) > COMPUTED_M:
+            return False
+    return True
 
 
 def _largest(offsets: FloatArray, chain: SerialChain) -> str:
