@@ -17,11 +17,13 @@ _TOKEN = re.compile(r'[^\W\d_]+|\d+|#')
 _CAMEL = re.compile(r'(?<=[a-z])(?=[A-Z])')
 # Words for the coordinates of surveyors: east, north and up are right-handed, as X, Y and Z.
 _AXIS_WORDS = {
-    **dict.fromkeys(('rechtswert', 'easting', 'ost', 'ostwert'), 'x'),
-    **dict.fromkeys(('hochwert', 'northing', 'nord', 'nordwert'), 'y'),
-    **dict.fromkeys(('höhe', 'hoehe', 'height', 'elevation'), 'z'),
+    **dict.fromkeys(('rechtswert', 'easting', 'east', 'e', 'ost', 'ostwert'), 'x'),
+    **dict.fromkeys(('hochwert', 'northing', 'north', 'n', 'nord', 'nordwert'), 'y'),
+    **dict.fromkeys(('höhe', 'hoehe', 'height', 'elevation', 'elev', 'h'), 'z'),
 }
 # Words of headers, in the languages of the programs and pendants seen so far.
+# Which height, and in which system: words that X and Y are without.
+_SURVEYED = {'ortho', 'orthometric', 'ellipsoidal', 'ell', 'local', 'grid'}
 _JOINT_WORDS = {
     'a',
     'j',
@@ -79,6 +81,7 @@ _WORDS = {
         'zeitstempel',
         'secs',
         'epoch',
+        'ts',
     },
     'date': {'date', 'datum'},
     'clock': {'uhrzeit', 'clock'},
@@ -89,6 +92,11 @@ _WORDS = {
     'marker': {'marker', 'reflector', 'reflektor'},
     'temperature': {'temperature', 'temp', 'temperatur', 'ambient'},
     'samples': {'samples', 'shots', 'messungen'},
+}
+# Whose clock it is.
+_CLOCKS = {
+    *('pc', 'ros', 'robot', 'system', 'sys', 'wall', 'host', 'log', 'unix', 'utc', 'local'),
+    *('controller', 'msg', 'message', 'header', 'recv', 'receive', 'capture', 'measurement'),
 }
 _KINDS = {word: kind for kind, words in _WORDS.items() for word in words}
 
@@ -209,6 +217,8 @@ def _first_kind(words: Sequence[str]) -> str:
     kinds = [_KINDS.get(word, '') for word in words]
     if len(words) == 2 and kinds[0] in ('name', 'time') and kinds[1] in ('name', 'time'):
         return kinds[0]
+    if len(words) == 2 and words[0] in _CLOCKS and kinds[1] == 'time':
+        return 'time'
     if 'samples' in kinds:
         return 'samples'
     return 'temperature' if 'temperature' in kinds and len(words) <= 2 else ''
@@ -426,7 +436,7 @@ _TURNED = {'quaternion', 'quat', 'orientation', 'rotation', 'q'}
 
 def _with_axis(words: Sequence[str]) -> tuple[str, ...]:
     """Return words with `px`, `posx`, `sy` or `dz` taken apart."""
-    words = [_AXIS_WORDS.get(word, word) for word in words]
+    words = [_AXIS_WORDS.get(word, word) for word in words if word not in _SURVEYED]
     apart = (
         (word[:-1], word[-1]) if re.fullmatch(r'(?:p|pos|s|d|r|t|v)[xyz]', word) else (word,)
         for word in words
@@ -442,7 +452,7 @@ def _take(found: Columns, columns: Sequence[int], taken: set[int]) -> None:
 def _by_place(table: TextTable, found: Columns, joints: int) -> Columns:
     """Take columns without a header by their place: a name, then joints, then X, Y, Z."""
     free = [i for i in range(len(table.names)) if i not in found.why]
-    numeric = [i for i in free if all(_numeric(table, row, i) for row in range(len(table.rows)))]
+    numeric = [i for i in free if _numeric(table, i)]
     texts = [i for i in free if i not in numeric]
     wanted = (0 if found.joints else joints, 0 if found.points else 3)
     first = numeric[:1] if _counts_up(table, numeric) else []
@@ -474,8 +484,10 @@ def _counts_up(table: TextTable, numeric: Sequence[int]) -> bool:
     return all(cell.isdigit() for cell in cells) and len(set(cells)) == len(cells)
 
 
-def _numeric(table: TextTable, row: int, column: int) -> bool:
+def _numeric(table: TextTable, column: int) -> bool:
+    """Return whether a column has numbers, and no other text but for missing ones."""
     try:
-        return table.number(row, column) is not None
+        values = [table.number(row, column) for row in range(len(table.rows))]
     except InputError:
         return False
+    return any(value is not None for value in values)

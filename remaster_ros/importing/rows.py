@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
 import re
+import string
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, cast
@@ -15,7 +17,13 @@ from remaster_ros.errors import InputError
 from remaster_ros.importing.columns import AXES, Columns, Table, Told, find_columns
 from remaster_ros.importing.makers import kuka
 from remaster_ros.importing.standstills import some, stopped
-from remaster_ros.importing.text_table import TABLE_LIMIT, TextTable, decode, read_table
+from remaster_ros.importing.text_table import (
+    TABLE_LIMIT,
+    TextTable,
+    decode,
+    is_missing,
+    read_table,
+)
 from remaster_ros.importing.units import ANGLES, LENGTHS
 from remaster_ros.importing.values import (
     joint_values,
@@ -38,6 +46,11 @@ How = Literal['', 'name', 'time', 'order']
 _STILL_DEG = 0.05
 # Between the parts of a name: SpatialAnalyzer's collection::group::point, and paths.
 _PATH = re.compile(r'::|[/\\|]')
+# The last of the levels at which names are compared, how many names that takes, and how many times
+# as many the other table may have.
+_OWN_PART, _FEWEST_NAMES, _MOST_TIMES = 3, 4, 3
+# A number with a decimal sign is measured, no name.
+_MEASURED = re.compile(r'[+-]?\d*[.,]\d+(?:[eE][+-]?\d+)?')
 _BRACKETS = re.compile(r'[\[\](){}_\s-]')
 
 
@@ -62,11 +75,13 @@ def join(
 ) -> Pairs:
     """Pair the rows of two tables, where something tells which belong together."""
     if how in ('', 'name'):
-        pairs = _by_name(points, joints)
+        pairs = _by_name(points, joints, by_header=how == '')
         if pairs is not None:
             return pairs
     if how in ('', 'time'):
         pairs = _by_time(points, joints, within_s)
+        if pairs is None and not how:
+            pairs = _by_name(points, joints, by_header=False)
         if pairs is not None:
             return pairs
     a, b = points[0], joints[0]
@@ -74,7 +89,7 @@ def join(
         if len(a.rows) != len(b.rows):
             raise InputError(
                 f'{a.path} has {len(a.rows)} rows, {b.path} {len(b.rows)}; only equally many can '
-                'be joined by their order'
+                'be joined by their order: remove what the other has not (such as a home position)'
             )
         rows = np.arange(len(a.rows))
         return Pairs(rows, rows, 'by the order of their rows')
@@ -89,27 +104,70 @@ def join(
     raise InputError(f'{a.path} and {b.path} have {what} in common; {remedy}')
 
 
-def common_names(points: Table, joints: Table) -> tuple[int, int, list[str], list[str]] | None:
+def common_names(
+    points: Table, joints: Table, by_header: bool = True
+) -> tuple[int, int, list[str], list[str]] | None:
     """Return the columns by whose names most rows belong together, and the names as compared.
 
     `P01`, `p1` and `P1 ` are the same; where no names are, then the last parts (`A::KR6::P1` and
-    `P1`), then those without brackets and underscores (`P[1]`).
+    `P1`), then those without brackets and underscores (`P[1]`), then what is not the same in all
+    names of a table (`KR6_P1` and `Pose 1`), where one table has all names of the other. If not
+    `by_header`, any column may have the names.
     """
-    best: tuple[int, int, int, int, list[str], list[str]] | None = None
-    for level in range(3):
-        for i in points[1].others['name']:
-            for j in joints[1].others['name']:
-                a, b = _keys(points[0], i, level), _keys(joints[0], j, level)
-                common = len(set(a) & set(b))
-                if common and (best is None or common > best[0]):
-                    best = common, level, i, j, a, b
-        if best is not None:
-            return best[2:]
+    named = [(i, j) for i in points[1].others['name'] for j in joints[1].others['name']]
+    for level in range(_OWN_PART + 1):
+        found = _matching(points, joints, level, named, level < _OWN_PART)
+        if found is not None:
+            return found
+    if by_header:
+        return None
+    pairs = [(i, j) for i in _spare(*points) for j in _spare(*joints)]
+    for level in range(_OWN_PART + 1):
+        found = _matching(points, joints, level, pairs, False)
+        if found is not None:
+            return found
     return None
 
 
-def _by_name(points: Table, joints: Table) -> Pairs | None:
-    best = common_names(points, joints)
+def _spare(table: TextTable, columns: Columns) -> list[int]:
+    """Return columns that may be names: of no other use, no two rows alike."""
+    used = {*columns.joints, *columns.from_joints, *columns.point}
+    used |= {
+        i for kind, own in columns.others.items() if kind not in ('name', 'pose') for i in own
+    }
+    return [
+        i
+        for i in range(len(table.names))
+        if i not in used
+        and all(row[i] and not _MEASURED.fullmatch(row[i]) for row in table.rows)
+        and len({row[i] for row in table.rows}) == len(table.rows)
+    ]
+
+
+def _matching(
+    points: Table, joints: Table, level: int, columns: Iterable[tuple[int, int]], sure: bool
+) -> tuple[int, int, list[str], list[str]] | None:
+    """Return the columns of which most names belong together, at this level of comparing them.
+
+    Where that is not `sure` by the header, one table has all names of the other.
+    """
+    best: tuple[int, int, int, list[str], list[str]] | None = None
+    for i, j in columns:
+        a, b = _keys(points[0], i, level), _keys(joints[0], j, level)
+        common = len(set(a) & set(b))
+        fewer, more = sorted((len(set(a)), len(set(b))))
+        # A log counts all of its rows: such numbers are no names of points.
+        if more > _MOST_TIMES * fewer and (not sure or ''.join((*a, *b)).isdigit()):
+            continue
+        if not sure and not common == fewer >= _FEWEST_NAMES:
+            continue
+        if common and (best is None or common > best[0]):
+            best = common, i, j, a, b
+    return best and best[1:]
+
+
+def _by_name(points: Table, joints: Table, *, by_header: bool) -> Pairs | None:
+    best = common_names(points, joints, by_header)
     if best is None:
         return None
     i, j, a, b = best
@@ -139,16 +197,31 @@ def _by_name(points: Table, joints: Table) -> Pairs | None:
 
 
 def _keys(table: TextTable, column: int, level: int) -> list[str]:
-    """Return names as they are compared: 0 whole, 1 their last parts, 2 those without brackets."""
+    """Return names as they are compared.
+
+    0 whole, 1 their last parts, 2 those without brackets, 3 without what all of them begin and end
+    with.
+    """
     names = [row[column] for row in table.rows]
     if level > 0:
         names = [_PATH.split(name.strip())[-1] for name in names]
-    if level > 1:
+    if level == _OWN_PART:
+        begin = _common([name.casefold() for name in names])
+        end = _common([name[begin:][::-1].casefold() for name in names])
+        names = [name[begin : len(name) - end] for name in names]
+    elif level > 1:
         names = [_BRACKETS.sub('', name) for name in names]
     return [
         re.sub(r'\d+', lambda digits: str(int(digits[0])), name.strip().casefold())
         for name in names
     ]
+
+
+def _common(names: Sequence[str]) -> int:
+    """Return with how many letters all names begin, without the digits of a number."""
+    first, last = min(names), max(names)
+    same = itertools.takewhile(lambda pair: pair[0] == pair[1], zip(first, last))
+    return len(''.join(letter for letter, _ in same).rstrip(string.digits))
 
 
 def _by_time(points: Table, joints: Table, within_s: float) -> Pairs | None:
@@ -174,6 +247,7 @@ def _by_time(points: Table, joints: Table, within_s: float) -> Pairs | None:
         )
     # Where both neighbours are near, the joints are a stream: it tells whether the arm moved.
     q = numbers(joints[0], joints[1].joints)
+    _refuse_equal_times(joints, reported, order, q, nearer[near])
     still = _STILL_DEG if np.abs(q).max(initial=0.0) > 2.1 * np.pi else np.deg2rad(_STILL_DEG)
     stream = near & (np.abs(reported[before] - when) <= within_s)
     stream &= np.abs(reported[after] - when) <= within_s
@@ -190,6 +264,31 @@ def _by_time(points: Table, joints: Table, within_s: float) -> Pairs | None:
     if not kept.any():
         raise InputError(f'{table.path}: every point was measured while the arm moved')
     return Pairs(np.flatnonzero(kept), order[nearer[kept]], 'by time', tuple(left_out))
+
+
+def _refuse_equal_times(
+    joints: Table, reported: FloatArray, order: IntArray, q: FloatArray, used: IntArray
+) -> None:
+    """Refuse joints that a point needs and that have the time of others.
+
+    ``reported``: s, rising; ``order``: their rows in the table; ``used``: which are needed.
+    """
+    table, columns = joints
+    for at in np.unique(used):
+        for other in (at - 1, at + 1):
+            if not 0 <= other < len(reported) or reported[other] != reported[at]:
+                continue
+            one, two = sorted((order[at], order[other]))
+            if np.any(q[one] != q[two]):
+                column = next(
+                    c for kind in ('time', 'clock', 'date') for c in columns.others[kind]
+                )
+                raise table.fault(
+                    int(two),
+                    column,
+                    f'is the time of line {table.lines[one]} as well, and the joints are others; '
+                    'give times with seconds, or say --join order',
+                )
 
 
 # A marker that moves by less than this share of what others move is not on the arm: one on the
@@ -338,7 +437,11 @@ def read_rows(paths: Sequence[Path], chain: SerialChain, options: TableOptions) 
     _refuse_untold(found, options.told)
     with_points = _told_first([pair for pair in found if pair[1].points], 'points')
     with_joints = _told_first([pair for pair in found if pair[1].joints], 'joints')
-    points = _only(with_points, tables, 'a measured point (X, Y, Z)', '--points')
+    # A log of joints may have where the robot believes its tool to be.
+    alone = [pair for pair in with_points if not pair[1].joints]
+    points = _only(
+        alone if len(alone) == 1 else with_points, tables, 'a measured point (X, Y, Z)', '--points'
+    )
     # Where the points' table repeats the joints, those of the other table were meant.
     joints = _only(
         [pair for pair in with_joints if pair is not points] or with_joints,
@@ -357,6 +460,10 @@ def read_rows(paths: Sequence[Path], chain: SerialChain, options: TableOptions) 
         )
     description = [table.describe() for table in tables]
     warnings = [note for table in tables for note in table.notes]
+    for table, columns in with_points:
+        if table is not points[0]:
+            unused = ', '.join(table.names[i] for i in columns.point)
+            warnings.append(f'{table.path}: {unused} left out, the points are in {points[0].path}')
     stamp = None
     told = options.join or options.told.time == 'none'
     still = None
@@ -371,13 +478,43 @@ def read_rows(paths: Sequence[Path], chain: SerialChain, options: TableOptions) 
         points, joints, stamp = still.points, still.joints, still.stamp_s
         description += still.description
         warnings += still.warnings
-    elif joints is not points:
+    else:
+        points, joints, left = _complete(points, joints)
+        warnings += left
+    if still is None and joints[0] is not points[0]:
         pairs = join(points, joints, options.join, options.within_s)
         description.append(f'{len(pairs.points)} rows joined {pairs.how}')
         warnings += pairs.left_out
         points = points[0].select(pairs.points), points[1]
         joints = joints[0].select(pairs.joints), joints[1]
     return _values(points, joints, chain, options, stamp, tuple(description), tuple(warnings))
+
+
+def _complete(points: Table, joints: Table) -> tuple[Table, Table, tuple[str, ...]]:
+    """Return tables without rows that have no joints or no point, and sentences on these."""
+    same = points[0] is joints[0]
+    kept, left = {}, []
+    for what, (table, _), places in (
+        ('no joints', joints, joints[1].joints),
+        ('no point', points, points[1].point),
+    ):
+        known = np.array([not all(is_missing(row[i]) for i in places) for row in table.rows])
+        kept[what] = known
+        lines = [str(table.lines[row]) for row in np.flatnonzero(~known)]
+        if lines and known.any():
+            plural = 's' * (len(lines) > 1)
+            left.append(f'{table.path}, line{plural} {some(lines)}: {what}, left out')
+        if not known.any():
+            kept[what] = np.ones(len(table.rows), bool)
+    if same:
+        both = kept['no joints'] & kept['no point']
+        table = points[0].select(np.flatnonzero(both).tolist())
+        return (table, points[1]), (table, joints[1]), tuple(left)
+    tables = [
+        (table.select(np.flatnonzero(kept[what]).tolist()), columns)
+        for what, (table, columns) in (('no point', points), ('no joints', joints))
+    ]
+    return tables[0], tables[1], tuple(left)
 
 
 def _visited(data: TextTable, program: Path) -> TextTable:

@@ -14,7 +14,7 @@ import numpy as np
 from remaster_ros.errors import InputError
 from remaster_ros.importing.makers import READERS
 from remaster_ros.importing.makers.named import Named
-from remaster_ros.importing.units import bare, is_unit
+from remaster_ros.importing.units import bare, is_unit, split_unit
 from remaster_ros.session.files import read_limited
 
 TABLE_LIMIT = 256 * 1024**2
@@ -26,6 +26,21 @@ _COMMENT = re.compile(r'\s*(?:#|//|%|!|\*)\s*')
 _PLAIN = re.compile(r'[+-]?(?:\d+[.,]?\d*|[.,]\d+)(?:[eE][+-]?\d+)?', re.ASCII)
 # Groups of three digits, as spreadsheets like to write thousands, and then a decimal sign.
 _THOUSANDS = re.compile(r'[+-]?\d{1,3}(?:([.,])\d{3})(?:\1\d{3})*[.,]\d+', re.ASCII)
+# A number whose unit stands in its cell, as spreadsheets show one.
+_WITH_UNIT = re.compile(r'([+-]?\d[\d.,]*(?:[eE][+-]?\d+)?)\s*(°|º|deg|rad|gon|µm|μm|mm|cm|m|in)')
+# What programs write in a field without a value.
+_MISSING = {
+    *('nan', 'none', 'null', 'nil', 'na', 'n/a', 'n.a.', '#n/a', '#na', '#nv', '<na>', 'nat'),
+    *('-', '--', '---', '–', '—', '?'),
+}
+# Groups of three digits apart by blanks or apostrophes; a plain blank may be a separator.
+_APART = r'(?<=\d)[{}](?=\d{{3}}(?!\d))'
+_GROUPS = re.compile(_APART.format("\u00a0\u2009\u202f'’"))
+_GROUP_OF_CELL = re.compile(r'[+-]?\d{1,3}(?: \d{3})+(?:[.,]\d+)?', re.ASCII)
+# The line below the names of a table in Markdown, and the frame of one in ASCII.
+_ORNAMENT = re.compile(r'(?=.*(?:--|==))[\s|+:=-]+')
+_NUMBERS = re.compile(r'(?<![\w.,])[+-]?\d+(?:[.,]\d*)?(?!\w)')
+_NEVER = re.compile(r'(?!)')
 # Blanks, but not those before a unit in brackets: `X [mm]  Y [mm]`.
 _BLANKS = re.compile(r'\s+(?![\[(])')
 # A row of the table has the joints of the smallest arm at least.
@@ -76,7 +91,7 @@ class TextTable(Named):
     def number(self, row: int, column: int) -> float | None:
         """Return a cell as a number; None where it is empty."""
         cell = self.rows[row][column]
-        if not cell:
+        if is_missing(cell):
             return None
         value = parse_number(cell, self.decimal)
         if value is None:
@@ -91,6 +106,11 @@ class TextTable(Named):
             rows=tuple(self.rows[row] for row in kept),
             lines=tuple(self.lines[row] for row in kept),
         )
+
+
+def is_missing(cell: str) -> bool:
+    """Return whether a cell says that there is no value."""
+    return not cell or cell.lower() in _MISSING
 
 
 def parse_number(cell: str, decimal: str) -> float | None:
@@ -123,27 +143,36 @@ def read_table(
             raise InputError(f'{path}, {error}') from None
         if found is not None:
             return TextTable(path=path, encoding=encoding, **vars(found))
+    text = _GROUPS.sub('', text.replace('\r\n', '\n').replace('\r', '\n').replace('\u2212', '-'))
     lines = [
         (number, line)
-        for number, line in enumerate(text.replace('\r\n', '\n').split('\n'), start=1)
-        if line.strip().strip(''.join(SEPARATORS))
+        for number, line in enumerate(text.split('\n'), start=1)
+        if line.strip().strip(''.join(SEPARATORS)) and not _ORNAMENT.fullmatch(line)
     ]
-    plain = [line for _, line in lines if not _COMMENT.match(line)]
+    comment = _COMMENT
+    plain = [line for _, line in lines if not comment.match(line)]
+    if not any(len(_NUMBERS.findall(line)) >= _FEWEST_NUMBERS for line in plain):
+        # Names of points may begin as comments do.
+        comment, plain = _NEVER, [line for _, line in lines]
     separator = separator or _find_separator(plain[:SEEN_LINES])
     split = [(number, line, _split(line, separator, path, number)) for number, line in lines]
-    width, first = _first_row(split, path)
+    width, first = _first_row(split, path, comment)
     header, preamble, named = _header(split[:first], width, separator)
+    written = [cells for _, _, cells in split[:named]]
     rows, at = [], []
     # Titles may hold numbers; below the names, and where there are none, that is a damaged row.
-    above = [entry for entry in split[named:first] if not _COMMENT.match(entry[1])]
+    above = [entry for entry in split[named:first] if not comment.match(entry[1])]
     damaged = [
         entry
         for entry in above
         if any(map(str.isalnum, entry[1]) if named else map(_is_number, entry[2]))
     ]
     for number, line, cells in (*damaged, *split[first:]):
-        if _COMMENT.match(line):
+        if comment.match(line):
             preamble += f'\n{line}'
+            continue
+        if cells in written:
+            # Files that were put together have their names again.
             continue
         # A separator at the end of a line is no further column.
         while len(cells) > width and not cells[-1]:
@@ -158,6 +187,7 @@ def read_table(
     while width > 1 and not any(row[width - 1] for row in rows):
         width -= 1
     rows = [row[:width] for row in rows]
+    rows, header = _without_units(rows, header)
     names = tuple(header[:width]) if header else tuple(map(str, range(1, width + 1)))
     for name in names:
         if name and names.count(name) > 1:
@@ -217,7 +247,26 @@ def _split(line: str, separator: str, path: Path, number: int) -> list[str]:
         cells = next(csv.reader([line], delimiter=separator, skipinitialspace=True, strict=True))
     except csv.Error as error:
         raise InputError(f'{path}, line {number}: {error}; correct the quotes') from None
-    return [cell.strip() for cell in cells]
+    stripped = [cell.strip() for cell in cells]
+    return [c.replace(' ', '') if _GROUP_OF_CELL.fullmatch(c) else c for c in stripped]
+
+
+def _without_units(
+    rows: list[tuple[str, ...]], header: list[str]
+) -> tuple[list[tuple[str, ...]], list[str]]:
+    """Return cells without the unit that all cells of a column have; it goes into its name."""
+    header = list(header)
+    for i, column in enumerate(zip(*rows)):
+        found = {cell: _WITH_UNIT.fullmatch(cell) for cell in column if not is_missing(cell)}
+        units = {'' if match is None else match[2] for match in found.values()}
+        if len(units) != 1 or '' in units or i >= len(header):
+            continue
+        (unit,) = units
+        plain = {cell: match[1] for cell, match in found.items() if match}
+        rows = [(*row[:i], plain.get(row[i], row[i]), *row[i + 1 :]) for row in rows]
+        if not split_unit(header[i])[1]:
+            header[i] = f'{header[i]} [{unit}]'
+    return rows, header
 
 
 def _find_separator(lines: Sequence[str]) -> str:
@@ -241,19 +290,21 @@ def _find_separator(lines: Sequence[str]) -> str:
 
 
 def _is_number(cell: str) -> bool:
-    return bool(_PLAIN.fullmatch(cell) or _THOUSANDS.fullmatch(cell))
+    return bool(_PLAIN.fullmatch(cell) or _THOUSANDS.fullmatch(cell) or _WITH_UNIT.fullmatch(cell))
 
 
 def _is_row(cells: Sequence[str]) -> bool:
     return sum(map(_is_number, cells)) >= _FEWEST_NUMBERS
 
 
-def _first_row(split: list[tuple[int, str, list[str]]], path: Path) -> tuple[int, int]:
+def _first_row(
+    split: list[tuple[int, str, list[str]]], path: Path, comment: re.Pattern[str]
+) -> tuple[int, int]:
     """Return the number of columns, and the index of the first line that is a row."""
     rows = [
         (i, cells)
         for i, (_, line, cells) in enumerate(split)
-        if _is_row(cells) and not _COMMENT.match(line)
+        if _is_row(cells) and not comment.match(line)
     ]
     if not rows:
         raise InputError(

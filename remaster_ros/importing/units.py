@@ -67,7 +67,7 @@ def unit_of(text: str) -> str:
 
 def is_unit(text: str) -> bool:
     """Return whether a cell below a header can be a unit."""
-    return bool(unit_of(text)) or bare(text) in ('', '-', '–', '1')
+    return bool(unit_of(text)) or bare(text).strip('-–—') in ('', '1')
 
 
 def bare(text: str) -> str:

@@ -22,6 +22,10 @@ _UNIT_LINE = re.compile(
 )
 # A time since 1970 that is larger is in ms, us or ns.
 _EPOCHS = ((1e17, 'ns'), (1e14, 'us'), (1e11, 'ms'))
+# Days since 1900, as spreadsheets count: of 1995 to 2119. As seconds of some clock they would be a
+# session of less than half a minute.
+_SERIAL, _SERIAL_DAYS = (34_700.0, 80_000.0), 30.0
+_SERIAL_OF_1970, _DAY_S = 25_569.0, 86_400.0
 # More than one turn each way: no arm reports that in radians.
 _LARGEST_RAD = 2.1 * np.pi
 
@@ -35,7 +39,8 @@ def numbers(table: TextTable, columns: tuple[int, ...], optional: bool = False) 
             if value is not None:
                 values[row, i] = value
             elif not optional:
-                raise table.fault(row, column, 'is empty; complete it or remove the row')
+                no = 'no value' if table.rows[row][column] else 'empty'
+                raise table.fault(row, column, f'is {no}; complete it or remove the row')
     return values
 
 
@@ -51,7 +56,7 @@ def angle_unit(table: TextTable, columns: Columns, told: str) -> tuple[str, str]
         )
     if units:
         return units.pop(), 'header'
-    largest = np.abs(numbers(table, columns.joints)).max(initial=0.0)
+    largest = np.nanmax(np.abs(numbers(table, columns.joints, optional=True)), initial=0.0)
     return ('rad', 'guessed') if largest < _LARGEST_RAD else ('deg', 'guessed')
 
 
@@ -163,6 +168,9 @@ def times(table: TextTable, columns: Columns) -> FloatArray | None:
         if value is None:
             raise table.fault(row, column, 'is no time; correct it, or say --time none')
         result[row] = value
+    serial = np.all((result > _SERIAL[0]) & (result < _SERIAL[1]))
+    if unit not in TIMES and serial and np.ptp(result) < _SERIAL_DAYS:
+        return (result - _SERIAL_OF_1970) * _DAY_S
     if unit not in TIMES:
         largest = np.abs(result).max(initial=0.0)
         unit = next((name for size, name in _EPOCHS if largest > size), 's')

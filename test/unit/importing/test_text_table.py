@@ -185,7 +185,7 @@ GOOD = text(
         ('P2;2.500000', 'P2;2.5o', "line 3, column A1 [deg]: '2.5o' is not a number"),
         ('P2;2.500000', 'P2;', "line 3, column A1 [deg]: '' is empty"),
         ('P2;2.500000', 'P2', 'line 3: 5 columns, where most rows have 6'),
-        ('P2;2.500000', 'P2;nan', "column A1 [deg]: 'nan' is not a number"),
+        ('P2;2.500000', 'P2;nan', "column A1 [deg]: 'nan' is no value"),
         ('P2;2.500000', 'P2;"2.5', 'line 3: '),
         ('A2 [deg]', 'A1 [deg]', "two columns are named 'A1 [deg]'"),
         (

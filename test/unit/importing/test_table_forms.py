@@ -1,0 +1,403 @@
+"""Tables, logs and programs as people really have them: each is read, or refused in one line."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pytest
+from foreign_streams import arm_of, log_of, run_of, take_of
+from foreign_tables import measured, text, write
+
+from remaster_ros.cli.main import main
+from remaster_ros.errors import InputError
+from remaster_ros.importing.makers import motive
+from remaster_ros.importing.rows import TableOptions, read_rows
+
+COUNT = 12
+POINTS = [f'P{i}' for i in range(1, COUNT + 1)]
+AXES = [f'A{i}' for i in range(1, 7)]
+
+
+@pytest.fixture(scope='module')
+def arm():
+    return measured(rows=COUNT)
+
+
+def degrees(arm):
+    return [*np.rad2deg(arm.q).T]
+
+
+def millimetres(arm):
+    return [*(1e3 * arm.points).T]
+
+
+def joints_table(arm, names=POINTS, header='Point'):
+    return text([header, *AXES], [names, *degrees(arm)])
+
+
+def points_table(arm, names=POINTS, header='Point'):
+    return text([header, 'X', 'Y', 'Z'], [names, *millimetres(arm)])
+
+
+def rows_of(arm, folder, *contents, **options):
+    paths = [write(folder, f't{i}.txt', content) for i, content in enumerate(contents)]
+    return read_rows(paths, arm.chain, TableOptions(**options))
+
+
+def assert_rows(rows, arm, which=slice(None)):
+    np.testing.assert_allclose(rows.q, arm.q[which], atol=2e-6)
+    np.testing.assert_allclose(rows.position, arm.points[which], atol=2e-6)
+
+
+def whole(arm, cell=str, separator=';'):
+    """Return a table of names, joints and points, each number written by `cell`."""
+    columns = [[cell(value) for value in column] for column in (*degrees(arm), *millimetres(arm))]
+    return text(['Punkt', *AXES, 'X', 'Y', 'Z'], [POINTS, *columns], separator)
+
+
+@pytest.mark.parametrize(
+    'cell',
+    [
+        lambda v: f'{v:,.6f}'.replace(',', '\u202f').replace('.', ','),
+        lambda v: f'{v:,.6f}'.replace(',', '\u00a0').replace('.', ','),
+        lambda v: f'{v:,.6f}'.replace(',', ' ').replace('.', ','),
+        lambda v: f'{v:,.6f}'.replace(',', "'"),
+        lambda v: f'{v:.6f}'.replace('-', '\u2212'),
+    ],
+    ids=['thin blank', 'no-break blank', 'blank', 'apostrophe', 'minus sign'],
+)
+def test_numbers_as_spreadsheets_write_them(cell, arm, tmp_path):
+    assert_rows(rows_of(arm, tmp_path, whole(arm, cell)), arm)
+
+
+def test_units_in_the_cells(arm, tmp_path):
+    columns = [[f'{v:.6f}°' for v in column] for column in degrees(arm)]
+    columns += [[f'{v:.6f} mm' for v in column] for column in millimetres(arm)]
+    table = text(['Punkt', *AXES, 'X', 'Y', 'Z'], [POINTS, *columns])
+    rows = rows_of(arm, tmp_path, table)
+    assert_rows(rows, arm)
+    assert (rows.angle_unit, rows.length_unit) == ('deg', 'mm')
+    with pytest.raises(InputError, match=r"line 2, column A4: '.* rad' is not a number"):
+        rows_of(arm, tmp_path, table.replace('°', '', 3).replace('°', ' rad', 2))
+
+
+@pytest.mark.parametrize(
+    'change',
+    [
+        lambda t: t.replace('\n', '\r'),
+        lambda t: t + t,
+        lambda t: '| ' + t.replace(';', ' | ').replace('\n', ' |\n|---|---|\n| ', 1),
+        lambda t: t.replace('P', '#P').replace('#Punkt', 'Punkt'),
+    ],
+    ids=['old line ends', 'twice', 'Markdown', 'names like comments'],
+)
+def test_lines_that_are_no_rows(change, arm, tmp_path):
+    table = change(whole(arm, lambda v: f'{v:.6f}'))
+    if table.startswith('| '):
+        table = table.replace('\n', ' |\n| ').replace('|\n| | ', '|\n| ').removesuffix('| ')
+    twice = table.count('Punkt') > 1
+    rows = rows_of(arm, tmp_path, table)
+    assert_rows(rows, arm, np.tile(np.arange(COUNT), 2) if twice else slice(None))
+
+
+@pytest.mark.parametrize('word', ['NaN', 'None', '', '-', 'n/a', '#N/A', '#NV', 'NULL'])
+def test_rows_without_a_point_or_joints_are_left_out_and_listed(word, arm, tmp_path):
+    columns = [[f'{v:.6f}' for v in column] for column in (*degrees(arm), *millimetres(arm))]
+    for column in columns[6:]:
+        column[3] = word
+    for column in columns[:6]:
+        column[7] = word
+    rows = rows_of(arm, tmp_path, text(['Punkt', *AXES, 'X', 'Y', 'Z'], [POINTS, *columns], ';'))
+    assert_rows(rows, arm, np.delete(np.arange(COUNT), [3, 7]))
+    assert 'line 5: no point, left out' in ' '.join(rows.warnings)
+    assert 'line 9: no joints, left out' in ' '.join(rows.warnings)
+    columns[6][5] = word
+    with pytest.raises(InputError, match='line 7, column X'):
+        rows_of(arm, tmp_path, text(['Punkt', *AXES, 'X', 'Y', 'Z'], [POINTS, *columns], ';'))
+
+
+@pytest.mark.parametrize(
+    ('names', 'others', 'headers'),
+    [
+        ([f'KR6_{p}' for p in POINTS], POINTS, ('Point', 'Point')),
+        ([f'{p}_meas' for p in POINTS], [f'Pose {p[1:]}' for p in POINTS], ('Point', 'Point')),
+        ([f'{p[1:]}.0' for p in POINTS], [p[1:] for p in POINTS], ('id', 'id')),
+        (POINTS, POINTS, ('Bezeichnung', 'Lfd. Nr.')),
+        ([f'Point {p[1:]}' for p in POINTS], POINTS, ('Name', 'Pose')),
+        ([*range(COUNT)], [*range(COUNT)], ('', 'Unnamed: 0')),
+    ],
+    ids=['prefix', 'suffix', 'decimals', 'any header', 'pose', 'index'],
+)
+def test_names_that_differ_in_what_all_have(names, others, headers, arm, tmp_path):
+    order = np.random.default_rng(1).permutation(COUNT)[:-2]
+    points = text(
+        [headers[0], 'X', 'Y', 'Z'],
+        [[names[i] for i in order], *(column[order] for column in millimetres(arm))],
+    )
+    rows = rows_of(arm, tmp_path, points, joints_table(arm, others, headers[1]))
+    assert_rows(rows, arm, order)
+    assert 'rows joined by' in rows.description[-1]
+
+
+def test_numbers_of_a_log_are_no_names_of_points(arm, tmp_path):
+    log = text(['index', *AXES], [range(4 * COUNT), *(np.tile(c, 4) for c in degrees(arm))])
+    for header, names in (('Point', POINTS), ('index', range(COUNT))):
+        with pytest.raises(InputError, match='neither names nor times in common'):
+            rows_of(arm, tmp_path, points_table(arm, names, header), log)
+
+
+def test_two_collections_of_an_instrument_and_a_group(arm, tmp_path):
+    lines = [f'A Main {p} {x:.6f} {y:.6f} {z:.6f}' for p, (x, y, z) in zip(POINTS, arm.points)]
+    rows = rows_of(arm, tmp_path, '\n'.join(reversed(lines)) + '\n', joints_table(arm))
+    assert_rows(rows, arm, slice(None, None, -1))
+
+
+def test_times_to_the_minute_do_not_join(arm, tmp_path):
+    times = [f'05.03.2026 10:{i // 2:02d}' for i in range(COUNT)]
+    tables = points_table(arm, times, 'Zeit'), joints_table(arm, times, 'Zeit')
+    with pytest.raises(InputError, match='is the time of line 2 as well'):
+        rows_of(arm, tmp_path, *tables)
+    assert_rows(rows_of(arm, tmp_path, *tables, join='order'), arm)
+
+
+def test_dates_of_a_spreadsheet_are_days(arm, tmp_path):
+    days = [f'{46_086.4 + 30.0 * i / 86_400.0:.9f}' for i in range(COUNT)]
+    rows = rows_of(arm, tmp_path, points_table(arm, days, 'Zeit'), joints_table(arm, days, 'Zeit'))
+    assert_rows(rows, arm)
+    # 5 March 2026, 09:36.
+    np.testing.assert_allclose(rows.stamp_s - 1_772_703_360.0, 30.0 * np.arange(COUNT), atol=1e-3)
+
+
+def test_surveyors_letters(arm, tmp_path):
+    header = ['Point Id', 'Easting [m]', 'Northing [m]', 'Ortho. Height [m]']
+    for names in (header, ['Pt', 'E', 'N', 'H']):
+        table = text(names, [POINTS, *arm.points.T])
+        assert_rows(rows_of(arm, tmp_path, table, joints_table(arm)), arm)
+
+
+def test_the_robots_own_tool_is_no_measured_point(tmp_path, capsys):
+    arm = measured(rows=30)
+    believed = 1e3 * arm.chain.forward(arm.q)[:, :3, 3]
+    urdf = write(tmp_path, 'robot.urdf', arm.urdf)
+    head = ['pose', *AXES, 'px', 'py', 'pz', 'mx', 'my', 'mz']
+    table = text(head, [range(30), *degrees(arm), *believed.T, *millimetres(arm)])
+    command = ['import', str(write(tmp_path, 't.csv', table)), '--urdf', str(urdf)]
+    assert main([*command, '--out', str(tmp_path / 's')]) == 1
+    assert 'name the columns of the measured point with --points' in capsys.readouterr().err
+    assert main([*command, '--out', str(tmp_path / 's'), '--points', 'mx,my,mz']) == 0
+
+
+def test_the_robots_own_tool_in_a_log_of_joints_is_left_out(arm, tmp_path):
+    log = text(['Point', *AXES, 'px', 'py', 'pz'], [POINTS, *degrees(arm), *3 * [degrees(arm)[0]]])
+    rows = rows_of(arm, tmp_path, log, points_table(arm))
+    assert_rows(rows, arm)
+    assert 'px, py, pz left out, the points are in' in ' '.join(rows.warnings)
+
+
+def axes_of(row, letter='A'):
+    return ', '.join(f'{letter}{i} {v:.6f}' for i, v in enumerate(np.rad2deg(row), 1))
+
+
+def listed(row, degrees=True):
+    return ', '.join(f'{v:.8f}' for v in (np.rad2deg(row) if degrees else row))
+
+
+UNUSED = '[9E9,9E9,9E9,9E9,9E9,9E9]'
+PROGRAMS = {
+    'array of KUKA': lambda q: ''.join(
+        f'POSE[{i}]={{{axes_of(row)}}}\n' for i, row in enumerate(q, 1)
+    ),
+    'log of KUKA': lambda q: ''.join(
+        f'P{i}: {{E6AXIS: {axes_of(row)}}}\n' for i, row in enumerate(q, 1)
+    ),
+    'array of RAPID': lambda q: (
+        f'MODULE Calib\n  CONST jointtarget jCal{{{len(q)}}}:=['
+        + ',\n'.join(f'[[{listed(row)}],{UNUSED}]' for row in q)
+        + '];\nENDMODULE\n'
+    ),
+    'assigned in RAPID': lambda q: (
+        'MODULE Calib(SYSMODULE)\n'
+        + ''.join(f'  VAR jointtarget p{i};\n' for i in range(1, len(q) + 1))
+        + '  CONST robtarget pHome:=[[364,0,594],[0.5,0,0.9,0],[0,0,0,0],'
+        + f'{UNUSED}];\n  PROC init()\n'
+        + ''.join(f'    p{i}:=[[{listed(row)}],{UNUSED}];\n' for i, row in enumerate(q, 1))
+        + '  ENDPROC\nENDMODULE\n'
+    ),
+    'Staubli without keys': lambda q: (
+        '<dataList><jointRxData name="jPos" public="true">\n'
+        + ''.join(
+            '<valueJointRx '
+            + ' '.join(f'j{i}="{v:.6f}"' for i, v in enumerate(np.rad2deg(row), 1))
+            + '/>\n'
+            for row in q
+        )
+        + '</jointRxData></dataList>\n'
+    ),
+    'list of URScript': lambda q: (
+        'def calib():\n  poses = ['
+        + ', '.join(f'[{listed(row, False)}]' for row in q)
+        + ']\n  movej(poses[0], a=1)\nend\n'
+    ),
+    'log with names': lambda q: ''.join(
+        f'P{i}: [{listed(row, False)}]\n' for i, row in enumerate(q, 1)
+    ),
+    'log of a call': lambda q: ''.join(
+        f'get_actual_joint_positions() = [{listed(row, False)}]\n' for row in q
+    ),
+    'array of NumPy': lambda q: (
+        '[' + '\n '.join('[' + ' '.join(f'{v: .8f}' for v in row) + ']' for row in q) + ']\n'
+    ),
+    'degrees of a Yaskawa job': lambda q: (
+        '/JOB\n//NAME C\n//POS\n///NPOS 12,0,0,0,0,0\n///POSTYPE ANGLE\n///ANGLE\n'
+        + ''.join(f'C{i:05d}={listed(row)}\n' for i, row in enumerate(q, 1))
+        + '//INST\nNOP\nEND\n'
+    ),
+    'groups of FANUC': lambda q: (
+        '/PROG  CALIB\n/POS\n'
+        + ''.join(
+            f'P[{i}]{{\n   GP1:\n\tUF : 0, UT : 1,\t\n\t'
+            + ',\t'.join(f'J{j}= {v:.6f} deg' for j, v in enumerate(np.rad2deg(row), 1))
+            + '\n   GP2:\n\tUF : 0, UT : 1,\t\n\tJ1=   250.000  mm\n};\n'
+            for i, row in enumerate(q, 1)
+        )
+        + '/END\n'
+    ),
+}
+
+
+@pytest.mark.parametrize('form', PROGRAMS)
+def test_joints_of_programs_and_logs(form, arm, tmp_path):
+    content = PROGRAMS[form](arm.q)
+    rows = rows_of(
+        arm, tmp_path, text(['X', 'Y', 'Z'], [*millimetres(arm)]), content, join='order'
+    )
+    assert_rows(rows, arm)
+    if form not in ('log of a call', 'array of NumPy'):
+        first = 0 if form in ('Staubli without keys', 'list of URScript') else 1
+        names = range(first, COUNT + first)
+        assert_rows(rows_of(arm, tmp_path, points_table(arm, names), content), arm)
+
+
+def test_a_log_with_times(arm, tmp_path):
+    times = [f'2026-03-05 10:{i:02d}:00.123' for i in range(COUNT)]
+    content = ''.join(f'{t} INFO joints=[{listed(row, False)}]\n' for t, row in zip(times, arm.q))
+    table = points_table(arm, times, 'time')
+    assert_rows(rows_of(arm, tmp_path, table, content), arm)
+    lines = content.splitlines()
+    damaged = '\n'.join([*lines[:2], 'stopped', *lines[2:]])
+    with pytest.raises(InputError, match="line 3: 'stopped', where a list of 6 numbers"):
+        rows_of(arm, tmp_path, table, damaged)
+
+
+def test_what_tells_no_joints_says_what_to_give(arm, tmp_path):
+    job = PROGRAMS['degrees of a Yaskawa job'](arm.q)
+    module = f'MODULE M\n  CONST robtarget p1:=[[1,2,3],[1,0,0,0],[0,0,0,0],{UNUSED}];\nENDMODULE'
+    for content, words in (
+        (job.replace('ANGLE', 'PULSE'), 'line 7: positions in pulses of the motors'),
+        (job.replace('POSTYPE ANGLE', 'POSTYPE BASE'), 'no position of joints in this job'),
+        (module, 'there is no joint target in it'),
+        ('header:\n  stamp:\nname:\n- a\nposition:\n- 1.0\n---\n', 'ros2 topic echo --csv'),
+        ('*110001+00000000000000P1 21.102+0000000012345678\r\n', 'export coordinates'),
+    ):
+        with pytest.raises(InputError, match=re.escape(words)):
+            rows_of(arm, tmp_path, points_table(arm), content)
+
+
+@pytest.mark.parametrize(('width', 'unit', 'scale'), [(16, '8', 1e5), (8, '6', 1e4)])
+def test_coordinates_of_a_total_station(width, unit, scale, arm, tmp_path):
+    lines = []
+    for i, (name, point) in enumerate(zip(POINTS, arm.points), 1):
+        line = f'110{i:03d}+{name.rjust(width, "0")}'
+        for word, value in zip((81, 82, 83), np.round(scale * point).astype(int)):
+            line += f' {word}..1{unit}{"-" if value < 0 else "+"}{abs(value):0{width}d}'
+        lines.append('*' * (width == 16) + line + ' ')
+    rows = rows_of(arm, tmp_path, '\r\n'.join(lines), joints_table(arm))
+    np.testing.assert_allclose(rows.q, arm.q, atol=2e-6)
+    np.testing.assert_allclose(rows.position, arm.points, atol=0.51 / scale)
+
+
+# Streams
+
+
+@pytest.fixture(scope='module')
+def run():
+    return run_of(arm_of())
+
+
+def assert_stops(rows, arm):
+    np.testing.assert_allclose(rows.q, arm.q, atol=2e-6)
+    assert np.linalg.norm(rows.position - arm.points, axis=1).max() < 2e-4
+
+
+@pytest.mark.parametrize('form', ['without words', 'without the first line', 'a marker alone'])
+def test_takes_of_other_settings(form, run, tmp_path):
+    lines = take_of(run).split('\r\n')
+    if form == 'without words':
+        lines = [re.sub('^,(?:Type|Name|ID),', ',,', line) for line in lines]
+    if form == 'without the first line':
+        lines = lines[1:]
+    if form == 'a marker alone':
+        lines = fragments(lines)
+    rows = rows_of(run.arm, tmp_path, '\r\n'.join(lines), log_of(run))
+    assert_stops(rows, run.arm)
+    if form == 'a marker alone':
+        assert '3 markers without a label' in ' '.join(rows.warnings)
+
+
+def fragments(lines):
+    """Return a take in which a marker without a label has another name each time it is seen."""
+    start = next(i for i, line in enumerate(lines) if line.startswith('Frame,'))
+    place = lines[start - 1].split(',').index('Position')
+    kinds, names = ',Type' + 9 * ',Marker', ',Name'
+    for i in range(3):
+        names += 3 * f',Unlabeled {1000 + i}'
+    head = [lines[0], kinds, names, ',' + 9 * ',Position', 'Frame,Time (Seconds)' + 3 * ',X,Y,Z']
+    found = [line.split(',') for line in lines[start + 1 :] if line]
+    return head + [
+        ','.join((*cells[:2], *at * 3 * [''], *cells[place : place + 3], *(2 - at) * 3 * ['']))
+        for i, cells in enumerate(found)
+        for at in [3 * i // len(found)]
+    ]
+
+
+def test_a_labelled_marker_that_its_body_has_as_well(run, tmp_path):
+    """The measured marker, beside the one that the solution of the body puts there."""
+    take = take_of(run).split('\r\n')
+    head = [line.split(',') for line in take[2:4]]
+    for i, (kind, name) in enumerate(zip(*head)):
+        if (kind, name) == ('Marker', 'Unlabeled 1004'):
+            head[1][i] = 'tool:Marker1'
+    take[2:4] = [','.join(line) for line in head]
+    read = motive.read('\r\n'.join(take))
+    assert set(read.groups) == {'tool', 'base', 'tool:Marker1', 'Rigid Body Marker tool:Marker1'}
+
+
+def test_a_log_whose_topics_have_rows_of_their_own(run, tmp_path):
+    head, *lines = log_of(run).splitlines()
+    table = [f'{head},/other/value']
+    for line in lines:
+        stamp = float(line.split(',')[0])
+        table += [f'{line},', f'{stamp + 0.01:.6f}{"," * head.count(",")},1.5']
+    rows = rows_of(run.arm, tmp_path, take_of(run), '\n'.join(table) + '\n')
+    assert_stops(rows, run.arm)
+
+
+def test_points_that_ros_prints(run, tmp_path):
+    take = take_of(run).split('\r\n')
+    start = next(i for i, line in enumerate(take) if line.startswith('Frame,'))
+    place = take[start - 1].split(',').index('Position')
+    lines = []
+    for cells in (line.split(',') for line in take[start + 1 :] if line):
+        if cells[place]:
+            second, nanosecond = divmod(round(1e9 * float(cells[1])), 10**9)
+            x, y, z = (float(cell) / 1e3 for cell in cells[place : place + 3])
+            lines.append(f'{second},{nanosecond},tracker,{x:.9f},{y:.9f},{z:.9f}')
+    rows = rows_of(run.arm, tmp_path, '\n'.join(lines) + '\n', log_of(run))
+    assert_stops(rows, run.arm)
+    assert rows.length_unit == 'm'
+
+
+def test_whose_clock_a_time_is(run, tmp_path):
+    log = log_of(run).replace('__time', 'pc_ts')
+    assert_stops(rows_of(run.arm, tmp_path, take_of(run), log), run.arm)
