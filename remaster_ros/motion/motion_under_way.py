@@ -16,7 +16,7 @@ from remaster_ros.motion.following import (
     Seen,
     allowed_lag_s,
 )
-from remaster_ros.motion.joint_units import TURNING, JointUnits
+from remaster_ros.motion.joint_units import JointUnits
 from remaster_ros.motion.motion_gate import MotionGate
 from remaster_ros.motion.path_check import FreePath
 from remaster_ros.motion.settling import SettleDetector
@@ -115,7 +115,7 @@ class Braking:
     deadline: float  # Robot time until which it must stand there, s
     near: float  # How far from the end it may stand: what this arm was seen to stand off, rad
     patience_s: float  # `ASTRAY_S`, s of robot time
-    units: JointUnits = TURNING
+    units: JointUnits
 
     def judge(self, seen: Seen) -> Outcome:
         """Return whether the arm has come to rest where its stop ends, by a report."""

@@ -242,8 +242,13 @@ def rows(monkeypatch):
     step = arm_supervisor.ArmSupervisor._step
 
     def recorded(supervisor, event, *actions):
-        used.add((supervisor.state, event))
-        return step(supervisor, event, *actions)
+        before = supervisor.state
+        left = step(supervisor, event, *actions)
+        then = ARM[before][event]
+        assert supervisor.state is then.state
+        assert tuple(map(type, left)) == then.actions
+        used.add((before, event))
+        return left
 
     monkeypatch.setattr(arm_supervisor.ArmSupervisor, '_step', recorded)
     return used

@@ -7,6 +7,7 @@ import pytest
 
 from remaster_ros.motion.actions import SupervisorRules
 from remaster_ros.motion.following import ON_PATH_RAD, STANDING_S, Following, Seen
+from remaster_ros.motion.joint_units import TURNING
 from remaster_ros.motion.motion_under_way import MOVED_RAD, PROBE_WAIT_S, Braking, Visit
 from remaster_ros.motion.settling import SettleDetector, SettleRules
 from remaster_ros.motion.trajectory import Line, Trajectory
@@ -94,7 +95,7 @@ NEAR, PATIENCE_S = 2.0**-11, 0.5
 
 def braking(begins=0.0, over=0.0, deadline=4.0):
     times = (SENT_S + after_s for after_s in (begins, over, deadline))
-    return Braking(np.zeros(2), *times, NEAR, PATIENCE_S)
+    return Braking(np.zeros(2), *times, NEAR, PATIENCE_S, TURNING)
 
 
 @pytest.mark.parametrize(('off', 'outcome'), [(NEAR, 'over'), (NEAR + 1e-12, 'halted')])

@@ -140,13 +140,34 @@ def test_who_goes_on_after_an_interruption(seconds, released, alone, place):
     assert len(rig.said(Drive)) > count
 
 
-def test_a_bridge_that_was_away_for_long_waits_for_a_person():
+@pytest.mark.parametrize('topic', [False, True])
+def test_a_bridge_that_was_away_for_long_waits_for_a_person(topic):
+    """Also where the robot says now that it is released: nobody listened meanwhile."""
     for gone_s, alone in ((3.0, True), (20.0, False)):
         rig = Rig(begun=False)
         rig.supervisor.interrupted(rig.wall - gone_s)
+        if topic:
+            rig.do(rig.supervisor.emergency(False, rig.wall))
+            rig.do(rig.supervisor.observe('safety_link', '', rig.wall))
         rig.plan([0.3, 0.0])
         rig.run(4.0)
         assert bool(rig.said(Drive)) == alone
+
+
+def test_after_a_stop_the_next_move_begins_only_where_the_stop_led():
+    rig = Rig()
+    rig.go([0.3, 0.2])
+    rig.state = 'paused'
+    rig.run(3.0)
+    (end,) = rig.last(Stop).admitted.waypoints
+    rig.alter = lambda t, q: np.add(q, [0.1, 0.0])
+    rig.supervisor.reports.forget()
+    rig.run(1.5)
+    rig.state = 'running'
+    rig.run(2.0)
+    at = np.rad2deg(end.q[0] + 0.1)
+    assert rig.last(Halted).reason.startswith(f'{ASKED}a at {at:.2f} deg, +5.73 deg from there')
+    assert len(rig.said(Drive)) == 1
 
 
 def test_the_next_move_begins_only_where_the_last_command_led():
