@@ -271,15 +271,19 @@ def _joints(
             # `x1 y1 z1 x2 …` are points.
             if number is not None and not set(stem) & {*AXES}:
                 groups[stem].setdefault(number, i)
+        found_here: dict[tuple[str, ...], tuple[int, ...]] = {}
         for stem, columns in groups.items():
             numbers = sorted(columns)
             if len(numbers) > 1 and numbers in (
                 list(range(1, len(numbers) + 1)),
                 list(range(len(numbers))),
             ):
-                complete.setdefault(stem, tuple(columns[number] for number in numbers))
-        # A pendant's words are looked for where the robot's names and numbers give nothing.
-        if complete:
+                found_here[stem] = tuple(columns[number] for number in numbers)
+        # A pendant's words are looked for where the robot's names and numbers do not give all.
+        whole = any(len(columns) == len(joint_names) for columns in found_here.values())
+        if whole or not complete:
+            complete = found_here
+        if whole:
             break
     came_from = [stem for stem in complete if 'from' in stem]
     if came_from:

@@ -40,6 +40,7 @@ _GROUP_OF_CELL = re.compile(r'[+-]?\d{1,3}(?: \d{3})+(?:[.,]\d+)?', re.ASCII)
 # The line below the names of a table in Markdown, and the frame of one in ASCII.
 _ORNAMENT = re.compile(r'(?=.*(?:--|==))[\s|+:=-]+')
 _NUMBERS = re.compile(r'(?<![\w.,])[+-]?\d+(?:[.,]\d*)?(?!\w)')
+_LIST = re.compile(r'[\[(]([^\[\]()]*)[\])]')
 _NEVER = re.compile(r'(?!)')
 # Blanks, but not those before a unit in brackets: `X [mm]  Y [mm]`.
 _BLANKS = re.compile(r'\s+(?![\[(])')
@@ -155,7 +156,9 @@ def read_table(
         # Names of points may begin as comments do.
         comment, plain = _NEVER, [line for _, line in lines]
     separator = separator or _find_separator(plain[:SEEN_LINES])
-    split = [(number, line, _split(line, separator, path, number)) for number, line in lines]
+    split = _without_lists(
+        [(number, line, _split(line, separator, path, number)) for number, line in lines]
+    )
     width, first = _first_row(split, path, comment)
     header, preamble, named = _header(split[:first], width, separator)
     written = [cells for _, _, cells in split[:named]]
@@ -251,6 +254,39 @@ def _split(line: str, separator: str, path: Path, number: int) -> list[str]:
     return [c.replace(' ', '') if _GROUP_OF_CELL.fullmatch(c) else c for c in stripped]
 
 
+def _listed(cell: str) -> list[str]:
+    """Return the numbers of a list in a cell, as `[0.1, -1.5]`; [] where it is none."""
+    found = _LIST.fullmatch(cell)
+    cells = re.split(r'\s*[,;]\s*|\s+', found[1].strip()) if found else []
+    return cells if len(cells) > 1 and all(map(_PLAIN.fullmatch, cells)) else []
+
+
+def _without_lists(
+    split: list[tuple[int, str, list[str]]],
+) -> list[tuple[int, str, list[str]]]:
+    """Return the cells with each list in as many columns as it has numbers, with their names."""
+    first = next((cells for *_, cells in split if any(map(_listed, cells))), [])
+    widths = [len(_listed(cell)) for cell in first]
+    if not first:
+        return split
+    wide = []
+    for number, line, cells in split:
+        parts: list[str] = []
+        for i, cell in enumerate(cells):
+            width = widths[i] if len(cells) == len(widths) else 0
+            if width and not _listed(cell) and not is_missing(cell):
+                # Of a name.
+                parts += [
+                    f'{cell} {one}' for one in ('xyz' if width == 3 else range(1, width + 1))
+                ]
+            elif width and is_missing(cell):
+                parts += width * ['']
+            else:
+                parts += _listed(cell) or [cell]
+        wide.append((number, line, parts))
+    return wide
+
+
 def _without_units(
     rows: list[tuple[str, ...]], header: list[str]
 ) -> tuple[list[tuple[str, ...]], list[str]]:
@@ -282,7 +318,7 @@ def _find_separator(lines: Sequence[str]) -> str:
         widths = Counter(len(cells) for cells in split if _is_row(cells))
         width = widths.most_common(1)[0][0] if widths else 0
         count = sum(
-            sum(map(_is_number, cells)) for cells in split if len(cells) == width and width > 1
+            sum(map(_count, cells)) for cells in split if len(cells) == width and width > 1
         )
         if count > most:
             best, most = separator, count
@@ -293,8 +329,13 @@ def _is_number(cell: str) -> bool:
     return bool(_PLAIN.fullmatch(cell) or _THOUSANDS.fullmatch(cell) or _WITH_UNIT.fullmatch(cell))
 
 
+def _count(cell: str) -> int:
+    """Return how many numbers a cell has."""
+    return len(_listed(cell)) or int(_is_number(cell))
+
+
 def _is_row(cells: Sequence[str]) -> bool:
-    return sum(map(_is_number, cells)) >= _FEWEST_NUMBERS
+    return sum(map(_count, cells)) >= _FEWEST_NUMBERS
 
 
 def _first_row(

@@ -56,6 +56,7 @@ _AT_END = re.compile(r'[ _.-]([^ _.-]+)$')
 _ONLY_IN_BRACKETS = ('min', 'h', 'k')
 # One letter at the end of a name is no unit: `point_s`, `J_m`; but x_m is one.
 _COORDINATE_IN_M = re.compile(r'(?:^|.*[ _.-])[xyz]_m$', re.IGNORECASE)
+_MM_AT_ONCE = re.compile(r'[xyz]mm', re.IGNORECASE)
 
 
 def unit_of(text: str) -> str:
@@ -84,6 +85,8 @@ def split_unit(header: str) -> tuple[str, str]:
     long = found and (len(found[1]) > 1 or found[1] in '°"' or _COORDINATE_IN_M.match(header))
     if found and long and unit_of(found[1]) not in ('', *_ONLY_IN_BRACKETS):
         return header[: found.start()].strip(), unit_of(found[1])
+    if _MM_AT_ONCE.fullmatch(header):
+        return header[0], 'mm'
     if header.endswith('°'):
         return header[:-1].strip(), 'deg'
     return header.strip(), ''

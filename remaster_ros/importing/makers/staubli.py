@@ -9,12 +9,14 @@ from remaster_ros.importing.makers.named import NUMBER, Named, axes_in_order, un
 
 _TAG = re.compile(r'<[^<>]*>')
 _ATTRIBUTE = re.compile(r'([\w:]+)\s*=\s*"([^"]*)"')
+# Attributes beside the joints.
+_KNOWN = ('name', 'key', 'size', 'access', 'public', 'type', 'xsi:type')
 _JOINT = re.compile(r'j\d+')
 
 
 def read(text: str) -> Named | None:
     """Return the joints of a data file of VAL 3; None for anything else."""
-    if not re.search(r'<[^<>]*\bj1\s*=\s*"', text):
+    if not re.search(r'<[^<>]*\bj\d\s*=\s*"', text):
         return None
     found: list[tuple[int, str, dict[str, str]]] = []
     name, several = '', False
@@ -28,12 +30,24 @@ def read(text: str) -> Named | None:
         joints = {key.upper(): cell for key, cell in attributes.items() if _JOINT.fullmatch(key)}
         if not joints:
             continue
+        others = _ATTRIBUTE.sub('', tag[0].partition(' ')[2]).strip(' \t\r\n/>')
+        names = [match[1] for match in _ATTRIBUTE.finditer(tag[0])]
+        # A joint that is not written is at 0: nothing else may stand there.
+        if (
+            others
+            or len({*names}) < len(names)
+            or not {*names} <= {*_KNOWN, *map(str.lower, joints)}
+        ):
+            raise unexpected(number, tag[0], 'j1="…" j2="…" once each and nothing else')
         if not all(NUMBER.fullmatch(cell.strip()) for cell in joints.values()):
             raise unexpected(number, tag[0], 'j1="…" j2="…" with a number each')
         key = attributes.get('key', '') if several else ''
         if 'key' not in attributes and 'name' not in attributes:
             without_key.append((len(found), name))
         found.append((number, f'{name}[{key}]' if key else name, joints))
+    last = max((int(axis[1:]) for *_, joints in found for axis in joints), default=0)
+    zeros = {f'J{i}': '0' for i in range(1, last + 1)}
+    found = [(number, key, {**zeros, **joints}) for number, key, joints in found]
     # Elements of an array, where no keys are written.
     repeated, count = Counter(name for _, name in without_key), Counter[str]()
     for i, name in without_key:

@@ -83,6 +83,29 @@ def test_units_in_the_cells(arm, tmp_path):
 
 
 @pytest.mark.parametrize(
+    ('brackets', 'between', 'separator'), [('[]', ', ', ';'), ('()', ',', '\t'), ('[]', ' ', ',')]
+)
+def test_lists_in_the_cells(brackets, between, separator, arm, tmp_path):
+    def cells(values):
+        return [between.join(f'{v:.8f}' for v in row).join(brackets) for row in values]
+
+    content = text(
+        ['name', 'actual_q', 'marker'], [POINTS, cells(arm.q), cells(arm.points)], separator
+    )
+    rows = rows_of(arm, tmp_path, content)
+    assert_rows(rows, arm)
+    assert rows.joint_columns[0] == 'actual_q 1'
+
+
+def test_a_pendants_words_of_which_some_are_numbered(tmp_path):
+    arm = measured('ur5e', rows=COUNT)
+    words = ['Basis', 'Schulter', 'Ellbogen', 'Handgelenk_1', 'Handgelenk_2', 'Handgelenk_3']
+    header = ['Punkt', *(word.replace('_', ' ') for word in words), 'Xmm', 'Ymm', 'Zmm']
+    content = text(header, [POINTS, *degrees(arm), *millimetres(arm)])
+    assert_rows(rows_of(arm, tmp_path, content), arm)
+
+
+@pytest.mark.parametrize(
     'change',
     [
         lambda t: t.replace('\n', '\r'),
@@ -277,6 +300,22 @@ def test_joints_of_programs_and_logs(form, arm, tmp_path):
         first = 0 if form in ('Staubli without keys', 'list of URScript') else 1
         names = range(first, COUNT + first)
         assert_rows(rows_of(arm, tmp_path, points_table(arm, names), content), arm)
+
+
+def test_joints_that_val_3_does_not_write_are_at_0(arm, tmp_path):
+    lines = [
+        f'<Value key="{i}" ' + ' '.join(f'j{j}="{v:.6f}"' for j, v in enumerate(row, 1)) + ' />'
+        for i, row in enumerate(np.rad2deg(arm.q))
+    ]
+    lines[2] = '<Value key="2" j3="90" j5="-45" />'
+    data = '<Data name="jPos" xsi:type="array" type="jointRx" size="12">{}</Data>'
+    names = [f'jPos[{i}]' for i in range(COUNT)]
+    rows = rows_of(arm, tmp_path, points_table(arm, names), data.format('\n'.join(lines)))
+    np.testing.assert_allclose(np.rad2deg(rows.q[2]), [0, 0, 90, 0, -45, 0], atol=1e-9)
+    for wrong in ('k4="90"', 'j5="90"', '=90'):
+        lines[2] = f'<Value key="2" j5="-45" {wrong} />'
+        with pytest.raises(InputError, match='once each and nothing else'):
+            rows_of(arm, tmp_path, points_table(arm, names), data.format('\n'.join(lines)))
 
 
 def test_a_log_with_times(arm, tmp_path):
