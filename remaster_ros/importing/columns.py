@@ -293,6 +293,7 @@ def _joints(
     known = [stem for stem in usable if set(stem) <= _JOINT_WORDS | _REPORTED | {'*', '='}]
     best = [stem for stem in known if '=' in stem or _REPORTED & set(stem)] or known or usable
     sets = [complete[stem] for stem in best]
+    sets = [columns for columns in sets if len(columns) == len(joint_names)] or sets
     chosen = _only_one(table, sets, 'the joint angles', 'name them, base to tip, with --joints')
     _take(found, chosen, taken)
     return chosen

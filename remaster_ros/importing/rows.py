@@ -26,6 +26,8 @@ from remaster_ros.importing.text_table import (
 )
 from remaster_ros.importing.units import ANGLES, LENGTHS
 from remaster_ros.importing.values import (
+    DAY_S,
+    WITHOUT_DATE_S,
     joint_values,
     length_unit,
     numbers,
@@ -35,6 +37,7 @@ from remaster_ros.importing.values import (
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.transforms import inverse_poses
 from remaster_ros.session.files import read_limited
+from remaster_ros.session.observations import LENGTH_TOLERANCE
 from remaster_ros.types import AngleUnit, BoolArray, FloatArray, IntArray
 
 # Which row of the joints belongs to which row of the points: by name, by time or by order.
@@ -231,6 +234,10 @@ def _by_time(points: Table, joints: Table, within_s: float) -> Pairs | None:
         return None
     order = np.argsort(reported, kind='stable')
     reported = reported[order]
+    days = np.round((np.median(reported) - np.median(when)) / DAY_S)
+    if days and any(np.all(np.abs(t - WITHOUT_DATE_S) < 2.0 * DAY_S) for t in (when, reported)):
+        # One of the two has no dates.
+        when = when + days * DAY_S
     after = np.searchsorted(reported, when)
     before = np.clip(after - 1, 0, len(reported) - 1)
     after = np.clip(after, 0, len(reported) - 1)
@@ -570,6 +577,7 @@ def _values(
             std[i] = numbers(table, columns.stds[name], optional=True) * LENGTHS[length]
         if name in columns.orientations:
             turns[i] = numbers(table, columns.orientations[name], optional=True)
+            _refuse_no_turn(table, columns.orientations[name], turns[i])
     if stamp is None and options.told.time != 'none':
         stamp = times(*points)
         if stamp is None and joints[0] is not table:
@@ -635,6 +643,18 @@ def _refuse_part_of_a_point(table: TextTable, columns: Columns, raw: FloatArray)
             )
     if len(raw) > 1 and np.isnan(raw).all():
         raise InputError(f'{table.path}: it has no point that was measured')
+
+
+def _refuse_no_turn(table: TextTable, columns: Sequence[int], turns: FloatArray) -> None:
+    """Refuse quaternions that are none."""
+    off = np.abs(np.linalg.norm(turns, axis=1) - 1.0) > LENGTH_TOLERANCE
+    for row in np.flatnonzero(off)[:1]:
+        raise table.fault(
+            int(row),
+            columns[0],
+            'and the three beside it are no quaternion of length 1; correct them, or '
+            'leave the four cells of the row empty',
+        )
 
 
 def _moved(

@@ -34,11 +34,11 @@ _MISSING = {
     *('-', '--', '---', '–', '—', '?'),
 }
 # Groups of three digits apart by blanks or apostrophes; a plain blank may be a separator.
-_APART = r'(?<=\d)[{}](?=\d{{3}}(?!\d))'
-_GROUPS = re.compile(_APART.format("\u00a0\u2009\u202f'’"))
+_APART = "\u00a0\u2009\u202f'’"
+_GROUPS = re.compile(rf'(?<=\d)[{_APART}](?=\d{{3}}(?!\d))')
 _GROUP_OF_CELL = re.compile(r'[+-]?\d{1,3}(?: \d{3})+(?:[.,]\d+)?', re.ASCII)
 # The line below the names of a table in Markdown, and the frame of one in ASCII.
-_ORNAMENT = re.compile(r'(?=.*(?:--|==))[\s|+:=-]+')
+_ORNAMENT = re.compile(r'[\s|+:=-]+')
 _NUMBERS = re.compile(r'(?<![\w.,])[+-]?\d+(?:[.,]\d*)?(?!\w)')
 _LIST = re.compile(r'[\[(]([^\[\]()]*)[\])]')
 _NEVER = re.compile(r'(?!)')
@@ -92,10 +92,8 @@ class TextTable(Named):
     def number(self, row: int, column: int) -> float | None:
         """Return a cell as a number; None where it is empty."""
         cell = self.rows[row][column]
-        if is_missing(cell):
-            return None
-        value = parse_number(cell, self.decimal)
-        if value is None:
+        value = parse_number(cell, self.decimal) if cell else None
+        if value is None and not is_missing(cell):
             raise self.fault(row, column, 'is not a number; correct it or remove the row')
         return value
 
@@ -144,11 +142,13 @@ def read_table(
             raise InputError(f'{path}, {error}') from None
         if found is not None:
             return TextTable(path=path, encoding=encoding, **vars(found))
-    text = _GROUPS.sub('', text.replace('\r\n', '\n').replace('\r', '\n').replace('\u2212', '-'))
+    text = text.replace('\r\n', '\n').replace('\r', '\n').replace('\u2212', '-')
+    if any(sign in text for sign in _APART):
+        text = _GROUPS.sub('', text)
     lines = [
         (number, line)
         for number, line in enumerate(text.split('\n'), start=1)
-        if line.strip().strip(''.join(SEPARATORS)) and not _ORNAMENT.fullmatch(line)
+        if line.strip().strip(''.join(SEPARATORS)) and not _is_ornament(line)
     ]
     comment = _COMMENT
     plain = [line for _, line in lines if not comment.match(line)]
@@ -251,7 +251,13 @@ def _split(line: str, separator: str, path: Path, number: int) -> list[str]:
     except csv.Error as error:
         raise InputError(f'{path}, line {number}: {error}; correct the quotes') from None
     stripped = [cell.strip() for cell in cells]
-    return [c.replace(' ', '') if _GROUP_OF_CELL.fullmatch(c) else c for c in stripped]
+    return [
+        c.replace(' ', '') if ' ' in c and _GROUP_OF_CELL.fullmatch(c) else c for c in stripped
+    ]
+
+
+def _is_ornament(line: str) -> bool:
+    return ('--' in line or '==' in line) and bool(_ORNAMENT.fullmatch(line))
 
 
 def _listed(cell: str) -> list[str]:
@@ -265,7 +271,7 @@ def _without_lists(
     split: list[tuple[int, str, list[str]]],
 ) -> list[tuple[int, str, list[str]]]:
     """Return the cells with each list in as many columns as it has numbers, with their names."""
-    first = next((cells for *_, cells in split if any(map(_listed, cells))), [])
+    first = next((cells for *_, cells in split[:SEEN_LINES] if any(map(_listed, cells))), [])
     widths = [len(_listed(cell)) for cell in first]
     if not first:
         return split
@@ -293,6 +299,8 @@ def _without_units(
     """Return cells without the unit that all cells of a column have; it goes into its name."""
     header = list(header)
     for i, column in enumerate(zip(*rows)):
+        if not _WITH_UNIT.fullmatch(next((cell for cell in column if not is_missing(cell)), '')):
+            continue
         found = {cell: _WITH_UNIT.fullmatch(cell) for cell in column if not is_missing(cell)}
         units = {'' if match is None else match[2] for match in found.values()}
         if len(units) != 1 or '' in units or i >= len(header):
@@ -315,7 +323,9 @@ def _find_separator(lines: Sequence[str]) -> str:
                 split.append(_split(line, separator, Path(), 0))
             except InputError:
                 continue
-        widths = Counter(len(cells) for cells in split if _is_row(cells))
+        widths = Counter(
+            len(cells) for cells in split if sum(map(_count, cells)) >= _FEWEST_NUMBERS
+        )
         width = widths.most_common(1)[0][0] if widths else 0
         count = sum(
             sum(map(_count, cells)) for cells in split if len(cells) == width and width > 1
@@ -331,11 +341,11 @@ def _is_number(cell: str) -> bool:
 
 def _count(cell: str) -> int:
     """Return how many numbers a cell has."""
-    return len(_listed(cell)) or int(_is_number(cell))
+    return int(_is_number(cell)) or len(_listed(cell))
 
 
 def _is_row(cells: Sequence[str]) -> bool:
-    return sum(map(_count, cells)) >= _FEWEST_NUMBERS
+    return sum(map(_is_number, cells)) >= _FEWEST_NUMBERS
 
 
 def _first_row(

@@ -25,7 +25,9 @@ _EPOCHS = ((1e17, 'ns'), (1e14, 'us'), (1e11, 'ms'))
 # Days since 1900, as spreadsheets count: of 1995 to 2119. As seconds of some clock they would be a
 # session of less than half a minute.
 _SERIAL, _SERIAL_DAYS = (34_700.0, 80_000.0), 30.0
-_SERIAL_OF_1970, _DAY_S = 25_569.0, 86_400.0
+_SERIAL_OF_1970, DAY_S = 25_569.0, 86_400.0
+# Times of day without a date are those of 1 January 2000.
+WITHOUT_DATE_S = 946_684_800.0
 # More than one turn each way: no arm reports that in radians.
 _LARGEST_RAD = 2.1 * np.pi
 
@@ -168,9 +170,12 @@ def times(table: TextTable, columns: Columns) -> FloatArray | None:
         if value is None:
             raise table.fault(row, column, 'is no time; correct it, or say --time none')
         result[row] = value
-    serial = np.all((result > _SERIAL[0]) & (result < _SERIAL[1]))
-    if unit not in TIMES and serial and np.ptp(result) < _SERIAL_DAYS:
-        return (result - _SERIAL_OF_1970) * _DAY_S
+    if unit not in TIMES:
+        if np.all((result > _SERIAL[0]) & (result < _SERIAL[1])) and np.ptp(result) < _SERIAL_DAYS:
+            return (result - _SERIAL_OF_1970) * DAY_S
+        if np.all((result >= 0.0) & (result < 1.0)):
+            # A time of day as its share of the day: no session takes less than a second.
+            return result * DAY_S
     if unit not in TIMES:
         largest = np.abs(result).max(initial=0.0)
         unit = next((name for size, name in _EPOCHS if largest > size), 's')

@@ -16,9 +16,11 @@ _FEWEST, _MOST = 2, 12
 
 def read(text: str) -> Named | None:
     """Return the lists of a log, with their names or times; None for anything else."""
+    if not _LINE.fullmatch(text.lstrip().partition('\n')[0].rstrip('\r')):
+        return None
     lines = [(i, line) for i, line in enumerate(text.splitlines(), 1) if line.strip()]
     found = [(number, line, _LINE.fullmatch(line)) for number, line in lines]
-    if not found or not all(match for *_, match in found[:2]):
+    if not all(match for *_, match in found[:2]):
         return None
     rows: list[list[str]] = []
     before: list[str] = []

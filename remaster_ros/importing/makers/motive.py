@@ -27,6 +27,8 @@ _HEADLESS = re.compile(
 )
 _NUMBER = re.compile(r'[+-]?\d+(?:[.,]\d+)?(?:[eE][+-]?\d+)?', re.ASCII)
 _MOST_HEAD_LINES = 12
+# A marker that moves by less than this share of what others move is not on the arm.
+_STATIC = 0.02
 # What a tool carries, the likeliest kind first: the points of a body are of one solution.
 _KINDS = ('Rigid Body', 'Marker', 'Rigid Body Marker')
 
@@ -119,7 +121,7 @@ def read(text: str) -> Named | None:
             seen = next((groups[label] for label in one if cells[groups[label][0]]), where)
             moved = dict(zip(where, seen, strict=True))
             table[i] = tuple(cells[moved.get(c, c)] for c in range(len(cells)))
-        chosen = [one[0]]
+        chosen = [one[0], *(label for label in groups if label not in one)]
         notes = (f'{len(one)} markers without a label, of which never two are seen, are one',)
     version = (
         f'format {take.get("Format Version", "?").strip()}' if take else 'without its first line'
@@ -138,8 +140,19 @@ def read(text: str) -> Named | None:
 
 
 def _one_of(groups: Mapping[str, tuple[int, ...]], table: Sequence[tuple[str, ...]]) -> list[str]:
-    """Return the markers of which each frame has one at most; [] where there are no such two."""
-    columns = [places[0] for places in groups.values()]
-    if len(columns) < 2 or any(sum(bool(row[i]) for i in columns) > 1 for row in table):
-        return []
-    return list(groups)
+    """Return the markers that move, where each frame has one of them at most; else []."""
+    seen = {
+        label: [i for i, row in enumerate(table) if row[places[0]]]
+        for label, places in groups.items()
+    }
+    # What stays in its place is not on the arm.
+    extents = {label: _extent(table, groups[label], rows) for label, rows in seen.items() if rows}
+    moving = [label for label, size in extents.items() if size > _STATIC * max(extents.values())]
+    frames = [i for label in moving for i in seen[label]]
+    return moving if len(moving) > 1 and len({*frames}) == len(frames) else []
+
+
+def _extent(table: Sequence[tuple[str, ...]], places: Sequence[int], rows: Sequence[int]) -> float:
+    """Return the longest side of the box around a marker, in the unit of the take."""
+    sides = [[float(table[i][place].replace(',', '.')) for i in rows] for place in places]
+    return max(max(side) - min(side) for side in sides)

@@ -8,7 +8,7 @@ from remaster_ros.errors import InputError
 from remaster_ros.importing.makers.named import NUMBER, Named, axes_in_order, unexpected
 
 _MODULE = re.compile(
-    r'^\s*MODULE\s+\w+|^[^!\n]*\brobtarget\s+\w+\s*:=', re.IGNORECASE | re.MULTILINE
+    r'^[ \t]*MODULE[ \t]+\w+|\brobtarget[ \t]+\w+[ \t]*:=', re.IGNORECASE | re.MULTILINE
 )
 # Lines that end without a semicolon.
 _LINE = re.compile(
@@ -35,7 +35,11 @@ _EXPECTED = '[[…,…],[…]] with a number for each axis'
 
 def read(text: str) -> Named | None:
     """Return the joint targets of a module; None for anything else."""
-    known = _TARGET.search(text) or _MOVE.search(text) or _MODULE.search(text)
+    lower = text.lower()
+    # Looking for words is much faster than for patterns, and logs are large.
+    known = any(word in lower for word in ('jointtarget', 'moveabsj', 'robtarget', 'module')) and (
+        _TARGET.search(text) or _MOVE.search(text) or _MODULE.search(text)
+    )
     if not (known or _LISTED.search(text)):
         return None
     found: list[tuple[int, str, dict[str, str]]] = []

@@ -192,6 +192,31 @@ def test_dates_of_a_spreadsheet_are_days(arm, tmp_path):
     np.testing.assert_allclose(rows.stamp_s - 1_772_703_360.0, 30.0 * np.arange(COUNT), atol=1e-3)
 
 
+def test_times_of_day_are_those_of_the_dates_beside(arm, tmp_path):
+    clock = [f'10:{i:02d}:30' for i in range(COUNT)]
+    dates = [f'2026-03-05T{time}' for time in clock]
+    for times in (clock, [f'{(10 + (i + 0.5) / 60) / 24:.9f}' for i in range(COUNT)]):
+        tables = points_table(arm, times, 'Zeit'), joints_table(arm, times, 'Zeit')
+        assert_rows(rows_of(arm, tmp_path, *tables), arm)
+    tables = points_table(arm, clock, 'Zeit'), joints_table(arm, dates, 'stamp')
+    assert_rows(rows_of(arm, tmp_path, *tables), arm)
+
+
+def test_quaternions_beside_the_joints(arm, tmp_path):
+    header = ['Point', *AXES, 'X', 'Y', 'Z', 'Q0', 'Q1', 'Q2', 'Q3']
+    turns = [np.ones(COUNT), *3 * [np.zeros(COUNT)]]
+    content = text(header, [POINTS, *degrees(arm), *millimetres(arm), *turns])
+    assert_rows(rows_of(arm, tmp_path, content), arm)
+    content = text(
+        [*header[:-4], 'qx', 'qy', 'qz', 'qw'],
+        [POINTS, *degrees(arm), *millimetres(arm), *4 * [np.zeros(COUNT)]],
+    )
+    with pytest.raises(
+        InputError, match=r't0.txt, line 2, column qx: .* no quaternion of length 1'
+    ):
+        rows_of(arm, tmp_path, content)
+
+
 def test_surveyors_letters(arm, tmp_path):
     header = ['Point Id', 'Easting [m]', 'Northing [m]', 'Ortho. Height [m]']
     for names in (header, ['Pt', 'E', 'N', 'H']):
@@ -388,13 +413,24 @@ def fragments(lines):
     """Return a take in which a marker without a label has another name each time it is seen."""
     start = next(i for i, line in enumerate(lines) if line.startswith('Frame,'))
     place = lines[start - 1].split(',').index('Position')
-    kinds, names = ',Type' + 9 * ',Marker', ',Name'
+    kinds, names = ',Type' + 12 * ',Marker', ',Name'
     for i in range(3):
         names += 3 * f',Unlabeled {1000 + i}'
-    head = [lines[0], kinds, names, ',' + 9 * ',Position', 'Frame,Time (Seconds)' + 3 * ',X,Y,Z']
+    names += 3 * ',Unlabeled 2000'
+    head = [lines[0], kinds, names, ',' + 12 * ',Position', 'Frame,Time (Seconds)' + 4 * ',X,Y,Z']
     found = [line.split(',') for line in lines[start + 1 :] if line]
     return head + [
-        ','.join((*cells[:2], *at * 3 * [''], *cells[place : place + 3], *(2 - at) * 3 * ['']))
+        ','.join(
+            (
+                *cells[:2],
+                *at * 3 * [''],
+                *cells[place : place + 3],
+                *(2 - at) * 3 * [''],
+                '500.0',
+                '0.0',
+                '0.0',
+            )
+        )
         for i, cells in enumerate(found)
         for at in [3 * i // len(found)]
     ]
