@@ -413,7 +413,9 @@ def _points(
     return markers
 
 
-_NAME_POINTS = 'name the three columns of the point, or three for each marker, with --points'
+_NAME_POINTS = (
+    'name the three columns of the point, three for each marker, or the markers, with --points'
+)
 
 
 def _orientations(headers: Sequence[_Header], taken: set[int], found: Columns) -> None:

@@ -49,9 +49,10 @@ How = Literal['', 'name', 'time', 'order']
 _STILL_DEG = 0.05
 # Between the parts of a name: SpatialAnalyzer's collection::group::point, and paths.
 _PATH = re.compile(r'::|[/\\|]')
-# The last of the levels at which names are compared, how many names that takes, and how many times
-# as many the other table may have.
-_OWN_PART, _FEWEST_NAMES, _MOST_TIMES = 3, 4, 3
+# From this level of comparing names on it takes so many of them, and the other table has at most
+# so many times as many.
+_OWN_PART, _LAST_WORD, _FEWEST_NAMES, _MOST_TIMES = 3, 4, 4, 3
+_WORDS = re.compile(r'[\s_.-]+')
 # A number with a decimal sign is measured, no name.
 _MEASURED = re.compile(r'[+-]?\d*[.,]\d+(?:[eE][+-]?\d+)?')
 _BRACKETS = re.compile(r'[\[\](){}_\s-]')
@@ -114,18 +115,18 @@ def common_names(
 
     `P01`, `p1` and `P1 ` are the same; where no names are, then the last parts (`A::KR6::P1` and
     `P1`), then those without brackets and underscores (`P[1]`), then what is not the same in all
-    names of a table (`KR6_P1` and `Pose 1`), where one table has all names of the other. If not
-    `by_header`, any column may have the names.
+    names of a table (`KR6_P1` and `Pose 1`), then the last words (`KR6_P1` and `P1`); in these two
+    one table has all names of the other. If not `by_header`, any column may have the names.
     """
     named = [(i, j) for i in points[1].others['name'] for j in joints[1].others['name']]
-    for level in range(_OWN_PART + 1):
+    for level in range(_LAST_WORD + 1):
         found = _matching(points, joints, level, named, level < _OWN_PART)
         if found is not None:
             return found
     if by_header:
         return None
     pairs = [(i, j) for i in _spare(*points) for j in _spare(*joints)]
-    for level in range(_OWN_PART + 1):
+    for level in range(_LAST_WORD + 1):
         found = _matching(points, joints, level, pairs, False)
         if found is not None:
             return found
@@ -203,12 +204,14 @@ def _keys(table: TextTable, column: int, level: int) -> list[str]:
     """Return names as they are compared.
 
     0 whole, 1 their last parts, 2 those without brackets, 3 without what all of them begin and end
-    with.
+    with, 4 their last words.
     """
     names = [row[column] for row in table.rows]
     if level > 0:
         names = [_PATH.split(name.strip())[-1] for name in names]
-    if level == _OWN_PART:
+    if level == _LAST_WORD:
+        names = [_WORDS.split(name.strip())[-1] for name in names]
+    elif level == _OWN_PART:
         begin = _common([name.casefold() for name in names])
         end = _common([name[begin:][::-1].casefold() for name in names])
         names = [name[begin : len(name) - end] for name in names]
@@ -436,7 +439,7 @@ def read_rows(paths: Sequence[Path], chain: SerialChain, options: TableOptions) 
         (
             table,
             find_columns(
-                table, chain.joint_names, _of_file(options.told, table.path, paths), sliding
+                table, chain.joint_names, _of_table(options.told, table, tables), sliding
             ),
         )
         for table in tables
@@ -725,6 +728,18 @@ def _meaning(
         if i in places:
             return f'{kind}{by_place}'
     return 'not used'
+
+
+def _of_table(told: Told, table: TextTable, tables: Sequence[TextTable]) -> Told:
+    """Return what was told of one table: numbers are of a table that has no names."""
+    own = _of_file(told, table.path, [one.path for one in tables])
+    if not table.has_header or all(one.has_header for one in tables):
+        return own
+    points, joints = (
+        () if names and all(map(str.isdigit, names)) else names
+        for names in (own.points, own.joints)
+    )
+    return replace(own, points=points, joints=joints)
 
 
 def _of_file(told: Told, path: Path, paths: Sequence[Path]) -> Told:

@@ -41,6 +41,7 @@ _GROUP_OF_CELL = re.compile(r'[+-]?\d{1,3}(?: \d{3})+(?:[.,]\d+)?', re.ASCII)
 _ORNAMENT = re.compile(r'[\s|+:=-]+')
 _NUMBERS = re.compile(r'(?<![\w.,])[+-]?\d+(?:[.,]\d*)?(?!\w)')
 _LIST = re.compile(r'[\[(]([^\[\]()]*)[\])]')
+_JSON = re.compile(r'\s*(?:\{\s*"|\[\s*\{)')
 _NEVER = re.compile(r'(?!)')
 # Blanks, but not those before a unit in brackets: `X [mm]  Y [mm]`.
 _BLANKS = re.compile(r'\s+(?![\[(])')
@@ -142,6 +143,10 @@ def read_table(
             raise InputError(f'{path}, {error}') from None
         if found is not None:
             return TextTable(path=path, encoding=encoding, **vars(found))
+    if _JSON.match(text):
+        raise InputError(
+            f'{path}: this is JSON, not a table; save it as CSV, a row for each configuration'
+        )
     text = text.replace('\r\n', '\n').replace('\r', '\n').replace('\u2212', '-')
     if any(sign in text for sign in _APART):
         text = _GROUPS.sub('', text)

@@ -11,6 +11,7 @@ from foreign_tables import measured, text, write
 
 from remaster_ros.cli.main import main
 from remaster_ros.errors import InputError
+from remaster_ros.importing.columns import Told
 from remaster_ros.importing.makers import motive
 from remaster_ros.importing.rows import TableOptions, read_rows
 
@@ -161,6 +162,20 @@ def test_names_that_differ_in_what_all_have(names, others, headers, arm, tmp_pat
     rows = rows_of(arm, tmp_path, points, joints_table(arm, others, headers[1]))
     assert_rows(rows, arm, order)
     assert 'rows joined by' in rows.description[-1]
+
+
+def test_names_whose_last_words_are_those_of_the_other(arm, tmp_path):
+    """Points of the instrument alone stand between."""
+    names = ['REF1', 'REF_2', *(f'KR6_{name}' for name in POINTS)]
+    points = [np.concatenate((column[:2], column)) for column in millimetres(arm)]
+    content = text(['Point', 'X', 'Y', 'Z'], [names, *points])
+    assert_rows(rows_of(arm, tmp_path, content, joints_table(arm)), arm)
+
+
+def test_numbers_of_columns_are_of_the_table_without_names(arm, tmp_path):
+    content = text([], [POINTS, *millimetres(arm), *3 * [[0.011] * COUNT]])
+    told = Told(points=('2', '3', '4'))
+    assert_rows(rows_of(arm, tmp_path, content, joints_table(arm), told=told), arm)
 
 
 def test_numbers_of_a_log_are_no_names_of_points(arm, tmp_path):
@@ -361,6 +376,7 @@ def test_what_tells_no_joints_says_what_to_give(arm, tmp_path):
         (job.replace('ANGLE', 'PULSE'), 'line 7: positions in pulses of the motors'),
         (job.replace('POSTYPE ANGLE', 'POSTYPE BASE'), 'no position of joints in this job'),
         (module, 'there is no joint target in it'),
+        ('[{"q": [1, 2], "p": [3, 4, 5]}]', 'this is JSON, not a table'),
         ('header:\n  stamp:\nname:\n- a\nposition:\n- 1.0\n---\n', 'ros2 topic echo --csv'),
         ('*110001+00000000000000P1 21.102+0000000012345678\r\n', 'export coordinates'),
     ):
