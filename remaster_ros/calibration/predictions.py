@@ -5,16 +5,26 @@ carried through the model's derivative J, and the covariance R of the sensor's n
 
     C = J Σ J' + R,    R = σ_across² I + (σ_along² − σ_across²) s s'
 
-with s the direction of the line of sight. A measurement lies in the 95 % region where its squared
-Mahalanobis distance is below the quantile of chi-squared with three degrees of freedom.
+with s the direction of the line of sight, and variances that are means over the posterior. A
+measurement lies in the 95 % region where its squared Mahalanobis distance is below the quantile of
+chi-squared with three degrees of freedom. C is multiplied by one factor, the largest of these:
 
-A model is never quite right, and its errors on poses that it was fitted to are smaller than on
-others. So C is multiplied by one factor, at least 1, such that 95 % of the fitted rows lie in
-their regions when their whole pose is left out (cross-validation; Vovk et al. 2005). Gross errors
-do not count. For a pose with the errors e, the rows' noise R and M = J Σ J' the errors
-left out and their covariance are, without another fit::
+*1.*
+
+*For a noise that is uncertain.* Few poses determine badly what the rows of a pose share, and all
+errors are as large as that is: a mixture of Gaussians with the covariances τ² C, the posterior of
+τ² being that of the sensor's variance over its mean. As Student's t, it has longer tails than a
+Gaussian with the same covariance: 95 % of it lies below the q with mean F(q / τ²) = 0.95, F being
+the distribution of chi-squared.
+
+*For a model that is never quite right.* Its errors on poses that it was fitted to are smaller than
+on others. 95 % of the fitted rows lie in their regions when their whole pose is left out
+(cross-validation; Vovk et al. 2005). Gross errors do not count. For a pose with the errors e, the
+rows' noise R and M = J Σ J' the errors left out and their covariance are, without another fit::
 
     e_out = R (R − M)⁻¹ e,    C_out = R (R − M)⁻¹ R
+
+Of three or four poses none can be left out, as each determines a registration.
 """
 
 from __future__ import annotations
@@ -88,7 +98,7 @@ def predict(
     measurements
         Those that were fitted, in the model's order of sensors and markers.
     widening
-        The factor on standard deviations; None where poses left out one by one determine it.
+        The factor on standard deviations; None where the fit and its poses determine it.
     """
     model, draws = fit.predictive.model, fit.predictive.draws
     root = (draws - draws.mean(axis=0)) / np.sqrt(max(1, len(draws) - 1))
@@ -107,13 +117,37 @@ def predict(
         covariance[source] = turn @ found @ np.swapaxes(turn, 1, 2)
     limit = float(scipy.special.chdtri(3, 1.0 - REGION))
     if widening is None:
+        reached = [limit, _distance_of_uncertain_noise(fit, measurements, limit)]
         left_out = _left_out_distances(fit, measurements, triangle)
-        widening = 1.0
         if len(left_out) >= FEWEST_ROWS:
-            widening = max(1.0, float(np.sqrt(np.quantile(left_out, REGION) / limit)))
+            reached.append(float(np.quantile(left_out, REGION)))
+        widening = float(np.sqrt(max(reached) / limit))
     covariance *= widening**2
     distance = squared_distances(measurements.position - position, covariance)
     return Predictions(position, covariance, distance <= limit, widening)
+
+
+def _distance_of_uncertain_noise(
+    fit: FitResult, measurements: Measurements, limit: float
+) -> float:
+    """Return the squared distance that 95 % of errors of a noise as uncertain as its stay below.
+
+    ``limit``: that of a known noise, from which on it is sought.
+    """
+    rows = np.bincount(measurements.sensor, minlength=len(fit.predictive.model.sensor_names))
+    along, across = np.moveaxis(fit.predictive.sigma[..., rows > 0, :] ** 2, -1, 0)
+    variance = (along + 2.0 * across) / 3.0
+    squares = variance / variance.mean(axis=0)
+    share = rows[rows > 0] / rows.sum()
+
+    def beyond(distance: float) -> float:
+        inside = scipy.special.chdtr(3, distance / squares).mean(axis=0) @ share
+        return REGION - float(inside)
+
+    if beyond(limit) <= 0.0:
+        return limit
+    # Of a posterior however wide: at the largest draw nothing is beyond.
+    return float(scipy.optimize.brentq(beyond, limit, 10.0 * limit * float(squares.max())))
 
 
 def squared_distances(errors: FloatArray, covariance: FloatArray) -> FloatArray:
@@ -179,7 +213,7 @@ class _Part:
 def _variances(fit: FitResult) -> FloatArray:
     """Return the noise of a row, shared by a pose and by a frame, m², (3, sensors, 2).
 
-    The last axis is along and across the line of sight.
+    Means of the posterior's variances; the last axis is along and across the line of sight.
     """
     variances = []
     for name in fit.predictive.model.sensor_names:
@@ -188,9 +222,9 @@ def _variances(fit: FitResult) -> FloatArray:
         variances.append(
             [
                 (
-                    side.sigma_m**2,
-                    (side.pose_sigma_m or 0.0) ** 2,
-                    (side.frame_sigma_m or 0.0) ** 2,
+                    side.sigma_m**2 + side.std_m**2,
+                    (side.pose_sigma_m or 0.0) ** 2 + (side.pose_std_m or 0.0) ** 2,
+                    (side.frame_sigma_m or 0.0) ** 2 + (side.frame_std_m or 0.0) ** 2,
                 )
                 for side in sides
             ]
