@@ -3,7 +3,9 @@
 The fitted noise is what the model leaves: it contains the errors of a tracker that was moved, of a
 compliant joint, of a sensor with a wrong scale. Two figures depend less on the model's errors:
 what the scatter of its frames leaves in their mean, which is the reading, and how far the errors
-of the joint solutions of one pose differ, which the sensor measures at one place.
+of the joint solutions of one pose differ, which the sensor measures at one place. Where no samples
+show it, noise is no more than what an arm errs by that nobody has calibrated: nobody calibrates
+arms with such an instrument, and a model that does not hold leaves errors of any size.
 """
 
 from __future__ import annotations
@@ -20,6 +22,7 @@ from remaster_ros.calibration.outliers import (
     gross_probability,
     robust_scale,
 )
+from remaster_ros.calibration.priors import UNCALIBRATED_ERROR_M
 from remaster_ros.types import BoolArray, FloatArray, IntArray, Measurements
 
 # Errors that all solutions of a pose share belong to a sensor's noise as well: 0.5 mm beside
@@ -96,10 +99,37 @@ class NoiseCheck:
     @property
     def explained(self) -> bool | None:
         """Whether noise explains the error; None where the noise is unknown."""
+        if self.is_of_no_instrument:
+            return False
         if self.noise_error_m is None:
             return None
-        few = 1.0 + 1.0 / np.sqrt(self.poses)
-        return bool(self.error_m <= MOST * few * self.noise_error_m)
+        return bool(self.error_m <= MOST * self._few * self.noise_error_m)
+
+    @property
+    def is_of_no_instrument(self) -> bool:
+        """Whether the error is more than any instrument's that its own samples do not show."""
+        most = MEAN_LENGTH * self.spread * self._few * UNCALIBRATED_ERROR_M
+        shown = self.stated_m is not None and self.stated_m >= UNCALIBRATED_ERROR_M
+        return bool(self.error_m > most) and not shown
+
+    @property
+    def no_instrument(self) -> str:
+        """What that means, a sentence; '' of an error that is not so large."""
+        if not self.is_of_no_instrument:
+            return ''
+        return (
+            f'The error at {self.sensor} is {1e3 * self.error_m:.3f} mm, and no instrument that '
+            'arms are measured with has such noise, nor do its own samples show it: an arm that '
+            f'nobody has calibrated errs by {1e3 * UNCALIBRATED_ERROR_M:.0f} mm at most. Check '
+            'that each point stands beside its own joints, that every marker turns with the tool '
+            'and was not computed from another one, and that the URDF is that of this arm; of a '
+            'table "remaster import" tells what it finds wrong, without --unchecked.'
+        )
+
+    @property
+    def _few(self) -> float:
+        """How much more the mean of few poses may be by chance."""
+        return float(1.0 + 1.0 / np.sqrt(self.poses))
 
 
 def check_noise(

@@ -268,8 +268,11 @@ class _Checks:
         )
 
     def beyond_stated(self) -> Iterator[Unexplained]:
-        """Errors larger than what the sensor itself states allows."""
+        """Errors larger than what the sensor itself states allows, or any instrument."""
         for check in self.fit.noise_checks:
+            if check.is_of_no_instrument:
+                yield Unexplained('noise', 'unknown', check.error_m, np.nan, check.no_instrument)
+                continue
             if check.stated_m is None or check.explained is not False:
                 continue
             stating = the('sensor', check.sensor)

@@ -271,6 +271,8 @@ def _dominated(result: FitResult, unexplained: Sequence[NoiseCheck]) -> str:
     deed = f'{SEARCH}.'
     if result.chain.slides.any():
         deed = '"remaster discover" does not take an arm with a joint that slides.'
+    if any(check.is_of_no_instrument for check in unexplained):
+        return 'But what is left is no noise of any instrument: the model does not hold.'
     if not any(check.noise_m is not None for check in unexplained):
         return (
             'But what is left has structure, which noise has not: other errors dominate; ' + deed
@@ -280,6 +282,8 @@ def _dominated(result: FitResult, unexplained: Sequence[NoiseCheck]) -> str:
 
 def _compared(check: NoiseCheck) -> str:
     """Return the figures of a sensor whose error noise does not explain."""
+    if check.is_of_no_instrument:
+        return check.no_instrument
     if check.noise_error_m is None:
         return (
             f'{check.sensor}: no reading has a standard deviation, and no pose was seen in two '
@@ -640,7 +644,7 @@ def fit_lines(fit: Fit) -> list[str]:
     if isinstance(fit.geometry, Struct) and (moved := fit.geometry.imitations):
         lines.append(as_drawn(fit.geometry, [max(moved, key=lambda one: one.deg)]))
         if fit.geometry.file:
-            lines += _to_load(loadable_of_fit(fit.geometry), '')
+            lines += _to_load(loadable_of_fit(fit.geometry))
     if any(row.unit == 'mm' for row in fit.joint_offsets):
         lines.append(
             'of an arm with a joint that slides neither lengths and tilts off their drawing nor '
@@ -662,12 +666,17 @@ def _offset(row: JointOffset) -> str:
     return f'{row.mean_deg:+9.4f} ± {row.std_deg:.4f} deg'
 
 
-def _to_load(rows: Sequence[Loadable], taken_out: str) -> list[str]:
+def _to_load(rows: Sequence[Loadable], effects: Sequence[Effect] = ()) -> list[str]:
     lines = []
     for row in rows:
         what, to_do = load_words(row)
         mean = row.held_out_mean_mm
-        error = '' if mean is None else f', mean error on held-out poses {mean:.3f} mm{taken_out}'
+        error = '' if mean is None else f', mean error on held-out poses {mean:.3f} mm'
+        if mean is not None and any(
+            effect.of_measurement if row.result == 'everything' else effect.is_taken_out
+            for effect in effects
+        ):
+            error += ' (measuring errors taken out)'
         lines.append(f'to load: {what}{error}: {to_do}')
     return lines
 
@@ -685,8 +694,7 @@ def discovery_lines(found: Discovered) -> list[str]:
             for other in effect.confusable_with
         ]
     lines += [f'unexplained: {left.next}' for left in found.unexplained or ()]
-    measured = any(effect.of_measurement for effect in found.effects)
-    lines += _to_load(found.loadable or (), ' (measuring errors taken out)' if measured else '')
+    lines += _to_load(found.loadable or (), found.effects)
     regions = found.predicted_regions95
     if isinstance(regions, Struct) and (
         words := coverage_words(regions.held_out, found.gain.held_out_gross)
