@@ -103,10 +103,10 @@ class Discovery:
         Structure that no cause explains.
     alone
         The sampled fit whose zero-offsets are right where nothing else of the arm is corrected:
-        with errors of the measurement taken out, and no other.
+        with errors of the measurement taken out where they are certain, and no other.
     geometry
-        All lengths and tilts beside the zero-offsets, errors of the measurement taken out; None
-        where they cannot be fitted.
+        All lengths and tilts beside the zero-offsets, the same taken out; None where they cannot
+        be fitted.
     """
 
     verdict: Verdict
@@ -246,9 +246,14 @@ def discover_session(
     if any(effect.tied for effect in (*effects[:1], *leading)):
         verdict = 'undetermined'
     report('fitting what can be loaded', 0.0)
-    measured = [cell for group in groups if group[0].of_measurement for cell in group]
+    measured = [
+        cell
+        for effect, group in zip(effects, groups, strict=False)
+        if effect.is_taken_out
+        for cell in group
+    ]
     alone = fit
-    if not all(effect.of_measurement for effect in effects):
+    if not all(effect.is_taken_out for effect in effects):
         errors = search.fit(measured) if measured else None
         alone = fit_session(
             session,

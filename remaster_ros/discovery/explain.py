@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
 
@@ -170,13 +170,25 @@ class FoundEffect:
     @property
     def sigmas(self) -> float:
         """Size of its clearest parameter in standard deviations."""
-        known = [abs(one.value) / one.std for one in self.parameters if one.std > 0.0]
-        return max(known, default=np.inf)
+        return clearest((one.value, one.std) for one in self.parameters)
 
     @property
     def is_certain(self) -> bool:
         """Whether its clearest parameter is clearly not nothing."""
         return self.sigmas >= UNCERTAIN
+
+    @property
+    def is_taken_out(self) -> bool:
+        """Whether what is loaded is fitted with it beside, as it is no error of the arm.
+
+        Where it may be nothing, lengths and offsets that imitate it may be right.
+        """
+        return self.of_measurement and self.is_certain
+
+
+def clearest(parameters: Iterable[tuple[float, float]]) -> float:
+    """Return the largest of some (value, std) in standard deviations; infinite of known ones."""
+    return max((abs(value) / std for value, std in parameters if std > 0.0), default=np.inf)
 
 
 def _later(remedy: str) -> str:

@@ -194,12 +194,12 @@ def _model(
 
 
 def all_taken_out(found: Discovered | None) -> bool:
-    """Whether all causes lie in how the arm was measured, and there is at least one."""
+    """Whether all causes surely lie in how the arm was measured, and there is at least one."""
     return (
         found is not None
         and found.verdict != 'undetermined'
         and bool(found.effects)
-        and all(effect.of_measurement for effect in found.effects)
+        and all(effect.is_taken_out for effect in found.effects)
     )
 
 

@@ -274,8 +274,10 @@ def _remarks(discovery: Discovery) -> list[str]:
     held = [effect for effect in discovery.effects if effect.in_robot_model]
     left = [effect for effect in discovery.effects if effect not in (*measured, *held)]
     remarks = []
-    if measured:
-        remarks.append(f'Taken out, as errors of the measurement: {_titles(measured)}.')
+    if certain := [effect for effect in measured if effect.is_taken_out]:
+        remarks.append(f'Taken out, as errors of the measurement: {_titles(certain)}.')
+    if doubtful := [effect for effect in measured if not effect.is_taken_out]:
+        remarks.append(f'Not taken out, as they are not certain: {_titles(doubtful)}.')
     if held:
         where = (
             f'{MODEL_FILE} has them, with zero-offsets of its own: load it in place of this file'
