@@ -106,6 +106,18 @@ def ur_moves(names, q):
     return '\n'.join(['def calib():', *[f'  movej([{", ".join(r)}], a=1.4)' for r in rows], 'end'])
 
 
+def kuka_named_log(names, q):
+    return '\n'.join(f'{name}: {{E6AXIS: {_kuka(row, ", ")}}}' for name, row in zip(names, q))
+
+
+def yaskawa(names, q):
+    lines = ['/JOB', '//NAME CALIB', '//POS', f'///NPOS {len(q)},0,0,0,0,0', '///TOOL 0']
+    lines += ['///POSTYPE ANGLE', '///ANGLE']
+    lines += [f'{n}={",".join(f"{v:.4f}" for v in row)}' for n, row in zip(names, q)]
+    lines += ['//INST', '///DATE 2026/03/05 10:00', 'NOP', 'END']
+    return '\n'.join(lines) + '\n'
+
+
 KINDS = {
     'kuka_dat': Kind(kuka_dat, comment=';'),
     'kuka_src': Kind(kuka_src, named=False, comment=';'),
@@ -115,6 +127,8 @@ KINDS = {
     'rapid_log': Kind(rapid_log, named=False, comment='!'),
     'rokae': Kind(rokae, comment='!'),
     'staubli': Kind(staubli, one_line=False),
+    'kuka_named_log': Kind(kuka_named_log, comment=';'),
+    'yaskawa': Kind(yaskawa),
     'ur_script': Kind(ur_script, comment='#'),
     'ur_moves': Kind(ur_moves, named=False, comment='#'),
 }

@@ -38,6 +38,8 @@ def read(text: str) -> Named | None:
                 found.append((number, position[1], axes))
             else:
                 places += 1
+        elif '=' in line or not line.strip().startswith('/'):
+            raise unexpected(number, line, 'a position such as C00001=…')
     if pulses and not found:
         raise InputError(
             f'line {pulses}: positions in pulses of the motors, which tell no angles without the '

@@ -17,7 +17,7 @@ _LINE = re.compile(
     re.IGNORECASE,
 )
 # An array of targets: its name, and how many there are.
-_ARRAY = re.compile(r'\s*([A-Za-z]\w*)\s*\{\s*\d+\s*\}\s*:=\s*\[')
+_ARRAY = re.compile(r'\s*([A-Za-z]\w*)\s*\{\s*(\d+)\s*\}\s*:=\s*\[')
 _TARGET = re.compile(r'\bjointtarget\b', re.IGNORECASE)
 _LISTED = re.compile(r'^\s*\[\s*\[', re.MULTILINE)
 _MOVE = re.compile(r'\bMoveAbsJ\s*\[', re.IGNORECASE)
@@ -49,8 +49,16 @@ def read(text: str) -> Named | None:
         name = ''
         if target and (array := _ARRAY.match(statement, target.end())):
             listed = [*_LISTED_AXES.finditer(statement, array.end())]
-            if _LISTED_AXES.sub('', statement[array.end() :]).strip(' \t\r\n,]'):
-                raise unexpected(number, statement, f'jointtarget NAME{{…}}:=[{_EXPECTED},…]')
+            # A comma between two of them, and a bracket behind the last.
+            between = _LISTED_AXES.sub('@', statement[array.end() :])
+            if int(array[2]) != len(listed) or not re.fullmatch(
+                r'(?:\s*@\s*,)*\s*@\s*\]\s*', between
+            ):
+                raise unexpected(
+                    number,
+                    statement,
+                    f'jointtarget NAME{{{array[2]}}}:=[…] of {array[2]} {_EXPECTED}',
+                )
             for i, one in enumerate(listed, 1):
                 found.append((number, f'{array[1]}{{{i}}}', _axes(number, statement, one)))
             continue

@@ -55,7 +55,7 @@ def read(text: str) -> Named | None:
         if (
             move
             and not assigned
-            and re.match(r'[A-Za-z]\w*(?:\[[^\[\]]*\])?\s*[,)]', code[start:])
+            and re.match(r'[A-Za-z]\w*(?:\[\s*\w+\s*\])?\s*[,)]', code[start:])
         ):
             # A waypoint, which stands above.
             continue

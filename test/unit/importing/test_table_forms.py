@@ -342,6 +342,16 @@ def test_joints_of_programs_and_logs(form, arm, tmp_path):
         assert_rows(rows_of(arm, tmp_path, points_table(arm, names), content), arm)
 
 
+@pytest.mark.parametrize(
+    ('old', 'new'), [('{12}', '{13}'), (',\n[[', ',\n[[1,2,3,4,5,6],[9E9]],[['), (']],\n', ']]\n')]
+)
+def test_an_array_has_as_many_targets_as_it_says(old, new, arm, tmp_path):
+    module = PROGRAMS['array of RAPID'](arm.q)
+    assert old in module
+    with pytest.raises(InputError, match=r't1.txt, line 2: .* of 1[23] \[\['):
+        rows_of(arm, tmp_path, points_table(arm), module.replace(old, new, 1))
+
+
 def test_joints_that_val_3_does_not_write_are_at_0(arm, tmp_path):
     lines = [
         f'<Value key="{i}" ' + ' '.join(f'j{j}="{v:.6f}"' for j, v in enumerate(row, 1)) + ' />'
