@@ -33,10 +33,10 @@ _MISSING = {
     *('nan', 'none', 'null', 'nil', 'na', 'n/a', 'n.a.', '#n/a', '#na', '#nv', '<na>', 'nat'),
     *('-', '--', '---', '–', '—', '?'),
 }
-# Groups of three digits apart by blanks or apostrophes; a plain blank may be a separator.
-_APART = "\u00a0\u2009\u202f'’"
-_GROUPS = re.compile(rf'(?<=\d)[{_APART}](?=\d{{3}}(?!\d))')
-_GROUP_OF_CELL = re.compile(r'[+-]?\d{1,3}(?: \d{3})+(?:[.,]\d+)?', re.ASCII)
+# Groups of three digits apart by blanks or apostrophes, and what shows that a column has none.
+_GROUPED = re.compile("[+-]?\\d{1,3}(?:[ \u00a0\u2009\u202f'’]\\d{3})+(?:[.,]\\d+)?", re.ASCII)
+_BETWEEN_GROUPS = re.compile("[ \u00a0\u2009\u202f'’]")
+_UNGROUPED = re.compile(r'[+-]?\d{4,}(?:[.,]\d*)?', re.ASCII)
 # The line below the names of a table in Markdown, and the frame of one in ASCII.
 _ORNAMENT = re.compile(r'[\s|+:=-]+')
 _NUMBERS = re.compile(r'(?<![\w.,])[+-]?\d+(?:[.,]\d*)?(?!\w)')
@@ -148,8 +148,6 @@ def read_table(
             f'{path}: this is JSON, not a table; save it as CSV, a row for each configuration'
         )
     text = text.replace('\r\n', '\n').replace('\r', '\n').replace('\u2212', '-')
-    if any(sign in text for sign in _APART):
-        text = _GROUPS.sub('', text)
     lines = [
         (number, line)
         for number, line in enumerate(text.split('\n'), start=1)
@@ -195,7 +193,7 @@ def read_table(
     while width > 1 and not any(row[width - 1] for row in rows):
         width -= 1
     rows = [row[:width] for row in rows]
-    rows, header = _without_units(rows, header)
+    rows, header = _without_units(_without_groups(rows), header)
     names = tuple(header[:width]) if header else tuple(map(str, range(1, width + 1)))
     for name in names:
         if name and names.count(name) > 1:
@@ -255,10 +253,7 @@ def _split(line: str, separator: str, path: Path, number: int) -> list[str]:
         cells = next(csv.reader([line], delimiter=separator, skipinitialspace=True, strict=True))
     except csv.Error as error:
         raise InputError(f'{path}, line {number}: {error}; correct the quotes') from None
-    stripped = [cell.strip() for cell in cells]
-    return [
-        c.replace(' ', '') if ' ' in c and _GROUP_OF_CELL.fullmatch(c) else c for c in stripped
-    ]
+    return [cell.strip() for cell in cells]
 
 
 def _is_ornament(line: str) -> bool:
@@ -296,6 +291,19 @@ def _without_lists(
                 parts += _listed(cell) or [cell]
         wide.append((number, line, parts))
     return wide
+
+
+def _without_groups(rows: list[tuple[str, ...]]) -> list[tuple[str, ...]]:
+    """Return cells without what is between thousands, in columns that have it everywhere."""
+    for i, column in enumerate(zip(*rows)):
+        # At once, as logs are large.
+        if not _BETWEEN_GROUPS.search('\n'.join(column)):
+            continue
+        grouped = {cell for cell in column if _GROUPED.fullmatch(cell)}
+        if grouped and not any(map(_UNGROUPED.fullmatch, column)):
+            plain = {cell: _BETWEEN_GROUPS.sub('', cell) for cell in grouped}
+            rows = [(*row[:i], plain.get(row[i], row[i]), *row[i + 1 :]) for row in rows]
+    return rows
 
 
 def _without_units(

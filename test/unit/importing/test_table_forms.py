@@ -72,6 +72,19 @@ def test_numbers_as_spreadsheets_write_them(cell, arm, tmp_path):
     assert_rows(rows_of(arm, tmp_path, whole(arm, cell)), arm)
 
 
+@pytest.mark.parametrize('sign', [' ', "'", '\u00a0'])
+def test_a_stray_sign_is_no_group(sign, arm, tmp_path):
+    content = whole(arm, lambda v: f'{v:.6f}')
+    large = re.search(r'(?<=;)-?\d{4}\.\d+', content)[0]
+    for wrong in (
+        large.replace('.', f'{sign}', 1),
+        f'{large[:-3]}{sign}{large[-3:]}',
+        f'{large[:2]}{sign}{large[2:]}',
+    ):
+        with pytest.raises(InputError, match='is not a number'):
+            rows_of(arm, tmp_path, content.replace(large, wrong, 1))
+
+
 def test_units_in_the_cells(arm, tmp_path):
     columns = [[f'{v:.6f}°' for v in column] for column in degrees(arm)]
     columns += [[f'{v:.6f} mm' for v in column] for column in millimetres(arm)]
