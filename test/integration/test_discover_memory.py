@@ -65,7 +65,7 @@ def peak_mb(rows: int, folder: Path) -> float:
         [sys.executable, '-c', COMMAND, folder / 'session', folder / 'out'],
         capture_output=True,
         text=True,
-        timeout=240,
+        timeout=1200,
         env={**os.environ, 'PYTHONPATH': str(ROOT), 'OMP_NUM_THREADS': '1'},
         check=False,
     )
