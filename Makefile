@@ -46,9 +46,13 @@ test: $(VENV)/installed
 
 # What make test leaves out: repetitions, sweeps, campaigns, every row of docs/faults.md; an hour.
 # PYTEST=test/… runs these files alone, PYTEST='-k name' those of all that have the name.
-qualify: $(VENV)/installed
+qualify: $(VENV)/qualify-installed
 	tools/run-tests $(BIN)/python $(if $(filter-out -%,$(firstword $(PYTEST))),,test) \
 		-m '' $(PYTEST)
+
+$(VENV)/qualify-installed: $(VENV)/installed
+	$(BIN)/python -m pip install -qq -c $(CONSTRAINTS) --no-build-isolation -e '.[qualify]'
+	@touch $@
 
 check: $(VENV)/installed
 	$(BIN)/ruff check .

@@ -113,14 +113,11 @@ setup(
             'colcon-common-extensions',
             *JUDGES,
         ],
+        # `make qualify`: a judge with an arm of its own. It has wheels up to Python 3.11; without
+        # it the paths of its iiwa are not judged.
+        'qualify': ['pybullet>=3.2.7; python_version < "3.12"'],
         # What the benchmarks compare with; figaroh and pybotics get environments of their own.
-        # PyBullet has wheels up to Python 3.11; without it the paths of its iiwa are not judged.
-        'bench': [
-            'emcee>=3.1',
-            'numpyro>=0.15',
-            'jax>=0.4.30',
-            'pybullet>=3.2.7; python_version < "3.12"',
-        ],
+        'bench': ['emcee>=3.1', 'numpyro>=0.15', 'jax>=0.4.30'],
         'check': ['ruff', 'mypy', 'types-PyYAML', 'import-linter'],
     },
     zip_safe=False,

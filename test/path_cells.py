@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+import pytest
 import trimesh
 import yaml
 from path_judges import BulletJudge, FclJudge, Judge, Part
@@ -128,9 +129,8 @@ def _six_urdf(folder: Path) -> tuple[str, list[Part]]:
 
 def _iiwa_urdf(folder: Path, spec: CellSpec) -> str:
     """Return PyBullet's iiwa with a tool frame; meshes by their full names."""
-    import pybullet_data
-
-    source = Path(pybullet_data.getDataPath()) / 'kuka_iiwa'
+    bullet = pytest.importorskip('pybullet_data', reason='needs the judge: pip install pybullet')
+    source = Path(bullet.getDataPath()) / 'kuka_iiwa'
     text = (source / 'model.urdf').read_text(encoding='utf-8')
     text = text[text.index('<robot') :].replace('"meshes/', f'"file://{source}/meshes/')
     tool = (

@@ -80,14 +80,15 @@ def through_the_layer(session: Session, apply: Path) -> Session:
 
 
 def through_the_pad(session: Session, apply: Path) -> Session:
-    """Read as a person does: each joint in the table is driven to its last column, and zeroed."""
+    """Read as a person does: each joint is driven to one angle, and set to show another there."""
     chain = SerialChain.from_urdf(session.urdf, session.base_link, session.tip_link)
-    new_zero = np.zeros(len(chain))
+    shift = np.zeros(len(chain))
     for line in (apply / 'remaster.txt').read_text(encoding='utf-8').splitlines():
         words = line.split()
-        if len(words) == 4 and words[0] in chain.joint_names:
-            new_zero[chain.joint_names.index(words[0])] = np.radians(float(words[3]))
-    return shifted(session, -new_zero)
+        if len(words) == 8 and words[1] in chain.joint_names:
+            drive_to, set_to = float(words[4]), float(words[6])
+            shift[chain.joint_names.index(words[1])] = np.radians(set_to - drive_to)
+    return shifted(session, shift)
 
 
 FORMS = {'urdf': through_the_urdf, 'layer': through_the_layer, 'pad': through_the_pad}
