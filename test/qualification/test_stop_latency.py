@@ -82,7 +82,7 @@ class Around:
                 status.publish()
         self.client.spin_some()
 
-    def until(self, condition, what, timeout_s=25):
+    def until(self, condition, what, timeout_s=180):
         deadline = time.monotonic() + timeout_s
         while not condition():
             assert time.monotonic() < deadline, (what, self.said[-1:])
