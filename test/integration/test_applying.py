@@ -80,14 +80,18 @@ def through_the_layer(session: Session, apply: Path) -> Session:
 
 
 def through_the_pad(session: Session, apply: Path) -> Session:
-    """Read as a person does: each joint is driven to one angle, and set to show another there."""
+    """Read as a person does: a joint is driven to an angle, and set to show another, or zero."""
     chain = SerialChain.from_urdf(session.urdf, session.base_link, session.tip_link)
     shift = np.zeros(len(chain))
     for line in (apply / 'remaster.txt').read_text(encoding='utf-8').splitlines():
         words = line.split()
         if len(words) == 8 and words[1] in chain.joint_names:
-            drive_to, set_to = float(words[4]), float(words[6])
-            shift[chain.joint_names.index(words[1])] = np.radians(set_to - drive_to)
+            name, drive_to, set_to = words[1], float(words[4]), float(words[6])
+        elif len(words) == 4 and words[0] in chain.joint_names:
+            name, drive_to, set_to = words[0], float(words[3]), 0.0
+        else:
+            continue
+        shift[chain.joint_names.index(name)] = np.radians(set_to - drive_to)
     return shifted(session, shift)
 
 
