@@ -6,11 +6,16 @@ import re
 
 from remaster_ros.importing.makers.named import NUMBER, Named, unexpected
 
-_LINE = re.compile(r'([^\[\]]*?)[\[(]{1,2}\s*([^\[\]()]*?)\s*[\])]{1,2}\s*[,;]?\s*')
+# In square brackets, or in round ones alone. Each has one way to match: a line of a large log that
+# is none of both is told at once.
+_LINE = re.compile(
+    r'(?:(?P<before>[^\[\]]*)\[{1,2}\(?(?P<list>[^\[\]()]*)\)?\]{1,2}\)?'
+    r'|(?P<head>[^\[\]()]*)\({1,2}(?P<row>[^\[\]()]*)\){1,2})\s*(?:[,;]\s*)?'
+)
 _BETWEEN = re.compile(r'\s*[,;]\s*|\s+')
 _TIME = re.compile(r'\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d(?:[.,]\d+)?|\d{5,}\.\d+')
 # What a name is set apart by, and what it is set before.
-_APART = ' \t:;,="\''
+_APART = ' \t:;,="\'('
 _FEWEST, _MOST = 2, 12
 
 
@@ -25,7 +30,8 @@ def read(text: str) -> Named | None:
     rows: list[list[str]] = []
     before: list[str] = []
     for number, line, match in found:
-        cells = [] if match is None else _BETWEEN.split(match[2])
+        words, numbers = ('', '') if match is None else _parts(match)
+        cells = _BETWEEN.split(numbers) if numbers else []
         if not rows and not (_FEWEST < len(cells) <= _MOST and all(map(NUMBER.fullmatch, cells))):
             return None
         if (
@@ -35,7 +41,7 @@ def read(text: str) -> Named | None:
         ):
             raise unexpected(number, line, f'a list of {len(rows[0])} numbers in brackets')
         rows.append(cells)
-        before.append(match[1].strip(_APART))
+        before.append(words)
     stamps = [_TIME.search(words) for words in before]
     lead: list[str] = []
     if all(stamps):
@@ -50,3 +56,9 @@ def read(text: str) -> Named | None:
         ),
         lines=tuple(number for number, _ in lines),
     )
+
+
+def _parts(line: re.Match[str]) -> tuple[str, str]:
+    """Return what stands before a list, and what is in it."""
+    before = line['before'] or line['head'] or ''
+    return before.strip(_APART), (line['list'] or line['row'] or '').strip()

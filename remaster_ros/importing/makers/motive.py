@@ -23,7 +23,7 @@ _START = re.compile(r'\s*"?Format Version"?([,;\t])')
 _KIND_NAMES = ('Rigid Body', 'Rigid Body Marker', 'Marker', 'Bone', 'Bone Marker', 'Skeleton')
 # A take that was written without its first line.
 _HEADLESS = re.compile(
-    rf'\s*([,;\t])"?(?:Type)?"?\1+"?(?:{"|".join(_KIND_NAMES)})"?(?:\1|\r?\n)', re.ASCII
+    rf'[ \r\n]*([,;\t])"?(?:Type)?"?\1+"?(?:{"|".join(_KIND_NAMES)})"?(?:\1|\r?\n)', re.ASCII
 )
 _NUMBER = re.compile(r'[+-]?\d+(?:[.,]\d+)?(?:[eE][+-]?\d+)?', re.ASCII)
 _MOST_HEAD_LINES = 12

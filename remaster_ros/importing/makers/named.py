@@ -10,7 +10,7 @@ from typing import Literal
 from remaster_ros.errors import InputError
 
 SHOWN = 60
-NUMBER = re.compile(r'[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?', re.ASCII)
+NUMBER = re.compile(r'[+-]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][+-]?\d+)?', re.ASCII)
 # An arm that this program calibrates has more than one joint.
 _FEWEST_AXES = 2
 

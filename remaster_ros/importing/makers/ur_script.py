@@ -12,7 +12,7 @@ _MOVE = re.compile(r'\b(?:movej|servoj)\s*\(\s*')
 _LIST = re.compile(r'\[([^\[\]]*)\]')
 _ASSIGNED = re.compile(r'\s*(?:global\s+|local\s+)?([A-Za-z]\w*)\s*=\s*')
 # A list of positions.
-_SEVERAL = re.compile(rf'{_ASSIGNED.pattern}\[((?:\s*\[[^\[\]]*\]\s*,?)+)\]\s*')
+_SEVERAL = re.compile(rf'{_ASSIGNED.pattern}\[\s*((?:\[[^\[\]]*\]\s*(?:,\s*)?)+)\]\s*')
 _LISTED = re.compile(rf'{_ASSIGNED.pattern}\[')
 _DEGREES = re.compile(rf'd2r\(\s*({NUMBER.pattern})\s*\)')
 # Six numbers in a list, and what takes such beside movej.
