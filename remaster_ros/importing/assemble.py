@@ -47,33 +47,22 @@ _SPLITS = {
 
 @dataclass(frozen=True)
 class SessionOptions:
-    """What the user said of the session.
+    """What the user said of the session."""
 
-    Attributes
-    ----------
-    couple, reverse, add_deg
-        Corrections of the joints by column, in this order: another joint that is added, with its
-        sign; signs that are reversed; angles added, degrees.
-    marker_m, marker_std_m
-        Where the marker is in the tool frame, m; None where nothing is known.
-    hold_out
-        Share of the poses that is held out where the table names none.
-    visited_in_order
-        Whether each row's configuration was reached from that of the row before.
-    on_tool
-        Whether the sensor is on the tool, and measures the pose of what stands.
-    """
-
+    # Corrections of the joints by column, in this order: another joint that is added, with its
+    # sign; signs that are reversed; angles added, degrees
     couple: tuple[tuple[str, tuple[str, Literal[1, -1]]], ...] = ()
     reverse: tuple[str, ...] = ()
     add_deg: tuple[tuple[str, float], ...] = ()
     sensor: str = 'sensor'
     marker: str = 'marker'
+    # Where the marker is in the tool frame, m; None where nothing is known
     marker_m: tuple[float, float, float] | None = None
     marker_std_m: float | None = None
+    # Share of the poses that is held out where the table names none
     hold_out: float = 1.0 / HOLD_OUT_ONE_OF
-    visited_in_order: bool = False
-    on_tool: bool = False
+    visited_in_order: bool = False  # Each row's configuration was reached from that before
+    on_tool: bool = False  # The sensor is, and measures the pose of what stands
 
 
 def controller_of(rows: RawRows, chain: SerialChain, options: SessionOptions) -> Controller | None:
@@ -137,13 +126,7 @@ def assemble(
     rng: np.random.Generator,
     notes: str,
 ) -> tuple[Session, list[str]]:
-    """Return the session, and how poses were found and held out, a sentence each.
-
-    Raises
-    ------
-    InputError
-        Labels that contradict each other, naming the row.
-    """
+    """Return the session, and how poses were found and held out, a sentence each."""
     controller = controller_of(rows, chain, options)
     pad = PadAngles.of(controller, chain.joint_names)
     q = pad.to_urdf(rows.q)
@@ -248,13 +231,7 @@ def _date(rows: RawRows) -> str:
 
 
 def refuse_outside_limits(rows: RawRows, chain: SerialChain, q: FloatArray) -> None:
-    """Refuse joint angles outside the URDF's limits, naming the row of the table.
-
-    Raises
-    ------
-    InputError
-        One line for the first such row.
-    """
+    """Refuse joint angles outside the URDF's limits, naming the row of the table."""
     allowed = chain.limit_tolerance
     outside = (q < chain.lower - allowed) | (q > chain.upper + allowed)
     for row, joint in np.argwhere(outside)[:1]:

@@ -328,65 +328,37 @@ class TableOptions:
 
 @dataclass(frozen=True, eq=False)
 class RawRows:
-    """Rows of joints and points in the order measured.
+    """Rows of joints and points in the order measured."""
 
-    Attributes
-    ----------
-    where
-        File and line of each row, for messages, n texts.
-    joint_columns
-        Names of the k joint columns.
-    q, from_q, position, std
-        rad and m, (n, k) and (n, 3); NaN where unknown.
-    stamp_s
-        s, (n,); None where there are no times.
-    labels
-        ``pose``, ``configuration``, ``split``, ``sensor``, ``marker`` -> n texts, where given.
-    temperature_c, samples
-        (n,); NaN and -1 where unknown.
-    columns
-        Column -> what it was taken for, for people.
-    points
-        Marker -> columns of X, Y and Z, where there are such.
-    length_unit
-        In which the points are.
-    angle_unit
-        In which the table has the joints; None where they are those of the URDF, as in a bag.
-    reading
-        Which rows were measured at once, (n,); None where each was measured by itself.
-    orientation
-        Quaternion x, y, z, w of the marker in the sensor's frame, (n, 4), NaN where unknown; None
-        where none was measured.
-    coupling
-        Joint column -> (another one, 1 or -1), as the controller of this file counts.
-    maker
-        Of the controller; '' where it is not known.
-    description
-        How the files were read and joined, a line each.
-    warnings
-        A sentence each.
-    """
-
-    where: tuple[str, ...]
-    joint_columns: tuple[str, ...]
+    where: tuple[str, ...]  # File and line of each row, for messages, n texts
+    joint_columns: tuple[str, ...]  # Names of the k joint columns
+    # rad and m, (n, k) and (n, 3); NaN where unknown
     q: FloatArray
     from_q: FloatArray
     position: FloatArray
     std: FloatArray
-    stamp_s: FloatArray | None
+    stamp_s: FloatArray | None  # s, (n,); None where there are no times
+    # ``pose``, ``configuration``, ``split``, ``sensor``, ``marker`` -> n texts, where given
     labels: dict[str, list[str]]
+    # (n,); NaN and -1 where unknown
     temperature_c: FloatArray
     samples: FloatArray
-    columns: dict[str, str]
-    description: tuple[str, ...]
-    warnings: tuple[str, ...]
+    columns: dict[str, str]  # Column -> what it was taken for, for people
+    description: tuple[str, ...]  # How the files were read and joined, a line each
+    warnings: tuple[str, ...]  # A sentence each
+    # Marker -> columns of X, Y and Z, where there are such
     points: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
-    length_unit: str = 'm'
+    length_unit: str = 'm'  # In which the points are
+    # In which the table has the joints; None where they are those of the URDF, as in a bag
     angle_unit: AngleUnit | None = None
+    # Which rows were measured at once, (n,); None where each was measured by itself
     reading: IntArray | None = None
+    # Quaternion x, y, z, w of the marker in the sensor's frame, (n, 4), NaN where unknown; None
+    # where none was measured
     orientation: FloatArray | None = None
+    # Joint column -> (another one, 1 or -1), as the controller of this file counts
     coupling: Mapping[str, tuple[str, Literal[1, -1]]] = field(default_factory=dict)
-    maker: str = ''
+    maker: str = ''  # Of the controller; '' where it is not known
 
     def in_order(self) -> RawRows:
         """Return the rows in the order of their times."""
@@ -410,13 +382,7 @@ class RawRows:
 
 
 def read_rows(paths: Sequence[Path], chain: SerialChain, options: TableOptions) -> RawRows:
-    """Read one table with joints and points, or one with each.
-
-    Raises
-    ------
-    InputError
-        One line naming file, line, column and remedy.
-    """
+    """Read one table with joints and points, or one with each."""
     programs = {
         data: path
         for path in paths
@@ -808,13 +774,7 @@ def _refuse_untold(found: list[Table], told: Told) -> None:
 
 
 def from_tool(rows: RawRows) -> RawRows:
-    """Return rows of a sensor on the tool as those of the sensor, in the frame of what it sees.
-
-    Raises
-    ------
-    InputError
-        A row without an orientation.
-    """
+    """Return rows of a sensor on the tool as those of the sensor, in the frame of what it sees."""
     orientation = np.full((1, 4), np.nan) if rows.orientation is None else rows.orientation
     unknown = np.isnan(orientation).any(axis=1)
     if unknown.any():

@@ -44,28 +44,14 @@ SHOWN_ROWS = 5
 
 @dataclass(frozen=True)
 class Sense:
-    """What trying the table against the robot has shown.
+    """What trying the table against the robot has shown."""
 
-    Attributes
-    ----------
-    fits
-        Whether it fits as it is.
-    sentence
-        What was found.
-    options
-        What to add to the command so that it fits; '' where nothing helps.
-    error_m
-        Median distance from the fit, m; None where there are too few rows to tell.
-    rows_off
-        Rows of the table that do not fit, with their distances, m, the farthest first.
-    warning
-        What to do about them where the rest fits; '' where there is nothing.
-    """
-
-    fits: bool
-    sentence: str
-    options: str = ''
-    error_m: float | None = None
+    fits: bool  # As it is
+    sentence: str  # What was found
+    options: str = ''  # What to add to the command so that it fits; '' where nothing helps
+    error_m: float | None = None  # Median distance from the fit, m; None of too few rows
+    # Rows of the table that do not fit, with their distances, m, the farthest first, and what to
+    # do about them where the rest fits; '' where there is nothing
     rows_off: tuple[tuple[str, float], ...] = ()
     warning: str = ''
 
@@ -73,12 +59,7 @@ class Sense:
 def check_sense(session: Session, rows: RawRows, progress: Callable[[str, float], None]) -> Sense:
     """Fit the table as it is and, where that is gross, as it might be meant.
 
-    Parameters
-    ----------
-    session
-        As it would be written.
-    rows
-        For the names of the columns.
+    ``session`` is as it would be written; ``rows`` name the columns.
     """
     # The marker is left free: one that is firm at a wrong place would bend the fit.
     part = replace(session, marker_std_m=UNKNOWN_MARKER_STD_M)

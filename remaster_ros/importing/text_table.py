@@ -51,25 +51,14 @@ _FEWEST_NUMBERS = 2
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class TextTable(Named):
-    """A table as text.
+    """A table as text."""
 
-    Attributes
-    ----------
-    path
-        The file, for messages.
-    encoding, separator
-        What it was found, or told, to be written with.
-    preamble
-        Title and comment lines.
-    has_header
-        Whether the names stand in the file.
-    """
-
-    path: Path
+    path: Path  # The file, for messages
+    # What it was found, or told, to be written with
     encoding: str
     separator: str = ''
-    preamble: str = ''
-    has_header: bool = True
+    preamble: str = ''  # Title and comment lines
+    has_header: bool = True  # The names stand in the file
 
     def describe(self) -> str:
         """Return how it is written, in a few words."""
@@ -127,13 +116,7 @@ def parse_number(cell: str, decimal: str) -> float | None:
 def read_table(
     path: Path, separator: str = '', decimal: str = '', encoding: str = ''
 ) -> TextTable:
-    """Read a text table; what is not told is found.
-
-    Raises
-    ------
-    InputError
-        One line naming file, line and remedy: no text, no numbers, or rows of unequal length.
-    """
+    """Read a text table; what is not told is found; an `InputError` names file, line, remedy."""
     data = read_limited(path, TABLE_LIMIT, 'name the table')
     text, encoding = decode(data, path, encoding)
     for read in READERS:

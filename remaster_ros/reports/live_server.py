@@ -309,23 +309,10 @@ class Seen(msgspec.Struct, forbid_unknown_fields=True):
 class LiveServer:
     """Serves the page in a thread of its own.
 
-    Parameters
-    ----------
-    place
-        Where.
-    token
-        What view and commands ask for.
-    scene
-        The fixed part of the 3-D view, JSON.
-    send
-        Called in the server's thread with the name of a command (``confirm/NAME`` for the plan
-        of that name) and with what takes its outcome, from any thread: whether it was done, and
-        a line for the person.
-
-    Raises
-    ------
-    InputError
-        The address or the certificate cannot be used.
+    ``token`` is what view and commands ask for, ``scene`` the fixed part of the 3-D view, JSON.
+    ``send`` is called in the server's thread with the name of a command (``confirm/NAME`` for the
+    plan of that name) and with what takes its outcome, from any thread: whether it was done, and a
+    line for the person. An `InputError` where address or certificate cannot be used.
     """
 
     def __init__(self, place: Place, token: str, scene: bytes, send: Send) -> None:

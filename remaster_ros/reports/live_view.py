@@ -114,28 +114,14 @@ class _Node:
 class LiveView:
     """What is known of a collection.
 
-    Parameters
-    ----------
-    chain
-        The arm.
-    markers
-        Sensor -> its markers -> their positions in the tool frame, m, (3,).
-
-    Attributes
-    ----------
-    registration
-        Where registered sensors stand, sensor -> (4, 4).
-    residuals
-        Of the markers.
-    plan_offered
-        Whether the planner offers the service that confirms the plan which is next.
+    ``markers``: sensor -> its markers -> their positions in the tool frame, m, (3,).
     """
 
     def __init__(
         self, chain: SerialChain, markers: Mapping[str, Mapping[str, FloatArray]]
     ) -> None:
         self._chain, self._sensors = chain, tuple(markers)
-        self.residuals = LiveResiduals(chain, markers)
+        self.residuals = LiveResiduals(chain, markers)  # Of the markers
         self._pace = Pace()
         self._nodes = {name: _Node() for name in NODES}
         self._values: dict[str, str] = {}
@@ -149,11 +135,14 @@ class LiveView:
         self._q: FloatArray | None = None
         self._target: FloatArray | None = None
         self._way: FloatArray = np.empty((0, 3))
+        # Where registered sensors stand, sensor -> (4, 4)
         self.registration: dict[str, FloatArray] = {}
         self._precision = Precision()
         self._offsets: Mapping[str, tuple[float, float]] = {}
         self._fit = FitFacts()
-        self._plan_page, self.plan_offered = PlanPage(), False
+        self._plan_page = PlanPage()
+        # Whether the planner offers the service that confirms the plan which is next
+        self.plan_offered = False
 
     # What comes in
 

@@ -45,18 +45,8 @@ def plan_page(
 ) -> str:
     """Return the page.
 
-    Parameters
-    ----------
-    plan
-        What is going to be done.
-    scene
-        The arm and all around it.
-    cell
-        What the cell is called.
-    registered
-        Whether the sensors are where they were measured, not at their rough places.
-    confirm
-        Name of the plan where the arm waits until it is confirmed.
+    ``registered``: whether the sensors are where they were measured, not at their rough places;
+    ``confirm``: name of the plan where the arm waits until it is confirmed.
     """
     # Only here: it brings the libraries of figures.
     from remaster_ros.reports.pages import compressed, page
@@ -115,19 +105,10 @@ def check_plan_page(path: Path) -> None:
 
 
 def read_plan_page(path: Path, plan: str) -> bytes:
-    """Return the page of a plan that waits for a confirmation.
+    """Return the page of the plan with this fingerprint, which waits for a confirmation.
 
-    Parameters
-    ----------
-    path
-        Whoever publishes on the network may have chosen it: nothing but such a page is returned.
-    plan
-        Its fingerprint.
-
-    Raises
-    ------
-    InputError
-        There is no such page, or it shows another plan.
+    Whoever publishes on the network may have chosen the path: nothing but such a page is returned,
+    else an `InputError`.
     """
     try:
         if not path.is_file() or path.stat().st_size > LARGEST_PAGE:
@@ -142,13 +123,7 @@ def read_plan_page(path: Path, plan: str) -> bytes:
 
 
 def write_plan_page(path: Path, html: str) -> None:
-    """Write the page, also over one that was written before, but over nothing else.
-
-    Raises
-    ------
-    InputError
-        Something else is there, or it cannot be written.
-    """
+    """Write the page, also over one that was written before, but over nothing else."""
     check_plan_page(path)
     with undone_on_failure():
         make_folder(path.parent)

@@ -276,28 +276,8 @@ class BagReader:
     """Read a rosbag2 MCAP bag, a folder or one ``.mcap`` file; iterate for its messages.
 
     The whole bag is checked when it is opened, closed files also by their checksum in SHA256SUMS:
-    no message of a damaged bag comes out. The bag of a killed writer is read as far as it goes,
-    with a warning.
-
-    Attributes
-    ----------
-    folder
-        Where the files are.
-    topics, counts
-        Message type, and number of messages, of every topic.
-    whole
-        Stamps and number of the messages of all files.
-    complete
-        False where the writer was killed before it closed the bag.
-    files
-        The MCAP files with their numbers of messages, in the order recorded.
-    torn_bytes
-        How many bytes at the end are no whole message.
-
-    Raises
-    ------
-    InputError
-        No such bag, another storage, or damaged; nothing else comes out of a bad file.
+    no message of a damaged bag comes out, but an `InputError`. The bag of a killed writer is read
+    as far as it goes, with a warning.
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
@@ -308,9 +288,10 @@ class BagReader:
         sums = read_manifest(self.folder)
         for path in paths:
             check_file(sums, path)
-        self.torn_bytes = 0
+        self.torn_bytes = 0  # At the end, of no whole message
+        self.complete = True  # False where the writer was killed before it closed the bag
+        # Message type, and number of messages, of every topic
         self.topics: dict[str, str] = {}
-        self.complete = True
         self.counts: Counter[str] = Counter()
         for file in self.files:
             for message in self.messages_of(file, first_look=True):

@@ -37,17 +37,8 @@ def bridge_file(kind: str, node: str, environment: Mapping[str, str]) -> Path:
 class HaltFile:
     """Keep why an arm is halted until a person clears it.
 
-    Parameters
-    ----------
-    node
-        Fully qualified name of the bridge; with the ROS domain it names the file.
-    environment
-        Where ROS_HOME (by default ~/.ros) and ROS_DOMAIN_ID are.
-
-    Attributes
-    ----------
-    path
-        The file; it is there while the arm is halted.
+    The file at `path` is there while the arm is halted. ``node`` is the bridge's fully qualified
+    name; ``environment`` has ROS_HOME (by default ~/.ros) and ROS_DOMAIN_ID.
     """
 
     def __init__(self, node: str, environment: Mapping[str, str] = os.environ) -> None:
@@ -66,13 +57,7 @@ class HaltFile:
         return f'{halt.halted} (halted {halt.since}, before this bridge was started)'
 
     def write(self, reason: str) -> None:
-        """Keep a halt.
-
-        Raises
-        ------
-        RemasterError
-            The folder cannot be made or written.
-        """
+        """Keep a halt."""
         make_folder(self.path.parent)
         since = datetime.now(UTC).strftime('%Y-%m-%d %H:%M:%S UTC')
         write_atomically(self.path, msgspec.json.encode(_Halt(reason, since)))
@@ -106,20 +91,7 @@ class LastCommandFile:
     """Keep where the last command leads.
 
     A bridge that is started again compares with it where the arm is reported, before it moves it.
-
-    Parameters
-    ----------
-    node
-        Fully qualified name of the bridge; with the ROS domain it names the file.
-    joints
-        Names of the arm's joints, in the order of all positions.
-    environment
-        Where ROS_HOME (by default ~/.ros) and ROS_DOMAIN_ID are.
-
-    Attributes
-    ----------
-    path
-        The file.
+    ``joints`` are named in the order of all positions; the rest is as of `HaltFile`.
     """
 
     def __init__(
@@ -144,13 +116,7 @@ class LastCommandFile:
         return LastCommand(end if known and np.isfinite(end).all() else None, age_s)
 
     def write(self, end: FloatArray, sent_ns: int) -> None:
-        """Keep where a command leads.
-
-        Raises
-        ------
-        RemasterError
-            The folder cannot be made or written.
-        """
+        """Keep where a command leads."""
         make_folder(self.path.parent)
         write_atomically(
             self.path, msgspec.json.encode(_Kept(self._joints, end.tolist(), sent_ns))

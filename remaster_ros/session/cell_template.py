@@ -36,48 +36,24 @@ SENSORS = {
 
 @dataclass(frozen=True)
 class CellProposal:
-    """What `cell_text` writes.
-
-    Attributes
-    ----------
-    urdf
-        As the cell file is to name it.
-    tips
-        Links that may be the tool frame, the proposed one first.
-    before
-        Joints that carry the whole arm, such as a rail's.
-    sensor_R
-        Rough place of the sensors in the base, m, (3,).
-    sensors
-        Names among `SENSORS`.
-    max_angle_deg
-        Of each of them, between the tool's Z axis and the line to it.
-    mesh_path
-        Folders in which the meshes were found.
-    missing_meshes
-        Those that were not.
-    kept
-        What became of poses everywhere around the arm, for people; '' before it is known.
-    marker_z
-        Where the markers are along the tool's Z axis, m.
-    link_radius
-        How thick links are, m.
-    """
+    """What `cell_text` writes."""
 
     source: str
-    urdf: str
+    urdf: str  # As the cell file is to name it
     chain: SerialChain
-    tips: Sequence[str]
-    before: Sequence[str]
+    tips: Sequence[str]  # Links that may be the tool frame, the proposed one first
+    before: Sequence[str]  # Joints that carry the whole arm, such as a rail's
     held: HeldJoint
     reach: Reach
     ranges: PoseRanges
-    kept: str
-    marker_z: float
-    link_radius: float
-    sensor_R: Sequence[float]
-    sensors: Sequence[str]
+    kept: str  # What became of poses everywhere around the arm; '' before it is known
+    marker_z: float  # Where the markers are along the tool's Z axis, m
+    link_radius: float  # How thick links are, m
+    sensor_R: Sequence[float]  # Rough place of the sensors in the base, m, (3,)
+    sensors: Sequence[str]  # Names among `SENSORS`
+    # Of each of them, between the tool's Z axis and the line to it
     max_angle_deg: Mapping[str, float]
+    # Folders in which meshes were found, and the meshes that were not
     mesh_path: Sequence[str]
     missing_meshes: Sequence[str]
     floor_z: float | None

@@ -32,44 +32,23 @@ _FINAL: tuple[Outcome, ...] = ('recorded', 'partial')
 class SessionJournal:
     """Write a session, new or unfinished, and keep what was decided.
 
-    Parameters
-    ----------
-    folder
-        The session's. A complete session is not written to; `closed` is set from the start.
-        `reopen` may go further with it.
-    header
-        Everything but the observations.
-
-    Attributes
-    ----------
-    closed
-        The exit status once the session is closed, else ''.
-    plan_id
-        The plan that the configurations are numbered by; '' before the first.
-    observations
-        How many observations there are.
-    notes
-        The state in which the session was found, for the user, a line each.
-    registration
-        The readings that the sensors were registered by in the runs before.
-    watched
-        What was measured at the references in the runs before, in order: ``reference`` with the
-        number of the configuration and its readings, ``other`` for any other configuration,
-        ``accepted`` where a person had seen to a change.
-
-    Raises
-    ------
-    InputError
-        The folder holds something else, another process writes it, or it cannot be written to.
+    A complete session is not written to, and `closed` is set from the start; `reopen` may go
+    further with it. ``header`` is everything but the observations.
     """
 
     def __init__(self, folder: Path, header: Session) -> None:
         self.folder, self._header = folder, header
         self._writer: SessionWriter | None = None
-        self.closed = self.plan_id = ''
+        self.closed = ''  # The exit status once the session is closed, else ''
+        self.plan_id = ''  # By which the configurations are numbered; '' before the first
         self.observations = 0
+        # The state in which the session was found, for the user, a line each
         self.notes: list[str] = []
+        # The readings that the sensors were registered by in the runs before
         self.registration: list[PairedReading] = []
+        # What was measured at the references in the runs before, in order: ``reference`` with the
+        # number of the configuration and its readings, ``other`` for any other configuration,
+        # ``accepted`` where a person had seen to a change
         self.watched: list[tuple[str, int, list[PairedReading]]] = []
         self._results: dict[tuple[int, int], str] = {}
         self._last_pose: int | None = None
@@ -172,32 +151,14 @@ class SessionJournal:
         temperatures_c: Sequence[float | None],
         change: FloatArray | None = None,
     ) -> int:
-        """Write what became of a configuration; durable on return.
+        """Write what became of a configuration, durable on return; return its number there.
 
-        Parameters
-        ----------
-        pose, solution
-            As the planner numbers them.
-        split
-            ``registration``, ``reference``, ``optimization`` or ``validation``.
-        result, reason
-            ``recorded``, ``partial`` or ``rejected``, and why.
-        readings, temperatures_c
-            What was accepted, and the temperature with each, degrees Celsius, None if unknown.
-        from_q
-            Where the arm came from, rad, (k,); None if unknown.
-        change
-            What a correction changed of what was wanted, rad, (k,); None where it was off.
-
-        Returns
-        -------
-        int
-            The number that the configuration has in the session, where it has readings.
-
-        Raises
-        ------
-        DiskError
-            The disk does not take it; try again when there is room.
+        ``pose`` and ``solution`` are as the planner numbers them; ``split`` is ``registration``,
+        ``reference``, ``optimization`` or ``validation``; ``result`` is ``recorded``, ``partial``
+        or ``rejected``. ``readings`` are what was accepted, with the temperature of each, degrees
+        Celsius, None if unknown. ``from_q`` is where the arm came from, ``change`` what a
+        correction changed of what was wanted, rad, (k,); None where it is unknown, or was off.
+        With a `DiskError` try again when there is room.
         """
         record: Record = {
             'kind': 'configuration',

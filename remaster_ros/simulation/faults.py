@@ -97,13 +97,7 @@ OF_TRACKER = (
 
 
 def inject(folder: Path, faults: Mapping[str, Numbers]) -> None:
-    """Replace the faults of the World in `folder`; with none, all end.
-
-    Raises
-    ------
-    InputError
-        A fault that neither the robot nor, of another device, any sensor has.
-    """
+    """Replace the faults of the World in `folder`; with none, all end."""
     for device, numbers in faults.items():
         known = OF_ROBOT if device == 'robot' else dict.fromkeys((*OF_OPTITRACK, *OF_TRACKER))
         for name in numbers:

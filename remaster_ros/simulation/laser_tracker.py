@@ -566,21 +566,8 @@ class FakeLaserTracker:
 
     As with the real one, a single client at a time; a second one is refused with an error report.
     The instrument is switched on when it is made; a client that leaves ends what it had begun.
-
-    Parameters
-    ----------
-    world
-        The hidden world.
-    sensor
-        The tracker's name in the world.
-    rng
-        Source of all randomness.
-    host, port
-        Address to listen on; port 0 takes a free one, see `address`.
-    behaviour
-        See `TrackerBehaviour`.
-    further
-        Further reflectors of the tool by name, with their numbers.
+    ``sensor`` is its name in the world; port 0 takes a free one, see `address`; ``further`` are
+    further reflectors of the tool by name, with their numbers.
     """
 
     def __init__(
@@ -631,13 +618,7 @@ class FakeLaserTracker:
         return self._instrument.locked
 
     def start(self) -> None:
-        """Listen, and serve in a thread of its own.
-
-        Raises
-        ------
-        DeviceError
-            If the port cannot be used.
-        """
+        """Listen, and serve in a thread of its own; a `DeviceError` for a port in use."""
         host, port = self._wanted
         try:
             self._listener = socket.create_server((host, port), backlog=4)

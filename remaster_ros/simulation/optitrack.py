@@ -337,38 +337,13 @@ class _Client:
 class FakeOptiTrackServer:
     """An OptiTrack server that streams the calibration marker of a world.
 
-    Parameters
-    ----------
-    world
-        The hidden world.
-    sensor
-        The camera bar's name in the world.
-    rng
-        Source of all randomness.
-    version
-        Bitstream version, such as ``(2, 10)``, ``(3, 1)`` or ``(4, 1)``.
-    transport
-        ``multicast`` streams to the group; ``unicast`` to every client that sends CONNECT.
-    rate_hz
-        Frames per second of world time.
-    host
-        Address of the interface to serve.
-    command_port
-        Port to listen on; 0 takes a free one, see `command_port`.
-    multicast_group, data_port
-        Where multicast frames go.
-    unicast_port
-        Send unicast frames to this port of a client instead of the one that it sends from, and
-        never drop it: old clients such as ``natnetclient`` listen there and send nothing more.
-    client_timeout_s
-        A unicast client that is silent for so long (wall time) is dropped.
-    behaviour
-        See `OptiTrackBehaviour`.
-
-    Raises
-    ------
-    InputError
-        If a setting cannot work.
+    ``sensor`` is the bar's name in the world; ``version`` that of the bitstream, such as ``(2,
+    10)`` or ``(4, 1)``. ``multicast`` streams to the group, ``unicast`` to every client that sends
+    CONNECT. ``rate_hz`` is of world time; ``host`` the address of the interface to serve;
+    `command_port` 0 takes a free one. ``unicast_port`` sends unicast frames to this port of a
+    client instead of the one that it sends from, and never drops it: old clients such as
+    ``natnetclient`` listen there and send nothing more. Any other that is silent for
+    ``client_timeout_s`` (wall time) is dropped.
     """
 
     def __init__(
@@ -429,13 +404,7 @@ class FakeOptiTrackServer:
             return tuple(self._clients)
 
     def start(self) -> None:
-        """Open the sockets and begin to stream.
-
-        Raises
-        ------
-        DeviceError
-            If the command port is in use or the host is no address of this machine.
-        """
+        """Open the sockets and begin to stream; a `DeviceError` where that cannot be."""
         self._command = open_socket(
             self._host,
             self._wanted_port,

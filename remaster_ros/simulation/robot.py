@@ -26,12 +26,8 @@ ENCODER_RAD = 2e-6
 class FakeArm:
     """Follows trajectories in the hidden World and reports joint states.
 
-    Parameters
-    ----------
-    world
-        The hidden World; this is the only fake that moves it.
-    rng
-        Source of repeatability errors, encoder noise and of the order of the reported joints.
+    It is the only fake that moves the World. ``rng`` is the source of repeatability errors,
+    encoder noise and of the order of the reported joints.
     """
 
     def __init__(self, world: World, rng: np.random.Generator) -> None:
@@ -49,19 +45,9 @@ class FakeArm:
     def command(
         self, names: Sequence[str], points: Sequence[ServoPoint], start_s: float = 0.0
     ) -> str | None:
-        """Take a trajectory.
+        """Take a trajectory; return why it was dropped, for the log, or None when it is followed.
 
-        Parameters
-        ----------
-        names, points
-            As in the message.
-        start_s
-            The header's stamp, s; 0 means now.
-
-        Returns
-        -------
-        str or None
-            Why the trajectory was dropped, for the log; None when it is followed.
+        ``start_s`` is the header's stamp, s; 0 means now.
         """
         now = self.world.now()
         faults = self.world.faults('robot')

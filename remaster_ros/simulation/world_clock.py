@@ -56,13 +56,9 @@ class _Participant:
 class Pace:
     """Follow the participants of a World, and move the limit of its time.
 
-    Parameters
-    ----------
-    clock
-        Of the World; its owner is whoever has this.
-    confirmed_every_s
-        What was taken is confirmed no more often, s: the last reports before a silence may never
-        be confirmed, and count as taken.
+    Whoever has this owns the clock. What was taken is confirmed no more often than
+    ``confirmed_every_s``, s: the last reports before a silence may never be confirmed, and count
+    as taken.
     """
 
     def __init__(self, clock: WorldClock, confirmed_every_s: float = 0.0) -> None:

@@ -356,15 +356,10 @@ Event = (
 
 
 def encode(event: Event) -> bytes:
-    """Return the packet of an event.
+    """Return the packet of an event; a `ValueError` where its values do not fit the layout.
 
     A failed reply is filled with zeros to the size of one that succeeded, because clients unpack
     the whole layout before they look at the status.
-
-    Raises
-    ------
-    ValueError
-        If the values do not fit the layout, or the event is no packet.
     """
     try:
         type_, body = _type_and_body(event)
@@ -397,23 +392,15 @@ class PacketReader:
     """Cuts a stream of bytes into events.
 
     Feed it with `receive_data` and call `next_event` until it returns `NEED_DATA`; memory is then
-    bounded by one packet and one read.
-
-    Parameters
-    ----------
-    side
-        ``client`` reads what an instrument sends, ``server`` what a client sends.
-
-    Attributes
-    ----------
-    broken
-        True once the boundaries of packets are lost; the connection is of no further use.
+    bounded by one packet and one read. ``side``: ``client`` reads what an instrument sends,
+    ``server`` what a client sends.
     """
 
     def __init__(self, side: Literal['client', 'server']) -> None:
         self._decode_command = _decode_reply if side == 'client' else _decode_request
         self._buffer = bytearray()
         self._at_end = False
+        # The boundaries of packets are lost; the connection is of no further use.
         self.broken = False
 
     @property
@@ -431,12 +418,9 @@ class PacketReader:
     def next_event(self) -> Event | NeedData:
         """Return the next event, or `NEED_DATA`.
 
-        Raises
-        ------
-        ProtocolError
-            If the packet does not fit its layout; it is dropped, and the next call goes on after
-            it. If the size of a packet is impossible, or the peer closed in the middle of one,
-            `broken` is set and every further call raises.
+        A packet that does not fit its layout is dropped with a `ProtocolError`, and the next call
+        goes on after it. If the size of a packet is impossible, or the peer closed in the middle
+        of one, `broken` is set and every further call raises.
         """
         buffer = self._buffer
         if len(buffer) < _HEADER.size:
