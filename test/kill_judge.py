@@ -14,7 +14,8 @@ from remaster_ros.errors import InputError
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.session.journal import read_journal
 from remaster_ros.session.reader import read_session
-from remaster_ros.simulation.truth import SessionTruth, from_plain
+from remaster_ros.session.yaml_records import from_plain
+from remaster_ros.simulation.truth import SessionTruth
 
 COUNTS = ('rows', 'planned_configurations', 'configurations', 'lost', 'twice', 'wrong')
 LARGEST_ERROR_M = {'mocap': 0.3e-3, 'tracker': 0.15e-3}

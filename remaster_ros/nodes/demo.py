@@ -66,12 +66,13 @@ from remaster_ros.session.files import cannot_write, make_folder, undone_on_fail
 from remaster_ros.session.reader import HEADER, read_session
 from remaster_ros.session.session_journal import is_complete
 from remaster_ros.session.workcell import Workcell, config_path, read_cell
+from remaster_ros.session.yaml_records import to_plain
 from remaster_ros.simulation.effect_sampling import EffectSpec
 from remaster_ros.simulation.expected_findings import causes, describe, named_cause
 from remaster_ros.simulation.hidden_arm import tool_points
 from remaster_ros.simulation.hidden_effects import true_parameters
 from remaster_ros.simulation.setup import make_world
-from remaster_ros.simulation.truth import SessionTruth, to_plain
+from remaster_ros.simulation.truth import SessionTruth
 from remaster_ros.types import Session
 
 _PR_SET_PDEATHSIG = 1

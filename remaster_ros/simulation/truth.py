@@ -7,9 +7,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, TypeVar
+from typing import Any
 
-import msgspec
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -20,14 +19,12 @@ from remaster_ros.kinematics.transforms import (
     quaternion_xyzw,
     transform,
 )
+from remaster_ros.session.yaml_records import to_plain
 from remaster_ros.simulation.hidden_effects import HiddenEffect
 from remaster_ros.types import FloatArray
 
 ROLL_RAD = 0.2
 """Largest roll of a sensor about its optical axis, and tilt of a body against the tool's axes."""
-
-Record = TypeVar('Record')
-
 
 @dataclass(frozen=True)
 class Warming:
@@ -123,16 +120,6 @@ def mount_body(rng: np.random.Generator) -> FloatArray:
     """Draw R_T_B (3, 3) of a camera, board or probe that looks along the tool's z axis, about."""
     tilt = rng.uniform(-ROLL_RAD, ROLL_RAD, 2)
     return matrix_from_rpy((*tilt, rng.uniform(-np.pi, np.pi)))
-
-
-def to_plain(record: Any) -> Any:
-    """Return a record of this package's simulation as dicts, lists and numbers, for a file."""
-    return msgspec.to_builtins(record, enc_hook=lambda array: array.tolist())
-
-
-def from_plain(data: Any, kind: type[Record]) -> Record:
-    """Undo `to_plain`."""
-    return msgspec.convert(data, kind, dec_hook=lambda _, values: np.array(values, float))
 
 
 def truth_to_dict(truth: SessionTruth, chain: SerialChain, seed: int) -> dict[str, Any]:

@@ -27,10 +27,11 @@ from remaster_ros.kinematics import transforms
 from remaster_ros.kinematics.line_of_sight import LinkCapsules
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.session.files import write_atomically
+from remaster_ros.session.yaml_records import from_plain, to_plain
 from remaster_ros.simulation.arm_motion import Motion, ServoPoint
 from remaster_ros.simulation.faults import Faults, Numbers, is_out
 from remaster_ros.simulation.hidden_arm import WrongArm
-from remaster_ros.simulation.truth import SessionTruth, SimulatedSensor, from_plain, to_plain
+from remaster_ros.simulation.truth import SessionTruth, SimulatedSensor
 from remaster_ros.simulation.world_clock import WorldClock
 from remaster_ros.types import FloatArray
 

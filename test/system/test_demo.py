@@ -19,7 +19,8 @@ from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.motion.settling import SettleRules
 from remaster_ros.session.bag import BagReader
 from remaster_ros.session.reader import read_session
-from remaster_ros.simulation.truth import SessionTruth, from_plain
+from remaster_ros.session.yaml_records import from_plain
+from remaster_ros.simulation.truth import SessionTruth
 from remaster_ros.types import Correction
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(900)]

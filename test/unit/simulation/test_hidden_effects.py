@@ -9,18 +9,13 @@ from calibration_scenes import CHAIN, random_poses
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.transforms import transform
 from remaster_ros.session.workcell import read_cell
+from remaster_ros.session.yaml_records import from_plain, to_plain
 from remaster_ros.simulation.arm_motion import ServoPoint
 from remaster_ros.simulation.effect_sampling import RANDOM, EffectSpec, hide
 from remaster_ros.simulation.hidden_arm import ChainArm, WrongArm
 from remaster_ros.simulation.hidden_effects import NAMED, UNNAMED, HiddenEffect
 from remaster_ros.simulation.setup import make_world
-from remaster_ros.simulation.truth import (
-    SessionTruth,
-    SimulatedSensor,
-    Warming,
-    from_plain,
-    to_plain,
-)
+from remaster_ros.simulation.truth import SessionTruth, SimulatedSensor, Warming
 from remaster_ros.simulation.world import World
 from remaster_ros.simulation.world_model import Round, WorldModel
 
