@@ -26,6 +26,7 @@ from remaster_ros.types import FloatArray
 ROLL_RAD = 0.2
 """Largest roll of a sensor about its optical axis, and tilt of a body against the tool's axes."""
 
+
 @dataclass(frozen=True)
 class Warming:
     """An arm warms up by ``kelvin`` from ``start_s`` on, with time constant ``time_s``."""

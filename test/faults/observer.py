@@ -23,8 +23,8 @@ from remaster_ros.collection.events import (
     Event,
     SolutionFailed,
 )
-from remaster_ros.simulation.arm_motion import Motion, ServoPoint, spline
 from remaster_ros.session.yaml_records import from_plain
+from remaster_ros.simulation.arm_motion import Motion, ServoPoint, spline
 from remaster_ros.simulation.world import MOTION_FILE, START_S
 
 TOUCHED_RAD = 1e-4
