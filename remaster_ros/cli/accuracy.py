@@ -12,7 +12,7 @@ import numpy as np
 
 from remaster_ros.calibration.evaluate_offsets import OffsetsJudgement, accuracy_with_offsets
 from remaster_ros.calibration.orientation_accuracy import METRICS as ORIENTATION
-from remaster_ros.cli.console import progress_bar, show
+from remaster_ros.cli.console import progress_bar, tell
 from remaster_ros.cli.sessions import read_to_fit
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.reports.fit_json import joint_offsets_rad, read_fit, require_own
@@ -75,12 +75,7 @@ def run(args: argparse.Namespace) -> int:
         with undone_on_failure():
             make_folder(args.out.parent)
             write_atomically(args.out, json.dumps(content, indent=2) + '\n')
-    if args.json:
-        print(json.dumps(content))
-        return 0
-    show(args.quiet, table(judged))
-    if args.out is not None:
-        show(args.quiet, f'written: {args.out}')
+    tell(args, content, table(judged), '' if args.out is None else f'written: {args.out}')
     return 0
 
 

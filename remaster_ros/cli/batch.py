@@ -31,7 +31,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from remaster_ros.cli.console import progress_bar, show
+from remaster_ros.cli.console import progress_bar, tell
 from remaster_ros.cli.options import integer
 from remaster_ros.errors import InputError, InsufficientDataError, RemasterError
 from remaster_ros.session.files import make_folder, writing
@@ -146,12 +146,8 @@ def run(args: argparse.Namespace) -> int:
 
     over_all = summary_of(found)
     write_batch_page(args.out / PAGE, found, over_all)
-    if args.json:
-        print(json.dumps({'format': FORMAT, 'rows': found, **over_all}))
-    else:
-        for line in over_all['lines']:
-            show(args.quiet, line)
-        show(args.quiet, f'written: {args.out / PAGE}')
+    content = {'format': FORMAT, 'rows': found, **over_all}
+    tell(args, content, *over_all['lines'], f'written: {args.out / PAGE}')
     return 0 if any(row['status'] == 'done' for row in found) else 1
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import logging
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from remaster_ros.calibration.gauge_words import listed
-from remaster_ros.cli.console import show
+from remaster_ros.cli.console import tell
 from remaster_ros.cli.options import number
 from remaster_ros.cli.verify import require_same_arm
 from remaster_ros.compensation.checking import SMALLEST_M, Checked, Measured, judge
@@ -100,12 +99,7 @@ def run(args: argparse.Namespace) -> int:
     content = content_of(found, baseline.model.chain.joint_names, names, args.smallest_mm, iso)
     if args.out is not None:
         write_check_page(args.out, content, found.series_m, names)
-    if args.json:
-        print(json.dumps(content))
-    else:
-        show(args.quiet, _text(content))
-        if args.out is not None:
-            show(args.quiet, f'written: {args.out}')
+    tell(args, content, _text(content), '' if args.out is None else f'written: {args.out}')
     return 0
 
 

@@ -5,14 +5,13 @@ from __future__ import annotations
 import argparse
 import csv
 import io
-import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from remaster_ros.calibration.gauge_words import counted
-from remaster_ros.cli.console import show
+from remaster_ros.cli.console import tell
 from remaster_ros.cli.options import names, number
 from remaster_ros.compensation.compensator import Compensator, Correction
 from remaster_ros.compensation.file import Compensation, read_compensation
@@ -98,10 +97,7 @@ def run(args: argparse.Namespace) -> int:
     write_atomically(args.out, _text(table, columns, result / ANGLES[unit], DIGITS.get(unit, 8)))
     wanted = result if args.inverse else given
     facts = _facts(compensation, given, result, wanted, done, times(table, columns))
-    if args.json:
-        print(json.dumps(facts))
-    else:
-        show(args.quiet, _summary(facts, args.out))
+    tell(args, facts, _summary(facts, args.out))
     return 0
 
 

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from pathlib import Path
+from typing import Any
 
 # So long a stage has to run before it is told how long it still takes, s.
 LEAST_S = 1.0
@@ -56,12 +57,15 @@ def _duration(seconds: float) -> str:
     return f'{seconds:.0f} s' if seconds < 90.0 else f'{seconds / 60.0:.0f} min'
 
 
-def show_file(path: Path) -> None:
-    """Print a JSON file on one line, for other programs."""
-    print(json.dumps(json.loads(path.read_text(encoding='utf-8'))))
+def tell(args: argparse.Namespace, content: Mapping[str, Any], *lines: str) -> None:
+    """Print one JSON object with --json, else those lines that there are, unless --quiet."""
+    if args.json:
+        print(json.dumps(content))
+    else:
+        show(args.quiet, *lines)
 
 
-def show(quiet: bool, text: str) -> None:
-    """Print unless --quiet was given."""
-    if not quiet:
-        print(text)
+def show(quiet: bool, *lines: str) -> None:
+    """Print those lines that there are unless --quiet was given."""
+    for line in filter(None, () if quiet else lines):
+        print(line)

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import json
 import time
 from pathlib import Path
 
 import numpy as np
 
-from remaster_ros.cli.console import progress_bar, show, show_file
+from remaster_ros.cli.console import progress_bar, tell
 from remaster_ros.cli.options import add_sessions
 from remaster_ros.cli.sessions import read_together
 from remaster_ros.discovery.confirmation import (
@@ -84,19 +85,14 @@ def run(args: argparse.Namespace) -> int:
             figures=not args.no_figures,
             decided=decisions(found, pairs),
         )
-    if args.json:
-        show_file(args.out / DISCOVERY_FILE)
-    else:
-        content = read_discovery(args.out / DISCOVERY_FILE)
-        for line in (*named, *discovery_lines(content)):
-            show(args.quiet, line)
-        if session.measurements.orientation is not None:
-            show(
-                args.quiet,
-                'the measured orientations are not used: causes are searched in the '
-                'positions alone; "remaster fit" fits both',
-            )
-        show(args.quiet, f'written: {report}')
+    path = args.out / DISCOVERY_FILE
+    lines = [*named, *discovery_lines(read_discovery(path))]
+    if session.measurements.orientation is not None:
+        lines.append(
+            'the measured orientations are not used: causes are searched in the positions alone; '
+            '"remaster fit" fits both'
+        )
+    tell(args, json.loads(path.read_bytes()), *lines, f'written: {report}')
     if refusal is not None:
         raise refusal
     return 0

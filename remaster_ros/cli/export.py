@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import json
 from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
 
-from remaster_ros.cli.console import show
+from remaster_ros.cli.console import tell
 from remaster_ros.compensation.controller_forms import FORMS, exported, held
 from remaster_ros.compensation.file import read_compensation
 from remaster_ros.compensation.pad_pages import MotorNumber
@@ -111,22 +110,16 @@ def run(args: argparse.Namespace) -> int:
         make_new_folder(args.out)
         for name, text in files.items():
             write_atomically(args.out / name, text)
-    if args.json:
-        print(
-            json.dumps(
-                {
-                    'format': FORMAT,
-                    'form': args.to,
-                    'files': list(files),
-                    'left_out': {
-                        'rms_mm': one.rms_mm,
-                        'max_mm': one.max_mm,
-                        'parts': [asdict(part) for part in one.parts],
-                        'corrected_in_no_form': [left.effect for left in one.never],
-                    },
-                }
-            )
-        )
-    else:
-        show(args.quiet, '\n'.join([*one.words, f'written: {args.out} ({", ".join(files)})']))
+    content = {
+        'format': FORMAT,
+        'form': args.to,
+        'files': list(files),
+        'left_out': {
+            'rms_mm': one.rms_mm,
+            'max_mm': one.max_mm,
+            'parts': [asdict(part) for part in one.parts],
+            'corrected_in_no_form': [left.effect for left in one.never],
+        },
+    }
+    tell(args, content, *one.words, f'written: {args.out} ({", ".join(files)})')
     return 0

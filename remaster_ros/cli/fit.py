@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import json
 import logging
 import time
 from pathlib import Path
 
-from remaster_ros.cli.console import progress_bar, show, show_file
+from remaster_ros.cli.console import progress_bar, tell
 from remaster_ros.cli.options import add_sessions, integer, number
 
 # What fits and draws is imported where it does so: SciPy and the rest take a second to load, and
@@ -84,10 +85,7 @@ def run(args: argparse.Namespace) -> int:
         report = save_fit(result, args.out, figures=not args.no_figures)
     for line in result.implausible:
         log.warning('%s', line)
-    if args.json:
-        show_file(args.out / FIT_FILE)
-    else:
-        fit = read_fit(args.out / FIT_FILE)
-        for line in (*named, *fit_lines(fit), f'written: {report}'):
-            show(args.quiet, line)
+    path = args.out / FIT_FILE
+    lines = (*named, *fit_lines(read_fit(path)), f'written: {report}')
+    tell(args, json.loads(path.read_bytes()), *lines)
     return 0

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import logging
 from collections.abc import Iterator
 from dataclasses import replace
@@ -14,7 +13,7 @@ from typing import Any, Literal
 import numpy as np
 
 from remaster_ros.calibration.mistakes import sound_estimate
-from remaster_ros.cli.console import progress_bar, show
+from remaster_ros.cli.console import progress_bar, show, tell
 from remaster_ros.cli.options import add_description, names, number, xacro_arguments
 from remaster_ros.errors import InputError, InsufficientDataError, MistakeFoundError
 from remaster_ros.importing.assemble import (
@@ -300,15 +299,11 @@ def run(args: argparse.Namespace) -> int:
             "was the maker's accuracy option ($ABS_ACCUR) on? The result belongs to that state "
             'alone: say --accuracy-option active or inactive'
         )
-    if not args.json:
-        show(args.quiet, _as_text(rows, session, how))
+    show(args.quiet or args.json, _as_text(rows, session, how))
     if sense.fits or args.unchecked:
         refuse_outside_limits(rows, chain, session.measurements.q)
         write_session(args.out, session)
-    if args.json:
-        print(
-            json.dumps(_as_json(args.out if sense.fits or args.unchecked else None, rows, sense))
-        )
+    tell(args, _as_json(args.out if sense.fits or args.unchecked else None, rows, sense))
     if not sense.fits and not args.unchecked:
         remedy = f'to write it so, add {sense.options}' if sense.options else 'nothing was written'
         raise InsufficientDataError(
@@ -316,12 +311,7 @@ def run(args: argparse.Namespace) -> int:
         )
     if sense.warning:
         log.warning('%s', sense.warning)
-    if not args.json:
-        show(args.quiet, sense.sentence)
-        show(
-            args.quiet,
-            f'written: {args.out}; go on with: remaster fit {quote(str(args.out))} --out …',
-        )
+    show(args.quiet or args.json, sense.sentence, _written(args.out))
     return 0
 
 
@@ -367,13 +357,13 @@ def _mend(args: argparse.Namespace) -> int:
                     '--unchecked'
                 ) from None
     write_session(args.out, without_whole_turns(session, chain)[0])
-    if args.json:
-        print(json.dumps({'session': str(args.out), 'columns': {}, 'warnings': [], 'hint': ''}))
-        return 0
-    show(
-        args.quiet, f'written: {args.out}; go on with: remaster fit {quote(str(args.out))} --out …'
-    )
+    content = {'session': str(args.out), 'columns': {}, 'warnings': [], 'hint': ''}
+    tell(args, content, _written(args.out))
     return 0
+
+
+def _written(out: Path) -> str:
+    return f'written: {out}; go on with: remaster fit {quote(str(out))} --out …'
 
 
 def _read(args: argparse.Namespace, chain: SerialChain) -> RawRows:

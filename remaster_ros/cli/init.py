@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import os
 from dataclasses import replace
 from pathlib import Path
@@ -12,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from remaster_ros.cli.console import progress_bar, show
+from remaster_ros.cli.console import progress_bar, show, tell
 from remaster_ros.cli.options import CANDIDATES, add_description, names, number, xacro_arguments
 from remaster_ros.cli.plan import free_start
 from remaster_ros.errors import InputError, InsufficientDataError, did_you_mean
@@ -121,13 +120,8 @@ def run(args: argparse.Namespace) -> int:
             reached, of = _reached(scene, tour, args.seed)
         else:
             planned, text, (reached, of) = _plan(cell, missing, args.seed)
-    if args.json:
-        print(json.dumps(_as_json(args.out, proposal) | planned))
-    else:
-        show(args.quiet, _as_text(proposal))
-        if text:
-            show(args.quiet, text)
-        show(args.quiet, f'written: {args.out}; look at its lines marked CHECK')
+    written = f'written: {args.out}; look at its lines marked CHECK'
+    tell(args, _as_json(args.out, proposal) | planned, _as_text(proposal), text, written)
     if reached < FEWEST_FITTED:
         # The file stays: what it states may be what is wrong.
         found = f'{reached} poses can be planned in this cell'
@@ -140,10 +134,8 @@ def run(args: argparse.Namespace) -> int:
             f'{geometry * bool(proposal.chain.slides.any())}, and see whether they suffice: '
             f'remaster plan {quote(str(args.out))}'
         )
-    if not args.json:
-        show(
-            args.quiet, f'every way, in 3-D: remaster plan {quote(str(args.out))} --out plan.html'
-        )
+    page = f'every way, in 3-D: remaster plan {quote(str(args.out))} --out plan.html'
+    show(args.quiet or args.json, page)
     return 0
 
 

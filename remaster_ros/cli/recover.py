@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
 
-from remaster_ros.cli.console import show
+from remaster_ros.cli.console import tell
 from remaster_ros.session.recovery import recover_session
 
 LOST = 3
@@ -26,12 +25,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Recover the session; returns the exit status."""
     recovery = recover_session(args.session)
-    if args.json:
-        content = {'session': str(args.session), 'finished': recovery.finished}
-        print(json.dumps({**content, 'lost': list(recovery.lost)}))
-        return LOST if recovery.lost else 0
-    for line in recovery.lost:
+    for line in () if args.json else recovery.lost:
         print(f'lost: {line}')
     done = 'recovered' if recovery.finished else 'at rest, nothing to recover'
-    show(args.quiet, f'{args.session}: {done}')
+    content = {'session': str(args.session), **vars(recovery)}
+    tell(args, content, f'{args.session}: {done}')
     return LOST if recovery.lost else 0

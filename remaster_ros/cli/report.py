@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import time
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from remaster_ros.calibration.fit import fit_session
-from remaster_ros.cli.console import progress_bar, show
+from remaster_ros.cli.console import progress_bar, tell
 from remaster_ros.cli.sessions import read_to_fit
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.reports.answer import Answer, parts, read_inputs
@@ -73,18 +72,10 @@ def run(args: argparse.Namespace) -> int:
         answer = write_answer(
             inputs, fit_path.parent, found_folder, out, not args.no_figures, args.pdf
         )
-    if args.json:
-        print(json.dumps(as_dict(answer, out, plan_facts(inputs))))
-    else:
-        show(args.quiet, summary(answer))
-        show(args.quiet, f'written: {out / REPORT_FILE}')
-    return 0
-
-
-def summary(answer: Answer) -> str:
-    """Return the answer in a few lines."""
     remains = [f'remains: {row.sentence}' for row in answer.remains]
-    return '\n'.join([answer.headline, *remains])
+    lines = (answer.headline, *remains, f'written: {out / REPORT_FILE}')
+    tell(args, as_dict(answer, out, plan_facts(inputs)), *lines)
+    return 0
 
 
 def as_dict(answer: Answer, out: Path, plan: PlanFacts | None) -> dict[str, Any]:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from remaster_ros.cli.console import progress_bar, show
+from remaster_ros.cli.console import progress_bar, tell
 from remaster_ros.cli.options import add_poses, names, number
 from remaster_ros.session.files import undone_on_failure, write_atomically
 from remaster_ros.session.reader import write_session
@@ -138,9 +138,6 @@ def run(args: argparse.Namespace) -> int:
         with undone_on_failure():
             write_session(args.out, made.session)
             write_atomically(args.out / TRUTH_FILE, json.dumps(truth, indent=2) + '\n')
-    if args.json:
-        print(json.dumps(truth))
-        return 0
-    show(args.quiet, made.tour.describe())
-    show(args.quiet, f'written: {args.out}, {len(made.session.measurements)} observations')
+    written = f'written: {args.out}, {len(made.session.measurements)} observations'
+    tell(args, truth, made.tour.describe(), written)
     return 0

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import logging
 from dataclasses import asdict
 from pathlib import Path
@@ -11,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from remaster_ros.cli.console import show
+from remaster_ros.cli.console import tell
 from remaster_ros.compensation.file import Compensation, read_compensation
 from remaster_ros.compensation.verification import Estimate, Verdict, Verified, Visits, verify
 from remaster_ros.errors import InputError
@@ -63,10 +62,7 @@ def run(args: argparse.Namespace) -> int:
     warnings = _warnings(session, compensation)
     for warning in warnings:
         log.warning('%s: %s', args.session, warning)
-    if args.json:
-        print(json.dumps(_content(found, warnings)))
-    else:
-        show(args.quiet, _text(found))
+    tell(args, _content(found, warnings), _text(found))
     return 0
 
 
