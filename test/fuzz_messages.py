@@ -10,10 +10,10 @@ import random
 import struct
 from collections.abc import Iterable, Sequence
 
-from remaster_ros.sensors.laser_tracker.protocol import packets
-from remaster_ros.sensors.laser_tracker.protocol import packets as emscon
-from remaster_ros.sensors.optitrack.protocol import natnet
-from remaster_ros.sensors.optitrack.protocol.natnet import (
+from remaster_ros.sensors.laser_tracker import packets
+from remaster_ros.sensors.laser_tracker import packets as emscon
+from remaster_ros.sensors.optitrack import natnet
+from remaster_ros.sensors.optitrack.natnet import (
     TRACKING_VALID,
     AnalogDevice,
     Asset,

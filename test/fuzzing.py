@@ -18,17 +18,16 @@ from pathlib import Path
 import numpy as np
 from fuzz_messages import VERSIONS, full_frame, model_definition, server_info
 
+from remaster_ros.sensors.laser_tracker import packets
+from remaster_ros.sensors.laser_tracker import packets as emscon
 from remaster_ros.sensors.laser_tracker.client import (
     LaserTrackerClient,
     LaserTrackerError,
     LaserTrackerSettings,
 )
-from remaster_ros.sensors.laser_tracker.protocol import packets
-from remaster_ros.sensors.laser_tracker.protocol import packets as emscon
-from remaster_ros.sensors.optitrack import marker_follower
+from remaster_ros.sensors.optitrack import marker_follower, natnet
 from remaster_ros.sensors.optitrack.client import NatNetClient
 from remaster_ros.sensors.optitrack.frame_gate import Dropped, MarkerChoice, MarkerSample
-from remaster_ros.sensors.optitrack.protocol import natnet
 from remaster_ros.sensors.optitrack.settings import NatNetSettings
 from remaster_ros.types import FARTHEST_M
 

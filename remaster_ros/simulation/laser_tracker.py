@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from remaster_ros.errors import DeviceError
-from remaster_ros.sensors.laser_tracker.protocol.packets import (
+from remaster_ros.sensors.laser_tracker.packets import (
     NEED_DATA,
     Change,
     Command,

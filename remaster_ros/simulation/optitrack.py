@@ -19,8 +19,8 @@ from typing import Literal
 import numpy as np
 
 from remaster_ros.errors import InputError
-from remaster_ros.sensors.optitrack.protocol import natnet
-from remaster_ros.sensors.optitrack.protocol.natnet import (
+from remaster_ros.sensors.optitrack import natnet
+from remaster_ros.sensors.optitrack.natnet import (
     HAS_MODEL,
     MEASURED,
     MODEL_FILLED,

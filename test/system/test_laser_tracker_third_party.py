@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from tracker_world import MARKER, ReflectorWorld, across_and_along
 
-from remaster_ros.sensors.laser_tracker.protocol.packets import (
+from remaster_ros.sensors.laser_tracker.packets import (
     Command,
     ErrorReport,
     Measurement,

@@ -21,12 +21,12 @@ from optitrack_world import SENSOR, MarkerWorld, eventually, free_port, nothing_
 
 from remaster_ros.errors import DeviceError, InputError
 from remaster_ros.sensors.driver import SensorClock
+from remaster_ros.sensors.optitrack import natnet as our_natnet
 from remaster_ros.sensors.optitrack import natnetclient_backend
 from remaster_ros.sensors.optitrack.driver import OptiTrackDriver, Parameters
 from remaster_ros.sensors.optitrack.frame_gate import Dropped, MarkerChoice
+from remaster_ros.sensors.optitrack.natnet import LabeledMarker
 from remaster_ros.sensors.optitrack.natnetclient_backend import NatNetClientBackend
-from remaster_ros.sensors.optitrack.protocol import natnet as our_natnet
-from remaster_ros.sensors.optitrack.protocol.natnet import LabeledMarker
 from remaster_ros.sensors.optitrack.settings import NatNetSettings
 from remaster_ros.simulation.optitrack import FakeOptiTrackServer, OptiTrackBehaviour
 

@@ -23,8 +23,8 @@ from numpy.typing import ArrayLike
 
 from remaster_ros.errors import DeviceError, InputError
 from remaster_ros.parameters import check_all, parameter
-from remaster_ros.sensors.laser_tracker.protocol import packets
-from remaster_ros.sensors.laser_tracker.protocol.packets import (
+from remaster_ros.sensors.laser_tracker import packets
+from remaster_ros.sensors.laser_tracker.packets import (
     NEED_DATA,
     Change,
     Command,

@@ -15,10 +15,10 @@ from collections import deque
 from collections.abc import Callable
 
 from remaster_ros.errors import DeviceError
+from remaster_ros.sensors.optitrack import natnet
 from remaster_ros.sensors.optitrack.frame_gate import Dropped, MarkerSample, Source
 from remaster_ros.sensors.optitrack.marker_follower import MarkerFollower
-from remaster_ros.sensors.optitrack.protocol import natnet
-from remaster_ros.sensors.optitrack.protocol.natnet import (
+from remaster_ros.sensors.optitrack.natnet import (
     BITSTREAM_CHANGED,
     MODEL_LIST_CHANGED,
     Frame,

@@ -10,7 +10,7 @@ from enum import Enum, StrEnum
 import numpy as np
 
 from remaster_ros.errors import InputError
-from remaster_ros.sensors.optitrack.protocol.natnet import (
+from remaster_ros.sensors.optitrack.natnet import (
     MODEL_FILLED,
     NOT_LIVE,
     OCCLUDED,

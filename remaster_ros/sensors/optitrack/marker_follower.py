@@ -12,6 +12,7 @@ from typing import Literal
 
 import numpy as np
 
+from remaster_ros.sensors.optitrack import natnet
 from remaster_ros.sensors.optitrack.frame_gate import (
     Dropped,
     GateCounts,
@@ -22,8 +23,7 @@ from remaster_ros.sensors.optitrack.frame_gate import (
     SourceVerdict,
     describe,
 )
-from remaster_ros.sensors.optitrack.protocol import natnet
-from remaster_ros.sensors.optitrack.protocol.natnet import (
+from remaster_ros.sensors.optitrack.natnet import (
     Frame,
     ProtocolError,
     ServerInfo,

@@ -18,10 +18,10 @@ from collections.abc import Callable
 from typing import Any
 
 from remaster_ros.errors import InputError
+from remaster_ros.sensors.optitrack import natnet
 from remaster_ros.sensors.optitrack.frame_gate import Dropped, MarkerSample
 from remaster_ros.sensors.optitrack.marker_follower import Diagnosis, MarkerFollower
-from remaster_ros.sensors.optitrack.protocol import natnet
-from remaster_ros.sensors.optitrack.protocol.natnet import (
+from remaster_ros.sensors.optitrack.natnet import (
     MODEL_FILLED,
     OCCLUDED,
     OLDEST_VERSION,

@@ -11,9 +11,9 @@ from typing import Literal
 
 from remaster_ros.errors import DeviceError, InputError
 from remaster_ros.parameters import check_all, parameter
+from remaster_ros.sensors.optitrack import natnet
 from remaster_ros.sensors.optitrack.frame_gate import MarkerChoice
-from remaster_ros.sensors.optitrack.protocol import natnet
-from remaster_ros.sensors.optitrack.protocol.natnet import (
+from remaster_ros.sensors.optitrack.natnet import (
     ProtocolError,
     Version,
     require_supported,

@@ -20,7 +20,7 @@ from remaster_ros.sensors.laser_tracker.client import (
     LaserTrackerSettings,
     TrackerStatus,
 )
-from remaster_ros.sensors.laser_tracker.protocol.packets import Status
+from remaster_ros.sensors.laser_tracker.packets import Status
 from remaster_ros.simulation.laser_tracker import FakeLaserTracker, TrackerBehaviour
 
 QUICK = TrackerBehaviour(warm_up_s=0.5, initialise_s=0.5, search_failure_share=0.0)

@@ -19,7 +19,7 @@ from remaster_ros.sensors.laser_tracker.client import (
     LaserTrackerError,
     LaserTrackerSettings,
 )
-from remaster_ros.sensors.laser_tracker.protocol.packets import (
+from remaster_ros.sensors.laser_tracker.packets import (
     NEED_DATA,
     Change,
     Command,

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from remaster_ros.sensors.laser_tracker.protocol.packets import (
+from remaster_ros.sensors.laser_tracker.packets import (
     MAX_PACKET_SIZE,
     NEED_DATA,
     Command,

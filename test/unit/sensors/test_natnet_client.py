@@ -12,9 +12,9 @@ from natnet_rig import LOCAL, NOISELESS, client_of, fake_server
 from optitrack_world import RATE, MarkerWorld, eventually, free_port, nothing_left
 
 from remaster_ros.errors import DeviceError, InputError
+from remaster_ros.sensors.optitrack import natnet
 from remaster_ros.sensors.optitrack.client import NatNetClient
 from remaster_ros.sensors.optitrack.frame_gate import Dropped, MarkerChoice
-from remaster_ros.sensors.optitrack.protocol import natnet
 from remaster_ros.sensors.optitrack.settings import NatNetSettings
 from remaster_ros.simulation.optitrack import OptiTrackBehaviour
 

@@ -13,7 +13,7 @@ from remaster_ros.sensors.optitrack.marker_follower import (
     diagnose,
     warning,
 )
-from remaster_ros.sensors.optitrack.protocol.natnet import Connection, ServerInfo
+from remaster_ros.sensors.optitrack.natnet import Connection, ServerInfo
 from remaster_ros.sensors.optitrack.settings import NatNetSettings
 
 GROUP = '239.255.42.99'

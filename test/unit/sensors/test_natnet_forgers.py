@@ -18,10 +18,10 @@ import numpy as np
 import pytest
 from optitrack_world import SENSOR, MarkerWorld, eventually, free_port
 
+from remaster_ros.sensors.optitrack import natnet
 from remaster_ros.sensors.optitrack.client import NatNetClient
 from remaster_ros.sensors.optitrack.frame_gate import Dropped
 from remaster_ros.sensors.optitrack.marker_follower import warning
-from remaster_ros.sensors.optitrack.protocol import natnet
 from remaster_ros.sensors.optitrack.settings import NatNetSettings
 from remaster_ros.simulation.optitrack import FakeOptiTrackServer, OptiTrackBehaviour
 

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from remaster_ros.sensors.optitrack.protocol.natnet import (
+from remaster_ros.sensors.optitrack.natnet import (
     MEASURED,
     OCCLUDED,
     TRACKING_VALID,

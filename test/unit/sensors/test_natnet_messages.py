@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from remaster_ros.sensors.optitrack.protocol import natnet
-from remaster_ros.sensors.optitrack.protocol.natnet import (
+from remaster_ros.sensors.optitrack import natnet
+from remaster_ros.sensors.optitrack.natnet import (
     Frame,
     MarkerSetDescription,
     MessageId,

@@ -13,10 +13,10 @@ from natnet_rig import LOCAL, client_of
 from optitrack_world import eventually
 
 from remaster_ros.sensors.optitrack import client as natnet_client
+from remaster_ros.sensors.optitrack import natnet
 from remaster_ros.sensors.optitrack.client import NatNetClient, _is_of_no_use
 from remaster_ros.sensors.optitrack.frame_gate import Dropped, MarkerChoice
-from remaster_ros.sensors.optitrack.protocol import natnet
-from remaster_ros.sensors.optitrack.protocol.natnet import (
+from remaster_ros.sensors.optitrack.natnet import (
     BITSTREAM_CHANGED,
     MODEL_LIST_CHANGED,
     Frame,

@@ -11,8 +11,8 @@ import pytest
 from optitrack_world import SENSOR, MarkerWorld, SteppedWorld, free_port
 
 from remaster_ros.errors import InputError
-from remaster_ros.sensors.optitrack.protocol import natnet
-from remaster_ros.sensors.optitrack.protocol.natnet import TRACKING_VALID, Frame, MessageId
+from remaster_ros.sensors.optitrack import natnet
+from remaster_ros.sensors.optitrack.natnet import TRACKING_VALID, Frame, MessageId
 from remaster_ros.simulation.optitrack import (
     MAX_CLIENTS,
     FakeOptiTrackServer,

@@ -1,1 +1,0 @@
-"""The emScon protocol: bytes to events and back; no sockets."""

@@ -1,1 +1,0 @@
-"""NatNet: bytes to events and back; no sockets."""
