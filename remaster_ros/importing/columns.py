@@ -25,19 +25,7 @@ _AXIS_WORDS = {
 # Which height, and in which system: words that X and Y are without.
 _SURVEYED = {'ortho', 'orthometric', 'ellipsoidal', 'ell', 'local', 'grid'}
 _JOINT_WORDS = {
-    'a',
-    'j',
-    'q',
-    'ax',
-    'th',
-    'theta',
-    'θ',
-    'jt',
-    'jnt',
-    'axis',
-    'joint',
-    'joints',
-} | {
+    *('a', 'j', 'q', 'ax', 'th', 'theta', 'θ', 'jt', 'jnt', 'axis', 'joint', 'joints'),
     *('achse', 'gelenk', 'eje', 'axe', 'asse', 'angle', 'position', 'positions', 'pos'),
     *('robot', 'lbr', 'rad', 'deg', 'state', 'states'),
 }
@@ -72,16 +60,8 @@ _WORDS = {
         *('number', 'nummer', '#', 'index', 'observation', 'messpunkt', 'prüfpunkt', 'row', 'nom'),
     },
     'time': {
-        'time',
-        'timestamp',
-        'stamp',
-        't',
-        'zeit',
-        'datetime',
-        'zeitstempel',
-        'secs',
-        'epoch',
-        'ts',
+        *('time', 'timestamp', 'stamp', 't', 'zeit', 'datetime', 'zeitstempel', 'secs'),
+        *('epoch', 'ts'),
     },
     'date': {'date', 'datum'},
     'clock': {'uhrzeit', 'clock'},

@@ -412,10 +412,10 @@ def between(stream: Stream, begin: float, end: float) -> slice:
     return slice(int(first), int(last))
 
 
-def some(names: Sequence[str], shown: int = 5) -> str:
-    """Return the first few names, and how many more there are."""
-    more = f' and {len(names) - shown} more' if len(names) > shown else ''
-    return f'{", ".join(names[:shown])}{more}'
+def some(names: Sequence[str]) -> str:
+    """Return the first five names, and how many more there are."""
+    more = f' and {len(names) - 5} more' if len(names) > 5 else ''
+    return f'{", ".join(names[:5])}{more}'
 
 
 # Tables that are streams (a take, a log of joints) as tables of standstills, one row each.

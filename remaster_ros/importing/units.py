@@ -12,42 +12,23 @@ TIMES = {'s': 1.0, 'ms': 1e-3, 'us': 1e-6, 'ns': 1e-9, 'min': 60.0, 'h': 3600.0}
 TEMPERATURES = {'degc': 1.0, 'k': 1.0}
 SI = {**ANGLES, **LENGTHS, **TIMES, **TEMPERATURES}
 
+# German grad are degrees; who means the other one writes gon.
 _WORDS = {
-    '°': 'deg',
-    'º': 'deg',
-    'degs': 'deg',
-    'degree': 'deg',
-    'degrees': 'deg',
-    # German; who means the other one writes gon.
-    'grad': 'deg',
-    'radian': 'rad',
-    'radians': 'rad',
-    'rads': 'rad',
-    'gons': 'gon',
-    'meter': 'm',
-    'meters': 'm',
-    'metre': 'm',
-    'metres': 'm',
-    'millimeter': 'mm',
-    'millimeters': 'mm',
-    'millimetre': 'mm',
-    'millimetres': 'mm',
-    'centimeters': 'cm',
-    'centimetres': 'cm',
-    'µm': 'um',
-    'μm': 'um',
-    'micron': 'um',
-    'microns': 'um',
-    'inch': 'in',
-    'inches': 'in',
-    '"': 'in',
-    'sec': 's',
-    'secs': 's',
-    'seconds': 's',
-    'c': 'degc',
-    '°c': 'degc',
-    'celsius': 'degc',
-    'kelvin': 'k',
+    word: unit
+    for unit, words in {
+        'deg': '° º degs degree degrees grad',
+        'rad': 'radian radians rads',
+        'gon': 'gons',
+        'm': 'meter meters metre metres',
+        'mm': 'millimeter millimeters millimetre millimetres',
+        'cm': 'centimeters centimetres',
+        'um': 'µm μm micron microns',
+        'in': 'inch inches "',
+        's': 'sec secs seconds',
+        'degc': 'c °c celsius',
+        'k': 'kelvin',
+    }.items()
+    for word in words.split()
 }
 _IN_BRACKETS = re.compile(r'\s*[\[(]\s*([^\])]+?)\s*[\])]\s*$')
 _AFTER_SLASH = re.compile(r'\s*(?:/|,| in )\s*([^\s/,]+)\s*$')

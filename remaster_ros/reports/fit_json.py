@@ -32,11 +32,7 @@ from remaster_ros.kinematics.transforms import quaternion_xyzw
 from remaster_ros.reports import schemas
 from remaster_ros.reports.rows_csv import RESIDUALS_FILE
 from remaster_ros.reports.sentences import verdict
-from remaster_ros.session.files import (
-    make_folder,
-    read_limited,
-    write_atomically,
-)
+from remaster_ros.session.files import read_limited
 from remaster_ros.types import FloatArray, Measurements, Session
 from remaster_ros.version import __version__
 
@@ -336,13 +332,6 @@ def _describe(session: Session) -> dict[str, Any]:
         **({} if session.timed else {'times': 'none'}),
         **({'observations_sha256': digest} if (digest := session.observations_sha256) else {}),
     }
-
-
-def write_fit(result: FitResult, path: str | os.PathLike[str]) -> None:
-    """Write fit.json in one step."""
-    path = Path(path)
-    make_folder(path.parent)
-    write_atomically(path, schemas.encode(fit_content(result)))
 
 
 def read_fit(path: str | os.PathLike[str]) -> schemas.Fit:

@@ -20,10 +20,10 @@ from remaster_ros.reports.fit_json import (
     REPORT_FILE,
     WRITTEN,
     compensation_text,
+    fit_content,
     geometry_of,
     model_text,
     require_own,
-    write_fit,
 )
 from remaster_ros.reports.rows_csv import (
     PREDICTIONS_FILE,
@@ -31,7 +31,7 @@ from remaster_ros.reports.rows_csv import (
     predictions_text,
     residuals_text,
 )
-from remaster_ros.session.files import cannot_write, make_folder, write_atomically, writing
+from remaster_ros.session.files import make_folder, write_atomically, writing
 
 if TYPE_CHECKING:
     from remaster_ros.calibration.result import FitResult
@@ -62,19 +62,15 @@ def prepare_folder(folder: str | os.PathLike[str], result: str) -> None:
             f'{folder}: holds {", ".join(foreign)}, not written by this command, some of which it '
             'would replace; name another folder'
         )
-    try:
+    with writing(folder):
         # A file without a name: an interrupt leaves nothing behind.
         tempfile.TemporaryFile(dir=folder).close()
-    except OSError as error:
-        raise cannot_write(folder, error) from None
 
 
-def remove_report(folder: Path) -> None:
+def _remove_report(folder: Path) -> None:
     """Remove the report of an earlier run, which would contradict the new result."""
-    try:
+    with writing(folder / REPORT_FILE):
         (folder / REPORT_FILE).unlink(missing_ok=True)
-    except OSError as error:
-        raise cannot_write(folder / REPORT_FILE, error) from None
 
 
 def save_fit(result: FitResult, folder: str | os.PathLike[str], figures: bool = True) -> Path:
@@ -83,8 +79,10 @@ def save_fit(result: FitResult, folder: str | os.PathLike[str], figures: bool = 
     Returns the report; without figures there is none, and fit.json.
     """
     folder = Path(folder)
-    write_fit(result, folder / FIT_FILE)
-    result_sha256 = hashlib.sha256((folder / FIT_FILE).read_bytes()).hexdigest()
+    make_folder(folder)
+    text = schemas.encode(fit_content(result))
+    write_atomically(folder / FIT_FILE, text)
+    result_sha256 = hashlib.sha256(text).hexdigest()
     write_atomically(folder / RESIDUALS_FILE, residuals_text(result))
     files = exports(result)
     if (geometry := geometry_of(result)) is not None and geometry.is_better:
@@ -94,7 +92,7 @@ def save_fit(result: FitResult, folder: str | os.PathLike[str], figures: bool = 
         files[COMPENSATION_FILE] = compensation_text(result, result_sha256)
     _write_applied(folder, files)
     if not figures:
-        remove_report(folder)
+        _remove_report(folder)
         return folder / FIT_FILE
     # Matplotlib and the templates take a second to import: only where a report is made.
     from remaster_ros.reports.report import write_fit_report
@@ -129,7 +127,7 @@ def save_discovery(
     write_atomically(folder / PREDICTIONS_FILE, rows)
     _write_applied(folder, applied(discovery, predictions.widening, result_sha256))
     if not figures:
-        remove_report(folder)
+        _remove_report(folder)
         return folder / DISCOVERY_FILE
     # Matplotlib and the templates take a second to import: only where a report is made.
     from remaster_ros.reports.report import write_discovery_report

@@ -210,8 +210,9 @@ def _hull(shape: Shape) -> tuple[FloatArray, IntArray]:
 
 
 @cache
-def _ball(count: int = 200) -> FloatArray:
+def _ball() -> FloatArray:
     """Return points spread evenly over the unit sphere, (n, 3), along a spiral."""
+    count = 200
     z = 1.0 - (2.0 * np.arange(count) + 1.0) / count
     turn = np.arange(count) * np.pi * (3.0 - 5.0**0.5)
     radius = np.sqrt(1.0 - z**2)

@@ -33,16 +33,10 @@ def read(text: str) -> Named | None:
 
 def _with_header(head: list[str], lines: list[tuple[int, str]]) -> Named | None:
     columns = {cell: i for i, cell in enumerate(head)}
-    names = {
-        match[2]: i
-        for cell, i in columns.items()
-        if (match := _FIELD.fullmatch(cell)) and match[1] == 'name'
-    }
-    positions = {
-        match[2]: i
-        for cell, i in columns.items()
-        if (match := _FIELD.fullmatch(cell)) and match[1] == 'position'
-    }
+    names, positions = dict[str, int](), dict[str, int]()
+    for cell, i in columns.items():
+        if match := _FIELD.fullmatch(cell):
+            (names if match[1] == 'name' else positions)[match[2]] = i
     if not names or {*names} != {*positions}:
         return None
     # The time of the message, not that of printing it.
@@ -65,7 +59,7 @@ def _with_header(head: list[str], lines: list[tuple[int, str]]) -> Named | None:
 
 def _names(cells: list[str]) -> list[str]:
     """Return the joints' names of a line of ``ros2 topic echo --csv``; [] of other lines."""
-    if len(cells) < 5 or not (cells[0].isdigit() and cells[1].isdigit() and int(cells[1]) < 1e9):
+    if len(cells) < 5 or not _stamp(cells):
         return []
     names = []
     for cell in cells[3:]:
@@ -83,18 +77,22 @@ def _without(lines: list[tuple[int, str]]) -> Named:
         if _names(cells) != first:
             raise unexpected(number, line, f'second, nanosecond, frame, {", ".join(first)}')
         start = 3 + len(first)
-        stamp = f'{cells[0]}.{int(cells[1]):09d}'
-        rows.append((stamp, *cells[start : start + len(first)]))
+        rows.append((_stamp(cells), *cells[start : start + len(first)]))
     return _named(first, rows, lines, 's')
+
+
+def _stamp(cells: list[str]) -> str:
+    """Return the time of a line that begins with second and nanosecond; '' of other lines."""
+    if not (cells[0].isdigit() and cells[1].isdigit() and int(cells[1]) < 1e9):
+        return ''
+    return f'{cells[0]}.{int(cells[1]):09d}'
 
 
 def _is_place(cells: list[str]) -> bool:
     """Return whether a line is a point or pose: second, nanosecond, frame, 3 or 7 numbers."""
     return (
         len(cells) - 3 in (len('xyz'), len('xyz') + len('xyzw'))
-        and cells[0].isdigit()
-        and cells[1].isdigit()
-        and int(cells[1]) < 1e9
+        and bool(_stamp(cells))
         and not NUMBER.fullmatch(cells[2])
         and all(map(NUMBER.fullmatch, cells[3:]))
     )
@@ -108,7 +106,7 @@ def _places(lines: list[tuple[int, str]]) -> Named:
         cells = [cell.strip() for cell in line.split(',')]
         if len(cells) != width or not _is_place(cells):
             raise unexpected(number, line, f'second, nanosecond, frame and {width - 3} numbers')
-        rows.append((f'{cells[0]}.{int(cells[1]):09d}', *cells[3:]))
+        rows.append((_stamp(cells), *cells[3:]))
     axes = [*(f'{axis} [m]' for axis in 'xyz'), *(f'q{axis}' for axis in 'xyzw')]
     return Named(
         kind='points as ROS prints them',

@@ -22,13 +22,13 @@ from remaster_ros.compensation.export import (
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.transforms import matrix_from_quaternion_xyzw, matrix_from_rpy
-from remaster_ros.reports.fit_json import fit_content, joint_offsets_rad, read_fit, write_fit
+from remaster_ros.reports.fit_json import fit_content, joint_offsets_rad, read_fit
 from remaster_ros.reports.report import fit_html
 from remaster_ros.reports.result_folder import prepare_folder, save_fit
 
 
 def test_fit_json_is_the_fit(fit_result, tmp_path):
-    write_fit(fit_result, tmp_path / 'new' / 'fit.json')
+    save_fit(fit_result, tmp_path / 'new', figures=False)
     fit = read_fit(tmp_path / 'new' / 'fit.json')
     assert fit == fit_content(fit_result)
     assert fit.format == 'remaster-fit/1'
@@ -82,8 +82,7 @@ def test_offsets_that_are_no_angles_are_refused(fit_result, key, value):
 )
 def test_a_wrong_fit_json_is_refused(fit_result, tmp_path, change, problem):
     path = tmp_path / 'fit.json'
-    write_fit(fit_result, path)
-    fit = json.loads(path.read_text())
+    fit = msgspec.to_builtins(fit_content(fit_result))
     change(fit)
     path.write_text(json.dumps(fit))
     with pytest.raises(InputError, match=problem) as caught:

@@ -12,7 +12,8 @@ from hostile.files import check_read, read_urdf, spoil_and_read
 
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.urdf import parse_urdf
-from remaster_ros.reports.fit_json import joint_offsets_rad, read_fit, write_fit
+from remaster_ros.reports import schemas
+from remaster_ros.reports.fit_json import fit_content, joint_offsets_rad, read_fit
 from remaster_ros.session.bag import BagReader
 from remaster_ros.session.bag_writer import BagWriter
 from remaster_ros.session.reader import read_session, write_session
@@ -62,7 +63,7 @@ def test_a_spoilt_cell_is_read_or_refused(tmp_path, rng):
 
 def test_a_spoilt_fit_is_read_or_refused(tmp_path, rng, fit_result):
     path = tmp_path / 'fit.json'
-    write_fit(fit_result, path)
+    path.write_bytes(schemas.encode(fit_content(fit_result)))
 
     def read():
         joint_offsets_rad(read_fit(path), fit_result.joint_names)
