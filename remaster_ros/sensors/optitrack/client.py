@@ -214,7 +214,7 @@ class NatNetClient(MarkerFollower):
             if self._status.version is None and (is_frame or message_id == MessageId.MODELDEF):
                 self._gate.drop(Dropped.UNRESOLVED)
                 return
-            message = natnet.decode_message(datagram, self._status.version, markers_only=True)
+            message = natnet.decode_message(datagram, self._status.version)
         except ProtocolError as error:
             self._note_malformed(error)
             self._malformed_in_a_row += 1

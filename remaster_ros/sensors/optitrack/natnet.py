@@ -314,8 +314,8 @@ class List(Codec):
 class SizedList(List):
     """A count, the size in bytes of all items, and the items.
 
-    The size bounds the items, and what a newer server adds behind them is skipped. Items of a
-    fixed layout must fill the size: another size shows that the layout is not the known one.
+    What a newer server adds behind items that are stepped over is so as well. Those that are read
+    have a fixed layout and must fill the size: another one shows that theirs is not the known one.
     """
 
     least = _COUNT_AND_SIZE.size
@@ -329,14 +329,11 @@ class SizedList(List):
     def read(self, reader: Reader) -> tuple[Any, ...]:
         """Read the items."""
         count, size = self._head(reader)
-        if isinstance(self.kind, Row):
-            if size == count * self.kind.least:
-                return self.kind.read_many(reader, count)
+        if size != count * self.kind.least:
             raise ProtocolError(
                 f'a section of {count} items of {self.kind.least} bytes that claims {size} bytes'
             )
-        with reader.bounded(size):
-            return self.kind.read_many(reader, count)
+        return self.kind.read_many(reader, count)
 
     def skip(self, reader: Reader) -> None:
         """Step over the items at once."""
@@ -456,25 +453,24 @@ class Frame:
     params: int = 0  # `RECORDING`, `MODEL_LIST_CHANGED`, `NOT_LIVE`, `BITSTREAM_CHANGED`
 
 
-def decode_frame(payload: bytes, version: Version, *, markers_only: bool = False) -> Frame:
-    """Decode the payload of a FRAMEOFDATA datagram, to its end tag.
+def decode_frame(payload: bytes, version: Version) -> Frame:
+    """Decode the labelled markers and the times of a FRAMEOFDATA datagram, to its end tag.
 
-    ``payload``: the bytes behind the 4-byte header; ``version``: the server's bitstream version;
-    ``markers_only``: step over everything but the labelled markers and the times: every count is
-    checked, but what is stepped over is left out and its numbers are not looked at. Half the work.
+    ``payload``: the bytes behind the 4-byte header; ``version``: the server's bitstream version.
+    Everything else is stepped over: every count is checked, but its numbers are not looked at.
     Raises ProtocolError: if the version is unknown, the bytes end early or late, a count does not
-    fit, or a number that must be finite is not. Positions of occluded markers and untracked bodies
-    claim nothing and may be anything.
+    fit, or a number that must be finite is not. Positions of occluded markers claim nothing and
+    may be anything.
     """
     require_supported(version)
     layout = _layout(min(version, NEWEST_VERSION))
     reader = Reader(payload)
     frame = {'number': I32.read(reader)}
     for name, codec in layout.sections.items():
-        if markers_only and name != 'labeled_markers':
-            codec.skip(reader)
-        else:
+        if name == 'labeled_markers':
             frame[name] = codec.read(reader)
+        else:
+            codec.skip(reader)
     *rest, tag = reader.unpack(layout.rest)
     frame.update(zip(layout.rest_names, rest))
     if tag != 0 or reader.left:
@@ -516,8 +512,8 @@ def _layout(version: Version) -> _Layout:
     labeled = _LABELED_3 if since_3 else _LABELED_2
     analog = Record(AnalogDevice, I32, List(List(F32)))
     sections: dict[str, Codec] = {
-        'marker_sets': section(Record(MarkerSet, TEXT, List(_POSITION))),
-        'other_markers': section(_POSITION),
+        'marker_sets': section(Record(MarkerSet, TEXT, List(VEC3))),
+        'other_markers': section(VEC3),
         'rigid_bodies': section(body),
         'skeletons': section(Record(Skeleton, I32, List(body))),
     }
@@ -542,11 +538,6 @@ def _layout(version: Version) -> _Layout:
 def _require_finite(values: Iterable[float], what: str) -> None:
     if not all(map(math.isfinite, values)):
         raise ProtocolError(f'the {what} is not finite')
-
-
-def _positions(rows: list[tuple]) -> list[tuple]:
-    _require_finite(chain.from_iterable(rows), 'position of a marker')
-    return rows
 
 
 def _labeled(rows: list[tuple], *, has_residual: bool) -> list[LabeledMarker]:
@@ -578,23 +569,8 @@ def _flat_labeled_3(marker: LabeledMarker) -> tuple:
     return *_flat_labeled_2(marker), math.nan if marker.residual is None else marker.residual
 
 
-def _bodies_3(rows: list[tuple]) -> list[RigidBody]:
-    bodies = [RigidBody(row[0], row[1:4], row[4:8], row[8], row[9]) for row in rows]
-    for body in bodies:
-        _require_finite_if_tracked(body)
-    return bodies
-
-
 def _flat_body_3(body: RigidBody) -> tuple:
     return body.id, *body.position, *body.orientation_xyzw, body.mean_error, body.params
-
-
-def _body_2(head: tuple, columns: tuple[tuple, ...], end: tuple) -> RigidBody:
-    markers = tuple(map(BodyMarker, *columns))
-    mean_error, params = end
-    body = RigidBody(head[0], head[1:4], head[4:8], mean_error, params, markers)
-    _require_finite_if_tracked(body)
-    return body
 
 
 def _parts_of_body_2(body: RigidBody) -> tuple:
@@ -603,19 +579,15 @@ def _parts_of_body_2(body: RigidBody) -> tuple:
     return head, columns, (body.mean_error, body.params)
 
 
-def _require_finite_if_tracked(body: RigidBody) -> None:
-    if not body.params & TRACKING_VALID:
-        return
-    _require_finite(body.position + body.orientation_xyzw, f'pose of rigid body {body.id}')
-    inside = chain.from_iterable([marker.position for marker in body.markers])
-    _require_finite(inside, f'position of a marker of body {body.id}')
-
-
-_POSITION = Row('3f', _positions)
 _LABELED_2 = Row('i4fH', partial(_labeled, has_residual=False), _flat_labeled_2)
 _LABELED_3 = Row('i4fHf', partial(_labeled, has_residual=True), _flat_labeled_3)
-_BODY_2 = Record(_body_2, Row('i7f'), Columns(VEC3, I32, F32), Row('fH'), flatten=_parts_of_body_2)
-_BODY_3 = Row('i8fH', _bodies_3, _flat_body_3)
+# Bodies are written and stepped over, never read.
+_BODY_2 = Record(
+    lambda *_: None,
+    *(Row('i7f'), Columns(VEC3, I32, F32), Row('fH')),
+    flatten=_parts_of_body_2,
+)
+_BODY_3 = Row('i8fH', flatten=_flat_body_3)
 
 
 MARKER_SET, RIGID_BODY, SKELETON, FORCE_PLATE, DEVICE, CAMERA, ASSET = range(7)
@@ -932,20 +904,17 @@ def join_datagram(message_id: int, payload: bytes = b'') -> bytes:
     return _HEADER.pack(message_id, len(payload)) + payload
 
 
-def decode_message(
-    datagram: bytes, version: Version | None, *, markers_only: bool = False
-) -> Message:
-    """Decode what a server sent.
+def decode_message(datagram: bytes, version: Version | None) -> Message:
+    """Decode what a server sent, of a frame what `decode_frame` does.
 
     ``datagram``: as received; ``version``: the server's bitstream version; None while it is
-    unknown, when frames and model definitions cannot be read; ``markers_only``: as for
-    `decode_frame`.
+    unknown, when frames and model definitions cannot be read.
     Raises ProtocolError: for anything that is not a whole, valid message from a server.
     """
     message_id, payload = split_datagram(datagram)
     match message_id:
         case MessageId.FRAMEOFDATA:
-            return decode_frame(payload, _known(version), markers_only=markers_only)
+            return decode_frame(payload, _known(version))
         case MessageId.SERVERINFO:
             return _decode_server_info(payload)
         case MessageId.MODELDEF:

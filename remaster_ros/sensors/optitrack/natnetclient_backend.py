@@ -150,7 +150,7 @@ class NatNetClientBackend(MarkerFollower):
             if self._is_foreign(sender[0]) or self._is_refused(sender):
                 continue
             try:
-                frame = natnet.decode_message(datagram, self._status.version, markers_only=True)
+                frame = natnet.decode_message(datagram, self._status.version)
                 if not isinstance(frame, Frame):
                     raise ProtocolError('a message on the data port that is no frame')
             except ProtocolError as error:
