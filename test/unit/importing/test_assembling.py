@@ -210,45 +210,47 @@ def test_joints_outside_their_limits_name_the_row_and_the_remedies(do):
     assert '1 of 48 rows' in error
 
 
-def test_a_zero_position_a_quarter_off_is_proposed_and_corrected(do):
+@pytest.mark.parametrize(
+    ('joint', 'share', 'said', 'option'),
+    [
+        (1, (1, 0, -90), '+90 degrees on A2', '--offset A2=90'),
+        # As FANUC's pendants show joint 3.
+        (2, (1, -1, 0), '+A2 added to A3 (it counts from the horizontal)', '--couple A3=A2'),
+        (2, (-1, 0, 0), 'with A3 reversed the data fit to 0.', '--reverse A3'),
+    ],
+)
+def test_what_a_pad_counts_otherwise_is_proposed_and_undone(do, joint, share, said, option):
+    """``share``: of the joint itself, of that before it, and degrees, in what the table has."""
     arm, run = do
     q = np.rad2deg(arm.q)
-    q[:, 1] -= 90.0
-    error = run(HEADER, [*q.T, *(1e3 * arm.points.T)])
-    assert '+90 degrees on A2' in error
-    assert 'add --offset A2=90;' in error
-    made = run(HEADER, [*q.T, *(1e3 * arm.points.T)], '--offset', 'A2=90').measurements
-    np.testing.assert_allclose(made.q, arm.q, atol=1e-7)
-
-
-def test_a_joint_that_counts_from_the_horizontal_is_proposed_and_coupled(do):
-    """As FANUC's pendants show joint 3."""
-    arm, run = do
-    q = np.rad2deg(arm.q)
-    q[:, 2] -= q[:, 1]
+    own, before, added = share
+    q[:, joint] = own * q[:, joint] + before * q[:, joint - 1] + added
     table = [*q.T, *(1e3 * arm.points.T)]
     error = run(HEADER, table)
-    assert '+A2 added to A3 (it counts from the horizontal)' in error
-    assert 'add --couple A3=A2;' in error
-    made = run(HEADER, table, '--couple', 'A3=A2').measurements
+    assert said in error
+    assert f'add {option};' in error
+    made = run(HEADER, table, *option.split()).measurements
     np.testing.assert_allclose(made.q, arm.q, atol=1e-7)
 
 
-def test_units_that_were_stated_wrongly_are_proposed(do):
+@pytest.mark.parametrize(
+    ('header', 'told', 'said', 'option'),
+    [
+        (HEADER, ('--length', 'in'), 'the points in mm', '--length mm'),
+        (HEADER, ('--angles', 'rad'), '', '--angles deg'),
+        (
+            [*HEADER[:3], 'A5', 'A4', *HEADER[5:]],
+            (),
+            'with the joints in the order A1, A2, A3, A5, A4, A6 the data fit to 0.',
+            '--joints A1,A2,A3,A5,A4,A6',
+        ),
+    ],
+)
+def test_units_and_columns_that_were_stated_wrongly_are_proposed(do, header, told, said, option):
     arm, run = do
-    error = run(HEADER, columns(arm), '--length', 'in')
-    assert 'the points in mm' in error
-    assert 'add --length mm;' in error
-    error = run(HEADER, columns(arm), '--angles', 'rad')
-    assert 'add --angles deg;' in error
-
-
-def test_columns_in_another_order_are_proposed(do):
-    arm, run = do
-    header = [*HEADER[:3], 'A5', 'A4', *HEADER[5:]]
-    error = run(header, columns(arm))
-    assert 'with the joints in the order A1, A2, A3, A5, A4, A6 the data fit to 0.' in error
-    assert 'add --joints A1,A2,A3,A5,A4,A6;' in error
+    error = run(header, columns(arm), *told)
+    assert said in error
+    assert f'add {option};' in error
 
 
 def test_another_robots_data_are_named_as_such(do, tmp_path):

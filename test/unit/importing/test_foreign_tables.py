@@ -114,23 +114,6 @@ def test_no_times_no_units_no_header(arm, do, tmp_path):
     assert_fits(session, arm)
 
 
-def test_a_reversed_joint_is_proposed_and_reversed_only_where_told(arm, do, tmp_path):
-    turned = arm.q.copy()
-    turned[:, 2] *= -1.0
-    header = [*joint_names(arm), 'X', 'Y', 'Z']
-    path = write(tmp_path, 't.csv', text(header, [*np.rad2deg(turned).T, *(1e3 * arm.points.T)]))
-    status, _, error, session = do(path)
-    assert (status, session) == (1, None)
-    assert error.count('\n') == 1
-    assert 'with A3 reversed the data fit to 0.' in error
-    assert 'without, to ' in error
-    assert 'add --reverse A3;' in error
-    status, _, _, session = do(path, '--reverse', 'A3')
-    assert status == 0
-    np.testing.assert_allclose(session.measurements.q, arm.q, atol=1e-8)
-    assert_fits(session, arm)
-
-
 def test_a_wrong_tip_is_named_by_the_marker(arm, do, tmp_path):
     """The marker's place is of the tool frame, and the flange before it was given."""
     header = [*joint_names(arm), 'X_mm', 'Y_mm', 'Z_mm']
