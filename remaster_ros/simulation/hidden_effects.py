@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -253,254 +254,7 @@ class HiddenKind:
     answers: tuple[str, ...] = ()  # Names of discovery.json that name it too, beside its own
 
 
-# What a hidden world can hide that has no name of its own in `NAMED`.
-#
-# Each is written from its equation, as there. A search should still find where it lies, what
-# drives it, or report that structure is left there.
-
-
-def _foreign_torque(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """δq_j = s τ_i: joint j gives way to another joint's torque."""
-    d.angle[:, e.joints[0] - 1] += e.values[0] * c.torque[:, e.detail['by'] - 1]
-
-
-def _creep(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """δq_j = s t."""
-    d.angle[:, e.joints[0] - 1] += e.values[0] * c.time_s
-
-
-def _slip(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """δq_j = s from some moment on."""
-    d.angle[:, e.joints[0] - 1] += e.values[0] * _after(e, c)
-
-
-def _warm_joint(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """δq_j = s ΔT."""
-    d.angle[:, e.joints[0] - 1] += e.values[0] * c.warming_k
-
-
-def _bent_coupling(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """δq_j = s q_i²: neither a line nor a wave of the other joint."""
-    d.angle[:, e.joints[0] - 1] += e.values[0] * c.q[:, e.detail['by'] - 1] ** 2
-
-
-def _sagging_tool(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """The marker's stem bends: δ = s (gravity's direction across the tool's z axis)."""
-    down = np.swapaxes(c.tool, -1, -2) @ np.array([0.0, 0.0, -1.0])
-    d.marker += e.values[0] * (down * (1.0, 1.0, 0.0))[:, None]
-
-
-def _bumped_sensor(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """From some moment on the sensor stands elsewhere: δp = v + w × p, values (v m, w rad)."""
-    s, after = d.sensors.index(e.detail['sensor']), _after(e, c)[:, None]
-    d.beside[:, s] += after * e.values[:3]
-    d.turn[:, s] += after * e.values[3:]
-
-
-def _slipped_marker(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """From some moment on one marker sits elsewhere on the tool, m along its x, y, z."""
-    d.marker[:, d.markers.index(e.detail['marker'])] += _after(e, c)[:, None] * e.values
-
-
-def _range_distortion(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """Along the line of sight k (|p|/D − 1)²: nothing near the mean distance D, as no scale is."""
-    s, k, mean = d.sensors.index(e.detail['sensor']), e.values[0], e.detail['distance_m']
-    d.along[:, s, 0] += k
-    d.scale[:, s] -= 2.0 * k / mean
-    d.along[:, s, 1] += k / mean**2
-
-
-def _spherical_distortion(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """δp = k ((|p|/D)² − 1) p: lengths are right at the mean distance D, and nowhere else."""
-    s = d.sensors.index(e.detail['sensor'])
-    d.along[:, s, 2] += e.values[0] / e.detail['distance_m'] ** 2
-    d.scale[:, s] -= e.values[0]
-
-
-def _one_sided_lens(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """δp = z u² k, u = (x, y)/z along k = values where that is positive, else nothing."""
-    d.half[:, d.sensors.index(e.detail['sensor'])] += e.values
-
-
-def _after(e: HiddenEffect, c: Circumstances) -> FloatArray:
-    return (c.time_s > e.detail['moment_s']).astype(float)
-
-
-def _draw_bump(kind: str, context: DrawContext) -> HiddenEffect:
-    # A turn about the sensor moves a marker two metres away about as far as the shift does.
-    values = np.concatenate((3e-3 * context.direction(3), 1.5e-3 * context.direction(3)))
-    return HiddenEffect(kind, (), values, {'sensor': str(context.rng.choice(context.sensors))})
-
-
-def _draw_marker_slip(kind: str, context: DrawContext) -> HiddenEffect:
-    marker = str(context.rng.choice(context.markers))
-    return HiddenEffect(kind, (), 3e-3 * context.direction(3), {'marker': marker})
-
-
-def _about_mean_distance(largest: float) -> Draw:
-    """Draw a sensor and a sign."""
-
-    def draw(kind: str, context: DrawContext) -> HiddenEffect:
-        sensor = str(context.rng.choice(context.sensors))
-        detail = {'sensor': sensor, 'distance_m': context.distance_m[sensor]}
-        return HiddenEffect(kind, (), np.array([largest * context.sign()]), detail)
-
-    return draw
-
-
-UNNAMED = {
-    'foreign_torque': HiddenKind(
-        'joint_angle',
-        'gravity_torque',
-        _foreign_torque,
-        two_joints(4e-4),
-        (Part('joint_{j}_by_gravity_torque_of_joint_{by}'),),
-    ),
-    'creeping_joint': HiddenKind(
-        'joint_angle', 'time', _creep, one_value(1e-6, 2), (Part('joint_{j}_by_time'),)
-    ),
-    'slipped_joint': HiddenKind(
-        'joint_angle',
-        'time',
-        _slip,
-        at_some_time(one_value(15 * ARC_MINUTE, 2)),
-        (Part('joint_{j}_step'),),
-    ),
-    'warm_joint': HiddenKind(
-        'joint_angle',
-        'temperature',
-        _warm_joint,
-        one_value(5e-4, 2),
-        (Part('joint_{j}_by_temperature'),),
-    ),
-    'bent_coupling': HiddenKind('joint_angle', 'angle', _bent_coupling, two_joints(3e-3)),
-    'sagging_tool': HiddenKind('marker', 'gravity', _sagging_tool, no_joint(3e-3)),
-    'bumped_sensor': HiddenKind('sensor_frame', 'time', _bumped_sensor, at_some_time(_draw_bump)),
-    'slipped_marker': HiddenKind(
-        'marker', 'time', _slipped_marker, at_some_time(_draw_marker_slip)
-    ),
-    'range_distortion': HiddenKind(
-        'sensor_frame',
-        'position',
-        _range_distortion,
-        _about_mean_distance(0.05),
-        answers=('sensor_distortion',),
-    ),
-    'spherical_distortion': HiddenKind(
-        'sensor_frame',
-        'position',
-        _spherical_distortion,
-        _about_mean_distance(0.02),
-        # It is the sum of the two.
-        answers=('sensor_distortion', 'sensor_scale'),
-    ),
-    'one_sided_lens': HiddenKind(
-        'sensor_frame',
-        'position',
-        _one_sided_lens,
-        of_sensor(0.05, 2),
-        answers=('sensor_distortion',),
-    ),
-}
-
-
-# Rules: true = drawn + what stands here
-
-
-def _compliance(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """δq_j = values_j τ_j for each of the joints, rad/(N m)."""
-    for value, j in zip(e.values, e.joints, strict=True):
-        d.angle[:, j - 1] += value * c.torque[:, j - 1]
-
-
-def _eccentricity(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """Per order o in detail: δq = a sin(o q) + b cos(o q), rad."""
-    q = c.q[:, e.joints[0] - 1]
-    for order, (a, b) in zip(e.detail['orders'], e.values.reshape(-1, 2), strict=True):
-        d.angle[:, e.joints[0] - 1] += a * np.sin(order * q) + b * np.cos(order * q)
-
-
-def _scale(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """δq = s q."""
-    d.angle[:, e.joints[0] - 1] += e.values[0] * c.q[:, e.joints[0] - 1]
-
-
-def _curve(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """A sum of waves of many orders, none of them slow enough for an eccentricity."""
-    q = c.q[:, e.joints[0] - 1]
-    waves = sum(
-        a * np.cos(order * q + phase)
-        for order, a, phase in zip(
-            e.detail['orders'], e.detail['amplitudes'], e.detail['phases'], strict=True
-        )
-    )
-    d.angle[:, e.joints[0] - 1] += e.values[0] * waves
-
-
-def _backlash(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """δq = ½ B sign(the last move of that joint)."""
-    d.angle[:, e.joints[0] - 1] += 0.5 * e.values[0] * c.approach[:, e.joints[0] - 1]
-
-
-def _settling(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """δq = −s (q − q before the move): the arm has not come all the way yet."""
-    d.angle[:, e.joints[0] - 1] -= e.values[0] * c.move[:, e.joints[0] - 1]
-
-
-def _coupling(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """δq_j = s q_i, or a sin q_i + b cos q_i."""
-    other = c.q[:, e.detail['by'] - 1]
-    if e.detail['form'] == 'linear':
-        d.angle[:, e.joints[0] - 1] += e.values[0] * other
-    else:
-        d.angle[:, e.joints[0] - 1] += e.values[0] * np.sin(other) + e.values[1] * np.cos(other)
-
-
-def _link_length(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """The next joint lies further along the link after joint j, or along an axis of it, m."""
-    j = e.joints[0]
-    axis = e.detail.get('axis', 'along')
-    along = c.segments[j] if axis == 'along' else np.eye(3)['xyz'.index(axis)]
-    d.shift[:, j] += e.values[0] * along / np.linalg.norm(along)
-
-
-def _tilt(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """Joint j's frame is turned about its x, y, z before its own turn, rad."""
-    d.tilt[:, e.joints[0] - 1] += e.values
-
-
-def _marker(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """The marker is not where the drawing has it, m along x, y, z of the tool."""
-    d.marker += e.values
-
-
-def _thermal(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """Every segment grows by α ΔT of its length, 1/K."""
-    d.shift += e.values[0] * c.warming_k[:, None, None] * c.segments
-
-
-def _base(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """The base turns by so much per moment of weight about x and y, rad/(N m)."""
-    d.base[:, :2] += e.values[0] * c.base_moment[:, :2]
-
-
-def _drift(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """What the sensor measures wanders with this velocity, m/s, in its own frame."""
-    d.beside[:, d.sensors.index(e.detail['sensor'])] += c.time_s[:, None] * e.values
-
-
-def _sensor_scale(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """δp = s p, or only in depth (z of N)."""
-    along = np.array([0.0, 0.0, 1.0]) if e.detail['form'] == 'depth' else np.ones(3)
-    d.scale[:, d.sensors.index(e.detail['sensor'])] += e.values[0] * along
-
-
-def _distortion(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """δp = k r² (x, y, 0), r the distance from the optical axis z, 1/m²."""
-    d.radial[:, d.sensors.index(e.detail['sensor'])] += e.values[0]
-
-
-# Draws of effects that need more than a size and a sign
+# Draws of effects that need more than a size and a sign.
 
 
 def _draw_compliance(kind: str, context: DrawContext) -> HiddenEffect:
@@ -558,104 +312,294 @@ def _draw_marker(kind: str, context: DrawContext) -> HiddenEffect:
     return HiddenEffect(kind, (), 10e-3 * context.direction(3))
 
 
+def _draw_bump(kind: str, context: DrawContext) -> HiddenEffect:
+    # A turn about the sensor moves a marker two metres away about as far as the shift does.
+    values = np.concatenate((3e-3 * context.direction(3), 1.5e-3 * context.direction(3)))
+    return HiddenEffect(kind, (), values, {'sensor': str(context.rng.choice(context.sensors))})
+
+
+def _draw_marker_slip(kind: str, context: DrawContext) -> HiddenEffect:
+    marker = str(context.rng.choice(context.markers))
+    return HiddenEffect(kind, (), 3e-3 * context.direction(3), {'marker': marker})
+
+
+def _about_mean_distance(largest: float) -> Draw:
+    """Draw a sensor and a sign."""
+
+    def draw(kind: str, context: DrawContext) -> HiddenEffect:
+        sensor = str(context.rng.choice(context.sensors))
+        detail = {'sensor': sensor, 'distance_m': context.distance_m[sensor]}
+        return HiddenEffect(kind, (), np.array([largest * context.sign()]), detail)
+
+    return draw
+
+
 # Parameters of more than one kind.
 WAVES = (Part('sin{order}_{j}', (1.0, 0.0)), Part('cos{order}_{j}', (0.0, 1.0)))
-UNIT = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
-NAMED = {
-    'joint_compliance': HiddenKind(
-        'joint_angle',
-        'gravity_torque',
-        _compliance,
-        _draw_compliance,
-        (Part('compliance_{j}'),),
-    ),
-    'encoder_eccentricity': HiddenKind(
-        'joint_angle', 'joint_angle', _eccentricity, _draw_eccentricity, WAVES
-    ),
-    'encoder_scale': HiddenKind(
-        'joint_angle', 'joint_angle', _scale, one_value(5e-3), (Part('scale_{j}'),)
-    ),
-    'gear_periodic': HiddenKind('joint_angle', 'joint_angle', _eccentricity, _draw_gear, WAVES),
-    'joint_error_curve': HiddenKind('joint_angle', 'joint_angle', _curve, _draw_curve),
-    'backlash': HiddenKind(
-        'joint_angle',
-        'approach',
-        _backlash,
-        one_value(15 * ARC_MINUTE, positive=True),
-        (Part('half_backlash_{j}', (2.0,)),),
-    ),
-    'settling': HiddenKind(
-        'joint_angle',
-        'last_move',
-        _settling,
-        one_value(3e-3, positive=True),
-        (Part('settling_{j}'),),
-    ),
-    'joint_coupling': HiddenKind(
-        'joint_angle',
-        'other_joint',
-        _coupling,
-        two_joints(5e-3, ('linear', 'sin/cos')),
-        (
-            Part('coupling_{j}_by_{by}', detail={'form': 'linear'}),
-            Part('sin_{j}_by_{by}', (1.0, 0.0), {'form': 'sin/cos'}),
-            Part('cos_{j}_by_{by}', (0.0, 1.0), {'form': 'sin/cos'}),
-        ),
-    ),
-    'link_length': HiddenKind(
-        'link_translation',
-        'constant',
-        _link_length,
-        _draw_link,
-        (
-            Part('length_{j}', detail={'axis': 'along'}),
-            *(Part(f'offset_{axis}_{{j}}', detail={'axis': axis}) for axis in 'xyz'),
-        ),
-    ),
-    'joint_axis_tilt': HiddenKind(
-        'link_rotation',
-        'constant',
-        _tilt,
-        _draw_tilt,
-        tuple(Part(f'tilt_{axis}_{{j}}', unit) for axis, unit in zip('xyz', UNIT)),
-    ),
-    'marker_offset': HiddenKind('marker', 'constant', _marker, _draw_marker),
-    'thermal_growth': HiddenKind(
-        'link_translation', 'temperature', _thermal, no_joint(2e-4), (Part('growth'),)
-    ),
-    'base_compliance': HiddenKind(
-        'base_rotation',
-        'gravity_moment',
-        _base,
-        no_joint(1e-4),
-        (Part('base_compliance'),),
-    ),
-    'registration_drift': HiddenKind(
-        'sensor_frame',
-        'time',
-        _drift,
-        of_sensor(1e-6, 3),
-        tuple(Part(f'drift_{axis}_{{sensor}}', unit) for axis, unit in zip('xyz', UNIT)),
-    ),
-    'sensor_scale': HiddenKind(
-        'sensor_frame',
-        'position',
-        _sensor_scale,
-        of_sensor(1e-2, 1, ('all', 'depth')),
-        (
-            Part('scale_z_{sensor}', detail={'form': 'depth'}),
-            Part('scale_{sensor}', detail={'form': 'all'}),
-        ),
-    ),
-    'sensor_distortion': HiddenKind(
-        'sensor_frame',
-        'position',
-        _distortion,
-        of_sensor(0.2),
-        (Part('radial_{sensor}'),),
-    ),
-}
+
+def _along_axes(name: str) -> tuple[Part, ...]:
+    units = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+    return tuple(Part(name.format(axis=axis), unit) for axis, unit in zip('xyz', units))
+
+
+# Rules: true = drawn + what stands here. A rule has the name of its kind.
+
+NAMED: dict[str, HiddenKind] = {}
+# What has no name of its own: a search should still find where it lies, what drives it, or report
+# that structure is left there.
+UNNAMED: dict[str, HiddenKind] = {}
+
+
+def _kind(
+    table: dict[str, HiddenKind],
+    place: str,
+    driver: str,
+    draw: Draw,
+    *parts: Part,
+    answers: tuple[str, ...] = (),
+    name: str = '',
+) -> Callable[[Rule], Rule]:
+    """Put the kind of a rule into a table, by the rule's name or another one."""
+
+    def take(rule: Rule) -> Rule:
+        table[name or rule.__name__] = HiddenKind(place, driver, rule, draw, parts, answers)
+        return rule
+
+    return take
+
+
+_named, _unnamed = partial(_kind, NAMED), partial(_kind, UNNAMED)
+
+
+def _after(e: HiddenEffect, c: Circumstances) -> FloatArray:
+    return (c.time_s > e.detail['moment_s']).astype(float)
+
+
+@_named('joint_angle', 'gravity_torque', _draw_compliance, Part('compliance_{j}'))
+def joint_compliance(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
+    """δq_j = values_j τ_j for each of the joints, rad/(N m)."""
+    for value, j in zip(e.values, e.joints, strict=True):
+        d.angle[:, j - 1] += value * c.torque[:, j - 1]
+
+
+@_named('joint_angle', 'joint_angle', _draw_eccentricity, *WAVES)
+def encoder_eccentricity(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
+    """Per order o in detail: δq = a sin(o q) + b cos(o q), rad."""
+    q = c.q[:, e.joints[0] - 1]
+    for order, (a, b) in zip(e.detail['orders'], e.values.reshape(-1, 2), strict=True):
+        d.angle[:, e.joints[0] - 1] += a * np.sin(order * q) + b * np.cos(order * q)
+
+
+@_named('joint_angle', 'joint_angle', one_value(5e-3), Part('scale_{j}'))
+def encoder_scale(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
+    """δq = s q."""
+    d.angle[:, e.joints[0] - 1] += e.values[0] * c.q[:, e.joints[0] - 1]
+
+
+_named('joint_angle', 'joint_angle', _draw_gear, *WAVES, name='gear_periodic')(
+    encoder_eccentricity
+)
+
+
+@_named('joint_angle', 'joint_angle', _draw_curve)
+def joint_error_curve(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
+    """A sum of waves of many orders, none of them slow enough for an eccentricity."""
+    q = c.q[:, e.joints[0] - 1]
+    waves = sum(
+        a * np.cos(order * q + phase)
+        for order, a, phase in zip(
+            e.detail['orders'], e.detail['amplitudes'], e.detail['phases'], strict=True
+        )
+    )
+    d.angle[:, e.joints[0] - 1] += e.values[0] * waves
+
+
+@_named(
+    'joint_angle',
+    'approach',
+    one_value(15 * ARC_MINUTE, positive=True),
+    Part('half_backlash_{j}', (2.0,)),
+)
+def backlash(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
+    """δq = ½ B sign(the last move of that joint)."""
+    d.angle[:, e.joints[0] - 1] += 0.5 * e.values[0] * c.approach[:, e.joints[0] - 1]
+
+
+@_named('joint_angle', 'last_move', one_value(3e-3, positive=True), Part('settling_{j}'))
+def settling(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
+    """δq = −s (q − q before the move): the arm has not come all the way yet."""
+    d.angle[:, e.joints[0] - 1] -= e.values[0] * c.move[:, e.joints[0] - 1]
+
+
+@_named(
+    'joint_angle',
+    'other_joint',
+    two_joints(5e-3, ('linear', 'sin/cos')),
+    Part('coupling_{j}_by_{by}', detail={'form': 'linear'}),
+    Part('sin_{j}_by_{by}', (1.0, 0.0), {'form': 'sin/cos'}),
+    Part('cos_{j}_by_{by}', (0.0, 1.0), {'form': 'sin/cos'}),
+)
+def joint_coupling(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
+    """δq_j = s q_i, or a sin q_i + b cos q_i."""
+    other = c.q[:, e.detail['by'] - 1]
+    if e.detail['form'] == 'linear':
+        d.angle[:, e.joints[0] - 1] += e.values[0] * other
+    else:
+        d.angle[:, e.joints[0] - 1] += e.values[0] * np.sin(other) + e.values[1] * np.cos(other)
+
+
+@_named(
+    'link_translation',
+    'constant',
+    _draw_link,
+    Part('length_{j}', detail={'axis': 'along'}),
+    *(Part(f'offset_{axis}_{{j}}', detail={'axis': axis}) for axis in 'xyz'),
+)
+def link_length(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
+    """The next joint lies further along the link after joint j, or along an axis of it, m."""
+    j = e.joints[0]
+    axis = e.detail.get('axis', 'along')
+    along = c.segments[j] if axis == 'along' else np.eye(3)['xyz'.index(axis)]
+    d.shift[:, j] += e.values[0] * along / np.linalg.norm(along)
+
+
+@_named('link_rotation', 'constant', _draw_tilt, *_along_axes('tilt_{axis}_{{j}}'))
+def joint_axis_tilt(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
+    """Joint j's frame is turned about its x, y, z before its own turn, rad."""
+    d.tilt[:, e.joints[0] - 1] += e.values
+
+
+@_named('marker', 'constant', _draw_marker)
+def marker_offset(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
+    """The marker is not where the drawing has it, m along x, y, z of the tool."""
+    d.marker += e.values
+
+
+@_named('link_translation', 'temperature', no_joint(2e-4), Part('growth'))
+def thermal_growth(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
+    """Every segment grows by α ΔT of its length, 1/K."""
+    d.shift += e.values[0] * c.warming_k[:, None, None] * c.segments
+
+
+@_named('base_rotation', 'gravity_moment', no_joint(1e-4), Part('base_compliance'))
+def base_compliance(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
+    """The base turns by so much per moment of weight about x and y, rad/(N m)."""
+    d.base[:, :2] += e.values[0] * c.base_moment[:, :2]
+
+
+@_named('sensor_frame', 'time', of_sensor(1e-6, 3), *_along_axes('drift_{axis}_{{sensor}}'))
+def registration_drift(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
+    """What the sensor measures wanders with this velocity, m/s, in its own frame."""
+    d.beside[:, d.sensors.index(e.detail['sensor'])] += c.time_s[:, None] * e.values
+
+
+@_named(
+    'sensor_frame',
+    'position',
+    of_sensor(1e-2, 1, ('all', 'depth')),
+    Part('scale_z_{sensor}', detail={'form': 'depth'}),
+    Part('scale_{sensor}', detail={'form': 'all'}),
+)
+def sensor_scale(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
+    """δp = s p, or only in depth (z of N)."""
+    along = np.array([0.0, 0.0, 1.0]) if e.detail['form'] == 'depth' else np.ones(3)
+    d.scale[:, d.sensors.index(e.detail['sensor'])] += e.values[0] * along
+
+
+@_named('sensor_frame', 'position', of_sensor(0.2), Part('radial_{sensor}'))
+def sensor_distortion(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
+    """δp = k r² (x, y, 0), r the distance from the optical axis z, 1/m²."""
+    d.radial[:, d.sensors.index(e.detail['sensor'])] += e.values[0]
+
+
+@_unnamed(
+    'joint_angle',
+    'gravity_torque',
+    two_joints(4e-4),
+    Part('joint_{j}_by_gravity_torque_of_joint_{by}'),
+)
+def foreign_torque(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
+    """δq_j = s τ_i: joint j gives way to another joint's torque."""
+    d.angle[:, e.joints[0] - 1] += e.values[0] * c.torque[:, e.detail['by'] - 1]
+
+
+@_unnamed('joint_angle', 'time', one_value(1e-6, 2), Part('joint_{j}_by_time'))
+def creeping_joint(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
+    """δq_j = s t."""
+    d.angle[:, e.joints[0] - 1] += e.values[0] * c.time_s
+
+
+@_unnamed(
+    'joint_angle', 'time', at_some_time(one_value(15 * ARC_MINUTE, 2)), Part('joint_{j}_step')
+)
+def slipped_joint(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
+    """δq_j = s from some moment on."""
+    d.angle[:, e.joints[0] - 1] += e.values[0] * _after(e, c)
+
+
+@_unnamed('joint_angle', 'temperature', one_value(5e-4, 2), Part('joint_{j}_by_temperature'))
+def warm_joint(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
+    """δq_j = s ΔT."""
+    d.angle[:, e.joints[0] - 1] += e.values[0] * c.warming_k
+
+
+@_unnamed('joint_angle', 'angle', two_joints(3e-3))
+def bent_coupling(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
+    """δq_j = s q_i²: neither a line nor a wave of the other joint."""
+    d.angle[:, e.joints[0] - 1] += e.values[0] * c.q[:, e.detail['by'] - 1] ** 2
+
+
+@_unnamed('marker', 'gravity', no_joint(3e-3))
+def sagging_tool(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
+    """The marker's stem bends: δ = s (gravity's direction across the tool's z axis)."""
+    down = np.swapaxes(c.tool, -1, -2) @ np.array([0.0, 0.0, -1.0])
+    d.marker += e.values[0] * (down * (1.0, 1.0, 0.0))[:, None]
+
+
+@_unnamed('sensor_frame', 'time', at_some_time(_draw_bump))
+def bumped_sensor(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
+    """From some moment on the sensor stands elsewhere: δp = v + w × p, values (v m, w rad)."""
+    s, after = d.sensors.index(e.detail['sensor']), _after(e, c)[:, None]
+    d.beside[:, s] += after * e.values[:3]
+    d.turn[:, s] += after * e.values[3:]
+
+
+@_unnamed('marker', 'time', at_some_time(_draw_marker_slip))
+def slipped_marker(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
+    """From some moment on one marker sits elsewhere on the tool, m along its x, y, z."""
+    d.marker[:, d.markers.index(e.detail['marker'])] += _after(e, c)[:, None] * e.values
+
+
+@_unnamed('sensor_frame', 'position', _about_mean_distance(0.05), answers=('sensor_distortion',))
+def range_distortion(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
+    """Along the line of sight k (|p|/D − 1)²: nothing near the mean distance D, as no scale is."""
+    s, k, mean = d.sensors.index(e.detail['sensor']), e.values[0], e.detail['distance_m']
+    d.along[:, s, 0] += k
+    d.scale[:, s] -= 2.0 * k / mean
+    d.along[:, s, 1] += k / mean**2
+
+
+@_unnamed(
+    'sensor_frame',
+    'position',
+    _about_mean_distance(0.02),
+    # It is the sum of the two.
+    answers=('sensor_distortion', 'sensor_scale'),
+)
+def spherical_distortion(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
+    """δp = k ((|p|/D)² − 1) p: lengths are right at the mean distance D, and nowhere else."""
+    s = d.sensors.index(e.detail['sensor'])
+    d.along[:, s, 2] += e.values[0] / e.detail['distance_m'] ** 2
+    d.scale[:, s] -= e.values[0]
+
+
+@_unnamed('sensor_frame', 'position', of_sensor(0.05, 2), answers=('sensor_distortion',))
+def one_sided_lens(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
+    """δp = z u² k, u = (x, y)/z along k = values where that is positive, else nothing."""
+    d.half[:, d.sensors.index(e.detail['sensor'])] += e.values
+
+
 KINDS = NAMED | UNNAMED
 
 
