@@ -30,44 +30,6 @@ STOP_NOTE = (
 )
 
 
-def commands(
-    *,
-    state: str,  # Of the planner
-    silent: bool,  # It was not heard for long
-    halted: bool,  # The arm is
-    begun: bool,  # Something was visited
-    measured: bool,  # Something was recorded
-    unconfirmed: bool,  # The arm waits until a plan is confirmed
-    confirmation: dict[str, Any] | None,  # Which plan that is; None as long as none is shown
-) -> dict[str, dict[str, Any]]:
-    """Return what each command is called, whether it is of use now, and a note."""
-    plan = confirmation['plan'] if confirmation else ''
-    why = 'the planner is silent' if silent else ''
-    if not why and halted:
-        why = 'the arm is halted'
-    if not why and state not in ('idle', 'paused', 'stopped'):
-        why = f'the collection is {state[:100]}'
-    if not why and unconfirmed:
-        why = f'plan {plan} is not confirmed' if plan else 'the plan is not shown yet'
-    idle = state not in ('running', 'held')
-    ready = bool(confirmation and confirmation['address'] and confirmation['offered'])
-    return {
-        'collect': {
-            'label': 'Go on' if begun else 'Begin the collection',
-            'on': not why,
-            'note': why or 'the arm moves',
-        },
-        'pause': {'label': 'Pause', 'on': not silent and not idle, 'note': ''},
-        'stop': {'label': STOP_LABEL, 'on': True, 'note': STOP_NOTE},
-        'fit': {'label': 'Fit', 'on': idle and measured, 'note': ''},
-        'confirm': {
-            'label': f'Confirm plan {plan}',
-            'on': ready and unconfirmed and idle and not silent,
-            'note': 'Nothing moves before you begin the collection or go on.',
-        },
-    }
-
-
 @dataclass(frozen=True)
 class PlanPage:
     """Where the page of a plan is served."""
@@ -396,15 +358,37 @@ class LiveView:
         }
 
     def _commands(self, now_s: float) -> dict[str, dict[str, Any]]:
-        return commands(
-            state=self._planner.state if self._planner else '',
-            silent=self._silent(PLANNER, now_s),
-            halted=bool(self._bridge and self._bridge.halted),
-            begun=bool(self._count('configurations_done') or self._count('poses_done')),
-            measured=bool(self._recorder and self._recorder.observations),
-            unconfirmed=self._values.get('confirmed') == 'no',
-            confirmation=self._confirmation(),
-        )
+        """Return what each command is called, whether it is of use now, and a note."""
+        state = self._planner.state if self._planner else ''
+        silent, confirmation = self._silent(PLANNER, now_s), self._confirmation()
+        unconfirmed = self._values.get('confirmed') == 'no'
+        plan = confirmation['plan'] if confirmation else ''
+        why = 'the planner is silent' if silent else ''
+        if not why and self._bridge and self._bridge.halted:
+            why = 'the arm is halted'
+        if not why and state not in ('idle', 'paused', 'stopped'):
+            why = f'the collection is {state[:100]}'
+        if not why and unconfirmed:
+            why = f'plan {plan} is not confirmed' if plan else 'the plan is not shown yet'
+        idle = state not in ('running', 'held')
+        begun = self._count('configurations_done') or self._count('poses_done')
+        measured = bool(self._recorder and self._recorder.observations)
+        ready = bool(confirmation and confirmation['address'] and confirmation['offered'])
+        return {
+            'collect': {
+                'label': 'Go on' if begun else 'Begin the collection',
+                'on': not why,
+                'note': why or 'the arm moves',
+            },
+            'pause': {'label': 'Pause', 'on': not silent and not idle, 'note': ''},
+            'stop': {'label': STOP_LABEL, 'on': True, 'note': STOP_NOTE},
+            'fit': {'label': 'Fit', 'on': idle and measured, 'note': ''},
+            'confirm': {
+                'label': f'Confirm plan {plan}',
+                'on': ready and unconfirmed and idle and not silent,
+                'note': 'Nothing moves before you begin the collection or go on.',
+            },
+        }
 
     def _scene(self) -> dict[str, Any]:
         q, target = self._q, self._target
