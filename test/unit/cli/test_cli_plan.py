@@ -4,7 +4,6 @@ import json
 
 import pytest
 
-from remaster_ros.cli import main as cli
 from remaster_ros.planning import planned_design, pose_design, tour_planner
 from remaster_ros.session.workcell import config_path
 
@@ -25,23 +24,17 @@ def cell_with(folder, poses):
     return path
 
 
-def run(capsys, *args):
-    status = cli.main(['plan', *map(str, args)])
-    out, err = capsys.readouterr()
-    return status, out, err
-
-
-def as_json(capsys, *args):
-    status, out, err = run(capsys, *args, '--json')
-    assert (status, err) == (0, '')
+def as_json(remaster, *args):
+    out, err = remaster('plan', *args, '--json')
+    assert err == ''
     return json.loads(out)
 
 
 FEW = ('--poses', 16, '--validation', 16)
 
 
-def test_the_object_says_what_is_planned(capsys):
-    found = as_json(capsys, 'demo', *FEW, '--reference-every', 0)
+def test_the_object_says_what_is_planned(remaster):
+    found = as_json(remaster, 'demo', *FEW, '--reference-every', 0)
     assert found['poses'] == sum(part['poses'] for part in found['splits'].values())
     assert found['configurations'] == sum(part['visits'] for part in found['splits'].values())
     assert (
@@ -59,10 +52,10 @@ def test_the_object_says_what_is_planned(capsys):
     assert found['robot_time_s'] > 3.5 * found['configurations']
 
 
-def test_an_optimal_design_is_as_precise_in_less_time(tmp_path, capsys):
-    whole = as_json(capsys, 'demo', *FEW)
+def test_an_optimal_design_is_as_precise_in_less_time(tmp_path, remaster):
+    whole = as_json(remaster, 'demo', *FEW)
     path = cell_with(tmp_path, '  design: optimal\n  solutions: chosen\n  order: fastest\n')
-    optimal = as_json(capsys, path, *FEW)
+    optimal = as_json(remaster, path, *FEW)
     assert optimal['goal']['reached']
     assert optimal['expected_rms_std_deg'] <= max(whole['expected_rms_std_deg'], 0.005) * 1.0001
     assert optimal['configurations'] < whole['configurations']
@@ -70,9 +63,9 @@ def test_an_optimal_design_is_as_precise_in_less_time(tmp_path, capsys):
     assert optimal['dropped']['not needed by the design'] > 0
 
 
-def test_people_read_a_subject_a_line(capsys):
-    status, out, err = run(capsys, 'demo', *FEW)
-    assert (status, err) == (0, '')
+def test_people_read_a_subject_a_line(remaster):
+    out, err = remaster('plan', 'demo', *FEW)
+    assert err == ''
     for words in (
         'to fit: ',
         'held out: ',
@@ -83,52 +76,49 @@ def test_people_read_a_subject_a_line(capsys):
     ):
         assert words in out
     assert 'joint_1              not identifiable' in out
-    assert run(capsys, 'demo', *FEW, '--quiet')[1] == ''
+    assert remaster('plan', 'demo', *FEW, '--quiet').out == ''
 
 
-def test_the_time_is_that_of_the_stated_speeds(capsys):
-    slow = as_json(capsys, 'demo', *FEW)
-    fast = as_json(capsys, 'demo', *FEW, '--cartesian-speed-limit', 0)
+def test_the_time_is_that_of_the_stated_speeds(remaster):
+    slow = as_json(remaster, 'demo', *FEW)
+    fast = as_json(remaster, 'demo', *FEW, '--cartesian-speed-limit', 0)
     assert fast['robot_time_s'] < slow['robot_time_s']
     assert fast['max_tool_speed_m_s'] > 0.25
-    patient = as_json(capsys, 'demo', *FEW, '--settle', 5)
+    patient = as_json(remaster, 'demo', *FEW, '--settle', 5)
     more = patient['robot_time_s'] - slow['robot_time_s']
     assert more == pytest.approx(2.0 * slow['configurations'], abs=0.2)
 
 
 @pytest.mark.parametrize(
-    ('poses', 'status', 'words'),
+    ('poses', 'words'),
     [
-        ('  design: best\n', 2, 'poses.design'),
+        ('  design: best\n', 'poses.design'),
         (
             '  design: optimal\n  tool_box: {center_m: [3, 0, 0], size_m: [1, 1, 1]}\n',
-            2,
             'no configuration has the tool in poses.tool_box',
         ),
     ],
 )
-def test_a_wrong_cell_is_one_line(tmp_path, capsys, poses, status, words):
-    found, out, err = run(capsys, cell_with(tmp_path, poses), *FEW)
-    assert (found, out) == (status, '')
+def test_a_wrong_cell_is_one_line(tmp_path, remaster, poses, words):
+    err = remaster('plan', cell_with(tmp_path, poses), *FEW, status=2).err
     assert err.startswith('error: ')
     assert words in err
-    assert err.count('\n') == 1
 
 
-def test_too_few_poses_are_told_from_too_few_measurements(capsys):
-    status, _, err = run(capsys, 'demo', '--poses', 2, '--validation', 0, '--reference-every', 0)
-    assert status == 1
+def test_too_few_poses_are_told_from_too_few_measurements(remaster):
+    few = ('--poses', 2, '--validation', 0, '--reference-every', 0)
+    err = remaster('plan', 'demo', *few, status=1).err
     assert '1 poses to fit can be visited, too few' in err
     assert 'plan more candidates, or widen their ranges in the cell file' in err
     assert err.count('\n') == 1
 
 
-def test_a_cell_without_reachable_poses_is_one_line(tmp_path, capsys):
+def test_a_cell_without_reachable_poses_is_one_line(tmp_path, remaster):
     path = cell_with(tmp_path, '')
     text = path.read_text(encoding='utf-8')
     path.write_text(text.replace('radius_m: [0.2, 0.5]', 'radius_m: [3.0, 3.5]'), encoding='utf-8')
-    status, out, err = run(capsys, path)
-    assert (status, out) == (1, '')
+    out, err = remaster('plan', path, status=1)
+    assert out == ''
     assert 'no pose is left to fit on' in err
     assert err.count('\n') == 1
 
@@ -168,13 +158,13 @@ def discovery_file(folder, look_alikes):
     return path
 
 
-def test_what_separates_two_causes_is_added_to_the_plan(tmp_path, capsys, monkeypatch):
+def test_what_separates_two_causes_is_added_to_the_plan(tmp_path, remaster, monkeypatch):
     monkeypatch.setattr(tour_planner, 'POOL_CANDIDATES', 40)
     look_alikes = {'encoder_eccentricity': 'the whole range', 'backlash': 'both sides'}
     path = discovery_file(tmp_path, look_alikes)
     options = (*FEW, '--reference-every', 0)
-    plain = as_json(capsys, 'demo', *options)
-    found = as_json(capsys, 'demo', *options, '--separate', path)
+    plain = as_json(remaster, 'demo', *options)
+    found = as_json(remaster, 'demo', *options, '--separate', path)
     added = found['separate']
     assert 0 < added['configurations'] == len(added['q_deg']) <= 25
     assert len(added['q_deg'][0]) == 7
@@ -186,15 +176,13 @@ def test_what_separates_two_causes_is_added_to_the_plan(tmp_path, capsys, monkey
     assert pair['std_apart'] > pair['std_apart_before']
     assert added['otherwise'] == ['encoder scale of joint 6 and backlash of joint 6: both sides']
     assert 'separate' not in plain
-    status, out, _ = run(capsys, 'demo', *options, '--separate', path)
-    assert status == 0
+    out = remaster('plan', 'demo', *options, '--separate', path).out
     assert f'of these to separate causes: {added["configurations"]} configurations' in out
     assert 'poses do not separate encoder scale of joint 6 and backlash of joint 6' in out
 
 
-def test_without_look_alikes_there_is_nothing_to_separate(tmp_path, capsys):
+def test_without_look_alikes_there_is_nothing_to_separate(tmp_path, remaster):
     path = discovery_file(tmp_path, {})
-    status, out, err = run(capsys, 'demo', *FEW, '--separate', path)
-    assert (status, out) == (2, '')
+    err = remaster('plan', 'demo', *FEW, '--separate', path, status=2).err
     assert 'none of its causes has a look-alike' in err
-    assert run(capsys, 'demo', '--separate', tmp_path / 'none.json')[0] == 2
+    remaster('plan', 'demo', '--separate', tmp_path / 'none.json', status=2)

@@ -8,7 +8,6 @@ import random
 import pytest
 from session_crashes import live, make_observations, session_header
 
-from remaster_ros.cli.main import main
 from remaster_ros.session.reader import read_session
 from remaster_ros.session.session_writer import SessionWriter
 
@@ -23,68 +22,53 @@ def killed(tmp_path):
     return tmp_path / 's'
 
 
-def run(capsys, *args):
-    status = main(['recover', *map(str, args)])
-    printed = capsys.readouterr()
-    return status, printed.out, printed.err
-
-
-def test_nothing_was_lost(killed, capsys):
+def test_nothing_was_lost(killed, remaster):
     before = len(read_session(killed).measurements)
-    assert run(capsys, killed) == (0, f'{killed}: recovered\n', '')
-    assert run(capsys, killed) == (0, f'{killed}: at rest, nothing to recover\n', '')
-    assert run(capsys, '--quiet', killed) == (0, '', '')
-    status, out, err = run(capsys, '--json', killed)
+    assert remaster('recover', killed) == (f'{killed}: recovered\n', '')
+    assert remaster('recover', killed) == (f'{killed}: at rest, nothing to recover\n', '')
+    assert remaster('recover', '--quiet', killed) == ('', '')
+    out, err = remaster('recover', '--json', killed)
     assert json.loads(out) == {'session': str(killed), 'finished': False, 'lost': []}
-    assert (status, err) == (0, '')
+    assert err == ''
     session = read_session(killed)
     assert len(session.measurements) == before
     assert session.exit_status == 'aborted'
 
 
 @pytest.mark.parametrize('tail', [b'{"kind":"configur', b'{"name":"gr\xc3', bytes(700)])
-def test_a_line_being_written_was_lost(killed, capsys, tail):
+def test_a_line_being_written_was_lost(killed, remaster, tail):
     with (killed / 'journal.jsonl').open('ab') as file:
         file.write(tail)
     before = len(read_session(killed).measurements)
-    status, out, _ = run(capsys, killed)
-    assert status == 3
+    out = remaster('recover', killed, status=3).out
     assert f'journal.jsonl, line 5: {len(tail)} bytes of a line' in out
-    assert run(capsys, killed)[0] == 0
+    remaster('recover', killed)
     assert len(read_session(killed).measurements) == before
 
 
 @pytest.mark.parametrize('zeros', [0, 40])
-def test_observations_that_only_the_journal_has_come_back(killed, capsys, zeros):
+def test_observations_that_only_the_journal_has_come_back(killed, remaster, zeros):
     path = killed / 'observations.csv'
     whole = path.read_bytes()
     last = whole.rstrip(b'\n').rfind(b'\n') + 1
     path.write_bytes(whole[: random.Random(2).randint(last + 1, len(whole) - 41)] + bytes(zeros))
-    assert run(capsys, killed)[0] == 0
+    remaster('recover', killed)
     assert path.read_bytes() == whole
 
 
-def test_what_is_no_session_or_damaged_or_in_use(killed, tmp_path, capsys):
-    status, _, err = run(capsys, tmp_path / 'none')
-    assert status == 2
-    assert 'none' in err
+def test_what_is_no_session_or_damaged_or_in_use(killed, tmp_path, remaster):
+    assert 'none' in remaster('recover', tmp_path / 'none', status=2).err
     writer = SessionWriter(killed, session_header(), resume=True)
-    status, _, err = run(capsys, killed)
-    assert status == 2
-    assert 'another process is writing' in err
+    assert 'another process is writing' in remaster('recover', killed, status=2).err
     writer.close('stopped')
     data = bytearray((killed / 'journal.jsonl').read_bytes())
     data[40] ^= 1
     (killed / 'journal.jsonl').write_bytes(data)
-    status, _, err = run(capsys, killed)
-    assert status == 2
-    assert 'journal.jsonl: not as it was closed' in err
+    assert 'journal.jsonl: not as it was closed' in remaster('recover', killed, status=2).err
     (killed / 'SHA256SUMS').unlink()
-    status, _, err = run(capsys, killed)
-    assert status == 2
-    assert 'journal.jsonl, line 1: damaged' in err
+    assert 'journal.jsonl, line 1: damaged' in remaster('recover', killed, status=2).err
 
 
-def test_a_life_without_a_crash_needs_no_recovery(tmp_path, capsys):
+def test_a_life_without_a_crash_needs_no_recovery(tmp_path, remaster):
     live(tmp_path, seed=5)
-    assert run(capsys, tmp_path / 'new' / 'session')[0] == 0
+    remaster('recover', tmp_path / 'new' / 'session')

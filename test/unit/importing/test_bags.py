@@ -8,12 +8,10 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as RosbagsWriter
 from rosbags.typesys import Stores, get_typestore
 
-from remaster_ros.cli.main import main
 from remaster_ros.errors import InputError
 from remaster_ros.importing.bags import is_bag, read_bag
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.session.bag_writer import BagWriter
-from remaster_ros.session.reader import read_session
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 JOINT_STATE, POINT = 'sensor_msgs/msg/JointState', 'geometry_msgs/msg/PointStamped'
@@ -109,18 +107,12 @@ def test_what_is_missing_is_named(bag, session, chain, tmp_path):
         read_bag(bag, chain)
 
 
-def test_the_command_makes_a_session_of_it(bag, session, tmp_path, capsys):
-    urdf = tmp_path / 'robot.urdf'
-    urdf.write_text(session.urdf)
-    args = ['--urdf', str(urdf), '--out', str(tmp_path / 'session')]
+def test_the_command_makes_a_session_of_it(bag, session, imported):
     # Three standstills are refused: any data would fit.
-    assert main(['import', str(bag), *args]) == 1
-    error = capsys.readouterr().err
+    (_, error), _ = imported(session.urdf, bag, status=1)
     assert '3 different configurations to fit are too few' in error
     assert 'it takes at least 4, ' in error
-    assert not (tmp_path / 'session').exists()
-    assert main(['import', str(bag), *args, '--unchecked']) == 0
-    made = read_session(tmp_path / 'session')
+    _, made = imported(session.urdf, bag, '--unchecked')
     assert made.sensor_names == ('laser_tracker', 'optitrack')
     # Two sensors saw each configuration.
     assert made.measurements.configuration.tolist() == [0, 0, 1, 1, 2, 2]

@@ -9,30 +9,12 @@ import pytest
 from foreign_tables import MARKER, measured, text, write
 
 from remaster_ros.calibration.fit import fit_session
-from remaster_ros.cli.main import main
 from remaster_ros.session.reader import read_session
 
 
 @pytest.fixture
 def arm():
     return measured()
-
-
-@pytest.fixture
-def do(arm, tmp_path, capsys):
-    """Return a function that imports files; it returns status, stdout, stderr and the session."""
-    urdf = tmp_path / 'robot.urdf'
-    urdf.write_text(arm.urdf)
-
-    def run(*args):
-        out = tmp_path / f'session{len(list(tmp_path.glob("session*")))}'
-        capsys.readouterr()
-        status = main(['import', *map(str, args), '--urdf', str(urdf), '--out', str(out)])
-        printed = capsys.readouterr()
-        print(printed.out, printed.err)
-        return status, printed.out, printed.err, read_session(out) if out.is_dir() else None
-
-    return run
 
 
 def assert_fits(session, arm):
@@ -52,12 +34,11 @@ def joint_names(arm):
     return [f'A{i + 1}' for i in range(arm.q.shape[1])]
 
 
-def test_degrees_millimetres_decimal_commas(arm, do, tmp_path):
+def test_degrees_millimetres_decimal_commas(arm, imported, tmp_path):
     header = ['Nr', *(f'{name} [°]' for name in joint_names(arm)), 'X [mm]', 'Y [mm]', 'Z [mm]']
     columns = [range(1, 41), *degrees(arm), *(1e3 * arm.points.T)]
     path = write(tmp_path, 'messung.csv', text(header, columns, ';', ','), 'cp1252')
-    status, out, _, session = do(path)
-    assert status == 0
+    (out, _), session = imported(arm.urdf, path)
     assert 'semicolons between the columns, decimal comma, CP1252' in out
     assert 'A3 [°]  joint 3 (joint_3), deg (header)' in out
     assert 'Y [mm]  y of the marker, mm (header)' in out
@@ -69,7 +50,7 @@ def test_degrees_millimetres_decimal_commas(arm, do, tmp_path):
     assert_fits(session, arm)
 
 
-def test_a_trackers_export_and_the_joints_beside_it(arm, do, tmp_path):
+def test_a_trackers_export_and_the_joints_beside_it(arm, imported, tmp_path):
     """SpatialAnalyzer writes comments, group and name; the controller has its own order."""
     order = np.random.default_rng(1).permutation(40)
     points = '// SpatialAnalyzer export\n// Units: Millimeters\n' + text(
@@ -87,10 +68,8 @@ def test_a_trackers_export_and_the_joints_beside_it(arm, do, tmp_path):
         [[f'P{i + 1}' for i in range(40)], *degrees(arm)],
         '\t',
     )
-    status, out, _, session = do(
-        write(tmp_path, 'points.txt', points), write(tmp_path, 'joints.txt', joints)
-    )
-    assert status == 0
+    files = write(tmp_path, 'points.txt', points), write(tmp_path, 'joints.txt', joints)
+    (out, _), session = imported(arm.urdf, *files)
     assert '40 rows joined by Point Name and name' in out
     assert 'X           x of the marker, mm' in out.replace('points.txt: ', '')
     assert session.timed
@@ -101,11 +80,11 @@ def test_a_trackers_export_and_the_joints_beside_it(arm, do, tmp_path):
     assert_fits(session, arm)
 
 
-def test_no_times_no_units_no_header(arm, do, tmp_path):
+def test_no_times_no_units_no_header(arm, imported, tmp_path):
     """Numbers alone, in rad and m, between blanks; the point's name stands before them."""
     columns = [[f'P{i}' for i in range(40)], *arm.q.T, *arm.points.T]
-    status, out, _, session = do(write(tmp_path, 'table.txt', text([], columns, '  ')))
-    assert status == 0
+    path = write(tmp_path, 'table.txt', text([], columns, '  '))
+    (out, _), session = imported(arm.urdf, path)
     assert 'no header' in out
     assert 'rad (guessed), by its place' in out
     assert 'm (guessed), by its place' in out
@@ -114,39 +93,33 @@ def test_no_times_no_units_no_header(arm, do, tmp_path):
     assert_fits(session, arm)
 
 
-def test_a_wrong_tip_is_named_by_the_marker(arm, do, tmp_path):
+def test_a_wrong_tip_is_named_by_the_marker(arm, imported, tmp_path):
     """The marker's place is of the tool frame, and the flange before it was given."""
     header = [*joint_names(arm), 'X_mm', 'Y_mm', 'Z_mm']
     path = write(tmp_path, 't.csv', text(header, [*degrees(arm), *(1e3 * arm.points.T)]))
     marker = ('--marker-mm', *(1e3 * MARKER), '--marker-std-mm', 1)
     tip, other = arm.chain.tip_link, 'link_5'
     # link_5 lies before the last joint.
-    status, _, error, _ = do(path, *marker, '--tip-link', other)
-    assert status == 2
+    (_, error), _ = imported(arm.urdf, path, *marker, '--tip-link', other, status=2)
     assert f"5 joints between 'base_link' and '{other}'" in error
-    status, _, error, session = do(path, *marker, '--tip-link', 'link_6')
-    assert (status, session) == (1, None)
+    (_, error), _ = imported(arm.urdf, path, *marker, '--tip-link', 'link_6', status=1)
     assert f'with the tip link {tip} the marker is ' in error
     assert f'add --tip-link {tip};' in error
-    status, _, _, session = do(path, *marker, '--tip-link', tip)
-    assert status == 0
-    assert_fits(session, arm)
+    assert_fits(imported(arm.urdf, path, *marker, '--tip-link', tip)[1], arm)
 
 
-def test_a_name_that_the_table_has_otherwise_is_said_not_to_be_used(arm, do, tmp_path):
+def test_a_name_that_the_table_has_otherwise_is_said_not_to_be_used(arm, imported, tmp_path):
     header = [*(f'{name} [deg]' for name in joint_names(arm)), 'x [mm]', 'y [mm]', 'z [mm]']
     columns = [*degrees(arm), *(1e3 * arm.points.T)]
     own = write(tmp_path, 'own.csv', text([*header, 'sensor'], [*columns, ['lt'] * 40], ',', '.'))
-    status, out, _, session = do(own, '--sensor', 'camera', '--marker', 'ball')
-    assert status == 0
+    (out, _), session = imported(arm.urdf, own, '--sensor', 'camera', '--marker', 'ball')
     assert '--sensor camera is not used: the table names its sensors (lt)' in out
     assert session.sensors == {'lt': 'ball'}
     assert '--marker' not in out
-    _, out, _, _ = do(own, '--sensor', 'lt')
-    assert 'not used' not in out
+    assert 'not used' not in imported(arm.urdf, own, '--sensor', 'lt')[0].out
 
 
-def test_a_cell_file_has_robot_sensor_and_marker(arm, tmp_path, capsys):
+def test_a_cell_file_has_robot_sensor_and_marker(arm, tmp_path, remaster):
     (tmp_path / 'arm.urdf').write_text(arm.urdf)
     cell = tmp_path / 'cell.yaml'
     cell.write_text(
@@ -159,31 +132,26 @@ def test_a_cell_file_has_robot_sensor_and_marker(arm, tmp_path, capsys):
     header = [*joint_names(arm), 'X_mm', 'Y_mm', 'Z_mm']
     path = write(tmp_path, 't.csv', text(header, [*degrees(arm), *(1e3 * arm.points.T)]))
     out = tmp_path / 'session'
-    assert main(['import', str(path), '--cell', str(cell), '--out', str(out)]) == 0
+    remaster('import', path, '--cell', cell, '--out', out)
     session = read_session(out)
     assert (session.sensors, session.tip_link) == ({'leica': 'smr'}, 'tool0')
     np.testing.assert_allclose(session.markers['smr'], MARKER)
     assert session.marker_std_m == 0.001
-    status = main(
-        ['import', str(path), '--cell', str(cell), '--out', f'{out}2', '--tip-link', 'link_6']
-    )
-    assert status == 1
-    assert 'with the tip link tool0 the marker is' in capsys.readouterr().err
+    other = ('--out', f'{out}2', '--tip-link', 'link_6')
+    error = remaster('import', path, '--cell', cell, *other, status=1).err
+    assert 'with the tip link tool0 the marker is' in error
 
 
-def test_json_has_the_columns_and_the_hint(arm, do, tmp_path):
+def test_json_has_the_columns_and_the_hint(arm, imported, tmp_path):
     header = [*joint_names(arm), 'X', 'Y', 'Z', 'remark']
     reversed_ = arm.q * [1, -1, 1, -1, 1, 1]
     columns = [*np.rad2deg(reversed_).T, *(1e3 * arm.points.T), ['x'] * 40]
     path = write(tmp_path, 't.csv', text(header, columns))
-    status, out, _, _ = do(path, '--json')
-    found = json.loads(out)
-    assert status == 1
+    found = json.loads(imported(arm.urdf, path, '--json', status=1)[0].out)
     assert found['session'] is None
     assert found['hint'].endswith('--reverse A2,A4')
     assert found['columns']['A1'] == 'joint 1 (joint_1), deg (guessed)'
     assert found['columns']['remark'] == 'not used'
-    status, out, _, session = do(path, '--json', '--unchecked')
-    assert status == 0
+    (out, _), session = imported(arm.urdf, path, '--json', '--unchecked')
     assert json.loads(out)['session'] is not None
     np.testing.assert_allclose(session.measurements.q, reversed_, atol=1e-8)

@@ -11,7 +11,6 @@ import pytest
 from foreign_makers import KINDS, names_of
 from foreign_tables import measured, text, write
 
-from remaster_ros.cli.main import main
 from remaster_ros.errors import InputError
 from remaster_ros.importing.columns import Told, find_columns
 from remaster_ros.importing.makers import READERS
@@ -48,35 +47,28 @@ def test_joints_and_names_are_those_that_were_written(kind, tmp_path):
         assert [row[found.one('name')] for row in table.rows] == names
 
 
-def test_the_coupling_of_fanuc_and_the_names_are_kept(tmp_path, capsys):
+def test_the_coupling_of_fanuc_and_the_names_are_kept(tmp_path, imported):
     arm = measured(rows=30)
     pad = np.rad2deg(arm.q)
     pad[:, 2] -= pad[:, 1]
     names = names_of('fanuc', len(pad))
     program = write(tmp_path, 'calib.ls', KINDS['fanuc'].write(names, pad))
     points = write(tmp_path, 'points.csv', text(['Name', 'X', 'Y', 'Z'], [names, *arm.points.T]))
-    (tmp_path / 'robot.urdf').write_text(arm.urdf)
-    out = tmp_path / 'session'
-    args = [str(program), str(points), '--urdf', str(tmp_path / 'robot.urdf'), '--out', str(out)]
-    assert main(['import', *args]) == 0
-    assert 'as a FANUC controller counts them: --couple J3=J2' in capsys.readouterr().out
-    session = read_session(out)
+    (out, _), session = imported(arm.urdf, program, points)
+    assert 'as a FANUC controller counts them: --couple J3=J2' in out
     np.testing.assert_allclose(session.measurements.q, arm.q, atol=2e-6)
     assert session.controller.maker == 'FANUC'
     assert session.controller.joints['joint_3'].coupling == {'joint_2': 1}
 
 
-def test_a_description_that_couples_itself_is_left_as_it_is(tmp_path, capsys):
+def test_a_description_that_couples_itself_is_left_as_it_is(tmp_path, imported):
     arm = measured(rows=30)
     names = names_of('fanuc', len(arm.q))
     program = write(tmp_path, 'calib.ls', KINDS['fanuc'].write(names, np.rad2deg(arm.q)))
     points = write(tmp_path, 'points.csv', text(['Name', 'X', 'Y', 'Z'], [names, *arm.points.T]))
-    (tmp_path / 'robot.urdf').write_text(arm.urdf)
-    out = tmp_path / 'session'
-    args = [str(program), str(points), '--urdf', str(tmp_path / 'robot.urdf'), '--out', str(out)]
-    assert main(['import', *args]) == 0
-    assert 'coupled' not in capsys.readouterr().out
-    np.testing.assert_allclose(read_session(out).measurements.q, arm.q, atol=2e-6)
+    (out, _), session = imported(arm.urdf, program, points)
+    assert 'coupled' not in out
+    np.testing.assert_allclose(session.measurements.q, arm.q, atol=2e-6)
 
 
 def test_spatial_analyzers_names_are_joined_by_their_last_part(tmp_path):
@@ -140,21 +132,16 @@ def test_columns_are_told_of_one_of_two_files_without_header(tmp_path):
 
 
 @pytest.mark.parametrize('turns', [1, -1, 2])
-def test_whole_turns_are_taken_off_where_the_limits_ask_for_it(turns, tmp_path, capsys):
+def test_whole_turns_are_taken_off_where_the_limits_ask_for_it(turns, tmp_path, imported):
     arm = measured(rows=30)
     q = np.rad2deg(arm.q)
     q[::2, 1] += 360.0 * turns
     q[:, 4] = q[:, 4] % 360.0
     header = [*[f'A{i}' for i in range(1, 7)], 'X', 'Y', 'Z']
     table = write(tmp_path, 't.csv', text(header, [*q.T, *arm.points.T]))
-    (tmp_path / 'robot.urdf').write_text(arm.urdf)
-    out = tmp_path / 'session'
-    args = [str(table), '--urdf', str(tmp_path / 'robot.urdf'), '--out', str(out)]
-    assert main(['import', *args]) == 0
-    assert 'whole turns were taken off, as the limits ask for it: joint_2 (15 rows)' in (
-        capsys.readouterr().out
-    )
-    np.testing.assert_allclose(read_session(out).measurements.q, arm.q, atol=2e-6)
+    (out, _), session = imported(arm.urdf, table)
+    assert 'whole turns were taken off, as the limits ask for it: joint_2 (15 rows)' in out
+    np.testing.assert_allclose(session.measurements.q, arm.q, atol=2e-6)
 
 
 def test_times_that_are_all_the_same_are_no_times(tmp_path):
@@ -260,23 +247,19 @@ def test_two_thousand_mutations_are_read_right_or_refused(kind, tmp_path):
     assert check_mutations(kind, 2000, 12, tmp_path / 'program.txt') > 0
 
 
-def test_the_accuracy_option_of_a_kuka_is_asked_for_and_kept(tmp_path, capsys):
+def test_the_accuracy_option_of_a_kuka_is_asked_for_and_kept(tmp_path, imported, remaster):
     arm = measured(rows=30)
     names = names_of('kuka_src', len(arm.q))
     program = write(tmp_path, 'calib.src', KINDS['kuka_src'].write(names, np.rad2deg(arm.q)))
     points = write(tmp_path, 'points.csv', text(['Name', 'X', 'Y', 'Z'], [names, *arm.points.T]))
-    (tmp_path / 'robot.urdf').write_text(arm.urdf)
-    args = ['import', str(program), str(points), '--urdf', str(tmp_path / 'robot.urdf')]
-    args += ['--length', 'm', '--join', 'order', '--unchecked']
-    assert main([*args, '--out', str(tmp_path / 'a')]) == 0
-    assert '--accuracy-option' in capsys.readouterr().out
-    told = ['--accuracy-option', 'active']
-    assert main([*args, '--out', str(tmp_path / 'b'), *told]) == 0
-    assert '--accuracy-option' not in capsys.readouterr().out
-    assert [read_session(tmp_path / s).accuracy_option for s in 'ab'] == ['', 'active']
+    args = [arm.urdf, program, points, '--length', 'm', '--join', 'order', '--unchecked']
+    for told, option in (((), ''), (('--accuracy-option', 'active'), 'active')):
+        (out, _), session = imported(*args, *told)
+        assert ('--accuracy-option' in out) == (not told)
+        assert session.accuracy_option == option
     # Of a session it can be said afterwards.
     told = ['--accuracy-option', 'inactive', '--unchecked', '--quiet']
-    assert main(['import', str(tmp_path / 'b'), '--out', str(tmp_path / 'c'), *told]) == 0
+    remaster('import', tmp_path / 'session1', '--out', tmp_path / 'c', *told)
     assert read_session(tmp_path / 'c').accuracy_option == 'inactive'
 
 

@@ -11,35 +11,27 @@ import numpy as np
 import pytest
 from foreign_tables import measured, text, write
 
-from remaster_ros.cli.main import main
-from remaster_ros.session.reader import read_session
-
 CASES = Path(__file__).parents[4] / 'shared' / 'cases'
 NAMES = [f'A{i}' for i in range(1, 7)]
 
 
 class Import:
-    def __init__(self, folder, capsys, rows):
-        self.folder, self.capsys, self.arm = folder, capsys, measured(rows=rows)
-        self.urdf = folder / 'robot.urdf'
-        self.urdf.write_text(self.arm.urdf)
+    def __init__(self, folder, imported, rows):
+        self.folder, self.imported, self.arm = folder, imported, measured(rows=rows)
+        self.urdf = self.arm.urdf
         self.q, self.points = np.rad2deg(self.arm.q), 1e3 * self.arm.points
 
-    def run(self, *args, points=('X', 'Y', 'Z'), limits=None):
-        """Import the table; return status, the JSON object, stderr and the session or None."""
+    def run(self, *args, points=('X', 'Y', 'Z'), status=0):
+        """Import the table; return the JSON object, stderr and the session or None."""
         table = text([*NAMES, *points], [*self.q.T, *self.points.T])
         path = write(self.folder, 't.csv', table)
-        out = self.folder / 'session'
-        self.capsys.readouterr()
-        line = ['import', path, '--urdf', self.urdf, '--out', out, '--json', *args]
-        status = main([*map(str, line)])
-        printed = self.capsys.readouterr()
-        return status, json.loads(printed.out), printed.err, out
+        printed, session = self.imported(self.urdf, path, '--json', *args, status=status)
+        return json.loads(printed.out), printed.err, session
 
 
 @pytest.fixture
-def table(tmp_path, capsys):
-    return lambda rows=48: Import(tmp_path, capsys, rows)
+def table(tmp_path, imported):
+    return lambda rows=48: Import(tmp_path, imported, rows)
 
 
 def exchanged(points, rows):
@@ -53,8 +45,8 @@ def test_a_few_rows_that_do_not_fit_are_named_and_the_session_is_written(table, 
     imported = table(72)
     rows = [7, 8, 30, 31]
     imported.points = exchanged(imported.points, rows)
-    status, found, _, out = imported.run()
-    assert (status, found['fits']) == (0, True)
+    found, _, session = imported.run()
+    assert found['fits']
     # The header is line 1.
     named = {row['where'] for row in found['rows_off']}
     assert named == {f'{imported.folder / "t.csv"}, line {row + 2}' for row in rows}
@@ -64,7 +56,7 @@ def test_a_few_rows_that_do_not_fit_are_named_and_the_session_is_written(table, 
     assert '4 of 72 rows do not fit' in found['warnings'][-1]
     assert 'line 9' in found['warnings'][-1]
     assert '4 of 72 rows do not fit' in caplog.text
-    assert len(read_session(out).measurements) == 72
+    assert len(session.measurements) == 72
 
 
 @pytest.mark.parametrize('count', [8, pytest.param(18, marks=pytest.mark.qualify)])
@@ -72,26 +64,23 @@ def test_more_rows_off_than_a_fit_leaves_out_are_no_session(table, count):
     """Of 48, and of them so many in a row that the median does not show them."""
     imported = table()
     imported.points = exchanged(imported.points, list(range(4, 4 + count)))
-    status, found, error, out = imported.run()
-    assert (status, found['fits'], found['session']) == (1, False, None)
+    found, error, _ = imported.run(status=1)
+    assert (found['fits'], found['session']) == (False, None)
     assert len(found['rows_off']) == count
     assert f'{count} of 48 rows do not fit' in error
     assert 'more than a fit leaves out' in error
-    assert not out.exists()
-    assert imported.run('--unchecked')[0] == 0
+    imported.run('--unchecked')
 
 
 def test_a_right_table_has_no_row_off(table):
-    status, found, error, _ = table(100).run()
-    assert (status, found['rows_off'], found['warnings'], error) == (0, [], [], '')
+    found, error, _ = table(100).run()
+    assert (found['rows_off'], found['warnings'], error) == ([], [], '')
 
 
 @pytest.mark.parametrize(('rows', 'enough'), [(2, False), (4, False), (5, True)])
 def test_fewer_configurations_than_unknowns_are_refused(table, rows, enough):
     """Four offsets, six of the sensor, three of the marker: 13 unknowns, 3 numbers a row."""
-    status, _found, error, out = table(rows).run()
-    assert status == (0 if enough else 1)
-    assert out.exists() == enough
+    _, error, _ = table(rows).run(status=0 if enough else 1)
     if not enough:
         assert f'{rows} different configurations to fit are too few' in error
         assert '13 unknowns' in error
@@ -101,8 +90,7 @@ def test_fewer_configurations_than_unknowns_are_refused(table, rows, enough):
 def test_configurations_measured_again_count_once(table):
     imported = table(2)
     imported.q, imported.points = np.tile(imported.q, (20, 1)), np.tile(imported.points, (20, 1))
-    status, _, error, _ = imported.run()
-    assert status == 1
+    _, error, _ = imported.run(status=1)
     assert '2 different configurations to fit are too few' in error
 
 
@@ -131,14 +119,11 @@ def test_a_proposal_is_one_that_the_program_accepts_and_that_helps(table, spoil,
     if points[0].startswith('Py'):
         imported.points = imported.points[:, [1, 0, 2]]
         points = ('Px [mm]', 'Py [mm]', 'Pz [mm]')
-    status, found, error, out = imported.run(*told, points=points)
-    assert status == 1, (told, points)
+    _, error, _ = imported.run(*told, points=points, status=1)
     proposed = error.split('to write it so, add ')[1].split('; to write it as')[0]
-    status, found, _, out = imported.run(*told, *shlex.split(proposed), points=points)
-    assert (status, found['fits']) == (0, True), proposed
-    np.testing.assert_allclose(
-        read_session(out).measurements.q, imported.arm.q, atol=1e-6, err_msg=proposed
-    )
+    found, _, session = imported.run(*told, *shlex.split(proposed), points=points)
+    assert found['fits'], proposed
+    np.testing.assert_allclose(session.measurements.q, imported.arm.q, atol=1e-6, err_msg=proposed)
 
 
 def test_points_in_a_table_of_their_own_are_exchanged_as_proposed(table):
@@ -148,11 +133,9 @@ def test_points_in_a_table_of_their_own_are_exchanged_as_proposed(table):
     joints = write(imported.folder, 'j.csv', text(['name', *NAMES], [names, *imported.q.T]))
     mirrored = imported.points[:, [1, 0, 2]]
     points = write(imported.folder, 'p.csv', text(['name', 'X', 'Y', 'Z'], [names, *mirrored.T]))
-    line = ['import', joints, points, '--urdf', imported.urdf, '--out', imported.folder / 's']
-    assert main([*map(str, line)]) == 1
-    error = imported.capsys.readouterr().err
+    error = imported.imported(imported.urdf, joints, points, status=1)[0].err
     proposed = error.split('to write it so, add ')[1].split('; to write it as')[0]
-    assert main([*map(str, line), *shlex.split(proposed)]) == 0, proposed
+    imported.imported(imported.urdf, joints, points, *shlex.split(proposed))
 
 
 def test_a_proposal_beyond_the_limits_of_the_robot_is_not_made(table):
@@ -168,21 +151,18 @@ def test_a_proposal_beyond_the_limits_of_the_robot_is_not_made(table):
         r'upper="[^"]*"', f'upper="{high}"', re.sub(r'lower="[^"]*"', f'lower="{low}"', joint)
     )
     assert narrow != joint
-    imported.urdf.write_text(f'{before}<joint name="joint_2" type{narrow}{end}{after}')
-    status, _found, error, _ = imported.run()
-    assert status == 1
+    imported.urdf = f'{before}<joint name="joint_2" type{narrow}{end}{after}'
+    _, error, _ = imported.run(status=1)
     assert 'to write it so, add' not in error
     assert 'nothing was written' in error
 
 
-def test_an_offset_that_the_data_do_not_determine_is_no_reason_to_refuse(tmp_path, capsys):
+def test_an_offset_that_the_data_do_not_determine_is_no_reason_to_refuse(imported):
     """The last joint of the chain, a gripper's, never moves: the one before may be anywhere."""
     if not CASES.is_dir():
         pytest.skip('the tables of other arms are not part of this repository')
-    table, urdf = CASES / '12_so101_five_joints.csv', CASES / 'so101.urdf'
+    table, urdf = CASES / '12_so101_five_joints.csv', (CASES / 'so101.urdf').read_text()
     for tip in ([], ['--tip-link', 'gripper_frame_link']):
-        out = tmp_path / f'session{len(tip)}'
-        args = ['import', table, '--urdf', urdf, '--out', out, *tip]
-        assert main([*map(str, args)]) == 0, capsys.readouterr().err
-        assert 'the robot fits to 0.46 mm (median)' in capsys.readouterr().out
-        assert len(read_session(out).measurements) == 50
+        (out, _), session = imported(urdf, table, *tip)
+        assert 'the robot fits to 0.46 mm (median)' in out
+        assert len(session.measurements) == 50

@@ -9,11 +9,9 @@ import pytest
 from foreign_streams import arm_of, log_of, run_of, seen, take_of
 from foreign_tables import text, write
 
-from remaster_ros.cli.main import main
 from remaster_ros.errors import InputError
 from remaster_ros.importing.columns import Told
 from remaster_ros.importing.rows import TableOptions, read_rows
-from remaster_ros.session.reader import read_session
 
 UNIX_S = 1_772_715_731.344
 
@@ -44,7 +42,7 @@ def assert_stops(rows, arm, which=slice(None), tolerance_m=2e-4):
     [('1.23', 'Millimeters', ',', '.'), ('1.25', 'Meters', ';', ',')],
 )
 def test_a_take_and_a_log_of_another_clock(
-    version, unit, separator, decimal, arm, run, tmp_path, capsys
+    version, unit, separator, decimal, arm, run, tmp_path, imported
 ):
     # The take begins in the third stop, and ends in the last but one.
     begins, ends = run.begin[2] + 0.4, run.end[-2] - 0.1
@@ -59,13 +57,8 @@ def test_a_take_and_a_log_of_another_clock(
     assert rows.samples.min() > 20
     assert 0.5e-4 < np.median(rows.std) < 2e-4
     # The command says so, and writes the session.
-    (tmp_path / 'robot.urdf').write_text(arm.urdf)
-    files = [str(tmp_path / name) for name in ('take.csv', 'log.csv')]
-    out = tmp_path / 'session'
-    capsys.readouterr()
-    assert main(['import', *files, '--urdf', str(tmp_path / 'robot.urdf'), '--out', str(out)]) == 0
-    assert '21 of 21 standstills of take.csv match 21 of 24' in capsys.readouterr().out
-    session = read_session(out)
+    (out, _), session = imported(arm.urdf, tmp_path / 'take.csv', tmp_path / 'log.csv')
+    assert '21 of 21 standstills of take.csv match 21 of 24' in out
     assert len(session.measurements) == 21
     assert [*session.markers] == ['tool']
     assert session.measurements.orientation is not None

@@ -9,7 +9,6 @@ import pytest
 from foreign_streams import arm_of, log_of, run_of, take_of
 from foreign_tables import measured, text, write
 
-from remaster_ros.cli.main import main
 from remaster_ros.errors import InputError
 from remaster_ros.importing.columns import Told
 from remaster_ros.importing.makers import motive
@@ -252,16 +251,15 @@ def test_surveyors_letters(arm, tmp_path):
         assert_rows(rows_of(arm, tmp_path, table, joints_table(arm)), arm)
 
 
-def test_the_robots_own_tool_is_no_measured_point(tmp_path, capsys):
+def test_the_robots_own_tool_is_no_measured_point(tmp_path, imported):
     arm = measured(rows=30)
     believed = 1e3 * arm.chain.forward(arm.q)[:, :3, 3]
-    urdf = write(tmp_path, 'robot.urdf', arm.urdf)
     head = ['pose', *AXES, 'px', 'py', 'pz', 'mx', 'my', 'mz']
     table = text(head, [range(30), *degrees(arm), *believed.T, *millimetres(arm)])
-    command = ['import', str(write(tmp_path, 't.csv', table)), '--urdf', str(urdf)]
-    assert main([*command, '--out', str(tmp_path / 's')]) == 1
-    assert 'name the columns of the measured point with --points' in capsys.readouterr().err
-    assert main([*command, '--out', str(tmp_path / 's'), '--points', 'mx,my,mz']) == 0
+    path = write(tmp_path, 't.csv', table)
+    error = imported(arm.urdf, path, status=1)[0].err
+    assert 'name the columns of the measured point with --points' in error
+    imported(arm.urdf, path, '--points', 'mx,my,mz')
 
 
 def test_the_robots_own_tool_in_a_log_of_joints_is_left_out(arm, tmp_path):
