@@ -24,8 +24,6 @@ class Announcements:
         # Of the last announcement, by which the others name it; '' where the pose is to be
         # announced anew.
         self.stamp = ''
-        # Stamp of each announcement of the open pose -> its solutions, in the order announced.
-        self._ids: dict[str, tuple[int, ...]] = {}
         self._announced_wall = 0.0
         # Which start of each peer was there when the pose was announced.
         self._told: dict[str, str] = {}
@@ -51,27 +49,22 @@ class Announcements:
             return False
         return now - self._matched_wall > MATCH_WALL_S
 
-    def solution(self, stamp: str, index: int) -> int | None:
-        """Return the planner's number of a solution of the open pose; None if it is none."""
-        ids = self._ids.get(stamp, ())
-        return ids[index] if index < len(ids) else None
-
-    def announced(self, stamp: str, ids: tuple[int, ...], now: float) -> None:
-        """Take it that the pose is announced now, with these of its solutions."""
+    def announced(self, stamp: str, now: float) -> None:
+        """Take it that the pose is announced now."""
         self.stamp, self._announced_wall = stamp, now
-        self._ids[stamp] = ids
         self._told = {node: heard.started for node, heard in self._heard()}
 
     def is_lost(self) -> bool:
         """Whether the open pose is to be announced (again): bridge or recorder lacks it.
 
         That is a peer that was started after the announcement, or one whose state shows another
-        pose some time later. While the recorder measures nothing is announced.
+        pose some time later. While the recorder measures nothing is announced: what comes of that
+        is not left of the pose any more.
         """
-        if not self.stamp:
-            return True
         if (recorder := self._peers.recorder) is not None and recorder.state == 'measuring':
             return False
+        if not self.stamp:
+            return True
         missed_wall = self._announced_wall + ANNOUNCE_WALL_S
         return any(
             heard.body.pose != self.stamp
@@ -86,7 +79,3 @@ class Announcements:
     def retract(self) -> None:
         """Have what is left of the open pose announced anew before anything else."""
         self.stamp = ''
-
-    def close(self) -> None:
-        """Be done with the open pose."""
-        self._ids, self.stamp = {}, ''

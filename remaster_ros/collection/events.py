@@ -99,11 +99,19 @@ class BridgeState(Body, frozen=True, kw_only=True, tag='bridge'):
     correction: str = ''
 
 
-class Decided(msgspec.Struct, frozen=True):
-    """The solutions of a pose that are recorded, by the planner's own numbers."""
+NO_FREE_PATH = 'no_free_path'
+"""Outcome of a configuration that the arm cannot get to without hitting something."""
 
-    pose: int
-    solutions: tuple[int, ...]
+
+class Decided(msgspec.Struct, frozen=True):
+    """What became of the configurations of a plan, as the session's journal has it."""
+
+    pose: int | None = None  # The last one of which any has an outcome; None before the first
+    solutions: tuple[int, ...] = ()  # Those of it that have one, by the planner's own numbers
+    # How many configurations came to which end: an `Outcome`, ``failed`` or ``no_free_path``.
+    # Those for a registration are not among them, and visits to references are counted apart.
+    outcomes: dict[str, int] = msgspec.field(default_factory=dict)
+    references: int = 0
 
 
 class RecorderState(Body, frozen=True, kw_only=True, tag='recorder'):
@@ -121,8 +129,9 @@ class RecorderState(Body, frozen=True, kw_only=True, tag='recorder'):
     # Stamp of the announced pose and token of the run, as the recorder has them
     pose: str = ''
     run: str = ''
-    decided: Decided | None = None  # What is recorded of the last pose; None before the first
+    decided: Decided = Decided()
     registration: str = ''  # How far the first registration of the sensors is, as text
+    registered: bool = False  # Whether every sensor that the arm waits for is registered
     require: str = 'all'  # Which sensors the arm waits for: ``all``, ``any`` or the name of one
     # Time since the last reading of each sensor, s; None for never
     read_age_s: dict[str, float | None] = msgspec.field(default_factory=dict)
@@ -162,7 +171,9 @@ class PoseAnnounced(Body, frozen=True, kw_only=True, tag='pose'):
     split: str
     # The planner's own numbers of the joint solutions, in the order published
     ids: tuple[Index, ...]
-    plan: str = ''  # The plan that both are numbered by
+    # Those that no free path leads to; where there are no others, no solutions follow
+    unreached: tuple[Index, ...] = ()
+    plan: str = ''  # The plan that all are numbered by
     last: bool = False  # Whether it is the last reference of a round
 
 

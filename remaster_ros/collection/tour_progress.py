@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 from typing import Any, Protocol, TypeVar
 
-from remaster_ros.collection.events import PlannerState, RecorderState
+from remaster_ros.collection.events import Decided, PlannerState, RecorderState
 from remaster_ros.collection.peers import RequiredSensors
 from remaster_ros.errors import InputError, InsufficientDataError
 from remaster_ros.planning.collection_plan import Expected, with_expected
@@ -24,7 +24,7 @@ class PlanMemory(Protocol):
     tour: Tour | None
     stop: PoseVisit | None
     trouble: str
-    outcomes: Counter[str]
+    decided: Decided
     earlier: Counter[str]
 
     def begin(self, tour: Tour, expected: Expected | None = None) -> None:
@@ -33,14 +33,8 @@ class PlanMemory(Protocol):
     def open_stop(self, stop: PoseVisit) -> None:
         """Remember the next stop."""
 
-    def reroute(self, stop: PoseVisit) -> None:
-        """Remember other ways to what is left of the stop."""
-
     def leave_rest(self) -> None:
         """Remember that no more poses to fit are visited."""
-
-    def outcome(self, solution: int, result: str) -> None:
-        """Remember what became of a solution of the stop."""
 
 
 class Planning(Protocol):
@@ -56,7 +50,7 @@ class TourProgress:
     Parameters
     ----------
     memory
-        The plan, the open pose, and what became of each configuration.
+        The plan and the open pose.
     tours
         Plans the tours.
     planning
@@ -66,6 +60,8 @@ class TourProgress:
     ----------
     phase
         ``registration`` or ``collection``.
+    decided
+        What became of configurations, as the recorder has it.
     resumed
         Whether poses were visited by a planner before this one.
     T_R_N
@@ -85,7 +81,7 @@ class TourProgress:
 
     def __init__(self, memory: PlanMemory, tours: TourPlanner, planning: Planning) -> None:
         self._memory, self._tours, self._planning = memory, tours, planning
-        tour = memory.tour
+        tour, self.decided = memory.tour, memory.decided
         self.resumed = tour is not None and tour.visited > 0
         collecting = tour is not None and REGISTRATION not in tour.plans
         self.phase = 'collection' if collecting else REGISTRATION
@@ -102,30 +98,15 @@ class TourProgress:
         """Return how far the collection is, as text."""
         tour = self._memory.tour
         poses = f'{tour.poses_begun} of {sum(tour.poses.values())}' if tour else 'none'
-        done = self._memory.outcomes.total()
+        done = sum(self.decided.outcomes.values())
         return f'{poses} {self.phase} poses begun, {done} configurations done'
 
-    # What became of configurations
-
-    def ended(self, solution: int, result: str, *, registered: bool) -> bool:
-        """Take what became of a solution; return whether it belongs to the open pose."""
-        if self._memory.stop is None or solution not in self._memory.stop.ids:
-            return False
-        self._registered = registered
-        self._memory.outcome(solution, result)
-        return True
-
-    def catch_up(self, recorder: RecorderState) -> bool:
-        """Take what was recorded while this planner was not there; return whether anything was."""
-        stop, decided = self._memory.stop, recorder.decided
-        if stop is None or decided is None or recorder.plan != self._memory.id:
-            return False
-        if decided.pose != stop.pose:
-            return False
-        found = [solution for solution in decided.solutions if solution in stop.ids]
-        for solution in found:
-            self._memory.outcome(solution, 'recorded')
-        return bool(found)
+    def follow(self, recorder: RecorderState) -> bool:
+        """Take what became of configurations; return whether that is new."""
+        before, self._registered = self.decided, recorder.registered
+        if recorder.plan == self._memory.id:
+            self.decided = recorder.decided
+        return self.decided != before
 
     # What is next
 
@@ -146,9 +127,13 @@ class TourProgress:
 
     @property
     def open_pose(self) -> PoseVisit | None:
-        """The pose with solutions that have no outcome yet; None where there is none."""
-        stop = self._memory.stop
-        return stop if stop is not None and stop.ids else None
+        """The last pose with those of its solutions that have no outcome; None without any."""
+        tour, stop = self._memory.tour, self._memory.stop
+        if tour is None or stop is None:
+            return None
+        done = self.decided.solutions if self.decided.pose == stop.pose else ()
+        left = [number for number in (*stop.ids, *stop.unreached) if number not in done]
+        return tour.along(stop, left) if left else None
 
     def rest(self, q: FloatArray) -> PoseVisit | None:
         """Return what is left of the open pose, by ways that begin at `q`; None while planned.
@@ -158,16 +143,13 @@ class TourProgress:
         q
             Where the arm stands, rad, (k,).
         """
-        tour, stop = self._memory.tour, self._memory.stop
+        tour, stop = self._memory.tour, self.open_pose
         assert tour is not None
         assert stop is not None
         self.standing = ''
         what = (tour, stop.split, stop.pose, stop.ids)
         found = self._planning.ask(what, q, lambda: tour.reroute(stop, q))
-        if found is None:
-            return None
-        self._memory.reroute(found[0])
-        return found[0]
+        return found[0] if found else None
 
     def next(self, q: FloatArray, sensors: RequiredSensors, words: str) -> PoseVisit | None:
         """Open the next pose and return it; None while it is planned, and at the end.
@@ -295,18 +277,18 @@ class TourProgress:
 
     def counts(self) -> dict[str, Any]:
         """Return figures of the tour for people."""
-        tour, outcomes = self._memory.tour, self._memory.outcomes
+        tour, outcomes = self._memory.tour, self.decided.outcomes
         earlier = self._memory.earlier
         values: dict[str, Any] = {
             'phase': self.phase,
             'poses_done': earlier['poses'] + (tour.poses_begun if tour else 0),
             'poses': earlier['poses'] + (sum(tour.poses.values()) if tour else 0),
-            'configurations_done': outcomes.total(),
+            'configurations_done': sum(outcomes.values()),
             'configurations': earlier['configurations']
             + (sum(tour.configurations.values()) if tour else 0),
             'references': tour.references if tour else 0,
         }
-        tables = {'outcome': outcomes}
+        tables: dict[str, Mapping[str, int]] = {'outcome': outcomes}
         if tour is not None and self.phase != REGISTRATION:
             tables |= {'dropped': tour.dropped, 'dropped_solutions': tour.dropped_solutions}
         for table, counts in tables.items():

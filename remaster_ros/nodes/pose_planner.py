@@ -8,9 +8,10 @@ Without a registration of every sensor the first poses serve the three-point reg
 What the planner does and in which run is decided in `collection.collection_run`, which pose is
 next in `collection.tour_progress`, whether it is announced again in `collection.announcements`.
 
-The plan, the pose under way and what became of each configuration are in the session folder
-before the arm moves. A planner that was killed goes on by itself where it was, if the run still
-lives: recorder and bridge hold its token (see `LivingRun`).
+The plan and the pose under way are in the session folder before the arm moves; what became of
+each configuration is in the recorder's journal there alone, which the recorder's state tells of. A
+planner that was killed goes on by itself where it was, if the run still lives: recorder and bridge
+hold its token (see `LivingRun`).
 
 Pause and stop have a thread of their own: neither planning nor the disk keeps them waiting. Their
 state goes out first; what the journal must remember is written afterwards.
@@ -81,7 +82,7 @@ from remaster_ros.planning.tour_order import FITTED, REGISTRATION, PoseVisit, To
 from remaster_ros.planning.tour_planner import REGISTRATION_CANDIDATES, TourPlanner
 from remaster_ros.planning.travel_time import SPEED_SHARE, TravelTime
 from remaster_ros.session.files import read_limited
-from remaster_ros.session.plan_journal import NO_FREE_PATH, PlanJournal, plan_page_path
+from remaster_ros.session.plan_journal import PlanJournal, plan_page_path
 from remaster_ros.session.reader import OBSERVATIONS_LIMIT, ROWS, read_session
 from remaster_ros.session.workcell import Workcell, read_cell
 from remaster_ros.types import FloatArray
@@ -339,9 +340,18 @@ class PosePublisher:
         # The event goes first: the recorder must have the pose before the arm gets there.
         status.event(
             PoseAnnounced(
-                stamp=key, pose=stop.pose, split=stop.split, ids=stop.ids, plan=plan, last=last
+                stamp=key,
+                pose=stop.pose,
+                split=stop.split,
+                ids=stop.ids,
+                unreached=stop.unreached,
+                plan=plan,
+                last=last,
             )
         )
+        if not stop.ids:
+            # Without a solution the bridge would take the pose back, which nothing asks for.
+            return key
         write_place(stop.T_R_T, pose.pose.position, pose.pose.orientation)
         self._poses.publish(pose)
         # Before the solutions: with those the bridge begins to move.
@@ -553,7 +563,7 @@ class PlanPreview(PlanConfirmation):
             return ''
         if self.shown:
             self.withdraw()
-        T_R_N, stop = dict(self._progress.T_R_N), self._memory.stop
+        T_R_N, stop = dict(self._progress.T_R_N), self._progress.open_pose
         # As it is now: the thread must not see it change.
         left = tour.fork() if tour is not None else None
         try:
@@ -603,9 +613,7 @@ class PlanPreview(PlanConfirmation):
             tours.append(planner.collection(planner.rough_places))
         if not registered or not T_R_N:
             places = planner.rough_places
-        plan = look_ahead(
-            planner, places, tours, q, stop if stop is not None and stop.ids else None
-        )
+        plan = look_ahead(planner, places, tours, q, stop)
         name = fingerprint(tour)
         scene = robot_scene(self._cell, planner.scene).with_sensors(places)
         html = plan_page(
@@ -855,33 +863,18 @@ class PosePlanner(RemasterNode):
                     self._end('paused', why)
             case events.SetupChanged(stops=True, text=why):
                 self._end('paused', why)
-            case events.ConfigurationEnded() as end:
-                self._on_ended(end.stamp, end.solution, end.result, end.registered)
-            case events.SolutionFailed() as end:
-                self._on_ended(end.stamp, end.solution, 'failed', False)
             case OptimizerState(enough=True, plan=plan) if plan and plan == self.journal.id:
                 # The pose under way is finished, what is held out is measured: an ordinary end.
                 self.progress.enough = True
             case events.RecorderState() as recorder:
                 self._on_recorder(recorder)
 
-    def _on_ended(self, stamp: str, index: int, result: str, registered: bool) -> None:
-        """Take what became of a solution of an announcement."""
-        solution = self._announcements.solution(stamp, index)
-        if solution is None:
-            return
-        if stamp != self._announcements.stamp and result not in ('recorded', 'partial'):
-            # It was announced again meanwhile, and will be visited again.
-            return
-        if self.progress.ended(solution, result, registered=registered):
-            self._step()
-
     def _on_recorder(self, recorder: events.RecorderState) -> None:
         if self.run.token and recorder.changed_run == self.run.token:
             # Found while this planner was not there; collect begins another run.
             self._end('paused', recorder.changed)
-        if self.run.state not in ('complete', 'failed') and self.progress.catch_up(recorder):
-            self._announcements.retract()
+        if self.progress.follow(recorder):
+            self._step()
         tour, closed = self.journal.tour, recorder.exit_status == 'complete'
         if self.run.state == 'complete' and tour is not None and recorder.plan == self.journal.id:
             for kind in KINDS:
@@ -915,7 +908,7 @@ class PosePlanner(RemasterNode):
                 required = self._peers.required()
                 stop = self.progress.next(q, required, recorder.registration)
                 if stop is not None:
-                    self._announcements.close()
+                    self._announcements.retract()
             elif self._announcements.is_lost():
                 stop = self.progress.rest(q)
             else:
@@ -929,7 +922,7 @@ class PosePlanner(RemasterNode):
         if self.progress.standing:
             self.run.why = self.progress.standing
             self._listen_again()
-        if stop is not None and stop.ids and not self.journal.trouble:
+        if stop is not None and not self.journal.trouble:
             self._announce(stop)
 
     def _hindrance(self, now: float) -> str:
@@ -972,7 +965,7 @@ class PosePlanner(RemasterNode):
             if self.run.state == 'running':
                 last = self.progress.is_last_reference(stop)
                 stamp = self._poses.announce(stop, self.journal.id, self.status, last=last)
-                self._announcements.announced(stamp, stop.ids, time.monotonic())
+                self._announcements.announced(stamp, time.monotonic())
 
     def _write_state(self) -> None:
         """Write the state down; a stop or pause came in a thread that must not wait for it."""
@@ -996,7 +989,7 @@ class PosePlanner(RemasterNode):
         values = {
             'robot': 'silent' if self._q is None else 'heard',
             'plan': self.journal.id,
-            'references_done': self.journal.references.total(),
+            'references_done': self.progress.decided.references,
             # Whether it may still go on by itself.
             'resuming': 'yes' if run.left else 'no',
             **self._preview.values(),
@@ -1004,7 +997,9 @@ class PosePlanner(RemasterNode):
             'verdict': self._judging.verdict,
             # Of the whole session; '' before its collection is planned.
             'robot_time_s': f'{self._session_s:.0f}' if self._session_s else '',
-            'dropped_solutions_no free path': self.journal.outcomes[NO_FREE_PATH],
+            'dropped_solutions_no free path': self.progress.decided.outcomes.get(
+                events.NO_FREE_PATH, 0
+            ),
         }
         why = full or run.why or self._judging.trouble
         level = 'error' if run.state == 'failed' else 'warn' if why else 'ok'

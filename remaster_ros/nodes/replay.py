@@ -62,6 +62,7 @@ IN_ORDER = ('/remaster/settled', '/remaster/joint_solutions')
 """Between these and what was sent before and after, the order counts as well."""
 ORDERED_EVENTS = (
     events.PoseAnnounced,
+    events.SolutionFailed,
     events.ArmStopped,
     events.ConfigurationEnded,
     events.ReadByHand,

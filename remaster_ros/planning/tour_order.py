@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from copy import copy, deepcopy
 from dataclasses import dataclass, replace
 from itertools import takewhile
@@ -57,20 +57,6 @@ class PoseVisit:
         if not self.paths:
             straight = np.empty((0, self.solutions.shape[1]))
             object.__setattr__(self, 'paths', (straight,) * len(self.solutions))
-
-    def only(self, ids: Collection[int]) -> PoseVisit:
-        """Return the stop with only these solutions, in the same order.
-
-        The ways stay as they were: they hold for an arm that has visited the others. From
-        anywhere else they are found anew (`Tour.reroute`).
-        """
-        kept = [i for i, number in enumerate(self.ids) if number in ids]
-        return replace(
-            self,
-            solutions=self.solutions[kept],
-            ids=tuple(self.ids[i] for i in kept),
-            paths=tuple(self.paths[i] for i in kept),
-        )
 
 
 class Tour:
@@ -268,8 +254,8 @@ class Tour:
         self,
         stop: PoseVisit,
         ids: Sequence[int],
-        paths: Sequence[FloatArray],
-        unreached: Sequence[int],
+        paths: Sequence[FloatArray] = (),
+        unreached: Sequence[int] = (),
     ) -> PoseVisit:
         """Return a stop at the same pose with another route (see `Route`)."""
         other = self._stop(stop.split, stop.index, Route(ids, paths, unreached))

@@ -1,8 +1,8 @@
-"""What a planner keeps on the disk: its plan, the open pose, the outcome of each configuration.
+"""What a planner keeps on the disk: its plan, and which of its poses was next.
 
 ``plan.jsonl`` in the session folder is a journal (see `journal`). The plan is in it before the
 arm first moves, each pose before the arm is sent there; a planner that is started again takes up
-the tour where it was.
+the tour where it was. What became of a configuration is in the session's journal alone.
 """
 
 from __future__ import annotations
@@ -10,34 +10,24 @@ from __future__ import annotations
 import uuid
 from collections import Counter, deque
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import msgspec
-import numpy as np
 
+from remaster_ros.collection.events import Decided
 from remaster_ros.errors import DiskError, InputError
 from remaster_ros.kinematics.collision import CollisionModel
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.planning.candidates import Plan
 from remaster_ros.planning.collection_plan import Expected
-from remaster_ros.planning.tour_order import (
-    FITTED,
-    REFERENCE,
-    REGISTRATION,
-    PoseVisit,
-    Route,
-    Tour,
-)
+from remaster_ros.planning.tour_order import FITTED, REFERENCE, REGISTRATION, PoseVisit, Tour
 from remaster_ros.session.files import make_folder
 from remaster_ros.session.journal import Journal, Record, read_journal
 from remaster_ros.session.reader import PLAN
+from remaster_ros.session.session_journal import read_outcomes
 from remaster_ros.session.yaml_records import from_plain, to_plain
-from remaster_ros.types import FloatArray
-
-NO_FREE_PATH = 'no_free_path'
-"""Outcome of a configuration that the arm cannot get to without hitting something."""
 
 
 class PlanBegun(msgspec.Struct, tag_field='kind', tag='plan'):
@@ -73,25 +63,17 @@ class TourNoted(msgspec.Struct, tag_field='kind', tag='tour'):
         )
 
 
-class RouteNoted(msgspec.Struct, tag_field='kind', tag='route'):
-    """Solutions in the order of their visits, by number; `paths` has those that go around."""
-
-    ids: tuple[int, ...]
-    paths: dict[str, FloatArray] = {}
-    unreached: tuple[int, ...] = ()
-
-    def route(self, joints: int) -> Route:
-        """Return it as a tour has it, for an arm with so many joints."""
-        straight = np.empty((0, joints))
-        paths = tuple(self.paths.get(str(number), straight) for number in self.ids)
-        return Route(self.ids, paths, self.unreached)
-
-
-class StopNoted(RouteNoted, kw_only=True, tag='stop'):
-    """The next pose: which of the poses of its split, and the way to its solutions."""
+class StopNoted(msgspec.Struct, tag_field='kind', tag='stop'):
+    """The next pose: which of its split, its solutions, and those that nothing leads to."""
 
     split: str
     index: int
+    ids: tuple[int, ...]
+    unreached: tuple[int, ...] = ()
+
+    def take(self, tour: Tour) -> PoseVisit:
+        """Go there in a tour; the ways to it are found anew from where the arm stands."""
+        return tour.go_to(self.split, self.index, self.ids, (), self.unreached)
 
 
 class RoundNoted(msgspec.Struct, tag_field='kind', tag='round'):
@@ -109,13 +91,6 @@ class ExpectationNoted(msgspec.Struct, tag_field='kind', tag='expected'):
     tool_rms_m: float
 
 
-class OutcomeNoted(msgspec.Struct, tag_field='kind', tag='outcome'):
-    """What became of a solution of the last pose."""
-
-    id: int
-    result: str
-
-
 class StateNoted(msgspec.Struct, tag_field='kind', tag='state'):
     """The planner's state, and the token of the run that it is in."""
 
@@ -124,15 +99,7 @@ class StateNoted(msgspec.Struct, tag_field='kind', tag='state'):
 
 
 PlanRecord = (
-    PlanBegun
-    | TourNoted
-    | RouteNoted
-    | StopNoted
-    | RoundNoted
-    | EnoughNoted
-    | ExpectationNoted
-    | OutcomeNoted
-    | StateNoted
+    PlanBegun | TourNoted | StopNoted | RoundNoted | EnoughNoted | ExpectationNoted | StateNoted
 )
 
 
@@ -187,32 +154,30 @@ def read_plan(folder: Path, chain: SerialChain) -> RecordedPlan | None:
     Raises
     ------
     InputError
-        plan.jsonl is damaged, or no plan of this version.
+        plan.jsonl or the session's journal is damaged, or it is no plan of this version.
     """
     path = folder / PLAN
     if not path.exists():
         return None
     plan: RecordedPlan | None = None
-    split, index = '', 0
     try:
+        found = read_outcomes(folder)
         for record in from_plain(read_journal(path).records, list[PlanRecord]):
             match record:
                 case TourNoted():
                     collection = REGISTRATION not in record.plans
                     tour = record.tour(chain)
                     plan = RecordedPlan(tour, plan_page_path(folder)) if collection else None
-                case StopNoted():
-                    split, index = record.split, record.index
-            if plan is None:
-                continue
-            match record:
-                case ExpectationNoted():
+                case StopNoted() if plan is not None:
+                    _, ends = found.poses.get(record.take(plan.tour).pose, ('', {}))
+                    if record.split == REFERENCE:
+                        plan.references.update(ends.values())
+                    else:
+                        place = record.split, record.index
+                        plan.outcomes |= {(*place, number): end for number, end in ends.items()}
+                case ExpectationNoted() if plan is not None:
                     plan.expected = record
-                case RouteNoted():
-                    _close(plan, split, index, record.unreached, NO_FREE_PATH)
-                case OutcomeNoted():
-                    _close(plan, split, index, (record.id,), record.result)
-                case EnoughNoted():
+                case EnoughNoted() if plan is not None:
                     plan.enough = True
         return plan if plan is not None and plan.tour.plans[FITTED].poses else None
     except (KeyError, IndexError, TypeError, ValueError) as error:
@@ -220,17 +185,6 @@ def read_plan(folder: Path, chain: SerialChain) -> RecordedPlan | None:
             f'{path}: no plan of this version ({type(error).__name__}: {error}); '
             'move it out of the session folder to go without'
         ) from None
-
-
-def _close(
-    plan: RecordedPlan, split: str, index: int, solutions: tuple[int, ...], result: str
-) -> None:
-    """Note what became of configurations; a first outcome stays."""
-    for solution in solutions:
-        if split == REFERENCE:
-            plan.references[result] += 1
-        else:
-            plan.outcomes.setdefault((split, index, solution), result)
 
 
 ENOUGH = 'enough is known'
@@ -260,11 +214,9 @@ class PlanJournal:
     tour
         The tour under way, at the stop where it was; None where there is none.
     stop
-        The last stop with the solutions that still have no outcome; None before the first.
-    outcomes
-        How many configurations of the collection came to which end, references not counted.
-    references
-        The same for visits to the references.
+        The last stop; None before the first.
+    decided
+        What the session's journal had of this plan at the beginning.
     earlier
         Of the collection's tours before this one: ``poses`` and ``configurations``; ``to_fit``,
         configurations to fit of the first; ``further``, of those behind it.
@@ -298,11 +250,13 @@ class PlanJournal:
         self._unwritten: deque[Record] = deque()
         self.tour: Tour | None = None
         self.stop: PoseVisit | None = None
-        self.outcomes: Counter[str] = Counter()
-        self.references: Counter[str] = Counter()
+        self.decided = Decided()
         self.earlier: Counter[str] = Counter()
         if self.path.exists():
+            outcomes = read_outcomes(folder)
             self._open()
+            if outcomes.plan == self.id:
+                self.decided = outcomes.decided()
 
     def _open(self) -> Journal:
         self._journal = Journal(self.path)
@@ -340,22 +294,18 @@ class PlanJournal:
             )
 
     def _replay(self, record: PlanRecord) -> None:
-        tour, stop, joints = self.tour, self.stop, len(self._chain)
+        tour = self.tour
         match record:
             case TourNoted():
                 self._count_earlier()
                 self.stop = None
                 self.tour = record.tour(self._chain, self._model)
             case StopNoted() if tour is not None:
-                self._take(tour.go_to(record.split, record.index, *record.route(joints)))
-            case RouteNoted() if tour is not None and stop is not None:
-                self._take(tour.along(stop, *record.route(joints)))
+                self.stop = record.take(tour)
             case RoundNoted() if tour is not None:
                 tour.ask_round()
             case EnoughNoted() if tour is not None:
                 tour.leave_out(FITTED, ENOUGH)
-            case OutcomeNoted():
-                self._close_solution(record.id, record.result)
             case StateNoted():
                 self.state, self.run = record.state, record.run
 
@@ -370,22 +320,6 @@ class PlanJournal:
                 to_fit=0 if tour.begin_at else count,
                 further=count if tour.begin_at else 0,
             )
-
-    def _take(self, stop: PoseVisit) -> None:
-        """Go to a stop; the solutions that nothing leads to have their outcome with it."""
-        if stop.unreached:
-            self._count(stop.split, NO_FREE_PATH, len(stop.unreached))
-        # Counted once.
-        self.stop = replace(stop, unreached=())
-
-    def _close_solution(self, solution: int, result: str) -> None:
-        assert self.stop is not None
-        self._count(self.stop.split, result, 1)
-        self.stop = self.stop.only([number for number in self.stop.ids if number != solution])
-
-    def _count(self, split: str, result: str, times: int) -> None:
-        if split != REGISTRATION:
-            (self.references if split == REFERENCE else self.outcomes)[result] += times
 
     def _append(self, record: PlanRecord) -> None:
         if self._journal is None:
@@ -429,29 +363,8 @@ class PlanJournal:
 
     def open_stop(self, stop: PoseVisit) -> None:
         """Note the next stop, before the arm is sent there."""
-        self._append(StopNoted(**_route(stop), split=stop.split, index=stop.index))
-        self._take(stop)
-
-    def reroute(self, stop: PoseVisit) -> None:
-        """Note other ways to what is left of the open stop, before the arm is sent there."""
-        self._append(RouteNoted(**_route(stop)))
-        self._take(stop)
-
-    def outcome(self, solution: int, result: str) -> None:
-        """Note what became of a solution of the open stop; a first outcome stays.
-
-        Parameters
-        ----------
-        solution
-            One of the stop's `ids`.
-        result
-            ``recorded``, ``partial``, ``rejected`` or ``failed``; what cannot be reached without
-            hitting something is counted as ``no_free_path`` when its stop is opened.
-        """
-        if self.stop is None or solution not in self.stop.ids:
-            return
-        self._append(OutcomeNoted(solution, result))
-        self._close_solution(solution, result)
+        self._append(StopNoted(stop.split, stop.index, stop.ids, stop.unreached))
+        self.stop = stop
 
     def say_state(self, state: str, run: str = '') -> None:
         """Note the planner's state and run, once there is a plan."""
@@ -463,8 +376,3 @@ class PlanJournal:
         """Let others go on with the plan."""
         if self._journal is not None:
             self._journal.close()
-
-
-def _route(stop: PoseVisit) -> dict[str, Any]:
-    paths = {str(number): path for number, path in zip(stop.ids, stop.paths) if len(path)}
-    return {'ids': stop.ids, 'paths': paths, 'unreached': stop.unreached}

@@ -1,7 +1,8 @@
 """What a recorder keeps on the disk: the session, and its decisions so far.
 
 A recorder that is started again finds here what it decided before, so that nothing is recorded
-twice, and the points that its sensors were registered by.
+twice, and the points that its sensors were registered by. What became of a configuration is noted
+here alone: planner and reports take it from this journal.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from typing import Any
 
 from remaster_ros.collection.events import Decided, Outcome
 from remaster_ros.collection.pairing import PairedReading
+from remaster_ros.collection.recording import BY_HAND
 from remaster_ros.planning.tour_order import REFERENCE, REGISTRATION
 from remaster_ros.session.files import read_limited
 from remaster_ros.session.journal import Record, read_journal
@@ -29,6 +31,45 @@ SHIFT_S = 1.0
 _FINAL: tuple[Outcome, ...] = ('recorded', 'partial')
 
 
+class Outcomes:
+    """What became of the configurations of a plan, by the records of a session's journal."""
+
+    def __init__(self) -> None:
+        self.plan = ''  # By which they are numbered; '' before the first
+        # Of each pose the split and what became of its solutions; that of the last record is last
+        self.poses: dict[int, tuple[str, dict[int, str]]] = {}
+
+    def take(self, record: Record) -> None:
+        """Take the next record; the last one of a configuration counts."""
+        if record['kind'] == 'plan':
+            self.plan, self.poses = record['id'], {}
+        elif record['kind'] == 'configuration' and record['pose'] != BY_HAND.pose:
+            split, ends = self.poses.pop(record['pose'], (record['split'], {}))
+            self.poses[record['pose']] = split, {**ends, record['solution']: record['result']}
+
+    def of(self, pose: int, solution: int) -> str:
+        """Return what became of a configuration; '' before it has an outcome."""
+        return self.poses.get(pose, ('', {}))[1].get(solution, '')
+
+    def decided(self) -> Decided:
+        """Return what the planner has to know of them."""
+        last = next(reversed(self.poses), None)
+        solutions = () if last is None else tuple(self.poses[last][1])
+        ends = [(split, end) for split, found in self.poses.values() for end in found.values()]
+        counts = Counter(end for split, end in ends if split not in (REFERENCE, REGISTRATION))
+        references = sum(split == REFERENCE for split, _ in ends)
+        return Decided(last, solutions, dict(counts), references)
+
+
+def read_outcomes(folder: Path) -> Outcomes:
+    """Return what became of the configurations of a session; none where it has no journal."""
+    outcomes = Outcomes()
+    if (folder / JOURNAL).exists():
+        for record in read_journal(folder / JOURNAL).records:
+            outcomes.take(record)
+    return outcomes
+
+
 class SessionJournal:
     """Write a session, new or unfinished, and keep what was decided.
 
@@ -40,7 +81,7 @@ class SessionJournal:
         self.folder, self._header = folder, header
         self._writer: SessionWriter | None = None
         self.closed = ''  # The exit status once the session is closed, else ''
-        self.plan_id = ''  # By which the configurations are numbered; '' before the first
+        self.outcomes = Outcomes()
         self.observations = 0
         # The state in which the session was found, for the user, a line each
         self.notes: list[str] = []
@@ -50,8 +91,6 @@ class SessionJournal:
         # number of the configuration and its readings, ``other`` for any other configuration,
         # ``accepted`` where a person had seen to a change
         self.watched: list[tuple[str, int, list[PairedReading]]] = []
-        self._results: dict[tuple[int, int], str] = {}
-        self._last_pose: int | None = None
         self._shift_s = 0.0
         self.reopen()
 
@@ -61,7 +100,7 @@ class SessionJournal:
             rows = read_limited(self.folder / ROWS, OBSERVATIONS_LIMIT, 'it is part of a session')
             self.observations = rows.count(b'\n') - 1
             self.closed = 'complete'
-            self.plan_id = _plan_of(self.folder / JOURNAL)
+            self.outcomes = read_outcomes(self.folder)
             self.notes = [f'{self.folder}: this session is complete; name a new folder to record']
             return
         self._writer = SessionWriter(self.folder, self._header, resume=True, go_further=go_further)
@@ -71,17 +110,14 @@ class SessionJournal:
             self.notes.append(f'{self.folder}: going on after {self.observations} observations')
         if self._writer.lost:
             self.notes.append(self._writer.lost)
-        self.registration, self._results, self.watched = [], {}, []
+        self.registration, self.outcomes, self.watched = [], Outcomes(), []
         for record in self._writer.records:
             self._replay(record)
 
     def _replay(self, record: Record) -> None:
         kind = record['kind']
-        if kind == 'plan':
-            self.plan_id = record['id']
-            self._results = {}
-        elif kind == 'configuration':
-            self._decide(record['pose'], record['solution'], record['result'])
+        self.outcomes.take(record)
+        if kind == 'configuration':
             readings = from_plain(record.get('readings', []), list[PairedReading])
             if record.get('split') == REGISTRATION:
                 self.registration += readings
@@ -94,13 +130,15 @@ class SessionJournal:
         elif kind == 'shift':
             self._shift_s = record['shift_s']
 
-    def _decide(self, pose: int, solution: int, result: str) -> None:
-        self._results[pose, solution] = result
-        self._last_pose = pose
-
     def _append(self, record: Record, observations: Sequence[Observation] = ()) -> None:
         assert self._writer is not None
         self._writer.record(record, observations)
+        self.outcomes.take(record)
+
+    @property
+    def plan_id(self) -> str:
+        """The plan that the configurations are numbered by; '' before the first."""
+        return self.outcomes.plan
 
     def follow(self, plan_id: str) -> bool:
         """Take the plan that the planner follows; False where the session is of another one."""
@@ -109,12 +147,11 @@ class SessionJournal:
         if self.observations and self.plan_id:
             return False
         self._append({'kind': 'plan', 'id': plan_id})
-        self.plan_id, self._results = plan_id, {}
         return True
 
     def result(self, pose: int, solution: int) -> Outcome | None:
         """Return what a configuration was recorded as, None where it is still to be recorded."""
-        result = self._results.get((pose, solution))
+        result = self.outcomes.of(pose, solution)
         return next((final for final in _FINAL if final == result), None)
 
     @property
@@ -127,17 +164,6 @@ class SessionJournal:
         assert self._writer is not None
         self._writer.correct(correction)
 
-    def decided(self) -> Decided | None:
-        """Return the solutions recorded at the last pose; None before the first."""
-        if self._last_pose is None:
-            return None
-        solutions = [
-            solution
-            for (pose, solution), result in self._results.items()
-            if pose == self._last_pose and result in _FINAL
-        ]
-        return Decided(self._last_pose, tuple(solutions))
-
     def write(
         self,
         *,
@@ -146,18 +172,19 @@ class SessionJournal:
         split: str,
         result: str,
         reason: str,
-        readings: Sequence[PairedReading],
-        from_q: FloatArray | None,
-        temperatures_c: Sequence[float | None],
+        readings: Sequence[PairedReading] = (),
+        from_q: FloatArray | None = None,
+        temperatures_c: Sequence[float | None] = (),
         change: FloatArray | None = None,
     ) -> int:
         """Write what became of a configuration, durable on return; return its number there.
 
         ``pose`` and ``solution`` are as the planner numbers them; ``split`` is ``registration``,
-        ``reference``, ``optimization`` or ``validation``; ``result`` is ``recorded``, ``partial``
-        or ``rejected``. ``readings`` are what was accepted, with the temperature of each, degrees
-        Celsius, None if unknown. ``from_q`` is where the arm came from, ``change`` what a
-        correction changed of what was wanted, rad, (k,); None where it is unknown, or was off.
+        ``reference``, ``optimization`` or ``validation``; ``result`` is ``recorded``, ``partial``,
+        ``rejected``, ``failed`` or ``no_free_path``. ``readings`` are what was accepted, with the
+        temperature of each, degrees Celsius, None if unknown. ``from_q`` is where the arm came
+        from, ``change`` what a correction changed of what was wanted, rad, (k,); None where it is
+        unknown, or was off.
         With a `DiskError` try again when there is room.
         """
         record: Record = {
@@ -178,7 +205,6 @@ class SessionJournal:
             rows = self._rows(pose, split, readings, from_q, temperatures_c, change)
             self._append(record, rows)
             self.observations += len(readings)
-        self._decide(pose, solution, result)
         return number
 
     def note_accepted(self) -> None:
@@ -267,14 +293,6 @@ class SessionJournal:
 def is_complete(folder: Path) -> bool:
     """Whether a folder holds a session that is complete; `InputError` where it is none."""
     return (folder / HEADER).exists() and read_header(folder).exit_status == 'complete'
-
-
-def _plan_of(path: Path) -> str:
-    """Return the plan that the journal of a session follows; '' where there is none."""
-    if not path.exists():
-        return ''
-    plans = [record['id'] for record in read_journal(path).records if record['kind'] == 'plan']
-    return plans[-1] if plans else ''
 
 
 def _split(name: str) -> Split:

@@ -233,6 +233,8 @@ class SessionRecorder:
         self.correction: str | None = None
         # The one at the beginning of the reading under way.
         self._read_with = ''
+        # Their poses may be announced on their way here.
+        self._failed: list[events.SolutionFailed] = []
         self._p = p
         self._begin()
 
@@ -347,6 +349,8 @@ class SessionRecorder:
         match record.body:
             case events.PoseAnnounced() as pose:
                 self._on_pose(pose)
+            case events.SolutionFailed() as failed:
+                self._failed.append(failed)
             case events.PlannerState() as planner:
                 self._on_planner(planner)
             case events.BridgeState() as bridge:
@@ -382,11 +386,10 @@ class SessionRecorder:
 
     def _on_pose(self, pose: events.PoseAnnounced) -> None:
         self.recording.announced = pose
+        self._failed = [failed for failed in self._failed if failed.stamp == pose.stamp]
         if pose.split not in (REFERENCE, REGISTRATION):
             self._report_change(self.changes.leave(self.registration.T_R_N))
-        if not self.keeper.full and not self.journal.closed:
-            # Before the arm gets there: it is held where there is no room.
-            self.keeper.write(partial(self.journal.follow, pose.plan))
+        self._note_unvisited()
 
     def _on_planner(self, planner: events.PlannerState) -> None:
         self.run = planner.run_held(self.run)
@@ -437,6 +440,32 @@ class SessionRecorder:
         self.end_reading()
         self.recording.look_again()
         self.take_next()
+        self._note_unvisited()
+
+    def _note_unvisited(self) -> None:
+        """Write down the plan of the announced pose, and what the arm does not get to of it."""
+        pose = self.recording.announced
+        if pose is None or self.journal.closed or self.keeper.full:
+            return
+        # Before the arm gets there: it is held where there is no room.
+        self.keeper.write(partial(self.journal.follow, pose.plan))
+        ends = [(number, events.NO_FREE_PATH, '') for number in pose.unreached]
+        ends += [
+            (pose.ids[failed.solution], 'failed', failed.reason)
+            for failed in self._failed
+            if pose == self.recording.pose
+            and failed.stamp == pose.stamp
+            and failed.solution < len(pose.ids)
+        ]
+        for number, result, reason in ends:
+            if self.keeper.full or self.journal.plan_id != pose.plan:
+                return
+            if not self.journal.outcomes.of(pose.pose, number):
+                end = partial(
+                    self.journal.write, pose=pose.pose, solution=number, split=pose.split
+                )
+                self.keeper.write(partial(end, result=result, reason=reason))
+                self._outlet.state()
 
     def take_next(self) -> None:
         """Begin the reading that is due, unless one is under way or written down."""
@@ -490,6 +519,10 @@ class SessionRecorder:
     def _write_down(self, ended: EndedReading) -> None:
         """Write what became of a configuration; publish it after that, and not before."""
         settled, pose = ended.settled, ended.settled.pose
+        if ended.result == 'rejected' and pose not in (self.recording.pose, BY_HAND):
+            # It was taken back, or announced again: it will be visited again.
+            self._report(ended.event(registered=self.is_registered))
+            return
         if self._read_with and ended.accepted and pose.split != REGISTRATION:
             # Before the first row, also of one with it off: it decides which columns there are.
             self.journal.take_correction(Correction(BRIDGE, self._read_with))
@@ -527,6 +560,8 @@ class SessionRecorder:
     def _report(self, end: events.ConfigurationEnded) -> None:
         self.counts[f'configurations_{end.result}'] += 1
         self._outlet.event(end)
+        # With what it has decided the planner goes on.
+        self._outlet.state()
 
     # The references
 

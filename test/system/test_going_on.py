@@ -35,7 +35,8 @@ def no_room(process):
 
 def test_one_required_sensor_is_enough_and_a_full_disk_is_waited_for(start, client, tmp_path):
     """The tracker is not there at all; then recorder and planner have no room to write."""
-    cell = Cell(start, client, tmp_path, 'mocap', ['mocap'])
+    # The planner writes at each pose: another one follows the first.
+    cell = Cell(start, client, tmp_path, 'mocap', ['mocap'], candidates=5)
     cell.until(lambda: cell.results.count('recorded') > 4, 'the first configurations')
 
     with no_room(cell.nodes['recorder']):

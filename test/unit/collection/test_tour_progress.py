@@ -6,13 +6,14 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from remaster_ros.collection.events import Decided, RecorderState
+from remaster_ros.collection.events import RecorderState
 from remaster_ros.collection.peers import RequiredSensors
 from remaster_ros.collection.tour_progress import TourProgress
 from remaster_ros.errors import InputError, InsufficientDataError
 from remaster_ros.planning.candidates import Plan, PlannedPose
 from remaster_ros.planning.tour_order import REFERENCE, REGISTRATION, Tour
 from remaster_ros.session.plan_journal import PlanJournal
+from remaster_ros.session.session_journal import Outcomes
 from remaster_ros.session.workcell import read_cell
 
 CHAIN = read_cell('demo').chain()
@@ -68,11 +69,22 @@ class Planning:
 
 
 class Bench:
-    """A planner's progress in a session folder."""
+    """A planner's progress in a session folder, and what a recorder has written down."""
 
     def __init__(self, folder, **options):
-        self.folder, self.tours = folder, Tours(**options)
+        self.folder, self.tours, self.outcomes = folder, Tours(**options), Outcomes()
         self.open()
+
+    def follow(self, **values):
+        """Follow the recorder's state; return whether that is news."""
+        values = {'plan': self.journal.id, 'decided': self.outcomes.decided(), **values}
+        return self.progress.follow(RecorderState(waiting_for='', **values))
+
+    def end(self, stop, solution, result='recorded', **values):
+        """Have the recorder tell what became of a configuration; return whether it is news."""
+        end = {'pose': stop.pose, 'split': stop.split, 'solution': solution, 'result': result}
+        self.outcomes.take({'kind': 'configuration', **end})
+        return self.follow(**values)
 
     def open(self):
         self.journal = PlanJournal(self.folder, {'cell': 'a'}, CHAIN)
@@ -82,6 +94,7 @@ class Bench:
         T_R_N = self.progress.T_R_N
         self.journal.close()
         self.open()
+        self.follow()
         self.progress.T_R_N = T_R_N
 
     def register(self):
@@ -97,7 +110,7 @@ class Bench:
 
     def visit(self, stop, result='recorded'):
         for solution in stop.ids:
-            assert self.progress.ended(solution, result, registered=False)
+            assert self.end(stop, solution, result)
         assert self.progress.open_pose is None
 
 
@@ -150,7 +163,7 @@ def test_nothing_is_planned_on_while_a_registration_is_on_its_way(bench):
     """The recorder has reported it; its transforms come on a topic of their own."""
     b = bench()
     stop = b.next()
-    assert b.progress.ended(stop.ids[0], 'recorded', registered=True)
+    assert b.end(stop, stop.ids[0], registered=True)
     assert b.next() is None
     b.register()
     assert b.next().split == 'optimization'
@@ -172,39 +185,40 @@ def test_one_of_the_sensors_may_be_enough(bench):
 
 def test_what_is_no_solution_of_the_open_pose_changes_nothing(bench):
     b = bench()
-    assert not b.progress.ended(0, 'recorded', registered=True)
+    assert not b.follow()
     b.register()
     stop = b.next()
-    assert not b.progress.ended(7, 'recorded', registered=True)
+    b.end(stop, 7)
+    assert not b.end(stop, stop.ids[0], plan='another')
     assert b.progress.open_pose.ids == stop.ids
+    b.end(replace(stop, pose=9), stop.ids[0])
+    assert b.progress.open_pose.ids == stop.ids
+
+
+def test_what_no_way_leads_to_is_open_until_the_recorder_has_written_it_down(bench):
+    b = bench()
+    b.register()
+    other = 1 - b.next().index
+    stop = b.journal.tour.go_to('optimization', other, (), (), (0, 1))
+    b.journal.open_stop(stop)
+    assert b.progress.open_pose.ids == (0, 1)
+    for number in (0, 1):
+        b.end(stop, number, 'no_free_path')
+    assert b.progress.open_pose is None
+    assert b.progress.counts()['outcome_no_free_path'] == 2
 
 
 def test_what_is_left_of_a_pose_is_reached_from_where_the_arm_stands(bench):
     b = bench()
     b.register()
     stop = b.next()
-    b.progress.ended(stop.ids[0], 'failed', registered=False)
+    b.end(stop, stop.ids[0], 'failed')
     elsewhere = Q + 0.3
     assert b.progress.rest(elsewhere) is None, 'it is planned'
     rest = b.progress.rest(elsewhere)
     assert (rest.pose, rest.ids) == (stop.pose, stop.ids[1:])
     b.restart()
     assert b.progress.open_pose.ids == stop.ids[1:]
-
-
-@pytest.mark.parametrize(
-    ('plan', 'pose', 'taken'), [('', 0, True), ('another', 0, False), ('', 9, False)]
-)
-def test_what_was_recorded_meanwhile_is_caught_up(bench, plan, pose, taken):
-    b = bench()
-    b.register()
-    stop = b.next()
-    decided = Decided(pose, (stop.ids[1], 99))
-    recorder = RecorderState(waiting_for='', plan=plan or b.journal.id, decided=decided)
-    assert b.progress.catch_up(recorder) == taken
-    assert b.progress.open_pose.ids == (stop.ids[:1] if taken else stop.ids)
-    assert not b.progress.catch_up(recorder), 'once'
-    assert not b.progress.catch_up(RecorderState(waiting_for='', plan=b.journal.id))
 
 
 @pytest.mark.parametrize(
@@ -257,11 +271,11 @@ def test_once_enough_is_known_the_rest_is_what_is_held_out_and_the_references(be
     while (stop := b.next()).split != 'optimization':
         b.visit(stop)
     assert b.progress.planned == 4
-    assert b.progress.ended(stop.ids[0], 'recorded', registered=False)
+    assert b.end(stop, stop.ids[0])
     b.progress.enough = True
     # The pose under way is finished, all of it.
     assert b.progress.open_pose.ids == stop.ids[1:]
-    b.progress.ended(stop.ids[1], 'recorded', registered=False)
+    b.end(stop, stop.ids[1])
     splits = []
     while (stop := b.next()) is not None:
         splits.append(stop.split)
@@ -301,7 +315,7 @@ def test_what_is_measured_further_follows_a_complete_collection_also_after_a_res
     assert b.progress.is_complete
     assert not b.progress.goes_further
     before = b.journal.tour
-    planned, done = b.progress.planned, b.journal.outcomes.total()
+    planned, done = b.progress.planned, b.progress.counts()['configurations_done']
     plan = plan_of(9, 2, 2)
 
     def further(T_R_N):

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from simple_cells import write_cell
 
+from remaster_ros.collection.events import Decided
 from remaster_ros.collection.peers import Peers
 from remaster_ros.collection.plan_confirmation import PlanConfirmation, fingerprint
 from remaster_ros.collection.tour_progress import TourProgress
@@ -119,7 +120,7 @@ def test_another_plan_needs_another_confirmation(bench):
     bench.progress.phase = 'collection'
     stop = collection.next(START)
     bench.journal.open_stop(stop)
-    bench.journal.outcome(stop.ids[0], 'recorded')
+    bench.progress.decided = Decided(stop.pose, stop.ids[:1])
     assert preview.draw(START, bench.peers) == ''
     assert preview.asked() == ''
     assert preview.allows(bench.journal.tour)
@@ -133,9 +134,9 @@ def test_a_planner_started_again_has_no_confirmation(bench, tmp_path):
     bench.journal.begin(collection)
     stop = collection.next(START)
     bench.journal.open_stop(stop)
-    bench.journal.outcome(stop.ids[0], 'recorded')
     bench.journal.close()
     again = Bench(tmp_path)
+    again.progress.decided = Decided(stop.pose, stop.ids[:1])
     assert not again.preview.allows(again.journal.tour)
     # The same plan, of which the page has what is left.
     name = fingerprint(again.journal.tour)

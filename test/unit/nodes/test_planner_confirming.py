@@ -12,7 +12,7 @@ import rclpy
 from simple_cells import write_cell
 from std_srvs.srv import Trigger
 
-from remaster_ros.collection.events import EventRecord, RecorderState
+from remaster_ros.collection.events import Decided, EventRecord, RecorderState
 from remaster_ros.nodes.pose_planner import PosePlanner
 
 pytestmark = [pytest.mark.ros, pytest.mark.timeout(60)]
@@ -74,8 +74,8 @@ class Planner:
 
     def done(self):
         """Have every solution of the open pose recorded."""
-        for number in self.announced[-1].ids:
-            self.node.journal.outcome(number, 'recorded')
+        stop = self.announced[-1]
+        self.node.progress.decided = Decided(stop.pose, stop.ids)
 
     def kill(self):
         """End it without a word; what is written stays as it is."""

@@ -196,7 +196,7 @@ def test_looking_ahead_leaves_a_tour_as_it_is_and_begins_with_what_is_left_of_it
         visited.append(stop)
         stop = tour.next(stop.solutions[-1])
     # The last one is under way, with its first solution measured.
-    here, rest = stop.solutions[0], stop.only(stop.ids[1:])
+    here, rest = stop.solutions[0], tour.along(stop, stop.ids[1:])
     done = sum(len(one.ids) for one in visited) + 1
     left = look_ahead(planner, planner.rough_places, [tour], here, rest)
     assert len(left.visits) == len(whole.visits) - done

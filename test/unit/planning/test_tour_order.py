@@ -195,7 +195,7 @@ def test_what_is_left_of_a_stop_is_reached_from_elsewhere():
     model = walled()
     tour = Tour(CHAIN, {'optimization': free_plan(model, 3, 2)}, model=model)
     stop = tour.next(np.zeros(7))
-    left = stop.only(stop.ids[1:])
+    left = tour.along(stop, stop.ids[1:])
     assert len(left.paths) == len(left.ids)
     elsewhere = np.deg2rad([-150.0, 20, 0, 60, 0, 30, 0])
     again = tour.reroute(left, elsewhere)

@@ -30,65 +30,58 @@ def plan_of(chain: SerialChain, seed: int, poses: int, solutions: int) -> Plan:
     return Plan(tuple(PlannedPose(chain.forward(own[0]), own) for own in q), {'out of reach': 4})
 
 
-def visit(tour, book, q, rng, outcomes):
-    """Go to the next stop and give some of its solutions an outcome; returns it."""
-    stop = tour.next(q)
-    if stop is None:
-        return None
-    book.open_stop(stop)
-    for number in stop.ids[: rng.integers(0, len(stop.ids) + 1)]:
-        result = str(rng.choice(['recorded', 'rejected']))
-        book.outcome(number, result)
-        outcomes[result] = outcomes.get(result, 0) + 1
-    return stop
+def killed_at_each_stop(chain, folder, rng, settings=SETTINGS, **tour):
+    """Visit a tour as one run does, with another planner after each stop.
 
-
-def test_any_number_of_restarts_visits_what_one_run_visits(chain, tmp_path):
-    seed = 17
-    print('seed', seed)
-    rng = np.random.default_rng(seed)
-    plans = {'optimization': plan_of(chain, 1, 7, 4), 'validation': plan_of(chain, 2, 5, 3)}
-    one_run = Tour(chain, plans)
-    book = PlanJournal(tmp_path / 'session', SETTINGS, chain)
+    Yields the planner's journal and the tour of the one run, to be used alike.
+    """
+    one_run, book = Tour(chain, **tour), PlanJournal(folder, settings, chain)
     assert not book.path.exists()
-    book.begin(Tour(chain, plans))
-    plan_id, outcomes, q = book.id, {}, np.zeros(len(chain))
+    book.begin(Tour(chain, **tour))
+    plan_id, q = book.id, np.zeros(len(chain))
     while (wanted := one_run.next(q)) is not None:
-        stop = visit(book.tour, book, q, rng, outcomes)
+        stop = book.tour.next(q)
+        book.open_stop(stop)
         assert (stop.pose, stop.split, stop.ids) == (wanted.pose, wanted.split, wanted.ids)
-        open_ids = book.stop.ids
+        yield book, one_run
         book.close()
-        book = PlanJournal(tmp_path / 'session', SETTINGS, chain)
+        book = PlanJournal(folder, settings, chain)
         assert book.id == plan_id
-        assert book.stop.ids == open_ids
-        assert book.stop.pose == stop.pose
-        for number, solution in zip(book.stop.ids, book.stop.solutions):
-            np.testing.assert_array_equal(solution, stop.solutions[stop.ids.index(number)])
-        assert dict(book.outcomes) == outcomes
+        assert (book.stop.ids, book.stop.pose) == (stop.ids, stop.pose)
+        np.testing.assert_array_equal(book.stop.solutions, stop.solutions)
         q = rng.uniform(-1, 1, len(chain))
     assert book.tour.next(q) is None
     assert book.tour.describe() == one_run.describe()
     book.close()
 
 
+@pytest.mark.parametrize('ordered', [False, True])
+def test_any_number_of_restarts_visits_what_one_run_visits(chain, tmp_path, ordered):
+    seed = 17
+    print('seed', seed)
+    rng = np.random.default_rng(seed)
+    plans = {'optimization': plan_of(chain, 1, 7, 4), 'validation': plan_of(chain, 2, 5, 3)}
+    visits = [
+        (split, index, number)
+        for split, plan in plans.items()
+        for index, pose in enumerate(plan.poses)
+        for number in range(len(pose.solutions))
+    ]
+    order = [visits[i] for i in rng.permutation(len(visits))] if ordered else ()
+    visited = []
+    for book, _ in killed_at_each_stop(chain, tmp_path / 'a', rng, plans=plans, order=order):
+        visited += [(book.stop.split, book.stop.index, number) for number in book.stop.ids]
+    assert sorted(visited) == sorted(visits)
+    assert not ordered or [v[:2] for v in visited] == [v[:2] for v in order]
+
+
 def test_a_registration_tour_keeps_its_order_and_its_numbers(chain, tmp_path):
-    tour = registration_tour(chain, plan_of(chain, 3, 6, 2), [np.array([0.1, 0.0, 0.02])])
-    book = PlanJournal(tmp_path, SETTINGS, chain)
-    book.begin(tour)
-    q = np.zeros(len(chain))
-    numbers = []
-    for _ in range(6):
-        stop = book.tour.next(q)
-        book.open_stop(stop)
-        book.outcome(stop.ids[0], 'recorded')
-        numbers.append(stop.pose)
-        assert stop.split == REGISTRATION
-        assert len(stop.ids) == 1
-        book.close()
-        book = PlanJournal(tmp_path, SETTINGS, chain)
-    assert numbers == [-1, -2, -3, -4, -5, -6]
-    assert not book.outcomes
-    book.close()
+    plans = registration_tour(chain, plan_of(chain, 3, 6, 2), [np.array([0.1, 0.0, 0.02])]).plans
+    rng, how = np.random.default_rng(3), {'in_order': True, 'one_solution': True}
+    visited = killed_at_each_stop(chain, tmp_path / 'a', rng, plans=plans, **how)
+    stops = [book.stop for book, _ in visited]
+    assert [stop.pose for stop in stops] == [-1, -2, -3, -4, -5, -6]
+    assert {(stop.split, len(stop.ids)) for stop in stops} == {(REGISTRATION, 1)}
 
 
 def test_the_state_and_its_run_are_known(chain, tmp_path):
@@ -130,7 +123,7 @@ def test_a_torn_line_is_dropped_and_a_damaged_one_refused(chain, tmp_path):
     book.begin(Tour(chain, {'optimization': plan_of(chain, 1, 2, 2)}))
     stop = book.tour.next(np.zeros(len(chain)))
     book.open_stop(stop)
-    book.outcome(stop.ids[0], 'recorded')
+    book.say_state('running', 'abc')
     book.close()
     whole = book.path.read_bytes()
     book.path.write_bytes(whole[:-5])
@@ -149,58 +142,29 @@ def test_what_a_full_disk_does_not_take_is_kept(chain, tmp_path, full_disk):
     stop = book.tour.next(np.zeros(len(chain)))
     with full_disk():
         book.open_stop(stop)
-        book.outcome(stop.ids[0], 'recorded')
+        book.say_state('running', 'abc')
         assert 'No space left' in book.trouble
         book.write_out()
         assert 'No space left' in book.trouble
     book.write_out()
     assert not book.trouble
-    left = book.stop.ids
     book.close()
     book = PlanJournal(tmp_path, SETTINGS, chain)
-    assert book.stop.ids == left == stop.ids[1:]
-    assert book.outcomes['recorded'] == 1
+    assert (book.stop.ids, book.run) == (stop.ids, 'abc')
     book.close()
 
 
-def test_ways_and_what_has_none_survive_a_restart(chain, tmp_path):
-    rng = np.random.default_rng(5)
-    book = PlanJournal(tmp_path / 'session', SETTINGS, chain)
-    book.begin(Tour(chain, {'optimization': plan_of(chain, 1, 2, 4)}))
-    way = rng.uniform(-1, 1, (2, len(chain)))
-    straight = np.empty((0, len(chain)))
-    stop = book.tour.go_to('optimization', 0, [2, 0], [way, straight], [1, 3])
-    book.open_stop(stop)
-    assert dict(book.outcomes) == {'no_free_path': 2}
-    book.outcome(2, 'recorded')
-    book.close()
-
-    book = PlanJournal(tmp_path / 'session', SETTINGS, chain)
-    assert dict(book.outcomes) == {'no_free_path': 2, 'recorded': 1}
-    assert book.stop.ids == (0,)
-    other = rng.uniform(-1, 1, (1, len(chain)))
-    book.reroute(replace(book.stop, paths=(other,)))
-    book.close()
-
-    book = PlanJournal(tmp_path / 'session', SETTINGS, chain)
-    np.testing.assert_array_equal(book.stop.paths[0], other)
-    assert (book.stop.ids, book.stop.pose) == ((0,), stop.pose)
-    # From where the arm stands now nothing leads there: its outcome, and the totals add up.
-    book.reroute(replace(book.stop.only([]), unreached=(0,)))
-    book.close()
-    book = PlanJournal(tmp_path / 'session', SETTINGS, chain)
-    assert book.stop.ids == ()
-    assert book.outcomes.total() == 4
-    assert book.tour.plans['optimization'].dropped_solutions == {}
-
-
-def test_the_counts_of_dropped_solutions_survive_a_restart(chain, tmp_path):
-    plan = replace(plan_of(chain, 1, 2, 2), dropped_solutions={'self-collision': 3})
+def test_what_no_way_leads_to_and_what_was_dropped_survive_a_restart(chain, tmp_path):
+    plan = replace(plan_of(chain, 1, 2, 4), dropped_solutions={'self-collision': 3})
     book = PlanJournal(tmp_path / 'session', SETTINGS, chain)
     book.begin(Tour(chain, {'optimization': plan}))
+    stop = book.tour.go_to('optimization', 0, [2, 0], (), [1, 3])
+    book.open_stop(stop)
     book.close()
     book = PlanJournal(tmp_path / 'session', SETTINGS, chain)
+    assert (book.stop.ids, book.stop.unreached, book.stop.pose) == ((2, 0), (1, 3), stop.pose)
     assert book.tour.dropped_solutions == {'self-collision': 3}
+    book.close()
 
 
 def test_references_are_visited_as_in_one_run_whatever_is_killed(chain, tmp_path):
@@ -208,40 +172,25 @@ def test_references_are_visited_as_in_one_run_whatever_is_killed(chain, tmp_path
     seed = 29
     print('seed', seed)
     rng = np.random.default_rng(seed)
-    plans = {
-        'optimization': plan_of(chain, 5, 6, 3),
-        'reference': plan_of(chain, 6, 3, 1),
-    }
-    settings = {**SETTINGS, 'reference_every': 7}
-    one_run = Tour(chain, plans, reference_every=7)
-    book = PlanJournal(tmp_path / 'session', settings, chain)
-    book.begin(Tour(chain, plans, reference_every=7))
-    q, number = np.zeros(len(chain)), 0
-    while (wanted := one_run.next(q)) is not None:
-        stop = visit(book.tour, book, q, rng, {})
-        assert (stop.pose, stop.split, stop.ids) == (wanted.pose, wanted.split, wanted.ids)
+    plans = {'optimization': plan_of(chain, 5, 6, 3), 'reference': plan_of(chain, 6, 3, 1)}
+    settings, number = {**SETTINGS, 'reference_every': 7}, 0
+    tour = {'plans': plans, 'reference_every': 7}
+    for book, one_run in killed_at_each_stop(chain, tmp_path / 'a', rng, settings, **tour):
         number += 1
         if number in (7, 10):
             # In the middle of a round, and between two.
             book.ask_round()
             one_run.ask_round()
-        for solution in book.stop.ids:
-            book.outcome(solution, 'recorded')
-        book.close()
-        book = PlanJournal(tmp_path / 'session', settings, chain)
-        q = rng.uniform(-1, 1, len(chain))
-    assert book.tour.next(q) is None
-    assert book.outcomes.total() == sum(book.tour.configurations.values()) == 18
-    assert book.references.total() == book.tour.reference_stops == number - 6
-    book.close()
+        assert book.tour.reference_stops == one_run.reference_stops
+    assert book.tour.reference_stops == number - 6
     with pytest.raises(InputError, match='another reference_every'):
-        PlanJournal(tmp_path / 'session', {**settings, 'reference_every': 8}, chain)
+        PlanJournal(tmp_path / 'a', {**settings, 'reference_every': 8}, chain)
 
 
 @pytest.mark.parametrize(
     'records',
     [
-        [{'kind': 'outcome', 'id': 0, 'result': 'recorded'}],
+        [{'kind': 'state', 'state': 'running'}],
         [{'kind': 'plan', 'id': 'a', 'settings': SETTINGS}, {'kind': 'other'}],
         [{'kind': 'plan', 'id': 'a', 'settings': SETTINGS}, {'kind': 'stop', 'split': 'x'}],
         [{'kind': 'plan', 'id': 'a'}],
@@ -257,33 +206,3 @@ def test_records_that_are_no_plan_are_refused(chain, tmp_path, records):
         PlanJournal(tmp_path, SETTINGS, chain)
     # And it is not held any longer.
     Journal(tmp_path / 'plan.jsonl').close()
-
-
-def test_a_tour_in_a_given_order_goes_on_in_it(chain, tmp_path):
-    seed = 18
-    print('seed', seed)
-    rng = np.random.default_rng(seed)
-    plans = {'optimization': plan_of(chain, 1, 5, 3), 'validation': plan_of(chain, 2, 3, 2)}
-    visits = [
-        (split, index, number)
-        for split, plan in plans.items()
-        for index, pose in enumerate(plan.poses)
-        for number in range(len(pose.solutions))
-    ]
-    order = [visits[i] for i in rng.permutation(len(visits))]
-    one_run = Tour(chain, plans, order=order)
-    book = PlanJournal(tmp_path, SETTINGS, chain)
-    book.begin(Tour(chain, plans, order=order))
-    q = np.zeros(len(chain))
-    while (wanted := one_run.next(q)) is not None:
-        stop = book.tour.next(q)
-        book.open_stop(stop)
-        assert (stop.pose, stop.split, stop.ids) == (wanted.pose, wanted.split, wanted.ids)
-        for number in stop.ids:
-            book.outcome(number, 'recorded')
-        book.close()
-        book = PlanJournal(tmp_path, SETTINGS, chain)
-        q = stop.solutions[-1]
-    assert book.tour.next(q) is None
-    assert book.outcomes['recorded'] == len(visits)
-    book.close()

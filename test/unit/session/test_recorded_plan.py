@@ -9,6 +9,7 @@ from remaster_ros.errors import InputError
 from remaster_ros.planning.candidates import Plan, PlannedPose
 from remaster_ros.planning.collection_plan import Expected
 from remaster_ros.planning.tour_order import FITTED, REFERENCE, REGISTRATION, Tour
+from remaster_ros.session.journal import Journal
 from remaster_ros.session.plan_journal import PlanJournal, plan_page_path, read_plan
 from remaster_ros.session.workcell import read_cell
 
@@ -23,11 +24,19 @@ def plan_of(seed, poses, solutions):
 
 def collected(folder, expected=None):
     """Register, then visit a reference and all of four poses but the last."""
-    journal = PlanJournal(folder, {}, CHAIN)
+    folder.mkdir()
+    journal, recorder = PlanJournal(folder, {}, CHAIN), Journal(folder / 'journal.jsonl')
+
+    def end(solution, result):
+        stop = {'pose': journal.stop.pose, 'split': journal.stop.split}
+        end = {'solution': solution, 'result': result}
+        recorder.append({'kind': 'configuration', **stop, **end})
+
     tour = Tour(CHAIN, {REGISTRATION: plan_of(1, 2, 1)}, in_order=True)
     journal.begin(tour)
+    recorder.append({'kind': 'plan', 'id': journal.id})
     journal.open_stop(tour.next(np.zeros(JOINTS)))
-    journal.outcome(journal.stop.ids[0], 'recorded')
+    end(journal.stop.ids[0], 'recorded')
     plans = {FITTED: plan_of(2, 2, 3), 'validation': plan_of(3, 2, 3)}
     plans[REFERENCE] = plan_of(4, 1, 1)
     tour = Tour(CHAIN, plans, reference_every=100)
@@ -37,9 +46,11 @@ def collected(folder, expected=None):
         journal.open_stop(tour.next(np.zeros(JOINTS)))
         visited.append(journal.stop)
         for number in journal.stop.ids:
-            journal.outcome(number, 'recorded' if number else 'rejected')
-            journal.outcome(number, 'failed')
+            end(number, 'rejected')
+            if number:
+                end(number, 'recorded')
     journal.close()
+    recorder.close()
     return tour, visited
 
 
@@ -54,7 +65,7 @@ def test_what_became_of_every_configuration(tmp_path):
     for stop in visited:
         if stop.split != REFERENCE:
             found = [plan.outcomes[stop.split, stop.index, number] for number in range(3)]
-            assert found == ['rejected', 'recorded', 'recorded'], 'a first outcome stays'
+            assert found == ['rejected', 'recorded', 'recorded'], 'the last one counts'
     assert len(plan.outcomes) == 6
     assert plan.page == plan_page_path(tmp_path / 's') == tmp_path / 's.plan.html'
 
@@ -68,6 +79,7 @@ def test_what_was_expected_is_kept_and_gone_on_with(tmp_path):
     again = PlanJournal(tmp_path / 's', {}, CHAIN)
     assert again.tour.plans.keys() == tour.plans.keys()
     assert again.stop is not None
+    assert again.decided.outcomes == {'recorded': 4, 'rejected': 2}
     again.close()
 
 
@@ -92,8 +104,6 @@ def test_what_is_no_plan_is_refused_in_one_line(tmp_path, change):
         record.pop('crc32')
     lines[last] |= change
     path.unlink()
-    from remaster_ros.session.journal import Journal
-
     journal = Journal(path)
     for record in lines:
         journal.append(record)

@@ -7,9 +7,10 @@ import pytest
 
 from remaster_ros.collection.events import Decided
 from remaster_ros.collection.pairing import PairedReading
+from remaster_ros.collection.recording import BY_HAND
 from remaster_ros.errors import InputError
 from remaster_ros.session.reader import read_session
-from remaster_ros.session.session_journal import SessionJournal
+from remaster_ros.session.session_journal import SessionJournal, read_outcomes
 
 
 def reading(sensor, stamp_s):
@@ -48,7 +49,14 @@ def test_a_recorder_started_again_knows_what_it_decided(session, tmp_path):
     assert book.plan_id == 'plan a'
     results = [book.result(0, solution) for solution in range(4)]
     assert results == [None, None, 'partial', 'recorded']
-    assert book.decided() == Decided(0, (3, 2))
+    write(book, 0, 4, [], result='failed')
+    write(book, 2, 0, [], result='no_free_path', split='reference')
+    write(book, BY_HAND.pose, 0, [], result='rejected', split='registration')
+    outcomes = {'recorded': 1, 'rejected': 1, 'partial': 1, 'failed': 1}
+    assert book.outcomes.decided() == Decided(2, (0,), outcomes, references=1)
+    write(book, 0, 4, [], result='rejected')
+    assert book.outcomes.decided().pose == 0
+    assert sorted(book.outcomes.decided().solutions) == [1, 2, 3, 4]
     assert [r.sensor for r in book.registration] == ['mocap', 'tracker']
     np.testing.assert_array_equal(book.registration[0].q, points[0].q)
     write(book, 0, 1, [reading('tracker', 12.0)])
@@ -63,6 +71,8 @@ def test_a_recorder_started_again_knows_what_it_decided(session, tmp_path):
     assert book.closed == 'complete'
     assert book.observations == 4
     assert 'is complete' in book.notes[0]
+    assert book.outcomes.decided().outcomes == {'recorded': 2, 'partial': 1, 'rejected': 1}
+    assert read_outcomes(tmp_path).poses == book.outcomes.poses
 
 
 def test_another_plan_is_not_followed_once_there_are_observations(session, tmp_path):
