@@ -95,6 +95,7 @@ BOMB = 'a: &a [x, x, x, x, x, x, x, x, x]\n' + ''.join(
         ('a: &a\n  b: *a\n', 'aliases'),
         ('a: !!python/object/apply:os.system ["true"]', 'tags'),
         ('a: !!binary aGk=', 'tags'),
+        ('a: !!float ""', 'tags'),
         ('a: 1\na: 2', 'twice'),
         ('[' * 100_000, 'nested too deep'),
         ('{a: ' * 100_000, 'nested too deep'),

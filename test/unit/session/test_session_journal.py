@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -176,3 +178,18 @@ def test_a_complete_session_that_was_changed_is_not_gone_further_with(session, t
     with pytest.raises(InputError, match=r'observations\.csv'):
         book.reopen(go_further=True)
     assert book.closed == 'complete'
+
+
+def test_orientations_are_kept_across_a_kill(session, tmp_path):
+    turn = np.array([0.0, 0.6, 0.0, 0.8])
+    oriented = replace(session, oriented=frozenset({'mocap'}))
+    for pose, split in enumerate(('optimization', 'registration', 'reference')):
+        # Opened anew each time, as after a kill.
+        book = SessionJournal(tmp_path, oriented)
+        write(book, pose, 0, [replace(reading('mocap', 5.0 + pose), orientation=turn)], split)
+        book._writer.release()  # killed
+    book = SessionJournal(tmp_path, oriented)
+    np.testing.assert_array_equal(book.registration[0].orientation, turn)
+    np.testing.assert_array_equal(book.watched[0][2][0].orientation, turn)
+    book.close('complete')
+    np.testing.assert_array_equal(read_session(tmp_path).measurements.orientation, [turn])

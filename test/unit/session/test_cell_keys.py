@@ -1,9 +1,9 @@
-"""The keys that choose poses: one clear line for each that is wrong."""
+"""The keys that choose poses and name markers: one clear line for each that is wrong."""
 
 import pytest
 
 from remaster_ros.errors import InputError
-from remaster_ros.session.workcell import config_path, read_cell
+from remaster_ros.session.workcell import config_path, parse_cell, read_cell
 
 
 def cell_file(folder, poses='', sensor=''):
@@ -117,3 +117,52 @@ def test_a_folder_of_the_name_of_a_shipped_cell_hides_it_not(tmp_path, monkeypat
     for folder in (tmp_path / 'demo', tmp_path):
         with pytest.raises(InputError, match='not a regular file'):
             read_cell(folder)
+
+
+def cell_with(change, markers):
+    """Return the demo cell with the marker line of its bar changed."""
+    path = config_path('cells/demo.yaml')
+    text = path.read_text()
+    text = text.replace('markers:\n', f'markers:\n{markers}', 1)
+    return parse_cell(text.replace('    marker: sir\n', change, 1).encode(), path)
+
+
+BODY = '  b: [0.05, 0.05, 0.0]\n  c: [0.0, -0.05, 0.03]\n'
+
+
+def test_a_cell_with_several_markers():
+    made = cell_with('    marker: sir\n    further_markers: {b: 2, c: 3}\n', BODY)
+    bar = made.sensors['mocap']
+    assert bar.markers == ('sir', 'b', 'c')
+    assert bar.topics == {
+        'sir': 'optitrack/marker',
+        'b': 'optitrack/marker/b',
+        'c': 'optitrack/marker/c',
+    }
+    (expected, _) = made.design_settings().sensors
+    assert list(expected.markers) == ['sir', 'b', 'c']
+
+
+@pytest.mark.parametrize(
+    ('markers', 'words'),
+    [
+        ('{b: 2, z: 3}', "has 'z'; markers has b, c, sir, smr"),
+        ('{sir: 2}', "has 'sir', which is its marker already"),
+        ('{b: 2, c: 2}', 'two markers have the number 2'),
+        ('{b: 0}', 'markers of a body have the numbers 1 to 65535'),
+        ('{b: two}', 'Expected `int`'),
+        ('{near: 2}', 'sir and near are 10 mm apart'),
+        ('{b-b: 2}', 'name the marker with letters, digits and underscores'),
+    ],
+)
+def test_markers_that_cannot_be_are_refused(markers, words):
+    further = f'    marker: sir\n    further_markers: {markers}\n'
+    extra = BODY
+    if 'near' in markers:
+        extra += '  near: [0.11, 0.0, 0.0]\n'
+    if 'b-b' in markers:
+        extra += '  b-b: [0.0, 0.11, 0.0]\n'
+    with pytest.raises(InputError, match='demo') as refused:
+        cell_with(further, extra)
+    assert words in str(refused.value)
+    assert '\n' not in str(refused.value)
