@@ -11,13 +11,28 @@ import sys
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 from remaster_ros.cli.main import main
 
 ROOT = Path(__file__).parent.parent
 
 
-def remaster(
+class Printed(NamedTuple):
+    """What a verb has printed."""
+
+    stdout: str
+    stderr: str
+
+
+def remaster(*args: object, status: int = 0, **options: object) -> Printed:
+    """Run a verb as `run`, that must end with this status; return what it printed."""
+    process = run(*args, **options)  # type: ignore[arg-type]
+    assert process.returncode == status, process.stderr
+    return Printed(process.stdout, process.stderr)
+
+
+def run(
     *args: object,
     environment: dict[str, str] | None = None,
     through: Sequence[str] = (),
@@ -88,9 +103,8 @@ def _in_this_process(words: list[str]) -> subprocess.CompletedProcess[str]:
 
 def refusal(*args: object, status: int = 2, **options: object) -> str:
     """Run a verb that must end with this status and exactly one line on stderr; return it."""
-    process = remaster(*args, **options)  # type: ignore[arg-type]
-    assert process.returncode == status, process.stderr
-    assert process.stdout == ''
-    assert process.stderr.count('\n') == 1, process.stderr
-    assert process.stderr.startswith('error: ')
-    return process.stderr
+    stdout, stderr = remaster(*args, status=status, **options)
+    assert stdout == ''
+    assert stderr.count('\n') == 1, stderr
+    assert stderr.startswith('error: ')
+    return stderr

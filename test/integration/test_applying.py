@@ -52,8 +52,7 @@ def simulated(robot: robot_descriptions.Description, seed: int) -> Session:
 def fitted(session: Session, folder: Path) -> Path:
     write_session(folder / 'session', session)
     out = folder / 'fit'
-    process = remaster('fit', folder / 'session', '--out', out, '--no-figures', '--quiet')
-    assert process.returncode == 0, process.stderr
+    remaster('fit', folder / 'session', '--out', out, '--no-figures', '--quiet')
     return out
 
 

@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from calibration_scenes import scene
+from command_line import refusal, remaster
 from foreign_tables import MARKER, measured
 from mistakes import SPOILS, with_offsets
 
 from remaster_ros.calibration.mistakes import sound_estimate
-from remaster_ros.cli.main import main
 from remaster_ros.errors import InsufficientDataError, MisfitError, MistakeFoundError
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.urdf import parse_urdf
@@ -168,17 +168,15 @@ def test_of_what_no_mistake_explains_all_that_was_tried_is_told() -> None:
         for verb in ('fit', 'discover')
     ],
 )
-def test_the_command_that_is_told_mends_the_session(name, kind, verb, tmp_path, capsys) -> None:
+def test_the_command_that_is_told_mends_the_session(name, kind, verb, tmp_path) -> None:
     session = session_of(name, 14)
     spoilt, _ = SPOILS[kind](session, np.random.default_rng(14))
     given = tmp_path / 'it is spoilt'
     write_outside_limits(given, spoilt)
-    arguments = [verb, str(given), '--out', str(tmp_path / 'out'), '--no-figures', '--quiet']
-    assert main(arguments) == 1
-    told = capsys.readouterr().err
+    told = refusal(verb, given, '--out', tmp_path / 'out', '--no-figures', '--quiet', status=1)
     command = shlex.split(told.partition('; to mend it: ')[2])
     assert command[0] == 'remaster'
-    assert main([*command[1:], '--quiet']) == 0, capsys.readouterr().err
+    remaster(*command[1:], '--quiet')
     again = read_session(command[command.index('--out') + 1])
     assert left(again) < 2.0 * left(session)
     assert again.sensors == session.sensors

@@ -14,11 +14,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from command_line import remaster
 from foreign_tables import MARKER, text, write
 from pad import Axis, Keeps, Pad, master_as_told
 from robot_descriptions import ROBOTS
 
-from remaster_ros.cli.main import main
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.transforms import apply, rotation_vector_to_matrix, transform
 from remaster_ros.session.reader import read_session
@@ -103,9 +103,8 @@ class Cell:
         """Measure, import, fit; return offsets and stds, degrees, what is known, remaster.txt."""
         session, out = self.folder / name, self.folder / f'{name}_fit'
         table, urdf = self.measured(f'{name}.csv'), self.folder / 'robot.urdf'
-        args = ['import', table, '--urdf', urdf, '--out', session, *self.told, '--quiet']
-        assert main([*map(str, args)]) == 0
-        assert main(['fit', str(session), '--out', str(out), *QUICK]) == 0
+        remaster('import', table, '--urdf', urdf, '--out', session, *self.told, '--quiet')
+        remaster('fit', session, '--out', out, *QUICK)
         rows = json.loads((out / 'fit.json').read_text())['joint_offsets']
         assert [row['joint'] for row in rows] == JOINTS
         told = (out / 'apply' / 'remaster.txt').read_text(encoding='utf-8')
@@ -120,8 +119,7 @@ class Cell:
 def page_of(session: Path, fit: Path) -> str:
     """Return the text of the page of ``remaster report``."""
     out = fit.with_name('page')
-    args = ['report', session, fit, '--out', out, '--no-figures', '--quiet']
-    assert main([*map(str, args)]) == 0
+    remaster('report', session, fit, '--out', out, '--no-figures', '--quiet')
     html = (out / 'report.html').read_text(encoding='utf-8')
     return ' '.join(re.sub('<[^>]+>', ' ', html).split())
 
@@ -220,9 +218,9 @@ def test_tables_of_pads_that_count_otherwise(table, urdf, told, drive_to, set_to
     if not CASES.is_dir():
         pytest.skip('the tables of other pads are not part of this repository')
     session, out = tmp_path / 'session', tmp_path / 'fit'
-    args = ['import', CASES / f'{table}.csv', '--urdf', CASES / f'{urdf}.urdf', *told]
-    assert main([*map(str, args), '--out', str(session), '--quiet']) == 0
-    assert main(['fit', str(session), '--out', str(out), *QUICK]) == 0
+    given = (CASES / f'{table}.csv', '--urdf', CASES / f'{urdf}.urdf', *told)
+    remaster('import', *given, '--out', session, '--quiet')
+    remaster('fit', session, '--out', out, *QUICK)
     text_file = (out / 'apply' / 'remaster.txt').read_text(encoding='utf-8')
     page = page_of(session, out)
     for name, angle in drive_to.items():

@@ -48,16 +48,15 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     print('seed', SEED)
     options = ('--poses', 26, '--validation', 8, '--sensors', 'mocap', '--seed', SEED)
     bump = ('--effect', 'bumped_sensor:1')
-    assert remaster('simulate', session, *options, *bump, '--quiet').returncode == 0
+    remaster('simulate', session, *options, *bump, '--quiet')
     with_clock(session)
-    assert remaster('fit', session, '--out', folder / 'fit', '--quiet').returncode == 0
-    assert remaster('discover', session, '--out', folder / 'found', '--quiet').returncode == 0
+    remaster('fit', session, '--out', folder / 'fit', '--quiet')
+    remaster('discover', session, '--out', folder / 'found', '--quiet')
     pdf = ('--pdf',) if find_spec('weasyprint') else ()
     done = remaster(
         *('report', session, folder / 'found', folder / 'fit'),
         *('--out', folder / 'report', '--json', *pdf),
     )
-    assert done.returncode == 0, done.stderr
     assert done.stderr == ''
     (folder / 'answer.json').write_text(done.stdout)
     return folder
@@ -190,7 +189,6 @@ def test_results_of_other_data_are_refused_in_one_line(made: Path, tmp_path: Pat
 
 def test_a_session_alone_is_fitted_first(made: Path, tmp_path: Path) -> None:
     done = remaster('report', made / 'session', '--out', tmp_path / 'out', '--no-figures')
-    assert done.returncode == 0, done.stderr
     assert (tmp_path / 'out/fit/fit.json').is_file()
     assert 'remaster discover' in done.stdout
     html = (tmp_path / 'out/report.html').read_text(encoding='utf-8')

@@ -7,9 +7,9 @@ import json
 
 import numpy as np
 import pytest
+from command_line import refusal, remaster
 from session_shapes import CHEAP, LARGE, LAST_ALONE, observations, one_pose_for_all
 
-from remaster_ros.cli.main import main
 from remaster_ros.session.reader import read_session, write_session
 from remaster_ros.session.session_writer import SessionWriter
 
@@ -39,7 +39,7 @@ def own_table(session, folder):
     return path
 
 
-def goes_through_every_verb(session, folder, capsys, figures=False):
+def goes_through_every_verb(session, folder, figures=False):
     given, fit, found = folder / 'session', folder / 'fit', folder / 'found'
     if len(session.measurements) <= MOST_RECORDED:
         with SessionWriter(given, session) as writer:
@@ -57,17 +57,12 @@ def goes_through_every_verb(session, folder, capsys, figures=False):
         ('report', given, fit, found, '--out', folder / 'page'),
         ('import', table, '--urdf', folder / 'arm.urdf', '--out', folder / 'again', *ends),
     ):
-        arguments = [str(word) for word in (*verb, '--quiet')]
-        if verb[0] in ('fit', 'discover', 'report') and not figures:
-            arguments.append('--no-figures')
-        status = main(arguments)
-        said = capsys.readouterr()
+        plain = verb[0] in ('fit', 'discover', 'report') and not figures
         # Without a recorder's journal there is nothing to recover from.
         recorded = (given / 'journal.jsonl').exists() or verb[0] != 'recover'
-        assert status == (0 if recorded else 2), (verb[0], said.err)
-        if not recorded:
-            continue
-        assert 'error' not in said.err
+        more = ('--quiet', *(['--no-figures'] if plain else []))
+        said = remaster(*verb, *more, status=0 if recorded else 2)
+        assert ('error' in said.stderr) == (not recorded)
     offsets = json.loads((fit / 'fit.json').read_text())['joint_offsets']
     assert sum(one['identifiable'] for one in offsets) >= len(offsets) - 3
     again = read_session(folder / 'again').measurements
@@ -78,26 +73,25 @@ def goes_through_every_verb(session, folder, capsys, figures=False):
     'shape',
     [pytest.param(s, marks=pytest.mark.qualify if s in ALIKE else ()) for s in CHEAP],
 )
-def test_a_small_session_goes_through_every_verb(shape, tmp_path, capsys):
+def test_a_small_session_goes_through_every_verb(shape, tmp_path):
     session = CHEAP[shape]()
     if session is None:
         pytest.skip('the real data sets are not beside this repository (../shared/data)')
-    goes_through_every_verb(session, tmp_path, capsys, figures=shape == LAST_ALONE)
+    goes_through_every_verb(session, tmp_path, figures=shape == LAST_ALONE)
 
 
 @pytest.mark.qualify
 @pytest.mark.timeout(3600)
 @pytest.mark.parametrize('shape', LARGE)
-def test_a_large_session_goes_through_every_verb(shape, tmp_path, capsys):
+def test_a_large_session_goes_through_every_verb(shape, tmp_path):
     session = LARGE[shape]()
     if session is None:
         pytest.skip('the real data sets are not beside this repository (../shared/data)')
-    goes_through_every_verb(session, tmp_path, capsys)
+    goes_through_every_verb(session, tmp_path)
 
 
-def test_forty_rows_of_one_pose_are_too_little_and_it_is_said(tmp_path, capsys):
+def test_forty_rows_of_one_pose_are_too_little_and_it_is_said(tmp_path):
     write_session(tmp_path / 'session', one_pose_for_all(10))
     for verb in ('fit', 'discover'):
-        out = str(tmp_path / verb)
-        assert main([verb, str(tmp_path / 'session'), '--out', out, '--no-figures']) == 1
-        assert 'saw 1 pose to fit; at least 3 are needed' in capsys.readouterr().err
+        args = (verb, tmp_path / 'session', '--out', tmp_path / verb, '--no-figures')
+        assert 'saw 1 pose to fit; at least 3 are needed' in refusal(*args, status=1)

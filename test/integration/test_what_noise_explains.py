@@ -18,8 +18,7 @@ from remaster_ros.types import Session
 @pytest.fixture(scope='module')
 def made(tmp_path_factory: pytest.TempPathFactory) -> Session:
     folder = tmp_path_factory.mktemp('made') / 'session'
-    process = remaster('simulate', folder, '--seed', 2, '--quiet')
-    assert process.returncode == 0, process.stderr
+    remaster('simulate', folder, '--seed', 2, '--quiet')
     return read_session(folder)
 
 
@@ -27,7 +26,6 @@ def fitted(session: Session, folder: Path) -> tuple[dict, str, str]:
     """Return fit.json, the mood of the report's verdict, and what was printed."""
     write_session(folder / 'session', session)
     process = remaster('fit', folder / 'session', '--out', folder / 'fit')
-    assert process.returncode == 0, process.stderr
     page = (folder / 'fit' / 'report.html').read_text(encoding='utf-8')
     mood = re.search(r'class="verdict (\w+)"', page)
     assert mood is not None

@@ -7,9 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from command_line import remaster
 from robot_descriptions import iiwa14, panda, xarm6, xarm7
-
-from remaster_ros.cli.main import main
 
 CASES = Path(__file__).parents[2].parent / 'shared' / 'cases'
 OF_CASES = ('ur5e', 'irb120', 'kr6', 'fer', 'meca500', 'fanuc_lrmate')
@@ -21,7 +20,7 @@ LENGTH_M, TILT_RAD = 2e-4, 1.5e-3
 @pytest.mark.parametrize(
     'arm', [*OF_CASES, iiwa14, panda, xarm6, xarm7], ids=lambda arm: getattr(arm, '__name__', arm)
 )
-def test_arms_with_calibrated_parameters_are_prepared_and_planned(arm, tmp_path, capsys):
+def test_arms_with_calibrated_parameters_are_prepared_and_planned(arm, tmp_path):
     pytest.importorskip('pinocchio', reason='needs the judge: pip install pin')
     from inverse_judge import with_errors
 
@@ -35,10 +34,7 @@ def test_arms_with_calibrated_parameters_are_prepared_and_planned(arm, tmp_path,
         pytest.skip(f'{CASES} is not here')
     description, cell = tmp_path / 'arm.urdf', tmp_path / 'cell.yaml'
     description.write_text(with_errors(urdf, LENGTH_M, TILT_RAD, np.random.default_rng(seed)))
-    assert main(['init', str(description), '--out', str(cell)]) == 0
-    said = capsys.readouterr().out
-    assert "by Newton's method" in said
-    assert main(['plan', str(cell), '--json']) == 0
-    plan = json.loads(capsys.readouterr().out)
+    assert "by Newton's method" in remaster('init', description, '--out', cell).stdout
+    plan = json.loads(remaster('plan', cell, '--json').stdout)
     assert plan['splits']['optimization']['poses'] >= 12
     assert plan['goal']['reached']

@@ -13,11 +13,10 @@ pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(900)]
 
 
 def simulated(folder, *options):
-    made = remaster(
+    remaster(
         'simulate', folder, '--poses', 16, '--validation', 8, '--seed', 3, '--sensors', 'mocap',
         *options,
     )  # fmt: skip
-    assert made.returncode == 0
     return folder
 
 

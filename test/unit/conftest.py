@@ -12,7 +12,6 @@ import pytest
 
 from remaster_ros.calibration.fit import fit_session
 from remaster_ros.calibration.result import FitResult
-from remaster_ros.cli.main import main
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.simulation.simulated_workcell import simulate_session
 from remaster_ros.simulation.truth import SimulatedSensor
@@ -127,23 +126,6 @@ def fit_result() -> FitResult:
         outlier_share=0.02,
     )
     return fit_session(session, rng=rng, draws=500)
-
-
-@pytest.fixture
-def remaster(capsys):
-    """Return a function that runs a command in this process and returns what it printed."""
-
-    def run(*args, status=0):
-        capsys.readouterr()
-        ended = main([*map(str, args)])
-        printed = capsys.readouterr()
-        print(printed.out, printed.err)
-        assert ended == status, printed.err
-        if status == 2:
-            assert (printed.out, printed.err.count('\n')) == ('', 1)
-        return printed
-
-    return run
 
 
 @pytest.fixture

@@ -7,9 +7,9 @@ import json
 import numpy as np
 import pytest
 from arms import jointed_arm as arm
+from command_line import refusal, remaster
 
 from remaster_ros.calibration.fit import fit_session
-from remaster_ros.cli.main import main
 from remaster_ros.compensation.export import calibrated_urdf
 from remaster_ros.compensation.mastering import mastering
 from remaster_ros.discovery.discover import discover_session
@@ -119,9 +119,8 @@ def measured(tmp_path_factory):
     head = 'j1,j2,j3,j4,j5,j6,x,y,z'
     np.savetxt(folder / 't.csv', table, '%.5f', ',', header=head, comments='')
     (folder / 'arm.urdf').write_text(STANFORD)
-    given = ['--urdf', str(folder / 'arm.urdf'), '--marker-mm', *map(str, 1e3 * MARKER)]
-    code = main(['import', str(folder / 't.csv'), *given, '--out', str(folder / 's'), '--quiet'])
-    assert code == 0
+    given = ['--urdf', folder / 'arm.urdf', '--marker-mm', *(1e3 * MARKER)]
+    remaster('import', folder / 't.csv', *given, '--out', folder / 's', '--quiet')
     return folder, offsets
 
 
@@ -131,7 +130,7 @@ def test_an_offset_in_mm_is_recovered_from_a_table(measured, tmp_path):
     text = (folder / 's' / 'observations.csv').read_text()
     assert ',q3_m,' in text.partition('\n')[0]
     out = tmp_path / 'fit'
-    assert main(['fit', str(folder / 's'), '--out', str(out), '--quiet', '--no-figures']) == 0
+    remaster('fit', folder / 's', '--out', out, '--quiet', '--no-figures')
     rows = json.loads((out / 'fit.json').read_text())['joint_offsets']
     slide = rows[SLIDE]
     assert slide['identifiable']
@@ -142,8 +141,8 @@ def test_an_offset_in_mm_is_recovered_from_a_table(measured, tmp_path):
     for joint in (1, 3, 4):
         error = rows[joint]['mean_deg'] - np.degrees(offsets[joint])
         assert abs(error) < 4.5 * rows[joint]['std_deg']
-    remaster = (out / 'apply' / 'remaster.txt').read_text()
-    assert f'{slide["mean_mm"]:+.4f} mm' in remaster
+    page = (out / 'apply' / 'remaster.txt').read_text()
+    assert f'{slide["mean_mm"]:+.4f} mm' in page
     assert not (out / 'apply' / 'compensation.json').exists()
 
 
@@ -160,9 +159,9 @@ def test_the_zero_of_a_slide_at_a_fixed_direction_is_the_registrations(tmp_path)
         tmp_path / 't.csv', np.column_stack((shown, points)), '%.7f', ',', header=head, comments=''
     )
     (tmp_path / 'arm.urdf').write_text(SCARA)
-    given = ['--urdf', str(tmp_path / 'arm.urdf'), '--marker-mm', *map(str, 1e3 * MARKER)]
-    table, session = str(tmp_path / 't.csv'), tmp_path / 's'
-    assert main(['import', table, *given, '--out', str(session), '--quiet']) == 0
+    given = ['--urdf', tmp_path / 'arm.urdf', '--marker-mm', *(1e3 * MARKER)]
+    session = tmp_path / 's'
+    remaster('import', tmp_path / 't.csv', *given, '--out', session, '--quiet')
     result = fit_session(read_session(session), rng=rng)
     assert result.identifiable.tolist() == [False, True, False, False]
     assert 'a shift of the sensor registration along its axis' in result.why[SLIDE]
@@ -178,10 +177,9 @@ def test_the_zero_of_a_slide_at_a_fixed_direction_is_the_registrations(tmp_path)
         ['import', 'SESSION', '--out', 'OUT'],
     ],
 )
-def test_what_supposes_angles_refuses_a_slide_in_one_line(verb, measured, tmp_path, capsys):
-    names = {'SESSION': str(measured[0] / 's'), 'OUT': str(tmp_path / 'out')}
-    assert main([names.get(word, word) for word in verb]) == 2
-    error = capsys.readouterr().err.strip().splitlines()[-1]
+def test_what_supposes_angles_refuses_a_slide_in_one_line(verb, measured, tmp_path):
+    names = {'SESSION': measured[0] / 's', 'OUT': tmp_path / 'out'}
+    error = refusal(*(names.get(word, word) for word in verb))
     assert 'j3' in error
     assert 'slides' in error
 

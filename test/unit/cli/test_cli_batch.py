@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import os
 import shutil
@@ -11,15 +10,14 @@ import subprocess
 import sys
 import time
 from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
-from contextlib import redirect_stdout
 from pathlib import Path
 
 import batch_jobs
 import numpy as np
 import pytest
+from command_line import refusal, remaster, run
 
 from remaster_ros.cli import batch
-from remaster_ros.cli.main import main
 from remaster_ros.errors import InputError
 from remaster_ros.reports.batch_page import summary_of, write_batch_page
 from remaster_ros.session.journal import read_journal
@@ -36,8 +34,8 @@ def rows(folder: Path) -> dict[str, dict]:
 def sessions(tmp_path_factory):
     folder = tmp_path_factory.mktemp('sessions')
     for seed, hidden in ((1, ['--effect', 'joint_compliance@2:1.0']), (2, [])):
-        given = ['--poses', '12', '--validation', '6', '--sensors', 'mocap', '--seed', str(seed)]
-        assert main(['simulate', str(folder / f's{seed}'), *given, '--quiet', *hidden]) == 0
+        given = ('--poses', 12, '--validation', 6, '--sensors', 'mocap', '--seed', seed)
+        remaster('simulate', folder / f's{seed}', *given, '--quiet', *hidden)
     return folder
 
 
@@ -55,18 +53,15 @@ def by_one(sessions, tmp_path_factory):
     out.mkdir()
     job = batch._job((sessions / 's1').resolve(), out.resolve(), 0, '')
     Path(job.out).write_text('in the way', encoding='utf-8')
-    given = [str(sessions / 's1'), str(folder / 'copy'), str(folder / 'empty')]
+    given = [sessions / 's1', folder / 'copy', folder / 'empty']
     printed = []
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(batch, '_pool', ThreadPoolExecutor)
         for sessions_given in (given[:1], given[:1], given):
             if sessions_given == given:
                 Path(job.out).unlink()
-            with io.StringIO() as text, redirect_stdout(text):
-                status = main(
-                    ['batch', *sessions_given, '--out', str(out), '--workers', '1', '--json']
-                )
-                printed.append((status, json.loads(text.getvalue())['rows']))
+            done = run('batch', *sessions_given, '--out', out, '--workers', 1, '--json')
+            printed.append((done.returncode, json.loads(done.stdout)['rows']))
     return out, printed
 
 
@@ -75,13 +70,13 @@ def by_two(sessions, tmp_path_factory):
     """Return the folder that two workers filled."""
     out = tmp_path_factory.mktemp('two') / 'out'
     (sessions / 'empty').mkdir()
-    both = [str(sessions / 'empty'), str(sessions / 's1')]
-    assert main(['batch', *both, '--out', str(out), '--workers', '2', '--quiet']) == 0
+    both = (sessions / 'empty', sessions / 's1')
+    remaster('batch', *both, '--out', out, '--workers', 2, '--quiet')
     return out
 
 
 def test_rows_do_not_depend_on_the_workers_and_are_not_made_again(
-    sessions, by_one, by_two, capsys, monkeypatch
+    sessions, by_one, by_two, monkeypatch
 ):
     """A broken session has its error and stops nobody."""
     out, (*_, (status, printed)) = by_one
@@ -101,8 +96,8 @@ def test_rows_do_not_depend_on_the_workers_and_are_not_made_again(
     before = (out / batch.ROWS).read_bytes()
     (out / batch.PAGE).unlink()
     monkeypatch.setattr(batch, '_pool', ThreadPoolExecutor)
-    assert main(['batch', s1, str(out.parent / 'empty'), '--out', str(out)]) == 0
-    assert '1 done, 1 error' in capsys.readouterr().out
+    said = remaster('batch', s1, out.parent / 'empty', '--out', out).stdout
+    assert '1 done, 1 error' in said
     assert (out / batch.ROWS).read_bytes() == before, 'made again'
     assert 's1' in (out / batch.PAGE).read_text(encoding='utf-8')
 
@@ -122,11 +117,9 @@ def test_a_page_does_not_advise_what_was_done(tmp_path):
 
 
 @pytest.mark.parametrize('file', ['fit.json', 'discovery.json', 'session.yaml', 'report.html'])
-def test_a_folder_of_another_command_is_refused(file, sessions, tmp_path, capsys):
+def test_a_folder_of_another_command_is_refused(file, sessions, tmp_path):
     (tmp_path / file).write_text('{}', encoding='utf-8')
-    assert main(['batch', str(sessions / 's1'), '--out', str(tmp_path)]) == 2
-    error = capsys.readouterr().err
-    assert error == (
+    assert refusal('batch', sessions / 's1', '--out', tmp_path) == (
         f'error: {tmp_path}: holds {file}, not written by this command; name another folder\n'
     )
     assert [path.name for path in tmp_path.iterdir()] == [file]
@@ -145,17 +138,16 @@ def test_a_row_is_of_the_files_the_seed_and_the_baseline(sessions, tmp_path):
     assert len(set(keys)) == 4
 
 
-def test_copies_are_worked_on_once_and_each_has_its_name(sessions, by_one, tmp_path, capsys):
+def test_copies_are_worked_on_once_and_each_has_its_name(sessions, by_one, tmp_path):
     """Also a session that was moved between two calls."""
     out, (*_, (_, printed)) = by_one
     s1, copy = str(sessions / 's1'), str(out.parent / 'copy')
     assert [row['session'] for row in printed][:2] == [s1, copy]
     assert len(list(out.glob('*/fit'))) == 1
     shutil.copytree(sessions / 's1', tmp_path / 'moved')
-    again = ['batch', str(tmp_path / 'moved'), '--out', str(out), '--workers', '1', '--json']
+    again = ('batch', tmp_path / 'moved', '--out', out, '--workers', 1, '--json')
     before = (out / batch.ROWS).read_bytes()
-    assert main(again) == 0
-    (moved,) = json.loads(capsys.readouterr().out)['rows']
+    (moved,) = json.loads(remaster(*again).stdout)['rows']
     assert moved['session'] == str(tmp_path / 'moved')
     assert (out / batch.ROWS).read_bytes() == before
     # Against the correction of one session, made of each: another arm's, and its own.
@@ -271,8 +263,8 @@ def scheduler():
 
 
 def test_a_scheduler_makes_the_same_rows(scheduler, sessions, by_two, tmp_path):
-    given = [str(sessions / 's1'), str(sessions / 'empty'), '--quiet', '--out', str(tmp_path)]
-    assert main(['batch', *given, '--scheduler', scheduler.scheduler_address]) == 0
+    given = (sessions / 's1', sessions / 'empty', '--quiet', '--out', tmp_path)
+    remaster('batch', *given, '--scheduler', scheduler.scheduler_address)
     assert rows(tmp_path) == rows(by_two)
 
 

@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from checked_arms import CheckedArm
+from command_line import refusal, remaster
 from compensation_files import save
 from hidden_tours import robot
 from scipy.spatial.transform import Rotation
 
-from remaster_ros.cli.main import main
 from remaster_ros.compensation.checking import Measured
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.session.reader import write_session
@@ -52,20 +52,19 @@ def arm():
 
 
 @pytest.fixture
-def run(tmp_path, arm, capsys):
+def run(tmp_path, arm):
     """Return a function that checks a session, and what it prints as JSON."""
     baseline = save(tmp_path, arm.found, robot('iiwa7'))
 
     def check(folder, *more, status=0, history='arm.jsonl'):
-        given = ['--baseline', str(baseline), '--history', str(tmp_path / history), '--json']
-        assert main(['check', str(folder), *given, *more]) == status
-        done = capsys.readouterr()
-        return json.loads(done.out) if status == 0 else done.err
+        given = ('--baseline', baseline, '--history', tmp_path / history, '--json')
+        stdout, stderr = remaster('check', folder, *given, *more, status=status)
+        return json.loads(stdout) if status == 0 else stderr
 
     return check
 
 
-def test_day_by_day_until_a_joint_has_changed(run, arm, tmp_path, capsys):
+def test_day_by_day_until_a_joint_has_changed(run, arm, tmp_path):
     for day in range(12):
         found = run(write(tmp_path / f'day{day}', arm.check()))
         assert found['format'] == 'remaster-check/1'
@@ -85,9 +84,8 @@ def test_day_by_day_until_a_joint_has_changed(run, arm, tmp_path, capsys):
     assert again == found
     assert 'joint_4: changed' in page.read_text(encoding='utf-8')
     assert 'already, as check 1 of 16' in run(tmp_path / 'day0', status=2)
-    args = ['check', str(tmp_path / 'day15'), '--history', str(tmp_path / 'arm.jsonl')]
-    assert main([*args, '--baseline', str(tmp_path / 'compensation.json')]) == 0
-    text = capsys.readouterr().out
+    args = ('check', tmp_path / 'day15', '--history', tmp_path / 'arm.jsonl')
+    text = remaster(*args, '--baseline', tmp_path / 'compensation.json').stdout
     assert 'changed: Changed since check 13 (day12): joint_4' in text
     assert 'joint_1: looks like a sensor that was moved' in text
 
@@ -110,12 +108,14 @@ def test_no_check_that_shows_a_change_says_that_none_has_changed(run, arm, tmp_p
         assert 'Nothing has changed' not in page.read_text(encoding='utf-8')
 
 
-def test_a_torn_line_is_dropped_and_said(run, arm, tmp_path, caplog):
+def test_a_torn_line_is_dropped_and_said(run, arm, tmp_path):
     run(write(tmp_path / 'day0', arm.check()))
     history = tmp_path / 'arm.jsonl'
     history.write_bytes(history.read_bytes() + b'{"format": "remaster-ch')
-    assert run(write(tmp_path / 'day1', arm.check()))['checks'] == 2
-    assert 'cut off while being written are dropped' in caplog.text
+    args = ('--history', history, '--baseline', tmp_path / 'compensation.json', '--json')
+    stdout, stderr = remaster('check', write(tmp_path / 'day1', arm.check()), *args)
+    assert json.loads(stdout)['checks'] == 2
+    assert 'cut off while being written are dropped' in stderr
 
 
 def test_what_is_refused_leaves_the_history_as_it_was(run, arm, tmp_path):
@@ -146,16 +146,15 @@ def test_a_file_that_is_no_history_is_left_as_it_was(run, arm, tmp_path):
         assert run(folder, history='torn.jsonl')['checks'] == 1
 
 
-def test_another_arm_and_another_baseline_are_refused(run, arm, tmp_path, capsys):
+def test_another_arm_and_another_baseline_are_refused(run, arm, tmp_path):
     folder = write(tmp_path / 'day0', arm.check())
     run(folder)
     other = tmp_path / 'other'
     other.mkdir()
     model = replace(arm.found, joint_offsets=arm.found.joint_offsets + 1e-3)
     baseline = save(other, model, robot('iiwa7'))
-    args = ['check', str(folder), '--history', str(tmp_path / 'arm.jsonl'), '--baseline']
-    assert main([*args, str(baseline)]) == 2
-    assert 'was compared with another baseline' in capsys.readouterr().err
+    args = ('check', folder, '--history', tmp_path / 'arm.jsonl', '--baseline', baseline)
+    assert 'was compared with another baseline' in refusal(*args)
 
 
 def test_figures_of_iso_9283_need_its_visits(run, arm, tmp_path):

@@ -7,11 +7,11 @@ import json
 
 import numpy as np
 import pytest
+from command_line import refusal, remaster
 from compensation_files import arm, save
 from hidden_tours import robot
 
 import remaster_ros
-from remaster_ros.cli.main import main
 from remaster_ros.compensation.arm_model import Function, Geometry, JointTerm
 
 URDF = robot('lwr4plus')
@@ -57,12 +57,11 @@ def wanted(count=20):
 
 
 @pytest.mark.parametrize(('unit', 'separator', 'decimal'), [('deg', ',', '.'), ('rad', ';', ',')])
-def test_a_table_is_corrected_and_comes_back(file, tmp_path, capsys, unit, separator, decimal):
+def test_a_table_is_corrected_and_comes_back(file, tmp_path, unit, separator, decimal):
     q = wanted()
     given = table(tmp_path / 'program.csv', q, unit, separator, decimal)
     out, back = tmp_path / 'corrected.csv', tmp_path / 'back.csv'
-    assert main(['compensate', str(file), str(given), '--out', str(out), '--json']) == 0
-    facts = json.loads(capsys.readouterr().out)
+    facts = json.loads(remaster('compensate', file, given, '--out', out, '--json').stdout)
     header, found = angles(out, separator, decimal)
     assert header == angles(given, separator, decimal)[0]
     found = np.radians(found) if unit == 'deg' else found
@@ -76,27 +75,24 @@ def test_a_table_is_corrected_and_comes_back(file, tmp_path, capsys, unit, separ
     np.testing.assert_allclose(list(facts['change_deg'].values()), changes, atol=1e-5)
     assert all(abs(share) < 10.0 for share in facts['added_speed_percent'].values())
     assert facts['expected_error_mm'] > 0.0
-    args = ['compensate', str(file), str(out), '--out', str(back), '--inverse', '--quiet']
-    assert main(args) == 0
+    remaster('compensate', file, out, '--out', back, '--inverse', '--quiet')
     again = angles(back, separator, decimal)[1]
     np.testing.assert_allclose(np.radians(again) if unit == 'deg' else again, q, rtol=0, atol=5e-8)
 
 
-def test_without_times_there_is_no_added_speed(file, tmp_path, capsys):
+def test_without_times_there_is_no_added_speed(file, tmp_path):
     given = table(tmp_path / 'program.csv', wanted(3), time=False)
-    args = ['compensate', str(file), str(given), '--out', str(tmp_path / 'o.csv'), '--json']
-    assert main(args) == 0
-    assert set(json.loads(capsys.readouterr().out)['added_speed_percent'].values()) == {None}
+    told = remaster('compensate', file, given, '--out', tmp_path / 'o.csv', '--json').stdout
+    assert set(json.loads(told)['added_speed_percent'].values()) == {None}
 
 
-def test_what_is_refused_is_one_line(file, tmp_path, capsys):
+def test_what_is_refused_is_one_line(file, tmp_path):
     q = wanted(4)
     out = tmp_path / 'out.csv'
 
     def refused(given, *more):
-        assert main(['compensate', str(file), str(given), '--out', str(out), *more]) == 2
+        line = refusal('compensate', file, given, '--out', out, *more)
         assert not out.exists()
-        (line,) = capsys.readouterr().err.splitlines()
         return line
 
     good = table(tmp_path / 'good.csv', q)
@@ -113,5 +109,4 @@ def test_what_is_refused_is_one_line(file, tmp_path, capsys):
     beyond[2, 1] = np.radians(125.0)
     assert 'line 4' in refused(table(tmp_path / 'beyond.csv', beyond))
     assert str(tmp_path / 'none.csv') in refused(tmp_path / 'none.csv')
-    assert main(['compensate', str(good), str(good), '--out', str(out)]) == 2
-    assert 'compensation.json' in capsys.readouterr().err
+    assert 'compensation.json' in refusal('compensate', good, good, '--out', out)

@@ -6,8 +6,8 @@ import types
 from dataclasses import replace
 
 import msgspec
+from command_line import refusal, remaster
 
-from remaster_ros.cli.main import main
 from remaster_ros.discovery.confirmation import Compared, Confirmation, ConfirmedCause, in_words
 from remaster_ros.discovery.explain import FoundEffect, LookAlike
 from remaster_ros.discovery.gain import Gain
@@ -171,33 +171,19 @@ def test_why_nothing_can_be_compared_is_said():
     assert 'nan' not in text
 
 
-def test_what_was_left_open_before_is_decided(tmp_path, capsys):
+def test_what_was_left_open_before_is_decided(tmp_path):
     simulated, out = tmp_path / 'session', tmp_path / 'causes'
     rival = LookAlike('base_compliance', (), 1.0, 'poses', title='Base compliance')
     open_one = replace(EFFECT, joints=(2,), confusable_with=(rival,))
     earlier = tmp_path / 'earlier.json'
     content = content_of(found((open_one,), Gain(None, None, 1e-4, {}), {}))
     earlier.write_bytes(msgspec.json.encode(content))
-    options = (
-        '--poses',
-        '20',
-        '--validation',
-        '6',
-        '--sensors',
-        'mocap',
-        '--seed',
-        '1',
-        '--quiet',
-    )
-    assert main(['simulate', str(simulated), *options, '--effect', 'joint_compliance@2:1']) == 0
-    quick = ('--no-figures', '--seed', '1')
-    capsys.readouterr()
-    again = ['discover', str(simulated), '--out', str(out), *quick, '--decide', str(earlier)]
-    assert main(again) == 0
-    said = capsys.readouterr().out
+    options = ('--poses', 20, '--validation', 6, '--sensors', 'mocap', '--seed', 1, '--quiet')
+    remaster('simulate', simulated, *options, '--effect', 'joint_compliance@2:1')
+    quick = ('--no-figures', '--seed', 1)
+    said = remaster('discover', simulated, '--out', out, *quick, '--decide', earlier).stdout
     (decided,) = json.loads((out / 'discovery.json').read_text())['decided']
     assert decided['answer'] == 'cause'
     assert decided['sentence'] in said
     assert f'not base compliance; {decided["sigma"]:.1f} sigma' in decided['sentence']
-    missing = ['discover', str(simulated), '--out', str(out), '--decide', str(tmp_path / 'none')]
-    assert main(missing) == 2
+    refusal('discover', simulated, '--out', out, '--decide', tmp_path / 'none')

@@ -15,6 +15,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 import yaml
+from command_line import refusal, remaster
 from compensation_files import arm, save
 from robot_descriptions import ROBOTS
 
@@ -22,7 +23,6 @@ pytest.importorskip('pinocchio', reason='needs the judge: pip install pin')
 
 import pinocchio
 
-from remaster_ros.cli.main import main
 from remaster_ros.compensation.arm_model import Function, Geometry, JointTerm
 from remaster_ros.session.robot_description import read_description
 from remaster_ros.types import Controller, PadJoint
@@ -107,8 +107,7 @@ def test_a_ur_with_half_a_degree_at_each_joint(tmp_path, joint):
     offsets[slice(None) if joint is None else joint] = HALF_DEGREE
     file = save(tmp_path, arm(urdf, tip='tool0', joint_offsets=offsets), urdf)
     out = tmp_path / 'out'
-    args = ['export', str(file), '--to', 'ur', '--base', str(own), '--out', str(out), '--quiet']
-    assert main(args) == 0
+    export(file, 'ur', out, '--base', own)
     new = out / own.name
     written, before = (yaml.safe_load(p.read_text())['kinematics'] for p in (new, own))
     assert written['hash'] == before['hash']
@@ -144,10 +143,9 @@ def makers_description(tmp_path: Path, share: Path, ur_type: str = 'ur5e') -> No
     offsets = np.full(6, HALF_DEGREE)
     text = urdf(own)
     file = save(tmp_path, arm(text, tip='tool0', joint_offsets=offsets), text)
-    out = str(tmp_path / 'out')
-    assert main(['export', str(file), '--to', 'ur', '--base', str(own), '--out', out]) == 0
+    out = export(file, 'ur', tmp_path / 'out', '--base', own)
     q = configurations()
-    same(reached(urdf(tmp_path / 'out/own.yaml'), q), reached(text, q + offsets))
+    same(reached(urdf(out / 'own.yaml'), q), reached(text, q + offsets))
 
 
 @pytest.fixture(scope='module')
@@ -164,7 +162,7 @@ def erring(tmp_path_factory):
 
 
 def export(file, form, out, *more):
-    assert main(['export', str(file), '--to', form, '--out', str(out), '--quiet', *more]) == 0
+    remaster('export', file, '--to', form, '--out', out, '--quiet', *more)
     return out
 
 
@@ -172,7 +170,7 @@ def export(file, form, out, *more):
 def test_lengths_and_tilts_too(erring, tmp_path, form):
     file, model, _, xacro, own = erring
     q = configurations()
-    out = export(file, form, tmp_path / 'o', *(['--base', str(own)] if form == 'ur' else []))
+    out = export(file, form, tmp_path / 'o', *(['--base', own] if form == 'ur' else []))
     wanted = model.state(q).tool
     if form == 'urdf':
         same(reached((out / 'robot_calibrated.urdf').read_text(), q), wanted)
@@ -270,7 +268,7 @@ def test_transmissions_give_the_true_angle(tmp_path):
     file, offsets = only_offsets(tmp_path)
     base = tmp_path / 'control.urdf'
     base.write_text(with_transmissions(UR.urdf, 0.25), encoding='utf-8')
-    out = export(file, 'ros2_control', tmp_path / 'o', '--base', str(base))
+    out = export(file, 'ros2_control', tmp_path / 'o', '--base', base)
     text = (out / 'control.urdf').read_text()
     root = ElementTree.fromstring(text)
     q, angles = configurations(), []
@@ -310,7 +308,7 @@ def test_rising_is_added_to_what_is_there(tmp_path):
         1,
     )
     base.write_text(text, encoding='utf-8')
-    out = export(file, 'rising', tmp_path / 'o', '--base', str(base))
+    out = export(file, 'rising', tmp_path / 'o', '--base', base)
     changed = (out / 'cal.urdf').read_text()
     joints = {}
     for element in ElementTree.fromstring(changed).findall('joint'):
@@ -348,7 +346,7 @@ def test_the_pad(tmp_path):
     assert not (export(file, 'pad', tmp_path / 'p') / 'motor_numbers.txt').exists()
 
 
-def test_what_is_left_out_is_stated_and_no_offset_without_its_cause(tmp_path, capsys):
+def test_what_is_left_out_is_stated_and_no_offset_without_its_cause(tmp_path):
     """A soft joint and its offset belong together: the offset alone is worse than none."""
     soft = JointTerm(
         1, 'joint_compliance', Function('gravity_torque', 'linear', 1), np.full(1, 1e-4)
@@ -362,8 +360,8 @@ def test_what_is_left_out_is_stated_and_no_offset_without_its_cause(tmp_path, ca
     )
     file = save(tmp_path, model, UR.urdf)
     out = tmp_path / 'o'
-    assert main(['export', str(file), '--to', 'rising', '--out', str(out), '--json']) == 0
-    left = json.loads(capsys.readouterr().out)['left_out']
+    told = remaster('export', file, '--to', 'rising', '--out', out, '--json').stdout
+    left = json.loads(told)['left_out']
     root = ElementTree.fromstring((out / 'robot.urdf').read_text())
     rising = np.array(
         [float(root.find(f"joint[@name='{n}']/calibration").get('rising')) for n in NAMES]
@@ -395,19 +393,14 @@ def rms_refitted(error, model, q):
     return np.sqrt(np.mean(np.sum(left.reshape(-1, 3) ** 2, axis=1)))
 
 
-def test_what_is_refused_is_one_line(tmp_path, capsys, erring):
+def test_what_is_refused_is_one_line(tmp_path, erring):
     file, _ = only_offsets(tmp_path)
     own = erring[4]
 
     def refused(*args):
         out = tmp_path / 'refused'
-        try:
-            status = main(['export', str(file), '--out', str(out), *map(str, args)])
-        except SystemExit as stopped:
-            status = stopped.code
-        assert status == 2
+        line = refusal('export', file, '--out', out, *args)
         assert not out.exists()
-        (line,) = capsys.readouterr().err.splitlines()
         return line
 
     assert '--base' in refused('--to', 'ur')
@@ -426,7 +419,7 @@ def test_what_is_refused_is_one_line(tmp_path, capsys, erring):
     assert 'expand the xacro' in refused('--to', 'ros2_control', '--base', broken)
 
 
-def test_another_file_of_this_program_is_refused_by_its_format(tmp_path, capsys):
+def test_another_file_of_this_program_is_refused_by_its_format(tmp_path):
     file = tmp_path / 'fit.json'
     for content, words in (
         ({'format': 'remaster-fit/1'}, "'remaster-fit/1', not 'remaster-compensation/1'"),
@@ -436,8 +429,7 @@ def test_another_file_of_this_program_is_refused_by_its_format(tmp_path, capsys)
     ):
         file.write_text(json.dumps(content))
         out = tmp_path / 'refused'
-        assert main(['export', str(file), '--to', 'urdf', '--out', str(out)]) == 2
+        line = refusal('export', file, '--to', 'urdf', '--out', out)
         assert not out.exists()
-        (line,) = capsys.readouterr().err.splitlines()
         assert words in line
         assert 'give the one in the folder apply' in line

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from command_line import refusal, remaster, run
 from robot_descriptions import ROBOTS, Description, xarm7
 
 from remaster_ros.cli import init
 from remaster_ros.cli import plan as plan_verb
-from remaster_ros.cli.main import main
 from remaster_ros.cli.plan import free_start
 from remaster_ros.compensation.arm_model import Geometry
 from remaster_ros.compensation.export import calibrated_urdf
@@ -34,15 +34,12 @@ def small(monkeypatch):
 
 
 @pytest.fixture
-def do(tmp_path, capsys):
-    def run(*args, out='cell.yaml'):
-        capsys.readouterr()
-        status = main(['init', *map(str, args), '--out', str(tmp_path / out)])
-        printed = capsys.readouterr()
-        print(printed.out, printed.err)
-        return status, printed.out, printed.err
+def do(tmp_path):
+    def init_verb(*args, out='cell.yaml'):
+        process = run('init', *args, '--out', tmp_path / out)
+        return process.returncode, process.stdout, process.stderr
 
-    return run
+    return init_verb
 
 
 def written(folder, description: Description, name='robot.urdf'):
@@ -62,7 +59,7 @@ def written(folder, description: Description, name='robot.urdf'):
         pytest.param('xarm7', 'joint5', marks=pytest.mark.qualify),
     ],
 )
-def test_known_arms_go_to_a_finished_plan_without_an_edit(robot, held, do, tmp_path, capsys):
+def test_known_arms_go_to_a_finished_plan_without_an_edit(robot, held, do, tmp_path):
     """Two commands: a cell file, and the page of its plan. The UR is a xacro file."""
     description = {**ROBOTS, 'xarm7': xarm7}[robot]()
     is_xacro = robot == 'ur5e'
@@ -84,11 +81,10 @@ def test_known_arms_go_to_a_finished_plan_without_an_edit(robot, held, do, tmp_p
     # Whoever has just met this arm is shown what it will do.
     assert cell.confirm
     poses = 40 if robot == 'panda' else 8
-    few = ('--poses', str(poses), '--validation', '3', '--reference-every', '0', '--seed', '1')
+    few = ('--poses', poses, '--validation', 3, '--reference-every', 0, '--seed', 1)
     page = tmp_path / 'plan.html'
-    capsys.readouterr()
-    assert main(['plan', str(tmp_path / 'cell.yaml'), *few, '--json', '--out', str(page)]) == 0
-    plan = json.loads(capsys.readouterr().out)
+    told = remaster('plan', tmp_path / 'cell.yaml', *few, '--json', '--out', page).stdout
+    plan = json.loads(told)
     html = page.read_text(encoding='utf-8')
     assert f'{plan["configurations"]} configurations at {plan["poses"]} poses in ' in html
     assert plan['robot_time_s'] > 10.0
@@ -140,7 +136,7 @@ def test_xacro_is_expanded_beside_the_cell_with_packages_found_by_their_name(do,
 
 @pytest.mark.parametrize('name', ['arm.urdf.xacro', 'arm.urdf'])
 @pytest.mark.parametrize('verb', ['init', 'import'])
-def test_a_description_runs_no_command(tmp_path, capsys, verb, name):
+def test_a_description_runs_no_command(tmp_path, verb, name):
     canary = tmp_path / 'canary'
     urdf = ROBOTS['irb120']().urdf.replace('<robot ', f'<robot {XACRO} ')
     popen = "[c for c in ().__class__.__base__.__subclasses__() if c.__name__ == 'Popen'][0]"
@@ -155,9 +151,7 @@ def test_a_description_runs_no_command(tmp_path, capsys, verb, name):
     table.write_text('A1;A2;A3;A4;A5;A6;X;Y;Z\n1;2;3;4;5;6;7;8;9\n')
     out = tmp_path / 'out'
     args = [path, '--out', out] if verb == 'init' else [table, '--urdf', path, '--out', out]
-    assert main([verb, *map(str, args)]) == 2
-    error = capsys.readouterr().err
-    assert len(error.splitlines()) == 1
+    error = refusal(verb, *args)
     assert name in error
     assert ('a lambda' if name.endswith('xacro') else 'let its name end in .xacro') in error
     assert not canary.exists()
@@ -243,17 +237,16 @@ def test_a_place_and_both_sensors_can_be_told(do, tmp_path):
     assert cell.floor_z_m is None
 
 
-def test_an_arm_that_lies_on_the_floor_at_zero_is_planned_from_elsewhere(do, tmp_path, capsys):
+def test_an_arm_that_lies_on_the_floor_at_zero_is_planned_from_elsewhere(do, tmp_path):
     """A UR's zero is stretched out; no way to anywhere is free from there."""
     assert do(written(tmp_path, ROBOTS['ur5e']()), '--no-plan')[0] == 0
     cell = read_cell(tmp_path / 'cell.yaml')
     model = cell.planning_scene(cell.chain()).model
     assert model.reasons(np.zeros((1, 6)))[0] == 'hits the floor'
     assert model.reasons(free_start(model, 0)[None])[0] == ''
-    capsys.readouterr()
-    few = ('--poses', '4', '--validation', '0', '--reference-every', '0', '--json')
-    assert main(['plan', str(tmp_path / 'cell.yaml'), *few]) == 0
-    assert json.loads(capsys.readouterr().out)['configurations'] > 0
+    few = ('--poses', 4, '--validation', 0, '--reference-every', 0, '--json')
+    told = remaster('plan', tmp_path / 'cell.yaml', *few).stdout
+    assert json.loads(told)['configurations'] > 0
 
 
 @pytest.mark.parametrize('options', [(), ('--no-plan',)])
@@ -323,7 +316,7 @@ def test_a_gantry_between_walls_ends_with_status_1(do, tmp_path):
 
 @pytest.mark.parametrize('options', [('--no-plan',), ()])
 def test_poses_that_no_free_way_leads_to_are_none_that_can_be_planned(
-    options, do, tmp_path, monkeypatch, capsys
+    options, do, tmp_path, monkeypatch
 ):
     """The arm can stand nowhere else than it begins: deep in the floor, from where none leads."""
     start = np.radians([0.0, 90.0, 60.0, 0.0, 0.0, 0.0])
@@ -338,9 +331,8 @@ def test_poses_that_no_free_way_leads_to_are_none_that_can_be_planned(
     assert 'what slides' not in error
     if not options:
         # The verb that it names agrees.
-        capsys.readouterr()
-        assert main(['plan', str(tmp_path / 'cell.yaml')]) == 1
-        assert 'no configuration can be reached' in capsys.readouterr().err
+        said = refusal('plan', tmp_path / 'cell.yaml', status=1)
+        assert 'no configuration can be reached' in said
 
 
 @pytest.mark.qualify
@@ -384,9 +376,7 @@ def test_a_scara_is_prepared_and_planned(do, tmp_path):
     assert {name for name, std in plan['expected_std_deg'].items() if std} == {'j2'}
 
 
-def test_a_rail_is_planned_with_the_arm_where_the_base_link_says_so(
-    do, tmp_path, capsys, monkeypatch
-):
+def test_a_rail_is_planned_with_the_arm_where_the_base_link_says_so(do, tmp_path, monkeypatch):
     # To look for the ways of this one takes minutes, and is for another test.
     monkeypatch.setattr(init, 'with_free_way', lambda *_: (10, 10))
     path = on_rail(tmp_path)
@@ -397,9 +387,8 @@ def test_a_rail_is_planned_with_the_arm_where_the_base_link_says_so(
     assert cell.held_values_m == [-0.5, 0.0, 0.5]
     assert re.search(r'root mean square +[\d.]+ deg, where 4.36 mm count as a degree', printed)
     # A check takes none.
-    capsys.readouterr()
-    assert main(['plan', str(tmp_path / 'cell.yaml'), '--check', str(tmp_path / 'c.csv')]) == 2
-    assert "joint 'rail' is prismatic" in capsys.readouterr().err
+    said = refusal('plan', tmp_path / 'cell.yaml', '--check', tmp_path / 'c.csv')
+    assert "joint 'rail' is prismatic" in said
     text = (tmp_path / 'cell.yaml').read_text()
     for values, words in (
         ('held_values_m: []', 'held_values_m is empty'),
@@ -450,9 +439,7 @@ def test_a_description_that_was_corrected_is_planned(do, tmp_path):
     assert found['plan']['splits']['optimization']['poses'] >= 10
 
 
-def test_an_arm_with_its_makers_calibration_is_planned_and_its_table_is_imported(
-    do, tmp_path, capsys
-):
+def test_an_arm_with_its_makers_calibration_is_planned_and_its_table_is_imported(do, tmp_path):
     """Literally what docs/apply.md tells the owner of a UR."""
     urdf = ROBOTS['ur5e']().urdf
     joint = '<joint name="elbow_joint" type="revolute">\n    '
@@ -500,14 +487,9 @@ def test_an_arm_with_its_makers_calibration_is_planned_and_its_table_is_imported
     lines = [';'.join(f'{value:.4f}' for value in row) for row in rows]
     table.write_text('A1;A2;A3;A4;A5;A6;X;Y;Z\n' + '\n'.join(lines) + '\n')
     arguments = [table, '--urdf', path, '--xacro-argument', argument, '--out', out]
-    assert main(['import', *map(str, arguments)]) == 0
+    remaster('import', *arguments)
     assert 'rpy="0.00179822366464 0 0"' in (out / 'robot.urdf').read_text()
-    with pytest.raises(SystemExit) as refused:
-        main(['import', str(table), '--urdf', str(path), '--out', str(out), '--xacro-argument'])
-    assert refused.value.code == 2
-    capsys.readouterr()
+    remaster('import', table, '--urdf', path, '--out', out, '--xacro-argument', status=2)
     plain = written(tmp_path, ROBOTS['irb120']())
-    assert main(['import', *map(str, [table, '--urdf', plain, *arguments[3:]])]) == 2
-    assert f'is no .xacro file, which alone takes arguments; leave out {argument}' in (
-        capsys.readouterr().err
-    )
+    said = refusal('import', table, '--urdf', plain, *arguments[3:])
+    assert f'is no .xacro file, which alone takes arguments; leave out {argument}' in said

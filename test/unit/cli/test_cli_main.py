@@ -8,6 +8,7 @@ import sys
 import types
 
 import pytest
+from command_line import remaster
 
 from remaster_ros.cli import main as cli
 from remaster_ros.errors import DeviceError, InputError, InsufficientDataError
@@ -68,26 +69,21 @@ def test_every_verb_takes_the_common_options():
         assert {'--seed', '--quiet', '--no-figures'} <= set(actions), verb
 
 
-def test_help_lists_the_verbs(capsys):
-    with pytest.raises(SystemExit) as stop:
-        cli.main(['--help'])
-    assert stop.value.code == 0
-    out = capsys.readouterr().out
+def test_help_lists_the_verbs():
+    out = remaster('--help').stdout
     assert all(verb in out for verb in cli.VERBS)
     assert 'Exit status' in out
 
 
-def test_without_a_verb_it_shows_its_help(capsys):
-    assert cli.main([]) == 0
-    out = capsys.readouterr().out
+def test_without_a_verb_it_shows_its_help():
+    out = remaster().stdout
     assert out.startswith('usage: remaster')
     assert all(verb in out for verb in cli.VERBS)
 
 
 @pytest.mark.parametrize('shell', cli.SHELLS)
-def test_it_prints_what_completes_it_in_a_shell(shell, capsys):
-    assert cli.main(['--completion', shell]) == 0
-    assert 'remaster' in capsys.readouterr().out
+def test_it_prints_what_completes_it_in_a_shell(shell):
+    assert 'remaster' in remaster('--completion', shell).stdout
 
 
 @pytest.mark.parametrize(

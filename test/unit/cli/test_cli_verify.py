@@ -7,11 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from command_line import refusal, remaster
 from compensation_files import save
 from hidden_tours import robot
 from verified_arms import Case, found_arm, measured
 
-from remaster_ros.cli.main import main
 from remaster_ros.cli.verify import WORDS
 from remaster_ros.compensation.file import read_compensation
 from remaster_ros.session.reader import write_session
@@ -53,27 +53,26 @@ def file(tmp_path):
     return save(tmp_path, found_arm(CASE)[1], robot(CASE.name))
 
 
-def verified(session, folder, file, capsys):
+def verified(session, folder, file):
     write_session(folder, session)
-    assert main(['verify', str(folder), '--compensation', str(file), '--json']) == 0
-    return json.loads(capsys.readouterr().out)
+    return json.loads(remaster('verify', folder, '--compensation', file, '--json').stdout)
 
 
 @pytest.mark.parametrize('state', ['in_use', 'not_in_use'])
-def test_a_recorded_session_with_the_layer_on(tmp_path, file, capsys, state):
+def test_a_recorded_session_with_the_layer_on(tmp_path, file, state):
     """Where raw joint states are recorded a new fit would find the old offsets in any case."""
-    found = verified(session_of(replace(CASE, state=state)), tmp_path / 's', file, capsys)
+    found = verified(session_of(replace(CASE, state=state)), tmp_path / 's', file)
     assert found['format'] == 'remaster-verify/1'
     assert found['verdict'] == found['toggle']['verdict'] == state
     assert [one['joint'] for one in found['joints']] == list(
         read_compensation(file).compensator.joint_names
     )
     assert found['error_mm']['on'].keys() == {'mean_mm', 'interval95_mm'}
-    assert main(['verify', str(tmp_path / 's'), '--compensation', str(file)]) == 0
-    assert capsys.readouterr().out.startswith(f'{state}: ')
+    told = remaster('verify', tmp_path / 's', '--compensation', file).stdout
+    assert told.startswith(f'{state}: ')
 
 
-def test_visits_for_the_same_joints_belong_together_whatever_their_numbers(tmp_path, file, capsys):
+def test_visits_for_the_same_joints_belong_together_whatever_their_numbers(tmp_path, file):
     """A recorder numbers each visit; the arm stands a little off what was wanted."""
     session = session_of(CASE)
     m, rng = session.measurements, np.random.default_rng(5)
@@ -82,18 +81,18 @@ def test_visits_for_the_same_joints_belong_together_whatever_their_numbers(tmp_p
     apart, each = m.select(order), np.arange(len(m))
     apart = replace(apart, observation=each, configuration=each, pose=each, stamp_s=1.0 * each)
     apart = replace(apart, wanted=apart.wanted + off, q=apart.q + off)
-    found = verified(replace(session, measurements=apart), tmp_path / 's', file, capsys)
+    found = verified(replace(session, measurements=apart), tmp_path / 's', file)
     assert found['verdict'] == found['toggle']['verdict'] == 'in_use'
     assert found['text'] == WORDS['in_use']
 
 
-def test_on_the_pad_what_is_reported_was_wanted(tmp_path, file, capsys):
+def test_on_the_pad_what_is_reported_was_wanted(tmp_path, file):
     session = session_of(replace(CASE, toggled=False))
     m = session.measurements
     mastered = replace(m, q=m.wanted, wanted=None, correction=None)
     found = verified(
         replace(session, measurements=mastered, correction=Correction('pad', 'x')),
-        *(tmp_path / 's', file, capsys),
+        *(tmp_path / 's', file),
     )
     assert found['verdict'] == 'in_use'
     assert found['toggle'] is None
@@ -103,29 +102,28 @@ def test_on_the_pad_what_is_reported_was_wanted(tmp_path, file, capsys):
     assert 'not seen' in found['warnings'][1]
 
 
-def test_the_makers_accuracy_option_is_compared(tmp_path, file, capsys):
+def test_the_makers_accuracy_option_is_compared(tmp_path, file):
     content = json.loads(file.read_text())
     content['state'] = {'accuracy_option': 'active'}
     file.write_text(json.dumps(content))
     other = replace(session_of(CASE), accuracy_option='inactive')
-    (warning,) = verified(other, tmp_path / 's', file, capsys)['warnings']
+    (warning,) = verified(other, tmp_path / 's', file)['warnings']
     assert "maker's accuracy option is inactive, and was active" in warning
     same = replace(other, accuracy_option='active')
-    assert verified(same, tmp_path / 't', file, capsys)['warnings'] == []
+    assert verified(same, tmp_path / 't', file)['warnings'] == []
     out = tmp_path / 'pad'
-    assert main(['export', str(file), '--to', 'pad', '--out', str(out), '--quiet']) == 0
+    remaster('export', file, '--to', 'pad', '--out', out, '--quiet')
     assert 'accuracy option active' in (out / 'remaster.txt').read_text()
 
 
-def test_what_is_refused_is_one_line(tmp_path, file, capsys):
+def test_what_is_refused_is_one_line(tmp_path, file):
     session = session_of(CASE)
     m = session.measurements
 
     def refused(changed, given=file, status=2):
         folder = tmp_path / str(len(list(tmp_path.iterdir())))
         write_session(folder, changed)
-        assert main(['verify', str(folder), '--compensation', str(given)]) == status
-        (line,) = capsys.readouterr().err.splitlines()
+        line = refusal('verify', folder, '--compensation', given, status=status)
         assert str(folder) in line or status == 1
         return line
 

@@ -10,10 +10,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from command_line import refusal, remaster
 from robot_descriptions import ROBOTS
 
 from remaster_ros.cli import init
-from remaster_ros.cli.main import main
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.session.files import make_folder, undone_on_failure, write_atomically
 
@@ -33,9 +33,9 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A small session, a fit of it, a robot, a table, and a cell file."""
     folder = tmp_path_factory.mktemp('made')
     session = folder / 'session'
-    assert main(['simulate', str(session), '--poses', '14', '--validation', '6', '--quiet']) == 0
-    fit = ['fit', str(session), '--out', str(folder / 'fit'), '--no-figures', '--quiet']
-    assert main([*fit, '--draws', '100', '--chains', '2']) == 0
+    remaster('simulate', session, '--poses', 14, '--validation', 6, '--quiet')
+    fit = ('fit', session, '--out', folder / 'fit', '--no-figures', '--quiet')
+    remaster(*fit, '--draws', 100, '--chains', 2)
     (folder / 'arm.urdf').write_text(ROBOTS['irb120']().urdf)
     (folder / 'arm.urdf.xacro').write_text(ROBOTS['irb120']().urdf.replace('<robot ', XACRO, 1))
     chain = SerialChain.from_urdf(ROBOTS['irb120']().urdf, 'base_link', 'link_6')
@@ -107,51 +107,48 @@ def full_disk(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None]:
 
 @pytest.mark.parametrize('verb', VERBS)
 def test_a_disk_that_is_full_leaves_nothing_and_the_next_try_works(
-    verb: str, made: Path, tmp_path: Path, full_disk: Callable[[int], None], capsys
+    verb: str, made: Path, tmp_path: Path, full_disk: Callable[[int], None]
 ) -> None:
     """After the first file, and at the last one."""
     (tmp_path / 'mine.txt').write_text('was here before\n')
-    arguments = [verb.split()[0], *map(str, VERBS[verb](made, tmp_path)), '--quiet']
+    arguments = [verb.split()[0], *VERBS[verb](made, tmp_path), '--quiet']
     before = content(tmp_path)
     full_disk(0)
-    assert main(arguments) == 2
-    assert 'No space left on device' in capsys.readouterr().err
+    assert 'No space left on device' in refusal(*arguments)
     assert content(tmp_path) == before
     full_disk(-1)
-    assert main(arguments) == 0
+    remaster(*arguments)
     files = sum(value is not None for value in content(tmp_path).values()) - 1
     assert files >= 1
     if files == 1:
         return
     again = tmp_path / 'again'
     again.mkdir()
-    arguments = [verb.split()[0], *map(str, VERBS[verb](made, again)), '--quiet']
+    arguments = [verb.split()[0], *VERBS[verb](made, again), '--quiet']
     full_disk(files - 1)
-    assert main(arguments) == 2
+    refusal(*arguments)
     assert content(again) == {}
     full_disk(-1)
-    assert main(arguments) == 0
+    remaster(*arguments)
 
 
-def test_an_init_that_was_refused_does_not_block_the_next(tmp_path: Path, capsys) -> None:
+def test_an_init_that_was_refused_does_not_block_the_next(tmp_path: Path) -> None:
     """The URDF that the xacro was made into lay there, and "with other content" was the answer."""
     robot, cell = tmp_path / 'arm.urdf.xacro', tmp_path / 'cell.yaml'
     good = ROBOTS['irb120']().urdf.replace('<robot ', XACRO, 1)
     bad = good.replace('type="revolute"', 'type="fixed"', 4)
     assert bad != good
     robot.write_text(bad)
-    assert main(['init', str(robot), '--out', str(cell), '--no-plan']) == 2
+    remaster('init', robot, '--out', cell, '--no-plan', status=2)
     assert [path.name for path in tmp_path.iterdir()] == [robot.name]
     robot.write_text(good)
-    assert main(['init', str(robot), '--out', str(cell), '--no-plan', '--quiet']) == 0
+    remaster('init', robot, '--out', cell, '--no-plan', '--quiet')
     # Where the URDF is not init's own, it stays; what is told to do then works.
     cell.unlink()
     robot.write_text(good.replace('<link', '<!-- changed --><link', 1))
-    capsys.readouterr()
-    assert main(['init', str(robot), '--out', str(cell), '--no-plan']) == 2
-    assert 'another folder with --out, such as new/cell.yaml' in capsys.readouterr().err
-    other = str(tmp_path / 'new/cell.yaml')
-    assert main(['init', str(robot), '--out', other, '--no-plan', '--quiet']) == 0
+    said = refusal('init', robot, '--out', cell, '--no-plan')
+    assert 'another folder with --out, such as new/cell.yaml' in said
+    remaster('init', robot, '--out', tmp_path / 'new/cell.yaml', '--no-plan', '--quiet')
 
 
 @pytest.mark.parametrize('verb', ['fit', 'discover', 'report'])
@@ -160,7 +157,7 @@ def test_data_that_allow_no_answer_leave_no_folder(verb: str, made: Path, tmp_pa
     rows = (session / 'observations.csv').read_text().splitlines(keepends=True)
     (session / 'observations.csv').write_text(''.join(rows[:5]))
     before = content(tmp_path)
-    assert main([verb, str(session), '--out', str(out)]) == 1
+    remaster(verb, session, '--out', out, status=1)
     assert content(tmp_path) == before
 
 

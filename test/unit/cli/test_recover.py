@@ -6,6 +6,7 @@ import json
 import random
 
 import pytest
+from command_line import refusal, remaster
 from session_crashes import live, make_observations, session_header
 
 from remaster_ros.session.reader import read_session
@@ -22,7 +23,7 @@ def killed(tmp_path):
     return tmp_path / 's'
 
 
-def test_nothing_was_lost(killed, remaster):
+def test_nothing_was_lost(killed):
     before = len(read_session(killed).measurements)
     assert remaster('recover', killed) == (f'{killed}: recovered\n', '')
     assert remaster('recover', killed) == (f'{killed}: at rest, nothing to recover\n', '')
@@ -36,18 +37,18 @@ def test_nothing_was_lost(killed, remaster):
 
 
 @pytest.mark.parametrize('tail', [b'{"kind":"configur', b'{"name":"gr\xc3', bytes(700)])
-def test_a_line_being_written_was_lost(killed, remaster, tail):
+def test_a_line_being_written_was_lost(killed, tail):
     with (killed / 'journal.jsonl').open('ab') as file:
         file.write(tail)
     before = len(read_session(killed).measurements)
-    out = remaster('recover', killed, status=3).out
+    out = remaster('recover', killed, status=3).stdout
     assert f'journal.jsonl, line 5: {len(tail)} bytes of a line' in out
     remaster('recover', killed)
     assert len(read_session(killed).measurements) == before
 
 
 @pytest.mark.parametrize('zeros', [0, 40])
-def test_observations_that_only_the_journal_has_come_back(killed, remaster, zeros):
+def test_observations_that_only_the_journal_has_come_back(killed, zeros):
     path = killed / 'observations.csv'
     whole = path.read_bytes()
     last = whole.rstrip(b'\n').rfind(b'\n') + 1
@@ -56,19 +57,19 @@ def test_observations_that_only_the_journal_has_come_back(killed, remaster, zero
     assert path.read_bytes() == whole
 
 
-def test_what_is_no_session_or_damaged_or_in_use(killed, tmp_path, remaster):
-    assert 'none' in remaster('recover', tmp_path / 'none', status=2).err
+def test_what_is_no_session_or_damaged_or_in_use(killed, tmp_path):
+    assert 'none' in refusal('recover', tmp_path / 'none')
     writer = SessionWriter(killed, session_header(), resume=True)
-    assert 'another process is writing' in remaster('recover', killed, status=2).err
+    assert 'another process is writing' in refusal('recover', killed)
     writer.close('stopped')
     data = bytearray((killed / 'journal.jsonl').read_bytes())
     data[40] ^= 1
     (killed / 'journal.jsonl').write_bytes(data)
-    assert 'journal.jsonl: not as it was closed' in remaster('recover', killed, status=2).err
+    assert 'journal.jsonl: not as it was closed' in refusal('recover', killed)
     (killed / 'SHA256SUMS').unlink()
-    assert 'journal.jsonl, line 1: damaged' in remaster('recover', killed, status=2).err
+    assert 'journal.jsonl, line 1: damaged' in refusal('recover', killed)
 
 
-def test_a_life_without_a_crash_needs_no_recovery(tmp_path, remaster):
+def test_a_life_without_a_crash_needs_no_recovery(tmp_path):
     live(tmp_path, seed=5)
     remaster('recover', tmp_path / 'new' / 'session')

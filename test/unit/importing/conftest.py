@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import pytest
+from command_line import remaster
 
 from remaster_ros.session.reader import read_session
 
 
 @pytest.fixture
-def imported(tmp_path, remaster):
+def imported(tmp_path):
     """Return a function that imports files for an arm, to what was printed and the session."""
 
     def run(urdf, *args, status=0):

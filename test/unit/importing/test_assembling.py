@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from command_line import remaster, run
 from foreign_tables import measured, text, write
 
-from remaster_ros.cli.main import main
 from remaster_ros.errors import InputError
 from remaster_ros.importing.rows import TableOptions, read_rows
 from remaster_ros.kinematics.serial_chain import SerialChain
@@ -98,25 +98,21 @@ def test_rows_stand_in_the_order_of_their_times(chain, tmp_path):
 
 
 @pytest.fixture
-def do(tmp_path, capsys):
+def do(tmp_path):
     arm = measured(rows=48)
     urdf = tmp_path / 'robot.urdf'
     urdf.write_text(arm.urdf)
 
-    def run(header, columns, *args):
+    def imported(header, columns, *args):
         path = write(tmp_path, 't.csv', text(header, columns))
         out = tmp_path / 'session'
-        capsys.readouterr()
-        args = ['import', str(path), *args, '--urdf', str(urdf), '--out', str(out)]
-        status = main([*map(str, args)])
-        printed = capsys.readouterr()
-        print(printed.out, printed.err)
-        if status:
-            assert printed.err.count('\n') == 1
+        process = run('import', path, *args, '--urdf', urdf, '--out', out)
+        if process.returncode:
+            assert process.stderr.count('\n') == 1
             assert not out.exists()
-        return read_session(out) if status == 0 else printed.err
+        return read_session(out) if process.returncode == 0 else process.stderr
 
-    return arm, run
+    return arm, imported
 
 
 def columns(arm):
@@ -281,8 +277,8 @@ def test_real_sets_survive_the_way_through_a_foreign_table(name, tmp_path):
     )
     path = write(tmp_path, 't.csv', table, 'utf-16')
     out = tmp_path / 'session'
-    args = ['import', path, '--urdf', DATA / name / 'robot.urdf', '--tip-link', 'tool']
-    assert main([*map(str, args), '--out', str(out)]) == 0
+    urdf = DATA / name / 'robot.urdf'
+    remaster('import', path, '--urdf', urdf, '--tip-link', 'tool', '--out', out)
     made = read_session(out).measurements
     np.testing.assert_allclose(made.q, m.q, atol=1e-7)
     np.testing.assert_allclose(made.position, m.position, atol=1e-8)

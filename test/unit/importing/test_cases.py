@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from command_line import run
 
 from remaster_ros.calibration.estimate import Problem, estimate
-from remaster_ros.cli.main import main
 from remaster_ros.session.reader import read_session
 
 CASES = Path(__file__).parents[4] / 'shared' / 'cases'
@@ -24,9 +24,11 @@ UR5E = (0.104, 0.246, 0.099, -0.391, 0.272, 0.134)
 ROUNDED_DEG, MOST_STDS = 5e-4, 3.5
 
 
-def imported(files, options, out):
-    paths = [str(CASES / name) for name in files]
-    return main(['import', *paths, *options, '--out', str(out), '--quiet'])
+def imported(files, options, urdf, out):
+    paths = [CASES / name for name in files]
+    return run(
+        'import', *paths, '--urdf', CASES / f'{urdf}.urdf', *options, '--out', out, '--quiet'
+    )
 
 
 @pytest.mark.parametrize(
@@ -51,7 +53,7 @@ def imported(files, options, out):
 )
 def test_the_offsets_are_those_that_made_the_table(files, options, urdf, true_deg, tmp_path):
     out = tmp_path / 'session'
-    assert imported(files, (*options, '--urdf', str(CASES / f'{urdf}.urdf')), out) == 0
+    assert imported(files, options, urdf, out).returncode == 0
     found = estimate(Problem.of(read_session(out)))
     assert bool(found.model.bodies) == files[0].startswith('j8')
     mean = np.rad2deg(found.model.offsets(found.mode.z))
@@ -88,17 +90,18 @@ def test_the_offsets_are_those_that_made_the_table(files, options, urdf, true_de
     ],
     ids=['motive', 'rtde', 'wide', 'order'],
 )
-def test_what_makes_no_session_ends_in_what_to_do(files, urdf, words, tmp_path, capsys):
+def test_what_makes_no_session_ends_in_what_to_do(files, urdf, words, tmp_path):
     out = tmp_path / 'session'
     name, *options = urdf
-    assert imported(files, (*options, '--urdf', str(CASES / f'{name}.urdf')), out) in (1, 2)
-    said = capsys.readouterr().err
-    assert words in said
-    assert said.count('\n') == 1
+    done = imported(files, options, name, out)
+    assert done.returncode in (1, 2)
+    assert words in done.stderr
+    assert done.stderr.count('\n') == 1
     assert not out.exists()
 
 
-def test_poses_of_a_camera_on_the_tool_say_so(tmp_path, capsys):
-    options = '--urdf', str(CASES / 'ur5e.urdf'), '--tip-link', 'tool0'
-    assert imported(('j8_board_in_camera.csv',), options, tmp_path / 'session') == 1
-    assert 'need --on-tool' in capsys.readouterr().err
+def test_poses_of_a_camera_on_the_tool_say_so(tmp_path):
+    files, options = ['j8_board_in_camera.csv'], ('--tip-link', 'tool0')
+    done = imported(files, options, 'ur5e', tmp_path / 'session')
+    assert done.returncode == 1
+    assert 'need --on-tool' in done.stderr

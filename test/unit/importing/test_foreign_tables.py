@@ -6,6 +6,7 @@ import json
 
 import numpy as np
 import pytest
+from command_line import remaster
 from foreign_tables import MARKER, measured, text, write
 
 from remaster_ros.calibration.fit import fit_session
@@ -116,10 +117,10 @@ def test_a_name_that_the_table_has_otherwise_is_said_not_to_be_used(arm, importe
     assert '--sensor camera is not used: the table names its sensors (lt)' in out
     assert session.sensors == {'lt': 'ball'}
     assert '--marker' not in out
-    assert 'not used' not in imported(arm.urdf, own, '--sensor', 'lt')[0].out
+    assert 'not used' not in imported(arm.urdf, own, '--sensor', 'lt')[0].stdout
 
 
-def test_a_cell_file_has_robot_sensor_and_marker(arm, tmp_path, remaster):
+def test_a_cell_file_has_robot_sensor_and_marker(arm, tmp_path):
     (tmp_path / 'arm.urdf').write_text(arm.urdf)
     cell = tmp_path / 'cell.yaml'
     cell.write_text(
@@ -138,7 +139,7 @@ def test_a_cell_file_has_robot_sensor_and_marker(arm, tmp_path, remaster):
     np.testing.assert_allclose(session.markers['smr'], MARKER)
     assert session.marker_std_m == 0.001
     other = ('--out', f'{out}2', '--tip-link', 'link_6')
-    error = remaster('import', path, '--cell', cell, *other, status=1).err
+    error = remaster('import', path, '--cell', cell, *other, status=1).stderr
     assert 'with the tip link tool0 the marker is' in error
 
 
@@ -147,7 +148,7 @@ def test_json_has_the_columns_and_the_hint(arm, imported, tmp_path):
     reversed_ = arm.q * [1, -1, 1, -1, 1, 1]
     columns = [*np.rad2deg(reversed_).T, *(1e3 * arm.points.T), ['x'] * 40]
     path = write(tmp_path, 't.csv', text(header, columns))
-    found = json.loads(imported(arm.urdf, path, '--json', status=1)[0].out)
+    found = json.loads(imported(arm.urdf, path, '--json', status=1)[0].stdout)
     assert found['session'] is None
     assert found['hint'].endswith('--reverse A2,A4')
     assert found['columns']['A1'] == 'joint 1 (joint_1), deg (guessed)'

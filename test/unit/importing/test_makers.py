@@ -8,6 +8,7 @@ from collections import Counter
 
 import numpy as np
 import pytest
+from command_line import remaster
 from foreign_makers import KINDS, names_of
 from foreign_tables import measured, text, write
 
@@ -247,7 +248,7 @@ def test_two_thousand_mutations_are_read_right_or_refused(kind, tmp_path):
     assert check_mutations(kind, 2000, 12, tmp_path / 'program.txt') > 0
 
 
-def test_the_accuracy_option_of_a_kuka_is_asked_for_and_kept(tmp_path, imported, remaster):
+def test_the_accuracy_option_of_a_kuka_is_asked_for_and_kept(tmp_path, imported):
     arm = measured(rows=30)
     names = names_of('kuka_src', len(arm.q))
     program = write(tmp_path, 'calib.src', KINDS['kuka_src'].write(names, np.rad2deg(arm.q)))

@@ -26,7 +26,7 @@ class Import:
         table = text([*NAMES, *points], [*self.q.T, *self.points.T])
         path = write(self.folder, 't.csv', table)
         printed, session = self.imported(self.urdf, path, '--json', *args, status=status)
-        return json.loads(printed.out), printed.err, session
+        return json.loads(printed.stdout), printed.stderr, session
 
 
 @pytest.fixture
@@ -41,11 +41,11 @@ def exchanged(points, rows):
     return moved
 
 
-def test_a_few_rows_that_do_not_fit_are_named_and_the_session_is_written(table, caplog):
+def test_a_few_rows_that_do_not_fit_are_named_and_the_session_is_written(table):
     imported = table(72)
     rows = [7, 8, 30, 31]
     imported.points = exchanged(imported.points, rows)
-    found, _, session = imported.run()
+    found, error, session = imported.run()
     assert found['fits']
     # The header is line 1.
     named = {row['where'] for row in found['rows_off']}
@@ -55,7 +55,7 @@ def test_a_few_rows_that_do_not_fit_are_named_and_the_session_is_written(table, 
     np.testing.assert_allclose(errors, np.sort(moved), rtol=0.1)
     assert '4 of 72 rows do not fit' in found['warnings'][-1]
     assert 'line 9' in found['warnings'][-1]
-    assert '4 of 72 rows do not fit' in caplog.text
+    assert '4 of 72 rows do not fit' in error
     assert len(session.measurements) == 72
 
 
@@ -133,7 +133,7 @@ def test_points_in_a_table_of_their_own_are_exchanged_as_proposed(table):
     joints = write(imported.folder, 'j.csv', text(['name', *NAMES], [names, *imported.q.T]))
     mirrored = imported.points[:, [1, 0, 2]]
     points = write(imported.folder, 'p.csv', text(['name', 'X', 'Y', 'Z'], [names, *mirrored.T]))
-    error = imported.imported(imported.urdf, joints, points, status=1)[0].err
+    error = imported.imported(imported.urdf, joints, points, status=1)[0].stderr
     proposed = error.split('to write it so, add ')[1].split('; to write it as')[0]
     imported.imported(imported.urdf, joints, points, *shlex.split(proposed))
 

@@ -257,7 +257,7 @@ def test_the_robots_own_tool_is_no_measured_point(tmp_path, imported):
     head = ['pose', *AXES, 'px', 'py', 'pz', 'mx', 'my', 'mz']
     table = text(head, [range(30), *degrees(arm), *believed.T, *millimetres(arm)])
     path = write(tmp_path, 't.csv', table)
-    error = imported(arm.urdf, path, status=1)[0].err
+    error = imported(arm.urdf, path, status=1)[0].stderr
     assert 'name the columns of the measured point with --points' in error
     imported(arm.urdf, path, '--points', 'mx,my,mz')
 

@@ -9,9 +9,9 @@ import subprocess
 
 import numpy as np
 import pytest
+from command_line import remaster
 from test_session_writer import observations
 
-from remaster_ros.cli.main import main
 from remaster_ros.errors import InputError, MovedError
 from remaster_ros.session.reader import read_session
 from remaster_ros.session.session_writer import SessionWriter
@@ -166,7 +166,7 @@ def test_a_restored_journal_is_still_written_by_one_process(begun, folder, sessi
     assert finish(writer, rest) == 'complete'
 
 
-def test_a_killed_session_whose_rows_were_changed_is_recovered(begun, folder, session, capsys):
+def test_a_killed_session_whose_rows_were_changed_is_recovered(begun, folder, session):
     """What the journal has is restored, and what was found is kept beside it."""
     writer, _rest = begun
     good = (folder / 'observations.csv').read_bytes()
@@ -174,10 +174,9 @@ def test_a_killed_session_whose_rows_were_changed_is_recovered(begun, folder, se
     sed(folder / 'observations.csv', '3s/$/0/')
     with pytest.raises(InputError, match='let `remaster recover` restore it'):
         SessionWriter(folder, session, resume=True)
-    assert main(['recover', str(folder)]) == 3
-    assert 'observations.csv.changed' in capsys.readouterr().out
+    assert 'observations.csv.changed' in remaster('recover', folder, status=3).stdout
     assert (folder / 'observations.csv').read_bytes() == good
-    assert main(['recover', str(folder)]) == 0
+    remaster('recover', folder)
     read = read_session(folder)
     assert read.exit_status == 'aborted'
     np.testing.assert_array_equal(read.measurements.observation, range(10))

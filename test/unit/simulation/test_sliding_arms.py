@@ -7,10 +7,10 @@ import json
 import numpy as np
 import pytest
 from arms import jointed_arm
+from command_line import refusal, remaster
 from scipy.stats import binom
 
 from remaster_ros.calibration.fit import fit_session
-from remaster_ros.cli.main import main
 from remaster_ros.kinematics.serial_chain import LEVER_M, SerialChain
 from remaster_ros.kinematics.transforms import matrix_from_quaternion_xyzw
 from remaster_ros.session.reader import read_session
@@ -51,7 +51,7 @@ def made(tmp_path_factory):
     (folder / 'arm.urdf').write_text(STANFORD)
     (folder / 'cell.yaml').write_text(CELL)
     size = ('--poses', '30', '--validation', '10', '--seed', '3', '--quiet')
-    assert main(['simulate', str(folder / 's'), '--cell', str(folder / 'cell.yaml'), *size]) == 0
+    remaster('simulate', folder / 's', '--cell', folder / 'cell.yaml', *size)
     return folder
 
 
@@ -84,7 +84,7 @@ def test_the_truth_of_a_slide_is_in_mm_and_is_what_made_the_rows(made):
 
 def test_the_offset_is_recovered_by_the_command(made, tmp_path):
     """Within 4.5 of its standard deviations: 1 of 100,000 tests fails."""
-    assert main(['fit', str(made / 's'), '--out', str(tmp_path), '--quiet', '--no-figures']) == 0
+    remaster('fit', made / 's', '--out', tmp_path, '--quiet', '--no-figures')
     truth = json.loads((made / 's' / 'truth.json').read_text())['joint_offsets'][SLIDE]
     found = json.loads((tmp_path / 'fit.json').read_text())['joint_offsets'][SLIDE]
     assert found['identifiable']
@@ -128,19 +128,16 @@ def test_intervals_hold_as_often_as_they_say(made, sessions):
         assert low <= np.mean(held) <= high
 
 
-def test_nothing_else_is_hidden_in_such_an_arm_and_discover_says_why_not(made, tmp_path, capsys):
-    args = ['simulate', str(tmp_path / 'o'), '--cell', str(made / 'cell.yaml')]
-    assert main([*args, '--poses', '8', '--validation', '0', '--effect', 'backlash@2']) == 2
-    error = capsys.readouterr().err.strip().splitlines()[-1]
+def test_nothing_else_is_hidden_in_such_an_arm_and_discover_says_why_not(made, tmp_path):
+    args = ('simulate', tmp_path / 'o', '--cell', made / 'cell.yaml', '--poses', 8)
+    error = refusal(*args, '--validation', 0, '--effect', 'backlash@2')
     assert "joint 'j3' slides" in error
     assert 'leave --effect out' in error
-    assert main([*args, '--poses', '8', '--orientation-noise-deg', '0.1']) == 2
-    error = capsys.readouterr().err.strip().splitlines()[-1]
+    error = refusal(*args, '--orientation-noise-deg', 0.1)
     assert "joint 'j3' slides" in error
     assert 'no fit takes orientations of such an arm; leave their noise out' in error
     assert not (tmp_path / 'o').exists()
-    assert main(['discover', str(made / 's'), '--out', str(tmp_path / 'd')]) == 2
-    (error,) = capsys.readouterr().err.strip().splitlines()
+    error = refusal('discover', made / 's', '--out', tmp_path / 'd')
     assert "joint 'j3' is prismatic" in error
     assert (
         'can be planned, measured by the nodes, simulated, imported and fitted, no more' in error
