@@ -40,6 +40,7 @@ from remaster_ros.reports.rows_csv import (
     PREDICTED,
     PREDICTIONS_FILE,
     RESIDUALS_FILE,
+    lengths_mm,
     read_columns,
 )
 from remaster_ros.reports.schemas import (
@@ -143,7 +144,7 @@ def read_inputs(
     fit = read_fit(fit_path)
     _require_same(session, fit, fit_path, 'fit')
     residuals = read_columns(fit_path.parent / RESIDUALS_FILE, session, BEFORE + AFTER, 'fit')
-    before_mm, after_mm = _lengths_mm(residuals[:, :3]), _lengths_mm(residuals[:, 3:])
+    before_mm, after_mm = lengths_mm(residuals[:, :3]), lengths_mm(residuals[:, 3:])
     if found_path is None:
         model, model_mm = _model(session, fit_path, _file_of(fit.geometry), 'fit')
         return Inputs(session, fit, None, before_mm, after_mm, None, model_mm, model, plan)
@@ -155,7 +156,7 @@ def read_inputs(
     if found.effects:
         path = found_path.parent / PREDICTIONS_FILE
         predicted = read_columns(path, session, PREDICTED, 'discover')
-        causes_mm = _lengths_mm(session.measurements.position - predicted)
+        causes_mm = lengths_mm(session.measurements.position - predicted)
     rows = found.loadable if isinstance(found.loadable, list) else []
     model, model_mm = _model(
         session,
@@ -198,12 +199,7 @@ def errors_with_model_mm(session: Session, urdf: str) -> FloatArray:
     """
     found = estimate(Problem.of(replace(session, urdf=urdf)))
     predicted = predicted_rows(found.problem, found.model, found.before.z)
-    return _lengths_mm(session.measurements.position - predicted)
-
-
-def _lengths_mm(errors: FloatArray) -> FloatArray:
-    lengths: FloatArray = 1e3 * np.linalg.norm(errors, axis=1)
-    return lengths
+    return lengths_mm(session.measurements.position - predicted)
 
 
 def _require_same(session: Session, result: Fit | Discovered, path: Path, verb: str) -> None:
@@ -611,8 +607,7 @@ def _of_discovery(found: Discovered, loads_model: bool) -> list[Remaining]:
     if more := stay[MOST_NAMED:]:
         largest = max(e.size_m for e in more if isinstance(e.size_m, float))
         size = f'up to {at_marker(largest)}'
-        name = f'{len(more)} smaller cause{"s" if len(more) > 1 else ""}'
-        rows.append(Remaining(name, size, 'See below.'))
+        rows.append(Remaining(counted(len(more), 'smaller cause'), size, 'See below.'))
     if found.verdict == 'undetermined':
         remedy = 'Measure what the look-alikes below call for.'
         rows.append(Remaining('Undecided', 'another explanation fits as well', remedy))

@@ -24,6 +24,7 @@ from remaster_ros.calibration.predictive_accuracy import predicted_accuracy, too
 from remaster_ros.discovery.effects.drivers import driver_named
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.transforms import apply
+from remaster_ros.reports.rows_csv import lengths_mm
 from remaster_ros.types import BoolArray, FloatArray, IntArray
 
 if TYPE_CHECKING:
@@ -455,11 +456,8 @@ def log_axis(ax: Axes, which: str) -> None:
 
 def _norms_mm(result: FitResult) -> tuple[FloatArray, FloatArray]:
     """Return the 3-D error of every row before and after, mm, never quite zero."""
-    before, after = (
-        np.maximum(1e3 * np.linalg.norm(residuals, axis=1), 1e-6)
-        for residuals in (result.residuals_before, result.residuals_after)
-    )
-    return before, after
+    before, after = map(lengths_mm, (result.residuals_before, result.residuals_after))
+    return np.maximum(before, 1e-6), np.maximum(after, 1e-6)
 
 
 def _splits(result: FitResult) -> list[tuple[str, BoolArray]]:
@@ -510,7 +508,7 @@ def gain(discovery: Discovery) -> Figure:
     held_out = data.context.measurements.is_validation
     rows = held_out if held_out.any() else np.isin(np.arange(len(held_out)), data.rows.source)
     errors = discovery.residuals_before, discovery.fit.residuals_after
-    lengths = [1e3 * np.linalg.norm(error[rows], axis=1) for error in errors]
+    lengths = [lengths_mm(error[rows]) for error in errors]
     error_histograms(left, *(np.maximum(values, 1e-4) for values in lengths))
     left.set_title('Held-out poses' if held_out.any() else 'Fitted poses')
     legend_above(left)
@@ -531,8 +529,8 @@ def gain(discovery: Discovery) -> Figure:
             values.append(within)
     y = np.arange(len(values))
     for column, (color, label) in enumerate(((BEFORE, 'before'), (AFTER, 'after'))):
-        lengths_mm = 1e3 * np.array(values)[:, column]
-        right.barh(y + 0.36 * column - 0.18, lengths_mm, 0.34, color=color, label=label)
+        noise_mm = 1e3 * np.array(values)[:, column]
+        right.barh(y + 0.36 * column - 0.18, noise_mm, 0.34, color=color, label=label)
     right.set_yticks(y.tolist(), labels)
     right.invert_yaxis()
     right.grid(False, axis='y')

@@ -47,6 +47,7 @@ from remaster_ros.reports.figures import (
 from remaster_ros.reports.fit_json import REPORT_FILE, fit_content
 from remaster_ros.reports.pages import compressed, inlined, page, write_report
 from remaster_ros.reports.robot_scene import RobotScene, scene_to_dict, view_script
+from remaster_ros.reports.rows_csv import lengths_mm
 from remaster_ros.reports.schemas import Accuracy, Discovered
 from remaster_ros.reports.sentences import (
     METRICS,
@@ -162,7 +163,7 @@ def _told(result: FitResult, shown: IntArray) -> list[str]:
     """Return what each point is."""
     m = result.session.measurements
     before, after = (
-        1e3 * np.linalg.norm(residuals[shown], axis=1)
+        lengths_mm(residuals[shown])
         for residuals in (result.residuals_before, result.residuals_after)
     )
     return [
@@ -232,11 +233,7 @@ def write_fit_report(result: FitResult, folder: Path) -> Path:
 
 def inputs_of(result: FitResult) -> Inputs:
     """Return a fit as the first screen takes it."""
-    lengths = (
-        1e3 * np.linalg.norm(residuals, axis=1)
-        for residuals in (result.residuals_before, result.residuals_after)
-    )
-    before_mm, after_mm = lengths
+    before_mm, after_mm = map(lengths_mm, (result.residuals_before, result.residuals_after))
     return Inputs(result.session, fit_content(result), None, before_mm, after_mm, None)
 
 

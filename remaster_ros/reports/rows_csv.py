@@ -59,6 +59,11 @@ def rows_text(session: Session, columns: Sequence[str], rows: Iterable[Sequence[
     return text.getvalue()
 
 
+def lengths_mm(errors: FloatArray) -> FloatArray:
+    """Return the 3-D error of every row, mm, (n,), of errors in m, (n, 3)."""
+    return np.asarray(1e3 * np.linalg.norm(errors, axis=1))
+
+
 def residuals_text(result: FitResult) -> str:
     """Return residuals.csv: measured minus modelled position in the frame of the sensor, m.
 

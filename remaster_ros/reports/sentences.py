@@ -18,6 +18,7 @@ from remaster_ros.compensation.export import APPLY_FOLDER, LAYER_FILE, REMASTER_
 from remaster_ros.discovery.explain import LookAlike
 from remaster_ros.discovery.thinning import Thinning
 from remaster_ros.discovery.words import called, part_words, percent, sentence_case, shown
+from remaster_ros.reports.rows_csv import lengths_mm
 from remaster_ros.reports.schemas import (
     Confirmed,
     Discovered,
@@ -78,7 +79,7 @@ def _held_out_poses(session: Session) -> int:
 
 def not_counted(gross: int) -> str:
     """Return '3 gross errors not counted'."""
-    return f'{gross} gross error{"s" if gross > 1 else ""} not counted'
+    return f'{counted(gross, "gross error")} not counted'
 
 
 def times_smaller(before: float, after: float) -> str:
@@ -207,10 +208,10 @@ def verdict(result: FitResult) -> Judgement:
         words = result.orientations_in_words
         points.append(f'{words[0].upper()}{words[1:]}.')
     if result.left_out:
-        plural = 's are' if len(result.left_out) > 1 else ' is'
+        left_out = len(result.left_out)
         points.append(
-            f'{len(result.left_out)} observation{plural} left out as gross errors; '
-            'they are listed below.'
+            f'{counted(left_out, "observation")} {"is" if left_out == 1 else "are"} left out as '
+            'gross errors; they are listed below.'
         )
     return Judgement(mood, headline, points, findings, doubts, disagreements)
 
@@ -224,11 +225,8 @@ def _mean_errors_mm(result: FitResult, validated: bool) -> tuple[float, float]:
         return metrics['before']['mean_mm'], metrics['after']['mean_mm']
     m = result.session.measurements
     rows = m.is_validation & ~np.isin(m.observation, gross)
-    before, after = (
-        1e3 * float(np.linalg.norm(residuals[rows], axis=1).mean())
-        for residuals in (result.residuals_before, result.residuals_after)
-    )
-    return before, after
+    before, after = map(lengths_mm, (result.residuals_before[rows], result.residuals_after[rows]))
+    return float(before.mean()), float(after.mean())
 
 
 def _structure(result: FitResult) -> list[str]:

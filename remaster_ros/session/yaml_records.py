@@ -203,12 +203,9 @@ def _fields(record: type[msgspec.Struct], steps: list[str]) -> list[str]:
 
 
 def _record_of(kind: Any) -> Any:
-    """Return what a type is beside None, and without its metadata."""
-    while isinstance(kind, msgspec.inspect.Metadata | msgspec.inspect.UnionType):
-        if isinstance(kind, msgspec.inspect.Metadata):
-            kind = kind.type
-        else:
-            kind = next(t for t in kind.types if not isinstance(t, msgspec.inspect.NoneType))
+    """Return what a type is beside None."""
+    if isinstance(kind, msgspec.inspect.UnionType):
+        kind = next(t for t in kind.types if not isinstance(t, msgspec.inspect.NoneType))
     return kind
 
 
