@@ -15,18 +15,12 @@ from remaster_ros.sensors.laser_tracker import packets as emscon
 from remaster_ros.sensors.optitrack import natnet
 from remaster_ros.sensors.optitrack.natnet import (
     TRACKING_VALID,
-    AnalogDevice,
-    Asset,
-    BodyMarker,
     Frame,
     LabeledMarker,
-    MarkerSet,
     MarkerSetDescription,
     ModelDefinition,
     RigidBody,
     RigidBodyDescription,
-    Skeleton,
-    SkeletonDescription,
 )
 
 VERSIONS: tuple[natnet.Version, ...] = (
@@ -50,12 +44,12 @@ def full_frame(
         LabeledMarker(1 << 16 | i, position, 0.014, 0x0A, residual)
         for i, position in enumerate(positions, start=1)
     )
-    inner = tuple(BodyMarker(p, i, 0.014) for i, p in enumerate(positions, start=1))
+    inner = tuple((p, i, 0.014) for i, p in enumerate(positions, start=1))
     body = RigidBody(
         1, positions[0], (0.0, 0.0, 0.0, 1.0), 1e-4, TRACKING_VALID,
         inner if version < (3, 0) else (),
     )  # fmt: skip
-    analog = (AnalogDevice(5, ((1.0, 2.0), (3.0,))),)
+    analog = ((5, ((1.0, 2.0), (3.0,))),)
     return Frame(
         number=number,
         timestamp=number / 120,
@@ -64,10 +58,10 @@ def full_frame(
             *([LabeledMarker(4711, (1.0,) * 3, 0.01, 0x12, residual)] if stray else []),
         ),
         rigid_bodies=(body,),
-        marker_sets=(MarkerSet('tool', positions), MarkerSet('all', positions)),
+        marker_sets=(('tool', positions), ('all', positions)),
         other_markers=((1.0, 1.0, 1.0),),
-        skeletons=(Skeleton(2, (body,)),),
-        assets=(Asset(3, (body,), labeled[:1]),) if version >= (4, 1) else (),
+        skeletons=((2, (body,)),),
+        assets=((3, (body,), labeled[:1]),) if version >= (4, 1) else (),
         force_plates=analog if version >= (2, 9) else (),
         devices=analog if version >= (2, 11) else (),
         mid_exposure=10**6 + number * 80_000,
@@ -83,19 +77,21 @@ def server_info(version: natnet.Version) -> natnet.ServerInfo:
     )
 
 
-def model_definition() -> ModelDefinition:
-    """Return the names of what `full_frame` holds."""
-    body = RigidBodyDescription(
-        'tool', 1, marker_positions=((0.0,) * 3,) * 3, marker_labels=(0, 0, 0),
-        marker_names=('a', 'b', 'c'),
-    )  # fmt: skip
-    return ModelDefinition(
-        (
-            MarkerSetDescription('tool', ('a', 'b', 'c')),
-            body,
-            SkeletonDescription('hand', 2, (body._replace(name='bone'),)),
-        )
-    )
+BODY = RigidBodyDescription(
+    'tool', 1, marker_positions=((0.0,) * 3,) * 3, marker_labels=(0, 0, 0),
+    marker_names=('a', 'b', 'c'),
+)  # fmt: skip
+MODEL = ModelDefinition((MarkerSetDescription('tool', ('a', 'b', 'c')), BODY))
+
+
+def skeleton_definition(version: natnet.Version) -> bytes:
+    """Return the datagram of a skeleton, of which a client keeps the name alone."""
+    sized = version >= (4, 1)
+    body = natnet.encode_model_definition(ModelDefinition((BODY,)), version)
+    hand = b'hand\0' + struct.pack('<2i', 2, 1) + body[12 if sized else 8 :]
+    size = struct.pack('<i', len(hand)) if sized else b''
+    payload = struct.pack('<2i', 1, natnet.SKELETON) + size + hand
+    return natnet.join_datagram(natnet.MessageId.MODELDEF, payload)
 
 
 def natnet_seeds(version: natnet.Version | None = None) -> list[bytes]:
@@ -107,9 +103,10 @@ def natnet_seeds(version: natnet.Version | None = None) -> list[bytes]:
             full_frame(spoken, 8, markers=1),
             Frame(9, 0.1, params=8),
             server_info(spoken),
-            model_definition(),
+            MODEL,
         ]
         seeds += [natnet.encode_message(message, spoken) for message in messages]
+        seeds.append(skeleton_definition(spoken))
     others: list[natnet.Message] = [
         natnet.Response(b'Bitstream,4.1\0'),
         natnet.Response(bytes(4)),

@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
-from fuzz_messages import VERSIONS, full_frame, model_definition, server_info
+from fuzz_messages import MODEL, VERSIONS, full_frame, server_info
 
 from remaster_ros.sensors.laser_tracker import packets
 from remaster_ros.sensors.laser_tracker import packets as emscon
@@ -97,7 +97,7 @@ class NatNetClientTarget:
     def __call__(self, data: bytes) -> None:
         """Receive one datagram; every so often the server introduces itself again."""
         if self._fed % 100 == 0:
-            for message in (server_info(self._version), model_definition()):
+            for message in (server_info(self._version), MODEL):
                 self._receive(natnet.encode_message(message, self._version), self._answers)
         if self._fed % 10 == 0:
             self._number += 1

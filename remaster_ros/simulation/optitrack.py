@@ -27,11 +27,9 @@ from remaster_ros.sensors.optitrack.natnet import (
     OCCLUDED,
     TRACKING_VALID,
     UNLABELED,
-    BodyMarker,
     ClientRequest,
     Frame,
     LabeledMarker,
-    MarkerSet,
     MarkerSetDescription,
     Message,
     MessageId,
@@ -255,7 +253,7 @@ class OptiTrackScene:
             (0.0, 0.0, 0.0, 1.0),
             _RESIDUAL_M,
             TRACKING_VALID if tracked else 0,
-            tuple(BodyMarker(p, i, _MARKER_SIZE_M) for i, p in enumerate(tool, 1)) if old else (),
+            tuple((p, i, _MARKER_SIZE_M) for i, p in enumerate(tool, 1)) if old else (),
         )
         ticks = self.ticks(t)
         return Frame(
@@ -263,10 +261,7 @@ class OptiTrackScene:
             timestamp=t - self._start_s,
             labeled_markers=labeled,
             rigid_bodies=(body,),
-            marker_sets=(
-                MarkerSet(behaviour.rigid_body, tool),
-                MarkerSet('all', tool),
-            ),
+            marker_sets=((behaviour.rigid_body, tool), ('all', tool)),
             other_markers=strays,
             data_received=ticks,
             transmitted=self.ticks(self._world.now()),

@@ -160,6 +160,10 @@ def _same(item: Any) -> Any:
     return item
 
 
+def _stepped_over(*_: Any) -> None:
+    """Build what is written and stepped over, and never kept."""
+
+
 class Row(Codec):
     """Numbers of a fixed layout.
 
@@ -377,14 +381,6 @@ class LabeledMarker(NamedTuple):
     residual: float | None = None  # Metres per ray; None before NatNet 3
 
 
-class BodyMarker(NamedTuple):
-    """A marker inside a rigid body; only NatNet 2 sends these."""
-
-    position: Vec3
-    id: int
-    size: float
-
-
 class RigidBody(NamedTuple):
     """Pose of a body or bone; stale or zero unless `params` has `TRACKING_VALID`."""
 
@@ -393,36 +389,8 @@ class RigidBody(NamedTuple):
     orientation_xyzw: Quaternion
     mean_error: float
     params: int
-    markers: tuple[BodyMarker, ...] = ()
-
-
-class MarkerSet(NamedTuple):
-    """A named list of positions, m; the one called ``all`` repeats the others. No flags."""
-
-    name: str
-    positions: tuple[Vec3, ...]
-
-
-class Skeleton(NamedTuple):
-    """Bones of one skeleton."""
-
-    id: int
-    bodies: tuple[RigidBody, ...]
-
-
-class Asset(NamedTuple):
-    """A trained marker set (4.1+): bones and markers."""
-
-    id: int
-    bodies: tuple[RigidBody, ...]
-    markers: tuple[LabeledMarker, ...]
-
-
-class AnalogDevice(NamedTuple):
-    """Samples of a force plate or another analog device, one tuple a channel."""
-
-    id: int
-    channels: tuple[tuple[float, ...], ...]
+    # Position, id and size of each of its markers; only NatNet 2 sends these
+    markers: tuple[tuple[Vec3, int, float], ...] = ()
 
 
 @dataclass(frozen=True)
@@ -432,25 +400,24 @@ class Frame:
     number: int  # Frame number; starts again with the stream, loops in Edit mode
     timestamp: float  # Seconds since Motive, or the recording, started
     labeled_markers: tuple[LabeledMarker, ...] = ()
-    rigid_bodies: tuple[RigidBody, ...] = ()
-    marker_sets: tuple[MarkerSet, ...] = ()
-    # Unlabelled positions, m (deprecated by OptiTrack; also in `labeled_markers`)
-    other_markers: tuple[Vec3, ...] = ()
-    skeletons: tuple[Skeleton, ...] = ()
-    assets: tuple[Asset, ...] = ()
-    force_plates: tuple[AnalogDevice, ...] = ()
-    devices: tuple[AnalogDevice, ...] = ()
     software_latency: float = 0.0  # Seconds, before 3.0 only
-    timecode: int = 0
-    timecode_sub: int = 0
     # Server clock ticks (3.0+); `mid_exposure` is 0 where the cameras have no such clock
     mid_exposure: int = 0
     data_received: int = 0
     transmitted: int = 0
-    # PTP time (4.1+), else 0
-    precision_seconds: int = 0
-    precision_fraction: int = 0
     params: int = 0  # `RECORDING`, `MODEL_LIST_CHANGED`, `NOT_LIVE`, `BITSTREAM_CHANGED`
+    # Written by a server and stepped over by a client, each as it lies on the wire
+    rigid_bodies: tuple[RigidBody, ...] = ()
+    # Names and positions, m; the set called ``all`` repeats the others
+    marker_sets: tuple[tuple[str, tuple[Vec3, ...]], ...] = ()
+    # Unlabelled positions, m (deprecated by OptiTrack; also in `labeled_markers`)
+    other_markers: tuple[Vec3, ...] = ()
+    skeletons: tuple[tuple[int, tuple[RigidBody, ...]], ...] = ()  # Ids and bones
+    # Trained marker sets (4.1+): ids, bones and markers
+    assets: tuple[tuple[int, tuple[RigidBody, ...], tuple[LabeledMarker, ...]], ...] = ()
+    # Ids, and the samples of each channel
+    force_plates: tuple[tuple[int, tuple[tuple[float, ...], ...]], ...] = ()
+    devices: tuple[tuple[int, tuple[tuple[float, ...], ...]], ...] = ()
 
 
 def decode_frame(payload: bytes, version: Version) -> Frame:
@@ -510,27 +477,26 @@ def _layout(version: Version) -> _Layout:
     section = SizedList if since_4_1 else List
     body = _BODY_3 if since_3 else _BODY_2
     labeled = _LABELED_3 if since_3 else _LABELED_2
-    analog = Record(AnalogDevice, I32, List(List(F32)))
+    analog = Record(_stepped_over, I32, List(List(F32)))
     sections: dict[str, Codec] = {
-        'marker_sets': section(Record(MarkerSet, TEXT, List(VEC3))),
+        'marker_sets': section(Record(_stepped_over, TEXT, List(VEC3))),
         'other_markers': section(VEC3),
         'rigid_bodies': section(body),
-        'skeletons': section(Record(Skeleton, I32, List(body))),
+        'skeletons': section(Record(_stepped_over, I32, List(body))),
     }
     if since_4_1:
-        sections['assets'] = section(Record(Asset, I32, List(body), List(labeled)))
+        sections['assets'] = section(Record(_stepped_over, I32, List(body), List(labeled)))
     sections['labeled_markers'] = section(labeled)
     if version >= (2, 9):
         sections['force_plates'] = section(analog)
     if version >= (2, 11):
         sections['devices'] = section(analog)
     rest = {} if since_3 else {'software_latency': 'f'}
-    rest |= {'timecode': 'I', 'timecode_sub': 'I', 'timestamp': 'd' if version >= (2, 7) else 'f'}
+    timecode = precise_time = '8x'
+    rest['timestamp'] = timecode + ('d' if version >= (2, 7) else 'f')
     if since_3:
         rest |= {'mid_exposure': 'Q', 'data_received': 'Q', 'transmitted': 'Q'}
-    if since_4_1:
-        rest |= {'precision_seconds': 'I', 'precision_fraction': 'I'}
-    rest['params'] = 'H'
+    rest['params'] = (precise_time if since_4_1 else '') + 'H'
     end_tag = 'i'
     return _Layout(sections, tuple(rest), Struct('<' + ''.join(rest.values()) + end_tag))
 
@@ -581,9 +547,8 @@ def _parts_of_body_2(body: RigidBody) -> tuple:
 
 _LABELED_2 = Row('i4fH', partial(_labeled, has_residual=False), _flat_labeled_2)
 _LABELED_3 = Row('i4fHf', partial(_labeled, has_residual=True), _flat_labeled_3)
-# Bodies are written and stepped over, never read.
 _BODY_2 = Record(
-    lambda *_: None,
+    _stepped_over,
     *(Row('i7f'), Columns(VEC3, I32, F32), Row('fH')),
     flatten=_parts_of_body_2,
 )
@@ -617,23 +582,15 @@ class RigidBodyDescription(NamedTuple):
     marker_names: tuple[str, ...] = ()  # Since 4.0
 
 
-class SkeletonDescription(NamedTuple):
-    """A skeleton and its bones."""
-
-    name: str
-    id: int
-    bodies: tuple[RigidBodyDescription, ...]
-
-
 class OtherDescription(NamedTuple):
-    """A force plate, device, camera or asset: only what names it is kept."""
+    """A skeleton, force plate, device, camera or asset: only what names it is kept."""
 
-    kind: int  # The wire's type number, `FORCE_PLATE` to `ASSET`, or one unknown here
+    kind: int  # The wire's type number, `SKELETON` to `ASSET`, or one unknown here
     name: str
     id: int | None = None  # None for cameras, which have none, and for unknown kinds
 
 
-Description = MarkerSetDescription | RigidBodyDescription | SkeletonDescription | OtherDescription
+Description = MarkerSetDescription | RigidBodyDescription | OtherDescription
 
 
 @dataclass(frozen=True)
@@ -707,7 +664,6 @@ def _write(description: Description, version: Version) -> bytes:
 _KINDS: dict[type, int] = {
     MarkerSetDescription: MARKER_SET,
     RigidBodyDescription: RIGID_BODY,
-    SkeletonDescription: SKELETON,
 }
 
 
@@ -718,11 +674,14 @@ def _codecs(version: Version) -> dict[int, Codec]:
     codecs: dict[int, Codec] = {
         MARKER_SET: Record(MarkerSetDescription, TEXT, List(TEXT)),
         RIGID_BODY: body,
-        SKELETON: Record(SkeletonDescription, TEXT, I32, List(body)),
+        SKELETON: Record(
+            lambda name, skeleton_id, _: OtherDescription(SKELETON, name, skeleton_id),
+            *(TEXT, I32, List(body)),
+        ),
     }
     if version >= (3, 0):
         plate = Row(f'{2 + 3 + 144 + 12}f2i')
-        marker = Record(lambda *_: None, TEXT, Row('i4fH'))
+        marker = Record(_stepped_over, TEXT, Row('i4fH'))
         codecs |= {
             FORCE_PLATE: Record(
                 lambda plate_id, serial, *_: OtherDescription(FORCE_PLATE, serial, plate_id),

@@ -18,7 +18,6 @@ from remaster_ros.sensors.optitrack.natnet import (
     OtherDescription,
     ProtocolError,
     RigidBodyDescription,
-    SkeletonDescription,
 )
 
 VERSIONS = [(2, 6), (2, 10), (2, 11), (3, 0), (3, 1), (4, 0), (4, 1), (4, 2), (4, 3)]
@@ -43,13 +42,7 @@ def tool(version):
 
 
 def model(version):
-    return ModelDefinition(
-        (
-            MarkerSetDescription('all', ('tool_1', 'tool_2')),
-            tool(version),
-            SkeletonDescription('person', 4, (tool(version), tool(version))),
-        )
-    )
+    return ModelDefinition((MarkerSetDescription('all', ('tool_1', 'tool_2')), tool(version)))
 
 
 def messages(version):
@@ -180,11 +173,15 @@ def other_descriptions(version):
     body = text('bone') + struct.pack('<2i3f', 1, -1, 0, 0, 0)
     if version >= (4, 2):
         body += bytes(16)
-    body += struct.pack('<i3fi', 1, 0, 0, 0, 0)
+    if version >= (3, 0):
+        body += struct.pack('<i3fi', 1, 0, 0, 0, 0)
     if version >= (4, 0):
         body += text('Marker 1')
     channels = struct.pack('<i', 2) + text('Fx') + text('Fy')
-    kinds = [
+    kinds = [(2, text('person') + struct.pack('<2i', 4, 2) + 2 * body)]
+    if version < (3, 0):
+        return kinds
+    kinds += [
         (3, struct.pack('<i', 8) + text('SN8') + struct.pack('<2f', 0.4, 0.6)
             + bytes(12 + 4 * 144 + 4 * 12) + struct.pack('<2i', 0, 0) + channels),
         (4, struct.pack('<i', 9) + text('DAQ') + text('SN9') + bytes(8) + channels),
@@ -197,7 +194,7 @@ def other_descriptions(version):
     return kinds
 
 
-@pytest.mark.parametrize('version', [(3, 0), (3, 1), (4, 0), (4, 1), (4, 2), (4, 3)])
+@pytest.mark.parametrize('version', VERSIONS)
 def test_descriptions_of_other_kinds_are_walked_over(version):
     kinds = other_descriptions(version)
     payload = struct.pack('<i', len(kinds) + 1)
@@ -207,7 +204,10 @@ def test_descriptions_of_other_kinds_are_walked_over(version):
     only_tool = natnet.encode_model_definition(ModelDefinition((tool(version),)), version)
     payload += only_tool[4:]
     definition = natnet.decode_model_definition(payload, version)
-    expected = [(3, 'SN8', 8), (4, 'DAQ', 9), (5, 'Camera 1', None), (6, 'leg', 12)]
+    expected = [
+        *((2, 'person', 4), (3, 'SN8', 8), (4, 'DAQ', 9), (5, 'Camera 1', None)),
+        (6, 'leg', 12),
+    ]
     assert definition.descriptions[:-1] == tuple(
         OtherDescription(*e) for e in expected[: len(kinds)]
     )
