@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Collection, Mapping
 from typing import Any, Protocol, TypeVar
 
@@ -24,14 +23,14 @@ class PlanMemory(Protocol):
     tour: Tour | None
     stop: PoseVisit | None
     trouble: str
+    tours: list[Tour]
     decided: Decided
-    earlier: Counter[str]
 
     def begin(self, tour: Tour, expected: Expected | None = None) -> None:
         """Remember a new tour, and what its fit is expected to state where that is known."""
 
     def open_stop(self, stop: PoseVisit) -> None:
-        """Remember the next stop."""
+        """Go to the next stop, and remember it."""
 
     def leave_rest(self) -> None:
         """Remember that no more poses to fit are visited."""
@@ -236,9 +235,8 @@ class TourProgress:
             # Here, as nothing is being planned; what was proposed may be one of them.
             self._memory.leave_rest()
             return None
-        stop = tour.take(found[0])
-        self._memory.open_stop(stop)
-        return (stop,)
+        self._memory.open_stop(found[0])
+        return found
 
     @property
     def planned(self) -> int:
@@ -246,12 +244,7 @@ class TourProgress:
 
         What is measured further is not among them.
         """
-        tour = self._memory.tour
-        if tour is None or FITTED not in tour.plans:
-            return 0
-        if tour.begin_at:
-            return self._memory.earlier['to_fit']
-        return sum(len(pose.solutions) for pose in tour.plans[FITTED].poses)
+        return sum(tour.to_fit for tour in self._memory.tours if not tour.begin_at)
 
     @property
     def planned_any(self) -> bool:
@@ -278,14 +271,13 @@ class TourProgress:
     def counts(self) -> dict[str, Any]:
         """Return figures of the tour for people."""
         tour, outcomes = self._memory.tour, self.decided.outcomes
-        earlier = self._memory.earlier
+        tours = self._memory.tours
         values: dict[str, Any] = {
             'phase': self.phase,
-            'poses_done': earlier['poses'] + (tour.poses_begun if tour else 0),
-            'poses': earlier['poses'] + (sum(tour.poses.values()) if tour else 0),
+            'poses_done': sum(one.poses_begun for one in tours),
+            'poses': sum(sum(one.poses.values()) for one in tours),
             'configurations_done': sum(outcomes.values()),
-            'configurations': earlier['configurations']
-            + (sum(tour.configurations.values()) if tour else 0),
+            'configurations': sum(sum(one.configurations.values()) for one in tours),
             'references': tour.references if tour else 0,
         }
         tables: dict[str, Mapping[str, int]] = {'outcome': outcomes}

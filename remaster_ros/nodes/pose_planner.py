@@ -78,7 +78,7 @@ from remaster_ros.nodes.status import (
 from remaster_ros.planning.collection_plan import look_ahead, session_time_s
 from remaster_ros.planning.rival_causes import FoundCause
 from remaster_ros.planning.separating_design import MOST_FURTHER
-from remaster_ros.planning.tour_order import FITTED, REGISTRATION, PoseVisit, Tour
+from remaster_ros.planning.tour_order import REGISTRATION, PoseVisit, Tour
 from remaster_ros.planning.tour_planner import REGISTRATION_CANDIDATES, TourPlanner
 from remaster_ros.planning.travel_time import SPEED_SHARE, TravelTime
 from remaster_ros.session.files import read_limited
@@ -139,10 +139,7 @@ class FurtherMeasuring:
 
     def _measured(self) -> int:
         """Return how many configurations were planned for this so far."""
-        tour, count = self._journal.tour, self._journal.earlier['further']
-        if tour is not None and tour.begin_at:
-            count += sum(len(pose.solutions) for pose in tour.plans[FITTED].poses)
-        return count
+        return sum(tour.to_fit for tour in self._journal.tours if tour.begin_at)
 
     def _plan(
         self, causes: tuple[FoundCause, ...], most: int, T_R_N: Mapping[str, FloatArray]

@@ -138,6 +138,11 @@ class Tour:
         self.visited = 0
 
     @property
+    def to_fit(self) -> int:
+        """How many configurations to fit it was planned with."""
+        return sum(len(pose.solutions) for pose in self.plans.get(FITTED, Plan(())).poses)
+
+    @property
     def judges(self) -> Literal['', 'verify', 'check']:
         """What its poses are for, where that is not a calibration: they are all held out."""
         if FITTED not in self.plans or self.plans[FITTED].poses:

@@ -215,11 +215,10 @@ class PlanJournal:
         The tour under way, at the stop where it was; None where there is none.
     stop
         The last stop; None before the first.
+    tours
+        Those of the collection so far, with the one under way; or that for the registration.
     decided
         What the session's journal had of this plan at the beginning.
-    earlier
-        Of the collection's tours before this one: ``poses`` and ``configurations``; ``to_fit``,
-        configurations to fit of the first; ``further``, of those behind it.
     state
         The planner's last state, '' before the first.
     run
@@ -250,8 +249,8 @@ class PlanJournal:
         self._unwritten: deque[Record] = deque()
         self.tour: Tour | None = None
         self.stop: PoseVisit | None = None
+        self.tours: list[Tour] = []
         self.decided = Decided()
-        self.earlier: Counter[str] = Counter()
         if self.path.exists():
             outcomes = read_outcomes(folder)
             self._open()
@@ -272,7 +271,7 @@ class PlanJournal:
             self.id = begun.id
             self._refuse_other_settings(begun.settings)
             for record in records:
-                self._replay(record)
+                self._follow(record)
         except BaseException as error:
             self._journal.close()
             if isinstance(error, (KeyError, IndexError, TypeError, ValueError)):
@@ -293,13 +292,13 @@ class PlanJournal:
                 'with the same to go on, or name a new session folder'
             )
 
-    def _replay(self, record: PlanRecord) -> None:
+    def _follow(self, record: PlanRecord) -> None:
+        """Go on by a record, new or of a planner before this one: both lead to the same state."""
         tour = self.tour
         match record:
             case TourNoted():
-                self._count_earlier()
-                self.stop = None
-                self.tour = record.tour(self._chain, self._model)
+                self.tour, self.stop = record.tour(self._chain, self._model), None
+                self.tours = [*(one for one in self.tours if FITTED in one.plans), self.tour]
             case StopNoted() if tour is not None:
                 self.stop = record.take(tour)
             case RoundNoted() if tour is not None:
@@ -309,24 +308,13 @@ class PlanJournal:
             case StateNoted():
                 self.state, self.run = record.state, record.run
 
-    def _count_earlier(self) -> None:
-        """Count the tour that another one of the collection follows."""
-        tour = self.tour
-        if tour is not None and FITTED in tour.plans:
-            count = sum(len(pose.solutions) for pose in tour.plans[FITTED].poses)
-            self.earlier += Counter(
-                poses=sum(tour.poses.values()),
-                configurations=sum(tour.configurations.values()),
-                to_fit=0 if tour.begin_at else count,
-                further=count if tour.begin_at else 0,
-            )
-
-    def _append(self, record: PlanRecord) -> None:
+    def _note(self, record: PlanRecord) -> None:
         if self._journal is None:
             make_folder(self.path.parent)
             self._journal = self._open()
         self._unwritten.append(to_plain(record))
         self.write_out()
+        self._follow(record)
 
     def write_out(self) -> None:
         """Write what the disk has not taken yet; `trouble` has why it still does not."""
@@ -341,36 +329,31 @@ class PlanJournal:
     def begin(self, tour: Tour, expected: Expected | None = None) -> None:
         """Note a new tour, and what its fit is expected to state where that is known."""
         how = tour.in_order, tour.one_solution, tour.reference_every, tour.order, tour.begin_at
-        self._append(TourNoted(tour.plans, *how))
+        self._note(TourNoted(tour.plans, *how))
         if expected is not None:
-            self._append(ExpectationNoted(dict(expected.joint_std), expected.tool_rms))
-        self._count_earlier()
+            self._note(ExpectationNoted(dict(expected.joint_std), expected.tool_rms))
         # As it was set before there was a file to keep it in.
-        self._append(StateNoted(self.state, self.run))
-        self.tour, self.stop = tour, None
+        self._note(StateNoted(self.state, self.run))
 
     def ask_round(self) -> None:
         """Visit the references next, since a person has changed something; note that."""
         if self.tour is not None and self.tour.references:
-            self._append(RoundNoted())
-            self.tour.ask_round()
+            self._note(RoundNoted())
 
     def leave_rest(self) -> None:
         """Visit no more poses to fit, since enough is known; note that."""
         if self.tour is not None:
-            self._append(EnoughNoted())
-            self.tour.leave_out(FITTED, ENOUGH)
+            self._note(EnoughNoted())
 
     def open_stop(self, stop: PoseVisit) -> None:
-        """Note the next stop, before the arm is sent there."""
-        self._append(StopNoted(stop.split, stop.index, stop.ids, stop.unreached))
-        self.stop = stop
+        """Go to a stop that the tour proposes, and note it, before the arm is sent there."""
+        self._note(StopNoted(stop.split, stop.index, stop.ids, stop.unreached))
 
     def say_state(self, state: str, run: str = '') -> None:
         """Note the planner's state and run, once there is a plan."""
         before, (self.state, self.run) = (self.state, self.run), (state, run)
         if self._journal is not None and before != (state, run):
-            self._append(StateNoted(state, run))
+            self._note(StateNoted(state, run))
 
     def close(self) -> None:
         """Let others go on with the plan."""

@@ -198,8 +198,9 @@ def test_what_is_no_solution_of_the_open_pose_changes_nothing(bench):
 def test_what_no_way_leads_to_is_open_until_the_recorder_has_written_it_down(bench):
     b = bench()
     b.register()
-    other = 1 - b.next().index
-    stop = b.journal.tour.go_to('optimization', other, (), (), (0, 1))
+    b.next()
+    tour = b.journal.tour
+    stop = tour.along(tour.propose(Q), (), (), (0, 1))
     b.journal.open_stop(stop)
     assert b.progress.open_pose.ids == (0, 1)
     for number in (0, 1):
@@ -350,8 +351,7 @@ def test_what_is_measured_further_follows_a_complete_collection_also_after_a_res
     counts = b.progress.counts()
     assert (counts['configurations_done'], counts['configurations']) == (done + 4, done + 4)
     assert (counts['poses_done'], counts['poses']) == (4, 4)
-    assert b.journal.earlier['to_fit'] == planned
-    assert b.journal.earlier['further'] == 0
+    assert [tour.to_fit for tour in b.journal.tours] == [planned, 4]
 
 
 def test_poses_to_judge_by_need_no_registration_and_keep_their_state_over_a_restart(bench):

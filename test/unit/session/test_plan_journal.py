@@ -40,7 +40,7 @@ def killed_at_each_stop(chain, folder, rng, settings=SETTINGS, **tour):
     book.begin(Tour(chain, **tour))
     plan_id, q = book.id, np.zeros(len(chain))
     while (wanted := one_run.next(q)) is not None:
-        stop = book.tour.next(q)
+        stop = book.tour.propose(q)
         book.open_stop(stop)
         assert (stop.pose, stop.split, stop.ids) == (wanted.pose, wanted.split, wanted.ids)
         yield book, one_run
@@ -121,7 +121,7 @@ def test_another_plan_is_refused(chain, tmp_path, settings, problem):
 def test_a_torn_line_is_dropped_and_a_damaged_one_refused(chain, tmp_path):
     book = PlanJournal(tmp_path, SETTINGS, chain)
     book.begin(Tour(chain, {'optimization': plan_of(chain, 1, 2, 2)}))
-    stop = book.tour.next(np.zeros(len(chain)))
+    stop = book.tour.propose(np.zeros(len(chain)))
     book.open_stop(stop)
     book.say_state('running', 'abc')
     book.close()
@@ -139,7 +139,7 @@ def test_a_torn_line_is_dropped_and_a_damaged_one_refused(chain, tmp_path):
 def test_what_a_full_disk_does_not_take_is_kept(chain, tmp_path, full_disk):
     book = PlanJournal(tmp_path, SETTINGS, chain)
     book.begin(Tour(chain, {'optimization': plan_of(chain, 1, 2, 2)}))
-    stop = book.tour.next(np.zeros(len(chain)))
+    stop = book.tour.propose(np.zeros(len(chain)))
     with full_disk():
         book.open_stop(stop)
         book.say_state('running', 'abc')
@@ -158,7 +158,8 @@ def test_what_no_way_leads_to_and_what_was_dropped_survive_a_restart(chain, tmp_
     plan = replace(plan_of(chain, 1, 2, 4), dropped_solutions={'self-collision': 3})
     book = PlanJournal(tmp_path / 'session', SETTINGS, chain)
     book.begin(Tour(chain, {'optimization': plan}))
-    stop = book.tour.go_to('optimization', 0, [2, 0], (), [1, 3])
+    q = np.zeros(len(chain))
+    stop = book.tour.along(book.tour.propose(q), [2, 0], (), [1, 3])
     book.open_stop(stop)
     book.close()
     book = PlanJournal(tmp_path / 'session', SETTINGS, chain)
