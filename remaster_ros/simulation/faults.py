@@ -3,69 +3,6 @@
 ``faults.json`` maps a device (``robot`` or a sensor's name) to its faults, and each fault to its
 number: ``{"robot": {"slow": 3.0}, "mocap": {"frozen": 1}}``. The fakes look at it all the time, so
 a fault begins and ends with the file.
-
-The robot:
-
-=================  =====================================================
-``off``            reports nothing and takes no command
-``dropped``        takes no command
-``estop``          stands still at once and takes no command
-``estop_reported`` the same, and its safety circuit reports it
-``elsewhere``      goes so many rad beside its target, at every joint (a slide 0.25 m for each)
-``slow``           needs so many times as long
-``late``           reports what was so many seconds ago
-``intermittent``   is off every other period of so many seconds
-``nan``            reports a joint that is not a number
-``renamed``        reports joints of other names
-``reordered``      reports the joints in another order each time
-``drift``          creeps to and fro by so many rad
-``copy``           reports what was commanded
-``clock``          has a clock that is off by so many seconds
-``lost``           every n-th report arrives, the others are lost
-``doubled``        sends every report twice
-``repeated``       sends the last report again and again, with its old stamp
-``frozen``         reports where it was when the fault began, with new stamps
-``wrapped``        reports the joint of this number (from 1) a turn too far
-``wrapped_once``   the same, in one report
-=================  =====================================================
-
-An OptiTrack server:
-
-=================  =====================================================
-``off``            neither streams nor answers
-``stopped``        answers, but does not stream
-``frozen``         streams new frames with old positions
-``swapped``        labels a stray as the marker
-``jumping``        shows the marker half a metre off in every fourth frame
-``occluded``       does not see the marker
-``hidden``         does not see the marker of this number in the rigid body
-``exchanged``      takes the marker of this number for the first one, and the other way round
-``filled``         guesses where the marker is
-``slow``           streams every n-th frame
-``late``           streams frames so many seconds late
-``intermittent``   does not see the marker every other period of so many seconds
-``garbage``        streams random bytes
-``duplicate``      sends every frame twice
-``reordered``      sends every second frame before the first
-``renumbered``     begins the frame numbers and the time anew, once
-``bumped``         has been moved by so many metres, across its line of sight
-=================  =====================================================
-
-A laser tracker:
-
-=================  =====================================================
-``off``            refuses connections and drops its client
-``stuck``          answers nothing
-``swapped``        measures another reflector, so many metres beside
-``slow``           needs so many times as long for everything
-``garbage``        sends random bytes
-``cut``            breaks off each packet after so many bytes
-``intermittent``   loses the beam every other period of so many seconds
-``occluded``       sees no reflector
-``hidden``         does not see the reflector of this number
-``renumbered``     has been switched off and on, once
-``bumped``         has been moved by so many metres, across its line of sight
-=================  =====================================================
 """
 
 from __future__ import annotations
@@ -79,27 +16,70 @@ from remaster_ros.errors import InputError, did_you_mean
 
 Numbers = Mapping[str, float]
 FILE = 'faults.json'
-OF_ROBOT = (
-    *('off', 'dropped', 'estop', 'estop_reported', 'elsewhere', 'slow', 'late', 'intermittent'),
-    *('nan', 'renamed', 'reordered', 'drift', 'copy', 'clock', 'lost', 'doubled', 'repeated'),
-    *('frozen', 'wrapped', 'wrapped_once'),
-)
-OF_OPTITRACK = (
-    *('off', 'stopped', 'frozen', 'swapped', 'jumping', 'occluded', 'hidden', 'exchanged'),
-    *('filled', 'slow', 'late', 'intermittent', 'garbage', 'duplicate', 'reordered'),
-    *('renumbered', 'bumped'),
-)
-OF_TRACKER = (
-    *('off', 'stuck', 'swapped', 'slow', 'garbage', 'cut', 'intermittent', 'occluded', 'hidden'),
-    *('renumbered', 'bumped'),
-)
-"""What the fakes know, as above."""
+# What the fakes know, and what each does with its number.
+# The robot:
+OF_ROBOT = {
+    'off': 'reports nothing and takes no command',
+    'dropped': 'takes no command',
+    'estop': 'stands still at once and takes no command',
+    'estop_reported': 'the same, and its safety circuit reports it',
+    'elsewhere': 'goes so many rad beside its target, at every joint (a slide 0.25 m for each)',
+    'slow': 'needs so many times as long',
+    'late': 'reports what was so many seconds ago',
+    'intermittent': 'is off every other period of so many seconds',
+    'nan': 'reports a joint that is not a number',
+    'renamed': 'reports joints of other names',
+    'reordered': 'reports the joints in another order each time',
+    'drift': 'creeps to and fro by so many rad',
+    'copy': 'reports what was commanded',
+    'clock': 'has a clock that is off by so many seconds',
+    'lost': 'every n-th report arrives, the others are lost',
+    'doubled': 'sends every report twice',
+    'repeated': 'sends the last report again and again, with its old stamp',
+    'frozen': 'reports where it was when the fault began, with new stamps',
+    'wrapped': 'reports the joint of this number (from 1) a turn too far',
+    'wrapped_once': 'the same, in one report',
+}
+# An OptiTrack server:
+OF_OPTITRACK = {
+    'off': 'neither streams nor answers',
+    'stopped': 'answers, but does not stream',
+    'frozen': 'streams new frames with old positions',
+    'swapped': 'labels a stray as the marker',
+    'jumping': 'shows the marker half a metre off in every fourth frame',
+    'occluded': 'does not see the marker',
+    'hidden': 'does not see the marker of this number in the rigid body',
+    'exchanged': 'takes the marker of this number for the first one, and the other way round',
+    'filled': 'guesses where the marker is',
+    'slow': 'streams every n-th frame',
+    'late': 'streams frames so many seconds late',
+    'intermittent': 'does not see the marker every other period of so many seconds',
+    'garbage': 'streams random bytes',
+    'duplicate': 'sends every frame twice',
+    'reordered': 'sends every second frame before the first',
+    'renumbered': 'begins the frame numbers and the time anew, once',
+    'bumped': 'has been moved by so many metres, across its line of sight',
+}
+# A laser tracker:
+OF_TRACKER = {
+    'off': 'refuses connections and drops its client',
+    'stuck': 'answers nothing',
+    'swapped': 'measures another reflector, so many metres beside',
+    'slow': 'needs so many times as long for everything',
+    'garbage': 'sends random bytes',
+    'cut': 'breaks off each packet after so many bytes',
+    'intermittent': 'loses the beam every other period of so many seconds',
+    'occluded': 'sees no reflector',
+    'hidden': 'does not see the reflector of this number',
+    'renumbered': 'has been switched off and on, once',
+    'bumped': 'has been moved by so many metres, across its line of sight',
+}
 
 
 def inject(folder: Path, faults: Mapping[str, Numbers]) -> None:
     """Replace the faults of the World in `folder`; with none, all end."""
     for device, numbers in faults.items():
-        known = OF_ROBOT if device == 'robot' else dict.fromkeys((*OF_OPTITRACK, *OF_TRACKER))
+        known = OF_ROBOT if device == 'robot' else OF_OPTITRACK | OF_TRACKER
         for name in numbers:
             if name not in known:
                 raise InputError(

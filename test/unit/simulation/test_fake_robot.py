@@ -1,14 +1,11 @@
 """The fake arm takes and drops trajectories as joint_trajectory_controller does."""
 
-import re
-
 import numpy as np
 import pytest
 
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.session.workcell import config_path
-from remaster_ros.simulation import faults
 from remaster_ros.simulation.arm_motion import ServoPoint
 from remaster_ros.simulation.faults import inject
 from remaster_ros.simulation.robot import FakeArm
@@ -163,14 +160,6 @@ def test_a_fault_that_no_fake_knows_is_refused(tmp_path):
     with pytest.raises(InputError, match="no fault 'occluded' of robot; there are off, dropped"):
         inject(tmp_path, {'robot': {'occluded': 1}})
     assert not any(tmp_path.iterdir())
-
-
-def test_the_faults_that_are_known_are_those_of_the_tables():
-    tables = [
-        re.findall(r'^``(\w+)``', part, re.MULTILINE)
-        for part in re.split('An OptiTrack server|A laser tracker', faults.__doc__)
-    ]
-    assert tables == [[*faults.OF_ROBOT], [*faults.OF_OPTITRACK], [*faults.OF_TRACKER]]
 
 
 def test_a_joint_that_is_a_turn_off(world, arm):
