@@ -12,6 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
+from remaster_ros.simulation.optitrack import FakeOptiTrackServer
+
 RATE = 10.0
 SENSOR = 'mocap'
 
@@ -89,3 +91,13 @@ def nothing_left() -> Iterator[None]:
     yield
     assert set(threading.enumerate()) <= threads
     assert _descriptors() <= descriptors
+
+
+class WatchedServer(FakeOptiTrackServer):
+    """A server whose last frame a forger may look at."""
+
+    latest = None
+
+    def _distribute(self, frame):
+        self.latest = frame
+        super()._distribute(frame)

@@ -384,7 +384,6 @@ class FakeOptiTrackServer:
         self._lock = threading.Lock()
         self._closing = threading.Event()
         self._threads: list[threading.Thread] = []
-        self._latest: Frame | None = None
 
     @property
     def command_port(self) -> int:
@@ -453,7 +452,7 @@ class FakeOptiTrackServer:
             # Before the wait: time that stood until this frame is sent would never get there.
             self._world.kept_up(self._sensor, due_s)
             self._world.sleep_until(due_s)
-            self._latest = frame = self._scene.frame(number, self._version, due_s)
+            frame = self._scene.frame(number, self._version, due_s)
             for message in self._spoiler.spoil(frame, self._world.faults(self._sensor)):
                 self._distribute(message)
 
@@ -493,8 +492,6 @@ class FakeOptiTrackServer:
             return [self._obey(request.text, address)]
         if request.id == MessageId.REQUEST_MODELDEF:
             return [self._scene.model]
-        if request.id == MessageId.REQUEST_FRAMEOFDATA:
-            return [self._latest] if self._latest is not None else [_UNRECOGNIZED]
         if request.id == MessageId.ECHOREQUEST:
             ticks = self._scene.ticks(self._world.now())
             return [natnet.EchoResponse(request.clock, ticks)]
@@ -526,8 +523,6 @@ class FakeOptiTrackServer:
     def _obey(self, command: str, address: Address) -> Message:
         """Answer a REQUEST."""
         name, _, argument = command.partition(',')
-        if name == 'FrameRate':
-            return natnet.Response(np.float32(self._rate_hz).tobytes())
         if name != 'Bitstream':
             return _UNRECOGNIZED
         if argument:
