@@ -38,16 +38,36 @@ def arguments_of(tmp_path):
     return {path.stem: path.read_text().split() for path in tmp_path.glob('[a-z]*.arguments')}
 
 
-def test_each_test_file_is_in_one_group(run, tmp_path):
-    assert run('-k', 'name') == 0
+@pytest.mark.parametrize('qualify', [False, True])
+def test_each_test_file_is_in_one_group(run, tmp_path, qualify):
+    assert run(*['--qualify'][: int(qualify)], '-k', 'name') == 0
     groups = arguments_of(tmp_path)
     assert set(groups) == set(GROUPS)
     assert all(arguments[-2:] == ['-k', 'name'] for arguments in groups.values())
     paths = {group: [w for w in groups[group] if w.startswith('test/')] for group in GROUPS}
     left_out = [word.split('=')[1] for word in groups['others'] if word.startswith('--ignore=')]
     assert paths['motion'] == left_out
-    assert all((ROOT / path).exists() for path in left_out)
-    assert paths['others'] == ['test/system', 'test/integration', 'test/unit']
+    assert all((ROOT / path).is_file() for path in left_out)
+    folders = ['test/system', 'test/integration', 'test/unit']
+    assert paths['others'] == ['test/qualification'] * qualify + folders
+    assert all(any(f'{folder}/' in path for folder in paths['others']) for path in left_out)
+
+
+def test_campaigns_and_their_folder_are_left_to_qualify(run, tmp_path):
+    assert run() == 0
+    for words in arguments_of(tmp_path).values():
+        assert '-m' not in words[2:]
+        assert not any('test/qualification' in word for word in words)
+    assert run('--qualify') == 0
+    groups = arguments_of(tmp_path)
+    assert all('-m' in words[2:] for words in groups.values())
+    assert 'test/qualification/test_watching.py' in groups['motion']
+
+
+def test_files_that_are_named_run_alone_with_their_campaigns(run, tmp_path):
+    assert run('--qualify', 'test/unit/test_run_tests.py', chosen=1) == 1
+    (words,) = arguments_of(tmp_path).values()
+    assert words[-2:] == ['-m', 'test/unit/test_run_tests.py']
 
 
 @pytest.mark.parametrize('group', GROUPS)
@@ -68,6 +88,6 @@ def test_files_that_are_named_run_alone(run, tmp_path):
 
 
 def test_no_two_test_modules_have_one_name():
-    """Make qualify collects all of them in one process, which refuses a name that comes twice."""
+    """Make qualify collects all folders in one process, which refuses a name that comes twice."""
     names = [path.name for path in (ROOT / 'test').rglob('test_*.py')]
     assert sorted(names) == sorted(set(names))
