@@ -59,12 +59,19 @@ def test_no_move_hits_anything(judged):
     assert [i for i, path in enumerate(moves) if collides(judge, path)[0]] == []
 
 
+# Where joint 2 has the arm upright, degrees, and what it then has around it at least, m. At zero
+# the 6R lies level and in the floor; its shoulder passes its base at 1 mm.
+UPRIGHT = {'six': (-90.0, 0.9e-3)}
+
+
 def test_the_judge_finds_what_is_there(judged):
-    """Else the test above could not fail: straight through the floor, and back."""
+    """Else the test above could not fail: from upright straight through the floor, and back."""
     cell, judge = judged
     chain = cell.chain()
-    down = np.zeros(len(chain))
+    joint_2_deg, room_m = UPRIGHT.get(chain.name, (0.0, 0.01))
+    upright, down = np.zeros((2, len(chain)))
+    upright[1] = np.deg2rad(joint_2_deg)
     down[1] = np.deg2rad(119.0)
-    assert judge.distance(np.zeros(len(chain))) > 0.01
-    assert collides(judge, np.array([np.zeros(len(chain)), down]))[0]
-    assert not collides(judge, np.array([np.zeros(len(chain)), 0.3 * down]))[0]
+    assert judge.distance(upright) > room_m
+    assert collides(judge, np.array([upright, upright + down]))[0]
+    assert not collides(judge, np.array([upright, upright + 0.3 * down]))[0]
