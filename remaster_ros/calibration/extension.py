@@ -85,26 +85,26 @@ class Extension:
         shift += self.displacement0[rows]
         return shift
 
-    def derivative(self, by_joints: FloatArray, base: FloatArray, rows: IntArray) -> FloatArray:
-        """Return the derivative of n points by theta, m per unit, (n, 3, m).
+    def derivative(
+        self, by_joints: FloatArray, turn: FloatArray, rows: IntArray, result: FloatArray
+    ) -> None:
+        """Add the derivative of n points by theta, m per unit, to ``result``, (n, 3, m).
 
         Parameters
         ----------
         by_joints
             Derivative of the points by the joint angles, m/rad, (n, 3, k).
-        base
+        turn
             Rotation that displacements are turned by, (3, 3).
         rows
             Their indices in the measurements, (n,).
         """
-        result = np.zeros((len(rows), 3, len(self.theta0)))
         for term in self.terms:
-            values = term.values[rows]
+            part, values = result[:, :, term.where], term.values[rows]
             if term.at is None:
-                result[:, :, term.where] += base @ values
+                part += np.einsum('ij,njc->nic', turn, values)
             else:
-                result[:, :, term.where] += by_joints[:, :, term.at, None] * values[:, None, :]
-        return result
+                part += by_joints[:, :, term.at, None] * values[:, None, :]
 
 
 def _product(values: FloatArray, theta: FloatArray) -> FloatArray:

@@ -46,7 +46,7 @@ AS_GOOD_AS_SEEN = 2.0
 # Entries of a direction below this share of its largest are rounding errors.
 NEGLIGIBLE = 1e-5
 # Rows whose derivatives are at hand at a time.
-BLOCK_ROWS = 5_000
+BLOCK_ROWS = 2_000
 
 
 @dataclass(frozen=True)

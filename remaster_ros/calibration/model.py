@@ -393,14 +393,11 @@ class Model:
     def _derivative(self, offsets: FloatArray, x: FloatArray, rows: Rows) -> FloatArray:
         derivative = np.zeros((len(rows.q), 3, self.size))
         tool, points, axes, by_joints = self._pose(offsets, x, rows)
-        by_theta = None
-        if self.extension is not None:
-            base = self._moved_by_first(offsets[0])[:3, :3]
+        base, turned = self._moved_by_first(offsets[0])[:3, :3], by_joints
+        if self.extension is not None and not self.chain.slides[0]:
             # The joints themselves turn under the displacements.
             turned = by_joints.copy()
-            if not self.chain.slides[0]:
-                turned[..., 0] -= np.cross(self.base_axis[1], self._extended(x, rows)[1] @ base.T)
-            by_theta = self.extension.derivative(turned, base, rows.source)
+            turned[..., 0] -= np.cross(self.base_axis[1], self._extended(x, rows)[1] @ base.T)
         correction = self.corrections(x)
         for index, span in rows.spans:
             sensor = self._sensor(rows, index)
@@ -428,8 +425,11 @@ class Model:
                 lever = self.R_T_B(x)[rows.body[span]] @ rows.lever[span][..., None]
                 arms = -by_marker @ _cross_matrix(lever[..., 0])
                 self._by_bodies(derivative, x, rows, span, arms)
-            if by_theta is not None:
-                derivative[span, :, self.core :] = turn @ by_theta[span]
+            if self.extension is not None:
+                by_theta = derivative[span, :, self.core :]
+                self.extension.derivative(
+                    turn @ turned[span], turn @ base, rows.source[span], by_theta
+                )
         if rows.turned is not None:
             # d log(exp(w) exp(v)) = J_l(v)⁻¹ w for a small turn w.
             end = rows.points

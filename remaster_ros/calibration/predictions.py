@@ -41,7 +41,7 @@ from remaster_ros.types import BoolArray, FloatArray, IntArray, Measurements
 
 REGION = 0.95
 # Rows whose derivatives are at hand at a time.
-BLOCK_ROWS = 5_000
+BLOCK_ROWS = 2_000
 # So many poses determine the factor, with so many rows of each.
 MOST_POSES = 1_000
 MOST_ROWS = 60

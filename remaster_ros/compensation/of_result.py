@@ -41,6 +41,8 @@ from remaster_ros.types import FloatArray, Measurements
 
 # Each takes away all of the difference but for what is of its second order.
 EXACT_STEPS = 2
+# Rows that the difference is taken from; of more, every second, every third, …
+MOST_ROWS = 3_000
 _DRIVERS: dict[str, Driver] = {
     'own_angle': 'angle',
     'angle': 'angle',
@@ -160,10 +162,8 @@ def geometry_too(
     return _described(beside, geometry.members, theta, None, widening)
 
 
-def everything(
-    fit: FitResult, cells: Sequence[Cell], data: Residuals, widening: float
-) -> Described:
-    """Return the arm of a sampled model with effects.
+def everything(fit: FitResult, cells: Sequence[Cell], data: Residuals) -> Described:
+    """Return the arm of a sampled model with effects; its predictions are not widened.
 
     Parameters
     ----------
@@ -173,10 +173,8 @@ def everything(
         Of the model, in that order.
     data
         What was searched.
-    widening
-        Of predictions, see `calibration.predictions`.
     """
-    return _described(fit, cells, fit.theta, data, widening)
+    return _described(fit, cells, fit.theta, data, 1.0)
 
 
 def corrected_residuals(
@@ -285,7 +283,7 @@ def _as_predicted(
     z = fit.predictive.after.copy()
     for where in measured:
         z[fit.predictive.model.core :][where] = 0.0
-    rows = problem.fitted
+    rows = problem.fitted[:: 1 + len(problem.fitted) // MOST_ROWS]
     m = problem.measurements.select(rows)
     expected = predicted_rows(problem, fit.predictive.model, z)[rows]
     for _ in range(EXACT_STEPS):

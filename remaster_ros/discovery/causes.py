@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
+from functools import cached_property
 
 import numpy as np
 
@@ -65,8 +66,7 @@ class Search:
         cells: Sequence[Cell],
         progress: Callable[[float], None] = lambda share: None,
     ) -> None:
-        self.data = data
-        self.catalogue = Catalogue.of(data, cells)
+        self.data, self.cells = data, tuple(cells)
         self.progress = progress
         self.families = []
         for names in FAMILIES:
@@ -75,6 +75,15 @@ class Search:
                 family = Family.of(data, f'all of {names[0]}', members)
                 self.families += [family] if family is not None else []
         self._fits: dict[frozenset[Cell], Solution | None] = {}
+
+    @cached_property
+    def catalogue(self) -> Catalogue:
+        """All that is tried, with its columns: most of the memory of a search; see `let_go`."""
+        return Catalogue.of(self.data, self.cells)
+
+    def let_go(self) -> None:
+        """Let go of the columns of all that is tried; fits need none of them."""
+        self.__dict__.pop('catalogue', None)
 
     def run(self) -> Solution:
         """Return the fit with the causes, families as their one cell."""
@@ -94,7 +103,8 @@ class Search:
 
         What happened at one moment is dated again: the rows beside it may have been left out.
         """
-        search = Search(data, self.catalogue.cells, self.progress)
+        self.let_go()
+        search = Search(data, self.cells, self.progress)
         families = {family.cell.name: family.cell for family in search.families}
         cells = [families.get(cell.name, cell) for cell in solution.cells]
         fitted = search.fit(cells, solution)
@@ -144,7 +154,7 @@ class Search:
         score = screen(self.data, self.catalogue, rest, chosen=chosen, known_noise=known_noise)
         for index in np.argsort(-score)[:SHORTLIST]:
             if np.isfinite(score[index]) and rest.log_evidence + score[index] > least - NEEDED:
-                found = self.fit((*rest.cells, self.catalogue.cells[index]), rest)
+                found = self.fit((*rest.cells, self.cells[index]), rest)
                 if found is not None:
                     yield found
 
@@ -158,7 +168,7 @@ class Search:
         """Return the fit with moments that none nearby is better than."""
         for _ in range(MOST_STEPS):
             before = [cell.moment for cell in solution.cells]
-            solution = refine_moments(solution, self.catalogue.cells, self.data.part, self.fit)
+            solution = refine_moments(solution, self.cells, self.data.part, self.fit)
             if np.array_equal(before, [cell.moment for cell in solution.cells], equal_nan=True):
                 break
         return solution
@@ -169,7 +179,7 @@ class Search:
         order = np.argsort(-score)[:SHORTLIST].tolist()
         # Structure hides in the noise common to a pose, and shows when that is estimated again.
         order += [i for i in np.flatnonzero(self.catalogue.structure) if i not in order]
-        cells = [self.catalogue.cells[i] for i in order if np.isfinite(score[i])]
+        cells = [self.cells[i] for i in order if np.isfinite(score[i])]
         cells += [one.cell for one in self.families if one.cell not in solution.cells]
         return _best([self.fit((*solution.cells, cell), solution) for cell in cells])
 
@@ -182,7 +192,7 @@ class Search:
             if rest is None:
                 continue
             names = {member.name for member in family.members}
-            kind = self.catalogue.cheap & [c.name in names for c in self.catalogue.cells]
+            kind = self.catalogue.cheap & [c.name in names for c in self.cells]
             single = _best([self._grown(rest, kind), self._grown(rest, self.catalogue.cheap)])
             if single is not None and single.log_evidence > solution.log_evidence - NEEDED:
                 solution = single
@@ -205,7 +215,7 @@ class Search:
         """
         for cell in solution.cells:
             shapes = self.catalogue.cheap & [
-                is_special_case(other, cell) for other in self.catalogue.cells
+                is_special_case(other, cell) for other in self.cells
             ]
             if shapes.any():
                 least = solution.log_evidence - NEEDED

@@ -38,7 +38,7 @@ from remaster_ros.discovery.geometry_model import GeometryModel, geometry_model
 from remaster_ros.discovery.guard import Unexplained, harm_of, is_harmful, nameless, unfitted
 from remaster_ros.discovery.marker_offsets import loosened, moved_markers
 from remaster_ros.discovery.omnibus import beyond_noise, structure_left
-from remaster_ros.discovery.random_effects import Family, by_members, fit_kinds, kinds
+from remaster_ros.discovery.random_effects import Family, by_members, fit_kinds, kinds, with_kinds, without_nothing
 from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.discovery.solution import Solution
 from remaster_ros.discovery.thinning import Thinning, draw_rows, judge_by_others
@@ -192,6 +192,7 @@ def discover_session(
     if (judged := _judged(found, residuals, named, search, pool)) is not residuals:
         search, named = search.again(judged, named)
     named, groups, described = _that_help(search, named, report)
+    search.let_go()
     unexplained: tuple[Unexplained, ...] = ()
     sampled: _Sampled | None = None
     # Kinds that nobody named may be what does harm, or what the poses do not determine. Where
@@ -406,13 +407,12 @@ class _Beside:
         """All kinds of errors without the members that have a name."""
         search = self.search
         members = by_members(self.named, search.families).cells
-        return kinds(search.data, search.catalogue.cells, members)
+        return kinds(search.data, search.cells, members)
 
     @cached_property
     def fit(self) -> Solution | None:
-        """The fit of causes and kinds; None without kinds, or where they agree with a cause."""
-        every = (*self.named.cells, *(family.cell for family in self.kinds))
-        return solve(self.search.data, every, self.named) if self.kinds else None
+        """The fit of the causes with these; None where they agree with a cause."""
+        return with_kinds(self.search.data, self.named, self.kinds)
 
 
 def of_all_kinds(beside: _Beside) -> Solution | None:
@@ -424,12 +424,13 @@ def of_all_kinds(beside: _Beside) -> Solution | None:
     nothing is beside these (one joint errs and no other), or where nothing is there at all.
     """
     search, named = beside.search, beside.named
-    data, cells = search.data, search.catalogue.cells
+    data, cells = search.data, search.cells
     of_a_kind = {name for family in kinds(data, cells) for name in family.parameters}
+    members = by_members(named, search.families).cells
     # A curve has a smoothness of its own: that of all together fits none of them.
     own = [
         cell
-        for cell in by_members(named, search.families).cells
+        for cell in members
         if cell.penalty is not None or not of_a_kind.issuperset(cell.parameters)
     ]
     every = kinds(data, cells, own)
@@ -441,7 +442,9 @@ def of_all_kinds(beside: _Beside) -> Solution | None:
         both = beside.fit
         if both is None or both.log_evidence < named.log_evidence + NEEDED:
             return None
-    return by_members(whole, every)
+    of_a_name = {name for cell in members for name in cell.parameters}
+    unnamed = [family for family in every if of_a_name.isdisjoint(family.parameters)]
+    return by_members(without_nothing(whole, unnamed, len(data)), every)
 
 
 def by_names(found: Estimate, beside: _Beside) -> tuple[Solution, FloatArray]:
@@ -452,14 +455,12 @@ def by_names(found: Estimate, beside: _Beside) -> tuple[Solution, FloatArray]:
     """
     data = beside.search.data
     members = by_members(beside.named, beside.search.families)
-    if beside.fit is None:
+    weights = {} if beside.fit is None else beside.fit.weight_precisions()
+    shown = [family.cell for family in beside.kinds if family.cell in weights]
+    if not shown:
         return members, np.zeros((found.model.size + len(members.parameters), 0))
-    weights = beside.fit.weight_precisions()
-    unseen = np.concatenate(
-        [data.columns([family.cell]) * weights[family.cell] ** -0.5 for family in beside.kinds],
-        axis=2,
-    )
-    return members, moved_by(found, data, members, unseen)
+    unseen = [data.columns([cell]) * weights[cell] ** -0.5 for cell in shown]
+    return members, moved_by(found, data, members, np.concatenate(unseen, axis=2))
 
 
 def _judged(

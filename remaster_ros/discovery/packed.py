@@ -32,9 +32,9 @@ def of_rows(rows: FloatArray, first: int) -> FloatArray:
 
 
 def picked(matrices: FloatArray, order: IntArray) -> FloatArray:
-    """Return packed matrices (m, length) with rows and columns in some order, (size,)."""
+    """Return packed matrices (m, length) with rows and columns in some order, (size,), to read."""
     if np.array_equal(order, np.arange(len(order))):
-        return matrices[:, : length(len(order))].copy()
+        return matrices[:, : length(len(order))]
     i, j = _half(len(order))
     one, other = order[i], order[j]
     high = np.maximum(one, other)

@@ -24,8 +24,9 @@ from remaster_ros.calibration.noise import Noise
 from remaster_ros.discovery.effects.base import RANDOM, Cell, Design
 from remaster_ros.discovery.effects.context import Context
 from remaster_ros.discovery.effects.registry import EFFECTS
-from remaster_ros.discovery.evidence import solve
+from remaster_ros.discovery.evidence import GAIN, solve
 from remaster_ros.discovery.residuals import Residuals
+from remaster_ros.discovery.screening import rises
 from remaster_ros.discovery.solution import Covariances, Solution
 from remaster_ros.types import FloatArray
 
@@ -37,6 +38,10 @@ LEAST_SHARE = 1e-7
 # Share of the offsets model's errors that is noise, where the rest is of the arm: a search for the
 # likelihood's maximum begins there as well as at one.
 SMALL_NOISE = 0.3
+# With so many numbers measured for each member there is one maximum of the likelihood, and kinds
+# of more than so many weights are looked at after the others: they are most of all columns, and
+# most of them have no variance.
+MANY_ROWS, FEW_WEIGHTS = 2.0, 50
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,11 +157,16 @@ def fit_kinds(
     """Fit cells and all members of some kinds; None where they cannot be distinguished.
 
     The likelihood has two maxima where rows are few: errors are noise, or they are all of the arm
-    and the noise is small. Newton's steps go to the nearer one, so they begin at either.
+    and the noise is small. Newton's steps go to the nearer one, so they begin at either. Where rows
+    are many, kinds with many members have a variance only where it raises the likelihood.
     """
-    every = (*cells, *(family.cell for family in families))
+    at_once, later = list(families), []
+    if 3 * len(data) > MANY_ROWS * sum(family.cell.size for family in families):
+        at_once = [family for family in families if family.cell.size <= FEW_WEIGHTS]
+        later = [family for family in families if family.cell.size > FEW_WEIGHTS]
+    every = (*cells, *(family.cell for family in at_once))
     found = solve(data, every)
-    if found is None or not families:
+    if found is None or not at_once:
         return found
     noise, least = data.noise, SMALL_NOISE
     quiet = Noise(least * noise.sigma, least * noise.pose_sigma, least * noise.frame_sigma)
@@ -164,7 +174,41 @@ def fit_kinds(
     shared = [variance**-1.0 if cell.form == RANDOM else np.nan for cell in found.cells]
     start = replace(found, noise=quiet, smoothness=np.array(shared))
     other = solve(data, every, start)
-    return found if other is None or other.log_evidence < found.log_evidence else other
+    best = found if other is None or other.log_evidence < found.log_evidence else other
+    return with_kinds(data, best, later)
+
+
+def with_kinds(data: Residuals, solution: Solution, families: Sequence[Family]) -> Solution | None:
+    """Return a fit with those of some kinds beside it that raise the likelihood.
+
+    None where they cannot be distinguished from what is there.
+    """
+    left = list(families)
+    while left:
+        shown = rises(data, solution, [family.cell for family in left])
+        if not any(shown):
+            break
+        more = [family.cell for family, so in zip(left, shown, strict=True) if so]
+        found = solve(data, (*solution.cells, *more), solution)
+        if found is None:
+            return None
+        solution, left = found, [f for f, so in zip(left, shown, strict=True) if not so]
+    return solution
+
+
+def without_nothing(solution: Solution, families: Sequence[Family], rows: int) -> Solution:
+    """Return a fit without those of some families that the likelihood does not show.
+
+    To within what Newton's steps leave of it (`GAIN`) these have a variance of nothing, and
+    hundreds of members that all that is computed later on would carry along.
+    """
+    for family in families:
+        if family.cell in solution.cells:
+            index = solution.cells.index(family.cell)
+            evidence = solution.evidence_without(index, rows)
+            if evidence > solution.log_evidence - GAIN:
+                solution = solution.less(index, evidence)
+    return solution
 
 
 def by_members(solution: Solution, families: Sequence[Family]) -> Solution:

@@ -32,8 +32,9 @@ ROUNDING = 1e-8
 # With more unpenalised parameters than this share of the numbers measured nothing is left to judge
 # the noise by.
 MOST_PARAMETERS = 0.75
-# Bytes of displacements that are kept for the next fit; only those of large sessions are more.
-KEPT_BYTES = 1 << 28
+# Bytes of displacements, and of Gram matrices, that are kept for the next fit; only those of large
+# sessions are more.
+KEPT_BYTES = 1 << 27
 # Gram matrices of so many sets are kept: of the set so far, and of families beside it.
 KEPT_GRAMS = 4
 
@@ -205,13 +206,13 @@ class Residuals:
 
         A search fits parts of them, and them with a cell more.
         """
-        return [((), *self._more_grams((), 0))]
+        return [((), *self._grams_of((), np.empty((1, 0)), 0))]
 
     def gram_matrices(self, cells: Sequence[Cell]) -> tuple[FloatArray, FloatArray]:
         """Return norms and Gram matrices of the base columns, of cells, and of the errors.
 
         Norms over all rows, (p + c + 1,); `packed` matrices of each error group of the noise
-        model, with the columns of cells in their units (`units`), (groups, length); a copy.
+        model, with the columns of cells in their units (`units`), (groups, length), to read.
         """
         wanted = set(cells)
         known, norms, grams = max(
@@ -221,10 +222,10 @@ class Residuals:
             part = [cell for cell in known if cell in wanted]
             chosen = self._positions(known, part)
             known = (*part, *(cell for cell in cells if cell not in part))
-            norms, more = self._more_grams(known, len(chosen))
-            grams = np.concatenate((packed.picked(grams, chosen), more), axis=1)
+            norms, grams = self._grams_of(known, packed.picked(grams, chosen), len(chosen))
             self._grams.insert(0, (known, norms, grams))
-            del self._grams[KEPT_GRAMS:]
+            sizes = np.cumsum([kept.nbytes for _, _, kept in self._grams])
+            del self._grams[max(1, min(KEPT_GRAMS, int(np.sum(sizes < KEPT_BYTES)))) :]
         p = self.base.shape[2]
         order = np.append(np.delete(self._positions(known, cells), p), p)
         return norms[order], packed.picked(grams, order)
@@ -236,15 +237,24 @@ class Residuals:
         parts = [np.arange(first[cell], first[cell] + cell.size) for cell in cells]
         return np.concatenate([np.arange(count), *parts])
 
-    def _more_grams(self, cells: Sequence[Cell], known: int) -> tuple[FloatArray, FloatArray]:
-        """Return the norms of base, errors and cells, and the Gram matrices but the known part."""
+    def _grams_of(
+        self, cells: Sequence[Cell], first: FloatArray, known: int
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return norms and Gram matrices of base, errors and cells; of so many columns known."""
         p = self.base.shape[2]
         columns = self.base, self.errors[:, :, None], self.columns(cells)
         joined = np.concatenate(columns, axis=2)
         norms = np.sqrt(np.einsum('nim,nim->m', joined, joined))
         joined[:, :, p + 1 :] /= units(cells, norms[p + 1 :])
-        grams = self.noise_model.gram(lambda _, where: joined[where], joined.shape[2], known)
-        return norms, packed.of_rows(grams, known)
+        width = joined.shape[2]
+        more = self.noise_model.gram(lambda _, where: joined[where], width, known)
+        del joined, columns
+        # Matrices of a thousand columns are most of what a search holds: none is copied twice.
+        grams = np.empty((len(more), packed.length(width)))
+        grams[:, : packed.length(known)] = first
+        for whole, rows in zip(grams, more, strict=True):
+            whole[packed.length(known) :] = packed.of_rows(rows, known)
+        return norms, grams
 
     def displaced(self, cells: Sequence[Cell], parameters: FloatArray) -> FloatArray:
         """Return what cells with these parameters displace in every row, m, (all rows, 3)."""

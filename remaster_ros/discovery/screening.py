@@ -55,29 +55,22 @@ class Catalogue:
     @classmethod
     def of(cls, data: Residuals, cells: Sequence[Cell]) -> Catalogue:
         """Compute all columns on the rows of the residuals, in single precision."""
-        context = data.part
-        at, features, shifts = [], [], []
-        for cell in cells:
-            columns = cell.columns(context)
-            values = columns.values.astype(np.float32)
-            if columns.at is None:
-                at += [-1] * cell.size
-                shifts.append(values)
-            else:
-                at += [columns.at] * cell.size
-                features.append(values)
-        joint = np.array(at, dtype=np.int64)
+        context, n = data.part, len(data)
+        turns = [cell.place == 'joint_angle' for cell in cells]
+        at = [c.joints[0] - 1 if so else -1 for c, so in zip(cells, turns, strict=True)]
+        joint = np.repeat(np.array(at, dtype=np.int64), [cell.size for cell in cells])
         position = np.where(joint >= 0, np.cumsum(joint >= 0), np.cumsum(joint < 0)) - 1
-        n = len(data)
-        return cls(
-            tuple(cells),
-            np.cumsum([0, *(cell.size for cell in cells)]),
-            joint,
-            np.concatenate([np.zeros((n, 0), np.float32), *features], axis=1),
-            np.concatenate([np.zeros((n, 3, 0), np.float32), *shifts], axis=2),
-            position,
-            context.jacobian.astype(np.float32),
-        )
+        starts = np.cumsum([0, *(cell.size for cell in cells)])
+        # Filled in place, as it is most of the memory of a search.
+        features = np.empty((n, int(np.sum(joint >= 0))), np.float32)
+        shifts = np.empty((n, 3, int(np.sum(joint < 0))), np.float32)
+        for cell, so, start in zip(cells, turns, starts, strict=False):
+            if cell.size:
+                first = int(position[start])
+                place = features if so else shifts
+                place[..., first : first + cell.size] = cell.columns(context).values
+        jacobian = context.jacobian.astype(np.float32)
+        return cls(tuple(cells), starts, joint, features, shifts, position, jacobian)
 
     @cached_property
     def cheap(self) -> BoolArray:
@@ -195,6 +188,23 @@ def screen(
         cells = [catalogue.cells[i] for i in batch]
         scores[batch] = _scores(cells, products, n_eff, explained)
     return scores
+
+
+def rises(data: Residuals, given: Solution, cells: Sequence[Cell]) -> list[bool]:
+    """Return of kinds of errors whether the likelihood rises with their variance from nothing.
+
+    Its derivative by the variance v of the weights of the columns X, beside the given ones, is
+    ½ (|X'P y|² − tr X'P X), with P the precision of the rows (Patterson & Thompson 1971).
+    """
+    project = _Projection(data, given)
+    white = data.noise_model.whitened(data.errors, given.noise).reshape(-1, 1)
+    residual = project.residual(white).astype(np.float32)
+    found = []
+    for cell in cells:
+        columns = data.noise_model.whitened(data.columns([cell]), given.noise)
+        left = project.residual(columns.reshape(len(white), -1).astype(np.float32))
+        found.append(bool(np.sum((left.T @ residual) ** 2) > np.sum(left**2)))
+    return found
 
 
 class _Projection:

@@ -1,12 +1,11 @@
 """Large sessions: part of the rows is searched, and the rest tests what was found.
 
-The search tries hundreds of causes on hundreds of surrogates, in memory that grows with the rows:
-0.1 MB each. An effect stands out of the noise with the root of their number, so beyond
-`MOST_ROWS` rows little is gained: an effect that 100,000 rows just show is a quarter of the size
-of one that 5,000 just show, a few hundredths of the noise of one reading. So the search is given
-a part of them, drawn evenly over time and sensors. Everything else works on all rows: the offsets
-before, the sampled model with the causes, the gain. The rows that were not
-searched test the causes with their parameters frozen.
+The search holds thousands of columns of every row it is given, 0.1 MB each. An effect stands out of
+the noise with the root of their number, so beyond `MOST_ROWS` rows little is gained: an effect that
+100,000 rows just show is a sixth of the size of one that 3,000 just show, a few hundredths of the
+noise of one reading. So the search is given a part of them, drawn evenly over time and sensors.
+Everything else works on all rows: the offsets before, the sampled model with the causes, the gain.
+The rows that were not searched test the causes with their parameters frozen.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.discovery.solution import Solution
 from remaster_ros.types import FloatArray, IntArray, Measurements
 
-MOST_ROWS = 5_000
+MOST_ROWS = 3_000
 """Sessions of fewer are searched whole."""
 FEWEST_POSES = 500
 """Of the poses that the same sensors measured: fewer rows of each are drawn before fewer poses."""

@@ -194,8 +194,8 @@ def compensation_of(discovery: Discovery, widening: float) -> Described:
     those fitted without them.
     """
     if holds_everything(discovery):
-        fit, cells = discovery.fit, discovery.solution.cells
-        return everything(fit, cells, discovery.residuals, widening)
+        described = _everything(discovery)[0]
+        return replace(described, model=replace(described.model, widening=widening))
     alone = discovery.alone
     rows = discovery.residuals.context.measurements
     drawn = discovery.geometry
@@ -216,22 +216,22 @@ def compensation_of(discovery: Discovery, widening: float) -> Described:
 def holds_everything(discovery: Discovery) -> bool:
     """Whether compensation.json holds everything in the model, and not the offsets alone."""
     alone = _held_out_mean(discovery, discovery.alone.residuals_after)
-    errors, can_be_commanded = _corrected(discovery)
+    _, errors, can_be_commanded = _everything(discovery)
     every = _held_out_mean(discovery, errors)
     better = bool(np.isnan(alone)) or round(every, 3) < round(alone, 3)
     return better and can_be_commanded and bool(discovery.solution.cells)
 
 
 @lru_cache(maxsize=1)
-def _corrected(discovery: Discovery) -> tuple[FloatArray, bool]:
-    """Return the residuals with what compensation.json corrects, where it holds everything.
+def _everything(discovery: Discovery) -> tuple[Described, FloatArray, bool]:
+    """Return the arm with everything corrected, and the residuals with it, m, (n, 3).
 
     And whether there is a command for each wanted angle: without it the file is not read.
     """
     fit, cells, data = discovery.fit, discovery.solution.cells, discovery.residuals
-    model = everything(fit, cells, data, 1.0).model
-    errors = corrected_residuals(fit, cells, model, data.context.measurements)
-    return errors, model.steepest() < 1.0
+    described = everything(fit, cells, data)
+    errors = corrected_residuals(fit, cells, described.model, data.context.measurements)
+    return described, errors, described.model.steepest() < 1.0
 
 
 def _held_out_mean(discovery: Discovery, errors: FloatArray) -> float:
@@ -250,7 +250,7 @@ def loadable(discovery: Discovery) -> list[Loadable]:
         file = f'{APPLY_FOLDER}/{MODEL_FILE}' if discovery.loads_geometry else ''
         results.append(('geometry', discovery.geometry.errors, file))
     file = f'{APPLY_FOLDER}/{COMPENSATION_FILE}' if holds_everything(discovery) else ''
-    results.append(('everything', _corrected(discovery)[0], file))
+    results.append(('everything', _everything(discovery)[1], file))
     rows: list[Loadable] = []
     # To what is shown: a difference in the fourth figure is no reason to load anything else.
     least = np.inf

@@ -192,7 +192,7 @@ def test_a_marker_near_an_axis_turns_no_joint_by_degrees():
     session = replace(session, measurements=replace(m, position=m.position + shift))
     found = remaster_ros.discover(session)
     fit, cells = found.fit, found.solution.cells
-    model = everything(fit, cells, found.residuals, 1.0).model
+    model = everything(fit, cells, found.residuals).model
     change = model.added_angles(model.drivers(m.q, model.warming(len(m.q), None)))
     assert np.abs(change - change.mean(axis=0)).max() < np.radians(2.0)
     assert model.steepest() < 0.1

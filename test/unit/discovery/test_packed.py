@@ -39,9 +39,3 @@ def test_further_rows_follow_those_that_are_packed(first):
     whole = symmetric(6, 2, 5)
     parts = packed.of_rows(whole[:, :first, :first], 0), packed.of_rows(whole[:, first:], first)
     assert np.array_equal(np.concatenate(parts, axis=1), packed.of_rows(whole, 0))
-
-
-def test_what_is_picked_is_a_copy():
-    half = packed.of_rows(symmetric(4, 2, 1), 0)
-    packed.picked(half, np.arange(3))[:] = np.nan
-    assert np.all(np.isfinite(half))
