@@ -214,9 +214,7 @@ class Search:
         it, too, and both explain the same errors.
         """
         for cell in solution.cells:
-            shapes = self.catalogue.cheap & [
-                is_special_case(other, cell) for other in self.cells
-            ]
+            shapes = self.catalogue.cheap & [is_special_case(other, cell) for other in self.cells]
             if shapes.any():
                 least = solution.log_evidence - NEEDED
                 best = _best(self.in_place(self.without(solution, cell), least, shapes))

@@ -38,7 +38,14 @@ from remaster_ros.discovery.geometry_model import GeometryModel, geometry_model
 from remaster_ros.discovery.guard import Unexplained, harm_of, is_harmful, nameless, unfitted
 from remaster_ros.discovery.marker_offsets import loosened, moved_markers
 from remaster_ros.discovery.omnibus import beyond_noise, structure_left
-from remaster_ros.discovery.random_effects import Family, by_members, fit_kinds, kinds, with_kinds, without_nothing
+from remaster_ros.discovery.random_effects import (
+    Family,
+    by_members,
+    fit_kinds,
+    kinds,
+    with_kinds,
+    without_nothing,
+)
 from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.discovery.solution import Solution
 from remaster_ros.discovery.thinning import Thinning, draw_rows, judge_by_others

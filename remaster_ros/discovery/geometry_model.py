@@ -32,6 +32,7 @@ from remaster_ros.discovery.effects.context import Context
 from remaster_ros.discovery.evidence import solve
 from remaster_ros.discovery.random_effects import Family, by_members
 from remaster_ros.discovery.residuals import Residuals
+from remaster_ros.discovery.thinning import of_spread_poses
 from remaster_ros.discovery.to_extension import extension_of, offsets_of, root_of_inverse
 from remaster_ros.errors import InsufficientDataError
 from remaster_ros.kinematics.serial_chain import SerialChain
@@ -132,7 +133,9 @@ def geometry_model(found: Estimate, causes: Sequence[Cell] = ()) -> GeometryMode
     tolerance_m = found.problem.priors.geometry_tolerance_m
     drawing = _fitted(found, causes)
     found = _without_open_offsets(found)
-    data = Residuals.of(found)
+    # What variances follow from: a fit of all rows follows.
+    some = of_spread_poses(found.problem.measurements, found.kept)
+    data = Residuals.of(found).only(some)
     families = [
         family
         for members in (_lengths(data.context), _tilts(data.context))

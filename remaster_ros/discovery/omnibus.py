@@ -34,6 +34,7 @@ from remaster_ros.discovery.gain import GROSS, rms
 from remaster_ros.discovery.guard import Unexplained
 from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.discovery.solution import Solution
+from remaster_ros.discovery.thinning import of_spread_poses
 from remaster_ros.types import BoolArray, FloatArray, IntArray
 
 # Of one check where nothing is wrong.
@@ -46,8 +47,6 @@ MOST_COMPARED = 200
 LISTED = 5
 # Share of gross errors among careful measurements; for the p-value.
 USUAL_GROSS = 0.01
-# Held-out rows that are predicted; of more, every second pose, every third, …
-MOST_ROWS = 3_000
 
 
 def structure_left(
@@ -367,8 +366,7 @@ def compared_held_out(
     Of many rows every second pose, every third, … is.
     """
     measurements = data.context.measurements
-    pose = np.unique(measurements.pose[source], return_inverse=True)[1]
-    source = source[pose % (1 + len(source) // MOST_ROWS) == 0]
+    source = of_spread_poses(measurements, source)
 
     def contrasts(part: Residuals) -> Contrasts:
         columns = part.base, part.columns(solution.cells), part.left(solution)[:, :, None]

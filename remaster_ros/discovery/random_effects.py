@@ -157,8 +157,8 @@ def fit_kinds(
     """Fit cells and all members of some kinds; None where they cannot be distinguished.
 
     The likelihood has two maxima where rows are few: errors are noise, or they are all of the arm
-    and the noise is small. Newton's steps go to the nearer one, so they begin at either. Where rows
-    are many, kinds with many members have a variance only where it raises the likelihood.
+    and the noise is small. Newton's steps go to the nearer one, so they begin at either. Where
+    rows are many, kinds with many members have a variance only where it raises the likelihood.
     """
     at_once, later = list(families), []
     if 3 * len(data) > MANY_ROWS * sum(family.cell.size for family in families):

@@ -246,11 +246,9 @@ class Residuals:
         joined = np.concatenate(columns, axis=2)
         norms = np.sqrt(np.einsum('nim,nim->m', joined, joined))
         joined[:, :, p + 1 :] /= units(cells, norms[p + 1 :])
-        width = joined.shape[2]
-        more = self.noise_model.gram(lambda _, where: joined[where], width, known)
-        del joined, columns
+        more = self.noise_model.gram(lambda _, where: joined[where], len(norms), known)
         # Matrices of a thousand columns are most of what a search holds: none is copied twice.
-        grams = np.empty((len(more), packed.length(width)))
+        grams = np.empty((len(more), packed.length(len(norms))))
         grams[:, : packed.length(known)] = first
         for whole, rows in zip(grams, more, strict=True):
             whole[packed.length(known) :] = packed.of_rows(rows, known)

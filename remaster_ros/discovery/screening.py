@@ -47,10 +47,12 @@ class Catalogue:
     cells: tuple[Cell, ...]  # As the effects gave them
     starts: IntArray  # First column of each cell, and the number of columns, (cells + 1,)
     at: IntArray  # Joint of each column, -1 where it displaces, (columns,)
-    features: FloatArray  # Added angles of the columns at joints, (n, joint columns), in order
-    shifts: FloatArray  # Displacements of the other columns, (n, 3, others), in order
+    features: NDArray[
+        np.float32
+    ]  # Added angles of the columns at joints, (n, joint columns), in order
+    shifts: NDArray[np.float32]  # Displacements of the other columns, (n, 3, others), in order
     position: IntArray  # Where each column is among the features or the shifts, (columns,)
-    jacobian: FloatArray
+    jacobian: NDArray[np.float32]
 
     @classmethod
     def of(cls, data: Residuals, cells: Sequence[Cell]) -> Catalogue:

@@ -1,11 +1,11 @@
 """Large sessions: part of the rows is searched, and the rest tests what was found.
 
-The search holds thousands of columns of every row it is given, 0.1 MB each. An effect stands out of
-the noise with the root of their number, so beyond `MOST_ROWS` rows little is gained: an effect that
-100,000 rows just show is a sixth of the size of one that 3,000 just show, a few hundredths of the
-noise of one reading. So the search is given a part of them, drawn evenly over time and sensors.
-Everything else works on all rows: the offsets before, the sampled model with the causes, the gain.
-The rows that were not searched test the causes with their parameters frozen.
+The search holds thousands of columns of every row it is given, 0.1 MB each. An effect stands out
+of the noise with the root of their number, so beyond `MOST_ROWS` rows little is gained: an effect
+that 100,000 rows just show is a sixth of the size of one that 3,000 just show, a few hundredths of
+the noise of one reading. So the search is given a part of them, drawn evenly over time and
+sensors. Everything else works on all rows: the offsets before, the sampled model with the causes,
+the gain. The rows that were not searched test the causes with their parameters frozen.
 """
 
 from __future__ import annotations
@@ -72,6 +72,12 @@ def draw_rows(
             mine = mine[_some_of_each_group(group, wanted / len(drawn), rng)]
         kept.append(rows[mine])
     return np.sort(np.concatenate(kept))
+
+
+def of_spread_poses(measurements: Measurements, rows: IntArray, most: int = MOST_ROWS) -> IntArray:
+    """Return the given rows, of many those of every second pose, every third, …"""
+    pose = np.unique(measurements.pose[rows], return_inverse=True)[1]
+    return rows[pose % (1 + len(rows) // most) == 0]
 
 
 def judge_by_others(

@@ -32,7 +32,7 @@ print(re.search(r'VmHWM:\\s+(\\d+) kB', Path('/proc/self/status').read_text())[1
 raise SystemExit(status)
 """
 FEW, MANY = 4_000, 24_000
-# It takes 2. With the causes' columns of all rows in memory at once it took 14.
+# With the columns of all kinds of errors in memory for all rows at once it took 64.
 MOST_MB_PER_THOUSAND_ROWS = 8.0
 CURVE_RAD = 8e-4
 
