@@ -74,7 +74,8 @@ def test_one_fault_after_the_other_and_the_run_completes(start, client, tmp_path
     ros_environment['TMPDIR'] = str(hidden)
     demo = start(
         'remaster_ros.cli.main', 'demo', '--out', out, '--candidates', '4', '--no-figures',
-        '--seed', SEED, '--rate', '20',
+        # With the live page it bears that the arm is halted: a person, here, may be at it.
+        '--seed', SEED, '--rate', '20', '--watch',
     )  # fmt: skip
     listener = Listener(client)
     rows = out / 'session' / 'observations.csv'
