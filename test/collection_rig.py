@@ -141,6 +141,20 @@ class Cell:
         self.nodes[name].wait()
         self.nodes[name] = self._begin(name)
 
+    def told_to_stand(self):
+        """Wait until the bridge says anew that the planner runs nothing, or that it has halted.
+
+        What it said last may be of a moment before, when there was still something to command.
+        """
+
+        def told():
+            message = self.messages.get('robot_bridge', '')
+            halted = message and self.said['robot_bridge']['halted']
+            return halted or 'planner is ' in message
+
+        self.messages.pop('robot_bridge', None)
+        self.until(told, 'the bridge')
+
     def _summary(self, node, message, values):
         self.said[node], self.messages[node] = values, message
 

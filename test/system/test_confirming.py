@@ -23,7 +23,7 @@ def test_nothing_moves_before_each_plan_is_confirmed(start, client, tmp_path):
 
     def confirm():
         """Look at the page, confirm the plan, and collect, in that order and no other."""
-        cell.until(lambda: 'robot_bridge' in cell.said, 'the bridge')
+        cell.told_to_stand()
         before = commanded()
         refused = call(client, '/remaster/collect')
         assert not refused.success

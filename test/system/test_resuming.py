@@ -44,6 +44,7 @@ def restart(cell, *others):
 
 def stands(cell, seconds=2.0):
     """Check that nothing is commanded for some seconds and that the planner does not run."""
+    cell.told_to_stand()
     commanded = cell.said['robot_bridge']['commanded']
     until = time.monotonic() + seconds
     cell.until(lambda: time.monotonic() > until, 'time')
