@@ -80,6 +80,8 @@ class CollectionPlan:
     undetermined: str = ''
     # What was added to separate causes; None without causes
     separated: SeparatingDesign | None = None
+    # Whether an optimal design reaches its goal and its floors, with what can be visited of it
+    goal_reached: bool = False
 
     @property
     def poses(self) -> dict[str, int]:
@@ -186,6 +188,13 @@ def look_ahead(
     except InsufficientDataError as error:
         # What the arm does is known all the same.
         undetermined = str(error)
+    designed = planner.designed
+    goal_reached = designed is not None and designed.reached
+    if designed is not None and goal_reached and lost:
+        number = np.repeat(np.arange(len(reached)), [len(pose.solutions) for pose in reached])
+        goal_reached = designed.floors.hold(number) and designed.goal.is_met(
+            expected.joint_rms, expected.tool_rms
+        )
     visits = tuple(steps.visits)
     measuring_s = planner.travel.measuring_s
     return CollectionPlan(
@@ -196,9 +205,10 @@ def look_ahead(
         sum(visit.trajectory.duration_s + measuring_s for visit in visits),
         max((visit.tool_speed_m_s for visit in visits), default=0.0),
         *expected,
-        planner.designed,
+        designed,
         undetermined,
         planner.separated,
+        goal_reached,
     )
 
 

@@ -159,6 +159,7 @@ class Designed:
     plans: Mapping[str, Plan]  # Split -> its poses, each with the solutions that were chosen
     goal: Goal  # What was to be reached
     reached: bool  # Whether it is, with the floors
+    floors: Floors
     # What is expected, rad and m
     joint_rms: float
     tool_rms: float
@@ -247,6 +248,7 @@ def designed_plans(
         designed,
         goal,
         design.reached,
+        floors,
         information.joint_rms(chosen.tolist()),
         information.tool_rms(chosen.tolist()),
     )

@@ -103,6 +103,11 @@ class Goal:
             parts.append(np.sqrt(self.tool_share) / self.tool_std_m * root)
         return np.concatenate(parts, axis=1)
 
+    def is_met(self, joint_rms: float, tool_rms: float) -> bool:
+        """Tell whether these, rad and m, reach each of what counts."""
+        joints = self.tool_share == 1.0 or joint_rms <= self.joint_std_rad
+        return joints and (self.tool_share == 0.0 or tool_rms <= self.tool_std_m)
+
     def is_reached(self, information: DesignInformation, chosen: Sequence[int]) -> bool:
         """Tell whether each of what counts is reached."""
         joints = self.tool_share == 1.0 or information.joint_rms(chosen) <= self.joint_std_rad

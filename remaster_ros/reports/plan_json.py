@@ -48,7 +48,7 @@ def plan_to_dict(plan: CollectionPlan) -> dict[str, Any]:
             'rms_std_deg': float(np.degrees(design.goal.joint_std_rad)),
             'tool_std_mm': design.goal.tool_std_m * 1e3,
             'tool_share': design.goal.tool_share,
-            'reached': design.reached,
+            'reached': plan.goal_reached,
         },
         **({} if plan.separated is None else {'separate': _separated(plan.separated)}),
     }
@@ -188,7 +188,7 @@ def minutes_text(seconds: float) -> str:
 
 def missed_goal(plan: CollectionPlan) -> str:
     """Return which goal an optimal design does not reach, and what would help; '' for none."""
-    if plan.designed is None or plan.designed.reached:
+    if plan.designed is None or plan.goal_reached:
         return ''
     return (
         f'not reached: {plan.designed.goal.describe()}, with the poses that a search for causes '

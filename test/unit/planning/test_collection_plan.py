@@ -1,6 +1,7 @@
 """A whole collection before it begins: designs and orders of a cell, every way of them free."""
 
 from collections import Counter
+from dataclasses import replace
 from itertools import groupby
 
 import numpy as np
@@ -13,8 +14,9 @@ from remaster_ros.planning.candidates import order_solutions, plan_poses
 from remaster_ros.planning.collection_plan import look_ahead, plan_collection, session_time_s
 from remaster_ros.planning.planned_design import ENOUGH_RAD, NOT_NEEDED, DesignSettings
 from remaster_ros.planning.pose_design import HELD_OUT_POSES, HELD_OUT_SOLUTIONS, Floors
+from remaster_ros.planning.tour_order import Tour
 from remaster_ros.planning.tour_planner import TourPlanner
-from remaster_ros.reports.plan_json import plan_text, plan_to_dict
+from remaster_ros.reports.plan_json import missed_goal, plan_text, plan_to_dict
 from remaster_ros.session.workcell import CellPoses, read_cell
 
 
@@ -170,9 +172,32 @@ def test_the_fastest_order_of_whole_poses_visits_each_once():
 def test_a_stated_goal_is_reached_or_said_not_to_be():
     _, easy = planned(CellPoses(design='optimal', joint_std_deg=0.01))
     assert easy.designed.reached
+    assert easy.goal_reached
     assert np.degrees(easy.joint_rms) <= 0.01
     _, hard = planned(CellPoses(design='optimal', joint_std_deg=1e-4), counts=(8, 0))
     assert not hard.designed.reached
+    assert not hard.goal_reached
+
+
+@pytest.mark.parametrize('few', [6, 11])
+def test_a_goal_is_reached_by_what_free_ways_lead_to_alone(few, monkeypatch):
+    """A design does not look at all ways: what a tour finds none to is not measured."""
+    next_stop = Tour.next
+
+    def lost(self, q):
+        stop = next_stop(self, q)
+        if stop is None or stop.split != 'optimization' or stop.index < few:
+            return stop
+        nothing = {'solutions': np.empty((0, len(q))), 'ids': (), 'paths': ()}
+        return replace(stop, **nothing, unreached=stop.ids)
+
+    monkeypatch.setattr(Tour, 'next', lost)
+    _, plan = planned(CellPoses(design='optimal', joint_std_deg=0.01))
+    assert plan.designed.reached
+    assert plan.unreached
+    assert not plan.goal_reached
+    assert not plan_to_dict(plan)['goal']['reached']
+    assert missed_goal(plan).startswith('not reached: ')
 
 
 def test_references_are_visited_between():
