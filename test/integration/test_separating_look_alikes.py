@@ -17,7 +17,8 @@ pytestmark = pytest.mark.timeout(600)
 
 @pytest.mark.qualify
 def test_a_sag_that_looks_like_a_base_that_yields_is_decided():
-    number = 1
+    # One that the search leaves open, and whose look-alikes it names.
+    number = 49
     print('session', number)
     pair = pair_session(number)
     assert (pair.true, pair.other) == (('joint_compliance', (2,)), ('base_compliance', ()))
