@@ -222,6 +222,8 @@ class Watch:
             ended = [name for name, process in self._running.items() if process.poll() is not None]
             if ended:
                 raise SystemExit(f'{", ".join(ended)} ended while we waited for {what}')
+            if halted := self.said.get('robot_bridge', {}).get('halted'):
+                raise SystemExit(f'halted while we waited for {what}: {halted}')
             if time.monotonic() > deadline:
                 raise SystemExit(f'waited {PATIENCE_S:g} s in vain for {what}: {self.said}')
             if time.monotonic() - told > 10.0:
