@@ -44,7 +44,6 @@ from remaster_ros.discovery.random_effects import (
     fit_kinds,
     kinds,
     with_kinds,
-    without_nothing,
 )
 from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.discovery.solution import Solution
@@ -441,7 +440,9 @@ def of_all_kinds(beside: _Beside) -> Solution | None:
         if cell.penalty is not None or not of_a_kind.issuperset(cell.parameters)
     ]
     every = kinds(data, cells, own)
-    whole = fit_kinds(data, own, every)
+    of_a_name = {name for cell in members for name in cell.parameters}
+    unnamed = [family for family in every if of_a_name.isdisjoint(family.parameters)]
+    whole = fit_kinds(data, own, [one for one in every if one not in unnamed], unnamed)
     nothing = search.fit(())
     if whole is None or nothing is None or whole.log_evidence < nothing.log_evidence + NAMED:
         return None
@@ -449,9 +450,7 @@ def of_all_kinds(beside: _Beside) -> Solution | None:
         both = beside.fit
         if both is None or both.log_evidence < named.log_evidence + NEEDED:
             return None
-    of_a_name = {name for cell in members for name in cell.parameters}
-    unnamed = [family for family in every if of_a_name.isdisjoint(family.parameters)]
-    return by_members(without_nothing(whole, unnamed, len(data)), every)
+    return by_members(whole, every)
 
 
 def by_names(found: Estimate, beside: _Beside) -> tuple[Solution, FloatArray]:

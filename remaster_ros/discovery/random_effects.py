@@ -152,30 +152,37 @@ def kinds(data: Residuals, cells: Sequence[Cell], apart: Sequence[Cell] = ()) ->
 
 
 def fit_kinds(
-    data: Residuals, cells: Sequence[Cell], families: Sequence[Family]
+    data: Residuals,
+    cells: Sequence[Cell],
+    named: Sequence[Family],
+    families: Sequence[Family] = (),
 ) -> Solution | None:
     """Fit cells and all members of some kinds; None where they cannot be distinguished.
+
+    Of ``named`` some member has a name; of the other ``families`` those that the likelihood does
+    not show are left out: to within what Newton's steps leave of it (`GAIN`) their variance is
+    nothing, and all that is computed later on would carry along hundreds of members.
 
     The likelihood has two maxima where rows are few: errors are noise, or they are all of the arm
     and the noise is small. Newton's steps go to the nearer one, so they begin at either. Where
     rows are many, kinds with many members have a variance only where it raises the likelihood.
     """
-    at_once, later = list(families), []
-    if 3 * len(data) > MANY_ROWS * sum(family.cell.size for family in families):
-        at_once = [family for family in families if family.cell.size <= FEW_WEIGHTS]
-        later = [family for family in families if family.cell.size > FEW_WEIGHTS]
+    many = 3 * len(data) > MANY_ROWS * sum(one.cell.size for one in (*named, *families))
+    later = [family for family in families if many and family.cell.size > FEW_WEIGHTS]
+    at_once = [*named, *(family for family in families if family not in later)]
     every = (*cells, *(family.cell for family in at_once))
     found = solve(data, every)
     if found is None or not at_once:
         return found
     noise, least = data.noise, SMALL_NOISE
     quiet = Noise(least * noise.sigma, least * noise.pose_sigma, least * noise.frame_sigma)
-    variance = float(np.max(data.noise_model.sensor_noise(noise).total)) ** 2 / len(families)
+    variance = float(np.max(data.noise_model.sensor_noise(noise).total)) ** 2 / len(at_once)
     shared = [variance**-1.0 if cell.form == RANDOM else np.nan for cell in found.cells]
     start = replace(found, noise=quiet, smoothness=np.array(shared))
     other = solve(data, every, start)
     best = found if other is None or other.log_evidence < found.log_evidence else other
-    return with_kinds(data, best, later)
+    whole = with_kinds(data, best, later)
+    return None if whole is None else _without_nothing(whole, families, len(data))
 
 
 def with_kinds(data: Residuals, solution: Solution, families: Sequence[Family]) -> Solution | None:
@@ -196,12 +203,8 @@ def with_kinds(data: Residuals, solution: Solution, families: Sequence[Family]) 
     return solution
 
 
-def without_nothing(solution: Solution, families: Sequence[Family], rows: int) -> Solution:
-    """Return a fit without those of some families that the likelihood does not show.
-
-    To within what Newton's steps leave of it (`GAIN`) these have a variance of nothing, and
-    hundreds of members that all that is computed later on would carry along.
-    """
+def _without_nothing(solution: Solution, families: Sequence[Family], rows: int) -> Solution:
+    """Return a fit without those of some families that the likelihood does not show."""
     for family in families:
         if family.cell in solution.cells:
             index = solution.cells.index(family.cell)
