@@ -15,22 +15,31 @@ from numpy.polynomial import legendre
 from remaster_ros.calibration.grouped_rows import Rows
 from remaster_ros.calibration.laplace import Mode
 from remaster_ros.calibration.noise import NoiseModel
-from remaster_ros.types import FloatArray
+from remaster_ros.types import FloatArray, IntArray
 
 # Degree of the polynomials of time, and number of harmonics of a joint's angle.
 TIME_DEGREE, HARMONICS = 3, 2
 POSITION_DEGREE = 2
 # Rows that are looked at; of larger sessions those of evenly spread poses.
 MOST_ROWS = 10_000
+GOLDEN = 0.5 * (5.0**0.5 - 1.0)
+
+
+def evenly(count: int, share: float) -> IntArray:
+    """Return which of so many in a row make an even share of them, the first among them.
+
+    Where a multiple of the golden ratio's inverse ends: of every second or third one, such as
+    those of one of several markers in turn, it is the same share, as it is not of every k-th.
+    """
+    return np.flatnonzero(np.arange(count) * GOLDEN % 1.0 < share)
 
 
 def spread_poses(rows: Rows) -> Rows:
     """Return all rows, or of a large session those of evenly spread poses."""
-    every = -(-len(rows) // MOST_ROWS)
-    if every == 1:
+    if len(rows) <= MOST_ROWS:
         return rows
-    kept = np.flatnonzero(rows.group_of_row % every == 0)
-    first = np.arange(0, len(rows.group_start), every)
+    first = evenly(len(rows.group_start), MOST_ROWS / len(rows))
+    kept = np.flatnonzero(np.isin(rows.group_of_row, first))
     size = rows.group_size[first]
     cuts = [
         (sensor, *np.searchsorted(kept, (s.start, s.stop)).tolist()) for sensor, s in rows.spans

@@ -35,14 +35,13 @@ from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.discovery.effects.splines import DEGREE, Curve
 from remaster_ros.discovery.geometry_model import GeometryModel
 from remaster_ros.discovery.residuals import Residuals
+from remaster_ros.discovery.thinning import of_spread_poses
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.transforms import apply, inverse, matrix_to_rotation_vector
 from remaster_ros.types import FloatArray, Measurements
 
 # Each takes away all of the difference but for what is of its second order.
 EXACT_STEPS = 2
-# Rows that the difference is taken from; of more, every second, every third, …
-MOST_ROWS = 3_000
 _DRIVERS: dict[str, Driver] = {
     'own_angle': 'angle',
     'angle': 'angle',
@@ -283,7 +282,7 @@ def _as_predicted(
     z = fit.predictive.after.copy()
     for where in measured:
         z[fit.predictive.model.core :][where] = 0.0
-    rows = problem.fitted[:: 1 + len(problem.fitted) // MOST_ROWS]
+    rows = of_spread_poses(problem.measurements, problem.fitted)
     m = problem.measurements.select(rows)
     expected = predicted_rows(problem, fit.predictive.model, z)[rows]
     for _ in range(EXACT_STEPS):

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from remaster_ros.calibration.smooth_functions import evenly
 from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.discovery.solution import Solution
 from remaster_ros.types import FloatArray, IntArray, Measurements
@@ -74,10 +75,11 @@ def draw_rows(
     return np.sort(np.concatenate(kept))
 
 
-def of_spread_poses(measurements: Measurements, rows: IntArray, most: int = MOST_ROWS) -> IntArray:
-    """Return the given rows, of many those of every second pose, every third, …"""
+def of_spread_poses(measurements: Measurements, rows: IntArray) -> IntArray:
+    """Return the given rows, of many those of evenly spread poses, about `MOST_ROWS`."""
     pose = np.unique(measurements.pose[rows], return_inverse=True)[1]
-    return rows[pose % (1 + len(rows) // most) == 0]
+    kept = evenly(int(pose.max(initial=-1)) + 1, MOST_ROWS / max(MOST_ROWS, len(rows)))
+    return rows[np.isin(pose, kept)]
 
 
 def judge_by_others(

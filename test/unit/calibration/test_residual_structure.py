@@ -165,7 +165,7 @@ def test_large_sessions_are_judged_by_evenly_spread_poses(monkeypatch) -> None:
     monkeypatch.setattr('remaster_ros.calibration.smooth_functions.MOST_ROWS', len(rows) // 3)
     part = spread_poses(rows)
     assert len(rows) // 5 < len(part) < len(rows) // 2
-    assert len(part.group_start) == -(-len(rows.group_start) // 4)
+    assert abs(len(part.group_start) - len(rows.group_start) / 3) < 2.0
     np.testing.assert_array_equal(rows.target[np.isin(rows.source, part.source)], part.target)
     for sensor, span in part.spans:
         groups = part.group_of_row[span]

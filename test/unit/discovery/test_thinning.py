@@ -11,7 +11,7 @@ from calibration_scenes import CHAIN
 from discovery_scenes import at_joint, discovered, session_with
 
 from remaster_ros.discovery import discover, residuals
-from remaster_ros.discovery.thinning import FEWEST_POSES, draw_rows
+from remaster_ros.discovery.thinning import FEWEST_POSES, MOST_ROWS, draw_rows, of_spread_poses
 from remaster_ros.types import Measurements
 
 
@@ -51,6 +51,20 @@ def test_whole_poses_are_drawn_evenly_over_time():
     assert (np.diff(np.searchsorted(poses, np.arange(0, 20_001, 1000))) == 100).all()
     assert len(set(np.diff(poses).tolist())) > 5, 'no comb that a periodic effect could hide in'
     assert (np.diff(drawn) > 0).all()
+
+
+@pytest.mark.parametrize('every', [2, 3, 4, 5])
+@pytest.mark.parametrize('markers', [1, 2, 3, 4, 5])
+def test_spread_poses_are_no_comb(every, markers):
+    """Of two sensors that measure by turns, and of markers of which each pose has the next."""
+    m = measurements(every * MOST_ROWS // 2, 1, sensors=2)
+    m = replace(m, marker=m.pose % markers)
+    drawn = of_spread_poses(m, np.arange(len(m.pose)))
+    assert 0.99 * MOST_ROWS < len(drawn) < 1.01 * MOST_ROWS
+    assert len(set(m.pose[drawn].tolist())) == len(drawn) // 2, 'whole poses'
+    share = np.bincount(m.marker[drawn], minlength=markers) * markers / len(drawn)
+    assert np.abs(share - 1.0).max() < 0.05
+    assert of_spread_poses(m, np.arange(MOST_ROWS)).tolist() == list(range(MOST_ROWS))
 
 
 def test_few_poses_with_many_rows_are_all_kept():
