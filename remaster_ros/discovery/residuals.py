@@ -252,6 +252,8 @@ class Residuals:
         grams[:, : packed.length(known)] = first
         for whole, rows in zip(grams, more, strict=True):
             whole[packed.length(known) :] = packed.of_rows(rows, known)
+        # Fits are given parts of them.
+        grams.setflags(write=False)
         return norms, grams
 
     def displaced(self, cells: Sequence[Cell], parameters: FloatArray) -> FloatArray:

@@ -47,9 +47,8 @@ class Catalogue:
     cells: tuple[Cell, ...]  # As the effects gave them
     starts: IntArray  # First column of each cell, and the number of columns, (cells + 1,)
     at: IntArray  # Joint of each column, -1 where it displaces, (columns,)
-    features: NDArray[
-        np.float32
-    ]  # Added angles of the columns at joints, (n, joint columns), in order
+    # Added angles of the columns at joints, (n, joint columns), in order
+    features: NDArray[np.float32]
     shifts: NDArray[np.float32]  # Displacements of the other columns, (n, 3, others), in order
     position: IntArray  # Where each column is among the features or the shifts, (columns,)
     jacobian: NDArray[np.float32]

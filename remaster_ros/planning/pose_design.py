@@ -110,9 +110,7 @@ class Goal:
 
     def is_reached(self, information: DesignInformation, chosen: Sequence[int]) -> bool:
         """Tell whether each of what counts is reached."""
-        joints = self.tool_share == 1.0 or information.joint_rms(chosen) <= self.joint_std_rad
-        tool = self.tool_share == 0.0 or information.tool_rms(chosen) <= self.tool_std_m
-        return joints and tool
+        return self.is_met(information.joint_rms(chosen), information.tool_rms(chosen))
 
     def describe(self) -> str:
         """Return what is to be reached, for people."""

@@ -72,10 +72,12 @@ def test_a_column_without_rows_has_the_unit_of_its_spline_or_one(scene):
 
 def test_what_a_caller_does_to_the_norms_stays_with_the_caller(scene):
     data = residuals_of(scene[0])
-    norms, _ = data.gram_matrices(scene[1])
+    norms, grams = data.gram_matrices(scene[1])
     kept = norms.copy()
     norms[:] = 0.0
     assert np.array_equal(data.gram_matrices(scene[1])[0], kept)
+    with pytest.raises(ValueError, match='read-only'):
+        grams[:] = 0.0
 
 
 def test_gram_matrices_of_a_known_set_with_other_cells_are_those_computed_for_it_alone(scene):
