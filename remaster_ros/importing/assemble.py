@@ -126,7 +126,13 @@ def assemble(
     rng: np.random.Generator,
     notes: str,
 ) -> tuple[Session, list[str]]:
-    """Return the session, and how poses were found and held out, a sentence each."""
+    """Return the session, and how poses were found and held out, a sentence each.
+
+    Raises
+    ------
+    InputError
+        Labels that contradict each other, naming the row.
+    """
     controller = controller_of(rows, chain, options)
     pad = PadAngles.of(controller, chain.joint_names)
     q = pad.to_urdf(rows.q)
@@ -231,7 +237,13 @@ def _date(rows: RawRows) -> str:
 
 
 def refuse_outside_limits(rows: RawRows, chain: SerialChain, q: FloatArray) -> None:
-    """Refuse joint angles outside the URDF's limits, naming the row of the table."""
+    """Refuse joint angles outside the URDF's limits, naming the row of the table.
+
+    Raises
+    ------
+    InputError
+        One line for the first such row.
+    """
     allowed = chain.limit_tolerance
     outside = (q < chain.lower - allowed) | (q > chain.upper + allowed)
     for row, joint in np.argwhere(outside)[:1]:

@@ -61,10 +61,21 @@ def read_bag(
     length: str = '',
     clock_offset_s: float | None = None,
 ) -> RawRows:
-    """Read a bag; each topic of points is a sensor. Without topics told, all that fit are read.
+    """Read a bag; each topic of points is a sensor.
 
-    ``length`` is the unit of the points where it is not the metre of ROS, ``clock_offset_s`` what
-    is added to their stamps to have the joints'; None to find it.
+    Parameters
+    ----------
+    joint_topics, point_topics
+        As told; () for all that fit.
+    length
+        Unit of the points where it is not the metre of ROS.
+    clock_offset_s
+        What is added to the stamps of the points to have the joints'; None to find it.
+
+    Raises
+    ------
+    InputError
+        No such topics, no standstill with a point in it, or a damaged bag.
     """
     refuse_sliding(chain, path)
     joints: dict[str, _Topic] = defaultdict(_Topic)

@@ -131,9 +131,17 @@ def find_columns(
 ) -> Columns:
     """Find out what the columns of a table are.
 
-    A header that holds one of the robot's ``joint_names`` is that joint's; ``sliding`` are the
-    indices of those whose columns hold lengths. An `InputError` where several columns could be the
-    same, or a told one is not there; with what to say.
+    Parameters
+    ----------
+    joint_names
+        Of the robot; a header that holds one of them is that joint's.
+    sliding
+        Indices of those whose columns hold lengths.
+
+    Raises
+    ------
+    InputError
+        Several columns could be the same, or a told one is not there; with what to say.
     """
     found = Columns()
     headers = [_Header.of(name) for name in table.names]

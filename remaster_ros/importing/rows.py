@@ -382,7 +382,13 @@ class RawRows:
 
 
 def read_rows(paths: Sequence[Path], chain: SerialChain, options: TableOptions) -> RawRows:
-    """Read one table with joints and points, or one with each."""
+    """Read one table with joints and points, or one with each.
+
+    Raises
+    ------
+    InputError
+        One line naming file, line, column and remedy.
+    """
     programs = {
         data: path
         for path in paths
@@ -774,7 +780,13 @@ def _refuse_untold(found: list[Table], told: Told) -> None:
 
 
 def from_tool(rows: RawRows) -> RawRows:
-    """Return rows of a sensor on the tool as those of the sensor, in the frame of what it sees."""
+    """Return rows of a sensor on the tool as those of the sensor, in the frame of what it sees.
+
+    Raises
+    ------
+    InputError
+        A row without an orientation.
+    """
     orientation = np.full((1, 4), np.nan) if rows.orientation is None else rows.orientation
     unknown = np.isnan(orientation).any(axis=1)
     if unknown.any():

@@ -59,7 +59,12 @@ class Sense:
 def check_sense(session: Session, rows: RawRows, progress: Callable[[str, float], None]) -> Sense:
     """Fit the table as it is and, where that is gross, as it might be meant.
 
-    ``session`` is as it would be written; ``rows`` name the columns.
+    Parameters
+    ----------
+    session
+        As it would be written.
+    rows
+        For the names of the columns.
     """
     # The marker is left free: one that is firm at a wrong place would bend the fit.
     part = replace(session, marker_std_m=UNKNOWN_MARKER_STD_M)

@@ -42,14 +42,29 @@ def arrangement_of(
     turn: tuple[str, float] = ('', 0.0),
     tip_link: str = '',
 ) -> Arrangement:
-    """Return the arrangement of a session that was told; `InputError` for names it has not.
+    """Return the arrangement of a session that was told.
 
-    ``order`` is the joint whose column each joint, base to tip, is to take; () for as they are.
-    ``couple``, ``reverse`` and ``add_deg`` are as of `assemble.SessionOptions`, angles being
-    quarters of a turn. ``mirrored`` is True where X and Y of the points are exchanged. ``shift``
-    and ``exchange`` are rows that each point is moved on by, and two markers whose labels are
-    exchanged. ``turn`` is an axis, and degrees by which the markers' places are turned about it;
-    '' for not at all.
+    Parameters
+    ----------
+    order
+        Joint whose column each joint, base to tip, is to take; () for as they are.
+    couple, reverse, add_deg
+        As of `assemble.SessionOptions`.
+    angle_scale, length_scale
+        What angles and points are multiplied by.
+    mirrored
+        True where X and Y of the points are exchanged.
+    shift, exchange
+        Rows that each point is moved on by, and two markers whose labels are exchanged.
+    turn
+        Axis, and degrees by which the markers' places are turned about it; '' for not at all.
+    tip_link
+        Tool frame; '' for as it is.
+
+    Raises
+    ------
+    InputError
+        Names that the session has not, or angles that are no quarters of a turn.
     """
     k = len(joint_names)
     if order and len(order) != k:

@@ -116,7 +116,13 @@ def parse_number(cell: str, decimal: str) -> float | None:
 def read_table(
     path: Path, separator: str = '', decimal: str = '', encoding: str = ''
 ) -> TextTable:
-    """Read a text table; what is not told is found; an `InputError` names file, line, remedy."""
+    """Read a text table; what is not told is found.
+
+    Raises
+    ------
+    InputError
+        One line naming file, line and remedy: no text, no numbers, or rows of unequal length.
+    """
     data = read_limited(path, TABLE_LIMIT, 'name the table')
     text, encoding = decode(data, path, encoding)
     for read in READERS:

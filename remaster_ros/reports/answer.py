@@ -137,9 +137,21 @@ def located(path: Path) -> Path:
 def read_inputs(
     session: Session, fit_path: Path, found_path: Path | None, plan: RecordedPlan | None = None
 ) -> Inputs:
-    """Read the results of a session, and refuse those of another: an `InputError` with the remedy.
+    """Read the results of a session, and refuse those of another.
 
-    residuals.csv and predictions.csv are beside fit.json and discovery.json.
+    Parameters
+    ----------
+    session
+        As read from its folder.
+    fit_path, found_path
+        fit.json and discovery.json; residuals.csv and predictions.csv are beside them.
+    plan
+        Of the session.
+
+    Raises
+    ------
+    InputError
+        One line naming file and remedy.
     """
     fit = read_fit(fit_path)
     _require_same(session, fit, fit_path, 'fit')
@@ -218,7 +230,13 @@ def _require_same(session: Session, result: Fit | Discovered, path: Path, verb: 
 
 
 def parts(paths: Sequence[Path]) -> tuple[Path | None, Path | None]:
-    """Return which of at most two paths is fit.json and which discovery.json, or refuse them."""
+    """Return which of at most two paths is fit.json and which discovery.json.
+
+    Raises
+    ------
+    InputError
+        Two of one kind, or a file of another name.
+    """
     found: dict[str, Path] = {}
     for path in map(located, paths):
         if path.name not in (FIT_FILE, DISCOVERY_FILE):

@@ -28,9 +28,17 @@ FEW = 5
 
 
 def summary_of(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Return what is to be said over all rows of rows.jsonl, in the order of the sessions given.
+    """Return what is to be said over all rows.
 
-    ``counts`` by status; ``joints``: one of each joint of each kind of arm; ``lines``.
+    Parameters
+    ----------
+    rows
+        Of rows.jsonl, in the order of the sessions given.
+
+    Returns
+    -------
+    dict
+        ``counts`` by status; ``joints``: one of each joint of each kind of arm; ``lines``.
     """
     counts: dict[str, int] = defaultdict(int)
     arms: dict[tuple[str, tuple[str, ...]], list[Mapping[str, Any]]] = defaultdict(list)

@@ -23,10 +23,21 @@ def write_check_page(
     series_m: FloatArray,
     names: list[str],
 ) -> None:
-    """Write the page of ``content``, as of ``remaster check --json``.
+    """Write the page.
 
-    ``series_m`` is what each check says of each joint, at the tool, m, (T, k); ``names`` are those
-    of the checks, oldest first.
+    Parameters
+    ----------
+    content
+        As of ``remaster check --json``.
+    series_m
+        What each check says of each joint, at the tool, m, (T, k).
+    names
+        Of the checks, oldest first.
+
+    Raises
+    ------
+    InputError
+        It cannot be written.
     """
     from remaster_ros.reports.figures import as_svg
 

@@ -162,7 +162,13 @@ def _regions(discovery: Discovery, predictions: Predictions) -> dict[str, Any]:
 
 
 def read_discovery(path: str | os.PathLike[str]) -> Discovered:
-    """Read discovery.json and check it against the contract; further keys are left out."""
+    """Read discovery.json and check it against the contract; further keys are left out.
+
+    Raises
+    ------
+    InputError
+        One line naming the file, the key and the remedy.
+    """
     return read_result(
         Path(path), Discovered, schemas.DISCOVERY_FORMAT, DISCOVERY_FILE, 'discover'
     )
@@ -303,8 +309,20 @@ def read_causes(
 ) -> tuple[FoundCause, ...]:
     """Return the causes of a discovery.json that have look-alikes.
 
-    An `InputError` where it has none, is of an arm with other joints or, where a sum is given, of
-    other observations.
+    Parameters
+    ----------
+    path
+        The file.
+    joint_names
+        Of the arm that it has to be of; empty for any.
+    observations_sha256
+        Of the observations that it has to be of; '' for any.
+
+    Raises
+    ------
+    InputError
+        It is no discovery.json, is of another arm or other observations, or has no cause with a
+        look-alike.
     """
     found = _read(path, joint_names)
     of = found.session and found.session.observations_sha256
@@ -337,8 +355,19 @@ def earlier_pairs(
 ) -> tuple[tuple[Named, Named], ...]:
     """Return causes and look-alikes of a discovery.json, and those that it has decided between.
 
-    None where it is of a session that was begun at another time than ``created``; an `InputError`
-    where it is of another arm.
+    Parameters
+    ----------
+    path
+        The file.
+    joint_names
+        Of the arm that it has to be of; empty for any.
+    created
+        When the session was begun that it has to be of; of another there are none. '' for any.
+
+    Raises
+    ------
+    InputError
+        It is no discovery.json, or is of another arm.
     """
     found = _read(path, joint_names)
     if created and (not found.session or found.session.created != created):

@@ -335,7 +335,13 @@ def _describe(session: Session) -> dict[str, Any]:
 
 
 def read_fit(path: str | os.PathLike[str]) -> schemas.Fit:
-    """Read fit.json and check it against the contract; further keys are left out."""
+    """Read fit.json and check it against the contract; further keys are left out.
+
+    Raises
+    ------
+    InputError
+        One line naming the file, the key and the remedy.
+    """
     return read_result(Path(path), schemas.Fit, schemas.FIT_FORMAT, FIT_FILE, 'fit')
 
 
@@ -362,8 +368,15 @@ def joint_offsets_rad(
 ) -> tuple[FloatArray, FloatArray]:
     """Return the offsets of a fit.json in the order of a robot's joints, with their std.
 
-    rad, (k,) each; the std of a joint that is not identifiable is 0. An `InputError` where the
-    offsets are for other joints, or are no angles.
+    Returns
+    -------
+    offsets, std
+        rad, (k,) each; the std of a joint that is not identifiable is 0.
+
+    Raises
+    ------
+    InputError
+        The offsets are for other joints, or are no angles.
     """
     rows = {row.joint: row for row in fit.joint_offsets}
     if set(rows) != set(joint_names) or len(rows) < len(fit.joint_offsets):

@@ -45,8 +45,18 @@ def plan_page(
 ) -> str:
     """Return the page.
 
-    ``registered``: whether the sensors are where they were measured, not at their rough places;
-    ``confirm``: name of the plan where the arm waits until it is confirmed.
+    Parameters
+    ----------
+    plan
+        What is going to be done.
+    scene
+        The arm and all around it.
+    cell
+        What the cell is called.
+    registered
+        Whether the sensors are where they were measured, not at their rough places.
+    confirm
+        Name of the plan where the arm waits until it is confirmed.
     """
     # Only here: it brings the libraries of figures.
     from remaster_ros.reports.pages import compressed, page
@@ -105,10 +115,19 @@ def check_plan_page(path: Path) -> None:
 
 
 def read_plan_page(path: Path, plan: str) -> bytes:
-    """Return the page of the plan with this fingerprint, which waits for a confirmation.
+    """Return the page of a plan that waits for a confirmation.
 
-    Whoever publishes on the network may have chosen the path: nothing but such a page is returned,
-    else an `InputError`.
+    Parameters
+    ----------
+    path
+        Whoever publishes on the network may have chosen it: nothing but such a page is returned.
+    plan
+        Its fingerprint.
+
+    Raises
+    ------
+    InputError
+        There is no such page, or it shows another plan.
     """
     try:
         if not path.is_file() or path.stat().st_size > LARGEST_PAGE:
@@ -123,7 +142,13 @@ def read_plan_page(path: Path, plan: str) -> bytes:
 
 
 def write_plan_page(path: Path, html: str) -> None:
-    """Write the page, also over one that was written before, but over nothing else."""
+    """Write the page, also over one that was written before, but over nothing else.
+
+    Raises
+    ------
+    InputError
+        Something else is there, or it cannot be written.
+    """
     check_plan_page(path)
     with undone_on_failure():
         make_folder(path.parent)

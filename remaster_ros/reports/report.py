@@ -474,8 +474,21 @@ def write_answer(
 ) -> Answer:
     """Write report.html, the files to apply and, if asked for, report.pdf; return the answer.
 
-    The folders of the fit and of the discovery hold figures and files to apply. An `InputError` as
-    of `require_ready`.
+    Parameters
+    ----------
+    inputs
+        What was read.
+    fit_folder, found_folder
+        Of the fit and of the discovery, which hold figures and files to apply.
+    folder
+        Where to; made if missing.
+    figures, pdf
+        Whether to have figures, and report.pdf.
+
+    Raises
+    ------
+    InputError
+        The folder holds another's report or cannot be written to, or there is no library for PDF.
     """
     printer = require_ready(folder, pdf)
     answer = answer_of(inputs)
@@ -507,7 +520,13 @@ def write_answer(
 
 
 def require_ready(folder: Path, pdf: bool) -> Any:
-    """Refuse a folder with another command's report; return the library for PDF if asked for."""
+    """Refuse a folder with a report of another command; return the library for PDF if asked for.
+
+    Raises
+    ------
+    InputError
+        One line with the remedy.
+    """
     from remaster_ros.reports.plan_page import check_plan_page
 
     path = folder / REPORT_FILE

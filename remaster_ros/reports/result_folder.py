@@ -43,9 +43,17 @@ if TYPE_CHECKING:
 def prepare_folder(folder: str | os.PathLike[str], result: str) -> None:
     """Create the folder for results and make sure that files can be written there.
 
-    ``result`` is the file that the command writes there, `FIT_FILE` or `DISCOVERY_FILE`. With it
-    in the folder, and without that of the other, the folder is one of the command's own; any other
-    that has what it would replace is refused, before the long work and not after it.
+    Parameters
+    ----------
+    result
+        The file that the command writes there, `FIT_FILE` or `DISCOVERY_FILE`. With it in the
+        folder, and without that of the other, the folder is one of the command's own.
+
+    Raises
+    ------
+    InputError
+        They cannot, or would replace what this command has not written. This is checked before
+        the long work, not after it.
     """
     folder = Path(folder)
     make_folder(folder)
@@ -76,7 +84,18 @@ def _remove_report(folder: Path) -> None:
 def save_fit(result: FitResult, folder: str | os.PathLike[str], figures: bool = True) -> Path:
     """Write fit.json, residuals.csv, the files to apply the offsets, and the report with figures.
 
-    Returns the report; without figures there is none, and fit.json.
+    Without figures there is no report; that of an earlier fit in the folder would contradict
+    fit.json and is removed.
+
+    Returns
+    -------
+    Path
+        The report; fit.json without figures.
+
+    Raises
+    ------
+    InputError
+        The folder cannot be written to.
     """
     folder = Path(folder)
     make_folder(folder)
@@ -109,8 +128,17 @@ def save_discovery(
 ) -> Path:
     """Write discovery.json, predictions.csv, what to apply and, with figures, the report.
 
-    ``decided`` is what was decided between causes and look-alikes of an earlier search. Returns
-    the report; discovery.json without figures.
+    ``decided`` is what was decided between causes and look-alikes of an earlier search.
+
+    Returns
+    -------
+    Path
+        The report; discovery.json without figures.
+
+    Raises
+    ------
+    InputError
+        The folder cannot be written to.
     """
     # `fit` does not need what discovers.
     from remaster_ros.reports.discovery_json import applied, discovery_content, predictions_of

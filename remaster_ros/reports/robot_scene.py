@@ -81,7 +81,15 @@ class RobotScene:
 
 
 def robot_scene(cell: Workcell, scene: PlanningScene) -> RobotScene:
-    """Return the scene of a cell, of what the collision checks have and of its sensors."""
+    """Return the scene of a cell.
+
+    Parameters
+    ----------
+    cell
+        The cell.
+    scene
+        Its planning scene: what the collision checks have, and the sensors.
+    """
     chain, folder = scene.model.chain, Path(cell.file).parent
     urdf, mesh_path = folder / cell.robot.urdf, [folder / path for path in cell.mesh_path]
     parts = cache(lambda name: read_mesh_parts(find_mesh(name, urdf, mesh_path)))
@@ -162,8 +170,14 @@ def coarser(
 
     Vertices of one cell of a grid become their mean, and triangles that lose a corner go (J.
     Rossignac and P. Borrel, "Multi-resolution 3D approximations for rendering complex scenes",
-    1993); the grid widens until few enough are left, or its cells are 5 cm. Equal vertices are
-    always merged. Vertices in m, (n, 3), faces (m, 3).
+    1993); the grid widens until few enough are left. Equal vertices are always merged.
+
+    Parameters
+    ----------
+    vertices, faces
+        m, (n, 3), and (m, 3).
+    most
+        How many triangles are left at most; more only where cells of 5 cm leave more.
     """
     points, left = _clustered(vertices, faces, _EQUAL_M)
     cell = _FINEST_M

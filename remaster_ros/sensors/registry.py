@@ -26,7 +26,13 @@ def kind_of(node_name: str) -> str:
 
 
 def load_driver(node_name: str) -> type[Driver]:
-    """Return the driver for the node of this name."""
+    """Return the driver for the node of this name.
+
+    Raises
+    ------
+    InputError
+        The name begins with that of no registered sensor.
+    """
     kind = kind_of(node_name)
     if not kind:
         raise InputError(

@@ -94,10 +94,23 @@ def record_from_bag(
     cell: Workcell | None = None,
     progress: Callable[[float], None] = lambda share: None,
 ) -> Replayed:
-    """Write the session of a recorder's bag into a new or empty folder.
+    """Write the session of a bag.
 
-    ``cell`` is in place of the cell that the recorder wrote into the bag; ``progress`` is called
-    with the share done.
+    Parameters
+    ----------
+    bag
+        Of the recorder.
+    out
+        The session's folder, new or empty.
+    cell
+        In place of the cell that the recorder wrote into the bag.
+    progress
+        Called with the share done.
+
+    Raises
+    ------
+    InputError
+        No bag of a recorder, a damaged message, or a folder that holds something.
     """
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise InputError(f'{out}: there is something already; name a new folder for the session')

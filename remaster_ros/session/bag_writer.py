@@ -60,10 +60,20 @@ WAITING_LIMIT = 64 * 1024**2
 class BagWriter:
     """Write a rosbag2 folder; what `write` returned from survives a kill of this process.
 
-    While the disk is full, messages are kept in memory and written when there is room. The folder
-    is new or empty, and the bag's name is the folder's. With ``resume`` it goes on with the bag
-    there: it finishes the file of a killed writer, and begins the next one, as rosbag2 does where
-    it splits a bag.
+    While the disk is full, messages are kept in memory and written when there is room.
+
+    Parameters
+    ----------
+    folder
+        New or empty; the bag's name is the folder's.
+    resume
+        Go on with the bag that the folder holds: finish the file of a killed writer, and begin
+        the next one, as rosbag2 does where it splits a bag.
+
+    Raises
+    ------
+    InputError
+        The folder holds files, with `resume` a damaged bag, or cannot be written to.
     """
 
     def __init__(self, folder: str | os.PathLike[str], *, resume: bool = False) -> None:
@@ -104,13 +114,29 @@ class BagWriter:
         self._metadata_waits = False
 
     def write(self, topic: str, msgtype: str, cdr: bytes, stamp_ns: int) -> None:
-        """Write one message, which was received at ``stamp_ns``, nanoseconds since the epoch.
+        """Write one message.
 
         Stamps that run backwards (a clock was set) are stored as the latest stamp so far, because
         readers refuse an unindexed file out of order; the given stamp is kept as MCAP's
-        ``publish_time``. Where the clock has started anew since the file before, the whole file is
-        shifted to a second behind it. A `DiskError` where so much waits for the disk already that
-        this message is not kept.
+        ``publish_time``. Where the clock has started anew since the file before, the whole file
+        is shifted to a second behind it.
+
+        Parameters
+        ----------
+        topic, msgtype
+            Such as ``/joint_states`` and ``sensor_msgs/msg/JointState``.
+        cdr
+            The serialised message.
+        stamp_ns
+            When it was received, nanoseconds since the epoch.
+
+        Raises
+        ------
+        InputError
+            The message type is not one of ROS 2 Jazzy's, a topic changes its type, the stamp is
+            no time, or the bag is closed.
+        DiskError
+            So much waits for the disk already that this message is not kept.
         """
         if self._file is None:
             raise InputError(f'{self.folder}: the bag is closed; start a new one')
@@ -141,7 +167,10 @@ class BagWriter:
     def close(self) -> None:
         """Finish file, metadata.yaml and checksums, durable on return; again does nothing.
 
-        Where the disk does not take it (`DiskError`), what was written before remains readable.
+        Raises
+        ------
+        DiskError
+            The disk does not take it; what was written before remains readable.
         """
         if self._file is None:
             return

@@ -57,7 +57,13 @@ class HaltFile:
         return f'{halt.halted} (halted {halt.since}, before this bridge was started)'
 
     def write(self, reason: str) -> None:
-        """Keep a halt."""
+        """Keep a halt.
+
+        Raises
+        ------
+        RemasterError
+            The folder cannot be made or written.
+        """
         make_folder(self.path.parent)
         since = datetime.now(UTC).strftime('%Y-%m-%d %H:%M:%S UTC')
         write_atomically(self.path, msgspec.json.encode(_Halt(reason, since)))
@@ -116,7 +122,13 @@ class LastCommandFile:
         return LastCommand(end if known and np.isfinite(end).all() else None, age_s)
 
     def write(self, end: FloatArray, sent_ns: int) -> None:
-        """Keep where a command leads."""
+        """Keep where a command leads.
+
+        Raises
+        ------
+        RemasterError
+            The folder cannot be made or written.
+        """
         make_folder(self.path.parent)
         write_atomically(
             self.path, msgspec.json.encode(_Kept(self._joints, end.tolist(), sent_ns))

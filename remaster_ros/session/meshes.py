@@ -30,15 +30,26 @@ Taken = TypeVar('Taken')
 
 
 def mesh_reader(urdf: Path, mesh_path: Sequence[Path] = ()) -> Callable[[str], FloatArray]:
-    """Return what reads the meshes that a URDF file names: name -> vertices, m, (n, 3).
+    """Return what reads the meshes that a URDF file names.
 
     ``package://NAME/rest`` is looked for as ``NAME/rest`` in the folders of `mesh_path`, in the
     share folders of AMENT_PREFIX_PATH, and beside and above the URDF (a package's own URDF lies
     inside it), also where a package's folder has another name than the package. ``file://`` and
     plain names are taken relative to the URDF's folder, then to those of `mesh_path`. What lies
-    neither in one of these folders nor in a ROS package is not read. An `InputError` where there
-    is no such file or none that can be read; a link without its mesh would be a link that hits
-    nothing.
+    neither in one of these folders nor in a ROS package is not read.
+
+    Parameters
+    ----------
+    urdf
+        The URDF file.
+    mesh_path
+        Folders to look in.
+
+    Returns
+    -------
+    callable
+        File name as written -> vertices, m, (n, 3). It raises InputError where there is no such
+        file or none that can be read; a link without its mesh would be a link that hits nothing.
     """
     return cache(lambda name: read_mesh(find_mesh(name, urdf, mesh_path)))
 
@@ -98,7 +109,13 @@ class MeshPart:
 
 
 def read_mesh_parts(path: Path) -> list[MeshPart]:
-    """Return the surfaces of a mesh file with their colours, those of one colour as one."""
+    """Return the surfaces of a mesh file with their colours, those of one colour as one.
+
+    Raises
+    ------
+    InputError
+        A file that cannot be read, or one without any triangle.
+    """
     parts = _loaded(path, _parts, skip_materials=False)
     if not parts:
         raise InputError(f'{path}: the mesh has no triangles, or vertices that are not finite')

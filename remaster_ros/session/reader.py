@@ -47,9 +47,23 @@ def read_session(folder: str | os.PathLike[str], *, within_limits: bool = True) 
     """Read a session folder (format ``remaster-session/1``), and refuse what does not fit it.
 
     The folder may be read at any moment, also while it is being written and after a power cut.
-    Every number is finite, every name known, joints are checked against the URDF's chain and, with
-    ``within_limits``, against its limits. An `InputError` names file, line, column or key, and the
-    remedy.
+
+    Parameters
+    ----------
+    folder
+        Holds session.yaml, observations.csv and the URDF that session.yaml names.
+    within_limits
+        Whether joint angles outside the robot's limits are refused.
+
+    Returns
+    -------
+    Session
+        Every number finite, every name known, joints checked against the URDF's chain.
+
+    Raises
+    ------
+    InputError
+        One line naming file, line, column or key, and the remedy.
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -112,7 +126,13 @@ def read_robot(
 
 
 def write_session(folder: str | os.PathLike[str], session: Session) -> None:
-    """Write a whole session into a new or empty folder; numbers survive the round trip exactly."""
+    """Write a whole session into a new or empty folder; numbers survive the round trip exactly.
+
+    Raises
+    ------
+    InputError
+        The folder holds files or cannot be written to, or the session breaks the format.
+    """
     folder = Path(folder)
     chain = read_chain(
         session.urdf, folder / URDF, session.base_link, session.tip_link, sliding=True

@@ -30,8 +30,13 @@ def recover_session(folder: str | os.PathLike[str]) -> Recovery:
     """Finish the files of a session whose recorder was killed or lost its power.
 
     Lines cut off while they were written are dropped, observations.csv is brought up to the
-    journal, the bag is finished, and SHA256SUMS is written. Nothing that was acknowledged is ever
-    dropped; a second recovery changes nothing. The exit status stays what it is.
+    journal, the bag is finished, and SHA256SUMS is written. Nothing that was acknowledged is
+    ever dropped; a second recovery changes nothing. The exit status stays what it is.
+
+    Raises
+    ------
+    InputError
+        No session of a recorder, one that is being written, or a damaged one; names the file.
     """
     folder = Path(folder)
     header = read_header(folder)

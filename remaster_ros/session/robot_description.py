@@ -53,9 +53,20 @@ def read_description(
 ) -> str:
     """Return the URDF text of a file, or of a .xacro file with these arguments.
 
-    ROS packages are looked for in the folders of ``package_path`` beside those around the file. A
-    ``trusted`` xacro file may do what a program may: any Python expression, any file, the
-    environment.
+    Parameters
+    ----------
+    arguments
+        What ``xacro`` takes as NAME:=VALUE.
+    package_path
+        Folders to look for ROS packages in, beside those around the file.
+    trusted
+        Whether a xacro file may do what a program may: any Python expression, any file, the
+        environment.
+
+    Raises
+    ------
+    InputError
+        Naming the file and the remedy.
     """
     text = decode_text(read_limited(path, URDF_LIMIT, 'name a URDF or xacro file'), path)
     if not is_xacro(path):
@@ -121,10 +132,21 @@ def read_arm(
     trusted: bool = False,
     tables: Sequence[Path] = (),
 ) -> tuple[str, SerialChain]:
-    """Read a URDF, or expand a xacro as `read_description` does, and find the arm in it.
+    """Read a URDF, or expand a xacro, and find the arm in it.
 
-    Links that are None are the likely ones; of several arms it is the one whose joints ``tables``
-    name.
+    Parameters
+    ----------
+    base_link, tip_link
+        As told; None for the likely ones.
+    arguments, package_path, trusted
+        As of `read_description`.
+    tables
+        Whose joints are the arm's: of several arms it is the one that they name.
+
+    Raises
+    ------
+    InputError
+        Naming the file and the remedy.
     """
     urdf = read_description(path, arguments, package_path, trusted=trusted)
     try:

@@ -73,8 +73,18 @@ def read_outcomes(folder: Path) -> Outcomes:
 class SessionJournal:
     """Write a session, new or unfinished, and keep what was decided.
 
-    A complete session is not written to, and `closed` is set from the start; `reopen` may go
-    further with it. ``header`` is everything but the observations.
+    Parameters
+    ----------
+    folder
+        The session's. A complete session is not written to; `closed` is set from the start.
+        `reopen` may go further with it.
+    header
+        Everything but the observations.
+
+    Raises
+    ------
+    InputError
+        The folder holds something else, another process writes it, or it cannot be written to.
     """
 
     def __init__(self, folder: Path, header: Session) -> None:
@@ -177,15 +187,32 @@ class SessionJournal:
         temperatures_c: Sequence[float | None] = (),
         change: FloatArray | None = None,
     ) -> int:
-        """Write what became of a configuration, durable on return; return its number there.
+        """Write what became of a configuration; durable on return.
 
-        ``pose`` and ``solution`` are as the planner numbers them; ``split`` is ``registration``,
-        ``reference``, ``optimization`` or ``validation``; ``result`` is ``recorded``, ``partial``,
-        ``rejected``, ``failed`` or ``no_free_path``. ``readings`` are what was accepted, with the
-        temperature of each, degrees Celsius, None if unknown. ``from_q`` is where the arm came
-        from, ``change`` what a correction changed of what was wanted, rad, (k,); None where it is
-        unknown, or was off.
-        With a `DiskError` try again when there is room.
+        Parameters
+        ----------
+        pose, solution
+            As the planner numbers them.
+        split
+            ``registration``, ``reference``, ``optimization`` or ``validation``.
+        result, reason
+            ``recorded``, ``partial``, ``rejected``, ``failed`` or ``no_free_path``, and why.
+        readings, temperatures_c
+            What was accepted, and the temperature with each, degrees Celsius, None if unknown.
+        from_q
+            Where the arm came from, rad, (k,); None if unknown.
+        change
+            What a correction changed of what was wanted, rad, (k,); None where it was off.
+
+        Returns
+        -------
+        int
+            The number that the configuration has in the session, where it has readings.
+
+        Raises
+        ------
+        DiskError
+            The disk does not take it; try again when there is room.
         """
         record: Record = {
             'kind': 'configuration',

@@ -394,7 +394,13 @@ class _Priors(_Strict):
 
 
 def read_priors(path: str | os.PathLike[str]) -> Priors:
-    """Read and check a file of priors; the fit checks that the session has these names."""
+    """Read and check a file of priors; the fit checks that the session has these names.
+
+    Raises
+    ------
+    InputError
+        One line naming file, key and remedy.
+    """
     path = Path(path)
     data = read_limited(path, YAML_LIMIT, 'give a YAML file of priors')
     content = read_yaml(data, path, _Priors, PRIORS_HELP)

@@ -20,8 +20,16 @@ from remaster_ros.types import Measurements, Session
 def together(sessions: Sequence[tuple[str, Session]]) -> tuple[Session, list[str]]:
     """Return one session of all rows, and for each later session a line on how its rows are named.
 
-    Each is given with its name for messages. Names of sensors and markers of the second end in
-    ``_2``; to the numbers of its observations a power of ten is added.
+    Parameters
+    ----------
+    sessions
+        Name of each, for messages, and the session. Names of sensors and markers of the second end
+        in ``_2``; to the numbers of its observations a power of ten is added.
+
+    Raises
+    ------
+    InputError
+        Sessions of different robots, or one given twice.
     """
     (first_name, first), *others = sessions
     for index, (name, session) in enumerate(others):

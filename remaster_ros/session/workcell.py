@@ -445,9 +445,20 @@ class Workcell(msgspec.Struct, forbid_unknown_fields=True):
     ) -> CollisionModel:
         """Return the arm with tool, markers and obstacles, for collision checks.
 
-        ``unknown_offset_rad`` is what a joint's zero-offset may still be off by;
-        `unknown_offset_deg` where None. ``without_meshes`` takes capsules in place of meshes,
-        which then need not be there: for simulated arms, never for one that moves.
+        Parameters
+        ----------
+        chain
+            The arm of this cell.
+        unknown_offset_rad
+            What a joint's zero-offset may still be off by, rad; `unknown_offset_deg` where None.
+        without_meshes
+            Take capsules in place of meshes, which then need not be there: for simulated arms,
+            never for one that moves.
+
+        Raises
+        ------
+        InputError
+            A mesh of the URDF that cannot be found or read, or geometry that cannot be.
         """
         folder = Path(self.file).parent
         urdf = folder / self.robot.urdf

@@ -29,7 +29,13 @@ class EffectSpec:
 
     @classmethod
     def parse(cls, text: str) -> EffectSpec:
-        """Read ``NAME[@JOINT][:SIZE_MM]``, such as ``backlash@4:0.3`` or ``random``."""
+        """Read ``NAME[@JOINT][:SIZE_MM]``, such as ``backlash``, ``backlash@4:0.3``, ``random``.
+
+        Raises
+        ------
+        InputError
+            Text that is no request.
+        """
         match = re.fullmatch(r'([a-z_]+)(?:@(\d+))?(?::(\d*\.?\d+))?', text)
         if match is None or match[1] not in (RANDOM, *KINDS):
             raise InputError(

@@ -37,7 +37,13 @@ def _without_name(effect: HiddenEffect) -> Cause:
 
 
 def named_cause(effect: Mapping[str, Any]) -> list[Cause]:
-    """Return what one of ``effects`` of a discovery.json claims, one cause for each joint."""
+    """Return what an effect of a discovery.json claims, one cause for each joint.
+
+    Parameters
+    ----------
+    effect
+        Of its list ``effects``.
+    """
     name, joints = effect['name'], tuple(effect['joints'])
     if name not in NAMED:
         return [(name, joints, f'{effect["place"]} {effect["driver"]}')]

@@ -139,8 +139,21 @@ class ChainArm:
 def tool_points(chain: SerialChain, truth: SessionTruth, q: FloatArray, marker: str) -> FloatArray:
     """Return where a marker truly is at the stops of a tour, whatever a sensor makes of it.
 
-    ``q`` are reported joint angles in the order of the tour, rad, (m, k); the places are in the
-    base's frame R, m, (m, 3).
+    Parameters
+    ----------
+    chain
+        The arm as drawn.
+    truth
+        What is wrong with it.
+    q
+        Reported joint angles, in the order of the tour, rad, (m, k).
+    marker
+        Its name.
+
+    Returns
+    -------
+    ndarray
+        In the base's frame R, m, (m, 3).
     """
     tour = model_of_tour(chain, truth, q)
     names = tuple(truth.sensors), tuple(truth.markers)

@@ -584,7 +584,13 @@ class FakeLaserTracker:
         return self._instrument.locked
 
     def start(self) -> None:
-        """Listen, and serve in a thread of its own; a `DeviceError` for a port in use."""
+        """Listen, and serve in a thread of its own.
+
+        Raises
+        ------
+        DeviceError
+            If the port cannot be used.
+        """
         host, port = self._wanted
         try:
             self._listener = socket.create_server((host, port), backlog=4)

@@ -398,7 +398,13 @@ class FakeOptiTrackServer:
             return tuple(self._clients)
 
     def start(self) -> None:
-        """Open the sockets and begin to stream; a `DeviceError` where that cannot be."""
+        """Open the sockets and begin to stream.
+
+        Raises
+        ------
+        DeviceError
+            If the command port is in use or the host is no address of this machine.
+        """
         self._command = open_socket(
             self._host,
             self._wanted_port,

@@ -45,9 +45,19 @@ class FakeArm:
     def command(
         self, names: Sequence[str], points: Sequence[ServoPoint], start_s: float = 0.0
     ) -> str | None:
-        """Take a trajectory; return why it was dropped, for the log, or None when it is followed.
+        """Take a trajectory.
 
-        ``start_s`` is the header's stamp, s; 0 means now.
+        Parameters
+        ----------
+        names, points
+            As in the message.
+        start_s
+            The header's stamp, s; 0 means now.
+
+        Returns
+        -------
+        str or None
+            Why the trajectory was dropped, for the log; None when it is followed.
         """
         now = self.world.now()
         faults = self.world.faults('robot')

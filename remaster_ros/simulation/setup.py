@@ -27,9 +27,12 @@ PLACEMENT_STD_M = 0.03
 
 
 def default_folder(namespace: str = '/') -> Path:
-    """Return the folder of the fakes of this user, DDS domain and ROS namespace (``/left``).
+    """Return the folder of the fakes of this user, DDS domain and ROS namespace.
 
-    Every cell of a domain has its own World.
+    Parameters
+    ----------
+    namespace
+        Such as ``/left``: every cell of a domain has its own World.
     """
     domain = os.environ.get('ROS_DOMAIN_ID', '0')
     cell = namespace.rstrip('/').replace('/', '%')
@@ -39,8 +42,13 @@ def default_folder(namespace: str = '/') -> Path:
 def make_private_folder(folder: Path) -> None:
     """Make a folder that only this user may read, or take over such a one.
 
-    Its name can be guessed and the temporary directory is open to all: another user may have put a
-    folder or a link there, through which files elsewhere would be overwritten.
+    Its name can be guessed and the temporary directory is open to all: another user may have
+    put a folder or a link there, through which files elsewhere would be overwritten.
+
+    Raises
+    ------
+    InputError
+        There is something else of this name; see `require_private`.
     """
     try:
         folder.mkdir(mode=0o700)
@@ -86,10 +94,22 @@ def make_world(
 ) -> World:
     """Draw a hidden World for a cell; its time begins now.
 
-    A World that is in the folder is replaced. Where the sensors really stand, and how far the arm
-    is off, comes from config/fake_world.yaml and the seed; ``rate`` is world time over wall time.
-    ``hidden`` is what else is wrong with the arm or the sensors; how large that is depends on
-    ``candidates``, the candidate poses of each split that will be visited.
+    Parameters
+    ----------
+    folder
+        Where to put it; a World that is there is replaced.
+    cell
+        The arm, the markers and the names of the sensors; where the sensors really stand, and how
+        far the arm is off, comes from config/fake_world.yaml and the seed.
+    seed
+        Of everything drawn.
+    rate
+        World time over wall time.
+    hidden
+        What else is wrong with the arm or the sensors.
+    candidates
+        Candidate poses of each split that will be visited; how large a hidden effect is depends
+        on them.
     """
     settings = yaml.safe_load(config_path('fake_world.yaml').read_text())
     chain = cell.chain(sliding=True)
@@ -157,7 +177,17 @@ def _start(chain: SerialChain, angles: FloatArray) -> FloatArray:
 def open_world(folder: str, namespace: str = '/', timeout_s: float = 20.0) -> World:
     """Open the World in `folder` ('' for the default one), waiting until it has been made.
 
-    An `InputError` where there is none after `timeout_s` of wall time.
+    Parameters
+    ----------
+    folder, namespace
+        See `default_folder`.
+    timeout_s
+        How long to wait, wall time, s.
+
+    Raises
+    ------
+    InputError
+        If there is none after `timeout_s` of wall time.
     """
     path = Path(folder) if folder else default_folder(namespace)
     deadline = time.monotonic() + timeout_s

@@ -43,9 +43,24 @@ def plan_tour(
 ) -> Tour:
     """Plan poses that face one sensor and that all of them see, for every split with a count.
 
-    ``places`` is T_R_N of every sensor that has to see its marker, (4, 4); None for the cell's
-    rough places. ``counts``: split -> number of candidate poses. ``without_meshes`` takes capsules
-    in place of meshes: a simulated arm can hurt no one, and its meshes may be on another machine.
+    Parameters
+    ----------
+    chain, cell
+        The arm, and where it works.
+    places
+        T_R_N of every sensor that has to see its marker, (4, 4); None for the cell's rough places.
+    counts
+        Split -> number of candidate poses.
+    rng
+        Source of randomness.
+    without_meshes
+        Take capsules in place of meshes: a simulated arm can hurt no one, and its meshes may be on
+        another machine.
+
+    Raises
+    ------
+    InputError
+        No way to solve for the joints of this robot, or no pose to fit that it can take.
     """
     scene = cell.planning_scene(chain, without_meshes=without_meshes)
     sensors_R = scene.rough_R
@@ -275,14 +290,36 @@ def simulate_workcell(
 ) -> SimulatedRun:
     """Plan in a workcell, draw a truth, and measure.
 
-    Of the candidate poses those that cannot be reached are dropped. ``sigma_m`` is the noise of
-    every point, ``pose_sigma_m`` the error common to the solutions of a pose, m per axis;
-    ``depth_sigma_m`` noise along the line of sight at 1 m, which grows with the square of the
-    distance. ``turn_sigma_rad`` and ``pose_turn_sigma_rad`` are the first two of orientations;
-    without the former none are measured. ``on_tool``: whether the sensors are on the tool and
-    measure what stands in their places. ``outlier_share`` of the observations are 20 mm off;
-    ``joint_offset_std`` is of the true zero-offsets, rad. ``measuring`` is called when the
-    planning has ended.
+    Parameters
+    ----------
+    cell, chain
+        The workcell and its arm, see `choose_robot`.
+    rng
+        Source of all randomness.
+    poses, validation_poses
+        Candidate poses; those that cannot be reached are dropped.
+    sigma_m, pose_sigma_m
+        Noise of every point, and error common to the solutions of a pose, m per axis.
+    depth_sigma_m
+        Noise along the line of sight at 1 m, which grows with the square of the distance, m.
+    turn_sigma_rad, pose_turn_sigma_rad
+        The same two of orientations, rad per axis; without the first one none are measured.
+    on_tool
+        Whether the sensors are on the tool and measure what stands in their places.
+    outlier_share
+        Share of the observations that are 20 mm off.
+    joint_offset_std
+        Of the true zero-offsets, rad.
+    effects
+        What else is wrong with the arm or the sensors.
+    measuring
+        Called when the planning has ended.
+
+    Raises
+    ------
+    InputError
+        No way to solve for the joints of this robot, no pose that it can take, or sensors that
+        cannot measure so.
     """
     if turn_sigma_rad is None and (on_tool or pose_turn_sigma_rad):
         what = 'on the tool' if on_tool else 'with noise of pose orientations'
@@ -350,7 +387,13 @@ def choose_robot(
     base_link: str | None = None,
     tip_link: str | None = None,
 ) -> SerialChain:
-    """Put another robot into the cell where one is named; return the chain."""
+    """Put another robot into the cell where one is named; return the chain.
+
+    Raises
+    ------
+    InputError
+        No such robot, or a URDF that is none.
+    """
     if robot is not None:
         shipped = config_path(f'robots/{robot}.urdf')
         path = shipped if shipped.is_file() else Path(robot)
@@ -373,7 +416,13 @@ def choose_robot(
 
 
 def choose_sensors(cell: Workcell, chosen: tuple[str, ...] | None) -> None:
-    """Leave the chosen sensors in the cell; aim at the first of them if need be."""
+    """Leave the chosen sensors in the cell; aim at the first of them if need be.
+
+    Raises
+    ------
+    InputError
+        The cell has no such sensor.
+    """
     if chosen is None:
         return
     for name in chosen:

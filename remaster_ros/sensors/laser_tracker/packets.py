@@ -287,10 +287,15 @@ Event = (
 
 
 def encode(event: Event) -> bytes:
-    """Return the packet of an event; a `ValueError` where its values do not fit the layout.
+    """Return the packet of an event.
 
     A failed reply is filled with zeros to the size of one that succeeded, because clients unpack
     the whole layout before they look at the status.
+
+    Raises
+    ------
+    ValueError
+        If the values do not fit the layout, or the event is no packet.
     """
     try:
         type_, body = _type_and_body(event)
@@ -349,9 +354,12 @@ class PacketReader:
     def next_event(self) -> Event | NeedData:
         """Return the next event, or `NEED_DATA`.
 
-        A packet that does not fit its layout is dropped with a `ProtocolError`, and the next call
-        goes on after it. If the size of a packet is impossible, or the peer closed in the middle
-        of one, `broken` is set and every further call raises.
+        Raises
+        ------
+        ProtocolError
+            If the packet does not fit its layout; it is dropped, and the next call goes on after
+            it. If the size of a packet is impossible, or the peer closed in the middle of one,
+            `broken` is set and every further call raises.
         """
         buffer = self._buffer
         if len(buffer) < _HEADER.size:

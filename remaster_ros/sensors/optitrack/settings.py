@@ -53,10 +53,19 @@ def interface_towards(server_ip: str, port: int) -> str:
 def open_socket(
     address: str, port: int, *, purpose: str, remedy: str, shared: bool = False
 ) -> socket.socket:
-    """Open a non-blocking UDP socket bound to an address and port, or raise a `DeviceError`.
+    """Open a non-blocking UDP socket bound to an address and port.
 
-    What the port is for, and which parameter to change, are for its message. ``shared``: whether
-    other programs may listen on the same port (multicast).
+    Parameters
+    ----------
+    purpose, remedy
+        For the error message: what the port is for, and which parameter to change.
+    shared
+        Whether other programs may listen on the same port (multicast).
+
+    Raises
+    ------
+    DeviceError
+        If the port is in use, or the address is not one of this machine.
     """
     opened = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     try:

@@ -142,9 +142,16 @@ class TopicDriver(StreamDriver):
         marker: str,
         publishers: Callable[[], Sequence[tuple[str, str]]],
     ) -> None:
-        """Learn what is subscribed to, for which marker of the cell.
+        """Learn what is subscribed to.
 
-        ``publishers`` gives node and message type of each publisher of the topic now.
+        Parameters
+        ----------
+        topic, message_type
+            As in the cell file.
+        marker
+            Its name in the cell.
+        publishers
+            Gives node and message type of each publisher of the topic now.
         """
         self.topic, self._type, self._marker = topic, message_type, self.p.select or marker
         self._publishers = publishers
