@@ -12,8 +12,6 @@ from pathlib import Path
 
 import numpy as np
 
-from remaster_ros.simulation.optitrack import FakeOptiTrackServer
-
 RATE = 10.0
 SENSOR = 'mocap'
 
@@ -91,13 +89,3 @@ def nothing_left() -> Iterator[None]:
     yield
     assert set(threading.enumerate()) <= threads
     assert _descriptors() <= descriptors
-
-
-class WatchedServer(FakeOptiTrackServer):
-    """A server whose last frame a forger may look at."""
-
-    latest = None
-
-    def _distribute(self, frame):
-        self.latest = frame
-        super()._distribute(frame)

@@ -176,6 +176,7 @@ def times(table: TextTable, columns: Columns) -> FloatArray | None:
         if np.all((result >= 0.0) & (result < 1.0)):
             # A time of day as its share of the day: no session takes less than a second.
             return result * DAY_S
+    if unit not in TIMES:
         largest = np.abs(result).max(initial=0.0)
         unit = next((name for size, name in _EPOCHS if largest > size), 's')
     return result * TIMES[unit]

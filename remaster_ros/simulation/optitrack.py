@@ -384,6 +384,7 @@ class FakeOptiTrackServer:
         self._lock = threading.Lock()
         self._closing = threading.Event()
         self._threads: list[threading.Thread] = []
+        self._latest: Frame | None = None
 
     @property
     def command_port(self) -> int:
@@ -458,7 +459,7 @@ class FakeOptiTrackServer:
             # Before the wait: time that stood until this frame is sent would never get there.
             self._world.kept_up(self._sensor, due_s)
             self._world.sleep_until(due_s)
-            frame = self._scene.frame(number, self._version, due_s)
+            self._latest = frame = self._scene.frame(number, self._version, due_s)
             for message in self._spoiler.spoil(frame, self._world.faults(self._sensor)):
                 self._distribute(message)
 
@@ -498,6 +499,8 @@ class FakeOptiTrackServer:
             return [self._obey(request.text, address)]
         if request.id == MessageId.REQUEST_MODELDEF:
             return [self._scene.model]
+        if request.id == MessageId.REQUEST_FRAMEOFDATA:
+            return [self._latest] if self._latest is not None else [_UNRECOGNIZED]
         if request.id == MessageId.ECHOREQUEST:
             ticks = self._scene.ticks(self._world.now())
             return [natnet.EchoResponse(request.clock, ticks)]
@@ -529,6 +532,8 @@ class FakeOptiTrackServer:
     def _obey(self, command: str, address: Address) -> Message:
         """Answer a REQUEST."""
         name, _, argument = command.partition(',')
+        if name == 'FrameRate':
+            return natnet.Response(np.float32(self._rate_hz).tobytes())
         if name != 'Bitstream':
             return _UNRECOGNIZED
         if argument:

@@ -17,14 +17,7 @@ from contextlib import contextmanager
 
 import numpy as np
 import pytest
-from optitrack_world import (
-    SENSOR,
-    MarkerWorld,
-    WatchedServer,
-    eventually,
-    free_port,
-    nothing_left,
-)
+from optitrack_world import SENSOR, MarkerWorld, eventually, free_port, nothing_left
 
 from remaster_ros.errors import DeviceError, InputError
 from remaster_ros.sensors.driver import SensorClock
@@ -35,7 +28,7 @@ from remaster_ros.sensors.optitrack.frame_gate import Dropped, MarkerChoice
 from remaster_ros.sensors.optitrack.natnet import LabeledMarker
 from remaster_ros.sensors.optitrack.natnetclient_backend import NatNetClientBackend
 from remaster_ros.sensors.optitrack.settings import NatNetSettings
-from remaster_ros.simulation.optitrack import OptiTrackBehaviour
+from remaster_ros.simulation.optitrack import FakeOptiTrackServer, OptiTrackBehaviour
 
 MARKER = np.array([0.3, -0.1, 2.0])
 TOOL = OptiTrackBehaviour()
@@ -52,7 +45,7 @@ class StillWorld(MarkerWorld):
 
 @contextmanager
 def fake_server(**options):
-    server = WatchedServer(
+    server = FakeOptiTrackServer(
         StillWorld(),
         SENSOR,
         np.random.default_rng(3),
@@ -286,7 +279,7 @@ def test_the_natnetclient_backend_believes_one_source():
         client.start()
         assert eventually(lambda: client.status().source)
         for _ in range(30):
-            frame = server.latest
+            frame = server._latest
             forged = dataclasses.replace(
                 frame,
                 number=frame.number + 1,

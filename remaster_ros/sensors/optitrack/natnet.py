@@ -792,6 +792,11 @@ class Response:
         return I32.read(Reader(self.payload)) if len(self.payload) == 4 else None
 
     @property
+    def value(self) -> float | None:
+        """The answer as a number, such as the frame rate; None if it is a text."""
+        return F32.read(Reader(self.payload)) if len(self.payload) == 4 else None
+
+    @property
     def text(self) -> str:
         """The answer as a text, such as ``Bitstream,4.1``."""
         return _text(self.payload)

@@ -16,14 +16,14 @@ import time
 
 import numpy as np
 import pytest
-from optitrack_world import SENSOR, MarkerWorld, WatchedServer, eventually, free_port
+from optitrack_world import SENSOR, MarkerWorld, eventually, free_port
 
 from remaster_ros.sensors.optitrack import natnet
 from remaster_ros.sensors.optitrack.client import NatNetClient
 from remaster_ros.sensors.optitrack.frame_gate import Dropped
 from remaster_ros.sensors.optitrack.marker_follower import warning
 from remaster_ros.sensors.optitrack.settings import NatNetSettings
-from remaster_ros.simulation.optitrack import OptiTrackBehaviour
+from remaster_ros.simulation.optitrack import FakeOptiTrackServer, OptiTrackBehaviour
 
 LOCAL = '127.0.0.1'
 HERE, FORGED = 2.0, 2.003
@@ -44,8 +44,8 @@ class StillWorld(MarkerWorld):
         return np.array([0.3, 0.0, HERE])
 
 
-class Server(WatchedServer):
-    """The genuine server."""
+class Server(FakeOptiTrackServer):
+    """The genuine server; a forger may look at what it sends."""
 
     def __init__(self, data_port, transport, command_port=0):
         quiet = OptiTrackBehaviour(noise_across_m=1e-6, noise_along_m=1e-6)
@@ -90,7 +90,7 @@ class Forger:
     def _forge(self):
         last = None
         while not self._stop.wait(0.001):
-            frame = self._server.latest
+            frame = self._server._latest
             target = self._target or self._server.target(self._data_port)
             if frame is None or frame is last or target is None:
                 continue
@@ -198,7 +198,7 @@ def test_a_server_from_another_port_is_taken_anew_and_reported(caplog):
             forger = at_end.enter_context(Forger(server, data_port))
             assert eventually(lambda: client.status().rivals)
             assert eventually(lambda: forger.sent > 40)
-            frame = server.latest
+            frame = server._latest
         # The forger goes on alone, with frames that advance.
         forger.pause()
         forger.go_on(frame, 4 * SILENCE_S)
@@ -222,10 +222,10 @@ def test_a_successor_needs_a_new_answer_of_the_command_channel():
     with following(command_port, data_port, 'multicast') as (client, samples):
         with Server(data_port, 'multicast', command_port) as server:
             assert eventually(lambda: len(samples) > 20)
-            frame = server.latest
+            frame = server._latest
         assert eventually(lambda: client.status().source == '')
         count = len(samples)
-        server.latest = None
+        server._latest = None
         with Forger(server, data_port) as newcomer:
             newcomer.go_on(frame, 3 * SILENCE_S)
         assert len(samples) == count

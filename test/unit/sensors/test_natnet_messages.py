@@ -146,7 +146,7 @@ def test_every_form_of_connect_is_understood(datagram, wanted):
 
 
 def test_requests_are_understood_whatever_their_header_says():
-    assert natnet.decode_request(natnet.encode_command_request('Bitstream')).text == 'Bitstream'
+    assert natnet.decode_request(natnet.encode_command_request('FrameRate')).text == 'FrameRate'
     assert natnet.decode_request(struct.pack('<HH', 2, 0) + b'Bitstream,4.1').text == (
         'Bitstream,4.1'
     )
@@ -158,9 +158,10 @@ def test_requests_are_understood_whatever_their_header_says():
 
 
 def test_answers_read_as_number_or_text():
+    assert natnet.Response(struct.pack('<f', 120.0)).value == 120.0
     assert natnet.Response(struct.pack('<i', -3)).code == -3
     named = natnet.Response(b'Bitstream,4.1\0')
-    assert (named.text, named.code) == ('Bitstream,4.1', None)
+    assert (named.text, named.code, named.value) == ('Bitstream,4.1', None, None)
 
 
 def text(value):

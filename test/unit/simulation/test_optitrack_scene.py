@@ -162,6 +162,8 @@ def test_the_command_channel_answers_what_clients_ask(unicast_server):
             info = asker.ask(connect, natnet.ServerInfo)
             assert info.natnet_version == (4, 1)
             assert not info.connection.is_multicast
+        rate = asker.ask(natnet.encode_command_request('FrameRate'), natnet.Response)
+        assert rate.value == 25.0
         echo = asker.ask(natnet.encode_echo_request(77), natnet.EchoResponse)
         assert echo.client_clock == 77
         assert asker.ask(natnet.encode_echo_request(78), natnet.EchoResponse).server_clock > (
@@ -170,11 +172,12 @@ def test_the_command_channel_answers_what_clients_ask(unicast_server):
         model = asker.ask(struct.pack('<2H', 4, 0) + b'\0', natnet.ModelDefinition)
         assert model.labelled_assets == {'tool': 1}
         assert model.rigid_bodies[0].marker_names[0] == 'tool_1'
+        assert asker.ask(natnet.join_datagram(MessageId.REQUEST_FRAMEOFDATA), Frame)
         for unknown in (struct.pack('<2H', 55, 0), natnet.encode_command_request('Fly')):
             notice = asker.ask(unknown, natnet.Notice)
             assert notice.id == MessageId.UNRECOGNIZED_REQUEST
         asker.socket.send(b'x')  # no header: ignored
-        assert asker.ask(natnet.encode_command_request('Bitstream'), natnet.Response)
+        assert asker.ask(natnet.encode_command_request('FrameRate'), natnet.Response)
 
 
 def test_the_bitstream_is_negotiated_as_from_4_0(unicast_server):
