@@ -8,6 +8,7 @@ import socket
 import threading
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -37,24 +38,37 @@ from remaster_ros.types import FloatArray
 LENGTH_UNITS_M = (1.0, 1e-3, 1e-6, 0.3048, 0.9144, 0.0254)
 """Metre, millimetre, micron, foot, yard, inch."""
 
-AIR = (20.0, 1013.25, 50.0)
-"""Temperature (°C) without warming, pressure (mbar) and relative humidity (%)."""
+REFLECTORS = {1: (1, 0.01905, 'CCR 1.5in'), 2: (1, 0.00635, 'CCR 0.5in')}
+"""Number -> target type (corner cube), surface offset (m), name."""
 
-SETTINGS: dict[Command, tuple[Change, tuple[Value, ...]]] = {
-    Command.SET_UNITS: (Change.UNITS, (1, 0, 0, 0, 0)),
-    Command.SET_MEASUREMENT_MODE: (Change.MEASUREMENT_MODE, (0,)),
-    Command.SET_COORDINATE_SYSTEM_TYPE: (Change.COORDINATE_SYSTEM_TYPE, (0,)),
-    Command.SET_STATIONARY_MODE: (Change.STATIONARY_MODE, (1000, 1)),
-    # The radius is kept in m.
-    Command.SET_SEARCH: (Change.SEARCH, (0.05, 10_000)),
-    Command.SET_STATISTIC_MODE: (Change.STATISTIC_MODE, (0, 0)),
+
+class Setting(NamedTuple):
+    """The command that reads a setting, what is sent when it changes, the first values."""
+
+    get: Command
+    change: Change
+    initial: tuple[Value, ...]
+
+
+SETTINGS = {
+    Command.SET_UNITS: Setting(Command.GET_UNITS, Change.UNITS, (1, 0, 0, 0, 0)),
+    Command.SET_ENVIRONMENT: Setting(
+        Command.GET_ENVIRONMENT, Change.ENVIRONMENT, (20.0, 1013.25, 50.0)
+    ),
+    Command.SET_MEASUREMENT_MODE: Setting(
+        Command.GET_MEASUREMENT_MODE, Change.MEASUREMENT_MODE, (0,)
+    ),
+    Command.SET_COORDINATE_SYSTEM_TYPE: Setting(
+        Command.GET_COORDINATE_SYSTEM_TYPE, Change.COORDINATE_SYSTEM_TYPE, (0,)
+    ),
+    Command.SET_STATIONARY_MODE: Setting(
+        Command.GET_STATIONARY_MODE, Change.STATIONARY_MODE, (1000, 1)
+    ),
+    Command.SET_REFLECTOR: Setting(Command.GET_REFLECTOR, Change.REFLECTOR, (1,)),
+    Command.SET_SEARCH: Setting(Command.GET_SEARCH, Change.SEARCH, (50.0, 10_000)),
+    Command.SET_STATISTIC_MODE: Setting(Command.GET_STATISTIC_MODE, Change.STATISTIC_MODE, (0, 0)),
 }
-"""What is sent when a setting changes, and its first values."""
-READ_BY = {
-    Command.GET_UNITS: Command.SET_UNITS,
-    Command.GET_MEASUREMENT_MODE: Command.SET_MEASUREMENT_MODE,
-    Command.GET_COORDINATE_SYSTEM_TYPE: Command.SET_COORDINATE_SYSTEM_TYPE,
-}
+"""The environment is temperature (°C), pressure (mbar) and relative humidity (%) of the air."""
 
 
 @dataclass(frozen=True)
@@ -103,6 +117,12 @@ def refusal(command: Command, values: tuple[Value, ...]) -> Status:
         Command.SET_STATISTIC_MODE,
     ):
         return Status.NOT_IMPLEMENTED if np.any(numbers) else Status.ALL_OK
+    if command is Command.SET_REFLECTOR:
+        return Status.ALL_OK if values[0] in REFLECTORS else Status.WRONG_PARAMETER_1
+    if command is Command.SET_ENVIRONMENT:
+        temperature, pressure, humidity = numbers
+        inside = -20 <= temperature <= 60 and 500 <= pressure <= 1200 and 0 <= humidity <= 100
+        return Status.ALL_OK if inside else Status.METEO_DATA_OUT_OF_RANGE
     # What is left are the search and the stationary mode: radius and time, time and a flag.
     return Status.ALL_OK if numbers[0] > 0 and numbers[1] >= 0 else Status.WRONG_PARAMETER
 
@@ -292,7 +312,7 @@ class TrackerInstrument:
         self._initialized = False
         self._operation: Operation | None = None
         self._out: list[Event] = []
-        self._settings = {command: initial for command, (_, initial) in SETTINGS.items()}
+        self._settings = {setting.get: setting.initial for setting in SETTINGS.values()}
 
     # What a client sees
 
@@ -319,8 +339,9 @@ class TrackerInstrument:
             self._set(command, request.values)
         elif command in _TAKES_TIME:
             self._begin(command, request.values)
-        elif values := self._answer(command):
-            self._reply(command, 0, values)
+        elif answers := self._answers(command):
+            for values in answers:
+                self._reply(command, 0, values)
         else:
             self._reply(command, Status.NOT_IMPLEMENTED)
         return self._sent()
@@ -361,29 +382,41 @@ class TrackerInstrument:
 
     @property
     def _unit_m(self) -> float:
-        return LENGTH_UNITS_M[int(self._settings[Command.SET_UNITS][0])]
+        return LENGTH_UNITS_M[int(self._settings[Command.GET_UNITS][0])]
 
     def _set(self, command: Command, values: tuple[Value, ...]) -> None:
+        setting = SETTINGS[command]
         status = Status.SERVER_BUSY if self._operation else refusal(command, values)
         if status == Status.ALL_OK:
-            if command is Command.SET_SEARCH:
-                values = (float(values[0]) * self._unit_m, values[1])
-            self._settings[command] = values
+            if command is Command.SET_UNITS:
+                self._convert_lengths(int(values[0]))
+            self._settings[setting.get] = values
         self._reply(command, status)
         if status == Status.ALL_OK:
-            self._out.append(StatusChange(SETTINGS[command][0]))
+            self._out.append(StatusChange(setting.change))
 
-    def _answer(self, command: Command) -> tuple[Value, ...]:
-        """Return the values of the reply to a query; none where it is no query."""
-        if command in READ_BY:
-            return self._settings[READ_BY[command]]
+    def _convert_lengths(self, unit: int) -> None:
+        """Keep the search radius what it is when its unit changes."""
+        radius, timeout = self._settings[Command.GET_SEARCH]
+        scale = self._unit_m / LENGTH_UNITS_M[unit]
+        self._settings[Command.GET_SEARCH] = (float(radius) * scale, timeout)
+
+    def _answers(self, command: Command) -> list[tuple[Value, ...]]:
+        """Return the values of each reply to a query; none where it is no query."""
+        if command in self._settings:
+            return [self._settings[command]]
         if command is Command.GET_TRACKER_STATUS:
-            return (self.readiness,)
+            return [(self.readiness,)]
         if command is Command.GET_SYSTEM_STATUS:
             processor = 5 if self._initialized else 3
             laser, adm = (3, 2) if self._time >= self._warm_at else (0, 1)
-            return (Status.ALL_OK, processor, laser, adm, 3, 8, 500, 0, 0, 390001)
-        return ()
+            return [(Status.ALL_OK, processor, laser, adm, 3, 8, 500, 0, 0, 390001)]
+        if command is Command.GET_REFLECTORS:
+            return [
+                (len(REFLECTORS), number, kind, offset / self._unit_m, name.encode('utf-16le'))
+                for number, (kind, offset, name) in REFLECTORS.items()
+            ]
+        return []
 
     # Commands that take time
 
@@ -462,8 +495,8 @@ class TrackerInstrument:
         A spiral of pitch p, run through at speed v, reaches the radius r after π r² / (p v).
         """
         b = self.behaviour
-        search_radius, timeout_ms = self._settings[Command.SET_SEARCH]
-        radius = float(search_radius)
+        search_radius, timeout_ms = self._settings[Command.GET_SEARCH]
+        radius = float(search_radius) * self._unit_m
         blind = self._rng.random() < b.search_failure_share
         yield from self._turn(target)
         start, reached, found = self._time, 0.0, False
@@ -481,7 +514,7 @@ class TrackerInstrument:
         self._reply(command, Status.ALL_OK if found else Status.MEASUREMENT_STATUS_NOT_READY)
 
     def _measure(self) -> Operation:
-        integration_ms, _ = self._settings[Command.SET_STATIONARY_MODE]
+        integration_ms, _ = self._settings[Command.GET_STATIONARY_MODE]
         end = self._time + int(integration_ms) * 1e-3
         samples = [self._beam.reflector(self._time)]
         problem = Status.ALL_OK
@@ -500,7 +533,8 @@ class TrackerInstrument:
     def _result(self, truth: FloatArray) -> Measurement:
         cov = covariance(truth, self.behaviour)
         position = self._rng.multivariate_normal(truth, cov)
-        temperature, pressure, humidity = AIR
+        temperature, pressure, humidity = map(float, self._settings[Command.GET_ENVIRONMENT])
+        # The weather station measures the warming on top of the temperature that was set.
         temperature += self._world.warming_k(self._time)
         return adm_result(
             position,

@@ -51,17 +51,27 @@ class Command(IntEnum):
     SET_UNITS = 5, '5I'  # length, angle, temperature, pressure, humidity
     GET_UNITS = 6, '', '5I'
     INITIALIZE = 7
+    SET_ENVIRONMENT = 20, '3d'  # temperature, pressure, humidity
+    GET_ENVIRONMENT = 21, '', '3d'
     SET_MEASUREMENT_MODE = 24, 'I'
     GET_MEASUREMENT_MODE = 25, '', 'I'
     SET_COORDINATE_SYSTEM_TYPE = 26, 'I'
     GET_COORDINATE_SYSTEM_TYPE = 27, '', 'I'
     SET_STATIONARY_MODE = 28, '2i'  # integration time in ms, use ADM
+    GET_STATIONARY_MODE = 29, '', '2i'
+    SET_REFLECTOR = 40, 'i'
+    GET_REFLECTOR = 41, '', 'i'
+    GET_REFLECTORS = 42, '', '2iId64s'  # one reply per reflector
     SET_SEARCH = 43, 'di'  # radius, time-out in ms
+    GET_SEARCH = 44, '', 'di'
     START_MEASUREMENT = 49
     GO_POSITION = 55, '3di'  # three coordinates, use ADM
     FIND_REFLECTOR = 63, 'd'  # approximate distance
     UNKNOWN = 64
+    GET_DIRECTION = 66, '', '2d'
     SET_STATISTIC_MODE = 80, '2I'  # stationary, continuous
+    GET_STATISTIC_MODE = 81, '', '2I'
+    GET_FACE = 98, '', 'I'
 
 
 class Status(IntEnum):
@@ -160,8 +170,10 @@ def describe_status(status: int) -> str:
 class Change(IntEnum):
     """What a status change reports (those that matter to us)."""
 
+    ENVIRONMENT = 2
     SEARCH = 4
     UNITS = 6
+    REFLECTOR = 7
     COORDINATE_SYSTEM_TYPE = 12
     MEASUREMENT_MODE = 17
     STATIONARY_MODE = 18

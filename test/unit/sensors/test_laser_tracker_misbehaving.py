@@ -159,7 +159,7 @@ def test_strange_packets_are_counted_and_change_nothing():
         StatusChange(123456),
         b'\x10\0\0\0\x08\0\0\0' + bytes(8),  # a status change of the wrong size
         ErrorReport(Command.FIND_REFLECTOR, 10004),  # about a command that is not under way
-        Reply(Command.GET_UNITS, 0, (0,) * 5),
+        Reply(Command.GET_FACE, 0, (1,)),
     ]
     script = instead(
         Command.START_MEASUREMENT, *noise, Reply(Command.START_MEASUREMENT), *noise, RESULT
@@ -181,7 +181,7 @@ def test_bytes_that_are_no_packets_end_the_connection():
 
 
 def test_an_instrument_that_never_stops_talking_holds_nobody():
-    chatter = [Reply(Command.GET_UNITS, 0, (0,) * 5)] * 50
+    chatter = [Reply(Command.GET_FACE, 0, (1,))] * 50
 
     def babble(request: Request) -> list[Event | bytes]:
         if request.command is not Command.START_MEASUREMENT:

@@ -187,7 +187,7 @@ def test_failed_reply_comes_with_or_without_its_values():
     [
         Request(Command.FIND_REFLECTOR),
         Request(Command.FIND_REFLECTOR, ('far',)),
-        Request(Command.SET_MEASUREMENT_MODE, (2**40,)),
+        Request(Command.SET_REFLECTOR, (2**40,)),
         Reply(Command.GET_UNITS, 0, (1, 2)),
         ErrorReport(-1, 0),
         ConnectionClosed(),

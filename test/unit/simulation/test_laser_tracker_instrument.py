@@ -18,7 +18,7 @@ from remaster_ros.sensors.laser_tracker.packets import (
     Status,
     StatusChange,
 )
-from remaster_ros.simulation.laser_tracker import AIR, TrackerBehaviour, TrackerInstrument
+from remaster_ros.simulation.laser_tracker import TrackerBehaviour, TrackerInstrument
 
 SURE = TrackerBehaviour(search_failure_share=0.0)
 METRES = Request(Command.SET_UNITS, (0, 0, 0, 0, 0))
@@ -115,13 +115,14 @@ def test_errors_are_those_of_the_data_sheet():
 def test_result_comes_in_the_unit_set_and_with_the_air():
     bench = Bench().locked()
     bench.send(Command.SET_UNITS, 1, 0, 0, 0, 0)
+    bench.send(Command.SET_ENVIRONMENT, 23.5, 990.0, 30.0)
     bench.send(Command.START_MEASUREMENT)
     events, took = bench.run_until_idle()
     (result,) = (e for e in events if isinstance(e, Measurement))
     assert took == pytest.approx(1.0, abs=0.11)
     np.testing.assert_allclose(result.values, MARKER * 1e3, atol=0.1)
     assert result.std_total < 0.05
-    assert (result.temperature, result.pressure, result.humidity) == AIR
+    assert (result.temperature, result.pressure, result.humidity) == (23.5, 990.0, 30.0)
 
 
 def test_a_second_command_while_busy_is_refused():
@@ -201,9 +202,7 @@ def test_large_reconfigurations_break_the_beam(joint_travel, share, locked):
     assert bench.instrument.locked is locked
 
 
-def find_from(
-    offset_m: float, radius_m: float, timeout_s: float = 20.0, per_m: float = 1.0
-) -> tuple[bool, float]:
+def find_from(offset_m: float, radius_m: float, timeout_s: float = 20.0) -> tuple[bool, float]:
     """Search for a reflector that is off the aim by so much; return whether found, and when."""
     across = np.cross(MARKER, [0, 0, 1.0])
     distance = np.linalg.norm(MARKER)
@@ -215,9 +214,7 @@ def find_from(
     bench.run_until_idle()
     bench.instrument.handle(METRES)
     bench.send(Command.SET_SEARCH, radius_m, round(1e3 * timeout_s))
-    if per_m == 1e3:
-        bench.send(Command.SET_UNITS, 1, 0, 0, 0, 0)
-    bench.send(Command.FIND_REFLECTOR, float(per_m * distance))
+    bench.send(Command.FIND_REFLECTOR, float(distance))
     events, took = bench.run_until_idle()
     status = Status.ALL_OK if bench.instrument.locked else Status.MEASUREMENT_STATUS_NOT_READY
     assert events[0] == Reply(Command.FIND_REFLECTOR, status)
@@ -231,10 +228,8 @@ def test_search_takes_longer_the_further_away():
 
 
 def test_search_ends_at_its_radius_and_at_its_time_out():
-    # The radius stays what it is when the unit changes.
-    for per_m in (1.0, 1e3):
-        assert find_from(0.19, 0.2, per_m=per_m)[0]
-        assert not find_from(0.21, 0.2, per_m=per_m)[0]
+    assert find_from(0.19, 0.2)[0]
+    assert not find_from(0.21, 0.2)[0]
     found, took = find_from(0.5, 0.6, timeout_s=3.0)
     assert not found
     assert took < 3.6
@@ -277,17 +272,28 @@ def test_search_fails_now_and_then():
         (Command.SET_UNITS, (9, 0, 0, 0, 0), Status.NOT_IMPLEMENTED),
         (Command.SET_COORDINATE_SYSTEM_TYPE, (7,), Status.NOT_IMPLEMENTED),
         (Command.SET_MEASUREMENT_MODE, (1,), Status.NOT_IMPLEMENTED),
+        (Command.SET_REFLECTOR, (17,), Status.WRONG_PARAMETER_1),
         (Command.SET_SEARCH, (-1.0, 1000), Status.WRONG_PARAMETER),
-        (Command.SET_SEARCH, (np.nan, 1000), Status.INVALID_INPUT_DATA),
         (Command.SET_STATIONARY_MODE, (0, 1), Status.WRONG_PARAMETER),
+        (Command.SET_ENVIRONMENT, (20.0, 10.0, 50.0), Status.METEO_DATA_OUT_OF_RANGE),
+        (Command.SET_ENVIRONMENT, (np.nan, 1000.0, 50.0), Status.INVALID_INPUT_DATA),
         (Command.GO_POSITION, (np.inf, 0.0, 0.0, 1), Status.INVALID_INPUT_DATA),
         (Command.GO_POSITION, (0.0, 0.0, 0.0, 1), Status.WRONG_PARAMETER),
         (Command.FIND_REFLECTOR, (-1.0,), Status.WRONG_PARAMETER_1),
-        (Command.UNKNOWN, (), Status.NOT_IMPLEMENTED),
+        (Command.GET_DIRECTION, (), Status.NOT_IMPLEMENTED),
     ],
 )
 def test_what_it_cannot_do_is_refused(command, values, status):
     assert Bench().locked().send(command, *values) == [Reply(command, status)]
+
+
+def test_search_radius_keeps_its_length_when_the_unit_changes():
+    bench = Bench().locked()
+    bench.send(Command.SET_SEARCH, 0.04, 8000)
+    bench.send(Command.SET_UNITS, 1, 0, 0, 0, 0)
+    ((radius, timeout_ms),) = (e.values for e in bench.send(Command.GET_SEARCH))
+    assert radius == pytest.approx(40.0)
+    assert timeout_ms == 8000
 
 
 def test_a_long_sleep_of_the_process_is_caught_up_in_bounded_work():
