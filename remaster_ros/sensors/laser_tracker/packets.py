@@ -30,7 +30,7 @@ class DataType(IntEnum):
 
 
 class Command(IntEnum):
-    """A command that is used here, with the layouts of its request and its reply.
+    """A command with the layouts of its request and its reply.
 
     A member is ``code, request, reply``: `struct` formats (little-endian, packed) of what follows
     the command in a request, and the status in a reply that succeeded. Truth values are ``i``.
@@ -46,13 +46,22 @@ class Command(IntEnum):
         member.request, member.reply = Struct('<' + request), Struct('<' + reply)
         return member
 
+    EXIT_APPLICATION = 0
     GET_SYSTEM_STATUS = 1, '', '4I3iIii'
     GET_TRACKER_STATUS = 2, '', 'I'
     SET_UNITS = 5, '5I'  # length, angle, temperature, pressure, humidity
     GET_UNITS = 6, '', '5I'
     INITIALIZE = 7
+    ACTIVATE_CAMERA_VIEW = 9
+    PARK = 10
+    SET_STATION_ORIENTATION = 12, '6d'
+    GET_STATION_ORIENTATION = 13, '', '6d'
+    SET_TRANSFORMATION = 14, '7d'
+    GET_TRANSFORMATION = 15, '', '7d'
     SET_ENVIRONMENT = 20, '3d'  # temperature, pressure, humidity
     GET_ENVIRONMENT = 21, '', '3d'
+    SET_REFRACTION = 22, '2d'
+    GET_REFRACTION = 23, '', '2d'
     SET_MEASUREMENT_MODE = 24, 'I'
     GET_MEASUREMENT_MODE = 25, '', 'I'
     SET_COORDINATE_SYSTEM_TYPE = 26, 'I'
@@ -64,14 +73,56 @@ class Command(IntEnum):
     GET_REFLECTORS = 42, '', '2iId64s'  # one reply per reflector
     SET_SEARCH = 43, 'di'  # radius, time-out in ms
     GET_SEARCH = 44, '', 'di'
+    SET_SYSTEM_SETTINGS = 47, 'I8i'
+    GET_SYSTEM_SETTINGS = 48, '', 'I8i'
     START_MEASUREMENT = 49
+    START_NIVEL_MEASUREMENT = 51
+    STOP_MEASUREMENT = 52
+    CHANGE_FACE = 53
+    GO_BIRD_BATH = 54
     GO_POSITION = 55, '3di'  # three coordinates, use ADM
+    GO_POSITION_HVD = 56, '3di'
+    POSITION_RELATIVE_HV = 57, '2d'
+    POINT_LASER = 58, '3d'
+    POINT_LASER_HVD = 59, '3d'
+    MOVE_HV = 60, '2i'
+    GO_NIVEL_POSITION = 61, 'I'
+    GO_LAST_MEASURED_POINT = 62
     FIND_REFLECTOR = 63, 'd'  # approximate distance
     UNKNOWN = 64
     GET_DIRECTION = 66, '', '2d'
+    CALL_ORIENT_TO_GRAVITY = 67, '', '2d'
+    SET_COMPENSATION = 79, 'i'
     SET_STATISTIC_MODE = 80, '2I'  # stationary, continuous
     GET_STATISTIC_MODE = 81, '', '2I'
+    SET_CAMERA = 83, '3i'
+    GET_CAMERA = 84, '', '3i'
+    GET_COMPENSATION = 85, '', 'i'
+    GET_COMPENSATIONS = 86, '', '2i64s256s64si'
+    GET_TP_INFO = 90, '', '6i2IiI'
+    GET_NIVEL_INFO = 91, '', '3i'
+    SET_LASER_ON_TIMER = 92, '2i'
+    GET_LASER_ON_TIMER = 93, '', '2i'
+    GO_BIRD_BATH_2 = 95, 'i'
     GET_FACE = 98, '', 'I'
+    SET_LONG_PARAMETER = 120, 'Ii'
+    GET_LONG_PARAMETER = 121, 'I', 'Ii'
+    GET_MEASUREMENT_STATUS_INFO = 122, '', 'Ii'
+    GET_COMPENSATIONS_2 = 123, '', '2i64s256s64s256s2i'
+    SET_DOUBLE_PARAMETER = 125, 'Id'
+    GET_DOUBLE_PARAMETER = 126, 'I', 'Id'
+    GET_OBJECT_TEMPERATURE = 127, '', 'd'
+    GET_OVERVIEW_CAMERA_INFO = 129, '', 'I64si3d2i'
+    CLEAR_COMMAND_QUEUE = 130, 'I'
+    GET_ADM_INFO_2 = 131, '', 'I64s3i2did'
+    GET_TRACKER_INFO = 132, '', 'I64s5i3d2i2dI2i'
+    GET_NIVEL_INFO_2 = 133, '', 'I64s3i3d'
+    RESTORE_STARTUP_CONDITIONS = 134
+    GO_AND_MEASURE = 135, '3d'
+    GET_ATR_INFO = 138, '', 'I64s6i4d'
+    GET_METEO_STATION_INFO = 139, '', 'I64s2i'
+    GET_AT4XX_INFO = 140, '', 'I64s10i2Ii6d'
+    GET_SYSTEM_SOFTWARE_VERSION = 142, '', '64s'
 
 
 class Status(IntEnum):
@@ -171,10 +222,14 @@ class Change(IntEnum):
     """What a status change reports (those that matter to us)."""
 
     ENVIRONMENT = 2
+    REFRACTION = 3
     SEARCH = 4
     UNITS = 6
     REFLECTOR = 7
+    SYSTEM_SETTINGS = 8
     COORDINATE_SYSTEM_TYPE = 12
+    STATION_ORIENTATION = 15
+    TRANSFORMATION = 16
     MEASUREMENT_MODE = 17
     STATIONARY_MODE = 18
     STATISTIC_MODE = 24
@@ -182,6 +237,8 @@ class Change(IntEnum):
     BUSY = 26
     READY = 27
     INITIALIZATION = 151
+    SERVER_CLOSING = 998
+    SERVER_STARTED = 999
 
 
 class Readiness(IntEnum):
