@@ -42,9 +42,9 @@ from pathlib import Path
 
 import common  # noqa: F401  its folder of helpers
 import numpy as np
-from calibration_study import NOISES, RANKS, Outcome, one_session
 from common import machine, progress, table
-from parallel import in_parallel
+from judges.calibration_study import NOISES, RANKS, Outcome, one_session
+from rigs.parallel import in_parallel
 from scipy.stats import binom, chi2, kstest
 
 BINS = 20

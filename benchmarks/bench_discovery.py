@@ -1,8 +1,8 @@
 """Does `remaster discover` name what is hidden, and nothing where nothing is?
 
-Sessions come from a world of its own (test/hidden_world.py: pinocchio, no code shared with the
-package but the plain records and the planning). Each is one line of the results file, so that the
-benchmark can be stopped and goes on where it was; figures are printed as they come.
+Sessions come from a world of its own (test/worlds/hidden_world.py: pinocchio, no code shared with
+the package but the plain records and the planning). Each is one line of the results file, so that
+the benchmark can be stopped and goes on where it was; figures are printed as they come.
 
     python benchmarks/bench_discovery.py                      all of it, on all cores
     python benchmarks/bench_discovery.py --only null --count 40
@@ -11,9 +11,9 @@ benchmark can be stopped and goes on where it was; figures are printed as they c
 
 Single effects are drawn with sizes between half and eight times the one at which the best possible
 test, which is given the effect and the noise, finds them in 90 % of sessions at 2 % false
-alarms. Judged by test/hidden_judge.py: right is who names exactly what was hidden. The model that
-is returned is compared with the offsets alone on a third set of poses, without noise; harm is an
-error more than 5 % larger there.
+alarms. Judged by test/judges/hidden_effects.py: right is who names exactly what was hidden. The
+model that is returned is compared with the offsets alone on a third set of poses, without noise;
+harm is an error more than 5 % larger there.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ from typing import Any
 import numpy as np
 from common import known, resumed
 from discovery_tables import report
-from hidden_judge import judge
-from hidden_sessions import (
+from judges.hidden_effects import judge
+from worlds.hidden_sessions import (
     NOISES,
     WRONG_NOISES,
     Recipe,
@@ -41,7 +41,7 @@ from hidden_sessions import (
     hidden_session,
     third_visits,
 )
-from hidden_third import third_errors
+from worlds.hidden_third import third_errors
 
 from remaster_ros.discovery.discover import discover_session
 from remaster_ros.simulation.hidden_effects import NAMED

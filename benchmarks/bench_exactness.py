@@ -21,9 +21,9 @@ import time
 import common  # noqa: F401  its folder of helpers
 import numpy as np
 from common import machine, progress, table
-from paper_experiment import OPTIMIZATION, experiment
 from paper_model import DIMENSION, NAMES, PaperModel, product_mode, product_states
 from scipy.special import gammaln
+from worlds.paper_experiment import OPTIMIZATION, experiment
 
 from remaster_ros.calibration import convergence
 from remaster_ros.calibration.sampling import sample_posterior

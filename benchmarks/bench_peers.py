@@ -30,8 +30,8 @@ from typing import Any
 import common  # noqa: F401  its folder of helpers
 import numpy as np
 from common import ROOT, machine, table
-from paper_experiment import CELL, CHAIN, experiment
 from paper_model import rigid_fit
+from worlds.paper_experiment import CELL, CHAIN, experiment
 
 from remaster_ros.calibration.fit import fit_session
 from remaster_ros.types import FloatArray, Session

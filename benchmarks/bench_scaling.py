@@ -25,7 +25,7 @@ from pathlib import Path
 import common  # noqa: F401  its folder of helpers
 import numpy as np
 from common import machine, table
-from paper_experiment import CELL, CHAIN, MARKER_OF, MARKERS, experiment, sensor_frames
+from worlds.paper_experiment import CELL, CHAIN, MARKER_OF, MARKERS, experiment, sensor_frames
 
 from remaster_ros.calibration.fit import fit_session
 from remaster_ros.session.reader import write_session

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 from common import table
-from hidden_judge import CURVE_SHARE
-from hidden_third import HARM
+from judges.hidden_effects import CURVE_SHARE
 from scipy.optimize import minimize
+from worlds.hidden_third import HARM
 
 from remaster_ros.simulation.hidden_effects import NAMED
 

@@ -15,7 +15,7 @@ from typing import Any
 
 import common  # noqa: F401  its folder of helpers
 import numpy as np
-from paper_experiment import CHAIN
+from worlds.paper_experiment import CHAIN
 
 from remaster_ros.calibration.estimate import Problem, estimate
 from remaster_ros.calibration.laplace import Mode, find_mode

@@ -21,9 +21,9 @@ from typing import Any, NamedTuple
 import common  # noqa: F401  its folder of helpers
 import numpy as np
 from common import progress, table
-from paper_convention import errors, random_configurations
-from paper_experiment import experiment
-from paper_published import ERRORS, SIGMA_MM, TABLE_I_DEG, TABLE_II
+from worlds.paper_convention import errors, random_configurations
+from worlds.paper_experiment import experiment
+from worlds.paper_published import ERRORS, SIGMA_MM, TABLE_I_DEG, TABLE_II
 
 from remaster_ros.calibration.accuracy import solution_pairs
 from remaster_ros.calibration.estimate import Problem, estimate

@@ -8,8 +8,8 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from foreign_tables import measured, text, write
-from robot_descriptions import ROBOTS
+from foreign.tables import measured, text, write
+from worlds.robot_descriptions import ROBOTS
 
 FOLDER = Path(__file__).parent / 'examples'
 AXES = [f'A{i}' for i in range(1, 7)]

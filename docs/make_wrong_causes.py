@@ -21,8 +21,8 @@ from scipy.stats import t as t_test
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT / 'test'))
 
-from hidden_tours import world  # noqa: E402
-from hidden_world import Noise  # noqa: E402
+from worlds.hidden_tours import world  # noqa: E402
+from worlds.hidden_world import Noise  # noqa: E402
 
 from remaster_ros.discovery.discover import Discovery, discover_session  # noqa: E402
 from remaster_ros.discovery.effects.base import Cell  # noqa: E402

@@ -20,8 +20,8 @@ from pathlib import Path
 
 import numpy as np
 from faults.observer import Observer
-from forked_nodes import NodeProcess
-from ros_rig import ASKED, PATIENCE
+from rigs.forked_nodes import NodeProcess
+from rigs.ros_rig import ASKED, PATIENCE
 
 from remaster_ros.collection.events import ConfigurationEnded, PoseAnnounced, SolutionSettled
 from remaster_ros.nodes.demo import free_ports

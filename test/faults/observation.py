@@ -16,7 +16,7 @@ from itertools import pairwise
 import numpy as np
 from faults.bench import Bench
 from faults.observer import plain
-from ros_rig import PATIENCE
+from rigs.ros_rig import PATIENCE
 
 from remaster_ros.collection.events import (
     ArmHalted,

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from forked_nodes import NodeProcess
+from rigs.forked_nodes import NodeProcess
 
 ROOT = Path(__file__).resolve().parents[2]
 

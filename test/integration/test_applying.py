@@ -8,9 +8,9 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-import robot_descriptions
 import yaml
-from command_line import remaster
+from rigs.command_line import remaster
+from worlds import robot_descriptions
 
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.transforms import rotation_vector_to_matrix, transform

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from command_line import refusal, remaster, run
+from rigs.command_line import refusal, remaster, run
 
 # Permissions do not bind root; without CAP_DAC_OVERRIDE (1) in what a process may inherit
 # (PR_CAPBSET_DROP, 24) they do from its next exec on.

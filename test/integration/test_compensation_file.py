@@ -10,9 +10,9 @@ import pytest
 
 pytest.importorskip('pinocchio', reason='needs the judge: pip install pin')
 
-from calibration_scenes import CHAIN, URDF, random_poses, sensors, simulate_session
-from compensation_judge import judged
-from hidden_sessions import HiddenSession, Recipe, hidden_session, third_visits
+from judges.commanded_arms import judged
+from worlds.calibration_scenes import CHAIN, URDF, random_poses, sensors, simulate_session
+from worlds.hidden_sessions import HiddenSession, Recipe, hidden_session, third_visits
 
 import remaster_ros
 from remaster_ros.compensation.compensator import Compensator

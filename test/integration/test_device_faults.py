@@ -12,10 +12,9 @@ import threading
 import time
 
 import numpy as np
-import optitrack_world
 import pytest
-import tracker_world
 from faults import page
+from worlds import optitrack_world, tracker_world
 
 from remaster_ros.calibration.registration import register_ransac
 from remaster_ros.errors import DeviceError, InsufficientDataError

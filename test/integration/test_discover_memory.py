@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from calibration_scenes import CHAIN, MARKERS, URDF, sensors
-from command_line import ROOT
+from rigs.command_line import ROOT
+from worlds.calibration_scenes import CHAIN, MARKERS, URDF, sensors
 
 from remaster_ros.reports.discovery_json import read_discovery
 from remaster_ros.session.reader import write_session

@@ -14,7 +14,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from documented_commands import (
+from foreign.tables import measured, text, write
+from judges.documented_commands import (
     FENCE,
     ROOT,
     Command,
@@ -25,8 +26,7 @@ from documented_commands import (
     reads,
     small,
 )
-from documented_commands import PAGES as ALL
-from foreign_tables import measured, text, write
+from judges.documented_commands import PAGES as ALL
 
 from remaster_ros.cli.main import VERBS, main
 

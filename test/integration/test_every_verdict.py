@@ -13,7 +13,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from command_line import refusal, remaster, run
+from rigs.command_line import refusal, remaster, run
 
 from remaster_ros.calibration.fit import fit_session
 from remaster_ros.session.reader import read_session, write_session

@@ -10,14 +10,14 @@ import pytest
 
 pytest.importorskip('pinocchio', reason='needs the judge: pip install pin')
 
-from discovery_scenes import residuals_of
-from hidden_arm import PinocchioArm
-from hidden_judge import part_of
-from hidden_offsets import true_offsets
-from hidden_oracle import Oracle
-from hidden_tours import robot, visits, world
-from hidden_world import HiddenWorld, Noise
+from judges.hidden_effects import part_of
+from judges.hidden_oracle import Oracle
 from scipy.stats import chi2
+from worlds.discovery_scenes import residuals_of
+from worlds.hidden_arm import PinocchioArm
+from worlds.hidden_offsets import true_offsets
+from worlds.hidden_tours import robot, visits, world
+from worlds.hidden_world import HiddenWorld, Noise
 
 from remaster_ros.discovery.effects.context import Context
 from remaster_ros.discovery.effects.registry import EFFECTS

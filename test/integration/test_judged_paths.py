@@ -10,8 +10,8 @@ import pytest
 pytest.importorskip('fcl', reason='needs the judge: pip install python-fcl')
 pytest.importorskip('pinocchio', reason='needs the judge: pip install pin')
 
-from path_cells import SPECS, make_cell
-from path_judges import collides
+from judges.paths import collides
+from worlds.path_cells import SPECS, make_cell
 
 from remaster_ros.planning.tour_planner import TourPlanner
 

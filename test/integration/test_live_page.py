@@ -10,8 +10,8 @@ from http.server import BaseHTTPRequestHandler, HTTPServer
 import msgspec
 import numpy as np
 import pytest
-from browser import Browser
-from played_collection import CELL, CHAIN, PlayedCollection
+from rigs.browser import Browser
+from worlds.played_collection import CELL, CHAIN, PlayedCollection
 
 from remaster_ros.planning.collection_plan import look_ahead
 from remaster_ros.planning.tour_planner import TourPlanner

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from calibration_scenes import scene
-from command_line import refusal, remaster
-from foreign_tables import MARKER, measured
-from mistakes import SPOILS, with_offsets
+from foreign.tables import MARKER, measured
+from rigs.command_line import refusal, remaster
+from worlds.calibration_scenes import scene
+from worlds.mistakes import SPOILS, with_offsets
 
 from remaster_ros.calibration.mistakes import sound_estimate
 from remaster_ros.errors import InsufficientDataError, MisfitError, MistakeFoundError

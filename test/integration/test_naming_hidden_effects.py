@@ -14,8 +14,8 @@ import pytest
 
 pytest.importorskip('pinocchio', reason='needs the judge: pip install pin')
 
-from hidden_judge import judge
-from hidden_sessions import (
+from judges.hidden_effects import judge
+from worlds.hidden_sessions import (
     NOISES,
     Recipe,
     another_session,
@@ -23,7 +23,7 @@ from hidden_sessions import (
     hidden_session,
     third_visits,
 )
-from hidden_third import predicted_by, predicted_by_offsets, third_errors
+from worlds.hidden_third import predicted_by, predicted_by_offsets, third_errors
 
 from remaster_ros import discover, simulate
 from remaster_ros.discovery.confirmation import confirm

@@ -14,10 +14,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command_line import remaster
-from foreign_tables import MARKER, text, write
-from pad import Axis, Keeps, Pad, master_as_told
-from robot_descriptions import ROBOTS
+from foreign.tables import MARKER, text, write
+from judges.pad import Axis, Keeps, Pad, master_as_told
+from rigs.command_line import remaster
+from worlds.robot_descriptions import ROBOTS
 
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.transforms import apply, rotation_vector_to_matrix, transform

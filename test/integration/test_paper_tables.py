@@ -5,9 +5,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from paper_convention import errors, random_configurations
-from paper_experiment import OPTIMIZATION, VALIDATION, choose_poses
-from paper_published import ERRORS
+from worlds.paper_convention import errors, random_configurations
+from worlds.paper_experiment import OPTIMIZATION, VALIDATION, choose_poses
+from worlds.paper_published import ERRORS
 
 SEED = 2
 PAGE = Path(__file__).resolve().parents[2] / 'docs' / 'paper.md'

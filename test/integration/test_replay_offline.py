@@ -5,8 +5,8 @@ import shutil
 
 import numpy as np
 import pytest
-from command_line import refusal, remaster
-from recorded_bags import CHAIN, RecordedArm
+from rigs.command_line import refusal, remaster
+from worlds.recorded_bags import CHAIN, RecordedArm
 
 from remaster_ros.collection.events import BridgeState, ReadByHand
 from remaster_ros.session.journal import read_journal

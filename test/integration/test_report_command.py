@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command_line import refusal, remaster
+from rigs.command_line import refusal, remaster
 
 # Seconds since 1970 of the first reading: 08:43:20 UTC on 22 November 2026.
 START_S = 1795337000.0

@@ -5,7 +5,7 @@ import pytest
 
 pytest.importorskip('pinocchio', reason='needs the judge: pip install pin')
 
-from hidden_pairs import measured_further, pair_session, separating, verdict, visits_of
+from worlds.hidden_pairs import measured_further, pair_session, separating, verdict, visits_of
 
 from remaster_ros.discovery.decision import Named, decisions
 from remaster_ros.discovery.discover import discover_session

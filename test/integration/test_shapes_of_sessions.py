@@ -7,8 +7,8 @@ import json
 
 import numpy as np
 import pytest
-from command_line import refusal, remaster
-from session_shapes import CHEAP, LARGE, LAST_ALONE, observations, one_pose_for_all
+from rigs.command_line import refusal, remaster
+from worlds.session_shapes import CHEAP, LARGE, LAST_ALONE, observations, one_pose_for_all
 
 from remaster_ros.session.reader import read_session, write_session
 from remaster_ros.session.session_writer import SessionWriter

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import robot_descriptions
-from command_line import ROOT, refusal, remaster, run
+from rigs.command_line import ROOT, refusal, remaster, run
+from worlds import robot_descriptions
 
 from remaster_ros.kinematics.transforms import transform
 from remaster_ros.session.reader import read_chain, read_session, write_session

@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from calibration_scenes import CHAIN, scene
+from worlds.calibration_scenes import CHAIN, scene
 
 from remaster_ros.calibration.evaluate_offsets import OffsetsJudgement, accuracy_with_offsets
 from remaster_ros.calibration.fit import FitResult, fit_session

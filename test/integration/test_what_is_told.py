@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command_line import ROOT, remaster
+from rigs.command_line import ROOT, remaster
 
 from remaster_ros.session.reader import read_session, write_session
 from remaster_ros.types import Session

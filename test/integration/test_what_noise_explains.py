@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command_line import remaster
+from rigs.command_line import remaster
 
 from remaster_ros.session.reader import read_session, write_session
 from remaster_ros.types import Session

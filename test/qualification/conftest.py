@@ -1,3 +1,3 @@
 """Campaigns of minutes: `make qualify` runs them, `make test` does not."""
 
-from ros_rig import client, ros_environment, start  # noqa: F401  fixtures
+from rigs.ros_rig import client, ros_environment, start  # noqa: F401  fixtures

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command_line import remaster
-from robot_descriptions import iiwa14, panda, xarm6, xarm7
+from rigs.command_line import remaster
+from worlds.robot_descriptions import iiwa14, panda, xarm6, xarm7
 
 CASES = Path(__file__).parents[2].parent / 'shared' / 'cases'
 OF_CASES = ('ur5e', 'irb120', 'kr6', 'fer', 'meca500', 'fanuc_lrmate')
@@ -22,7 +22,7 @@ LENGTH_M, TILT_RAD = 2e-4, 1.5e-3
 )
 def test_arms_with_calibrated_parameters_are_prepared_and_planned(arm, tmp_path):
     pytest.importorskip('pinocchio', reason='needs the judge: pip install pin')
-    from inverse_judge import with_errors
+    from judges.inverse_kinematics import with_errors
 
     seed = 5
     print(f'seed {seed}')

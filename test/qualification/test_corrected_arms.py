@@ -11,9 +11,9 @@ import pytest
 
 pytest.importorskip('pinocchio', reason='needs the judge: pip install pin')
 
-from compensation_judge import ARM_KINDS, judged
-from hidden_sessions import Recipe, hidden_session, third_visits
-from parallel import in_parallel
+from judges.commanded_arms import ARM_KINDS, judged
+from rigs.parallel import in_parallel
+from worlds.hidden_sessions import Recipe, hidden_session, third_visits
 
 import remaster_ros
 from remaster_ros.compensation.compensator import Compensator

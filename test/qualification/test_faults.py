@@ -9,7 +9,7 @@ import time
 
 import numpy as np
 import pytest
-from ros_rig import call, clear_halt, wait_until
+from rigs.ros_rig import call, clear_halt, wait_until
 
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.session.reader import read_session

@@ -10,8 +10,8 @@ import time
 
 import pytest
 import yaml
-from kill_judge import judge, node_processes
-from ros_rig import wait_until
+from judges.kills import judge, node_processes
+from rigs.ros_rig import wait_until
 
 from remaster_ros.session.workcell import read_cell
 from remaster_ros.simulation.setup import make_world

@@ -13,8 +13,8 @@ from functools import partial
 
 import numpy as np
 import pytest
-from calibration_study import RANKS, Outcome, one_session
-from parallel import in_parallel
+from judges.calibration_study import RANKS, Outcome, one_session
+from rigs.parallel import in_parallel
 from scipy.stats import binom, chi2, kstest
 
 pytestmark = pytest.mark.slow

@@ -5,8 +5,8 @@ import re
 
 import numpy as np
 import pytest
-from collection_rig import Cell
-from ros_rig import call
+from rigs.collection_rig import Cell
+from rigs.ros_rig import call
 
 from remaster_ros.collection.events import SetupChanged
 from remaster_ros.session.journal import read_journal

@@ -4,7 +4,7 @@ import sys
 import time
 
 import pytest
-from ros_rig import node_arguments
+from rigs.ros_rig import node_arguments
 
 from remaster_ros.collection.events import BridgeState, RecorderState, SensorReport
 from remaster_ros.session.workcell import read_cell

@@ -1,7 +1,7 @@
 """Collections through topics of other packages' nodes: every fault, kills of every node."""
 
 import pytest
-from topic_rig import Collection
+from rigs.topic_rig import Collection
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(900)]
 

@@ -4,7 +4,7 @@ import subprocess
 import sys
 
 import pytest
-from ros_rig import ROOT
+from rigs.ros_rig import ROOT
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(3000)]
 

@@ -12,10 +12,10 @@ import socket
 from pathlib import Path
 
 import pytest
-from browser import Browser
-from collection_rig import Cell
-from ros_rig import ROOT, clear_halt, node_arguments
-from simple_cells import write_cell
+from rigs.browser import Browser
+from rigs.collection_rig import Cell
+from rigs.ros_rig import ROOT, clear_halt, node_arguments
+from worlds.simple_cells import write_cell
 
 from remaster_ros.nodes.demo import free_ports
 

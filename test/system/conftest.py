@@ -1,3 +1,3 @@
 """Real nodes, real DDS, real sockets."""
 
-from ros_rig import client, ros_environment, start  # noqa: F401  fixtures
+from rigs.ros_rig import client, ros_environment, start  # noqa: F401  fixtures

@@ -1,16 +1,16 @@
 """A collection whose arm is commanded by FollowJointTrajectory.
 
 The action is control_msgs' own where that is installed, else made from its definition; the server
-stands for joint_trajectory_controller in front of the fake arm (test/action_controller.py).
+stands for joint_trajectory_controller in front of the fake arm (test/rigs/action_controller.py).
 """
 
 import os
 
-import control_messages
 import numpy as np
 import pytest
-from collection_rig import Cell
-from ros_rig import call
+from rigs import control_messages
+from rigs.collection_rig import Cell
+from rigs.ros_rig import call
 
 from remaster_ros.nodes.controller_link import COPIES
 from remaster_ros.session.bag import BagReader

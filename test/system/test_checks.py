@@ -5,10 +5,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from collection_rig import SEED, Cell
-from command_line import remaster
-from compensation_files import save
-from ros_rig import call
+from rigs.collection_rig import SEED, Cell
+from rigs.command_line import remaster
+from rigs.ros_rig import call
+from worlds.compensation_files import save
 
 from remaster_ros.compensation.arm_model import ArmModel
 from remaster_ros.session.workcell import read_cell

@@ -1,9 +1,9 @@
 """With `confirm: true` the arm of real nodes follows no plan that was not shown and confirmed."""
 
 import pytest
-from collection_rig import Cell
-from ros_rig import call
-from simple_cells import write_cell
+from rigs.collection_rig import Cell
+from rigs.ros_rig import call
+from worlds.simple_cells import write_cell
 
 pytestmark = [pytest.mark.ros, pytest.mark.qualify, pytest.mark.timeout(900)]
 

@@ -6,10 +6,10 @@ import json
 import numpy as np
 import pytest
 import scipy.stats
-from collection_rig import SEED, Cell
-from command_line import remaster
-from compensation_files import save
-from ros_rig import call
+from rigs.collection_rig import SEED, Cell
+from rigs.command_line import remaster
+from rigs.ros_rig import call
+from worlds.compensation_files import save
 
 from remaster_ros.calibration.fit import fit_session
 from remaster_ros.cli.verify import visits

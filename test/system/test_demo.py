@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from command_line import remaster
-from ros_rig import ROOT, call, node_arguments, wait_until
+from rigs.command_line import remaster
+from rigs.ros_rig import ROOT, call, node_arguments, wait_until
 
 from remaster_ros.compensation.file import read_compensation
 from remaster_ros.kinematics.serial_chain import SerialChain

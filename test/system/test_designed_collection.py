@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from collection_rig import Cell
+from rigs.collection_rig import Cell
 
 from remaster_ros.collection.events import PoseAnnounced, TourPlanned
 from remaster_ros.kinematics.serial_chain import SerialChain

@@ -5,10 +5,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from collection_rig import Cell
-from designed_sessions import measured
-from ros_rig import node_arguments, wait_until
-from stopping_scene import world
+from rigs.collection_rig import Cell
+from rigs.ros_rig import node_arguments, wait_until
+from worlds.designed_sessions import measured
+from worlds.stopping_scene import world
 
 from remaster_ros.collection.events import (
     ArmHalted,

@@ -4,8 +4,8 @@ import json
 
 import numpy as np
 import pytest
-from command_line import remaster
-from ros_rig import call, found, node_arguments, wait_until
+from rigs.command_line import remaster
+from rigs.ros_rig import call, found, node_arguments, wait_until
 
 from remaster_ros.session.reader import read_session, write_session
 

@@ -12,7 +12,7 @@ import sys
 import numpy as np
 import pytest
 from faults import observation, observer, page, rows
-from ros_rig import ROOT, domains
+from rigs.ros_rig import ROOT, domains
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(900)]
 

@@ -5,8 +5,8 @@ from contextlib import contextmanager
 
 import numpy as np
 import pytest
-from collection_rig import SEED, Cell
-from ros_rig import call, node_arguments, wait_until
+from rigs.collection_rig import SEED, Cell
+from rigs.ros_rig import call, node_arguments, wait_until
 
 from remaster_ros.collection.events import (
     ConfigurationEnded,

@@ -9,7 +9,7 @@ import time
 
 import numpy as np
 import pytest
-from ros_rig import ROOT, call, clear_halt, node_arguments, wait_until
+from rigs.ros_rig import ROOT, call, clear_halt, node_arguments, wait_until
 
 pytest.importorskip('rclpy', reason='needs ROS 2 Jazzy or its wheels')
 pytest.importorskip('pinocchio', reason='the judge needs pinocchio (pip install .[test])')

@@ -14,7 +14,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from ros_rig import domains
+from rigs.ros_rig import domains
 
 pytest.importorskip('rclpy', reason='needs ROS 2 Jazzy or its wheels')
 pytestmark = [pytest.mark.ros, pytest.mark.slow]

@@ -6,7 +6,7 @@ import re
 
 import numpy as np
 import pytest
-from tracker_world import MARKER, ReflectorWorld, across_and_along
+from worlds.tracker_world import MARKER, ReflectorWorld, across_and_along
 
 from remaster_ros.sensors.laser_tracker.packets import (
     Command,

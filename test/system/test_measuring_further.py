@@ -3,8 +3,8 @@
 import json
 
 import pytest
-from collection_rig import Cell
-from ros_rig import call, node_arguments
+from rigs.collection_rig import Cell
+from rigs.ros_rig import call, node_arguments
 
 from remaster_ros.collection.events import TourPlanned
 from remaster_ros.planning.separating_design import MOST_FURTHER

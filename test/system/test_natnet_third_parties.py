@@ -17,7 +17,7 @@ from contextlib import contextmanager
 
 import numpy as np
 import pytest
-from optitrack_world import SENSOR, MarkerWorld, eventually, free_port, nothing_left
+from worlds.optitrack_world import SENSOR, MarkerWorld, eventually, free_port, nothing_left
 
 from remaster_ros.errors import DeviceError, InputError
 from remaster_ros.sensors.driver import SensorClock

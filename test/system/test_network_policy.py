@@ -5,8 +5,8 @@ import xml.etree.ElementTree as ElementTree
 from fnmatch import fnmatch
 
 import pytest
-import viewer_configs
-from ros_rig import ROOT, node_arguments, wait_until
+from judges import viewer_configs
+from rigs.ros_rig import ROOT, node_arguments, wait_until
 
 from remaster_ros.collection.plan_confirmation import service_name
 

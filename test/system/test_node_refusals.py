@@ -5,8 +5,8 @@ import subprocess
 import sys
 
 import pytest
-from ros_rig import node_arguments
-from sliding_cells import sliding_cell, telescope
+from rigs.ros_rig import node_arguments
+from worlds.sliding_cells import sliding_cell, telescope
 
 from remaster_ros.errors import InputError
 

@@ -9,7 +9,7 @@ import sys
 import time
 
 import pytest
-from ros_rig import FOUND_S, node_arguments, wait_until
+from rigs.ros_rig import FOUND_S, node_arguments, wait_until
 
 pytestmark = [pytest.mark.ros, pytest.mark.timeout(900)]
 

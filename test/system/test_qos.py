@@ -1,7 +1,7 @@
 """Best-effort joint states are received; a mismatch of the quality of service is reported."""
 
 import pytest
-from ros_rig import node_arguments, wait_until
+from rigs.ros_rig import node_arguments, wait_until
 
 from remaster_ros.session.workcell import read_cell
 

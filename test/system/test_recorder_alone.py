@@ -9,7 +9,7 @@ import time
 
 import numpy as np
 import pytest
-from ros_rig import ROOT, found, node_arguments, wait_until
+from rigs.ros_rig import ROOT, found, node_arguments, wait_until
 
 from remaster_ros.collection.events import (
     ArmStopped,

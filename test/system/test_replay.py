@@ -6,8 +6,8 @@ import sys
 
 import numpy as np
 import pytest
-from recorded_bags import RecordedArm
-from ros_rig import node_arguments, wait_until
+from rigs.ros_rig import node_arguments, wait_until
+from worlds.recorded_bags import RecordedArm
 
 from remaster_ros.session.bag import BagReader
 from remaster_ros.session.bag_replay import differences, record_from_bag

@@ -4,8 +4,8 @@ import os
 import time
 
 import pytest
-from collection_rig import Cell
-from ros_rig import PATIENCE, call, node_arguments
+from rigs.collection_rig import Cell
+from rigs.ros_rig import PATIENCE, call, node_arguments
 
 from remaster_ros.collection.events import BridgeState
 

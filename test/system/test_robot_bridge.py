@@ -8,14 +8,14 @@ import pytest
 pytest.importorskip('rclpy', reason='needs ROS 2 Jazzy or its wheels')
 pytest.importorskip('pinocchio', reason='the judge needs pinocchio (pip install .[test])')
 
-from compensation_files import arm, save
 from hostile.bench import Bench
 from hostile.lines import EMERGENCY
 from hostile.process import environment
 from hostile.scene import HOME
-from ros_rig import PATIENCE, found
-from simple_cells import write_cell
+from rigs.ros_rig import PATIENCE, found
 from std_msgs.msg import String
+from worlds.compensation_files import arm, save
+from worlds.simple_cells import write_cell
 
 from remaster_ros.collection.events import SolutionFailed
 from remaster_ros.session.workcell import read_cell

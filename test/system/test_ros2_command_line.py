@@ -8,7 +8,7 @@ import subprocess
 
 import pytest
 import yaml
-from ros_rig import node_arguments, wait_until
+from rigs.ros_rig import node_arguments, wait_until
 
 from remaster_ros.session.bag import BagReader
 from remaster_ros.session.bag_writer import BagWriter

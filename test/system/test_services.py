@@ -6,8 +6,8 @@ import sys
 
 import numpy as np
 import pytest
-from command_line import remaster
-from ros_rig import call, node_arguments, wait_until
+from rigs.command_line import remaster
+from rigs.ros_rig import call, node_arguments, wait_until
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(900)]
 

@@ -9,7 +9,7 @@ import socket
 
 import pytest
 import yaml
-from ros_rig import call, node_arguments, wait_until
+from rigs.ros_rig import call, node_arguments, wait_until
 
 from remaster_ros.nodes.demo import free_ports
 from remaster_ros.session.bag import BagReader

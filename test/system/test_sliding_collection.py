@@ -5,9 +5,9 @@ import signal
 import numpy as np
 import pytest
 import scipy.stats
-from collection_rig import Cell
-from ros_rig import call, node_arguments, wait_until
-from sliding_cells import sliding_cell, telescope
+from rigs.collection_rig import Cell
+from rigs.ros_rig import call, node_arguments, wait_until
+from worlds.sliding_cells import sliding_cell, telescope
 
 from remaster_ros.reports.fit_json import read_fit
 

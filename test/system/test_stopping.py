@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 import yaml
-from ros_rig import wait_until
+from rigs.ros_rig import wait_until
 
 from remaster_ros.session.reader import read_session
 

@@ -1,7 +1,7 @@
 """Collections whose sensors are topics of nodes of other packages: faults and kills."""
 
 import pytest
-from topic_rig import Collection
+from rigs.topic_rig import Collection
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(900)]
 

@@ -5,7 +5,7 @@ import subprocess
 import time
 
 import pytest
-from collection_rig import Cell
+from rigs.collection_rig import Cell
 
 from remaster_ros.session.reader import read_session
 

@@ -4,7 +4,7 @@ import signal
 import time
 
 import pytest
-from ros_rig import node_arguments, wait_until
+from rigs.ros_rig import node_arguments, wait_until
 
 pytestmark = [pytest.mark.ros, pytest.mark.timeout(900)]
 

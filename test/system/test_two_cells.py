@@ -5,7 +5,7 @@ import socket
 import numpy as np
 import pytest
 import yaml
-from ros_rig import ROOT, call, wait_until
+from rigs.ros_rig import ROOT, call, wait_until
 
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.nodes.demo import free_ports

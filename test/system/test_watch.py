@@ -6,8 +6,8 @@ import re
 from pathlib import Path
 
 import pytest
-from played_collection import CHAIN, T_R_N
-from ros_rig import found, node_arguments, wait_until
+from rigs.ros_rig import found, node_arguments, wait_until
+from worlds.played_collection import CHAIN, T_R_N
 
 pytestmark = [pytest.mark.ros, pytest.mark.timeout(900)]
 

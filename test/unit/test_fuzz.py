@@ -6,9 +6,8 @@ import os
 import random
 import time
 
-import fuzz_messages
-import fuzzing
 import pytest
+from hostile import fuzz_messages, fuzzing
 
 SEED = random.SystemRandom().randrange(10**6)
 INPUTS = int(os.environ.get('FUZZ', '5000'))

@@ -10,9 +10,9 @@ import pytest
 
 pytest.importorskip('pinocchio', reason='needs the judge: pip install pin')
 
-from hidden_judge import judge, part_of
-from hidden_tours import visits, world
-from hidden_world import HiddenTruth, HiddenWorld, Noise
+from judges.hidden_effects import judge, part_of
+from worlds.hidden_tours import visits, world
+from worlds.hidden_world import HiddenTruth, HiddenWorld, Noise
 
 from remaster_ros.simulation.hidden_effects import HiddenEffect, true_parameters
 

@@ -12,8 +12,8 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
-from calibration_scenes import scene
 from threadpoolctl import threadpool_info, threadpool_limits
+from worlds.calibration_scenes import scene
 
 from remaster_ros import linear_algebra
 from remaster_ros.calibration.fit import fit_session

@@ -10,7 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from arms import jointed_arm
+from worlds.arms import jointed_arm
 
 import remaster_ros
 from remaster_ros.errors import MisfitError, MistakeFoundError

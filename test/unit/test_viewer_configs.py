@@ -4,7 +4,7 @@ That each topic in them has the type that is expected there is tested with runni
 test/system/test_network_policy.py.
 """
 
-from viewer_configs import (
+from judges.viewer_configs import (
     DISPLAYS,
     PANELS,
     POLICIES,

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from foreign_tables import measured
+from foreign.tables import measured
 
 from remaster_ros.calibration.arrangement import (
     Arrangement,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from calibration_scenes import one_tool_direction
+from worlds.calibration_scenes import one_tool_direction
 
 from remaster_ros.calibration import sampling
 from remaster_ros.calibration.fit import fit_session

@@ -7,7 +7,7 @@ from dataclasses import replace
 import msgspec
 import numpy as np
 import pytest
-from calibration_scenes import scene
+from worlds.calibration_scenes import scene
 
 from remaster_ros.calibration.estimate import Problem, estimate, stating_directions
 from remaster_ros.calibration.fit import fit_session

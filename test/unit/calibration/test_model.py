@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from calibration_scenes import CHAIN, extension, scene
+from worlds.calibration_scenes import CHAIN, extension, scene
 
 from remaster_ros.calibration.grouped_rows import Rows
 from remaster_ros.calibration.model import Model, predict_in_sensor

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from calibration_scenes import scene
+from worlds.calibration_scenes import scene
 
 from remaster_ros.calibration.estimate import Problem, estimate
 from remaster_ros.calibration.moved_since import SIGNIFICANCE, moved_since

@@ -7,7 +7,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from calibration_scenes import scene
+from worlds.calibration_scenes import scene
 
 from remaster_ros.calibration.estimate import Problem, estimate
 from remaster_ros.calibration.grouped_rows import Rows

@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
-from calibration_scenes import scene
+from worlds.calibration_scenes import scene
 
 from remaster_ros.calibration.fit import fit_session
 from remaster_ros.reports.sentences import verdict

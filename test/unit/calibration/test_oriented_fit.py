@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from oriented_sessions import KINDS, Problem, estimate, make_session, one_session
-from parallel import in_parallel
+from rigs.parallel import in_parallel
 from scipy.spatial.transform import Rotation
 from scipy.stats import binom
+from worlds.oriented_sessions import KINDS, Problem, estimate, make_session, one_session
 
 from remaster_ros.calibration.fit import fit_session
 from remaster_ros.reports.fit_json import fit_content

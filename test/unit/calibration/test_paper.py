@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from calibration_scenes import CHAIN, scene
 from scipy.spatial.transform import Rotation
+from worlds.calibration_scenes import CHAIN, scene
 
 from remaster_ros.calibration.estimate import Problem
 from remaster_ros.calibration.fit import fit_session

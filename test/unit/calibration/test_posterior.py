@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from calibration_scenes import scene
 from scipy.stats import kstest, multivariate_normal, norm
+from worlds.calibration_scenes import scene
 
 from remaster_ros.calibration import convergence, laplace, sampling
 from remaster_ros.calibration.estimate import Problem, estimate

@@ -4,8 +4,8 @@ from functools import lru_cache
 
 import numpy as np
 import pytest
-from designed_sessions import measured
-from stopping_scene import world
+from worlds.designed_sessions import measured
+from worlds.stopping_scene import world
 
 from remaster_ros.calibration.estimate import Problem, estimate
 from remaster_ros.calibration.fit import fit_session

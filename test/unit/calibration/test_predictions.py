@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from calibration_scenes import scene
 from scipy.stats import binom, chi2
+from worlds.calibration_scenes import scene
 
 from remaster_ros.calibration.estimate import Problem
 from remaster_ros.calibration.fit import fit_session

@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from calibration_scenes import scene
-from discovery_scenes import at_joint, session_with
-from session_shapes import repeats
+from worlds.calibration_scenes import scene
+from worlds.discovery_scenes import at_joint, session_with
+from worlds.session_shapes import repeats
 
 from remaster_ros.calibration.estimate import Estimate, Problem, estimate
 from remaster_ros.calibration.fit import fit_session

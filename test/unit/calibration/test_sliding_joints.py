@@ -6,8 +6,8 @@ import json
 
 import numpy as np
 import pytest
-from arms import jointed_arm as arm
-from command_line import refusal, remaster
+from rigs.command_line import refusal, remaster
+from worlds.arms import jointed_arm as arm
 
 from remaster_ros.calibration.fit import fit_session
 from remaster_ros.compensation.export import calibrated_urdf

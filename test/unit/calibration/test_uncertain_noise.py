@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scipy
-from calibration_scenes import scene
+from worlds.calibration_scenes import scene
 
 from remaster_ros import simulate
 from remaster_ros.calibration.estimate import Problem

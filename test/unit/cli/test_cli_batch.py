@@ -12,10 +12,10 @@ import time
 from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
 from pathlib import Path
 
-import batch_jobs
 import numpy as np
 import pytest
-from command_line import refusal, remaster, run
+from rigs import batch_jobs
+from rigs.command_line import refusal, remaster, run
 
 from remaster_ros.cli import batch
 from remaster_ros.errors import InputError

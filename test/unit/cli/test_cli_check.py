@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from checked_arms import CheckedArm
-from command_line import refusal, remaster
-from compensation_files import save
-from hidden_tours import robot
+from rigs.command_line import refusal, remaster
 from scipy.spatial.transform import Rotation
+from worlds.checked_arms import CheckedArm
+from worlds.compensation_files import save
+from worlds.hidden_tours import robot
 
 from remaster_ros.compensation.checking import Measured
 from remaster_ros.kinematics.serial_chain import SerialChain

@@ -7,9 +7,9 @@ import json
 
 import numpy as np
 import pytest
-from command_line import refusal, remaster
-from compensation_files import arm, save
-from hidden_tours import robot
+from rigs.command_line import refusal, remaster
+from worlds.compensation_files import arm, save
+from worlds.hidden_tours import robot
 
 import remaster_ros
 from remaster_ros.compensation.arm_model import Function, Geometry, JointTerm

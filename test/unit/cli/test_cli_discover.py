@@ -6,7 +6,7 @@ import types
 from dataclasses import replace
 
 import msgspec
-from command_line import refusal, remaster
+from rigs.command_line import refusal, remaster
 
 from remaster_ros.discovery.confirmation import Compared, Confirmation, ConfirmedCause, in_words
 from remaster_ros.discovery.explain import FoundEffect, LookAlike

@@ -15,9 +15,9 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 import yaml
-from command_line import refusal, remaster
-from compensation_files import arm, save
-from robot_descriptions import ROBOTS
+from rigs.command_line import refusal, remaster
+from worlds.compensation_files import arm, save
+from worlds.robot_descriptions import ROBOTS
 
 pytest.importorskip('pinocchio', reason='needs the judge: pip install pin')
 

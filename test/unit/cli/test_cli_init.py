@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command_line import refusal, remaster, run
-from robot_descriptions import ROBOTS, Description, xarm7
+from rigs.command_line import refusal, remaster, run
+from worlds.robot_descriptions import ROBOTS, Description, xarm7
 
 from remaster_ros.cli import init
 from remaster_ros.cli import plan as plan_verb

@@ -8,7 +8,7 @@ import sys
 import types
 
 import pytest
-from command_line import remaster
+from rigs.command_line import remaster
 
 from remaster_ros.cli import main as cli
 from remaster_ros.errors import DeviceError, InputError, InsufficientDataError

@@ -3,7 +3,7 @@
 import json
 
 import pytest
-from command_line import refusal, remaster
+from rigs.command_line import refusal, remaster
 
 from remaster_ros.planning import planned_design, pose_design, tour_planner
 from remaster_ros.session.workcell import config_path

@@ -7,10 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from command_line import refusal, remaster
-from compensation_files import save
-from hidden_tours import robot
-from verified_arms import Case, found_arm, measured
+from rigs.command_line import refusal, remaster
+from worlds.compensation_files import save
+from worlds.hidden_tours import robot
+from worlds.verified_arms import Case, found_arm, measured
 
 from remaster_ros.cli.verify import WORDS
 from remaster_ros.compensation.file import read_compensation

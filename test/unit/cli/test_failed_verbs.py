@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command_line import refusal, remaster
-from robot_descriptions import ROBOTS
+from rigs.command_line import refusal, remaster
+from worlds.robot_descriptions import ROBOTS
 
 from remaster_ros.cli import init
 from remaster_ros.kinematics.serial_chain import SerialChain

@@ -6,8 +6,8 @@ import json
 import random
 
 import pytest
-from command_line import refusal, remaster
-from session_crashes import live, make_observations, session_header
+from faults.session_crashes import live, make_observations, session_header
+from rigs.command_line import refusal, remaster
 
 from remaster_ros.session.reader import read_session
 from remaster_ros.session.session_writer import SessionWriter

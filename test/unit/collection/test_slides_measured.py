@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 from pairing_feed import STREAM, Q, run
-from sliding_cells import rail, scara, sliding_cell, telescope
+from worlds.sliding_cells import rail, scara, sliding_cell, telescope
 
 from remaster_ros import simulate
 from remaster_ros.collection.events import PoseAnnounced

@@ -5,9 +5,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from designed_sessions import measured
 from scipy.stats import binomtest
-from stopping_scene import SOLUTIONS, world
+from worlds.designed_sessions import measured
+from worlds.stopping_scene import SOLUTIONS, world
 
 from remaster_ros.calibration.estimate import Problem, estimate
 from remaster_ros.collection.stopping_rule import (

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from checked_arms import NOISE_M, CheckedArm
+from worlds.checked_arms import NOISE_M, CheckedArm
 
 from remaster_ros.compensation.checking import (
     ALARM,

@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from calibration_scenes import scene
-from compensation_files import arm as arm_of
-from discovery_scenes import residuals_of
-from hidden_tours import robot
+from worlds.calibration_scenes import scene
+from worlds.compensation_files import arm as arm_of
+from worlds.discovery_scenes import residuals_of
+from worlds.hidden_tours import robot
 
 from remaster_ros.compensation.arm_model import ArmModel, Function, Geometry, JointTerm
 from remaster_ros.compensation.compensator import FADES_BELOW, Compensator

@@ -6,10 +6,10 @@ import time
 
 import numpy as np
 import pytest
-from compensation_files import save
-from drawn_moves import drawn, line
-from hidden_tours import robot
 from test_compensator import configurations, erring
+from worlds.compensation_files import save
+from worlds.drawn_moves import drawn, line
+from worlds.hidden_tours import robot
 
 from remaster_ros.compensation.compensator import FADES_BELOW
 from remaster_ros.compensation.foreign_motion import (

@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from compensation_files import arm, save
-from hidden_tours import robot
+from worlds.compensation_files import arm, save
+from worlds.hidden_tours import robot
 
 from remaster_ros.compensation.arm_model import ArmModel, Function, Geometry, JointTerm
 from remaster_ros.compensation.compensator import Compensator

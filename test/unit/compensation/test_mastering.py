@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from robot_descriptions import ROBOTS
+from worlds.robot_descriptions import ROBOTS
 
 from remaster_ros.compensation.mastering import mastering
 from remaster_ros.kinematics.pad_angles import PadAngles

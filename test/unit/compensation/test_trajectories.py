@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from drawn_moves import drawn
 from test_compensator import arm, configurations, erring
+from worlds.drawn_moves import drawn
 
 from remaster_ros.compensation.arm_model import Function, JointTerm
 from remaster_ros.compensation.compensator import Compensator

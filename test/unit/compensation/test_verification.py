@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from verified_arms import Case, measured
+from worlds.verified_arms import Case, measured
 
 from remaster_ros.compensation.verification import verify
 from remaster_ros.errors import InsufficientDataError

@@ -8,8 +8,9 @@ from functools import cache
 
 import numpy as np
 import pytest
-from calibration_scenes import CHAIN, MARKERS, URDF, random_poses, sensors
-from discovery_scenes import (
+from scipy.stats import norm, spearmanr
+from worlds.calibration_scenes import CHAIN, MARKERS, URDF, random_poses, sensors
+from worlds.discovery_scenes import (
     at_joint,
     discovered,
     residuals_of,
@@ -17,7 +18,6 @@ from discovery_scenes import (
     sagging_arm,
     session_with,
 )
-from scipy.stats import norm, spearmanr
 
 from remaster_ros.calibration.fit import fit_session
 from remaster_ros.calibration.noise import NoiseModel

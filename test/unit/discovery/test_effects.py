@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from calibration_scenes import CHAIN
-from discovery_scenes import residuals_of, session_with
+from worlds.calibration_scenes import CHAIN
+from worlds.discovery_scenes import residuals_of, session_with
 
 from remaster_ros.discovery.effects.base import PLACES, Cell
 from remaster_ros.discovery.effects.context import Context

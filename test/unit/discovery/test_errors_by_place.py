@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from discovery_scenes import residuals_of, session_with
 from scipy.stats import binom
+from worlds.discovery_scenes import residuals_of, session_with
 
 from remaster_ros.discovery.evidence import solve
 from remaster_ros.discovery.guard import Unexplained

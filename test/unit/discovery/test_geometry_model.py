@@ -9,7 +9,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from discovery_scenes import CHAIN, at_joint, session_with
+from worlds.discovery_scenes import CHAIN, at_joint, session_with
 
 import remaster_ros
 from remaster_ros.calibration.registration import register_points

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from discovery_scenes import residuals_of, session_with
+from worlds.discovery_scenes import residuals_of, session_with
 
 from remaster_ros.discovery.evidence import solve
 from remaster_ros.discovery.omnibus import compared_held_out

@@ -5,7 +5,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from discovery_scenes import at_joint, discovered, residuals_of, session_with
+from worlds.discovery_scenes import at_joint, discovered, residuals_of, session_with
 
 from remaster_ros.discovery import discover
 from remaster_ros.discovery.causes import Search, is_special_case

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from calibration_scenes import CHAIN
-from discovery_scenes import at_joint, residuals_of, session_with
+from worlds.calibration_scenes import CHAIN
+from worlds.discovery_scenes import at_joint, residuals_of, session_with
 
 from remaster_ros.discovery import random_effects
 from remaster_ros.discovery.effects.registry import EFFECTS

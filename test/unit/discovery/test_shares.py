@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from discovery_scenes import residuals_of, session_with
+from worlds.discovery_scenes import residuals_of, session_with
 
 from remaster_ros.discovery import evidence
 from remaster_ros.discovery.effects.base import Cell

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from discovery_scenes import at_joint, discovered, residuals_of, session_with
+from worlds.discovery_scenes import at_joint, discovered, residuals_of, session_with
 
 import remaster_ros
 from remaster_ros.discovery.discover import discover_session

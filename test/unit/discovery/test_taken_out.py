@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from discovery_scenes import session_with
+from worlds.discovery_scenes import session_with
 
 from remaster_ros.calibration.estimate import Problem, estimate
 from remaster_ros.discovery import explain

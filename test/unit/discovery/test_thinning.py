@@ -7,8 +7,8 @@ from functools import partial
 
 import numpy as np
 import pytest
-from calibration_scenes import CHAIN
-from discovery_scenes import at_joint, discovered, session_with
+from worlds.calibration_scenes import CHAIN
+from worlds.discovery_scenes import at_joint, discovered, session_with
 
 from remaster_ros.discovery import discover, residuals
 from remaster_ros.discovery.thinning import FEWEST_POSES, MOST_ROWS, draw_rows, of_spread_poses

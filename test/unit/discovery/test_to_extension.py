@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from calibration_scenes import one_tool_direction
-from discovery_scenes import at_joint, session_with
+from worlds.calibration_scenes import one_tool_direction
+from worlds.discovery_scenes import at_joint, session_with
 
 from remaster_ros.calibration.estimate import Estimate, Problem, estimate
 from remaster_ros.calibration.priors import OFFSET_STD, STEP_STD

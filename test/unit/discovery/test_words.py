@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from calibration_scenes import scene
-from discovery_scenes import residuals_of
+from worlds.calibration_scenes import scene
+from worlds.discovery_scenes import residuals_of
 
 from remaster_ros.calibration.gauge_words import the
 from remaster_ros.discovery.effects.registry import EFFECTS

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from command_line import remaster
+from rigs.command_line import remaster
 
 from remaster_ros.session.reader import read_session
 

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command_line import remaster, run
-from foreign_tables import measured, text, write
+from foreign.tables import measured, text, write
+from rigs.command_line import remaster, run
 
 from remaster_ros.errors import InputError
 from remaster_ros.importing.rows import TableOptions, read_rows

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command_line import run
+from rigs.command_line import run
 
 from remaster_ros.calibration.estimate import Problem, estimate
 from remaster_ros.session.reader import read_session

@@ -6,8 +6,8 @@ import json
 
 import numpy as np
 import pytest
-from command_line import remaster
-from foreign_tables import MARKER, measured, text, write
+from foreign.tables import MARKER, measured, text, write
+from rigs.command_line import remaster
 
 from remaster_ros.calibration.fit import fit_session
 from remaster_ros.session.reader import read_session

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from foreign_tables import measured, text, write
+from foreign.tables import measured, text, write
 
 import remaster_ros
 from remaster_ros.errors import InputError, InsufficientDataError

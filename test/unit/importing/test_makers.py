@@ -8,9 +8,9 @@ from collections import Counter
 
 import numpy as np
 import pytest
-from command_line import remaster
-from foreign_makers import KINDS, names_of
-from foreign_tables import measured, text, write
+from foreign.makers import KINDS, names_of
+from foreign.tables import measured, text, write
+from rigs.command_line import remaster
 
 from remaster_ros.errors import InputError
 from remaster_ros.importing.columns import Told, find_columns

@@ -8,8 +8,8 @@ from collections import Counter
 
 import numpy as np
 import pytest
-from foreign_streams import arm_of, run_of, take_of
-from foreign_tables import text
+from foreign.streams import arm_of, run_of, take_of
+from foreign.tables import text
 from test_makers import JOINTS, joints_of, mutated
 
 from remaster_ros.errors import InputError

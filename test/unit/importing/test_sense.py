@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from foreign_tables import measured, text, write
+from foreign.tables import measured, text, write
 
 CASES = Path(__file__).parents[4] / 'shared' / 'cases'
 NAMES = [f'A{i}' for i in range(1, 7)]

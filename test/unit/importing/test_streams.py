@@ -6,8 +6,8 @@ import re
 
 import numpy as np
 import pytest
-from foreign_streams import arm_of, log_of, run_of, seen, take_of
-from foreign_tables import text, write
+from foreign.streams import arm_of, log_of, run_of, seen, take_of
+from foreign.tables import text, write
 
 from remaster_ros.errors import InputError
 from remaster_ros.importing.columns import Told

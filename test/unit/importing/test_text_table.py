@@ -7,7 +7,7 @@ from contextlib import suppress
 
 import numpy as np
 import pytest
-from foreign_tables import text, write
+from foreign.tables import text, write
 from hypothesis import given, settings
 from hypothesis import strategies as st
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from robot_descriptions import ROBOTS, Joint, arm, document, link, xarm7
+from worlds.robot_descriptions import ROBOTS, Joint, arm, document, link, xarm7
 
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.arm_ends import (

@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-from arms import planar_arm
 from collision_scene import EXACT, at, capsules, distances
+from worlds.arms import planar_arm
 
 from remaster_ros.kinematics import body_pairs
 from remaster_ros.kinematics.bodies import Body, box, capsule, cylinder, hull, obstacle, sphere

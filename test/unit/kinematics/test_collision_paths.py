@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
-from arms import planar_arm
 from collision_scene import EXACT, at, capsules, distances
-from random_arm import random_arm_urdf
+from worlds.arms import planar_arm
+from worlds.random_arm import random_arm_urdf
 
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.bodies import Body, box, cylinder, hull, obstacle, sphere

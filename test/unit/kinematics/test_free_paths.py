@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from arms import planar_arm
+from worlds.arms import planar_arm
 
 from remaster_ros.kinematics.bodies import Body, cylinder, obstacle, sphere
 from remaster_ros.kinematics.body_pairs import RESERVE_M

@@ -4,10 +4,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from random_arm import random_arm_urdf
-from robot_descriptions import Description, iiwa14, irb120, panda, ur5e, xarm6
 from scipy.linalg import expm
 from srs_solver import SrsArm
+from worlds.random_arm import random_arm_urdf
+from worlds.robot_descriptions import Description, iiwa14, irb120, panda, ur5e, xarm6
 
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.inverse_kinematics import (
@@ -359,7 +359,7 @@ def ur10():
 def test_arms_without_a_closed_form_keep_all_solutions(make, errors, held, way, poses):
     """Against pinocchio from random starts; of each pose the angles it was made from, too."""
     pytest.importorskip('pinocchio', reason='needs the judge: pip install pin')
-    from inverse_judge import InverseJudge, apart, with_errors
+    from judges.inverse_kinematics import InverseJudge, apart, with_errors
 
     seed = 11
     rng = np.random.default_rng(seed)
@@ -405,7 +405,7 @@ def test_arms_without_a_closed_form_keep_all_solutions(make, errors, held, way, 
 def test_arms_with_few_or_sliding_joints_keep_all_solutions(joints, slides, poses):
     """Against pinocchio from random starts; of each pose the positions it was made from, too."""
     pytest.importorskip('pinocchio', reason='needs the judge: pip install pin')
-    from inverse_judge import InverseJudge
+    from judges.inverse_kinematics import InverseJudge
 
     seed = 12
     print('seed', seed)

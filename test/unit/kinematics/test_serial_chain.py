@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from random_arm import random_arm_urdf
+from worlds.random_arm import random_arm_urdf
 
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.serial_chain import SerialChain

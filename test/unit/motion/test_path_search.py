@@ -4,7 +4,7 @@ import functools
 
 import numpy as np
 import pytest
-from simple_cells import write_cell
+from worlds.simple_cells import write_cell
 
 from remaster_ros.motion.actions import CheckPath
 from remaster_ros.motion.path_check import PointSpeeds

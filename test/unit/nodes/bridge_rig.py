@@ -15,7 +15,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from hostile.arm import HostileArm
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import QoSProfile
-from ros_rig import OWN_DOMAIN
+from rigs.ros_rig import OWN_DOMAIN
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from std_srvs.srv import Trigger

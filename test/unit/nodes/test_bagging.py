@@ -3,7 +3,7 @@
 import time
 
 import pytest
-from ros_rig import OWN_DOMAIN
+from rigs.ros_rig import OWN_DOMAIN
 
 pytest.importorskip('rclpy', reason='needs ROS 2 Jazzy or its wheels')
 

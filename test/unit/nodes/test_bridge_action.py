@@ -7,10 +7,10 @@ import pytest
 
 pytest.importorskip('rclpy', reason='needs ROS 2 Jazzy or its wheels')
 
-from action_controller import ActionController, follow_joint_trajectory
 from bridge_places import AWAY, TARGET
 from bridge_rig import CHAIN, HOME, Rig, point
 from rclpy.action import ActionClient
+from rigs.action_controller import ActionController, follow_joint_trajectory
 from trajectory_msgs.msg import JointTrajectory
 
 from remaster_ros.collection.events import ArmStopped

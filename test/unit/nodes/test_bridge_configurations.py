@@ -10,10 +10,10 @@ pytest.importorskip('rclpy', reason='needs ROS 2 Jazzy or its wheels')
 
 from bridge_places import AWAY, LOW, POST, TARGET, TOOL, turned
 from bridge_rig import CHAIN, HOME, stamp
-from compensation_files import arm, save
-from simple_cells import write_cell
 from std_msgs.msg import String
 from trajectory_msgs.msg import JointTrajectory
+from worlds.compensation_files import arm, save
+from worlds.simple_cells import write_cell
 
 from remaster_ros.collection.events import (
     ArmStopped,

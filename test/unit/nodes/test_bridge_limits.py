@@ -7,9 +7,9 @@ pytest.importorskip('rclpy', reason='needs ROS 2 Jazzy or its wheels')
 
 from bridge_places import AWAY, POST, turned
 from bridge_rig import CHAIN, HOME
-from compensation_files import arm, save
 from rclpy.parameter import Parameter
-from simple_cells import write_cell
+from worlds.compensation_files import arm, save
+from worlds.simple_cells import write_cell
 
 from remaster_ros.collection.events import (
     ArmStopped,

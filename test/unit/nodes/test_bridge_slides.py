@@ -7,9 +7,9 @@ import pytest
 
 pytest.importorskip('rclpy', reason='needs ROS 2 Jazzy or its wheels')
 
-from compensation_files import arm, save
 from sensor_msgs.msg import JointState
-from sliding_cells import lift, rail, scara, sliding_cell
+from worlds.compensation_files import arm, save
+from worlds.sliding_cells import lift, rail, scara, sliding_cell
 
 from remaster_ros.collection.events import ArmHalted, ArmStopped, SolutionFailed
 from remaster_ros.errors import InputError

@@ -6,21 +6,21 @@ import time
 
 import numpy as np
 import pytest
-from ros_rig import OWN_DOMAIN
+from rigs.ros_rig import OWN_DOMAIN
 
 pytest.importorskip('rclpy', reason='needs ROS 2 Jazzy or its wheels')
 
 import rclpy
-from action_controller import ActionController, follow_joint_trajectory
-from compensation_files import arm, save
-from drawn_moves import drawn, line
 from rclpy.action import ActionClient
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import DurabilityPolicy, QoSProfile
+from rigs.action_controller import ActionController, follow_joint_trajectory
 from sensor_msgs.msg import JointState, Temperature
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
+from worlds.compensation_files import arm, save
+from worlds.drawn_moves import drawn, line
 
 from remaster_ros.collection.message_fields import seconds
 from remaster_ros.compensation.arm_model import Geometry

@@ -6,7 +6,7 @@ import time
 
 import numpy as np
 import pytest
-from simple_cells import write_cell
+from worlds.simple_cells import write_cell
 
 from remaster_ros.collection.events import Decided
 from remaster_ros.collection.peers import Peers

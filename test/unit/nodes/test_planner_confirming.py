@@ -4,13 +4,13 @@ import time
 
 import numpy as np
 import pytest
-from ros_rig import OWN_DOMAIN
+from rigs.ros_rig import OWN_DOMAIN
 
 pytest.importorskip('rclpy', reason='needs ROS 2 Jazzy or its wheels')
 
 import rclpy
-from simple_cells import write_cell
 from std_srvs.srv import Trigger
+from worlds.simple_cells import write_cell
 
 from remaster_ros.collection.events import Decided, EventRecord, RecorderState
 from remaster_ros.nodes.pose_planner import PosePlanner

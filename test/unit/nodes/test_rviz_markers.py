@@ -12,8 +12,8 @@ from collections import Counter
 
 import numpy as np
 from builtin_interfaces.msg import Time
-from played_collection import CELL, CHAIN, T_R_N, PlayedCollection
 from visualization_msgs.msg import Marker
+from worlds.played_collection import CELL, CHAIN, T_R_N, PlayedCollection
 
 from remaster_ros.nodes import rviz_markers
 from remaster_ros.nodes.messages import transform_array

@@ -9,7 +9,7 @@ pytest.importorskip('rclpy', reason='needs ROS 2 Jazzy or its wheels')
 from types import SimpleNamespace
 
 import numpy as np
-from played_collection import CHAIN
+from worlds.played_collection import CHAIN
 
 from remaster_ros.errors import InputError
 from remaster_ros.nodes import watch

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from robot_descriptions import irb120
+from worlds.robot_descriptions import irb120
 
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics import body_pairs

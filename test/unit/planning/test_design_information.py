@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from designed_sessions import MARKER_STD, measured
+from worlds.designed_sessions import MARKER_STD, measured
 
 from remaster_ros.calibration.estimate import Problem, estimate
 from remaster_ros.calibration.model import predict_in_sensor

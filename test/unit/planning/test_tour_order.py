@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from arms import planar_arm
+from worlds.arms import planar_arm
 
 from remaster_ros.errors import InsufficientDataError
 from remaster_ros.kinematics.bodies import obstacle

@@ -12,8 +12,8 @@ from xml.etree import ElementTree
 import msgspec
 import numpy as np
 import pytest
-from discovery_scenes import at_joint, session_with
 from matplotlib.figure import Figure
+from worlds.discovery_scenes import at_joint, session_with
 
 from remaster_ros.calibration.noise import Noise, NoiseModel
 from remaster_ros.discovery.confirmation import confirm

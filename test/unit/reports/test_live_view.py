@@ -7,7 +7,7 @@ import json
 import msgspec
 import numpy as np
 import pytest
-from played_collection import CHAIN, MARKERS, T_R_N, PlayedCollection
+from worlds.played_collection import CHAIN, MARKERS, T_R_N, PlayedCollection
 
 from remaster_ros import simulate
 from remaster_ros.collection import events

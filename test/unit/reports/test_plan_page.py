@@ -6,7 +6,7 @@ from html.parser import HTMLParser
 
 import numpy as np
 import pytest
-from browser import NO_WEBGL, seen
+from rigs.browser import NO_WEBGL, seen
 
 from remaster_ros.cli import main as cli
 from remaster_ros.reports.plan_page import write_plan_page

@@ -11,7 +11,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from browser import seen
+from rigs.browser import seen
 
 from remaster_ros.calibration.noise_estimate import NoiseEstimate
 from remaster_ros.kinematics import transforms

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 import trimesh
-from robot_descriptions import irb120
-from simple_cells import write_cell
+from worlds.robot_descriptions import irb120
+from worlds.simple_cells import write_cell
 
 from remaster_ros.kinematics.transforms import apply
 from remaster_ros.reports.robot_scene import MOST_TRIANGLES, coarser, robot_scene

@@ -10,8 +10,8 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
-from optitrack_world import nothing_left
-from tracker_world import MARKER, ReflectorWorld, across_and_along, wait_for
+from worlds.optitrack_world import nothing_left
+from worlds.tracker_world import MARKER, ReflectorWorld, across_and_along, wait_for
 
 from remaster_ros.errors import DeviceError, InputError
 from remaster_ros.sensors.laser_tracker.client import (

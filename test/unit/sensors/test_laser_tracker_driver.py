@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from tracker_world import MARKER, OTHER_BESIDE, ReflectorWorld
+from worlds.tracker_world import MARKER, OTHER_BESIDE, ReflectorWorld
 
 from remaster_ros.errors import DeviceError
 from remaster_ros.sensors.driver import SensorClock

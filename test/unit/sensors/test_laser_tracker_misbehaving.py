@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 import pytest
-from tracker_world import wait_for
+from worlds.tracker_world import wait_for
 
 from remaster_ros.errors import DeviceError
 from remaster_ros.sensors.laser_tracker.client import (

@@ -8,8 +8,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from natnet_rig import LOCAL, NOISELESS, client_of, fake_server
-from optitrack_world import RATE, MarkerWorld, eventually, free_port, nothing_left
+from rigs.natnet_rig import LOCAL, NOISELESS, client_of, fake_server
+from worlds.optitrack_world import RATE, MarkerWorld, eventually, free_port, nothing_left
 
 from remaster_ros.errors import DeviceError, InputError
 from remaster_ros.sensors.optitrack import natnet

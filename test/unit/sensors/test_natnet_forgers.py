@@ -16,7 +16,7 @@ import time
 
 import numpy as np
 import pytest
-from optitrack_world import SENSOR, MarkerWorld, eventually, free_port
+from worlds.optitrack_world import SENSOR, MarkerWorld, eventually, free_port
 
 from remaster_ros.sensors.optitrack import natnet
 from remaster_ros.sensors.optitrack.client import NatNetClient

@@ -8,7 +8,7 @@ import math
 import struct
 
 import pytest
-from fuzz_messages import VERSIONS, full_frame
+from hostile.fuzz_messages import VERSIONS, full_frame
 from hypothesis import given, settings
 from hypothesis import strategies as st
 

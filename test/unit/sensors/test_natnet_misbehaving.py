@@ -7,10 +7,10 @@ import time
 
 import numpy as np
 import pytest
-from fuzz_messages import full_frame
-from fuzzing import DatagramSource
-from natnet_rig import LOCAL, client_of
-from optitrack_world import eventually
+from hostile.fuzz_messages import full_frame
+from hostile.fuzzing import DatagramSource
+from rigs.natnet_rig import LOCAL, client_of
+from worlds.optitrack_world import eventually
 
 from remaster_ros.sensors.optitrack import client as natnet_client
 from remaster_ros.sensors.optitrack import natnet

@@ -1,7 +1,7 @@
 """A bag that several files of tests read."""
 
 import pytest
-from bag_messages import messages
+from foreign.bag_messages import messages
 
 from remaster_ros.session.bag_writer import BagWriter
 

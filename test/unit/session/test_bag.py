@@ -8,10 +8,10 @@ import subprocess
 import sys
 from pathlib import Path
 
-import bag_messages
 import numpy as np
 import pytest
-from bag_messages import START_NS, STORE, TOPICS, joint_state, messages, part
+from foreign import bag_messages
+from foreign.bag_messages import START_NS, STORE, TOPICS, joint_state, messages, part
 from mcap.exceptions import EndOfFile
 from mcap.reader import NonSeekingReader, make_reader
 from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
@@ -118,7 +118,7 @@ def test_bags_of_other_recorders_are_read(tmp_path):
 KILLED = """
 import sys
 sys.path.insert(0, {tests!r})
-from bag_messages import messages
+from foreign.bag_messages import messages
 from remaster_ros.session.bag_writer import BagWriter
 writer = BagWriter({folder!r})
 for i, message in enumerate(messages()):
@@ -130,7 +130,7 @@ sys.stdin.read()
 
 def test_a_killed_writer_leaves_all_it_wrote(tmp_path, caplog):
     folder = tmp_path / 'bag'
-    script = KILLED.format(tests=str(Path(bag_messages.__file__).parent), folder=str(folder))
+    script = KILLED.format(tests=str(Path(bag_messages.__file__).parents[1]), folder=str(folder))
     with subprocess.Popen(
         [sys.executable, '-c', script], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     ) as process:

@@ -8,7 +8,7 @@ import subprocess
 
 import numpy as np
 import pytest
-from bag_messages import abandon, messages, part
+from foreign.bag_messages import abandon, messages, part
 from rosbags.rosbag2 import Reader
 
 from remaster_ros.errors import InputError

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from calibration_scenes import scene
-from command_line import refusal, remaster
+from rigs.command_line import refusal, remaster
+from worlds.calibration_scenes import scene
 
 from remaster_ros.calibration.fit import fit_session
 from remaster_ros.errors import InputError

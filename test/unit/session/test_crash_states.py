@@ -1,6 +1,7 @@
 """Simulated power cuts in the life of a session; CRASH_STATES=12000 tries more.
 
-What a crash may leave is in test/crash_states.py, what must hold then in test/session_crashes.py.
+What a crash may leave is in test/faults/crash_states.py, what must hold then in session_crashes.py
+beside it.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from collections import Counter
 from pathlib import Path
 
 import pytest
-from session_crashes import check, live, yaml_read_once
+from faults.session_crashes import check, live, yaml_read_once
 
 SHARED_MEMORY = Path('/dev/shm')
 

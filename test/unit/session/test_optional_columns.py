@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from calibration_scenes import scene
-from oriented_sessions import make_session
+from worlds.calibration_scenes import scene
+from worlds.oriented_sessions import make_session
 
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.transforms import inverse, matrix_from_quaternion_xyzw, transform

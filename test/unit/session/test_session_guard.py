@@ -9,7 +9,7 @@ import subprocess
 
 import numpy as np
 import pytest
-from command_line import remaster
+from rigs.command_line import remaster
 from test_session_writer import observations
 
 from remaster_ros.errors import InputError, MovedError

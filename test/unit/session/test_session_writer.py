@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from session_shapes import observations
+from worlds.session_shapes import observations
 
 from remaster_ros.errors import DiskError, InputError
 from remaster_ros.session.reader import read_session, write_session
@@ -125,7 +125,7 @@ import sys
 from remaster_ros.session.reader import read_session
 from remaster_ros.session.session_writer import SessionWriter
 sys.path[:0] = [{tests!r}]
-from session_shapes import observations
+from worlds.session_shapes import observations
 session = read_session({source!r})
 writer = SessionWriter({folder!r}, session)
 for observation in observations(session):

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from command_line import refusal, remaster
+from rigs.command_line import refusal, remaster
 
 import remaster_ros
 from remaster_ros.calibration.estimate import Problem, estimate

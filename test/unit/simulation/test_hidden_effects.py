@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from calibration_scenes import CHAIN, random_poses
+from worlds.calibration_scenes import CHAIN, random_poses
 
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.transforms import transform

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from tracker_world import MARKER, ReflectorWorld, across_and_along
+from worlds.tracker_world import MARKER, ReflectorWorld, across_and_along
 
 from remaster_ros.sensors.laser_tracker.packets import (
     Change,

@@ -8,7 +8,7 @@ import struct
 
 import numpy as np
 import pytest
-from optitrack_world import SENSOR, MarkerWorld, SteppedWorld, free_port
+from worlds.optitrack_world import SENSOR, MarkerWorld, SteppedWorld, free_port
 
 from remaster_ros.errors import InputError
 from remaster_ros.sensors.optitrack import natnet

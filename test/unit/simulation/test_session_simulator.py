@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from calibration_scenes import CHAIN, MARKERS, URDF, random_poses, scene, sensors
+from worlds.calibration_scenes import CHAIN, MARKERS, URDF, random_poses, scene, sensors
 
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.transforms import apply

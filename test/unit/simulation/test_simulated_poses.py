@@ -7,11 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from calibration_scenes import CHAIN, MARKERS, URDF, random_poses, sensors
-from command_line import refusal, remaster
-from parallel import in_parallel
+from rigs.command_line import refusal, remaster
+from rigs.parallel import in_parallel
 from scipy.spatial.transform import Rotation
 from scipy.stats import binom
+from worlds.calibration_scenes import CHAIN, MARKERS, URDF, random_poses, sensors
 
 import remaster_ros
 from remaster_ros.calibration.fit import fit_session

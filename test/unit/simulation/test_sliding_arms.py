@@ -6,9 +6,9 @@ import json
 
 import numpy as np
 import pytest
-from arms import jointed_arm
-from command_line import refusal, remaster
+from rigs.command_line import refusal, remaster
 from scipy.stats import binom
+from worlds.arms import jointed_arm
 
 from remaster_ros.calibration.fit import fit_session
 from remaster_ros.kinematics.serial_chain import LEVER_M, SerialChain

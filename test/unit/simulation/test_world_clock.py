@@ -9,7 +9,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from optitrack_world import SENSOR, MarkerWorld
+from worlds.optitrack_world import SENSOR, MarkerWorld
 
 from remaster_ros.simulation import world_clock
 from remaster_ros.simulation import world_clock as pace_module
