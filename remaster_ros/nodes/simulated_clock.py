@@ -20,7 +20,7 @@ from remaster_ros.nodes.running import RemasterNode
 
 TAKEN = 'remaster/joint_states_taken'
 TAKEN_EVERY_S = 0.1
-"""No more often than this are reports confirmed, s of their stamps."""
+"""No more often than this are reports confirmed, s of their stamps; where these stand, of wall time."""
 STANDS_WALL_S = 5.0
 """A clock that stands longer than this has ended, and watchdogs follow the wall's, s."""
 
@@ -79,11 +79,19 @@ class ReportsTaken:
 
     def __init__(self, node: RemasterNode, simulated: float) -> None:
         self._publisher = node.create_publisher(Header, TAKEN, 10) if simulated else None
-        self._last_s = -TAKEN_EVERY_S
+        # Stamps of what was confirmed and of what was taken last, and when that was confirmed.
+        self._confirmed_s = self._taken_s = -TAKEN_EVERY_S
+        self._confirmed_wall = 0.0
 
     def take(self, stamp: Time) -> None:
         """Process that all was taken: up to the report with this stamp, or until this time."""
-        if self._publisher is None or abs(seconds(stamp) - self._last_s) < TAKEN_EVERY_S:
+        if self._publisher is None:
             return
-        self._last_s = seconds(stamp)
+        stamp_s, wall = seconds(stamp), time.monotonic()
+        # A robot that sends one report again and again has published something all the same.
+        again = stamp_s == self._taken_s and wall - self._confirmed_wall >= TAKEN_EVERY_S
+        self._taken_s = stamp_s
+        if not again and abs(stamp_s - self._confirmed_s) < TAKEN_EVERY_S:
+            return
+        self._confirmed_s, self._confirmed_wall = stamp_s, wall
         self._publisher.publish(Header(stamp=stamp, frame_id=str(os.getpid())))

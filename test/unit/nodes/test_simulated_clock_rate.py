@@ -1,4 +1,7 @@
-"""Time of a node's watchdogs: the wall clock's beside an arm, and never faster than that."""
+"""Time of a node's watchdogs: the wall clock's beside an arm, and never faster than that.
+
+And what a simulation that waits for its nodes hears of them.
+"""
 
 from types import SimpleNamespace
 
@@ -6,9 +9,11 @@ import pytest
 
 pytest.importorskip('rclpy', reason='needs ROS 2 Jazzy or its wheels')
 
+from builtin_interfaces.msg import Time
+
 from remaster_ros.errors import InputError
 from remaster_ros.nodes import simulated_clock
-from remaster_ros.nodes.simulated_clock import STANDS_WALL_S, SteadyTime
+from remaster_ros.nodes.simulated_clock import STANDS_WALL_S, ReportsTaken, SteadyTime
 
 pytestmark = pytest.mark.ros
 
@@ -82,3 +87,18 @@ def test_silence_is_noticed_where_the_simulation_has_ended(wall):
     assert passes(steady, node, wall, STANDS_WALL_S + 4.0, 0.0) == pytest.approx(4.0, abs=0.05)
     node.now = 0.5
     assert passes(steady, node, wall, 1.0, RATE) == pytest.approx(1.0, abs=0.05)
+
+
+def test_reports_are_confirmed_ten_times_a_second_one_that_comes_again_too(wall):
+    node, confirmed = Node(), []
+    node.create_publisher = lambda *_: SimpleNamespace(publish=confirmed.append)
+    reports = ReportsTaken(node, RATE)
+    for hundredths in range(100):
+        reports.take(Time(sec=7, nanosec=hundredths * 10_000_000))
+    assert 10 <= len(confirmed) <= 11
+    confirmed.clear()
+    for _ in range(100):
+        wall.now += 0.01
+        reports.take(Time(sec=7, nanosec=990_000_000))
+    assert 9 <= len(confirmed) <= 11
+    assert {message.stamp.nanosec for message in confirmed} == {990_000_000}
