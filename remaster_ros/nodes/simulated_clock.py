@@ -20,7 +20,8 @@ from remaster_ros.nodes.running import RemasterNode
 
 TAKEN = 'remaster/joint_states_taken'
 TAKEN_EVERY_S = 0.1
-"""No more often than this are reports confirmed, s of their stamps; where these stand, of wall time."""
+"""Reports are confirmed no more often than this, s of their stamps, or where these stand of wall
+time."""
 STANDS_WALL_S = 5.0
 """A clock that stands longer than this has ended, and watchdogs follow the wall's, s."""
 
