@@ -111,6 +111,8 @@ MOST_CANDIDATES = 1500
 """Configurations that it chooses from at most: about a second of choice for each hundred."""
 MOST_TRIES = 5
 """So often a design, or an order, is made anew where a way is not free."""
+JOINING = 2
+"""So many pairs of configurations are tried between two parts, the nearest first."""
 DETOUR = 2.0
 """A way around something counts as so many times the straight one, until it is planned."""
 
@@ -219,10 +221,16 @@ def designed_plans(
         among, floors = information.only(left), _floors(information, left, settings.whole_poses)
         design = choose(among, travel, goal, rng, floors, whole_poses=settings.whole_poses)
         chosen = left[np.array(design.chosen, dtype=np.int64)]
-        lost = _without_way(scene.model, information.q[chosen], travel)
-        if not lost:
+        apart = _apart(scene.model, information.q[chosen], travel)
+        if not apart:
             break
-        left = np.setdiff1d(left, chosen[lost])
+        # What lies nearest to a part that no way leads to is of that part: another design of it
+        # would be as much apart.
+        q = information.q[left]
+        nearest = np.argmin([travel.straight(one, q) for one in information.q[chosen]], axis=0)
+        islands = [part for part in apart if len(part) > 1]
+        left = left[~np.isin(nearest, np.concatenate([*islands, []]))]
+        left = np.setdiff1d(left, chosen[np.concatenate(apart)])
     kept = [
         PlannedPose(poses[index].T_R_T, poses[index].solutions[number[mine]])
         for index in np.unique(information.pose[chosen])
@@ -340,20 +348,35 @@ def _is_free(
     return is_straight_free(model, q[one[int(a)]], q[other[int(b)]])
 
 
-def _without_way(model: CollisionModel, q: FloatArray, travel: TravelTime) -> list[int]:
-    """Return which of some configurations (n, k) no free way leads to from its two nearest."""
+def _apart(model: CollisionModel, q: FloatArray, travel: TravelTime) -> list[IntArray]:
+    """Return which of some configurations (n, k) no free way leads to from most of them, in parts.
+
+    Ways are sought from the two nearest of each, then from the largest part that hangs together to
+    each of the others.
+    """
     times = travel.between(q)
     np.fill_diagonal(times, np.inf)
     limits = model.chain.velocity_limits
-    return [
-        index
-        for index in range(len(q))
-        if len(q) > 1
-        and all(
-            free_way(model, q[other], q[index], limits, index) is None
-            for other in np.argsort(times[index])[:2]
-        )
-    ]
+    part = np.arange(len(q))
+
+    def joins(index: int, other: int) -> bool:
+        if part[index] != part[other]:
+            if free_way(model, q[other], q[index], limits, index) is None:
+                times[index, other] = times[other, index] = np.inf
+                return False
+            part[part == part[index]] = part[other]
+        return True
+
+    for index in range(len(q)):
+        any(joins(index, int(other)) for other in np.argsort(times[index])[:2])
+    most = int(np.argmax(np.bincount(part)))
+    for number in np.unique(part[part != most]):
+        for _ in range(JOINING):
+            between = np.where(np.outer(part == number, part == most), times, np.inf)
+            pair = np.unravel_index(int(np.argmin(between)), between.shape)
+            if not np.isfinite(between[pair]) or joins(*map(int, pair)):
+                break
+    return [np.flatnonzero(part == number) for number in np.unique(part[part != most])]
 
 
 def _sum(*counts: Mapping[str, int]) -> dict[str, int]:

@@ -263,3 +263,20 @@ def test_a_verification_has_ten_poses_off_and_on_in_random_order_that_no_collect
     other = TourPlanner(planner.scene, {}, 1, 0, planner.design).verification()
     orders = [[p.correction for p in t.plans['validation'].poses] for t in (again, other)]
     assert orders[0] != orders[1]
+
+
+def test_a_design_stays_in_one_part_of_what_is_free(monkeypatch):
+    """Two halves without a way between: each configuration has neighbours of its own half."""
+    sides = []
+
+    def way_in_a_half(model, q, goal, limits, seed):
+        sides.append(q[3] > 0)
+        return goal[None] if (q[3] > 0) == (goal[3] > 0) else None
+
+    monkeypatch.setattr(planned_design, 'free_way', way_in_a_half)
+    planner, _ = planner_of(CellPoses())
+    planner.collection(planner.rough_places)
+    poses = planner.designed.plans['optimization'].poses
+    assert {True, False} == set(sides)
+    assert len({q[3] > 0 for pose in poses for q in pose.solutions}) == 1
+    assert planner.designed.reached
