@@ -19,7 +19,7 @@ from scipy.spatial.distance import cdist
 from remaster_ros.discovery.effects.base import Cell, Design, Effect, along_axes, displaced
 from remaster_ros.discovery.effects.context import Context
 from remaster_ros.discovery.effects.sizes import up_to
-from remaster_ros.discovery.effects.splines import basis, knot_vector, mean_penalty, roughness
+from remaster_ros.discovery.effects.splines import basis, knot_vector, roughness
 from remaster_ros.types import FloatArray
 
 # Lengths of the kernel, of the RMS distance from the middle of the volume: about a quadratic and
@@ -67,7 +67,8 @@ def cells(context: Context) -> Iterator[Cell]:
         yield EFFECT.cell(
             partial(_along_sight, sensor=index, knots=knots),
             [f'field_range_{name}_{i}' for i in range(len(knots) - 4)],
-            penalty=roughness(len(knots) - 4) + mean_penalty(len(knots) - 4),
+            # Its mean is free: bound to zero, what it lacked was a scale of the sensor.
+            penalty=roughness(len(knots) - 4),
             drawn_from=rarity,
             variant='range',
             subject=name,

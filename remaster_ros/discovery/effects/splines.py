@@ -190,8 +190,3 @@ def roughness(count: int, closed: bool = False) -> FloatArray:
     else:
         differences = np.diff(np.eye(count), n=2, axis=0)
     return differences.T @ differences + RIDGE * np.eye(count)
-
-
-def mean_penalty(count: int) -> FloatArray:
-    """Return a penalty on the mean of m coefficients, (m, m), where it is not bound to be zero."""
-    return np.full((count, count), 1.0 / count)
