@@ -13,12 +13,13 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 from worlds.hidden_arm import PinocchioArm
+from worlds.measured_rows import measured_rows
 
 from remaster_ros.calibration.estimate import Problem, estimate
 from remaster_ros.calibration.fit import fit_session
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.transforms import inverse, looking_at, transform
-from remaster_ros.types import FloatArray, Measurements, Session
+from remaster_ros.types import FloatArray, Session
 
 KINDS = ('tracker', 'camera_stands', 'camera_on_tool')
 ROBOTS = Path(__file__).parents[2] / 'config' / 'robots'
@@ -109,22 +110,8 @@ def make_session(
         board = np.array([_by_camera(one, rng) for one in board])
         pose = inverse(board) if kind == 'camera_on_tool' else board
         position, turned = pose[:, :3, 3], Rotation.from_matrix(pose[:, :3, :3])
-    rows = np.arange(n)
-    measurements = Measurements(
-        observation=rows,
-        pose=number,
-        configuration=rows,
-        is_validation=np.zeros(n, bool),
-        stamp_s=10.0 * rows,
-        sensor=0 * rows,
-        marker=0 * rows,
-        q=q,
-        from_q=np.full((n, k), np.nan),
-        position=position,
-        std=np.full((n, 3), np.nan),
-        samples=np.full(n, -1),
-        temperature_c=np.full(n, np.nan),
-        orientation=turned.as_quat(),
+    measurements = measured_rows(
+        q, position, pose=number, stamp_s=10.0 * np.arange(n), orientation=turned.as_quat()
     )
     session = Session(
         urdf=urdf,

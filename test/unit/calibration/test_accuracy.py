@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from worlds.measured_rows import measured_rows
 
 from remaster_ros.calibration import accuracy
 from remaster_ros.calibration.accuracy import (
@@ -17,24 +18,8 @@ from remaster_ros.types import Measurements
 RNG = np.random.default_rng(0)
 
 
-def measurements(pose, position, sensor=None, marker=None, configuration=None) -> Measurements:
-    n = len(pose)
-    zeros = np.zeros(n, dtype=np.int64)
-    return Measurements(
-        observation=np.arange(n),
-        pose=np.asarray(pose),
-        configuration=np.arange(n) if configuration is None else np.asarray(configuration),
-        is_validation=np.zeros(n, dtype=bool),
-        stamp_s=np.arange(n, dtype=float),
-        sensor=zeros if sensor is None else np.asarray(sensor),
-        marker=zeros if marker is None else np.asarray(marker),
-        q=np.zeros((n, 2)),
-        from_q=np.full((n, 2), np.nan),
-        position=np.asarray(position, dtype=float),
-        std=np.full((n, 3), np.nan),
-        samples=np.full(n, -1),
-        temperature_c=np.full(n, np.nan),
-    )
+def measurements(pose, position, **columns) -> Measurements:
+    return measured_rows(np.zeros((len(pose), 2)), position, pose=pose, **columns)
 
 
 def test_relative_error_compares_distances_of_all_pairs_of_a_pose() -> None:

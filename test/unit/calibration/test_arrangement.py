@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from foreign.tables import measured
+from worlds.measured_rows import measured_rows
 
 from remaster_ros.calibration.arrangement import (
     Arrangement,
@@ -15,37 +16,20 @@ from remaster_ros.calibration.arrangement import (
     search,
     some_rows,
 )
-from remaster_ros.types import Measurements, Session
+from remaster_ros.types import Session
 
 LENGTHS = (1e-3, 0.0254, 1e3, 25.4)
 
 
 def scene(robot, rows, seed):
     arm = measured(robot, rows, seed)
-    joints, i = arm.q.shape[1], np.arange(rows)
-    measurements = replace(
-        Measurements.empty(joints),
-        observation=i,
-        pose=i,
-        configuration=i,
-        is_validation=np.zeros(rows, bool),
-        stamp_s=i.astype(float),
-        sensor=0 * i,
-        marker=0 * i,
-        q=arm.q,
-        from_q=np.full((rows, joints), np.nan),
-        position=arm.points,
-        std=np.full((rows, 3), np.nan),
-        samples=-np.ones(rows, int),
-        temperature_c=np.full(rows, np.nan),
-    )
     return Session(
         urdf=arm.urdf,
         base_link=arm.chain.base_link,
         tip_link=arm.chain.tip_link,
         markers={'m': np.zeros(3)},
         sensors={'s': 'm'},
-        measurements=measurements,
+        measurements=measured_rows(arm.q, arm.points),
         marker_std_m=0.3,
     )
 

@@ -6,13 +6,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from worlds.calibration_scenes import scene
+from worlds.measured_rows import measured_rows
 
+from remaster_ros.calibration.fit import fit_session
 from remaster_ros.calibration.noise import MEDIAN_LENGTH
 from remaster_ros.calibration.noise_check import (
     MEAN_LENGTH,
     NoiseCheck,
     check_noise,
 )
+from remaster_ros.reports.sentences import verdict
 from remaster_ros.types import Measurements
 
 POSES, EACH = 40, 5
@@ -27,22 +31,13 @@ def measurements(
     """
     rows = POSES * EACH
     pose = np.repeat(np.arange(POSES), EACH)
-    empty = Measurements.empty(2)
-    return replace(
-        empty,
-        observation=np.arange(rows),
+    return measured_rows(
+        np.zeros((rows, 2)),
+        np.zeros((rows, 3)),
         pose=pose,
-        configuration=np.arange(rows),
         is_validation=(pose % 3 == 2) & validation,
-        stamp_s=np.arange(rows, dtype=float),
-        sensor=np.zeros(rows, np.int64),
-        marker=np.zeros(rows, np.int64),
-        q=np.zeros((rows, 2)),
-        from_q=np.zeros((rows, 2)),
-        position=np.zeros((rows, 3)),
         std=np.full((rows, 3), std_m * np.sqrt(max(samples, 1))),
         samples=np.full(rows, samples),
-        temperature_c=np.zeros(rows),
     )
 
 
@@ -173,3 +168,22 @@ def test_every_sensor_is_judged_by_its_own_noise():
     assert (first.sensor, first.explained) == ('mocap', True)
     assert (second.sensor, second.explained) == ('tracker', False)
     assert rest == []
+
+
+def test_held_out_gross_errors_that_make_up_the_error_are_named_and_not_green():
+    session, _ = scene(61, poses=30, validation=20, sigma_m=0.1e-3, pose_sigma_m=0.0)
+    clean = fit_session(session, rng=np.random.default_rng(0), precision=0.05)
+    assert [check.spoilt for check in clean.noise_checks] == ['']
+    assert verdict(clean).mood == 'good'
+    m = session.measurements
+    wrong = np.flatnonzero(m.is_validation)[3::25]
+    position = m.position.copy()
+    position[wrong] += 0.04
+    spoilt = replace(session, measurements=replace(m, position=position))
+    result = fit_session(spoilt, rng=np.random.default_rng(0), precision=0.05)
+    (check,) = result.noise_checks
+    assert check.gross == tuple(m.observation[wrong].tolist())
+    assert str(m.observation[wrong[0]]) in check.spoilt
+    found = verdict(result)
+    assert found.mood == 'caution'
+    assert check.spoilt in found.points

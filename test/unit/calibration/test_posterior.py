@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.stats import kstest, multivariate_normal, norm
-from worlds.calibration_scenes import scene
+from worlds.calibration_scenes import one_tool_direction, scene
 
 from remaster_ros.calibration import convergence, laplace, sampling
 from remaster_ros.calibration.estimate import Problem, estimate
@@ -16,12 +16,13 @@ from remaster_ros.calibration.laplace import find_mode
 from remaster_ros.calibration.linearisation import linearise
 from remaster_ros.calibration.metropolis import random_walk_sampler
 from remaster_ros.calibration.noise import RESOLUTION_M
+from remaster_ros.calibration.posterior import Posterior
 from remaster_ros.calibration.priors import base_prior, marker_prior
 from remaster_ros.calibration.proposal import AdaptedProposal, StudentT, Weighted
 from remaster_ros.calibration.sampling import sample_posterior
 from remaster_ros.errors import InsufficientDataError
 from remaster_ros.kinematics.transforms import quaternion_xyzw
-from remaster_ros.types import BasePrior
+from remaster_ros.types import BasePrior, FloatArray, Session
 
 
 @pytest.fixture(scope='module')
@@ -285,3 +286,39 @@ def test_steps_that_settle_slowly_are_near_enough_and_none_at_all_is_refused(mon
     monkeypatch.setattr(laplace, 'NEAR_ENOUGH', 0.0)
     with pytest.raises(InsufficientDataError, match='does not settle'):
         find_mode(posterior)
+
+
+@pytest.fixture(scope='module')
+def one_direction() -> Session:
+    return one_tool_direction(3)
+
+
+def test_a_nearly_singular_session_ends_with_its_direction_named(
+    one_direction, monkeypatch
+) -> None:
+    evaluated = 0
+    density = Posterior._log_density
+
+    def counted(self: Posterior, points: FloatArray) -> FloatArray:
+        nonlocal evaluated
+        evaluated += len(points) * len(self.rows)
+        return density(self, points)
+
+    monkeypatch.setattr(Posterior, '_log_density', counted)
+    monkeypatch.setattr(sampling, 'EVALUATED_ROWS', 5_000_000)
+    result = fit_session(one_direction, rng=np.random.default_rng(1))
+    sampler = result.sampler
+    assert evaluated < sampling.EVALUATED_ROWS
+    assert sampler.method == 'laplace'
+    assert not sampler.converged
+    assert not sampler.wandering
+    assert 'hardly determine registration.mocap.z (+1.00) and joint_2' in sampler.message
+    assert f'Pareto k of the proposals {sampler.pareto_k:.2f}' in sampler.message
+    assert np.all(np.isnan(sampler.r_hat))
+
+
+@pytest.mark.qualify
+def test_the_allowance_does_not_depend_on_the_machine(one_direction, monkeypatch) -> None:
+    monkeypatch.setattr(sampling, 'EVALUATED_ROWS', 2_000_000)
+    first, second = (fit_session(one_direction, rng=np.random.default_rng(1)) for _ in range(2))
+    np.testing.assert_array_equal(first.draws, second.draws)

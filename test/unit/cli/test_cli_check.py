@@ -13,32 +13,17 @@ from scipy.spatial.transform import Rotation
 from worlds.checked_arms import CheckedArm
 from worlds.compensation_files import save
 from worlds.hidden_tours import robot
+from worlds.measured_rows import measured_rows
 
 from remaster_ros.compensation.checking import Measured
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.session.reader import write_session
-from remaster_ros.types import Measurements, Session
+from remaster_ros.types import Session
 
 
 def write(folder: Path, one: Measured) -> Path:
     """Write a check as a session."""
-    rows = len(one.q)
-    m = replace(
-        Measurements.empty(one.q.shape[1]),
-        observation=np.arange(rows),
-        pose=np.arange(rows),
-        configuration=np.arange(rows),
-        is_validation=np.zeros(rows, bool),
-        stamp_s=np.arange(float(rows)),
-        sensor=np.zeros(rows, np.int64),
-        marker=np.zeros(rows, np.int64),
-        q=one.q,
-        from_q=np.full_like(one.q, np.nan),
-        position=one.position,
-        std=np.full((rows, 3), np.nan),
-        samples=np.full(rows, -1),
-        temperature_c=np.full(rows, np.nan),
-    )
+    m = measured_rows(one.q, one.position)
     markers = {'sir': np.array([0.1, 0.0, 0.02])}
     write_session(
         folder, Session(robot('iiwa7'), 'base_link', 'tool', markers, {'mocap': 'sir'}, m)

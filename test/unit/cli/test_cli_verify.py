@@ -10,12 +10,13 @@ import pytest
 from rigs.command_line import refusal, remaster
 from worlds.compensation_files import save
 from worlds.hidden_tours import robot
+from worlds.measured_rows import measured_rows
 from worlds.verified_arms import Case, found_arm, measured
 
 from remaster_ros.cli.verify import WORDS
 from remaster_ros.compensation.file import read_compensation
 from remaster_ros.session.reader import write_session
-from remaster_ros.types import Correction, Measurements, Session
+from remaster_ros.types import Correction, Session
 
 CASE = Case(11, 0.2, 0.1, 'in_use', toggled=True)
 
@@ -23,24 +24,12 @@ CASE = Case(11, 0.2, 0.1, 'in_use', toggled=True)
 def session_of(case: Case) -> Session:
     """Return a session as a recorder writes it: reported angles are those commanded."""
     compensator, visits = measured(case)
-    rows = len(visits.on)
-    reported = np.where(visits.on[:, None], compensator.command(visits.wanted), visits.wanted)
-    plain = Measurements.empty(compensator.model.joints)
-    m = replace(
-        plain,
-        observation=np.arange(rows),
+    m = measured_rows(
+        np.where(visits.on[:, None], compensator.command(visits.wanted), visits.wanted),
+        visits.position,
         pose=visits.configuration,
         configuration=visits.configuration,
-        is_validation=np.ones(rows, bool),
-        stamp_s=np.arange(float(rows)),
-        sensor=np.zeros(rows, np.int64),
-        marker=np.zeros(rows, np.int64),
-        q=reported,
-        from_q=np.full_like(reported, np.nan),
-        position=visits.position,
-        std=np.full((rows, 3), np.nan),
-        samples=np.full(rows, -1),
-        temperature_c=np.full(rows, np.nan),
+        is_validation=np.ones(len(visits.on), bool),
         wanted=visits.wanted,
         correction=visits.on.astype(np.int64),
     )

@@ -1,0 +1,36 @@
+"""Rows of a session for tests that need a few columns of them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from remaster_ros.types import Measurements
+
+
+def measured_rows(q: ArrayLike, position: ArrayLike, **columns: ArrayLike) -> Measurements:
+    """Return rows of one sensor and one marker, a pose and a configuration each, all to be fitted.
+
+    What a session may leave out is unknown, but for the ``columns`` that are given.
+    """
+    angles = np.asarray(q, float)
+    rows = len(angles)
+    each, none = np.arange(rows), np.zeros(rows, np.int64)
+    usual = {
+        'observation': each,
+        'pose': each,
+        'configuration': each,
+        'is_validation': np.zeros(rows, bool),
+        'stamp_s': each.astype(float),
+        'sensor': none,
+        'marker': none,
+        'from_q': np.full_like(angles, np.nan),
+        'std': np.full((rows, 3), np.nan),
+        'samples': np.full(rows, -1),
+        'temperature_c': np.full(rows, np.nan),
+    }
+    given = {name: np.asarray(values) for name, values in columns.items()}
+    rest = {'q': angles, 'position': np.asarray(position, float)}
+    return replace(Measurements.empty(angles.shape[1]), **{**usual, **rest, **given})
