@@ -4,6 +4,7 @@ import json
 
 import pytest
 from rigs.command_line import refusal, remaster
+from worlds.discovery_files import discovery_content, effect, look_alike
 
 from remaster_ros.planning import planned_design, pose_design, tour_planner
 from remaster_ros.session.workcell import config_path
@@ -120,36 +121,13 @@ def test_a_cell_without_reachable_poses_is_one_line(tmp_path):
 
 def discovery_file(folder, look_alikes):
     """Write a discovery.json of a scale of joint 6."""
-    content = {
-        'format': 'remaster-discovery/1',
-        'verdict': 'undetermined',
-        'effects': [
-            {
-                'name': 'encoder_scale',
-                'joints': [6],
-                'place': 'joint_angle',
-                'driver': 'own_angle',
-                'form': 'linear',
-                'parameters': [{'name': 'scale_6', 'value': 1e-3, 'std': 1e-4, 'unit': '1'}],
-                'p_value': 0.003,
-                'log_evidence_gain': 20.0,
-                'confusable_with': [
-                    {'name': name, 'joints': [6], 'log_evidence_gain': 19.0, 'separate_by': words}
-                    for name, words in look_alikes.items()
-                ],
-                'cause': 'The angle reading of joint 6 is off in proportion.',
-            }
-        ],
-        'gain': {
-            'held_out_rms_before_m': 1e-3,
-            'held_out_rms_after_m': 1e-4,
-            'noise_floor_m': 1e-4,
-        },
-        'noise': {'pose_common_fraction': 0.5, 'outliers': [], 'heteroscedastic': {}},
-        'joint_offsets_after': [],
-    }
+    rivals = [look_alike(name, (6,), separate_by=words) for name, words in look_alikes.items()]
+    size = {'name': 'scale_6', 'value': 1e-3, 'std': 1e-4, 'unit': '1'}
+    cause = effect(
+        'encoder_scale', (6,), driver='own_angle', parameters=[size], confusable_with=rivals
+    )
     path = folder / 'discovery.json'
-    path.write_text(json.dumps(content), encoding='utf-8')
+    path.write_text(json.dumps(discovery_content(cause)), encoding='utf-8')
     return path
 
 

@@ -8,6 +8,7 @@ from dataclasses import replace
 import msgspec
 import numpy as np
 import pytest
+from worlds.discovery_files import discovery_content, effect
 
 from remaster_ros.compensation.export import exports
 from remaster_ros.errors import InputError
@@ -34,20 +35,7 @@ from remaster_ros.reports.schemas import (
 from remaster_ros.reports.sentences import more_than_noise
 
 STEP = {'driver': 'time', 'form': 'step', 'name': 'unnamed', 'moment_s': 455.0}
-LENGTH = {
-    'name': 'link_length',
-    'place': 'link_translation',
-    'driver': 'constant',
-    'title': 'Link length of joint 2',
-    'in_robot_model': True,
-}
-SOFT = {
-    'name': 'joint_compliance',
-    'place': 'joint_angle',
-    'driver': 'gravity_torque',
-    'title': 'Joint compliance of joint 2',
-}
-SLIP = {**STEP, 'place': 'joint_angle', 'joints': [3], 'title': 'Joint 3 slipped'}
+SLIP = {**STEP, 'joints': [3], 'title': 'Joint 3 slipped'}
 BUMP = {
     **STEP,
     'place': 'sensor_frame',
@@ -55,59 +43,42 @@ BUMP = {
     'title': 'The sensor tracker moved',
     'of_measurement': True,
 }
+LENGTH = {
+    'name': 'link_length',
+    'place': 'link_translation',
+    'driver': 'constant',
+    'title': 'Link length of joint 2',
+    'in_robot_model': True,
+}
+SOFT = {'title': 'Joint compliance of joint 2'}
 # Its form is a step as well, over the side of approach and not over time.
 BACKLASH = {
     'name': 'backlash',
-    'place': 'joint_angle',
     'driver': 'approach',
     'form': 'step',
     'title': 'Backlash of joint 2',
 }
 
 
-def effect(name, place, driver, form='constant', joints=(2,), **more):
-    return {
-        'name': name,
-        'joints': list(joints),
-        'place': place,
-        'driver': driver,
-        'form': form,
-        'parameters': [
-            {'name': 'size_2', 'value': 1e-3, 'std': 1e-5, 'unit': 'm'},
-        ],
-        'p_value': 0.003,
-        'log_evidence_gain': 40.0,
-        'confusable_with': [],
-        'cause': 'The cause.',
+def discovery(fit, effects, verdict='effects', mood='good'):
+    content = msgspec.to_builtins(fit)
+    noise = {'pose_common_fraction': 0.5, 'outliers': [], 'heteroscedastic': {}}
+    shown = {
         'sizes': ['by 1.00 mm ± 0.01 mm'],
         'size_m': 1e-3,
         'share': 0.5,
         'remedy': 'The remedy.',
-        **more,
     }
-
-
-def discovery(fit, effects, verdict='effects', mood='good'):
-    content = msgspec.to_builtins(fit)
-    offsets = [row | {'mean_deg': row['mean_deg'] + 0.5} for row in content['joint_offsets']]
-    return msgspec.convert(
-        {
-            'format': 'remaster-discovery/1',
-            'verdict': verdict,
-            'effects': [effect(**found) for found in effects],
-            'gain': dict.fromkeys(('held_out_rms_before_m', 'held_out_rms_after_m'), 1e-3)
-            | {'noise_floor_m': 1e-4},
-            'noise': {
-                'pose_common_fraction': 0.5,
-                'outliers': [],
-                'heteroscedastic': {},
-                'sensors': content['noise'],
-            },
-            'joint_offsets_after': offsets,
-            'judgement': {'mood': mood, 'headline': '.'},
-        },
-        Discovered,
+    content = discovery_content(
+        *(effect(**{**shown, **found}) for found in effects),
+        verdict=verdict,
+        noise={**noise, 'sensors': content['noise']},
+        joint_offsets_after=[
+            row | {'mean_deg': row['mean_deg'] + 0.5} for row in content['joint_offsets']
+        ],
+        judgement={'mood': mood, 'headline': '.'},
     )
+    return msgspec.convert(content, Discovered)
 
 
 @pytest.fixture
@@ -127,15 +98,8 @@ def inputs(fit_result, fit):
         rows = np.ones(len(fit_result.session.measurements))
         found = None if effects is None else discovery(fit, effects, verdict, mood)
         before, after, causes = (rows * error for error in errors)
-        return Inputs(
-            fit_result.session,
-            fit,
-            found,
-            before,
-            after,
-            causes if effects else None,
-            None if model is None else rows * model,
-        )
+        by = (before, after, causes if effects else None, None if model is None else rows * model)
+        return Inputs(fit_result.session, fit, found, *by)
 
     return made
 
@@ -193,14 +157,8 @@ def test_no_page_names_a_file_that_is_not_beside_it(inputs, fit_result, model, e
     made = inputs([length, SOFT], errors=errors, model=model)
     made.found.untestable, made.found.unexplained = {}, []
     none = {'rows': 0, 'inside': 0, 'share': None, 'interval95': None}
-    made.found.predicted_regions95 = msgspec.convert(
-        {
-            'widening': 1.0,
-            'held_out': none,
-            'fitted': none,
-        },
-        PredictedRegions,
-    )
+    regions = {'widening': 1.0, 'held_out': none, 'fitted': none}
+    made.found.predicted_regions95 = msgspec.convert(regions, PredictedRegions)
     for key in ('registration', 'markers', 'sampler'):
         setattr(made.found, key, getattr(made.fit, key))
     answer = answer_of(made)
@@ -433,6 +391,7 @@ def test_which_file_is_which_is_found_by_its_name(tmp_path):
         ([fit, tmp_path / 'fit'], 'two files fit.json'),
         ([tmp_path], 'neither fit.json nor discovery.json'),
         ([tmp_path / 'other.json'], 'give fit.json or discovery.json'),
+        ([tmp_path / 'fitt'], 'there is no such file or folder; give'),
     ):
         with pytest.raises(InputError, match=words):
             parts(wrong)
@@ -498,9 +457,7 @@ def test_what_held_out_rows_show_to_be_more_than_noise(fit, rows, inside, after_
     content.gain.held_out_rms_after_m, content.gain.noise_floor_m = after_m, 0.4e-3
     held_out = {'rows': rows, 'inside': rows, 'share': 1.0, 'interval95': inside}
     regions = {'widening': 1.0, 'held_out': held_out, 'fitted': held_out}
-    kind = msgspec.structs.fields(Discovered)
-    kind = next(field.type for field in kind if field.name == 'predicted_regions95')
-    content.predicted_regions95 = msgspec.convert(regions, kind)
+    content.predicted_regions95 = msgspec.convert(regions, PredictedRegions)
     content.session = msgspec.convert(msgspec.to_builtins(fit.session), MeasuredSession)
     found = more_than_noise(content)
     assert (says in found) if says else not found
@@ -529,11 +486,6 @@ def test_what_the_measurement_errs_by_is_said_where_it_stays_in_both_errors(inpu
     # A cause without sizes of its own has that at the marker.
     assert told.remains[0].size == '1.000 mm RMS at the marker'
     assert 'Both contain' not in answer_of(inputs([LENGTH], model=0.4)).headline
-
-
-def test_a_folder_that_is_not_there_is_not_said_to_be_another_file(tmp_path):
-    with pytest.raises(InputError, match='there is no such file or folder; give'):
-        parts([tmp_path / 'fitt'])
 
 
 def test_so_few_poses_are_not_sent_to_a_search(inputs, fit):

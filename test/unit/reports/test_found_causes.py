@@ -3,39 +3,22 @@
 import json
 
 import pytest
+from worlds.discovery_files import discovery_content, effect, look_alike
 
 from remaster_ros.errors import InputError
 from remaster_ros.reports.discovery_json import earlier_pairs, read_causes
 
 
-def alike(name, joints=(), **more):
-    plain = {'log_evidence_gain': 9.0, 'separate_by': 'poses'}
-    return {'name': name, 'joints': list(joints), **plain, **more}
-
-
 def written(folder, *look_alikes, **more):
-    effect = {
-        'name': 'joint_compliance', 'joints': [2], 'place': 'joint_angle',
-        'driver': 'gravity_torque', 'form': 'linear',
-        'parameters': [{'name': 'compliance_2', 'value': 1e-5, 'std': 1e-6, 'unit': 'rad/(N m)'}],
-        'p_value': 0.003, 'log_evidence_gain': 10.0, 'confusable_with': list(look_alikes),
-        'cause': 'It sags.',
-    }  # fmt: skip
     session = {
         'optimization': {'observations': 1, 'configurations': 1, 'poses': 1},
         'validation': {'observations': 0, 'configurations': 0, 'poses': 0},
         'sensors': {'mocap': 'sir'}, 'created': '2026-01-01', 'exit_status': 'complete',
         'observations_sha256': 'ab',
     }  # fmt: skip
-    content = {
-        'format': 'remaster-discovery/1', 'verdict': 'undetermined', 'effects': [effect],
-        'gain': {
-            'held_out_rms_before_m': 1e-3, 'held_out_rms_after_m': 1e-4, 'noise_floor_m': 1e-4,
-        },
-        'noise': {'pose_common_fraction': 0.5, 'outliers': [], 'heteroscedastic': {}},
-        'joint_offsets_after': [], 'session': session, **more,
-    }  # fmt: skip
+    cause = effect(confusable_with=list(look_alikes))
     path = folder / 'discovery.json'
+    content = discovery_content(cause, session=session, **more)
     path.write_text(json.dumps(content), encoding='utf-8')
     return path
 
@@ -43,20 +26,20 @@ def written(folder, *look_alikes, **more):
 def test_what_nothing_separates_is_left_out(tmp_path):
     path = written(
         tmp_path,
-        alike('base_compliance'),
-        alike('link_length', (3,), same=True),
-        alike('joint_error_curve', (2,), general=True),
+        look_alike('base_compliance'),
+        look_alike('link_length', (3,), same=True),
+        look_alike('joint_error_curve', (2,), general=True),
     )
     (cause,) = read_causes(path, observations_sha256='ab')
     assert cause.look_alikes == (('base_compliance', (), 'poses'),)
     assert cause.driver == 'gravity_torque'
     assert earlier_pairs(path) == ((('joint_compliance', (2,)), ('base_compliance', ())),)
     with pytest.raises(InputError, match='nothing to separate'):
-        read_causes(written(tmp_path, alike('link_length', (3,), same=True)))
+        read_causes(written(tmp_path, look_alike('link_length', (3,), same=True)))
 
 
 def test_a_search_of_other_observations_or_of_another_session_does_not_count(tmp_path):
-    path = written(tmp_path, alike('base_compliance'))
+    path = written(tmp_path, look_alike('base_compliance'))
     with pytest.raises(InputError, match='not of the observations that the session has now'):
         read_causes(path, observations_sha256='cd')
     assert len(earlier_pairs(path, created='2026-01-01')) == 1
@@ -68,7 +51,7 @@ def test_a_search_of_another_arm_is_refused(tmp_path):
         'name': 'arm', 'urdf_sha256': 'cd', 'joint_names': ['a', 'b'], 'base_link': 'base',
         'tip_link': 'tip',
     }  # fmt: skip
-    path = written(tmp_path, alike('base_compliance'), robot=robot)
+    path = written(tmp_path, look_alike('base_compliance'), robot=robot)
     for read in (read_causes, earlier_pairs):
         assert len(read(path, ('a', 'b'))) == 1
         with pytest.raises(InputError, match='joints a, b, this one has a, b, c; give'):
@@ -81,7 +64,7 @@ def test_what_was_decided_is_looked_at_again(tmp_path):
         'look_alike': {'name': 'settling', 'joints': [4]},
         'answer': 'open', 'log_evidence': None, 'sigma': 0.0, 'sentence': 'still open',
     }  # fmt: skip
-    path = written(tmp_path, alike('base_compliance'), decided=[decided])
+    path = written(tmp_path, look_alike('base_compliance'), decided=[decided])
     assert earlier_pairs(path) == (
         (('backlash', (4,)), ('settling', (4,))),
         (('joint_compliance', (2,)), ('base_compliance', ())),

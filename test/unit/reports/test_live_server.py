@@ -66,11 +66,18 @@ class Page:
     def view(self):
         return json.loads(self.ask('GET', '/view')[2])
 
-    def decide(self, name, **changes):
-        """Ask for what a person must have seen something of."""
-        shown = self.view()
+    def decide(self, name, shown=None, **changes):
+        """Ask for what a person must have seen something of: of the view now, or of this one."""
+        shown = shown or self.view()
         body = {'view': shown['number'], 'seen': shown['view']['seen'], **changes}
-        return self.ask('POST', f'/command/{name}', json.dumps(body).encode())
+        status, _, content = self.ask('POST', f'/command/{name}', json.dumps(body).encode())
+        return status, content
+
+    def filled(self, texts):
+        """Fill the port into a text or into several."""
+        if isinstance(texts, list):
+            return [self.filled(text) for text in texts]
+        return texts and texts.format(port=self.server.port)
 
 
 @pytest.fixture
@@ -150,13 +157,8 @@ def test_a_token_in_the_address_does_not_count(page):
 )
 def test_another_name_of_this_address_is_refused(page, host):
     """A page whose name is made to resolve to this address (DNS rebinding) has its own Host."""
-
-    def filled(name):
-        return name and name.format(port=page.server.port)
-
-    value = list(map(filled, host)) if isinstance(host, list) else filled(host)
     for method, path in (('GET', '/'), ('GET', '/view'), ('POST', '/command/stop')):
-        assert page.ask(method, path, Host=value)[0] in (400, 421)
+        assert page.ask(method, path, Host=page.filled(host))[0] in (400, 421)
     assert page.sent == []
 
 
@@ -176,10 +178,7 @@ def test_another_name_of_this_address_is_refused(page, host):
 )
 @pytest.mark.parametrize('name', COMMANDS)
 def test_commands_of_other_pages_are_refused(page, name, origin):
-    def filled(text):
-        return text and text.format(port=page.server.port)
-
-    value = list(map(filled, origin)) if isinstance(origin, list) else filled(origin)
+    value = page.filled(origin)
     assert page.ask('POST', f'/command/{name}', Origin=value)[0] == 403
     if origin is not None:
         assert page.ask('GET', '/view', Origin=value)[0] == 403
@@ -238,16 +237,14 @@ def test_what_was_seen_of_another_state_or_in_an_old_view_is_refused(page, name,
     assert page.decide(name, seen='é')[0] == 409
     shown = page.view()
     page.show('b')
-    body = json.dumps({'view': shown['number'], 'seen': 'a'}).encode()
-    status, _, content = page.ask('POST', f'/command/{name}', body)
+    status, content = page.decide(name, shown)
     assert status == 409
     assert b'changed meanwhile' in content
     # What was held up on its way: the view that it names was shown too long ago.
     monkeypatch.setattr(live_server, 'FRESH_S', 0.05)
     old = page.view()
     time.sleep(0.1)
-    body = json.dumps({'view': old['number'], 'seen': 'b'}).encode()
-    status, _, content = page.ask('POST', f'/command/{name}', body)
+    status, content = page.decide(name, old)
     assert status == 409
     assert b'not up to date' in content
     assert page.sent == []
@@ -256,20 +253,18 @@ def test_what_was_seen_of_another_state_or_in_an_old_view_is_refused(page, name,
 @pytest.mark.parametrize('name', SEEN_FIRST)
 def test_what_comes_twice_counts_once(page, name):
     shown = page.view()
-    body = json.dumps({'view': shown['number'], 'seen': 'a'}).encode()
-    assert [page.ask('POST', f'/command/{name}', body)[0] for _ in range(2)] == [200, 409]
+    assert [page.decide(name, shown)[0] for _ in range(2)] == [200, 409]
     assert len(page.sent) == 1
 
 
 def test_a_plan_is_confirmed_only_while_the_view_has_it(page):
     shown = page.view()
     page.show('b', plan='')
-    body = json.dumps({'view': shown['number'], 'seen': 'a'}).encode()
-    status, _, content = page.ask('POST', '/command/confirm', body)
+    status, content = page.decide('confirm', shown)
     assert status == 409
     assert b'no plan waits' in content
     page.show('c', plan='00000001')
-    assert page.ask('POST', '/command/confirm', body)[0] == 409
+    assert page.decide('confirm', shown)[0] == 409
     assert page.decide('confirm')[0] == 200
     assert page.sent == ['confirm/00000001']
 

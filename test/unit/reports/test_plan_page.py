@@ -1,15 +1,21 @@
 """The page of a plan: complete in itself, true to the plan, and played in a browser."""
 
+import base64
+import gzip
+import importlib.resources
 import json
 import re
-from html.parser import HTMLParser
 
 import numpy as np
 import pytest
+from judges.html_page import Page
+from py_mini_racer import JSEvalException, JSParseException, MiniRacer
 from rigs.browser import NO_WEBGL, seen
 
+from remaster_ros import reports
 from remaster_ros.cli import main as cli
 from remaster_ros.reports.plan_page import write_plan_page
+from remaster_ros.reports.robot_scene import view_script
 from remaster_ros.session.workcell import read_cell
 
 FEW = ('--poses', '12', '--validation', '8')
@@ -27,31 +33,13 @@ def planned(tmp_path_factory):
     return path, json.loads(''.join(printed))
 
 
-class Page(HTMLParser):
-    def __init__(self):
-        super().__init__()
-        self.sources, self.text, self.skipping = [], [], False
-
-    def handle_starttag(self, tag, attrs):
-        self.sources += [value for key, value in attrs if key in ('src', 'href', 'srcset')]
-        self.skipping = tag in ('script', 'style')
-
-    def handle_data(self, data):
-        if not self.skipping:
-            self.text += data.split()
-
-    def handle_endtag(self, tag):
-        self.skipping = False
-
-
 def test_the_page_is_complete_in_itself_and_has_the_figures_of_the_plan(planned):
     path, plan = planned
     html = path.read_text(encoding='utf-8')
-    page = Page()
-    page.feed(html)
-    assert all(source.startswith('#') for source in page.sources)
+    page = Page(html)
+    assert all(address.startswith('#') for address in page.addresses)
     assert not re.search(r'url\((?!#)|@import', html)
-    text = ' '.join(page.text)
+    text = page.text
     assert f'{plan["configurations"]} configurations at {plan["poses"]} poses' in text
     assert f'{plan["robot_time_s"] / 60:.1f} min of robot time' in text
     assert f'faster than {plan["max_tool_speed_m_s"]:.2f} m/s' in text
@@ -185,3 +173,39 @@ def test_only_a_page_of_its_own_is_written_over(planned, tmp_path, capsys):
     assert error.startswith('error: ')
     assert 'give another name' in error
     assert other.read_text() == '<html>mine</html>'
+
+
+# Scripts of the pages, also where there is no browser to try them in
+
+
+def compiled(script):
+    """Compile a script with V8 and run nothing of it."""
+    return MiniRacer().eval('(function () {\n' + script + '\n})')
+
+
+def live_page(name):
+    """Return what a script of the live page says."""
+    path = importlib.resources.files(reports).joinpath('live_page', name)
+    return path.read_text(encoding='utf-8')
+
+
+def test_the_live_page_s_scripts_compile_beside_one_another():
+    # They share one global scope: a name that two of them declare stops the second.
+    names = re.findall(r'<script src="([^"]+)"', live_page('index.html'))
+    assert names == ['plotly.js', 'robot_view.js', 'scene.js', 'page.js']
+    compiled('\n'.join([view_script(), live_page('scene.js'), live_page('page.js')]))
+
+
+def test_a_plan_s_scripts_compile(planned):
+    html = planned[0].read_text(encoding='utf-8')
+    packed = re.search(r'id="code-gzip">([^<]*)<', html)[1]
+    played = gzip.decompress(base64.b64decode(packed)).decode()
+    [own] = re.findall(r'<script>(.*?)</script>', html, re.DOTALL)
+    compiled(own + played)
+    # The judge judges: with one name declared twice it refuses.
+    with pytest.raises((JSParseException, JSEvalException), match='already been declared'):
+        compiled(own + played + 'const RobotView = 1;')
+
+
+def test_a_report_s_scripts_compile():
+    compiled(view_script('fit_page.js'))
