@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 
 import numpy as np
-from worlds.optitrack_world import SENSOR, MarkerWorld, eventually
+from worlds.optitrack_world import SENSOR, MarkerWorld, eventually, free_port
 
 from remaster_ros.errors import DeviceError
 from remaster_ros.sensors.optitrack.client import NatNetClient
@@ -57,3 +57,14 @@ def client_of(port, data_port, on_sample=lambda sample: None, wait_s=20.0, clock
         yield client
     finally:
         client.stop()
+
+
+@contextlib.contextmanager
+def followed(on_sample=lambda sample: None, server=None, **settings):
+    """Run a fake server with these options, and a client of it with these settings."""
+    port = free_port()
+    with (
+        fake_server(port, **(server or {})) as fake,
+        client_of(fake.command_port, port, on_sample, **settings) as client,
+    ):
+        yield fake, client
