@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 from rosbags.typesys import Stores, get_typestore
 
@@ -52,12 +54,16 @@ TOPICS = {
 }
 
 
-def messages(count=40):
-    for i in range(count):
-        topic = list(TOPICS)[i % len(TOPICS)]
-        msgtype, message = TOPICS[topic](i)
-        cdr = bytes(STORE.serialize_cdr(message, msgtype))
-        yield topic, msgtype, cdr, START_NS + i * 10_000_000
+@cache
+def message_of(i):
+    topic = list(TOPICS)[i % len(TOPICS)]
+    msgtype, message = TOPICS[topic](i)
+    cdr = bytes(STORE.serialize_cdr(message, msgtype))
+    return topic, msgtype, cdr, START_NS + i * 10_000_000
+
+
+def messages():
+    return map(message_of, range(40))
 
 
 def part(writer, first, last):

@@ -189,28 +189,6 @@ def test_a_cut_at_any_byte_loses_only_what_is_behind_it(bag, tmp_path):
     assert counts[-1] == 40
 
 
-def test_a_flipped_bit_never_gives_another_message(bag, tmp_path):
-    """Either the one documented error, or the very same messages (flips in the summary)."""
-    whole = (bag / 'bag_0.mcap').read_bytes()
-    wanted = list(messages())
-    path = tmp_path / 'flipped.mcap'
-    refused = 0
-    seed = 5
-    print('seed', seed)
-    rng = np.random.default_rng(seed)
-    for _ in range(400):
-        data = bytearray(whole)
-        data[rng.integers(len(data))] ^= 1 << rng.integers(8)
-        path.write_bytes(data)
-        try:
-            read = list(BagReader(path))
-        except InputError:
-            refused += 1
-        else:
-            assert read == wanted
-    assert refused > 200
-
-
 def test_garbage_is_refused(tmp_path):
     path = tmp_path / 'garbage.mcap'
     for data in (bytes(100), b'SQLite format 3', b'\x89MCAP0\r\n' + b'\xff' * 100 + MCAP0_MAGIC):
@@ -224,28 +202,13 @@ def test_zeros_after_a_power_cut_are_no_messages(bag, tmp_path):
     path = tmp_path / 'zeros.mcap'
     wanted = list(messages())
     counts = set()
-    for cut in range(len(whole) // 2, len(whole) // 2 + 400):
+    for cut in range(len(whole) // 2, len(whole) // 2 + 400, 5):
         path.write_bytes(whole[:cut] + bytes(5000))
         reader = BagReader(path)
         assert not reader.complete
         assert list(reader) == wanted[: reader.whole.count]
         counts.add(reader.whole.count)
     assert len(counts) > 1
-
-
-def test_a_chunk_that_says_it_is_enormous(tmp_path):
-    path = tmp_path / 'bomb.mcap'
-    with path.open('wb') as file:
-        writer = Writer(file, compression=CompressionType.ZSTD)
-        writer.start('ros2')
-        writer.add_message(1, 0, bytes(10), 0)
-        writer.finish()
-    data = path.read_bytes()
-    size = (9 + 22 + 10).to_bytes(8, 'little')
-    assert data.count(size) >= 1
-    path.write_bytes(data.replace(size, (2**40).to_bytes(8, 'little'), 1))
-    with pytest.raises(InputError, match='damaged'):
-        BagReader(path)
 
 
 def test_missing_bags_are_named(tmp_path):

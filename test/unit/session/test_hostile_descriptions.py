@@ -121,20 +121,52 @@ def test_what_real_descriptions_have_is_evaluated(expression, value):
     assert evaluate(expression, names) == pytest.approx(value)
 
 
-# Whole descriptions, by what they try: text (SECRET is a file that lies outside, CANARY one that
-# is not there), and words of the refusal.
+# Whole descriptions. CALL is an expression that would run the shell, SECRET a file that lies
+# outside, CANARY one that is not there.
+CALL = f'${{(lambda: {SHELL})()}}'
+# Where the shell is called.
+CALLED = {
+    'an attribute': '<link name="CALL"/>',
+    'a text': '<a>CALL</a>',
+    'a property': '<xacro:property name="p" value="CALL"/><a b="${p}"/>',
+    'an eager property': '<xacro:property name="p" value="CALL" lazy_eval="false"/>',
+    'an argument': f'<xacro:arg name="a" default="{CALL[2:-1]}"/><link name="${{$(arg a)}}"/>',
+    'a condition': '<xacro:if value="CALL"><a/></xacro:if>',
+    'a default of a macro': f'<xacro:macro name="m" params="p:=${{(lambda:{SHELL})()}}">'
+    '<a b="${p}"/></xacro:macro><xacro:m/>',
+    'nested macros': '<xacro:macro name="m" params="p"><a b="CALL"/></xacro:macro>'
+    '<xacro:macro name="n" params="q"><xacro:m p="${q}"/></xacro:macro><xacro:n q="1"/>',
+    'the name of a macro': '<xacro:call macro="CALL"/>',
+    'the name of an element': '<xacro:element xacro:name="CALL"/>',
+    'a comment': '<!-- xacro:eval-comments --><!-- CALL -->',
+}
+# What leads out of the folder of the description.
+OUTSIDE = {
+    'include above': '<xacro:include filename="../SECRET.xml"/>',
+    'optional include above': '<xacro:include filename="../SECRET.xml" optional="true"/>',
+    'include by a link': '<xacro:include filename="link.xml"/>',
+    'include by a linked folder': '<xacro:include filename="folder/SECRET.xml"/>',
+    'include by a pattern': '<xacro:include filename="../*.xml"/>',
+    'include by a pattern of links': '<xacro:include filename="l*.xml"/>',
+    'include by a pattern with steps up': '<xacro:include filename="f[o]lder/SECRET.xml"/>',
+    'include beside, not a package': '<xacro:include filename="$(find neighbour)/a.xml"/>',
+    'YAML above': '<a b="${xacro.load_yaml(\'../SECRET.yaml\')}"/>',
+    'YAML above, the old way': '<a b="${load_yaml(\'../SECRET.yaml\')}"/>',
+    'YAML by an absolute name': '<a b="${xacro.load_yaml(xacro.abs_filename('
+    "'../SECRET.yaml'))}\"/>",
+}
+# Name: text, and words of the refusal.
 DESCRIPTIONS = {
-    'shell in an attribute': (robot(f'<link name="${{{SHELL}}}"/>'), 'a lambda'),
-    'shell behind a lambda': (robot(f'<link name="${{(lambda: {SHELL})()}}"/>'), 'a lambda'),
-    'shell in a text': (robot(f'<a>${{(lambda: {SHELL})()}}</a>'), 'a lambda'),
-    'shell in a property': (
-        robot(f'<xacro:property name="p" value="${{(lambda: {SHELL})()}}"/><a b="${{p}}"/>'),
-        'a lambda',
-    ),
-    'shell in an eager property': (
-        robot(f'<xacro:property name="p" value="${{(lambda: {SHELL})()}}" lazy_eval="false"/>'),
-        'a lambda',
-    ),
+    **{
+        f'shell in {place}': (
+            robot(
+                body.replace('CALL', CALL).replace('SHORT', CALL.replace('lambda: ', 'lambda:'))
+            ),
+            'a lambda',
+        )
+        for place, body in CALLED.items()
+    },
+    **{name: (robot(body), 'lies outside') for name, body in OUTSIDE.items()},
     'shell built by properties': (
         robot(
             f'<xacro:property name="a" value="{SHELL[:40]}"/>'
@@ -144,40 +176,6 @@ DESCRIPTIONS = {
             '<link name="${d}"/><xacro:if value="${c}"/>'
         ),
         'which is not a boolean',
-    ),
-    'shell in an argument': (
-        robot(f'<xacro:arg name="a" default="(lambda: {SHELL})()"/><link name="${{$(arg a)}}"/>'),
-        'a lambda',
-    ),
-    'shell in a condition': (
-        robot(f'<xacro:if value="${{(lambda: {SHELL})()}}"><a/></xacro:if>'),
-        'a lambda',
-    ),
-    'shell in a default of a macro': (
-        robot(
-            f'<xacro:macro name="m" params="p:=${{(lambda:{SHELL})()}}"><a b="${{p}}"/>'
-            '</xacro:macro><xacro:m/>'
-        ),
-        'a lambda',
-    ),
-    'shell through nested macros': (
-        robot(
-            f'<xacro:macro name="m" params="p"><a b="${{(lambda: {SHELL})()}}"/></xacro:macro>'
-            '<xacro:macro name="n" params="q"><xacro:m p="${q}"/></xacro:macro><xacro:n q="1"/>'
-        ),
-        'a lambda',
-    ),
-    'shell in the name of a macro': (
-        robot(f'<xacro:call macro="${{(lambda: {SHELL})()}}"/>'),
-        'a lambda',
-    ),
-    'shell in the name of an element': (
-        robot(f'<xacro:element xacro:name="${{(lambda: {SHELL})()}}"/>'),
-        'a lambda',
-    ),
-    'shell in a comment': (
-        robot(f'<!-- xacro:eval-comments --><!-- ${{(lambda: {SHELL})()}} -->'),
-        'a lambda',
     ),
     'shell in the unit of a number': (
         robot('<a b="${xacro.load_yaml(\'unit.yaml\')}"/>'),
@@ -193,33 +191,7 @@ DESCRIPTIONS = {
     '$(find) of a path': (robot('<a b="$(find ../../..)"/>'), 'it needs the ROS package ../../..'),
     '$(find) of the root': (robot('<a b="$(find /etc)"/>'), 'it needs the ROS package /etc'),
     'include of a whole path': (robot('<xacro:include filename="/etc/passwd"/>'), '/etc/passwd'),
-    'include above': (robot('<xacro:include filename="../SECRET.xml"/>'), 'lies outside'),
-    'optional include above': (
-        robot('<xacro:include filename="../SECRET.xml" optional="true"/>'),
-        'lies outside',
-    ),
-    'include by a link': (robot('<xacro:include filename="link.xml"/>'), 'lies outside'),
-    'include by a linked folder': (
-        robot('<xacro:include filename="folder/SECRET.xml"/>'),
-        'lies outside',
-    ),
-    'include by a pattern': (robot('<xacro:include filename="../*.xml"/>'), 'lies outside'),
-    'include by a pattern of links': (robot('<xacro:include filename="l*.xml"/>'), 'lies outside'),
-    'include by a pattern with steps up': (
-        robot('<xacro:include filename="f[o]lder/SECRET.xml"/>'),
-        'lies outside',
-    ),
-    'include beside, not a package': (
-        robot('<xacro:include filename="$(find neighbour)/a.xml"/>'),
-        'lies outside',
-    ),
     'include of a device': (robot('<xacro:include filename="pipe.xml"/>'), 'not a regular file'),
-    'YAML above': (robot('<a b="${xacro.load_yaml(\'../SECRET.yaml\')}"/>'), 'lies outside'),
-    'YAML above, the old way': (robot('<a b="${load_yaml(\'../SECRET.yaml\')}"/>'), 'outside'),
-    'YAML by an absolute name': (
-        robot('<a b="${xacro.load_yaml(xacro.abs_filename(\'../SECRET.yaml\'))}"/>'),
-        'lies outside',
-    ),
     'YAML with a tag': (robot('<a b="${xacro.load_yaml(\'tag.yaml\')}"/>'), 'no YAML'),
     'YAML that doubles': (robot('<a b="${xacro.load_yaml(\'laughs.yaml\')}"/>'), 'too long'),
     'YAML that holds itself': (robot('<a b="${xacro.load_yaml(\'self.yaml\')}"/>'), 'too'),

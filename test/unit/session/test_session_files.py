@@ -87,6 +87,8 @@ def refused(folder, *parts):
         ('x_m', ' 1', 'not a finite number'),
         ('x_m', '١', 'not a finite number'),
         ('x_m', '0x1', 'not a finite number'),
+        ('y_m', '512.3', 'are the units metres?'),
+        ('y_m', '-1e200', 'are the units metres?'),
         ('q2_rad', 'NaN', 'not a finite number'),
         ('q2_rad', '2.1', 'outside the limits of joint_2'),
         ('from_q2_rad', '-2.1', 'outside the limits of joint_2'),
@@ -100,7 +102,6 @@ def refused(folder, *parts):
         ('pose', '', 'not an integer'),
         ('pose', '99999999999999999999', 'not an integer'),
         ('observation', '3', 'already on line 5'),
-        ('observation', '100', ''),
         ('stamp_s', '0.0', 'time runs backwards'),
         ('sensor', 'camera', 'not among the sensors of session.yaml (mocap, tracker)'),
         ('marker', 'ball', 'not among the markers of session.yaml (sir, smr)'),
@@ -110,12 +111,13 @@ def refused(folder, *parts):
     ],
 )
 def test_a_wrong_cell_is_named(folder, column, value, problem):
-    line = 11
-    cell(folder, line, column, value)
-    if (column, value) == ('observation', '100'):
-        refused(folder, 'line 12', 'column observation', 'in the order measured')
-    else:
-        refused(folder, 'observations.csv', f'line {line}', f'column {column}', problem)
+    cell(folder, 11, column, value)
+    refused(folder, 'observations.csv', 'line 11', f'column {column}', problem)
+
+
+def test_rows_are_in_the_order_measured(folder):
+    cell(folder, 11, 'observation', '100')
+    refused(folder, 'line 12', 'column observation', 'in the order measured')
 
 
 @pytest.mark.parametrize(('excess_deg', 'accepted'), [(0.9, True), (1.1, False)])
@@ -127,12 +129,6 @@ def test_joint_limits_have_one_degree_of_grace(folder, excess_deg, accepted):
         refused(folder, 'line 7', 'q1_rad')
 
 
-@pytest.mark.parametrize('value', ['512.3', '-1e200'])
-def test_positions_in_millimetres_are_refused(folder, value):
-    cell(folder, 3, 'y_m', value)
-    refused(folder, 'line 3', 'y_m', 'are the units metres?')
-
-
 def edit(path, old, new):
     text = path.read_text()
     assert old in text
@@ -140,34 +136,29 @@ def edit(path, old, new):
 
 
 @pytest.mark.parametrize(
-    ('old', 'new', 'problem'),
+    ('file', 'old', 'new', 'problem'),
     [
-        ('x_m,', '', ('line 1', 'column x_m is missing')),
-        ('samples,', '', ('line 2: ', 'columns instead of')),
-        ('y_m,', 'x_m,', ("column 'x_m' is given twice",)),
-        ('q2_rad,', 'q3_rad,', ('for the 2 joints',)),
-        ('effort2_nm', 'effort3_nm', ('columns effort',)),
+        ('observations.csv', 'x_m,', '', ('line 1', 'column x_m is missing')),
+        ('observations.csv', 'samples,', '', ('line 2: ', 'columns instead of')),
+        ('observations.csv', 'y_m,', 'x_m,', ("column 'x_m' is given twice",)),
+        ('observations.csv', 'q2_rad,', 'q3_rad,', ('for the 2 joints',)),
+        ('observations.csv', 'effort2_nm', 'effort3_nm', ('columns effort',)),
+        ('observations.csv', '\n1,', '\n\xff1,', ('line 3', 'UTF-8')),
+        ('robot.urdf', 'joint_2" type="revolute', 'joint_2" type="fixed', ('q1_rad', '1 joints')),
+        (
+            'robot.urdf',
+            'joint_2" type="revolute',
+            'joint_2" type="prismatic',
+            ('q2_rad', 'slides', 'q2_m'),
+        ),
     ],
 )
-def test_wrong_columns_are_named(folder, old, new, problem):
-    edit(folder / 'observations.csv', old, new)
-    refused(folder, *problem)
-
-
-def test_joints_that_do_not_match_the_urdf(folder):
-    path = folder / 'robot.urdf'
-    text = path.read_text().replace(
-        'name="joint_2" type="revolute"', 'name="joint_2" type="fixed"'
-    )
-    path.write_text(text)
-    refused(folder, 'observations.csv', 'q1_rad', '1 joints')
-
-
-def test_angles_of_a_prismatic_joint_are_refused(folder):
-    edit(
-        folder / 'robot.urdf', 'name="joint_2" type="revolute"', 'name="joint_2" type="prismatic"'
-    )
-    refused(folder, 'observations.csv', 'q2_rad', 'slides', 'q2_m')
+def test_wrong_columns_are_named(folder, file, old, new, problem):
+    path = folder / file
+    text = path.read_text()
+    assert old in text
+    path.write_bytes(text.replace(old, new, 1).encode('latin-1'))
+    refused(folder, 'observations.csv', *problem)
 
 
 def test_missing_parts_are_named(folder, tmp_path):
@@ -184,14 +175,6 @@ def test_an_empty_session_is_refused(folder, rows):
     path = folder / 'observations.csv'
     path.write_text('' if not rows else path.read_text().splitlines()[0] + '\n')
     refused(folder, 'observations.csv', 'no ')
-
-
-def test_bytes_that_are_no_text(folder):
-    path = folder / 'observations.csv'
-    data = path.read_bytes().split(b'\n')
-    data[3] = b'\xff' + data[3]
-    path.write_bytes(b'\n'.join(data))
-    refused(folder, 'line 4', 'UTF-8')
 
 
 def test_windows_line_ends_byte_order_mark_and_quotes_are_tolerated(session, folder):
@@ -217,7 +200,7 @@ def test_only_a_line_without_its_end_counts_as_torn(session, folder, caplog):
     path = folder / 'observations.csv'
     whole = path.read_bytes()
     last = whole.rstrip(b'\n').rfind(b'\n') + 1
-    for cut in range(last + 1, len(whole)):
+    for cut in (*range(last + 1, len(whole) - 1, 9), len(whole) - 1):
         path.write_bytes(whole[:cut])
         caplog.clear()
         with caplog.at_level(logging.WARNING, 'remaster_ros'):
@@ -253,11 +236,6 @@ def test_only_a_line_without_its_end_counts_as_torn(session, folder, caplog):
 def test_a_wrong_session_yaml_is_refused(folder, old, new, problem):
     edit(folder / 'session.yaml', old, new)
     refused(folder, problem)
-
-
-def test_numbers_in_yaml_mean_what_people_write(folder):
-    edit(folder / 'session.yaml', 'marker_std_m: 0.0005', 'marker_std_m: 5e-4')
-    assert read_session(folder).marker_std_m == 5e-4
 
 
 def test_unknown_yaml_keys_are_reported_and_kept(folder, caplog):
@@ -313,20 +291,13 @@ def test_references_stay_apart_from_what_is_fitted(session, tmp_path):
     assert read_session(tmp_path / 'again').select(np.array([0])).references is not None
 
 
-def test_a_session_of_references_alone_has_nothing_to_fit(session, tmp_path):
-    m = session.measurements
-    write_session(tmp_path / 'session', session)
-    path = tmp_path / 'session' / 'observations.csv'
+def test_a_session_of_references_alone_has_nothing_to_fit(folder):
+    path = folder / 'observations.csv'
     for split in ('optimization', 'validation'):
         path.write_text(path.read_text().replace(f',{split},', ',reference,'))
-    with pytest.raises(InputError, match='reference alone; measure before fitting'):
-        read_session(tmp_path / 'session')
-    assert len(m) == 20
+    refused(folder, 'reference alone; measure before fitting')
 
 
-def test_a_pose_is_not_reference_and_fitted(session, tmp_path):
-    write_session(tmp_path / 'session', session)
-    path = tmp_path / 'session' / 'observations.csv'
-    path.write_text(path.read_text().replace(',optimization,', ',reference,', 1))
-    with pytest.raises(InputError, match='column split: pose 0 is reference on line 2 and optim'):
-        read_session(tmp_path / 'session')
+def test_a_pose_is_not_reference_and_fitted(folder):
+    edit(folder / 'observations.csv', ',optimization,', ',reference,')
+    refused(folder, 'column split: pose 0 is reference on line 2 and optim')

@@ -10,7 +10,7 @@ import subprocess
 import numpy as np
 import pytest
 from rigs.command_line import remaster
-from test_session_writer import observations
+from worlds.session_shapes import observations
 
 from remaster_ros.errors import InputError, MovedError
 from remaster_ros.session.reader import read_session
@@ -60,9 +60,9 @@ def check_is_whole(folder, whole):
     assert sealed.returncode == 0
     read = read_session(folder)
     assert read.exit_status == 'complete'
-    kept = [line for line in whole['journal.jsonl'].splitlines()]
     journal = (folder / 'journal.jsonl').read_bytes().splitlines()
-    assert [line for line in journal if b'"kind":"restored"' not in line] == kept
+    kept = [line for line in journal if b'"kind":"restored"' not in line]
+    assert kept == whole['journal.jsonl'].splitlines()
 
 
 def sed(path, script):
@@ -85,9 +85,18 @@ def test_a_file_that_an_editor_saved_is_restored(begun, folder, whole):
 
 
 @pytest.mark.parametrize('name', FILES)
-@pytest.mark.parametrize('when', ['in the run', 'before the end'])
 @pytest.mark.parametrize(
-    'change', ['saved', 'flipped', 'flipped, dated back', 'cut', 'longer', 'removed', 'folder']
+    ('change', 'when'),
+    [
+        ('saved', 'in the run'),
+        ('saved', 'before the end'),
+        ('flipped', 'before the end'),
+        ('flipped, dated back', 'in the run'),
+        ('cut', 'before the end'),
+        ('longer', 'in the run'),
+        ('removed', 'before the end'),
+        ('folder', 'in the run'),
+    ],
 )
 def test_whatever_is_done_to_a_file_is_undone(begun, folder, whole, name, when, change):
     writer, rest = begun
@@ -172,7 +181,7 @@ def test_a_killed_session_whose_rows_were_changed_is_recovered(begun, folder, se
     good = (folder / 'observations.csv').read_bytes()
     writer.release()
     sed(folder / 'observations.csv', '3s/$/0/')
-    with pytest.raises(InputError, match='let `remaster recover` restore it'):
+    with pytest.raises(InputError, match=r'line 3: not as .*let `remaster recover` re'):
         SessionWriter(folder, session, resume=True)
     assert 'observations.csv.changed' in remaster('recover', folder, status=3).stdout
     assert (folder / 'observations.csv').read_bytes() == good

@@ -105,12 +105,6 @@ def test_time_goes_on_though_the_clock_began_anew(session, tmp_path):
     assert stamps == pytest.approx([500.0, 501.0, 502.0, 503.0])
 
 
-def test_a_folder_of_something_else_is_refused(session, tmp_path):
-    (tmp_path / 'observations.csv').write_text('mine\n')
-    with pytest.raises(InputError, match='already holds files'):
-        SessionJournal(tmp_path, session)
-
-
 def test_references_are_rows_of_their_own_and_are_remembered(session, tmp_path):
     book = SessionJournal(tmp_path, session)
     book.follow('a')

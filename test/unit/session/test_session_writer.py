@@ -224,19 +224,6 @@ def test_a_session_of_another_program_is_not_gone_on_with(session, tmp_path):
         )
 
 
-def test_rows_that_were_changed_by_hand_are_not_gone_on_with(session, tmp_path):
-    writer = SessionWriter(tmp_path / 's', session)
-    for observation in observations(session):
-        writer.append(observation)
-    writer.release()
-    path = tmp_path / 's' / 'observations.csv'
-    lines = path.read_text().split('\n')
-    lines[3] = lines[3].replace('sir', 'smr')
-    path.write_text('\n'.join(lines))
-    with pytest.raises(InputError, match='line 4: not as'):
-        resumed(session, tmp_path / 's')
-
-
 @pytest.mark.parametrize('name', ['observations.csv', 'session.yaml', 'robot.urdf'])
 def test_a_closed_file_that_changed_is_named_and_not_used(session, tmp_path, name):
     with SessionWriter(tmp_path / 's', session) as writer:

@@ -11,7 +11,6 @@ import pytest
 
 from remaster_ros.errors import InputError
 from remaster_ros.session.session_yaml import BaseFrame
-from remaster_ros.session.workcell import config_path, read_cell
 from remaster_ros.session.yaml_records import Bounds, Triple, read_yaml
 
 
@@ -69,59 +68,3 @@ def test_a_quaternion_is_normalised_or_refused() -> None:
     for wrong in ((0.0, 0.0, 0.6, 0.9), (0.0, 0.0, 0.0, 0.0), (np.nan, 0.0, 0.0, 1.0)):
         problem = BaseFrame((1.0, 2.0, 3.0), wrong, 1e-3, 1e-3).problem('base.bar')
         assert problem.startswith('base.bar.rotation_xyzw has norm')
-
-
-@pytest.mark.parametrize(
-    ('old', 'new', 'words'),
-    [
-        ('markers:', 'markerz:', "line {line}: unknown key 'markerz'; did you mean 'markers'?"),
-        (
-            '    topic: opt',
-            '    topc: opt',
-            "line {line}: unknown key 'topc'; did you mean 'topic'?",
-        ),
-        ('floor_z_m:', 'q:', "line {line}: unknown key 'q'; the keys here are robot, mar"),
-        (
-            'single_shot: false',
-            'single_shot: 3',
-            'line {line}: sensors.mocap.single_shot: Expected',
-        ),
-        (
-            'smr: [-0.1, 0.0, 0.0]',
-            'smr: [-0.1]',
-            'line {line}: markers.smr: Expected `array` of len',
-        ),
-        ('marker_std_m: 0.5e-3', 'marker_std_m: 5', 'line {line}: marker_std_m is 5; it must be'),
-        (
-            'max_angle_deg: 25.0',
-            'max_angle_deg: 1',
-            'line {line}: sensors.tracker.max_angle_deg is',
-        ),
-        (
-            'aim_at: tracker',
-            'aim_at: traker',
-            "line {line}: aim_at 'traker' is none of the sensors ",
-        ),
-        ('marker: smr', 'marker: smrr', "sensors.tracker.marker is 'smrr'; markers has sir, smr"),
-        (
-            'held_joint: joint_3',
-            'held_joint: joint3',
-            "line {line}: held_joint 'joint3' is none of ",
-        ),
-        ('tip_link: tool', 'tip_link: Tol', "there is no link 'Tol'; it has base_link"),
-    ],
-)
-def test_a_wrong_cell_names_line_key_and_what_was_meant(old, new, words, tmp_path):
-    demo = config_path('cells/demo.yaml')
-    text = demo.read_text().replace('../robots', str(demo.parents[1] / 'robots'))
-    assert old in text
-    line = 1 + text[: text.index(old)].count('\n') + new.count('\n')
-    words = words.format(line=line)
-    path = tmp_path / 'cell.yaml'
-    path.write_text(text.replace(old, new, 1))
-    with pytest.raises(InputError) as error:
-        read_cell(path)
-    line = text[: text.index(old)].count('\n') + 1
-    assert words.format(line=line) in str(error.value)
-    named = ('markerz', 'topc', 'traker', 'smrr', 'joint3', 'Tol')
-    assert ('did you mean' in str(error.value)) == any(name in new for name in named)

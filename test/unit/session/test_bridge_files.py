@@ -1,4 +1,4 @@
-"""The file that keeps a halt."""
+"""What a bridge keeps on the disk: a halt, and where the arm was led last."""
 
 import json
 import re
@@ -6,11 +6,12 @@ import time
 from datetime import UTC, datetime
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from remaster_ros.errors import RemasterError
 from remaster_ros.session import bridge_files
-from remaster_ros.session.bridge_files import HaltFile
+from remaster_ros.session.bridge_files import HaltFile, LastCommandFile
 
 
 @pytest.fixture
@@ -44,7 +45,9 @@ def test_no_two_bridges_have_the_same_file(tmp_path):
 
 
 def test_a_halt_is_kept_until_it_is_cleared(file):
+    file.clear()
     assert file.read() == ''
+    assert not file.path.parent.exists()
     file.write('the arm was pushed')
     pattern = (
         r'the arm was pushed \(halted \d{4}-\d\d-\d\d \d\d:\d\d:\d\d UTC, '
@@ -58,11 +61,6 @@ def test_a_halt_is_kept_until_it_is_cleared(file):
     assert file.read() == ''
     assert list(file.path.parent.iterdir()) == []
     file.clear()
-
-
-def test_clearing_where_nothing_was_ever_written_is_fine(file):
-    file.clear()
-    assert not file.path.parent.exists()
 
 
 @pytest.mark.parametrize(
@@ -137,3 +135,54 @@ def test_the_folder_may_be_there_with_others_in_it(file):
     file.write('x')
     file.clear()
     assert other.read_text() == 'x'
+
+
+JOINTS = ['joint_1', 'joint_2']
+NOW_NS = 1_800_000_000_123_456_789
+
+
+def command(folder, joints=JOINTS, node='/left/robot_bridge'):
+    return LastCommandFile(node, joints, {'ROS_HOME': str(folder), 'ROS_DOMAIN_ID': '7'})
+
+
+def test_the_last_command_is_beside_the_halt(tmp_path):
+    environment = {'ROS_HOME': str(tmp_path), 'ROS_DOMAIN_ID': '7'}
+    assert command(tmp_path).path.parent == HaltFile('/left/robot_bridge', environment).path.parent
+    assert command(tmp_path).path.name == 'command_7_left.robot_bridge.json'
+
+
+def test_the_end_of_a_command_comes_back_to_the_last_bit(tmp_path):
+    assert command(tmp_path).read(NOW_NS) is None
+    end = np.array([0.1 + 0.2, -np.pi])
+    command(tmp_path).write(end, NOW_NS)
+    last = command(tmp_path).read(NOW_NS + 2_500_000_000)
+    assert last.end.tolist() == end.tolist()
+    assert last.age_s == 2.5
+
+
+@pytest.mark.parametrize(
+    'joints', [['joint_2', 'joint_1'], ['joint_1'], ['joint_1', 'joint_2', 'joint_3']]
+)
+def test_of_another_arm_it_is_not_known_where_the_command_led(tmp_path, joints):
+    command(tmp_path).write(np.zeros(2), NOW_NS)
+    last = command(tmp_path, joints).read(NOW_NS)
+    assert (last.end, last.age_s) == (None, 0.0)
+
+
+@pytest.mark.parametrize(
+    'text',
+    ['', 'x', '{}', '{"joints": ["joint_1", "joint_2"], "end": [0.1], "sent_ns": "now"}'],
+)
+def test_of_a_damaged_one_nothing_is_known(tmp_path, text):
+    path = command(tmp_path).path
+    path.parent.mkdir()
+    path.write_text(text)
+    last = command(tmp_path).read(NOW_NS)
+    assert (last.end, last.age_s) == (None, np.inf)
+
+
+def test_after_the_clock_was_set_back_it_is_not_known_how_long_ago_it_was(tmp_path):
+    command(tmp_path).write(np.zeros(2), NOW_NS)
+    last = command(tmp_path).read(NOW_NS - 1)
+    assert last.end is not None
+    assert last.age_s == np.inf
