@@ -1,10 +1,10 @@
 """The supervisor of most tests here."""
 
 import pytest
-from supervisor_rig import Rig
+from supervisor_rig import begun
 
 
 @pytest.fixture
 def rig():
     """Return a supervisor and its arm, in stepped time."""
-    return Rig()
+    return begun()

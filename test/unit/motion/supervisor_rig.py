@@ -1,6 +1,8 @@
 """The supervisor with an arm in stepped time: a servo that lags and overshoots behind cubics."""
 
+import copy
 import dataclasses
+from functools import cache
 
 import numpy as np
 
@@ -89,7 +91,7 @@ class Rig:
             return
         # The first move is the probe; then the arm settles where it stands.
         self.plan(HOME)
-        self.run(10.0, lambda: self.said(Settled))
+        self.settles()
         self.answer(0)
         self.actions.clear()
         self.commands.clear()
@@ -192,6 +194,20 @@ class Rig:
                 return
         assert until is None, f'waited {seconds} s in vain'
 
+    def settles(self, count=1):
+        """Wait until it has settled so often."""
+        self.run(60.0, lambda: len(self.said(Settled)) >= count)
+
+    def halts(self, within_s=20.0):
+        """Wait for the halt; return its reason."""
+        self.run(within_s, lambda: self.said(Halted))
+        return self.last(Halted).reason
+
+    def pause(self):
+        """Have the planner tell at once that it is paused."""
+        self.state = 'paused'
+        self.do(self.supervisor.planner_is('paused', self.wall))
+
     def plan(self, *solutions, waypoints=None):
         targets = np.reshape(np.array(solutions, float), (-1, 2)) * self.unit
         between = {number: way * self.unit for number, way in (waypoints or {}).items()}
@@ -238,6 +254,16 @@ class Rig:
         self.run(1.0)
 
 
+@cache
+def _begun():
+    return Rig()
+
+
+def begun():
+    """Return a rig that is ready, and the test's own."""
+    return copy.deepcopy(_begun())
+
+
 def supervisor(rules=RULES, limits=LIMITS, end=None):
     """Return one that is fed by hand."""
     reports = JointReports(limits.lower, limits.upper, 3 * SPEED)
@@ -251,8 +277,7 @@ def report(t, q, wall):
 def halted(rig, reason, within_s=5.0):
     """Wait for the halt; nothing is commanded with it or after it, whatever happens."""
     commands = len(rig.commands)
-    rig.run(within_s, lambda: rig.said(Halted))
-    assert rig.last(Halted).reason == rig.supervisor.halted == reason
+    assert rig.halts(within_s) == rig.supervisor.halted == reason
     assert rig.supervisor.blocked(rig.wall) == reason
     stays_halted(rig, reason)
     assert len(rig.commands) == commands

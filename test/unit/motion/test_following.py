@@ -1,24 +1,131 @@
-"""Where the arm is on its path: lag, off the path, lost, and the window of a stop."""
+"""Where the arm is by its reports: whether it stands, and on its path, lag, and what is lost."""
 
 import numpy as np
 import pytest
-from following_arm import AT, CORNERS, LINE, RULES, Arm, see
 
 from remaster_ros.motion.actions import SupervisorRules
 from remaster_ros.motion.following import (
     ASTRAY_S,
     FRESH_S,
     JITTER_S,
+    LATENCY_S,
     ON_PATH_RAD,
     STANDING_S,
     STOPPED_ON_ITS_WAY,
     Following,
     Seen,
+    allowed_lag_s,
 )
 from remaster_ros.motion.joint_reports import JointReport
 from remaster_ros.motion.settling import SettleRules
-from remaster_ros.motion.trajectory import Line, Trajectory
+from remaster_ros.motion.trajectory import REST_S, Line, Trajectory
 from remaster_ros.simulation import arm_motion as servo
+
+RULES = SupervisorRules(settle=SettleRules(settle_s=1.0, still_tolerance=2.0**-12))
+AT = np.array([0.25, 0.5])
+LINE = Line(np.array([0.25, -0.5]), np.array([1.25, -0.5]), 0.5)
+"""2.5 s, of which 1.5 s at half a radian a second."""
+
+
+def see(stamp, q, wall=None, last=None, late=0.0):
+    wall = stamp if wall is None else wall
+    report = JointReport(stamp, np.asarray(q, float), stamp, wall)
+    return Seen.after(last, report, RULES, late)
+
+
+CORNERS = Trajectory((LINE, Line(LINE.end, np.array([1.25, 0.5]), 0.5)))
+
+
+class Arm:
+    """A trajectory sent at 64 s; reports at 50 Hz of an arm that is where a function tells."""
+
+    def __init__(self, trajectory=None, rate=1.0, rules=RULES):
+        self.trajectory = trajectory or Trajectory((LINE,))
+        self.following = Following(self.trajectory, 64.0, 512.0, rules)
+        self.rate, self.seen, self.said = rate, None, ''
+
+    def run(self, until_s, where, dt=1 / 64):
+        """Report up to `until_s`; return the time when it was said to be astray, or None."""
+        first = 0.0 if self.seen is None else self.seen.time - 64.0 + dt
+        for elapsed in np.arange(first, until_s + dt / 2, dt):
+            q = np.asarray(where(elapsed), float)
+            self.seen = see(64.0 + elapsed, q, 512.0 + elapsed / self.rate, self.seen)
+            self.said = self.following.update(self.seen, self.rate)
+            if self.said:
+                return float(elapsed)
+        return None
+
+    @property
+    def lost(self):
+        return self.following.lost(self.seen, self.seen.wall)
+
+    @property
+    def window(self):
+        return self.following.window(self.seen, self.seen.wall, self.rate)
+
+    def lagging(self, lag_s):
+        return lambda elapsed: self.trajectory.at(elapsed - lag_s)[0]
+
+
+# Standstill, and robot time
+
+
+def test_robot_time_goes_by_the_stamps():
+    seen = see(100.0, AT, wall=7.0)
+    assert (seen.time, seen.stamp, seen.wall) == (100.0, 100.0, 7.0)
+    seen = see(100.5, AT, wall=7.25, last=seen)
+    assert seen.time == 100.5
+    assert seen.now(7.5, 2.0) == 101.0
+    assert seen.now(7.25, 9.0) == 100.5
+
+
+@pytest.mark.parametrize(('passed', 'stands'), [(0.125, False), (STANDING_S, True)])
+def test_how_long_an_arm_must_stand(passed, stands):
+    seen = see(8.0 + passed, AT, wall=8.0, last=see(8.0, AT, wall=8.0))
+    assert seen.stands(8.0) == stands
+
+
+@pytest.mark.parametrize(('moved', 'stands'), [(2.0**-12, True), (2.0**-11, False)])
+@pytest.mark.parametrize('side', [1.0, -1.0])
+def test_what_counts_as_standing(moved, stands, side):
+    seen = see(8.0, AT)
+    seen = see(8.25, np.add(AT, [0.0, side * moved]), last=seen)
+    assert seen.stands(8.25) == stands
+    assert seen.stands_since == (8.0 if stands else 8.25)
+    np.testing.assert_array_equal(
+        seen.stands_at, AT if stands else np.add(AT, [0.0, side * moved])
+    )
+
+
+def test_an_arm_that_creeps_does_not_stand():
+    seen = see(8.0, AT)
+    for i in range(1, 50):
+        seen = see(8.0 + i * 0.125, np.add(AT, [i * 2.0**-12, 0.0]), last=seen)
+        assert not seen.stands(seen.wall)
+
+
+@pytest.mark.parametrize(('gap', 'stands'), [(0.5, True), (0.625, False)])
+def test_a_gap_begins_the_standstill_anew(gap, stands):
+    seen = see(8.0 + gap, AT, last=see(8.0, AT))
+    assert seen.stands(seen.wall) == stands
+    assert seen.time == 8.0 + gap
+
+
+def test_an_old_report_proves_nothing():
+    seen = see(8.5, AT, wall=8.5, last=see(8.25, AT))
+    assert seen.is_fresh(8.5 + FRESH_S - 1e-6)
+    assert seen.stands(8.5 + FRESH_S - 1e-6)
+    assert not seen.is_fresh(8.5 + FRESH_S + 1e-6)
+    assert not seen.stands(8.5 + FRESH_S + 1e-6)
+
+
+def test_the_lag_that_is_allowed():
+    assert allowed_lag_s(RULES, 1.0) == pytest.approx(RULES.lag_s + LATENCY_S)
+    assert allowed_lag_s(RULES, 0.2) == pytest.approx(RULES.lag_s + LATENCY_S)
+    assert allowed_lag_s(RULES, 20.0) == pytest.approx(RULES.lag_s + 20 * LATENCY_S)
+    # So that an arm is never on two lines at once.
+    assert allowed_lag_s(RULES, 1.0) + JITTER_S < REST_S
+
 
 # Along a line
 

@@ -10,7 +10,7 @@ from supervisor_rig import HOME, Rig, restless, stays_halted
 from test_supervisor_way_out import in_contact
 
 from remaster_ros.motion import arm_supervisor
-from remaster_ros.motion.actions import CheckPath, Drive, Halted, PathAnswer, Settled, Stop
+from remaster_ros.motion.actions import CheckPath, Drive, Halted, PathAnswer, Stop
 from remaster_ros.motion.states import ARM, CONSENT, PLACE, Arm, Consent, Event, Place, Word, after
 
 DOCS = Path(__file__).parents[3] / 'docs'
@@ -93,7 +93,7 @@ def asks(rig):
 
 def measures(rig):
     rig.plan([0.2, 0.1])
-    rig.run(20.0, lambda: rig.said(Settled))
+    rig.settles()
     return rig
 
 
@@ -131,9 +131,7 @@ def halted(rig):
     return rig
 
 
-def pause(rig):
-    rig.state = 'paused'
-    rig.do(rig.supervisor.planner_is('paused', rig.wall))
+pause = Rig.pause
 
 
 def rival(rig):

@@ -4,16 +4,10 @@ import re
 
 import numpy as np
 import pytest
-from supervisor_rig import LIMITS, RULES, SPEED, Rig
+from supervisor_rig import LIMITS, RULES, SPEED, Rig, begun
 
-from remaster_ros.motion.actions import Drive, Failed, Halted, Settled, Stop, SupervisorRules
-from remaster_ros.motion.following import STANDING_S
+from remaster_ros.motion.actions import Drive, Failed, Halted, Stop, SupervisorRules
 from remaster_ros.motion.joint_reports import JointReport
-
-
-def pause(rig):
-    rig.state = 'paused'
-    rig.do(rig.supervisor.planner_is('paused', rig.wall))
 
 
 def check_last_command(rig, line):
@@ -37,13 +31,13 @@ def test_a_stop_at_random_moments_of_random_moves():
     """From where the arm really is: it lags, and a stop does not send it back."""
     rng = np.random.default_rng(11)
     stops = moving = 0
-    for _ in range(60):
-        rig = Rig()
+    for _ in range(40):
+        rig = begun()
         rig.plan(rng.uniform(LIMITS.lower, LIMITS.upper))
         move = rig.last(Drive).admitted.trajectory
         rig.run(rng.uniform(0.0, move.duration_s))
         before = rig.speed()
-        pause(rig)
+        rig.pause()
         if rig.said(Stop):
             stops += 1
             remaining = move.duration_s - (rig.t - rig.commands[0][0])
@@ -54,22 +48,22 @@ def test_a_stop_at_random_moments_of_random_moves():
         rig.run(1.6)
         assert rig.speed() < 1e-2
         assert not rig.said(Halted)
-    assert stops > 50
-    assert moving > 20
+    assert stops > 33
+    assert moving > 13
 
 
 @pytest.mark.parametrize('delay', [0.05, 0.1, 0.15, 0.2, 0.24])
 def test_a_stop_by_reports_that_are_late_since_a_moment(delay):
     """So late they are believed; where the arm is now they do not tell, and that counts."""
     rng = np.random.default_rng(12)
-    for _ in range(12):
-        rig = Rig()
+    for _ in range(6):
+        rig = begun()
         rig.plan([0.9, -1.9])
         line = rig.last(Drive).admitted.trajectory.lines[0]
         rig.run(rng.uniform(0.1, 1.2))
         rig.delay_s = delay
         rig.run(delay + rng.uniform(0.1, 0.5))
-        pause(rig)
+        rig.pause()
         assert rig.said(Stop)
         back, beyond = check_last_command(rig, line)
         assert back >= -1e-3
@@ -80,14 +74,14 @@ def test_a_stop_on_a_path_of_several_lines():
     rng = np.random.default_rng(13)
     corners = np.array([[0.5, 1.0], [-0.5, 1.0], [-0.5, -1.0]])
     stops = 0
-    for _ in range(30):
-        rig = Rig()
+    for _ in range(20):
+        rig = begun()
         rig.plan([0.5, -1.0], waypoints={0: corners})
         move = rig.last(Drive).admitted.trajectory
         assert len(move.lines) == 4
         sent = rig.t
         rig.run(rng.uniform(0.0, move.duration_s))
-        pause(rig)
+        rig.pause()
         if not rig.said(Stop):
             continue
         stops += 1
@@ -100,7 +94,7 @@ def test_a_stop_on_a_path_of_several_lines():
         rig.run(1.6)
         assert rig.speed() < 1e-2
         assert not rig.said(Halted), rig.supervisor.halted
-    assert stops > 25
+    assert stops > 16
 
 
 # Messages
@@ -109,7 +103,7 @@ def test_a_stop_on_a_path_of_several_lines():
 @pytest.mark.parametrize('what', ['doubled', 'reordered', 'lost', 'late', 'slow'])
 def test_messages_that_are_doubled_reordered_lost_or_late(what):
     """Some of them, all along: counted, and without any consequence."""
-    rig = Rig()
+    rig = begun()
     rng = np.random.default_rng(14)
     honest = rig.supervisor.report
     kept = []
@@ -136,9 +130,9 @@ def test_messages_that_are_doubled_reordered_lost_or_late(what):
 
     rig.supervisor.report = deliver
     rig.plan([0.9, -1.9], [-0.5, 1.0])
-    rig.run(30.0, lambda: rig.said(Settled))
+    rig.settles()
     rig.answer(0)
-    rig.run(30.0, lambda: len(rig.said(Settled)) == 2)
+    rig.settles(2)
     assert not rig.said(Stop, Failed, Halted), rig.supervisor.halted
     assert (rig.supervisor.reports.refused['stamp'] > 10) == (what in ('doubled', 'reordered'))
 
@@ -151,13 +145,13 @@ def test_a_constant_difference_of_the_clocks_does_not_disturb(offset):
     rig = Rig(begun=False)
     rig.stamp_shift = offset
     rig.plan([0.9, -1.9], [-0.5, 1.0])
-    rig.run(30.0, lambda: rig.said(Settled))
+    rig.settles()
     rig.answer(0)
     rig.run(1.0)
-    pause(rig)
+    rig.pause()
     assert rig.said(Stop)
     rig.state = 'running'
-    rig.run(30.0, lambda: len(rig.said(Settled)) == 2)
+    rig.settles(2)
     assert not rig.said(Failed, Halted)
 
 
@@ -167,16 +161,16 @@ def test_a_fast_simulated_clock(rate):
     rig = Rig(begun=False, rate=rate)
     rig.run(20.0)
     rig.plan([0.9, -1.9], [-0.5, 1.0])
-    rig.run(60.0, lambda: rig.said(Settled))
+    rig.settles()
     rig.answer(0)
     line = rig.last(Drive).admitted.trajectory.lines[0]
     rig.run(1.0)
-    pause(rig)
+    rig.pause()
     assert rig.said(Stop)
     _, beyond = check_last_command(rig, line)
     assert beyond <= 1e-3
     rig.state = 'running'
-    rig.run(60.0, lambda: len(rig.said(Settled)) == 2)
+    rig.settles(2)
     assert not rig.said(Failed, Halted), rig.supervisor.halted
     assert not rig.supervisor.reports.refused
 
@@ -205,7 +199,7 @@ def test_how_long_an_arm_may_be_unobserved_is_wall_time_too():
     """One second of it, and ten of the clock's: shorter than a heartbeat."""
     rig = Rig(rate=10.0)
     rig.plan([0.3, 0.1])
-    rig.run(60.0, lambda: rig.said(Settled))
+    rig.settles()
     rig.alive.discard('robot')
     rig.run(10.0)
     rig.alive.add('robot')
@@ -230,7 +224,7 @@ def test_a_pause_of_this_process_is_nobodys_silence(rig, seconds):
     rig.plan([0.9, -1.9], [-0.9, 1.9])
     rig.run(0.5)
     paused_for(rig, seconds)
-    rig.run(30.0, lambda: rig.said(Settled))
+    rig.settles()
     assert not rig.said(Stop, Failed, Halted), rig.supervisor.halted
 
 
@@ -242,7 +236,7 @@ def test_a_pause_of_this_process_with_an_emergency_stop_in_it(rig):
     rig.freeze()
     rig.run(1.5)
     rig.alive.add('bridge')
-    rig.run(5.0, lambda: rig.said(Halted))
+    rig.halts(5.0)
     rig.run(5.0)
     assert len(rig.commands) == commands
     assert not rig.said(Stop)
@@ -252,12 +246,11 @@ def test_a_pause_of_this_process_with_an_emergency_stop_in_it(rig):
 def test_after_a_pause_longer_than_a_heartbeat_nobody_has_seen_the_arm(rig, where):
     rig.plan([0.9, -1.9], [-0.9, 1.9])
     if where == 'settled':
-        rig.run(20.0, lambda: rig.said(Settled))
+        rig.settles()
     else:
         rig.run(0.5)
     paused_for(rig, 4.0)
-    rig.run(1.0, lambda: rig.said(Halted))
-    assert rig.last(Halted).reason == 'the robot was not observed for 3.8 s'
+    assert rig.halts(1.0) == 'the robot was not observed for 3.8 s'
     assert not rig.said(Stop)
 
 
@@ -267,7 +260,7 @@ def test_a_gap_is_given_in_wall_time_where_the_clock_of_the_robot_runs_faster():
     rig.plan([0.9, -1.9], [-0.9, 1.9])
     rig.run(1.0)
     paused_for(rig, 8.0)
-    rig.run(2.0, lambda: rig.said(Halted))
+    rig.halts(2.0)
     found = re.fullmatch(r'the robot was not observed for (\d\.\d) s', rig.last(Halted).reason)
     assert found is not None
     assert 3.5 < float(found[1]) < 4.2
@@ -314,14 +307,3 @@ def test_a_gap_while_halted_does_not_change_why(rig):
     rig.run(2.0)
     assert rig.supervisor.halted == 'the robot reports an emergency stop'
     assert len(rig.said(Halted)) == 1
-
-
-def test_the_arm_must_stand_before_it_is_sent_on_after_a_stop(rig):
-    rig.go([0.9, -1.9])
-    pause(rig)
-    stopped = rig.t
-    rig.state = 'running'
-    rig.do(rig.supervisor.planner_is('running', rig.wall))
-    rig.run(5.0, lambda: len(rig.said(Drive)) == 2)
-    assert rig.t - stopped > STANDING_S + 0.3
-    assert rig.speed(rig.t - 0.02) < 1e-3

@@ -6,30 +6,7 @@ import numpy as np
 import pytest
 from supervisor_rig import LIMITS
 
-from remaster_ros.motion.actions import Drive, Failed, Halted, Settled, Stop
-
-
-def test_an_emergency_stop_just_before_the_end_halts(rig):
-    """It is behind by less than an arm may lag, and stands 0.07 rad from its target."""
-    target = np.array([0.9, -1.9])
-    rig.plan(target)
-    rig.run(5.0, lambda: np.max(np.abs(rig.arm.at(rig.t)[0] - target)) < 0.07)
-    rig.freeze()
-    rig.run(5.0, lambda: rig.said(Halted))
-    assert rig.last(Halted).reason.startswith('the robot stands 0.06')
-    assert not rig.said(Failed, Stop)
-
-
-def test_an_emergency_stop_in_a_stop_halts(rig):
-    """It stands long before the stop's end."""
-    rig.go([0.9, -1.9], 1.2)
-    rig.state = 'paused'
-    rig.do(rig.supervisor.planner_is('paused', rig.wall))
-    rig.step()
-    rig.freeze()
-    rig.run(2.0, lambda: rig.said(Halted))
-    assert 'rad from where its stop led: an emergency stop?' in rig.last(Halted).reason
-    assert len(rig.said(Stop)) == 1
+from remaster_ros.motion.actions import Drive, Halted, Stop
 
 
 def test_other_limits_stop_the_arm_and_it_goes_on_with_them(rig):
@@ -38,7 +15,7 @@ def test_other_limits_stop_the_arm_and_it_goes_on_with_them(rig):
     rig.do(rig.supervisor.use_limits(slow, rig.wall))
     assert rig.last(Stop).reason == 'other limits'
     assert rig.supervisor.gate.limits is slow
-    rig.run(30.0, lambda: rig.said(Settled))
+    rig.settles()
     first, second = rig.said(Drive)
     assert first.solution == second.solution == 0
     fastest = max(np.max(np.abs(p.velocity) / slow.velocity) for p in second.admitted.waypoints)
@@ -92,7 +69,7 @@ def test_a_collection_that_is_begun_at_once_after_the_halt_was_cleared_goes_on(r
     rig.plan([0.9, -1.9])
     rig.run(5.0, lambda: rig.speed() > 0.3)
     rig.freeze()
-    rig.run(2.0, lambda: rig.said(Halted))
+    rig.halts(2.0)
     rig.run(0.5)
     if paused:
         planner('paused', '')
@@ -108,24 +85,11 @@ def test_a_collection_that_is_begun_at_once_after_the_halt_was_cleared_goes_on(r
     assert len(rig.said(Drive)) > count
 
 
-@pytest.mark.parametrize('later_s', [0.16, 0.3, 0.42])
-def test_a_pause_just_after_an_emergency_stop_commands_nothing(rig, later_s):
-    """Its lag alone would not tell yet; 4 of 45 emergency stops of a campaign ended so."""
-    rig.go([0.9, -1.9], 1.2)
-    rig.freeze()
-    rig.run(later_s)
-    rig.state = 'paused'
-    rig.do(rig.supervisor.planner_is('paused', rig.wall))
-    assert not rig.said(Stop)
-    assert 'planner is paused; the robot stopped on its way' in rig.supervisor.halted
-
-
 def test_a_stop_that_was_not_sent_halts_and_nothing_follows(rig):
     """The process was paused between the decision and its publication (1 of 1,000 injections)."""
     rig.go([0.9, -1.9])
     rig.obey = lambda waypoints: ()
-    rig.state = 'paused'
-    rig.do(rig.supervisor.planner_is('paused', rig.wall))
+    rig.pause()
     stop = rig.last(Stop)
     assert stop.wall_s == rig.wall
     rig.do(rig.supervisor.not_sent(stop, rig.wall + 1.88))
@@ -158,8 +122,7 @@ def test_a_stop_of_an_arm_that_has_hardly_begun_to_move(rig, moved_s, delay_s):
     rig.plan([0.9, -1.9])
     rig.run(5.0, lambda: rig.said(Drive))
     rig.run(moved_s)
-    rig.state = 'paused'
-    rig.do(rig.supervisor.planner_is('paused', rig.wall))
+    rig.pause()
     rig.run(0.1)
     # Whoever wants to go on at once waits until the arm is there.
     rig.state = 'running'

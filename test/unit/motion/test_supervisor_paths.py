@@ -4,14 +4,7 @@ import numpy as np
 import pytest
 from supervisor_rig import HOME, Rig
 
-from remaster_ros.motion.actions import (
-    CheckPath,
-    Drive,
-    Failed,
-    Halted,
-    PathAnswer,
-    Settled,
-)
+from remaster_ros.motion.actions import CheckPath, Drive, Failed, Halted, PathAnswer
 from remaster_ros.motion.move_queue import PROBE
 from remaster_ros.motion.path_check import FreePath
 from remaster_ros.motion.states import Arm
@@ -32,7 +25,7 @@ def test_the_way_is_asked_for_and_a_slow_answer_waited_for(rig):
     np.testing.assert_array_equal(rig.last(Drive).admitted.trajectory.points, answer.path.points)
     # The same answer once more counts nothing.
     assert rig.supervisor.path_found(check.number, answer, rig.wall) == []
-    rig.run(20.0, lambda: rig.said(Settled))
+    rig.settles()
 
 
 def test_an_answer_to_another_pose_counts_nothing(rig):
@@ -50,12 +43,12 @@ def test_an_answer_to_another_pose_counts_nothing(rig):
 
 def test_the_way_to_the_next_solution_goes_through_its_own_waypoints(rig):
     rig.plan([0.3, 0.0], [0.4, 0.0], waypoints={1: np.array([[0.2, 0.4], [0.3, 0.4]])})
-    rig.run(20.0, lambda: rig.said(Settled))
+    rig.settles()
     rig.answer(0)
     first, second = rig.said(CheckPath)
     assert first.waypoints.shape == (0, 2)
     np.testing.assert_array_equal(second.waypoints, [[0.2, 0.4], [0.3, 0.4]])
-    rig.run(20.0, lambda: len(rig.said(Settled)) == 2)
+    rig.settles(2)
     assert len(rig.said(Drive)[1].admitted.trajectory.lines) == 3
     # Another pose does not inherit them.
     rig.plan([0.3, 0.0], [0.4, 0.0])

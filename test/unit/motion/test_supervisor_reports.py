@@ -2,24 +2,9 @@
 
 import numpy as np
 import pytest
-from supervisor_rig import (
-    LIMITS,
-    NOT_TAKEN,
-    STOPPED,
-    Rig,
-    goes_on,
-    halted,
-    restless,
-    stays_halted,
-)
+from supervisor_rig import LIMITS, NOT_TAKEN, Rig, goes_on, halted, restless, stays_halted
 
-from remaster_ros.motion.actions import (
-    Drive,
-    Failed,
-    Halted,
-    Settled,
-    Stop,
-)
+from remaster_ros.motion.actions import Drive, Failed, Halted, Settled, Stop
 from remaster_ros.motion.move_queue import PROBE
 
 
@@ -51,7 +36,7 @@ def test_one_wrong_report_is_counted_and_disturbs_nothing(rig, alter, kind):
     rig.alter = alter
     rig.step()
     rig.alter = lambda t, q: q
-    rig.run(20.0, lambda: rig.said(Settled))
+    rig.settles()
     assert rig.supervisor.reports.refused == {kind: 1}
     assert not rig.said(Stop, Failed, Halted)
     np.testing.assert_allclose(rig.last(Settled).q, [0.5, -1.0], atol=1e-4)
@@ -64,14 +49,14 @@ def test_a_jump_by_a_whole_turn_for_good(rig, when):
     if when == 'moving':
         rig.run(0.8)
     else:
-        rig.run(20.0, lambda: rig.said(Settled))
+        rig.settles()
     if when == 'idle':
         rig.answer(0)
         rig.state = 'idle'
         rig.run(1.0)
     rig.alter = lambda t, q: np.add(q, [2 * np.pi, 0.0])
     commands = len(rig.commands)
-    rig.run(2.0, lambda: rig.said(Halted))
+    rig.halts(2.0)
     assert 'outside its limits' in rig.last(Halted).reason
     stays_halted(rig, rig.last(Halted).reason)
     assert len(rig.commands) == commands
@@ -79,12 +64,12 @@ def test_a_jump_by_a_whole_turn_for_good(rig, when):
 
 def test_a_jump_faster_than_any_arm_halts_though_nothing_is_collected(rig):
     rig.plan([-0.9, 0.2])
-    rig.run(30.0, lambda: rig.said(Settled))
+    rig.settles()
     rig.answer(0)
     rig.state = 'idle'
     rig.run(1.0)
     rig.alter = lambda t, q: np.add(q, [1.8, 0.0])
-    rig.run(0.7, lambda: rig.said(Halted))
+    rig.halts(0.7)
     assert 'joint 1 is reported 103.1 deg away after 0.5' in rig.supervisor.halted
 
 
@@ -160,15 +145,7 @@ def test_reports_that_cannot_be_read_while_idle_only_hold(rig):
     rig.run(1.0)
     assert rig.supervisor.trouble == ''
     rig.plan([0.3, 0.0])
-    rig.run(20.0, lambda: rig.said(Settled))
-
-
-def test_a_frozen_driver_is_an_arm_that_stopped(rig):
-    """It sends the same position for ever with new stamps."""
-    rig.go([0.9, -1.9], 1.0)
-    here = rig.arm.at(rig.t)[0]
-    rig.alter = lambda t, q: here
-    halted(rig, STOPPED)
+    rig.settles()
 
 
 def test_stamps_that_stand_still(rig):
@@ -188,12 +165,12 @@ def test_stamps_that_jump(rig, jump, after):
     assert not rig.said(Settled)
     rig.stamp_shift = jump
     reason = 'do not advance' if jump < 0 else 's ahead of their time'
-    rig.run(3.0, lambda: rig.said(Halted))
+    rig.halts(3.0)
     assert reason in rig.last(Halted).reason
     assert not rig.said(Stop)
     # Seen to by a person, the new time is learned while the arm stands.
     rig.collect()
-    rig.run(30.0, lambda: rig.said(Settled))
+    rig.settles()
     assert rig.last(Settled).settle_s >= 1.0
     np.testing.assert_allclose(rig.last(Settled).q, [0.9, -1.9], atol=1e-4)
 
@@ -207,13 +184,13 @@ def test_while_nothing_is_collected_a_clock_may_be_set(rig):
     rig.state = 'running'
     rig.run(1.0)
     rig.plan([0.3, 0.0])
-    rig.run(20.0, lambda: rig.said(Settled))
+    rig.settles()
 
 
 def test_a_recorder_that_answers_nothing_does_not_count_with_failures_of_the_arm(rig):
     rig.alter = restless(rig, (1, 2))
     rig.plan([0.3, 0.0], [0.2, 0.1], [0.1, 0.2], [0.0, 0.3])
-    rig.run(150.0, lambda: len(rig.said(Settled)) == 2)
+    rig.settles(2)
     assert [f.solution for f in rig.said(Failed)] == [0, 1, 2]
     assert not rig.said(Halted)
 
@@ -227,7 +204,7 @@ def test_before_a_planner_is_there_a_clock_may_be_set():
     assert rig.supervisor.trouble == ''
     rig.alive.add('planner')
     rig.plan([0.3, 0.0])
-    rig.run(20.0, lambda: rig.said(Settled))
+    rig.settles()
 
 
 def test_a_halt_that_was_cleared_before_the_planner_came_waits_for_a_person():
@@ -267,7 +244,7 @@ def test_a_pause_while_the_arm_settles_commands_nothing(rig):
     assert not rig.said(Settled)
     assert len(rig.commands) == before
     rig.state = 'running'
-    rig.run(20.0, lambda: rig.said(Settled))
+    rig.settles()
 
 
 def test_reports_that_come_late_in_a_pause_do_not_become_the_usual_ones(rig):
@@ -288,19 +265,18 @@ def test_reports_that_come_late_in_a_pause_do_not_become_the_usual_ones(rig):
     rig.run(2.0)
     before = len(rig.commands)
     rig.state = 'running'
-    rig.run(3.0, lambda: rig.said(Halted))
-    assert rig.last(Halted).reason == 'joint_states come 0.44 s late'
+    assert rig.halts(3.0) == 'joint_states come 0.44 s late'
     assert len(rig.commands) == before
     rig.delay_s = 0.0
     rig.collect()
-    rig.run(30.0, lambda: rig.said(Settled))
+    rig.settles()
 
 
 def test_reports_that_come_much_too_late_from_a_moment_on(rig):
     rig.go([0.9, -1.9])
     rig.delay_s = 1.0
     late = rig.t
-    rig.run(5.0, lambda: rig.said(Halted))
+    rig.halts(5.0)
     assert 'joint_states come 1.00 s late' in rig.last(Halted).reason
     assert 1.5 < rig.t - late < 1.6
     assert not rig.said(Stop)
@@ -313,7 +289,6 @@ def test_reports_that_come_much_too_late_from_the_start(delay):
     rig = Rig(begun=False)
     rig.delay_s = delay
     rig.plan([0.9, -1.9])
-    rig.run(20.0, lambda: rig.said(Halted))
-    assert rig.last(Halted).reason == NOT_TAKEN or 'come late?' in rig.last(Halted).reason
+    assert rig.halts(20.0) == NOT_TAKEN or 'come late?' in rig.last(Halted).reason
     assert not rig.said(Settled)
     assert [d.solution for d in rig.said(Drive)] == [PROBE, 0]

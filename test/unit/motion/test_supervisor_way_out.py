@@ -1,21 +1,9 @@
 """The way out of a margin: offered, confirmed by a person, gone slowly."""
 
 import numpy as np
-from supervisor_rig import (
-    HOME,
-    LIMITS,
-    STOPPED,
-    Rig,
-    halted,
-)
+from supervisor_rig import HOME, LIMITS, STOPPED, Rig, halted
 
-from remaster_ros.motion.actions import (
-    CheckPath,
-    Drive,
-    Halted,
-    PathAnswer,
-    Settled,
-)
+from remaster_ros.motion.actions import CheckPath, Drive, Halted, PathAnswer
 from remaster_ros.motion.move_queue import PROBE, WAY_OUT
 from remaster_ros.motion.path_check import FreePath
 from remaster_ros.simulation import arm_motion as servo
@@ -53,7 +41,7 @@ def test_a_way_out_is_offered_confirmed_and_gone_slowly(rig):
     assert [d.solution for d in drives] == [PROBE, WAY_OUT]
     fastest = max(np.max(np.abs(p.velocity)) for p in drives[1].admitted.waypoints)
     assert fastest <= 0.1 * LIMITS.velocity[0]
-    rig.run(40.0, lambda: rig.said(Settled))
+    rig.settles()
     assert [d.solution for d in rig.said(Drive)] == [PROBE, WAY_OUT, 0]
     assert len(rig.said(Halted)) == 1
 

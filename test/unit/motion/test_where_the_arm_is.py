@@ -4,9 +4,9 @@ import copy
 
 import numpy as np
 import pytest
-from supervisor_rig import ASKED, HOME, LIMITS, RULES, SPEED, Rig
+from supervisor_rig import ASKED, HOME, LIMITS, RULES, SPEED, Rig, begun
 
-from remaster_ros.motion.actions import Drive, Halted, Settled, Stop
+from remaster_ros.motion.actions import Drive, Halted, Stop
 from remaster_ros.motion.following import allowed_lag_s
 from remaster_ros.motion.motion_gate import Cubic, MotionGate
 from remaster_ros.motion.move_queue import PROBE, probe_path
@@ -20,7 +20,7 @@ def test_an_emergency_stop_while_it_brakes_halts(trial):
     """Released at once; a sensor is missing for two seconds. It never goes on by itself."""
     rng = np.random.default_rng([SEED, trial])
     print(f'seed {SEED}, trial {trial}')
-    rig = Rig()
+    rig = begun()
     rig.go([0.9, -1.9], rng.uniform(0.8, 2.0))
     rig.waiting_for = 'mocap'
     rig.do(rig.supervisor.recorder_waits('mocap', rig.wall))
@@ -36,7 +36,7 @@ def test_an_emergency_stop_while_it_brakes_halts(trial):
 
 def test_what_halts_an_arm_that_is_being_halted_does_not_hide_why_it_was():
     """An emergency stop while it brakes, as a second publisher was noticed."""
-    rig = Rig()
+    rig = begun()
     rig.go([0.9, -1.9], 1.2)
     rig.do(rig.supervisor.observe('rivals', 'two publishers', rig.wall))
     assert rig.said(Stop)
@@ -65,8 +65,7 @@ def test_a_stop_that_is_long_on_its_way_is_no_emergency_stop(rate):
         duration_s = rig.last(Drive).admitted.waypoints[-1].time_s
         rig.run(duration_s - rng.uniform(0.05, 0.8))
         rig.stop_s = rng.uniform(0.8, 1.0) * allowed_lag_s(RULES, rate) - 0.02
-        rig.state = 'paused'
-        rig.do(rig.supervisor.planner_is('paused', rig.wall))
+        rig.pause()
         if not rig.said(Stop):
             continue
         (end,) = rig.last(Stop).admitted.waypoints
@@ -87,14 +86,14 @@ def test_an_arm_that_stops_as_ever_goes_on(noise, sag):
     rig = Rig(begun=False)
     rig.alter = lambda t, q: q + [sag, -sag] + rng.normal(0.0, noise, 2)
     rig.plan([0.3, 0.3], [0.9, -1.9])
-    rig.run(20.0, lambda: rig.said(Settled))
+    rig.settles()
     rig.answer(0)
     for _ in range(2):
         rig.run(5.0, lambda: rig.speed() > 0.2)
         rig.waiting_for = 'mocap'
         rig.run(3.0)
         rig.waiting_for = ''
-    rig.run(30.0, lambda: len(rig.said(Settled)) == 2)
+    rig.settles(2)
     assert not rig.said(Halted)
     assert len(rig.said(Stop)) == 2
 
@@ -106,14 +105,14 @@ def test_an_arm_that_stops_as_ever_goes_on(noise, sag):
 @pytest.mark.parametrize('place', ['moving', 'settled'])
 def test_who_goes_on_after_an_interruption(seconds, released, alone, place):
     """A person, unless the robot reported all the time that nobody has stopped it."""
-    rig = Rig()
+    rig = begun()
     if released == 'always':
         rig.do(rig.supervisor.emergency(False, rig.wall))
     if place == 'moving':
         rig.go([0.9, -1.9], 1.2)
     else:
         rig.plan([0.3, 0.0], [0.9, -1.9])
-        rig.run(20.0, lambda: rig.said(Settled))
+        rig.settles()
     rig.waiting_for = 'mocap'
     rig.run(seconds / 2)
     if released == 'lately':
@@ -155,7 +154,7 @@ def test_a_bridge_that_was_away_for_long_waits_for_a_person(topic):
 
 
 def test_after_a_stop_the_next_move_begins_only_where_the_stop_led():
-    rig = Rig()
+    rig = begun()
     rig.go([0.3, 0.2])
     rig.state = 'paused'
     rig.run(3.0)
@@ -170,26 +169,13 @@ def test_after_a_stop_the_next_move_begins_only_where_the_stop_led():
     assert len(rig.said(Drive)) == 1
 
 
-def test_the_next_move_begins_only_where_the_last_command_led():
-    rig = Rig()
-    count = len(rig.said(Drive))
-    rig.alter = lambda t, q: np.add(q, [0.1, 0.0])
-    rig.supervisor.reports.forget()
-    rig.run(1.5)
-    rig.plan([0.5, 0.5])
-    rig.run(2.0)
-    (halted,) = rig.said(Halted)
-    assert halted.reason.startswith(f'{ASKED}a at 11.46 deg, +5.73 deg from there; compare ')
-    assert len(rig.said(Drive)) == count
-
-
 def test_frozen_reports_and_a_person_who_clears_the_halt():
     """It is asked for a comparison first; whoever does not compare sends the arm off slowly."""
-    rig = Rig()
+    rig = begun()
     rig.go([0.9, -1.9], 1.0)
     q = rig.arm.at(rig.t)[0]
     rig.alter = lambda t, _: q
-    rig.run(5.0, lambda: rig.said(Halted))
+    rig.halts(5.0)
     # It has completed its move, unseen.
     rig.run(5.0)
     np.testing.assert_allclose(rig.arm.at(rig.t)[0], [0.9, -1.9], atol=1e-3)
@@ -207,10 +193,10 @@ def test_frozen_reports_and_a_person_who_clears_the_halt():
 
 
 def test_reports_that_move_on_after_the_question_are_not_what_was_confirmed():
-    rig = Rig()
+    rig = begun()
     rig.go([0.9, -1.9], 1.0)
     rig.freeze()
-    rig.run(5.0, lambda: rig.said(Halted))
+    rig.halts(5.0)
     rig.run(0.5)
     first = rig.supervisor.clear_halt()
     rig.alter = lambda t, q: np.add(q, [0.02, 0.0])
@@ -271,5 +257,5 @@ def test_a_slow_probe_that_was_interrupted_is_slow_again(pause_s):
     for probe in rig.said(Drive):
         assert probe.solution == PROBE
         assert probe.admitted.waypoints[0].time_s > 3.0
-    rig.run(20.0, lambda: rig.said(Settled))
+    rig.settles()
     assert rig.supervisor.end is not None
