@@ -61,24 +61,6 @@ from remaster_ros.types import FloatArray, IntArray, Measurements
 REGISTRATION_AXES = ('x', 'y', 'z', 'rx', 'ry', 'rz')
 
 
-def predict_in_sensor(
-    chain: SerialChain,
-    measurements: Measurements,
-    joint_offsets: FloatArray,
-    T_R_N: FloatArray,
-    markers: FloatArray,
-) -> FloatArray:
-    """Return where the sensors should measure the markers.
-
-    ``chain``: the nominal robot, k joints; ``measurements``: the observations to predict, n rows;
-    ``joint_offsets``: zero-offsets, rad, (k,); ``T_R_N``: registration of each sensor, (sensors,
-    4, 4); ``markers``: position of each marker in the tool frame, m, (markers, 3).
-    Returns marker positions in the frame N of the row's sensor, m, (n, 3).
-    """
-    points = chain.positions(measurements.q, markers[measurements.marker], joint_offsets)
-    return apply(inverse(T_R_N)[measurements.sensor], points)
-
-
 @dataclass(frozen=True, eq=False)
 class Model:
     """The parameters' layout and the prediction with its derivative."""

@@ -11,10 +11,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from worlds.calibration_scenes import CHAIN, scene
+from worlds.measured_rows import predict_in_sensor
 
 from remaster_ros.calibration.evaluate_offsets import OffsetsJudgement, accuracy_with_offsets
 from remaster_ros.calibration.fit import FitResult, fit_session
-from remaster_ros.calibration.model import predict_in_sensor
 from remaster_ros.errors import InputError, InsufficientDataError
 from remaster_ros.kinematics.transforms import quaternion_xyzw
 from remaster_ros.simulation.truth import SessionTruth

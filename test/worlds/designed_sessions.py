@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from worlds.measured_rows import predict_in_sensor
 
-from remaster_ros.calibration.model import predict_in_sensor
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.planning.expected_sensors import (
     ExpectedSensor,

@@ -1,4 +1,4 @@
-"""Rows of a session for tests that need a few columns of them."""
+"""Rows of a session for tests that need a few columns of them, and where markers are in them."""
 
 from __future__ import annotations
 
@@ -7,7 +7,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from remaster_ros.types import Measurements
+from remaster_ros.kinematics.serial_chain import SerialChain
+from remaster_ros.kinematics.transforms import apply, inverse
+from remaster_ros.types import FloatArray, Measurements
 
 
 def measured_rows(q: ArrayLike, position: ArrayLike, **columns: ArrayLike) -> Measurements:
@@ -34,3 +36,15 @@ def measured_rows(q: ArrayLike, position: ArrayLike, **columns: ArrayLike) -> Me
     given = {name: np.asarray(values) for name, values in columns.items()}
     rest = {'q': angles, 'position': np.asarray(position, float)}
     return replace(Measurements.empty(angles.shape[1]), **{**usual, **rest, **given})
+
+
+def predict_in_sensor(
+    chain: SerialChain,
+    measurements: Measurements,
+    joint_offsets: FloatArray,
+    T_R_N: FloatArray,
+    markers: FloatArray,
+) -> FloatArray:
+    """Return where the sensors should measure the markers, in the frame of each row's sensor."""
+    points = chain.positions(measurements.q, markers[measurements.marker], joint_offsets)
+    return apply(inverse(T_R_N)[measurements.sensor], points)

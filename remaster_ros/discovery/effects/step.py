@@ -30,12 +30,6 @@ MOMENTS = 40
 LEAST_SHARE = 0.04
 
 
-def moments_of(context: Context) -> FloatArray:
-    """Return the middles of the gaps between configurations, s since the first row, (m,)."""
-    middles: FloatArray = _gaps(context).mean(axis=1)
-    return middles
-
-
 def _gaps(context: Context) -> FloatArray:
     """Return start and end of gaps between configurations, s since the first row, (m, 2)."""
     _, row = np.unique(context.measurements.configuration, return_inverse=True)

@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from worlds.calibration_scenes import CHAIN, scene
+from worlds.measured_rows import predict_in_sensor
 
 from remaster_ros.calibration.estimate import Problem, estimate
 from remaster_ros.calibration.fit import fit_session
 from remaster_ros.calibration.identifiability import Gauge, find_gauge
-from remaster_ros.calibration.model import predict_in_sensor
 from remaster_ros.errors import InsufficientDataError
 from remaster_ros.kinematics.transforms import quaternion_xyzw
 from remaster_ros.types import BasePrior, Session

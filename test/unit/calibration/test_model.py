@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 from worlds.calibration_scenes import CHAIN, extension, scene
+from worlds.measured_rows import predict_in_sensor
 
 from remaster_ros.calibration.grouped_rows import Rows
-from remaster_ros.calibration.model import Model, predict_in_sensor
+from remaster_ros.calibration.model import Model
 from remaster_ros.kinematics.transforms import apply, rotation_vector_to_matrix, transform
 
 

@@ -10,13 +10,17 @@ from worlds.discovery_scenes import at_joint, discovered, residuals_of, session_
 import remaster_ros
 from remaster_ros.discovery.discover import discover_session
 from remaster_ros.discovery.effects.registry import EFFECTS
-from remaster_ros.discovery.effects.step import moments_of
 from remaster_ros.discovery.evidence import solve
 from remaster_ros.reports.discovery_json import discovery_content
 from remaster_ros.types import FloatArray, Session
 
 # As many poses as these causes need to be located.
 SMALL = {'poses': 20, 'validation': 12, 'pose_sigma_m': 0.05e-3}
+
+
+def moments_of(context) -> FloatArray:
+    """Return the moments at which a step is tried, s since the first row."""
+    return np.unique([cell.moment for cell in EFFECTS['step'].cells(context)])
 
 
 def in_time(session: Session) -> np.ndarray:

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from worlds.designed_sessions import MARKER_STD, measured
+from worlds.measured_rows import predict_in_sensor
 
 from remaster_ros.calibration.estimate import Problem, estimate
-from remaster_ros.calibration.model import predict_in_sensor
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.transforms import inverse, rotation_vector_to_matrix, transform
 from remaster_ros.planning.candidates import PlannedPose
