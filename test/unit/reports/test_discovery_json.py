@@ -476,7 +476,7 @@ def test_gross_errors_do_not_count_among_the_rows_that_lie_where_they_were_predi
     assert '; 3 gross errors not counted' in '\n'.join(discovery_lines(content))
 
 
-@pytest.mark.parametrize('scene', ['bent', 'scale', 'unproven'])
+@pytest.mark.parametrize('scene', ['scale', 'unproven'])
 def test_causes_are_drawn(scenes, scene, tmp_path):
     page, mood, names = shown(scenes[scene], tmp_path)
     assert names == {'gain', 'drivers', 'causes'}

@@ -16,7 +16,7 @@ from rigs.browser import seen
 from remaster_ros.calibration.noise_estimate import NoiseEstimate
 from remaster_ros.kinematics import transforms
 from remaster_ros.kinematics.transforms import apply
-from remaster_ros.reports.report import _round_factor, draw_view, fit_html, write_fit_report
+from remaster_ros.reports.report import _round_factor, draw_view, fit_html
 from remaster_ros.reports.result_folder import save_fit
 from remaster_ros.reports.sentences import verdict
 
@@ -217,10 +217,9 @@ def test_error_vectors_lead_from_the_measured_to_the_modelled_marker(fit_result)
     np.testing.assert_allclose(starts + (ends - starts) / view.magnification, modelled, atol=3e-5)
 
 
-def test_the_picture_of_a_fit_is_drawn_and_explained(fit_result, tmp_path):
-    path = write_fit_report(fit_result, tmp_path)
+def test_the_picture_of_a_fit_is_drawn_and_explained(folder):
     found = seen(
-        path,
+        folder / 'report.html',
         """
         const place = document.getElementById('scene');
         place.scrollIntoView();

@@ -219,7 +219,7 @@ def test_missing_bags_are_named(tmp_path):
 
 def test_the_writer_refuses_what_no_reader_would_understand(tmp_path):
     with BagWriter(tmp_path / 'bag') as writer:
-        writer.write('/clock', 'std_msgs/msg/Empty', b'\0\1\0\0\0', 5)
+        writer.write('/clock', 'std_msgs/msg/Empty', b'\0\1\0\0\0', 0)
         for arguments, problem in [
             (('/a', 'no_msgs/msg/Such', b'', 6), 'not a message type'),
             (('/clock', 'sensor_msgs/msg/JointState', b'', 6), 'one type'),
