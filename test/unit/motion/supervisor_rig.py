@@ -51,14 +51,7 @@ class Rig:
     """
 
     def __init__(
-        self,
-        rules=RULES,
-        wall_s=1000.0,
-        begun=True,
-        halted='',
-        rate=1.0,
-        end=HOME,
-        units=TURNING,
+        self, rules=RULES, wall_s=1000.0, begun=True, halted='', rate=1.0, end=HOME, units=TURNING
     ):
         self.unit = unit = units.per_radian
         ways = {
@@ -197,6 +190,15 @@ class Rig:
     def settles(self, count=1):
         """Wait until it has settled so often."""
         self.run(60.0, lambda: len(self.said(Settled)) >= count)
+
+    def visit(self, *solutions, **how):
+        """Send the arm to solutions of a pose, and let it settle at the first."""
+        self.plan(*solutions, **how)
+        self.settles()
+
+    def collects_nothing(self):
+        self.state = 'idle'
+        self.run(1.0)
 
     def halts(self, within_s=20.0):
         """Wait for the halt; return its reason."""

@@ -226,8 +226,7 @@ def test_a_required_sensor_that_is_gone_stops_the_arm(rig):
 
 
 def test_a_reading_goes_on_while_paused_and_no_command_follows_it(rig):
-    rig.plan([0.3, 0.0], [0.4, 0.0])
-    rig.settles()
+    rig.visit([0.3, 0.0], [0.4, 0.0])
     rig.state = 'paused'
     rig.run(2.0)
     assert not rig.said(Stop)
@@ -244,8 +243,7 @@ def test_a_reading_goes_on_while_paused_and_no_command_follows_it(rig):
 
 
 def test_a_recorder_that_does_not_answer_loses_the_configuration_and_not_the_run(rig):
-    rig.plan([0.5, 0.5], [0.2, 0.2])
-    rig.settles()
+    rig.visit([0.5, 0.5], [0.2, 0.2])
     settled = rig.t
     rig.run(40.0, lambda: rig.said(Failed))
     assert rig.last(Failed).solution == 0
@@ -256,8 +254,7 @@ def test_a_recorder_that_does_not_answer_loses_the_configuration_and_not_the_run
 
 
 def test_the_wait_for_the_recorder_does_not_run_while_it_waits_for_a_sensor(rig):
-    rig.plan([0.5, 0.5])
-    rig.settles()
+    rig.visit([0.5, 0.5])
     rig.waiting_for = 'mocap'
     rig.run(RULES.answer_timeout_s + 1.0)
     assert not rig.said(Failed)
@@ -306,8 +303,7 @@ def test_the_settled_position_is_the_mean_and_not_the_last_report(rig):
         return q
 
     rig.alter = sway
-    rig.plan(target)
-    rig.settles()
+    rig.visit(target)
     said = rig.last(Settled)
     since = said.stamp_s - said.settle_s
     still = np.array([q for t, q in seen if since - 1e-9 <= t <= said.stamp_s + 1e-9])

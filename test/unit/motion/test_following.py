@@ -33,6 +33,8 @@ def see(stamp, q, wall=None, last=None, late=0.0):
     return Seen.after(last, report, RULES, late)
 
 
+BESIDE = 'the robot does not follow its path: 1.7 deg beside it'
+NOT_TAKEN = 'the robot does not take commands: see its controller, and its driver'
 CORNERS = Trajectory((LINE, Line(LINE.end, np.array([1.25, 0.5]), 0.5)))
 
 
@@ -203,21 +205,16 @@ def test_exactly_at_the_tolerances():
     assert following.reacted
 
 
-def test_at_a_fast_clock_a_move_has_ended_later():
+def test_at_a_fast_clock_a_move_has_ended_later_and_the_window_is_wider():
     """By how much commands may differ on their way is wall time."""
     for rate in (1.0, 10.0):
         arm = Arm(rate=rate)
+        arm.run(1.0, arm.lagging(0.1))
+        assert arm.window[1] == pytest.approx(1.0 + rate * JITTER_S)
         arm.run(2.5 + JITTER_S * rate - 1 / 32, arm.lagging(0.0))
         assert not arm.following.has_ended(arm.seen, arm.seen.wall, rate)
         arm.run(2.5 + JITTER_S * rate + 1 / 64, arm.lagging(0.0))
         assert arm.following.has_ended(arm.seen, arm.seen.wall, rate)
-
-
-def test_at_a_fast_clock_the_window_is_wider():
-    arm = Arm(rate=10.0)
-    arm.run(1.0, arm.lagging(0.1))
-    _, high = arm.window
-    assert high == pytest.approx(1.0 + 10 * JITTER_S)
 
 
 @pytest.mark.parametrize(('lag', 'follows'), [(0.44, True), (0.47, False)])
@@ -252,71 +249,41 @@ def test_a_clock_that_runs_ten_times_as_fast_stands_still_meanwhile(ahead, follo
     assert (arm.run(9.0, arm.lagging(-ahead)) is None) == follows
 
 
-def test_off_its_path_for_a_moment_is_no_reason_and_for_longer_is():
+def late(t):
+    return LINE.start + LINE.share(t - 0.1)[0] * LINE.way
+
+
+def beside(off_rad, when=lambda t: t > 0.0):
+    """Return the way of an arm that lags by 0.1 s and is off its line at some times."""
+    return lambda t: late(t) + [0.0, off_rad * when(t)]
+
+
+@pytest.mark.parametrize(
+    ('where', 'until_s', 'astray_s', 'said'),
+    [
+        # A bump, and two of them, which are not added.
+        (beside(0.03, lambda t: 1.0 < t < 1.25), 2.4, None, ''),
+        (beside(0.03, lambda t: 1.0 < t < 1.2 or 1.3 < t < 1.55), 2.4, None, ''),
+        (beside(0.03, lambda t: t > 1.0), 2.4, 1.0 + ASTRAY_S, BESIDE),
+        (beside(0.95 * ON_PATH_RAD), 2.4, None, ''),
+        (beside(1.05 * ON_PATH_RAD), 2.4, ASTRAY_S, BESIDE.replace('1.7', '1.2')),
+        # An arm that stays 15 mrad short has a lag of seconds, and is near all the same.
+        (lambda t: np.minimum(late(t), [1.235, 0.0]), 6.0, None, ''),
+        (lambda t: late(min(t, 1.0)), 4.0, 1.35 + ASTRAY_S, STOPPED_ON_ITS_WAY),
+        (lambda t: LINE.start, 4.0, RULES.reaction_s + ASTRAY_S, NOT_TAKEN),
+    ],
+)
+def test_when_an_arm_is_astray(where, until_s, astray_s, said):
     arm = Arm()
+    astray = arm.run(until_s, where)
+    assert arm.said == arm.lost == said
+    assert astray is None if astray_s is None else astray_s < astray < astray_s + 0.05
 
-    def bump(t):
-        return LINE.start + LINE.share(t - 0.1)[0] * LINE.way + [0.0, 0.03 * (1.0 < t < 1.25)]
 
-    assert arm.run(1.1, bump) is None
-    assert arm.lost == 'the robot does not follow its path: 1.7 deg beside it'
-    assert arm.run(2.4, bump) is None
-    assert arm.lost == ''
-    # The bump ended; the next one counts for itself.
+def test_an_arm_is_lost_before_it_is_astray():
     arm = Arm()
-
-    def off(t):
-        return LINE.start + LINE.share(t - 0.1)[0] * LINE.way + [0.0, 0.03 * (t > 1.0)]
-
-    astray = arm.run(2.4, off)
-    assert 1.0 + ASTRAY_S < astray < 1.0 + ASTRAY_S + 0.05
-    assert arm.said == 'the robot does not follow its path: 1.7 deg beside it'
-
-
-def test_two_bumps_are_not_added():
-    arm = Arm()
-
-    def bumps(t):
-        return (
-            LINE.start
-            + LINE.share(t - 0.1)[0] * LINE.way
-            + [0.0, 0.03 * (1.0 < t < 1.2 or 1.3 < t < 1.55)]
-        )
-
-    assert arm.run(2.4, bumps) is None
-
-
-@pytest.mark.parametrize(('off', 'follows'), [(0.95, True), (1.05, False)])
-def test_how_far_beside_its_path_an_arm_follows(off, follows):
-    arm = Arm()
-
-    def beside(t):
-        return LINE.start + LINE.share(t - 0.1)[0] * LINE.way + [0.0, off * ON_PATH_RAD]
-
-    start = arm.run(0.0, lambda t: LINE.start)
-    assert start is None
-    assert (arm.run(2.4, beside) is None) == follows
-
-
-def test_at_the_ends_a_small_distance_is_no_lag():
-    """An arm that stays 15 mrad short has a lag of seconds, and is near all the same."""
-    arm = Arm()
-
-    def short(t):
-        return np.minimum(LINE.start + LINE.share(t - 0.1)[0] * LINE.way, [1.235, 0.0])
-
-    assert arm.run(6.0, short) is None
-    assert arm.lost == ''
-
-
-def test_an_arm_that_stopped_on_its_way():
-    arm = Arm()
-    astray = arm.run(4.0, lambda t: LINE.start + LINE.share(min(t, 1.0) - 0.1)[0] * LINE.way)
-    assert arm.said == STOPPED_ON_ITS_WAY
-    assert 1.35 + ASTRAY_S < astray < 1.35 + ASTRAY_S + 0.05
-
-
-def test_a_command_that_is_not_taken():
+    assert arm.run(1.1, beside(0.03, lambda t: t > 1.0)) is None
+    assert arm.lost == BESIDE
     arm = Arm()
     assert arm.run(0.44, lambda t: LINE.start) is None
     assert arm.lost == ''
@@ -325,10 +292,6 @@ def test_a_command_that_is_not_taken():
     assert high == pytest.approx(arm.following.elapsed_s(arm.seen.time) + JITTER_S)
     assert arm.run(0.49, lambda t: LINE.start) is None
     assert arm.lost == 'the arm is not seen to move yet'
-    astray = arm.run(4.0, lambda t: LINE.start)
-    reason = 'the robot does not take commands: see its controller, and its driver'
-    assert arm.said == arm.lost == reason
-    assert RULES.reaction_s + ASTRAY_S < astray < RULES.reaction_s + ASTRAY_S + 0.05
 
 
 def test_the_reaction_is_wall_time():

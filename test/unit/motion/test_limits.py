@@ -4,16 +4,9 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from supervisor_rig import LIMITS
 
 from remaster_ros.motion.limits import ACCELERATION, MotionLimits
-
-LIMITS = MotionLimits(
-    ('a', 'b'),
-    np.array([-1.0, -2.0]),
-    np.array([1.0, 2.0]),
-    np.array([0.5, 1.0]),
-    np.array([5.0, 5.0]),
-)
 
 
 class Arm(SimpleNamespace):

@@ -8,9 +8,9 @@ from gate_rig import judge
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.interpolate import CubicHermiteSpline
+from supervisor_rig import LIMITS
 
 from remaster_ros.motion import motion_gate
-from remaster_ros.motion.limits import MotionLimits
 from remaster_ros.motion.motion_gate import (
     ON_PATH_RAD,
     START_RAD,
@@ -22,13 +22,6 @@ from remaster_ros.motion.motion_gate import (
 from remaster_ros.motion.path_check import FreePath
 from remaster_ros.motion.trajectory import HEADROOM, Trajectory, Waypoint
 
-LIMITS = MotionLimits(
-    ('a', 'b'),
-    np.array([-1.0, -2.0]),
-    np.array([1.0, 2.0]),
-    np.array([0.5, 1.0]),
-    np.array([5.0, 5.0]),
-)
 ZERO = np.zeros(2)
 
 

@@ -92,8 +92,7 @@ def asks(rig):
 
 
 def measures(rig):
-    rig.plan([0.2, 0.1])
-    rig.settles()
+    rig.visit([0.2, 0.1])
     return rig
 
 

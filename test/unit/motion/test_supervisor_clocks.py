@@ -129,8 +129,7 @@ def test_messages_that_are_doubled_reordered_lost_or_late(what):
         return actions
 
     rig.supervisor.report = deliver
-    rig.plan([0.9, -1.9], [-0.5, 1.0])
-    rig.settles()
+    rig.visit([0.9, -1.9], [-0.5, 1.0])
     rig.answer(0)
     rig.settles(2)
     assert not rig.said(Stop, Failed, Halted), rig.supervisor.halted
@@ -144,8 +143,7 @@ def test_messages_that_are_doubled_reordered_lost_or_late(what):
 def test_a_constant_difference_of_the_clocks_does_not_disturb(offset):
     rig = Rig(begun=False)
     rig.stamp_shift = offset
-    rig.plan([0.9, -1.9], [-0.5, 1.0])
-    rig.settles()
+    rig.visit([0.9, -1.9], [-0.5, 1.0])
     rig.answer(0)
     rig.run(1.0)
     rig.pause()
@@ -160,8 +158,7 @@ def test_a_fast_simulated_clock(rate):
     """Nobody is silent, nothing late; a stop keeps to the line; the reaction is wall time."""
     rig = Rig(begun=False, rate=rate)
     rig.run(20.0)
-    rig.plan([0.9, -1.9], [-0.5, 1.0])
-    rig.settles()
+    rig.visit([0.9, -1.9], [-0.5, 1.0])
     rig.answer(0)
     line = rig.last(Drive).admitted.trajectory.lines[0]
     rig.run(1.0)
@@ -198,8 +195,7 @@ def test_with_a_fast_clock_a_command_has_its_time_to_be_seen():
 def test_how_long_an_arm_may_be_unobserved_is_wall_time_too():
     """One second of it, and ten of the clock's: shorter than a heartbeat."""
     rig = Rig(rate=10.0)
-    rig.plan([0.3, 0.1])
-    rig.settles()
+    rig.visit([0.3, 0.1])
     rig.alive.discard('robot')
     rig.run(10.0)
     rig.alive.add('robot')

@@ -40,8 +40,7 @@ def test_failures_are_counted_anew_in_another_run(rig, pauses):
 @pytest.mark.parametrize('bad', [[9.0, 9.0], [np.nan, 0.0]])
 def test_a_planner_whose_configurations_are_all_refused_is_not_followed_to_its_end(rig, bad):
     """A collection of which nothing is commanded would be complete in seconds."""
-    rig.plan(*[bad] * 11, [0.3, 0.1], *[bad] * 13)
-    rig.settles()
+    rig.visit(*[bad] * 11, [0.3, 0.1], *[bad] * 13)
     assert [f.solution for f in rig.said(Failed)] == list(range(11))
     rig.answer(11)
     rig.halts(1.0)
@@ -85,8 +84,7 @@ def test_the_first_configurations_of_all_may_fail_as_often_as_others():
 
 def test_a_configuration_that_is_reached_ends_the_row_of_failures(rig):
     rig.alter = restless(rig, {0, 1, 3, 4})
-    rig.plan(*([0.1 * i, 0.3] for i in range(6)))
-    rig.settles()
+    rig.visit(*([0.1 * i, 0.3] for i in range(6)))
     rig.answer(2)
     rig.settles(2)
     assert [f.solution for f in rig.said(Failed)] == [0, 1, 3, 4]
@@ -145,8 +143,7 @@ def test_what_was_never_right_holds_a_collection(rig, name):
 
 
 def test_a_rival_always_halts_a_collection_and_otherwise_holds_it(rig):
-    rig.state = 'idle'
-    rig.run(1.0)
+    rig.collects_nothing()
     rig.do(rig.supervisor.observe('rivals', 'another publisher', rig.wall))
     assert not rig.said(Halted)
     assert rig.supervisor.blocked(rig.wall) == 'planner is idle'

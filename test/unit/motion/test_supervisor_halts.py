@@ -73,8 +73,7 @@ def test_the_robots_own_signal_of_an_emergency_stop(rig):
 @pytest.mark.parametrize('state', ['idle', 'running'])
 def test_an_emergency_stop_while_the_arm_stands_halts_too(rig, state):
     """In a measurement, or between two of them, or before the first."""
-    rig.plan([0.3, 0.0])
-    rig.settles()
+    rig.visit([0.3, 0.0])
     rig.state = state
     rig.run(1.0)
     rig.do(rig.supervisor.emergency(True, rig.wall))
@@ -126,8 +125,7 @@ def test_a_silent_robot(rig, when):
 
 
 def test_a_robot_that_is_silent_while_nothing_is_collected_is_waited_for(rig):
-    rig.state = 'idle'
-    rig.run(1.0)
+    rig.collects_nothing()
     rig.alive.discard('robot')
     rig.run(20.0)
     assert not rig.said(Halted)
@@ -135,8 +133,7 @@ def test_a_robot_that_is_silent_while_nothing_is_collected_is_waited_for(rig):
     rig.alive.add('robot')
     rig.state = 'running'
     rig.run(1.0)
-    rig.plan([0.3, 0.0])
-    rig.settles()
+    rig.visit([0.3, 0.0])
 
 
 @pytest.mark.parametrize('stop', ['paused', 'plan'])

@@ -42,8 +42,7 @@ def test_an_answer_to_another_pose_counts_nothing(rig):
 
 
 def test_the_way_to_the_next_solution_goes_through_its_own_waypoints(rig):
-    rig.plan([0.3, 0.0], [0.4, 0.0], waypoints={1: np.array([[0.2, 0.4], [0.3, 0.4]])})
-    rig.settles()
+    rig.visit([0.3, 0.0], [0.4, 0.0], waypoints={1: np.array([[0.2, 0.4], [0.3, 0.4]])})
     rig.answer(0)
     first, second = rig.said(CheckPath)
     assert first.waypoints.shape == (0, 2)

@@ -52,8 +52,7 @@ def test_a_jump_by_a_whole_turn_for_good(rig, when):
         rig.settles()
     if when == 'idle':
         rig.answer(0)
-        rig.state = 'idle'
-        rig.run(1.0)
+        rig.collects_nothing()
     rig.alter = lambda t, q: np.add(q, [2 * np.pi, 0.0])
     commands = len(rig.commands)
     rig.halts(2.0)
@@ -63,11 +62,9 @@ def test_a_jump_by_a_whole_turn_for_good(rig, when):
 
 
 def test_a_jump_faster_than_any_arm_halts_though_nothing_is_collected(rig):
-    rig.plan([-0.9, 0.2])
-    rig.settles()
+    rig.visit([-0.9, 0.2])
     rig.answer(0)
-    rig.state = 'idle'
-    rig.run(1.0)
+    rig.collects_nothing()
     rig.alter = lambda t, q: np.add(q, [1.8, 0.0])
     rig.halts(0.7)
     assert 'joint 1 is reported 103.1 deg away after 0.5' in rig.supervisor.halted
@@ -84,8 +81,7 @@ def test_an_arm_that_was_never_seen_inside_its_limits_is_waited_for():
 
 def test_after_how_long_doubts_halt(rig):
     """At half a second they do not yet."""
-    rig.state = 'idle'
-    rig.run(1.0)
+    rig.collects_nothing()
     rig.alive.discard('robot')
     wall = np.ceil(rig.wall)
     for passed in (0.0, 0.25, 0.5):
@@ -132,8 +128,7 @@ def test_reports_that_cannot_be_read(rig):
 
 
 def test_reports_that_cannot_be_read_while_idle_only_hold(rig):
-    rig.state = 'idle'
-    rig.run(1.0)
+    rig.collects_nothing()
     rig.alive.discard('robot')
     for _ in range(50):
         rig.step()
@@ -144,8 +139,7 @@ def test_reports_that_cannot_be_read_while_idle_only_hold(rig):
     rig.alive.add('robot')
     rig.run(1.0)
     assert rig.supervisor.trouble == ''
-    rig.plan([0.3, 0.0])
-    rig.settles()
+    rig.visit([0.3, 0.0])
 
 
 def test_stamps_that_stand_still(rig):
@@ -176,15 +170,13 @@ def test_stamps_that_jump(rig, jump, after):
 
 
 def test_while_nothing_is_collected_a_clock_may_be_set(rig):
-    rig.state = 'idle'
-    rig.run(1.0)
+    rig.collects_nothing()
     rig.stamp_shift = -3600.0
     rig.run(3.0)
     assert not rig.said(Halted)
     rig.state = 'running'
     rig.run(1.0)
-    rig.plan([0.3, 0.0])
-    rig.settles()
+    rig.visit([0.3, 0.0])
 
 
 def test_a_recorder_that_answers_nothing_does_not_count_with_failures_of_the_arm(rig):
@@ -203,8 +195,7 @@ def test_before_a_planner_is_there_a_clock_may_be_set():
     rig.run(3.0)
     assert rig.supervisor.trouble == ''
     rig.alive.add('planner')
-    rig.plan([0.3, 0.0])
-    rig.settles()
+    rig.visit([0.3, 0.0])
 
 
 def test_a_halt_that_was_cleared_before_the_planner_came_waits_for_a_person():

@@ -46,8 +46,7 @@ def scene(kinds, halted=''):
 
 @scene('Drive Settled Drive Settled')
 def settles(rig):
-    rig.plan([0.5, 0.5], [-0.9, 1.0])
-    rig.settles()
+    rig.visit([0.5, 0.5], [-0.9, 1.0])
     rig.answer(0)
     rig.settles(2)
 
@@ -68,8 +67,7 @@ def is_stopped_and_goes_on(rig):
     rig.state = 'paused'
     rig.run(3.0)
     rig.state = 'running'
-    rig.plan([0.9, -1.9])
-    rig.settles()
+    rig.visit([0.9, -1.9])
 
 
 @scene('Drive Halted', STOPPED)
@@ -168,8 +166,7 @@ def stands_just_near_enough(rig):
 
 @scene('Drive Settled Halted', 'the arm was moved by 1.[12] deg, and not by a command')
 def is_moved_while_measured(rig):
-    rig.plan([0.3, 0.0])
-    rig.settles()
+    rig.visit([0.3, 0.0])
     begun = rig.t
     rig.alter = lambda t, q: np.add(q, [min(0.05 * (t - begun), 0.1), -0.06 * (t - begun)])
     rig.run(3.0)
@@ -177,8 +174,7 @@ def is_moved_while_measured(rig):
 
 @scene('Drive Settled')
 def is_touched_while_measured(rig):
-    rig.plan([0.3, 0.0])
-    rig.settles()
+    rig.visit([0.3, 0.0])
     rig.alter = lambda t, q: np.add(q, [0.015, 0.0])
     rig.run(5.0)
 
@@ -228,8 +224,7 @@ def is_elsewhere_when_its_halt_is_cleared(rig):
     rig.run(1.0)
     rig.told = re.sub(r' -?\d.*? (deg|mm)', '', rig.supervisor.clear_halt())
     rig.collect()
-    rig.plan([0.5, 0.5])
-    rig.settles()
+    rig.visit([0.5, 0.5])
 
 
 @scene('Halted Drive Drive Drive Drive Settled')
@@ -243,8 +238,7 @@ def leaves_a_contact(rig):
     rig.run(5.0)
     rig.answer_path = rig._free
     rig.collect()
-    rig.plan([0.5, 0.5])
-    rig.settles()
+    rig.visit([0.5, 0.5])
 
 
 @scene('Drive Stop Drive Drive Settled')
@@ -255,14 +249,12 @@ def goes_through_corners(rig):
     rig.state = 'paused'
     rig.run(3.0)
     rig.state = 'running'
-    rig.plan([0.9, 1.5], waypoints=corners)
-    rig.settles()
+    rig.visit([0.9, 1.5], waypoints=corners)
 
 
 @scene('Failed Failed Drive Settled')
 def is_asked_for_what_is_outside(rig):
-    rig.plan([0.5, 2.1], [1.3, 0.5], [0.2, 0.2])
-    rig.settles()
+    rig.visit([0.5, 2.1], [1.3, 0.5], [0.2, 0.2])
 
 
 @scene('Halted', ASKED + 'b at 11.63 deg, +0.17 deg from there; compare *')

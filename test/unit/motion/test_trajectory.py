@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 from scipy.interpolate import CubicHermiteSpline
+from supervisor_rig import LIMITS
 
 from remaster_ros.motion.limits import MotionLimits
 from remaster_ros.motion.trajectory import (
@@ -16,14 +17,6 @@ from remaster_ros.motion.trajectory import (
     Line,
     Trajectory,
     plan_trajectory,
-)
-
-LIMITS = MotionLimits(
-    ('a', 'b'),
-    np.array([-1.0, -2.0]),
-    np.array([1.0, 2.0]),
-    np.array([0.5, 1.0]),
-    np.array([5.0, 5.0]),
 )
 
 

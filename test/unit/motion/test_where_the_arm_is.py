@@ -85,8 +85,7 @@ def test_an_arm_that_stops_as_ever_goes_on(noise, sag):
     rng = np.random.default_rng([SEED, 1])
     rig = Rig(begun=False)
     rig.alter = lambda t, q: q + [sag, -sag] + rng.normal(0.0, noise, 2)
-    rig.plan([0.3, 0.3], [0.9, -1.9])
-    rig.settles()
+    rig.visit([0.3, 0.3], [0.9, -1.9])
     rig.answer(0)
     for _ in range(2):
         rig.run(5.0, lambda: rig.speed() > 0.2)
@@ -111,8 +110,7 @@ def test_who_goes_on_after_an_interruption(seconds, released, alone, place):
     if place == 'moving':
         rig.go([0.9, -1.9], 1.2)
     else:
-        rig.plan([0.3, 0.0], [0.9, -1.9])
-        rig.settles()
+        rig.visit([0.3, 0.0], [0.9, -1.9])
     rig.waiting_for = 'mocap'
     rig.run(seconds / 2)
     if released == 'lately':
