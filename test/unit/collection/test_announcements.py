@@ -16,12 +16,14 @@ from remaster_ros.collection.peers import Peers
 class Bench:
     """The planner's side, with both peers there and matched."""
 
-    def __init__(self):
+    def __init__(self, announced='7.0'):
         self.peers, self.now = Peers(()), 100.0
         self.known = Announcements(self.peers)
         self.started = {'robot_bridge': 'first', 'recorder': 'first'}
         self.bridge()
         self.recorder()
+        if announced:
+            self.announce(announced)
 
     def take(self, body):
         record = EventRecord(node=f'/{body.sender}', body=body, started=self.started[body.sender])
@@ -33,7 +35,7 @@ class Bench:
     def recorder(self, pose='', state='waiting'):
         self.take(RecorderState(waiting_for='', pose=pose, state=state))
 
-    def announce(self, stamp='7.0'):
+    def announce(self, stamp):
         self.known.announced(stamp, self.now)
 
 
@@ -61,7 +63,6 @@ def test_other_nodes_are_no_peers():
 
 def test_a_pose_that_both_know_is_not_lost():
     bench = Bench()
-    bench.announce()
     assert not bench.known.is_lost(), 'their states are still on their way'
     bench.now += ANNOUNCE_WALL_S + 1.0
     bench.bridge('7.0')
@@ -72,7 +73,6 @@ def test_a_pose_that_both_know_is_not_lost():
 @pytest.mark.parametrize('name', ['bridge', 'recorder'])
 def test_who_does_not_know_it_after_a_while_has_missed_it(name):
     bench = Bench()
-    bench.announce()
     bench.bridge('7.0')
     bench.recorder('7.0')
     getattr(bench, name)('')
@@ -85,7 +85,6 @@ def test_who_does_not_know_it_after_a_while_has_missed_it(name):
 @pytest.mark.parametrize('node', ['robot_bridge', 'recorder'])
 def test_who_was_started_after_it_has_missed_it(node):
     bench = Bench()
-    bench.announce()
     bench.bridge('7.0')
     bench.recorder('7.0')
     bench.started[node] = 'second'
@@ -98,7 +97,6 @@ def test_who_was_started_after_it_has_missed_it(node):
 
 def test_nothing_is_announced_while_the_recorder_measures():
     bench = Bench()
-    bench.announce()
     bench.now += ANNOUNCE_WALL_S + 1.0
     bench.bridge('')
     bench.recorder('7.0', state='measuring')
@@ -108,9 +106,9 @@ def test_nothing_is_announced_while_the_recorder_measures():
 
 
 def test_a_pose_that_was_taken_back_is_announced_anew():
-    bench = Bench()
+    bench = Bench(announced='')
     assert bench.known.is_lost(), 'not announced yet'
-    bench.announce()
+    bench.announce('7.0')
     bench.known.retract()
     bench.recorder('7.0', state='measuring')
     assert not bench.known.is_lost(), 'what is being measured is not left'

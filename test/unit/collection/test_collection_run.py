@@ -80,12 +80,7 @@ def test_a_run_that_lives_is_gone_on_with():
             RecorderState(waiting_for=''),
             'robot_bridge and recorder did not take part in its run',
         ),
-        (
-            ALIVE_S,
-            BridgeState(halted='lag', run='a'),
-            RECORDER,
-            'the arm is halted: lag',
-        ),
+        (ALIVE_S, BridgeState(halted='lag', run='a'), RECORDER, 'the arm is halted: lag'),
         (
             ALIVE_S,
             BRIDGE,

@@ -154,7 +154,10 @@ def test_a_reference_may_be_beside_its_place_but_not_frozen(scene):
 BODY = {'sir': MARKER, 'b': np.array([0.02, 0.09, 0.0]), 'c': np.array([0.04, -0.06, 0.05])}
 
 
-def frame_of(q, T_R_N, places=BODY):
+T_R_N = transforms.transform(np.eye(3), np.array([2.0, 0.1, 1.2]))
+
+
+def frame_of(q, places=BODY):
     """Return the readings of a body's markers at these places of the tool."""
     T_N_R = transforms.inverse(T_R_N)
     return [
@@ -169,15 +172,14 @@ def test_a_frame_whose_markers_were_exchanged_is_refused_as_a_whole(registered):
     print(f'seed {seed}')
     rng = np.random.default_rng(seed)
     true = {name: place + 0.5e-3 * rng.standard_normal(3) for name, place in BODY.items()}
-    T_R_N = transforms.transform(np.eye(3), np.array([2.0, 0.1, 1.2]))
     given = T_R_N if registered else None
     for q in poses(rng, 20):
         plausibility = Plausibility(CHAIN, BODY)
-        good = frame_of(q, T_R_N, true)
+        good = frame_of(q, true)
         assert plausibility.judge_frame(good, given) == good
         for one, other in (('sir', 'b'), ('sir', 'c'), ('b', 'c')):
             swapped = {**true, one: true[other], other: true[one]}
-            (verdict,) = plausibility.judge_frame(frame_of(q, T_R_N, swapped), given)
+            (verdict,) = plausibility.judge_frame(frame_of(q, swapped), given)
             assert isinstance(verdict, Rejection)
             assert verdict.reason == 'swapped'
             assert 'mm apart' in verdict.detail
@@ -185,9 +187,8 @@ def test_a_frame_whose_markers_were_exchanged_is_refused_as_a_whole(registered):
 
 def test_a_stray_that_is_taken_for_a_further_marker_is_refused_before_any_registration():
     rng = np.random.default_rng(5)
-    T_R_N = transforms.transform(np.eye(3), np.array([2.0, 0.1, 1.2]))
     (q,) = poses(rng, 1)
-    readings = frame_of(q, T_R_N)
+    readings = frame_of(q)
     readings[2] = replace(readings[2], position=readings[2].position + (0.0, 0.008, 0.0))
     (verdict,) = Plausibility(CHAIN, BODY).judge_frame(readings, None)
     assert verdict.reason == 'swapped'
@@ -196,10 +197,9 @@ def test_a_stray_that_is_taken_for_a_further_marker_is_refused_before_any_regist
 def test_every_marker_of_a_frame_has_a_last_reading_of_its_own():
     """A sensor that repeats a frame is frozen; two markers of one frame are not compared."""
     rng = np.random.default_rng(6)
-    T_R_N = transforms.transform(np.eye(3), np.array([2.0, 0.1, 1.2]))
     first, second = poses(rng, 2)
     plausibility = Plausibility(CHAIN, BODY)
-    readings = frame_of(first, T_R_N)
+    readings = frame_of(first)
     assert plausibility.judge_frame(readings, T_R_N) == readings
     again = [replace(one, q=second) for one in readings]
     assert [item.reason for item in plausibility.judge_frame(again, None)] == ['frozen'] * 3

@@ -64,10 +64,16 @@ class Bench:
         return known
 
 
-def test_a_settled_configuration_is_read_and_reported():
-    bench = Bench()
+def begun(*rules, at=Q, **options):
+    """Return a bench whose arm has settled at a solution of the pose."""
+    bench = Bench(*rules, **options)
     bench.announce()
-    assert bench.settle(OTHER)
+    assert bench.settle(at)
+    return bench
+
+
+def test_a_settled_configuration_is_read_and_reported():
+    bench = begun(at=OTHER)
     settled_s = bench.t
     (ended,) = bench.stand(OTHER, 1.0, T_R_N={'mocap': np.eye(4)})
     assert (ended.result, ended.why) == ('recorded', '')
@@ -94,9 +100,7 @@ def test_a_reference_may_lie_anywhere():
 
 
 def test_where_the_arm_comes_from_is_known_until_it_is_stopped():
-    bench = Bench()
-    bench.announce()
-    bench.settle(Q)
+    bench = begun()
     bench.stand(Q, 1.0)
     bench.settle(OTHER)
     (ended,) = bench.stand(OTHER, 1.0)
@@ -161,9 +165,7 @@ def test_the_event_and_the_solutions_belong_together():
 
 
 def test_one_after_the_other():
-    bench = Bench()
-    bench.announce()
-    bench.settle(Q)
+    bench = begun()
     assert bench.recording.take_settled(bench.t + 0.6, OTHER)
     assert bench.recording.next() is None, 'a reading is under way'
     assert not bench.recording.is_idle
@@ -184,9 +186,7 @@ def test_one_after_the_other():
     ],
 )
 def test_what_is_recorded_in_part_or_not_at_all(require, sensors, refused, result, reasons):
-    bench = Bench(BAR, TRACKER, require=require, refused=refused)
-    bench.announce()
-    bench.settle(Q)
+    bench = begun(BAR, TRACKER, require=require, refused=refused)
     (ended,) = bench.stand(Q, 1.0, sensors)
     assert ended.result == result
     assert sorted(item.reason for item in ended.rejected) == reasons
@@ -194,9 +194,7 @@ def test_what_is_recorded_in_part_or_not_at_all(require, sensors, refused, resul
 
 
 def test_a_sensor_that_is_silent_is_given_up():
-    bench = Bench()
-    bench.announce()
-    bench.settle(Q)
+    bench = begun()
     bench.stand(Q, 4.0, sensors=())
     bench.recording.give_up((), {})
     ended = bench.recording.end({})
@@ -205,9 +203,7 @@ def test_a_sensor_that_is_silent_is_given_up():
 
 
 def test_a_required_sensor_that_is_absent_is_waited_for():
-    bench = Bench()
-    bench.announce()
-    bench.settle(Q)
+    bench = begun()
     for _ in range(8):
         bench.stand(Q, 1.0, sensors=())
         bench.recording.give_up(('mocap',), {})
@@ -267,9 +263,7 @@ def test_markers_of_a_frame_end_together_and_one_that_is_none_costs_no_other():
         ('b', 2, 'recorded'),
         ('mocap', 0, 'rejected'),
     ):
-        bench = Bench(rules, refused=refused)
-        bench.announce()
-        bench.settle(Q)
+        bench = begun(rules, refused=refused)
         ended = []
         for i in range(40):
             bench.t += 0.02

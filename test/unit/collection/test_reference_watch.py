@@ -89,6 +89,12 @@ class Scene:
         return replay(ReferenceWatch(CHAIN, MARKERS), self.readings, self.others, registered)
 
 
+def scenes(**options):
+    for seed in range(5):
+        print(f'seed {seed}')
+        yield Scene(seed, **options)
+
+
 def unit(rng):
     vector = rng.normal(size=3)
     return vector / np.linalg.norm(vector)
@@ -124,15 +130,9 @@ MIDDLE = CHAIN.forward(REFERENCES)[:, :3, 3].mean(axis=0)
 @pytest.mark.parametrize('size_m', [1e-3, 2e-3, 5e-3, 10e-3, 20e-3])
 @pytest.mark.parametrize('name', CELL.sensors)
 def test_a_bump_of_a_sensor(name, size_m):
-    for seed in range(5):
-        print(f'seed {seed}')
-        scene = Scene(seed)
-        shift = size_m * unit(scene.rng)
-
-        def bump(scene=scene, shift=shift):
-            scene.moved[name] = move(np.eye(4), shift, np.zeros(3), MIDDLE)
-
-        found = changed(scene, bump)
+    for scene in scenes():
+        T = move(np.eye(4), size_m * unit(scene.rng), np.zeros(3), MIDDLE)
+        found = changed(scene, scene.moved.update, {name: T})
         assert (found.kind, found.subject) == ('sensor', f'{name} was moved')
         assert found.size_m == pytest.approx(size_m, rel=0.02, abs=1.5e-4)
 
@@ -140,9 +140,7 @@ def test_a_bump_of_a_sensor(name, size_m):
 @pytest.mark.parametrize('name', CELL.sensors)
 def test_a_turn_of_a_sensor_about_itself(name):
     """By 0.05 degrees, which is 1.6 mm at the arm."""
-    for seed in range(5):
-        print(f'seed {seed}')
-        scene = Scene(seed)
+    for scene in scenes():
         turn = np.deg2rad(0.05) * unit(scene.rng)
         about = scene.true[name][:3, 3]
         # A turn about the line of sight is a turn alone.
@@ -152,9 +150,7 @@ def test_a_turn_of_a_sensor_about_itself(name):
 
 
 def test_a_turn_of_the_base():
-    for seed in range(5):
-        print(f'seed {seed}')
-        scene = Scene(seed)
+    for scene in scenes():
         turn = np.deg2rad(0.05) * unit(scene.rng)
         T = move(np.eye(4), 5e-4 * unit(scene.rng), turn, np.zeros(3))
         found = changed(scene, scene.moved.update, dict.fromkeys(scene.moved, T))
@@ -164,9 +160,7 @@ def test_a_turn_of_the_base():
 
 @pytest.mark.parametrize('name', MARKERS)
 def test_a_slipped_marker(name):
-    for seed in range(5):
-        print(f'seed {seed}')
-        scene = Scene(seed)
+    for scene in scenes():
         slip = 5e-4 * unit(scene.rng)
         place = scene.markers[name] + slip
         found = changed(scene, scene.markers.update, {name: place})
@@ -184,9 +178,7 @@ def test_a_slipped_encoder(joint):
     within the noise of one reading. Those slip by 0.1 degrees.
     """
     slip = np.deg2rad(0.03 if joint < 4 else 0.1)
-    for seed in range(5):
-        print(f'seed {seed}')
-        scene = Scene(seed)
+    for scene in scenes():
         found = changed(scene, scene.slip.__setitem__, joint, slip)
         name = f'the encoder of {CHAIN.joint_names[joint]} slipped'
         assert name == found.subject or name in found.look_alikes
@@ -195,9 +187,7 @@ def test_a_slipped_encoder(joint):
 
 
 def test_one_sensor_alone_cannot_tell_its_move_from_that_of_the_base():
-    for seed in range(5):
-        print(f'seed {seed}')
-        scene = Scene(seed, only=('tracker',))
+    for scene in scenes(only=('tracker',)):
         T = move(np.eye(4), 1e-3 * unit(scene.rng), np.zeros(3), MIDDLE)
         found = changed(scene, scene.moved.update, {'tracker': T})
         assert (found.kind, found.subject) == ('sensor', 'tracker or the base was moved')
@@ -205,9 +195,7 @@ def test_one_sensor_alone_cannot_tell_its_move_from_that_of_the_base():
 
 def test_a_drift_is_told_from_a_bump():
     """0.15 mm in each 25 configurations: it says so as soon as it can be told."""
-    for seed in range(5):
-        print(f'seed {seed}')
-        scene = Scene(seed)
+    for scene in scenes():
         way = 1.5e-4 * unit(scene.rng)
 
         def drift(scene=scene, way=way):
@@ -250,9 +238,7 @@ def test_what_does_not_repeat_from_the_first_is_said():
 
 
 def test_two_changes_at_once_are_called_unexplained():
-    for seed in range(5):
-        print(f'seed {seed}')
-        scene = Scene(seed)
+    for scene in scenes():
 
         def both(scene=scene):
             scene.markers['sir'] = scene.markers['sir'] + 2e-3 * unit(scene.rng)

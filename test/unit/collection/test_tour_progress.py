@@ -118,8 +118,10 @@ class Bench:
 def bench(tmp_path):
     made = []
 
-    def make(**options):
+    def make(registered=True, **options):
         made.append(Bench(tmp_path / 'session', **options))
+        if registered:
+            made[-1].register()
         return made[-1]
 
     yield make
@@ -128,7 +130,7 @@ def bench(tmp_path):
 
 
 def test_the_registration_comes_first_then_the_collection_to_its_end(bench):
-    b = bench()
+    b = bench(registered=False)
     stop = b.next()
     assert (stop.split, stop.pose, b.progress.phase) == (REGISTRATION, -1, REGISTRATION)
     b.visit(stop)
@@ -151,7 +153,6 @@ def test_the_registration_comes_first_then_the_collection_to_its_end(bench):
 
 def test_a_pose_is_in_the_journal_before_it_is_returned(bench):
     b = bench()
-    b.register()
     stop = b.next()
     b.restart()
     assert b.progress.open_pose.ids == stop.ids
@@ -161,7 +162,7 @@ def test_a_pose_is_in_the_journal_before_it_is_returned(bench):
 
 def test_nothing_is_planned_on_while_a_registration_is_on_its_way(bench):
     """The recorder has reported it; its transforms come on a topic of their own."""
-    b = bench()
+    b = bench(registered=False)
     stop = b.next()
     assert b.end(stop, stop.ids[0], registered=True)
     assert b.next() is None
@@ -170,7 +171,7 @@ def test_nothing_is_planned_on_while_a_registration_is_on_its_way(bench):
 
 
 def test_poses_that_register_nothing_are_an_error_with_the_reason(bench):
-    b = bench()
+    b = bench(registered=False)
     for _ in range(2):
         b.visit(b.next())
     with pytest.raises(InsufficientDataError, match=r'mocap after 2 poses \(point 2 of 3\)'):
@@ -179,14 +180,12 @@ def test_poses_that_register_nothing_are_an_error_with_the_reason(bench):
 
 def test_one_of_the_sensors_may_be_enough(bench):
     b = bench()
-    b.register()
     assert b.next(RequiredSensors(['mocap', 'tracker'], 'any')).split == 'optimization'
 
 
 def test_what_is_no_solution_of_the_open_pose_changes_nothing(bench):
     b = bench()
     assert not b.follow()
-    b.register()
     stop = b.next()
     b.end(stop, 7)
     assert not b.end(stop, stop.ids[0], plan='another')
@@ -197,7 +196,6 @@ def test_what_is_no_solution_of_the_open_pose_changes_nothing(bench):
 
 def test_what_no_way_leads_to_is_open_until_the_recorder_has_written_it_down(bench):
     b = bench()
-    b.register()
     b.next()
     tour = b.journal.tour
     stop = tour.along(tour.propose(Q), (), (), (0, 1))
@@ -211,7 +209,6 @@ def test_what_no_way_leads_to_is_open_until_the_recorder_has_written_it_down(ben
 
 def test_what_is_left_of_a_pose_is_reached_from_where_the_arm_stands(bench):
     b = bench()
-    b.register()
     stop = b.next()
     b.end(stop, stop.ids[0], 'failed')
     elsewhere = Q + 0.3
@@ -227,7 +224,6 @@ def test_what_is_left_of_a_pose_is_reached_from_where_the_arm_stands(bench):
 )
 def test_the_session_of_another_plan_is_refused(bench, plan, observations, refused):
     b = bench()
-    b.register()
     b.next()
     recorder = RecorderState(
         waiting_for='', plan=plan, observations=observations, session='their session'
@@ -241,7 +237,6 @@ def test_the_session_of_another_plan_is_refused(bench, plan, observations, refus
 
 def test_an_arm_that_stands_too_near_is_not_planned_for(bench):
     b = bench()
-    b.register()
     b.tours.standing = 'tool and floor'
     assert b.next() is None
     assert b.progress.standing == 'the arm stands too near to something: tool and floor'
@@ -252,7 +247,6 @@ def test_an_arm_that_stands_too_near_is_not_planned_for(bench):
 
 def test_the_last_reference_of_a_round_is_known(bench):
     b = bench(references=2)
-    b.register()
     last = []
     for _ in range(4):
         stop = b.next()
@@ -267,7 +261,6 @@ def test_the_last_reference_of_a_round_is_known(bench):
 
 def test_once_enough_is_known_the_rest_is_what_is_held_out_and_the_references(bench):
     b = bench(references=1, held_out=2)
-    b.register()
     assert b.progress.planned == 0
     while (stop := b.next()).split != 'optimization':
         b.visit(stop)
@@ -299,7 +292,6 @@ def test_once_enough_is_known_the_rest_is_what_is_held_out_and_the_references(be
 
 def test_enough_at_the_last_pose_changes_nothing(bench):
     b = bench()
-    b.register()
     for _ in range(2):
         b.visit(b.next())
     b.progress.enough = True
@@ -310,7 +302,6 @@ def test_enough_at_the_last_pose_changes_nothing(bench):
 
 def test_what_is_measured_further_follows_a_complete_collection_also_after_a_restart(bench):
     b = bench(references=2)
-    b.register()
     while (stop := b.next()) is not None:
         b.visit(stop)
     assert b.progress.is_complete
@@ -355,7 +346,7 @@ def test_what_is_measured_further_follows_a_complete_collection_also_after_a_res
 
 
 def test_poses_to_judge_by_need_no_registration_and_keep_their_state_over_a_restart(bench):
-    b = bench()
+    b = bench(registered=False)
     plan = plan_of(9, 2, 1)
     visits = [replace(p, correction=state) for p in plan.poses for state in ('off', 'on')]
     plans = {'optimization': Plan(()), 'validation': Plan(tuple(visits))}
