@@ -6,12 +6,7 @@ import pytest
 from worlds.robot_descriptions import ROBOTS, Joint, arm, document, link, xarm7
 
 from remaster_ros.errors import InputError
-from remaster_ros.kinematics.arm_ends import (
-    likely_base,
-    likely_tip,
-    likely_tips,
-    moving_before,
-)
+from remaster_ros.kinematics.arm_ends import likely_base, likely_tip, likely_tips, moving_before
 from remaster_ros.kinematics.urdf import parse_urdf
 
 
@@ -135,11 +130,7 @@ def test_an_arm_that_slides_in_its_midst_goes_on_behind_it():
 
 
 def test_a_rail_is_of_the_arm_where_what_it_carries_is_none_or_a_base_says_so():
-    gantry = (
-        ('x', 'hall', 'a', 'prismatic'),
-        ('y', 'a', 'b', 'prismatic'),
-        ('c', 'b', 'tool0'),
-    )
+    gantry = (('x', 'hall', 'a', 'prismatic'), ('y', 'a', 'b', 'prismatic'), ('c', 'b', 'tool0'))
     assert likely_base(tree(*gantry)) == 'hall'
     assert likely_tips(tree(*gantry), 'hall') == ['tool0']
     on_rail = tree(('rail', 'hall', 'l0', 'prismatic'), *FIVE)

@@ -44,7 +44,7 @@ def test_sweeps_agree_with_the_finest_sampling(lwr, seed):
         obstacle('pole', [-0.4, 0.3, 0.5], [0.05, 0.05, 1.0]),
     ]
     model = capsules(lwr, 0.06, *things)
-    q = rng.uniform(lwr.lower, lwr.upper, (80, 7))
+    q = rng.uniform(lwr.lower, lwr.upper, (50, 7))
     q = q[model.free_mask(q)]
     outcomes = []
     for start, goal in zip(q[::2], q[1::2]):

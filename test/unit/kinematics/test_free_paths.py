@@ -1,27 +1,22 @@
 """Free paths around what is in the way, and ways out of margins and contacts."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
+from collision_scene import capsules
 from worlds.arms import planar_arm
 
 from remaster_ros.kinematics.bodies import Body, cylinder, obstacle, sphere
 from remaster_ros.kinematics.body_pairs import RESERVE_M
 from remaster_ros.kinematics.collision import CollisionModel, arm_bodies
 from remaster_ros.kinematics.free_paths import free_path, way_out
-from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.transforms import transform
-
-ROBOTS = Path(__file__).parents[3] / 'config' / 'robots'
 
 
 @pytest.fixture(scope='module')
-def lwr():
-    chain = SerialChain.from_urdf((ROBOTS / 'lwr4plus.urdf').read_text(encoding='utf-8'))
+def lwr(lwr):
     wall = obstacle('wall', [0.0, 0.6, 0.5], [0.05, 0.5, 1.0])
     table = obstacle('table', [0.6, 0.0, 0.2], [0.3, 0.3, 0.4])
-    return CollisionModel(chain, [*arm_bodies(chain, [], 0.075), wall, table])
+    return capsules(lwr, 0.075, wall, table)
 
 
 def test_a_free_way_is_straight(lwr):

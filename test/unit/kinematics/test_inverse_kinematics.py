@@ -19,11 +19,7 @@ from remaster_ros.kinematics.inverse_kinematics import (
 )
 from remaster_ros.kinematics.inverse_kinematics import distinct as distinct_rows
 from remaster_ros.kinematics.serial_chain import SerialChain
-from remaster_ros.kinematics.transforms import (
-    inverse,
-    matrix_to_rotation_vector,
-    transform,
-)
+from remaster_ros.kinematics.transforms import inverse, matrix_to_rotation_vector, transform
 
 
 def usable(ik: InverseKinematics, T: np.ndarray) -> np.ndarray:

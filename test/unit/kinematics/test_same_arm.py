@@ -80,10 +80,7 @@ J = CHAIN.joint_names
         ),
         (changed('xyz', J[3], '0 0 0.2035'), f'the axis of {J[3]} lies 5.0 mm elsewhere'),
         # The zero of the last joint.
-        (
-            changed('xyz', J[6], r'\1" rpy="0 0 0.01'),
-            'tool lies elsewhere',
-        ),
+        (changed('xyz', J[6], r'\1" rpy="0 0 0.01'), 'tool lies elsewhere'),
         (
             TEXT.replace('<axis xyz="0 0 1"', '<axis xyz="0 0 -1"', 1),
             f'the axis of {J[0]} is turned',

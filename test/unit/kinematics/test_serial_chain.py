@@ -154,6 +154,14 @@ def arm(joint='', limit='<limit lower="-1" upper="1" velocity="1"/>', kind='revo
         {more}</robot>"""
 
 
+def fixed(name, parent, child, link=''):
+    """Return a fixed joint, behind its child where that is new."""
+    return (
+        f'{link}<joint name="{name}" type="fixed"><parent link="{parent}"/>'
+        f'<child link="{child}"/></joint>'
+    )
+
+
 def test_a_robot_without_masses_says_so():
     chain = SerialChain.from_urdf(arm())
     assert not chain.has_inertials
@@ -178,6 +186,8 @@ def test_a_fixed_joint_has_no_axis_and_an_expanded_xacro_may_say_where_it_is_fro
     assert SerialChain.from_urdf(text).tip_link == 'flange'
 
 
+LOOP = '<link name="b"/><link name="c"/>' + fixed('j', 'b', 'c') + fixed('k', 'c', 'b')
+HEAVY = '<link name="x"><inertial><mass value="-1"/></inertial></link>'
 BAD = {
     'prismatic': (arm(kind='prismatic'), "'joint_1' is prismatic"),
     'planar': (arm(kind='planar'), "'joint_1' is planar"),
@@ -211,63 +221,33 @@ BAD = {
     'empty': ('', 'not well-formed XML'),
     'other XML': ('<sdf/>', 'outermost element is <sdf>'),
     'doctype': ('<!DOCTYPE robot [<!ENTITY a "b">]>' + arm(), 'declares a DOCTYPE'),
-    'missing child': (
-        arm(more='<joint name="j" type="fixed"><parent link="tool"/><child link="x"/></joint>'),
-        "joint 'j' names link 'x'",
-    ),
+    'missing child': (arm(more=fixed('j', 'tool', 'x')), "joint 'j' names link 'x'"),
     'no parent': (arm(more='<joint name="j" type="fixed"/>'), "joint 'j' has no <parent>"),
     'no type': (
         arm(more='<joint name="j"><parent link="tool"/><child link="link_1"/></joint>'),
         "joint 'j' has no attribute 'type'",
     ),
     'two parents': (
-        arm(
-            more='<joint name="j" type="fixed"><parent link="tool"/><child link="link_1"/></joint>'
-        ),
+        arm(more=fixed('j', 'tool', 'link_1')),
         "link 'link_1' hangs on two joints, 'joint_1' and 'j'",
     ),
-    'loop': (
-        '<robot name="r"><link name="a"/><link name="b"/><link name="c"/>'
-        '<joint name="j" type="fixed"><parent link="b"/><child link="c"/></joint>'
-        '<joint name="k" type="fixed"><parent link="c"/><child link="b"/></joint></robot>',
-        "link 'b' is part of a loop",
-    ),
-    'no root': (
-        '<robot name="r"><link name="b"/><link name="c"/>'
-        '<joint name="j" type="fixed"><parent link="b"/><child link="c"/></joint>'
-        '<joint name="k" type="fixed"><parent link="c"/><child link="b"/></joint></robot>',
-        'found none, the links form a loop',
-    ),
+    'loop': (f'<robot name="r"><link name="a"/>{LOOP}</robot>', "link 'b' is part of a loop"),
+    'no root': (f'<robot name="r">{LOOP}</robot>', 'found none, the links form a loop'),
     'two roots': (arm(more='<link name="loose"/>'), 'found base_link, loose'),
     'link twice': (arm(more='<link name="tool"/>'), "two links are named 'tool'"),
     'joint twice': (
-        arm(
-            more='<link name="x"/><joint name="joint_1" type="fixed"><parent link="tool"/>'
-            '<child link="x"/></joint>'
-        ),
+        arm(more=fixed('joint_1', 'tool', 'x', '<link name="x"/>')),
         "two joints are named 'joint_1'",
     ),
     'two ends': (
-        arm(
-            more='<link name="x"/><joint name="j" type="fixed"><parent link="link_1"/>'
-            '<child link="x"/></joint>'
-        ),
+        arm(more=fixed('j', 'link_1', 'x', '<link name="x"/>')),
         'several ends (tool, x)',
     ),
     'no mass': (
-        arm(
-            more='<link name="x"><inertial/></link><joint name="j" type="fixed">'
-            '<parent link="tool"/><child link="x"/></joint>'
-        ),
+        arm(more=fixed('j', 'tool', 'x', '<link name="x"><inertial/></link>')),
         "link 'x' has <inertial> without <mass>",
     ),
-    'negative mass': (
-        arm(
-            more='<link name="x"><inertial><mass value="-1"/></inertial></link>'
-            '<joint name="j" type="fixed"><parent link="tool"/><child link="x"/></joint>'
-        ),
-        "mass of link 'x' is -1.0 kg",
-    ),
+    'negative mass': (arm(more=fixed('j', 'tool', 'x', HEAVY)), "mass of link 'x' is -1.0 kg"),
 }
 
 

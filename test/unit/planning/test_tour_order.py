@@ -163,11 +163,16 @@ def test_every_move_of_a_tour_is_free_and_none_is_forgotten(seed):
     assert hits > 0
 
 
-def test_a_solution_behind_a_free_one_waits_and_one_that_is_shut_in_is_unreached():
-    """On a circle with two posts: the nearer solution lies behind the post, the other is free."""
+def beside_a_post():
+    """An arm that goes round in a circle, with a post at half a radian."""
     chain = planar_arm(1, limit=3.0)
     post = obstacle('post', [0.25 * np.sin(0.5), 0, 0.3 + 0.25 * np.cos(0.5)], [0.01, 0.4, 0.01])
-    model = CollisionModel(chain, [*arm_bodies(chain, [], 0.02), post], floor_z=None)
+    return chain, CollisionModel(chain, [*arm_bodies(chain, [], 0.02), post], floor_z=None)
+
+
+def test_a_solution_behind_a_free_one_waits_and_one_that_is_shut_in_is_unreached():
+    """On a circle with two posts: the nearer solution lies behind the post, the other is free."""
+    chain, model = beside_a_post()
     solutions = np.array([[1.0], [-1.5]])
     rng = np.random.default_rng(0)
     order, paths = free_order(model, np.array([0.0]), solutions, np.ones(1), rng)
@@ -339,9 +344,7 @@ def test_references_come_between_the_visits_of_a_given_order():
 
 
 def test_what_cannot_be_reached_in_a_given_order_is_not_tried_again():
-    chain = planar_arm(1, limit=3.0)
-    post = obstacle('post', [0.25 * np.sin(0.5), 0, 0.3 + 0.25 * np.cos(0.5)], [0.01, 0.4, 0.01])
-    model = CollisionModel(chain, [*arm_bodies(chain, [], 0.02), post], floor_z=None)
+    chain, model = beside_a_post()
     pose = PlannedPose(chain.forward([0.0]), np.array([[0.0], [1.0], [-0.3]]))
     order = [('optimization', 0, number) for number in range(3)]
     tour = Tour(chain, {'optimization': Plan((pose,))}, model=model, order=order)
