@@ -21,6 +21,7 @@ class MarkerWorld:
 
     def __init__(self) -> None:
         self.visible = True
+        self.faulty: dict[str, float] = {}
         self._started = time.monotonic()
 
     def now(self) -> float:
@@ -40,7 +41,7 @@ class MarkerWorld:
         return self.visible
 
     def faults(self, device: str) -> dict[str, float]:
-        return {}
+        return self.faulty
 
 
 class SteppedWorld(MarkerWorld):

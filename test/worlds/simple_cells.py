@@ -6,6 +6,18 @@ import yaml
 
 from remaster_ros.session.workcell import config_path
 
+DEMO = config_path('cells/demo.yaml').read_text(encoding='utf-8')
+
+
+def edited_cell(path: Path, *changes: tuple[str, str]) -> Path:
+    """Write the demo cell with these texts (old, new) in place of others."""
+    text = DEMO.replace('../robots', str(config_path('robots')))
+    for old, new in changes:
+        assert old in text
+        text = text.replace(old, new, 1)
+    path.write_text(text, encoding='utf-8')
+    return path
+
 
 def write_cell(path: Path, **changes) -> Path:
     """Write the demo cell with these keys changed; its URDF by an absolute path."""

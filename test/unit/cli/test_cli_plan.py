@@ -5,9 +5,9 @@ import json
 import pytest
 from rigs.command_line import refusal, remaster
 from worlds.discovery_files import discovery_content, effect, look_alike
+from worlds.simple_cells import edited_cell
 
 from remaster_ros.planning import planned_design, pose_design, tour_planner
-from remaster_ros.session.workcell import config_path
 
 
 @pytest.fixture(autouse=True)
@@ -16,14 +16,12 @@ def small(monkeypatch):
     monkeypatch.setattr(pose_design, 'EFFORT', 300)
 
 
+HYPERCUBE = '  design: latin_hypercube\n'
+
+
 def cell_with(folder, poses):
-    text = config_path('cells/demo.yaml').read_text(encoding='utf-8')
-    text = text.replace('../robots', str(config_path('robots')))
-    path = folder / 'cell.yaml'
-    if 'design:' in poses:
-        text = text.replace('  design: latin_hypercube\n', '')
-    path.write_text(text.replace('poses:\n', f'poses:\n{poses}', 1), encoding='utf-8')
-    return path
+    keys = poses if 'design:' in poses else HYPERCUBE + poses
+    return edited_cell(folder / 'cell.yaml', (HYPERCUBE, keys))
 
 
 def as_json(*args):
@@ -113,9 +111,8 @@ def test_too_few_poses_are_told_from_too_few_measurements():
 
 
 def test_a_cell_without_reachable_poses_is_one_line(tmp_path):
-    path = cell_with(tmp_path, '')
-    text = path.read_text(encoding='utf-8')
-    path.write_text(text.replace('radius_m: [0.2, 0.5]', 'radius_m: [3.0, 3.5]'), encoding='utf-8')
+    far = ('radius_m: [0.2, 0.5]', 'radius_m: [3.0, 3.5]')
+    path = edited_cell(tmp_path / 'cell.yaml', far)
     assert 'no pose is left to fit on' in refusal('plan', path, status=1)
 
 

@@ -13,21 +13,10 @@ QUICK = TrackerBehaviour(warm_up_s=0.1, initialise_s=0.1, search_failure_share=0
 NEAR_M = 0.2e-3
 
 
-class World(ReflectorWorld):
-    """With faults that are set by hand."""
-
-    def __init__(self):
-        super().__init__()
-        self.numbers = {}
-
-    def faults(self, device):
-        return self.numbers
-
-
 @pytest.fixture
 def scene():
     """Return world and driver of a tracker with two reflectors, 143 mm apart."""
-    world = World()
+    world = ReflectorWorld()
     with FakeLaserTracker(
         world, 'tracker', np.random.default_rng(3), behaviour=QUICK, further={'b': 2}
     ) as fake:
@@ -59,7 +48,7 @@ def test_one_that_is_hidden_is_not_replaced_by_the_other(scene):
     world, driver = scene
     driver.turn_to('', MARKER)
     driver.measure(MARKER)
-    world.numbers = {'hidden': 2}
+    world.faulty = {'hidden': 2}
     searches = [driver.tracker.counts['searches']]
     for _ in range(2):
         with pytest.raises(DeviceError):
@@ -70,7 +59,7 @@ def test_one_that_is_hidden_is_not_replaced_by_the_other(scene):
     # Nor is the other one taken for it afterwards, and it is found again where it is.
     driver.turn_to('', MARKER)
     assert off(driver.measure(MARKER), MARKER) < NEAR_M
-    world.numbers = {}
+    world.faulty = {}
     driver.turn_to('b', MARKER + OTHER_BESIDE)
     assert off(driver.measure(MARKER + OTHER_BESIDE), MARKER + OTHER_BESIDE) < NEAR_M
 

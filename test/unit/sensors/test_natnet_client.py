@@ -213,14 +213,10 @@ class BodyWorld(MarkerWorld):
 
     def __init__(self):
         super().__init__()
-        self.current = {}
         self.places = {'': np.zeros(3), 'b': np.array([0.1, 0, 0]), 'c': np.array([0, 0.07, 0])}
 
     def marker_in_sensor(self, sensor, t, marker=''):
         return super().marker_in_sensor(sensor, t) + self.places[marker]
-
-    def faults(self, device):
-        return self.current
 
 
 @pytest.mark.parametrize('version', [(2, 10), (3, 1), (4, 1)])
@@ -246,7 +242,7 @@ def test_all_markers_of_a_frame_are_read_and_a_hidden_one_hides_no_other(version
     with followed(samples.append, options, **how) as (_, client):
         assert names_seen() == {'', 'b', 'c'}
         for number, others in ((1, {'b', 'c'}), (4, {'', 'b'})):
-            world.current = {'hidden': number}
+            world.faulty = {'hidden': number}
             assert names_seen() == others
             assert client.diagnosis().fault == 'none', client.diagnosis()
         counts = client.further_counts()

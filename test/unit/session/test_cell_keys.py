@@ -1,11 +1,11 @@
 """Keys of a cell file: what they come to, and one clear line for each that is wrong."""
 
 import pytest
+from worlds.simple_cells import DEMO, edited_cell
 
 from remaster_ros.errors import InputError
-from remaster_ros.session.workcell import config_path, read_cell
+from remaster_ros.session.workcell import read_cell
 
-DEMO = config_path('cells/demo.yaml').read_text(encoding='utf-8')
 HYPERCUBE = '  design: latin_hypercube\n'
 TOPIC = '    topic: optitrack/marker'
 BAR, ANGLE = '    marker: sir\n', '    max_angle_deg: 60.0'
@@ -14,14 +14,7 @@ BOX = 'tool_box: {center_m: [0.4, 0, 0.5], size_m: [0.2, 0.3, 0.2]}\n'
 
 
 def cell_file(folder, *changes):
-    """Write the demo cell, with these texts (old, new) in place of others."""
-    text = DEMO.replace('../robots', str(config_path('robots')))
-    for old, new in changes:
-        assert old in text
-        text = text.replace(old, new, 1)
-    path = folder / 'cell.yaml'
-    path.write_text(text, encoding='utf-8')
-    return path
+    return edited_cell(folder / 'cell.yaml', *changes)
 
 
 def poses(keys):

@@ -47,12 +47,15 @@ class Bench:
             events += self.run(0.1)
         return events, self.t - start
 
-    def locked(self) -> Bench:
+    def initialised(self) -> Bench:
         self.run(SURE.warm_up_s + 0.2)
         self.send(Command.INITIALIZE)
         self.run_until_idle()
         self.instrument.handle(METRES)
-        self.send(Command.GO_POSITION, *self.world.path(self.t), 1)
+        return self
+
+    def locked(self) -> Bench:
+        self.initialised().send(Command.GO_POSITION, *self.world.path(self.t), 1)
         self.run_until_idle()
         assert self.instrument.locked
         return self
@@ -208,11 +211,7 @@ def find_from(offset_m: float, radius_m: float, timeout_s: float = 20.0) -> tupl
     distance = np.linalg.norm(MARKER)
     turn = np.tan(offset_m / distance) * distance
     world = ReflectorWorld(lambda t: MARKER + turn * across / np.linalg.norm(across))
-    bench = Bench(world, aim=MARKER)
-    bench.run(SURE.warm_up_s + 0.2)
-    bench.send(Command.INITIALIZE)
-    bench.run_until_idle()
-    bench.instrument.handle(METRES)
+    bench = Bench(world, aim=MARKER).initialised()
     bench.send(Command.SET_SEARCH, radius_m, round(1e3 * timeout_s))
     bench.send(Command.FIND_REFLECTOR, float(distance))
     events, took = bench.run_until_idle()
@@ -236,12 +235,7 @@ def test_search_ends_at_its_radius_and_at_its_time_out():
 
 
 def test_go_position_finds_what_the_present_aim_is_far_from():
-    world = ReflectorWorld()
-    bench = Bench(world, aim=np.array([0.0, -2.0, 0.0]))
-    bench.run(SURE.warm_up_s + 0.2)
-    bench.send(Command.INITIALIZE)
-    bench.run_until_idle()
-    bench.instrument.handle(METRES)
+    bench = Bench(aim=np.array([0.0, -2.0, 0.0])).initialised()
     bench.send(Command.FIND_REFLECTOR, 2.0)
     bench.run_until_idle()
     assert not bench.instrument.locked
@@ -254,13 +248,10 @@ def test_search_fails_now_and_then():
     """Share 0.5 of 40: outside 8 to 32 once in 10^4 seeds."""
     behaviour = TrackerBehaviour(search_failure_share=0.5)
     seed = 7
-    bench = Bench(behaviour=behaviour, seed=seed)
-    bench.run(SURE.warm_up_s + 0.2)
-    bench.send(Command.INITIALIZE)
-    bench.run_until_idle()
+    bench = Bench(behaviour=behaviour, seed=seed).initialised()
     found = 0
     for _ in range(40):
-        bench.send(Command.FIND_REFLECTOR, 2000.0)
+        bench.send(Command.FIND_REFLECTOR, 2.0)
         bench.run_until_idle()
         found += bench.instrument.locked
     assert 8 <= found <= 32, f'seed {seed}'
