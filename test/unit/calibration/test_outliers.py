@@ -56,24 +56,23 @@ def test_one_bad_row_is_named_and_its_neighbours_are_not() -> None:
     assert not any(why for row, why in enumerate(found.why) if row != 17)
 
 
-def test_two_bad_rows_of_a_pose_of_five_and_one_of_a_pair() -> None:
-    rows = rows_of(40, 5)
-    errors = errors_of(rows, 2)
-    errors[[20, 22]] += [[0.02, 0, 0], [0, -0.03, 0]]
-    assert np.flatnonzero(find(rows, errors).gross).tolist() == [20, 22]
-    pairs = rows_of(100, 2)
-    errors = errors_of(pairs, 3)
-    errors[31] += [0.0, 0.0, 0.02]
-    assert np.flatnonzero(find(pairs, errors).gross).tolist() == [31]
-
-
-def test_a_pose_that_is_off_as_a_whole() -> None:
-    rows = rows_of(40, 4)
-    errors = errors_of(rows, 4)
-    errors[8:12] += [0.0, 0.02, 0.0]
+@pytest.mark.parametrize(
+    ('poses', 'solutions', 'seed', 'off'),
+    [
+        (40, 5, 2, {20: [0.02, 0.0, 0.0], 22: [0.0, -0.03, 0.0]}),
+        (100, 2, 3, {31: [0.0, 0.0, 0.02]}),
+        (40, 4, 4, {row: [0.0, 0.02, 0.0] for row in range(8, 12)}),
+    ],
+    ids=['two of a pose of five', 'one of a pair', 'a whole pose'],
+)
+def test_bad_rows_of_a_pose_are_named_and_no_other(poses, solutions, seed, off) -> None:
+    rows = rows_of(poses, solutions)
+    errors = errors_of(rows, seed)
+    for row, error in off.items():
+        errors[row] += error
     found = find(rows, errors)
-    assert np.flatnonzero(found.gross).tolist() == [8, 9, 10, 11]
-    assert 'residual' in found.why[8]
+    assert np.flatnonzero(found.gross).tolist() == list(off)
+    assert all('residual' in found.why[row] for row in off)
 
 
 def test_good_rows_are_left_alone() -> None:

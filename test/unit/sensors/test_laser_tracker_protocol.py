@@ -29,19 +29,10 @@ from remaster_ros.sensors.laser_tracker.packets import (
 )
 
 RESULT = Measurement(
-    0,
-    0,
-    0,
-    values=(1.0, 2.0, 3.0),
-    std=(1e-6, 2e-6, 3e-6),
-    std_total=4e-6,
-    pointing_error=(0.1, 0.2, 0.3),
-    a_priori_std=(5e-6, 6e-6, 7e-6),
-    a_priori_std_total=8e-6,
-    temperature=20.5,
-    pressure=1013.0,
-    humidity=42.0,
-)
+    0, 0, 0, values=(1.0, 2.0, 3.0), std=(1e-6, 2e-6, 3e-6), std_total=4e-6,
+    pointing_error=(0.1, 0.2, 0.3), a_priori_std=(5e-6, 6e-6, 7e-6), a_priori_std_total=8e-6,
+    temperature=20.5, pressure=1013.0, humidity=42.0,
+)  # fmt: skip
 
 # Written out by hand from the layout, so that encode and decode cannot share a mistake.
 KNOWN: list[tuple[str, Event, bytes]] = [
@@ -236,20 +227,10 @@ def replies(draw):
 
 
 results = st.builds(
-    Measurement,
-    status=uint32,
-    mode=uint32,
-    is_try=st.integers(0, 1),
-    values=three,
-    std=three,
-    std_total=double,
-    pointing_error=three,
-    a_priori_std=three,
-    a_priori_std_total=double,
-    temperature=double,
-    pressure=double,
-    humidity=double,
-)
+    Measurement, status=uint32, mode=uint32, is_try=st.integers(0, 1), values=three, std=three,
+    std_total=double, pointing_error=three, a_priori_std=three, a_priori_std_total=double,
+    temperature=double, pressure=double, humidity=double,
+)  # fmt: skip
 from_instrument = (
     replies()
     | results

@@ -25,26 +25,11 @@ def server(version=(3, 1), connection=MULTICAST):
 
 
 FINE = StreamStatus(
-    server_ip='10.0.0.2',
-    interface='10.0.0.1',
-    server=server(),
-    version=(3, 1),
-    port_closed=False,
-    send_error='',
-    silent_s=0.1,
-    starved_s=0.1,
-    frames=100,
-    accepted=90,
-    lost=0,
-    restarts=0,
-    dropped={},
-    last_reason=None,
-    foreign=(),
-    last_malformed='',
-    problem='',
-    marker_id=65537,
-    labels=(65537,),
-)
+    server_ip='10.0.0.2', interface='10.0.0.1', server=server(), version=(3, 1),
+    port_closed=False, send_error='', silent_s=0.1, starved_s=0.1, frames=100, accepted=90,
+    lost=0, restarts=0, dropped={}, last_reason=None, foreign=(), last_malformed='', problem='',
+    marker_id=65537, labels=(65537,),
+)  # fmt: skip
 SETTINGS = NatNetSettings(server='motive', transport='multicast')
 
 
