@@ -294,6 +294,8 @@ def print_hidden(console: Console, discovery: Discovered, truth: SessionTruth) -
         console.print(line)
 
 
+ANSWER_WALL_S = 30.0
+"""So long a node may take to answer, and one that was killed to be ready again, s."""
 AFTERWARDS = 5
 """Candidate poses, each, that are visited with the correction on: with all their solutions a dozen
 or two of configurations, and `remaster verify` asks for ten."""
@@ -621,7 +623,20 @@ class Demo:
             and summaries['optitrack_markers']['published'] != '0'
         )
 
-    def _trigger(self, service: str, server: str, timeout_s: float = 30.0) -> None:
+    def _go_on(self) -> None:
+        """Do as a person does whose planner waits, again where it was started just now."""
+        deadline = time.monotonic() + ANSWER_WALL_S
+        while True:
+            try:
+                self._trigger('remaster/collect', 'pose_planner')
+                return
+            except DeviceError:
+                if time.monotonic() > deadline:
+                    raise
+            for _ in range(10):
+                self._spin()
+
+    def _trigger(self, service: str, server: str, timeout_s: float = ANSWER_WALL_S) -> None:
         """Call a service until it answers; its node may be killed meanwhile."""
         future, process = None, self.processes.pid(server)
 
@@ -660,13 +675,13 @@ class Demo:
                     )
                 if planner.get('state') == 'idle' and planner.get('resuming') == 'no':
                     # It was killed and waits for a person to resume its run.
-                    self._trigger('remaster/collect', 'pose_planner')
+                    self._go_on()
                 recorder = self.node.summaries.get('recorder', {})
                 if planner.get('state') == 'paused' and recorder.get('changed'):
                     # A person would look at the cell first; in the demo there is nothing to mend.
                     self.console.print(f'changed since the reference: {recorder["changed"]}')
                     self.console.print('going on, as /remaster/collect does')
-                    self._trigger('remaster/collect', 'pose_planner')
+                    self._go_on()
                 if planner.get('state') == 'failed':
                     raise DeviceError(f'the planner gave up: {planner["message"]}')
                 halted = self.node.summaries.get('robot_bridge', {}).get('halted')
