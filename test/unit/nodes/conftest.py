@@ -1,4 +1,4 @@
-"""The robot bridge of most tests here; other nodes have a rig of their own."""
+"""The robot bridge of most tests here, and plain nodes; other nodes have a rig of their own."""
 
 import pytest
 
@@ -17,3 +17,34 @@ def rig(monkeypatch, tmp_path):
     yield make
     for one in made:
         one.close()
+
+
+@pytest.fixture
+def own_nodes(monkeypatch):
+    """Return what makes nodes in this process."""
+    from own_nodes import OwnNodes
+
+    monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+    made = OwnNodes()
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def start_sensor(own_nodes, monkeypatch, tmp_path):
+    """Return a function that starts the node of a sensor, and a peer that is spun with it."""
+    import rclpy
+    from own_nodes import SensorBench
+
+    monkeypatch.setenv('ROS_HOME', str(tmp_path))
+    made = []
+
+    def start(name, own_name, **parameters):
+        made.append(SensorBench(own_nodes, name, own_name, parameters))
+        return made[-1]
+
+    yield start
+    for bench in made:
+        bench.node.close()
+        bench.node.destroy_node()
+    rclpy.try_shutdown()

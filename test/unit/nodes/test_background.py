@@ -5,13 +5,10 @@ import time
 
 import numpy as np
 import pytest
-from rigs.ros_rig import OWN_DOMAIN
 
 pytest.importorskip('rclpy', reason='needs ROS 2 Jazzy or its wheels')
 
-import rclpy
 from bridge_rig import PATIENCE_S
-from rclpy.executors import SingleThreadedExecutor
 
 from remaster_ros.errors import InputError
 from remaster_ros.nodes.background import Background, PlanningThread
@@ -20,25 +17,10 @@ pytestmark = [pytest.mark.ros, pytest.mark.timeout(60)]
 
 
 @pytest.fixture
-def node(monkeypatch):
-    monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
-    context = rclpy.Context()
-    rclpy.init(context=context, domain_id=OWN_DOMAIN)
-    made = rclpy.create_node('worker', context=context)
-    executor = SingleThreadedExecutor(context=context)
-    executor.add_node(made)
-
-    def spin(condition):
-        end = time.monotonic() + PATIENCE_S
-        while not condition():
-            assert time.monotonic() < end, 'waited in vain'
-            executor.spin_once(timeout_sec=0.1)
-
-    made.spin_until = spin
-    yield made
-    executor.shutdown()
-    made.destroy_node()
-    rclpy.shutdown(context=context)
+def node(own_nodes):
+    made = own_nodes.make('worker')
+    made.spin_until = own_nodes.until
+    return made
 
 
 def test_work_is_done_elsewhere_and_its_result_taken_here(node):

@@ -8,11 +8,10 @@ import pytest
 
 pytest.importorskip('rclpy', reason='needs ROS 2 Jazzy or its wheels')
 
-from bridge_places import AWAY, LOW, POST, TARGET, TOOL, turned
+from bridge_places import AWAY, POST, TARGET, TOOL, correction, turned
 from bridge_rig import CHAIN, HOME, stamp
 from std_msgs.msg import String
 from trajectory_msgs.msg import JointTrajectory
-from worlds.compensation_files import arm, save
 from worlds.simple_cells import write_cell
 
 from remaster_ros.collection.events import (
@@ -22,24 +21,22 @@ from remaster_ros.collection.events import (
     SolutionSettled,
 )
 from remaster_ros.compensation.arm_model import Function, JointTerm
-from remaster_ros.compensation.compensator import Compensator
 from remaster_ros.nodes import robot_bridge
 from remaster_ros.session.workcell import read_cell
 
 pytestmark = [pytest.mark.ros, pytest.mark.timeout(60)]
 
 
+OFFSETS_DEG = [0.5, -0.7, 0.4, 0.9, -1.2, 0.3, 0.6]
+
 # What it commands
 
 
 def test_what_is_commanded_is_corrected_before_it_is_checked(rig, tmp_path):
     """Limits are those of the true arm: what is wanted within them may be commanded beyond."""
-    urdf = read_cell('demo').urdf_text
-    offsets = np.deg2rad([0.5, -0.7, 0.4, 0.9, -1.2, 0.3, 0.6])
-    model = arm(urdf, CHAIN.base_link, CHAIN.tip_link, joint_offsets=offsets)
-    file = save(tmp_path, model, urdf)
+    file, corrected = correction(tmp_path, OFFSETS_DEG)
     r = rig(compensation=file)
-    command = Compensator(model).command(TARGET)
+    command = corrected(TARGET)
     assert np.max(np.abs(command - TARGET)) > 0.01
     way = 0.5 * (HOME + TARGET) + 0.02
     sha256 = hashlib.sha256(file.read_bytes()).hexdigest()
@@ -57,7 +54,7 @@ def test_what_is_commanded_is_corrected_before_it_is_checked(rig, tmp_path):
     np.testing.assert_allclose(move.q[-1], command, atol=1e-9)
     # The way to it is corrected as well: the path goes through the corrected waypoint.
     q, _, _ = move.spline().sample(200)
-    off = np.max(np.abs(q - Compensator(model).command(way)), axis=1)
+    off = np.max(np.abs(q - corrected(way)), axis=1)
     assert off.min() < 2e-3
     (message,) = r.settled
     assert list(message.name) == [*r.names, *(f'wanted/{name}' for name in r.names)]
@@ -74,11 +71,9 @@ def asked(rig, prefix):
 def test_a_pose_has_the_correction_on_or_off_and_a_move_is_stopped_before_it_is_switched(
     rig, tmp_path
 ):
-    urdf = read_cell('demo').urdf_text
-    offsets = np.deg2rad([0.5, -0.7, 0.4, 0.9, -1.2, 0.3, 0.6])
-    model = arm(urdf, CHAIN.base_link, CHAIN.tip_link, joint_offsets=offsets)
-    r = rig(compensation=save(tmp_path, model, urdf))
-    command = Compensator(model).command(TARGET)
+    file, corrected = correction(tmp_path, OFFSETS_DEG)
+    r = rig(compensation=file)
+    command = corrected(TARGET)
     r.settle(TARGET, names=asked(r, 'uncorrected/'))
     np.testing.assert_allclose(r.moves()[-1].q[-1], TARGET, atol=1e-12)
     assert list(r.settled[-1].name) == r.names
@@ -101,11 +96,8 @@ def test_a_pose_has_the_correction_on_or_off_and_a_move_is_stopped_before_it_is_
 def test_with_the_correction_off_the_limits_are_still_those_of_the_true_arm(
     rig, tmp_path, degrees, refused
 ):
-    urdf = read_cell('demo').urdf_text
-    offsets = np.zeros(len(CHAIN))
-    offsets[1] = np.deg2rad(degrees)
-    model = arm(urdf, CHAIN.base_link, CHAIN.tip_link, joint_offsets=offsets)
-    r = rig(compensation=save(tmp_path, model, urdf), limit_margin_deg=0.0)
+    file, _ = correction(tmp_path, {'joint_2': degrees})
+    r = rig(compensation=file, limit_margin_deg=0.0)
     target = HOME.copy()
     target[1] = CHAIN.upper[1] - np.deg2rad(1.0)
     r.plan(target, names=asked(r, 'uncorrected/'))
@@ -135,9 +127,8 @@ def test_a_correction_that_a_bridge_does_not_have_is_refused_by_name(rig):
 def test_a_configuration_that_the_correction_changes_too_much_is_given_up(
     rig, tmp_path, monkeypatch
 ):
-    urdf = read_cell('demo').urdf_text
-    model = arm(urdf, CHAIN.base_link, CHAIN.tip_link, joint_offsets=np.full(7, 0.01))
-    r = rig(compensation=save(tmp_path, model, urdf))
+    file, _ = correction(tmp_path, [0.5] * 7)
+    r = rig(compensation=file)
     monkeypatch.setattr(r.bridge._correction, '_most_deg', 0.1)
     r.plan(TARGET)
     r.run(2.0, lambda: r.named(SolutionFailed))
@@ -150,18 +141,13 @@ def test_a_waypoint_that_the_correction_changes_too_much_is_not_gone_through(
     rig, tmp_path, monkeypatch
 ):
     """A soft arm, changed more where it is stretched out."""
-    urdf = read_cell('demo').urdf_text
     soft = Function('gravity_torque', 'linear', 1, 0)
-    model = arm(
-        urdf,
-        CHAIN.base_link,
-        CHAIN.tip_link,
-        joint_terms=(JointTerm(1, 'x', soft, np.array([1e-4])),),
-    )
-    r = rig(compensation=save(tmp_path, model, urdf))
+    terms = (JointTerm(1, 'x', soft, np.array([1e-4])),)
+    file, corrected = correction(tmp_path, joint_terms=terms)
+    r = rig(compensation=file)
     ways = HOME + np.linspace(-0.4, 0.4, 9)[:, None] * np.eye(7)[1]
-    change = np.degrees(np.abs(Compensator(model).command(ways) - ways).max(axis=1))
-    at_target = np.degrees(np.abs(Compensator(model).command(TARGET) - TARGET).max())
+    change = np.degrees(np.abs(corrected(ways) - ways).max(axis=1))
+    at_target = np.degrees(np.abs(corrected(TARGET) - TARGET).max())
     assert change.max() > at_target + 1e-3
     most = 0.5 * (change.max() + at_target)
     monkeypatch.setattr(r.bridge._correction, '_most_deg', most)
@@ -366,18 +352,6 @@ def test_a_path_that_is_not_free_is_gone_around(rig, tmp_path):
     q, _, _ = move.spline().sample(30)
     assert not any(model.trouble(row) for row in q)
     np.testing.assert_allclose(r.settled[0].position, target, atol=1e-4)
-
-
-def test_a_target_that_is_not_free_is_given_up(rig, tmp_path):
-    box = {'center_m': CHAIN.forward(LOW)[:3, 3].tolist(), 'size_m': [0.02, 0.02, 0.02]}
-    r = rig(cell=write_cell(tmp_path / 'cell.yaml', obstacles={'box': box}))
-    r.plan(LOW, HOME + 0.01)
-    r.run(20.0, lambda: r.settled)
-    (failed,) = r.named(SolutionFailed)
-    assert failed.solution == 0
-    assert failed.reason.startswith('no free path: ')
-    assert 'box' in failed.reason
-    assert [commanded.solution for commanded in r.named(SolutionCommanded)] == [1]
 
 
 def test_a_path_that_cannot_be_checked_is_not_gone(rig, monkeypatch):

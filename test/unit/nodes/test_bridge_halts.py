@@ -5,11 +5,9 @@ import time
 
 import numpy as np
 import pytest
-from rigs.ros_rig import OWN_DOMAIN
 
 pytest.importorskip('rclpy', reason='needs ROS 2 Jazzy or its wheels')
 
-import rclpy
 from bridge_places import AWAY
 from bridge_rig import HOME, stamp
 from rclpy.qos import DurabilityPolicy, QoSProfile
@@ -33,15 +31,9 @@ TOPICS = [
 
 
 @pytest.fixture
-def intruder(monkeypatch):
+def intruder(own_nodes):
     """Return a node in a process of its own, as far as DDS can tell."""
-    monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
-    context = rclpy.Context()
-    rclpy.init(context=context, domain_id=OWN_DOMAIN)
-    node = rclpy.create_node('intruder', context=context)
-    yield node
-    node.destroy_node()
-    rclpy.shutdown(context=context)
+    return own_nodes.make('intruder', is_spun=False)
 
 
 def listed(bridge, topic, count):

@@ -5,15 +5,12 @@ import pytest
 
 pytest.importorskip('rclpy', reason='needs ROS 2 Jazzy or its wheels')
 
-from bridge_places import AWAY, POST, turned
+from bridge_places import AWAY, POST, correction, turned
 from bridge_rig import CHAIN, HOME
 from rclpy.parameter import Parameter
-from worlds.compensation_files import arm, save
 from worlds.simple_cells import write_cell
 
-from remaster_ros.collection.events import (
-    ArmStopped,
-)
+from remaster_ros.collection.events import ArmStopped
 from remaster_ros.errors import InputError
 from remaster_ros.motion.joint_units import TURNING
 from remaster_ros.motion.limits import MotionLimits
@@ -143,21 +140,10 @@ def test_the_fastest_point_keeps_the_cartesian_limit(rig):
     assert 0.09 < fastest < 0.1002
 
 
-def corrected_by(folder, offsets_deg, known=()):
-    """Write the compensation.json of the demo's arm with these offsets; return its path."""
-    names = list(CHAIN.joint_names)
-    offsets = np.zeros(len(names))
-    for name, degrees in offsets_deg.items():
-        offsets[names.index(name)] = np.deg2rad(degrees)
-    urdf = read_cell('demo').urdf_text
-    model = arm(urdf, CHAIN.base_link, CHAIN.tip_link, joint_offsets=offsets)
-    return save(folder, model, urdf, known=known)
-
-
 @pytest.mark.parametrize('sign', [1.0, -1.0])
 def test_offsets_in_use_shift_the_limits(rig, tmp_path, sign):
     """True angle = reported + offset: with +2 degrees the upper stop comes 2 degrees earlier."""
-    file = corrected_by(tmp_path, {'joint_2': 1.9 * sign})
+    file, _ = correction(tmp_path, {'joint_2': 1.9 * sign})
     r = rig(ready=False, compensation=file, limit_margin_deg=0.0)
     limits = r.bridge.supervisor.gate.limits
     lower, upper = CHAIN.lower.copy(), CHAIN.upper.copy()
@@ -172,7 +158,7 @@ def test_offsets_in_use_shift_the_limits(rig, tmp_path, sign):
 @pytest.mark.parametrize(('sign', 'free'), [(1.0, False), (-1.0, True)])
 def test_paths_are_checked_where_the_arm_is_with_its_offsets(rig, tmp_path, sign, free):
     """A post on the left: an arm that is further to the left than it reports reaches it."""
-    file = corrected_by(tmp_path, {'joint_1': 1.9 * sign})
+    file, _ = correction(tmp_path, {'joint_1': 1.9 * sign})
     cell = write_cell(tmp_path / 'cell.yaml', obstacles={'post': POST})
     nominal = read_cell(cell).collision_model(CHAIN, np.deg2rad(0.1))
     turns = np.linspace(-0.8, 0.0, 161)
@@ -190,13 +176,13 @@ def test_paths_are_checked_where_the_arm_is_with_its_offsets(rig, tmp_path, sign
 
 @pytest.mark.parametrize(('known', 'unknown_deg'), [((), 0.1), (6 * (True,) + (False,), 1.0)])
 def test_the_clearance_covers_what_is_still_unknown(rig, tmp_path, known, unknown_deg):
-    file = corrected_by(tmp_path, {'joint_1': 1.5}, known)
+    file, _ = correction(tmp_path, {'joint_1': 1.5}, known)
     bridge = rig(ready=False, compensation=file).bridge
     assert bridge._search._model.unknown_offset == pytest.approx(np.deg2rad(unknown_deg))
 
 
 def test_a_compensation_of_another_arm_or_by_another_name_is_refused_at_the_start(rig, tmp_path):
-    file = corrected_by(tmp_path, {'joint_1': 1.0})
+    file, _ = correction(tmp_path, {'joint_1': 1.0})
     cell = write_cell(tmp_path / 'cell.yaml')
     (tmp_path / 'other.urdf').write_text(read_cell('demo').urdf_text + '<!-- another -->')
     text = cell.read_text()

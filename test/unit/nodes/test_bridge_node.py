@@ -14,13 +14,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory
 
-from remaster_ros.collection.events import (
-    Alive,
-    ArmHalted,
-    ArmStopped,
-    PlannerState,
-    RecorderState,
-)
+from remaster_ros.collection.events import Alive, ArmHalted, PlannerState, RecorderState
 from remaster_ros.nodes import robot_bridge, running
 
 pytestmark = [pytest.mark.ros, pytest.mark.timeout(60)]
@@ -89,18 +83,6 @@ def test_others_summaries_are_no_sign_of_planner_or_recorder(rig):
     assert r.summary()[:2] == ('ok', 'waiting for a pose')
 
 
-def test_a_planner_that_pauses_stops_the_arm(rig):
-    r = rig()
-    r.go(AWAY, speed=0.2)
-    r.say_planner('paused')
-    r.run(1.5)
-    assert [stop.reason for stop in r.named(ArmStopped)] == ['planner is paused']
-    assert r.arm.speed() < 1e-6
-    r.say_planner('running')
-    r.run(20.0, lambda: r.settled)
-    np.testing.assert_allclose(r.settled[0].position, AWAY, atol=1e-4)
-
-
 # Reports of the joints
 
 
@@ -161,13 +143,10 @@ def test_the_halt_is_shown_at_once_and_with_its_level(rig):
     )
 
 
-@pytest.mark.parametrize(
-    'reliability', [ReliabilityPolicy.RELIABLE, ReliabilityPolicy.BEST_EFFORT]
-)
-def test_joint_states_of_either_reliability_are_heard(rig, reliability):
+def test_joint_states_of_best_effort_are_heard(rig):
     r = rig(ready=False)
     first = r.states
-    qos = QoSProfile(depth=200, reliability=reliability)
+    qos = QoSProfile(depth=200, reliability=ReliabilityPolicy.BEST_EFFORT)
     r.states = r.peer.create_publisher(JointState, 'joint_states', qos)
     r.wait(lambda: r.bridge.count_publishers('joint_states') == 2, 'the second publisher')
     r.wait(r.states.get_subscription_count, 'the match')
@@ -255,8 +234,7 @@ def test_a_controller_that_goes_halts_the_arm(rig):
 
 
 @pytest.mark.parametrize(
-    'name',
-    ['recorder', 'laser_tracker_markers', 'laser_tracker_markers_left', 'robot_bridge'],
+    'name', ['recorder', 'laser_tracker_markers', 'laser_tracker_markers_left', 'robot_bridge']
 )
 def test_a_recorder_that_listens_is_no_controller(rig, name):
     """Nodes of ours listen to the commands, too: no arm moves by it."""
@@ -265,6 +243,13 @@ def test_a_recorder_that_listens_is_no_controller(rig, name):
     node.create_subscription(JointTrajectory, robot_bridge.COMMANDS, print, 10)
     r.alone()
     r.wait(r.bridge._controller.matched, 'the match')
+
+    def listed():
+        # A node's name is known later than its subscription.
+        found = r.bridge.get_subscriptions_info_by_topic(f'/{robot_bridge.COMMANDS}')
+        return name in [info.node_name for info in found]
+
+    r.wait(listed, 'the node')
     r.plan(TARGET)
     r.run(1.5)
     assert r.summary()[1].startswith('no controller listens to ')
@@ -272,12 +257,11 @@ def test_a_recorder_that_listens_is_no_controller(rig, name):
     node.destroy_node()
 
 
-@pytest.mark.parametrize(
-    'reliability', [ReliabilityPolicy.RELIABLE, ReliabilityPolicy.BEST_EFFORT]
-)
-def test_controllers_of_either_reliability_hear_it(rig, reliability):
+def test_controllers_of_best_effort_hear_it(rig):
     r = rig(ready=False, controller=False)
-    r.open_controller(reliability=reliability, durability=DurabilityPolicy.VOLATILE)
+    r.open_controller(
+        reliability=ReliabilityPolicy.BEST_EFFORT, durability=DurabilityPolicy.VOLATILE
+    )
     r.ready()
     r.plan(TARGET)
     r.run(5.0, lambda: r.moves())

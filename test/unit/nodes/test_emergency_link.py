@@ -3,13 +3,9 @@
 from types import SimpleNamespace
 
 import pytest
-from rigs.ros_rig import OWN_DOMAIN
 
 pytest.importorskip('rclpy', reason='needs ROS 2 Jazzy or its wheels')
 
-import rclpy
-from bridge_rig import PATIENCE_S
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Bool
 
@@ -28,19 +24,14 @@ BEST_EFFORT = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
 class Bench:
-    """A listener and a publisher in one process, on a clock of the test."""
+    """A listener and a robot, on a clock of the test."""
 
-    def __init__(self, monkeypatch):
-        monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
-        self.now = 500.0
+    def __init__(self, monkeypatch, own_nodes):
+        self.now, self.states = 500.0, []
         monkeypatch.setattr(robot_bridge, 'time', SimpleNamespace(monotonic=lambda: self.now))
-        self.context = rclpy.Context()
-        rclpy.init(context=self.context, domain_id=OWN_DOMAIN)
-        self.node = rclpy.create_node('listener', context=self.context)
-        self.robot = rclpy.create_node('robot', context=self.context)
-        self.executor = SingleThreadedExecutor(context=self.context)
-        self.executor.add_node(self.node)
-        self.states = []
+        self.node = own_nodes.make('listener')
+        self.robot = own_nodes.make('robot', is_spun=False, beside=self.node)
+        self.spin = own_nodes.until
 
     def link(self, topic=TOPIC, silence_s=3.0):
         made = EmergencyLink(self.node, topic, self.states.append, silence_s)
@@ -50,14 +41,6 @@ class Bench:
     def publisher(self, qos=LATCHED):
         return self.robot.create_publisher(Bool, TOPIC, qos)
 
-    def spin(self, condition):
-        import time
-
-        end = time.monotonic() + PATIENCE_S
-        while not condition():
-            assert time.monotonic() < end, 'waited in vain'
-            self.executor.spin_once(timeout_sec=0.01)
-
     def say(self, publisher, state, times):
         """Publish, and let the link hear it `times` times (once a subscription that matches)."""
         count = len(self.states)
@@ -65,18 +48,10 @@ class Bench:
         self.spin(lambda: len(self.states) >= count + times)
         assert self.states[count:] == [state] * times
 
-    def close(self):
-        self.executor.shutdown()
-        self.node.destroy_node()
-        self.robot.destroy_node()
-        rclpy.shutdown(context=self.context)
-
 
 @pytest.fixture
-def bench(monkeypatch):
-    made = Bench(monkeypatch)
-    yield made
-    made.close()
+def bench(monkeypatch, own_nodes):
+    return Bench(monkeypatch, own_nodes)
 
 
 def matched(bench, publisher, count):

@@ -238,9 +238,7 @@ def test_the_launch_files(name, monkeypatch):
         enclave = ['--enclave', f'/remaster/{node["executable"]}']
         assert node['ros_arguments'] == (enclave if name == 'real' else None)
     ended = types.SimpleNamespace(returncode=2, process_name='recorder')
-    assert on_exit(ended, None) == [
-        ('emit', ('shutdown', 'recorder ended with status 2')),
-    ]
+    assert on_exit(ended, None) == [('emit', ('shutdown', 'recorder ended with status 2'))]
     assert not on_exit(types.SimpleNamespace(returncode=-9, process_name='recorder'), None)
     assert not re.search(r'namespace=.?/', path.read_text())
 

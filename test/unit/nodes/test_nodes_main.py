@@ -27,29 +27,28 @@ def test_an_unknown_node_is_refused_with_the_one_that_was_meant(capsys):
     assert 'there are pose_planner, robot_bridge' in capsys.readouterr().err
 
 
-def test_what_a_node_may_never_need_is_not_loaded_when_it_starts():
-    """A third of the time until nine nodes are there went into libraries for fits and figures."""
+@pytest.mark.parametrize(
+    ('others', 'late'),
+    [
+        # A third of the time until nine nodes are there went into libraries for fits and figures.
+        (('watch', 'demo'), ('scipy.stats', 'scipy.optimize', 'scipy.interpolate', 'matplotlib')),
+        # Nodes that measure and move need neither fit nor search.
+        (
+            ('pose_planner', 'optimizer', 'watch', 'demo'),
+            [
+                f'remaster_ros.{name}'
+                for name in ('calibration.estimate', 'discovery.screening', 'planning.pose_design')
+            ],
+        ),
+    ],
+)
+def test_what_a_node_may_never_need_is_not_loaded_when_it_starts(others, late):
     pytest.importorskip('rclpy', reason='needs ROS 2 Jazzy or its wheels')
-    nodes = [name for name in NODES if name not in ('watch', 'demo')]
     code = (
         'import importlib, sys\n'
-        f'for name in {nodes}: importlib.import_module(f"remaster_ros.nodes.{{name}}")\n'
-        'late = "scipy.stats", "scipy.optimize", "scipy.interpolate", "matplotlib"\n'
-        'print([name for name in late if name in sys.modules])'
-    )
-    done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == '[]'
-
-
-def test_nodes_that_measure_and_move_load_neither_fit_nor_search_when_they_start():
-    pytest.importorskip('rclpy', reason='needs ROS 2 Jazzy or its wheels')
-    planning = ('pose_planner', 'optimizer', 'watch', 'demo')
-    code = (
-        'import importlib, sys\n'
-        f'for name in {[name for name in NODES if name not in planning]}: '
+        f'for name in {[name for name in NODES if name not in others]}: '
         'importlib.import_module(f"remaster_ros.nodes.{name}")\n'
-        'late = "calibration.estimate", "discovery.screening", "planning.pose_design"\n'
-        'print([name for name in late if f"remaster_ros.{name}" in sys.modules])'
+        f'print([name for name in {late} if name in sys.modules])'
     )
     done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == '[]'

@@ -1,17 +1,12 @@
 """Who else publishes: told at once, or by their leases where a killed one may still be listed."""
 
-import time
 from types import SimpleNamespace
 
 import pytest
-from rigs.ros_rig import OWN_DOMAIN
 
 pytest.importorskip('rclpy', reason='needs ROS 2 Jazzy or its wheels')
 
-import rclpy
-from bridge_rig import PATIENCE_S
 from rclpy.duration import Duration
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.logging import LoggingSeverity, set_logger_level
 from rclpy.qos import LivelinessPolicy, QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Bool
@@ -37,24 +32,14 @@ MORTAL = QoSProfile(
 class Bench:
     """A node that depends on a topic and others that publish there, on a clock of the test."""
 
-    def __init__(self, monkeypatch):
-        monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
-        self.now = 500.0
+    def __init__(self, monkeypatch, own_nodes):
+        self.now, self.nodes, self.spin = 500.0, own_nodes, own_nodes.until
         monkeypatch.setattr(rivals, 'time', SimpleNamespace(monotonic=lambda: self.now))
-        self.context = rclpy.Context()
-        rclpy.init(context=self.context, domain_id=OWN_DOMAIN)
-        self.node = rclpy.create_node('bridge', context=self.context, namespace='/left')
-        self.others = []
-        self.executor = SingleThreadedExecutor(context=self.context)
-        self.executor.add_node(self.node)
+        self.node = own_nodes.make('bridge', '/left')
         self.only = OnlyPublisher(self.node, TOPIC, Bool)
 
     def other(self, name, qos=PLAIN, namespace='/left'):
-        # In a context of its own, as a process has one: a DDS participant.
-        context = rclpy.Context()
-        rclpy.init(context=context, domain_id=OWN_DOMAIN)
-        node = rclpy.create_node(name, context=context, namespace=namespace)
-        self.others.append(node)
+        node = self.nodes.make(name, namespace, is_spun=False)
         count = self.node.count_publishers(f'/left/{TOPIC}')
         publisher = node.create_publisher(Bool, f'/left/{TOPIC}', qos)
         self.spin(lambda: self.node.count_publishers(f'/left/{TOPIC}') == count + 1)
@@ -67,26 +52,10 @@ class Bench:
         )
         return publisher
 
-    def spin(self, condition=None, seconds=PATIENCE_S):
-        end = time.monotonic() + seconds
-        while condition is None or not condition():
-            if time.monotonic() > end:
-                assert condition is None, 'waited in vain'
-                return
-            self.executor.spin_once(timeout_sec=0.01)
-
-    def close(self):
-        self.executor.shutdown()
-        for node in (*self.others, self.node):
-            node.destroy_node()
-            rclpy.shutdown(context=node.context)
-
 
 @pytest.fixture
-def bench(monkeypatch):
-    made = Bench(monkeypatch)
-    yield made
-    made.close()
+def bench(monkeypatch, own_nodes):
+    return Bench(monkeypatch, own_nodes)
 
 
 def words(*names):
@@ -177,7 +146,7 @@ def test_one_that_was_dead_before_it_was_counted_does_not_count(bench):
     bench.node.create_publisher(Bool, TOPIC, LEASED)
     bench.other('killed', MORTAL)
     assert bench.only.trouble() == ''
-    bench.spin(seconds=0.5)
+    bench.nodes.spin(0.5)
     bench.now += COUNT_WALL_S + 0.01
     assert bench.only.trouble() == ''
     assert bench.node.count_publishers('/left/moves') == 2
@@ -195,7 +164,7 @@ def test_what_they_publish_is_taken_and_left(bench):
     bench.only.trouble()
     bench.spin(lambda: bench.only._alive == 2)
     first.publish(Bool(data=True))
-    bench.spin(seconds=0.1)
+    bench.nodes.spin(0.1)
 
 
 def test_the_count_warns_of_nobody_that_it_cannot_hear(bench, capfd):
@@ -206,7 +175,7 @@ def test_the_count_warns_of_nobody_that_it_cannot_hear(bench, capfd):
     assert bench.only.trouble() == ''
     bench.spin(lambda: bench.only._alive == 2)
     bench.other('intruder')
-    bench.spin(seconds=0.2)
+    bench.nodes.spin(0.2)
     assert 'incompatible' not in capfd.readouterr().err
 
 

@@ -4,17 +4,13 @@ import os
 import sys
 import time
 from dataclasses import dataclass
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from rigs.ros_rig import OWN_DOMAIN
 
 pytest.importorskip('rclpy', reason='needs ROS 2 Jazzy or its wheels')
 
-import rclpy
 from geometry_msgs.msg import PointStamped, PoseStamped, TransformStamped
-from rclpy.executors import MultiThreadedExecutor, SingleThreadedExecutor
 from sensor_msgs.msg import JointState, Temperature
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
@@ -23,7 +19,6 @@ from remaster_ros.collection.message_fields import seconds
 from remaster_ros.errors import DeviceError, InputError
 from remaster_ros.kinematics.transforms import transform
 from remaster_ros.nodes.messages import transform_message
-from remaster_ros.nodes.sensor_markers import SensorNode
 from remaster_ros.nodes.simulated_clock import TAKEN
 from remaster_ros.nodes.status import LATCHED, pairs
 from remaster_ros.parameters import parameter
@@ -128,72 +123,32 @@ def shown(summary):
 
 
 @pytest.fixture
-def rig(monkeypatch, tmp_path):
+def rig(start_sensor, monkeypatch):
     """Return a function that starts the node of a driver, and a peer that listens."""
-    monkeypatch.setenv('ROS_HOME', str(tmp_path))
-    monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
-    made = []
 
     def start(driver, name='gauge', own_name=registry.GENERIC, **parameters):
-        where = f'{__name__}:{driver.__name__}'
-        monkeypatch.setitem(registry.DRIVERS, 'gauge', where)
-        find = registry.importlib.import_module
-        monkeypatch.setattr(
-            registry,
-            'importlib',
-            SimpleNamespace(
-                import_module=lambda module: (
-                    sys.modules[__name__] if module.endswith(f'.{__name__}') else find(module)
-                )
-            ),
-        )
+        monkeypatch.setitem(registry.DRIVERS, 'gauge', f'{__name__}:{driver.__name__}')
+        monkeypatch.setitem(sys.modules, f'remaster_ros.sensors.{__name__}', sys.modules[__name__])
         triggered = issubclass(driver, TriggeredDriver)
         place = 'laser_tracker' if triggered else 'optitrack'
-        parameters = {'sensor': 'tracker' if triggered else 'mocap', **parameters}
-        args = ['--ros-args', '--log-level', 'fatal', '-r', f'__node:={name}']
-        for key, value in parameters.items():
-            args += ['-p', f'{key}:={value}']
-        rclpy.init(args=args, domain_id=OWN_DOMAIN)
-        context = rclpy.Context()
-        rclpy.init(context=context, domain_id=OWN_DOMAIN)
-        peer = rclpy.create_node('peer', context=context)
-        r = SimpleNamespace(peer=peer, context=context, points=[], temperatures=[], node=None)
-        made.append(r)
-        peer.create_subscription(PointStamped, f'{place}/marker', r.points.append, 10)
-        peer.create_subscription(Temperature, f'{place}/temperature', r.temperatures.append, 10)
-        peer_executor = SingleThreadedExecutor(context=context)
-        peer_executor.add_node(peer)
-        r.node = SensorNode(own_name)
-        executor = MultiThreadedExecutor(3)
-        executor.add_node(r.node)
-
-        def wait(condition, what):
-            deadline = time.monotonic() + 20.0
-            while not condition():
-                assert time.monotonic() < deadline, what
-                executor.spin_once(timeout_sec=0.01)
-                peer_executor.spin_once(timeout_sec=0.01)
+        sensor = 'tracker' if triggered else 'mocap'
+        r = start_sensor(name, own_name, **{'sensor': sensor, **parameters})
+        r.points, r.temperatures, r.driver = [], [], r.node.driver
+        r.peer.create_subscription(PointStamped, f'{place}/marker', r.points.append, 10)
+        r.peer.create_subscription(Temperature, f'{place}/temperature', r.temperatures.append, 10)
 
         def measure():
-            client = peer.create_client(Trigger, 'laser_tracker/measure')
-            wait(client.service_is_ready, 'the service')
+            client = r.peer.create_client(Trigger, 'laser_tracker/measure')
+            r.wait(client.service_is_ready, 'the service')
             future = client.call_async(Trigger.Request())
-            wait(future.done, 'the answer')
+            r.wait(future.done, 'the answer')
             return future.result()
 
-        r.wait, r.measure, r.driver = wait, measure, r.node.driver
-        r.values = lambda: shown(r.node._summary())
-        wait(lambda: peer.count_publishers(f'{place}/marker'), 'the match')
+        r.measure, r.values = measure, lambda: shown(r.summary())
+        r.wait(lambda: r.peer.count_publishers(f'{place}/marker'), 'the match')
         return r
 
-    yield start
-    for r in made:
-        if r.node is not None:
-            r.node.close()
-            r.node.destroy_node()
-        r.peer.destroy_node()
-        rclpy.shutdown(context=r.context)
-    rclpy.try_shutdown()
+    return start
 
 
 def test_a_stream_is_published_under_its_time_of_capture(rig):

@@ -4,13 +4,10 @@ import time
 from types import SimpleNamespace
 
 import pytest
-from rigs.ros_rig import OWN_DOMAIN
 
 pytest.importorskip('rclpy', reason='needs ROS 2 Jazzy or its wheels')
 
-import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from rclpy.executors import SingleThreadedExecutor
 from std_msgs.msg import String
 
 from remaster_ros.collection.events import (
@@ -32,10 +29,8 @@ HALT = 'the robot does not follow'
 class Bench:
     """A node in a namespace that publishes its status, and what comes of it."""
 
-    def __init__(self):
-        self.context = rclpy.Context()
-        rclpy.init(context=self.context, domain_id=OWN_DOMAIN)
-        self.node = rclpy.create_node('robot_bridge', context=self.context, namespace='left')
+    def __init__(self, own_nodes):
+        self.node, self.wait = own_nodes.make('robot_bridge', 'left'), own_nodes.until
         self.summary = Summary('error', HALT, {'commanded': 3}, BridgeState(halted=HALT))
         self.status = NodeStatus(self.node, lambda: self.summary, 'lwr4plus')
         self.records, self.summaries, self.diagnostics = [], [], []
@@ -43,29 +38,14 @@ class Bench:
         self.node.create_subscription(
             DiagnosticArray, '/left/diagnostics', self._on_diagnostics, RELIABLE
         )
-        self.executor = SingleThreadedExecutor(context=self.context)
-        self.executor.add_node(self.node)
 
     def _on_diagnostics(self, array):
         self.diagnostics.append((time.monotonic(), array))
 
-    def wait(self, condition):
-        end = time.monotonic() + 20.0
-        while not condition():
-            assert time.monotonic() < end
-            self.executor.spin_once(timeout_sec=0.05)
-
-    def close(self):
-        self.executor.shutdown()
-        self.node.destroy_node()
-        rclpy.shutdown(context=self.context)
-
 
 @pytest.fixture
-def bench():
-    bench = Bench()
-    yield bench
-    bench.close()
+def bench(own_nodes):
+    return Bench(own_nodes)
 
 
 def test_the_state_is_a_record_and_text(bench):
@@ -182,11 +162,7 @@ def test_tables_have_a_pair_for_each_entry():
     [
         ('/', 'recorder', '/recorder'),
         ('/cell', 'recorder', '/cell/recorder'),
-        (
-            '_NODE_NAMESPACE_UNKNOWN_',
-            '_NODE_NAME_UNKNOWN_',
-            'a node that has just started',
-        ),
+        ('_NODE_NAMESPACE_UNKNOWN_', '_NODE_NAME_UNKNOWN_', 'a node that has just started'),
     ],
 )
 def test_a_node_is_called_by_its_full_name(namespace, name, called):

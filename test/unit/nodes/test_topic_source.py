@@ -1,24 +1,20 @@
 """A topic of another package's node as a sensor, through real DDS: its publishers are fakes."""
 
 import time
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from rigs.ros_rig import OWN_DOMAIN
 
 pytest.importorskip('rclpy', reason='needs ROS 2 Jazzy or its wheels')
 
 import rclpy
 from geometry_msgs.msg import PointStamped, PoseStamped
-from rclpy.executors import MultiThreadedExecutor, SingleThreadedExecutor
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from remaster_ros.collection.events import SensorReport
 from remaster_ros.collection.message_fields import seconds
 from remaster_ros.errors import InputError
 from remaster_ros.nodes.messages import stamp_of
-from remaster_ros.nodes.sensor_markers import SensorNode
 from remaster_ros.sensors.registry import GENERIC
 from remaster_ros.session.workcell import config_path
 
@@ -49,48 +45,16 @@ def fake_message(kind, stamp_s, position):
 
 
 @pytest.fixture
-def rig(monkeypatch, tmp_path):
+def rig(start_sensor, tmp_path):
     """Return a function that starts the sensor's node, and a peer that publishes and listens."""
-    monkeypatch.setenv('ROS_HOME', str(tmp_path))
-    monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
-    made = []
 
     def start(message_type, name='topic_markers_mocap'):
-        cell = cell_of(tmp_path, message_type)
-        args = ['--ros-args', '--log-level', 'fatal', '-r', f'__node:={name}']
-        args += ['-p', f'cell:={cell}', '-p', 'sensor:=mocap']
-        rclpy.init(args=args, domain_id=OWN_DOMAIN)
-        context = rclpy.Context()
-        rclpy.init(context=context, domain_id=OWN_DOMAIN)
-        peer = rclpy.create_node('vrpn', context=context)
-        r = SimpleNamespace(peer=peer, context=context, points=[], node=None)
-        made.append(r)
-        peer.create_subscription(PointStamped, 'mocap/marker', r.points.append, 100)
-        near = SingleThreadedExecutor(context=context)
-        near.add_node(peer)
-        r.node = SensorNode(GENERIC)
-        executor = MultiThreadedExecutor(3)
-        executor.add_node(r.node)
-
-        def wait(condition, what, act=lambda: None):
-            deadline = time.monotonic() + 20.0
-            while not condition():
-                assert time.monotonic() < deadline, (what, r.node._summary())
-                act()
-                executor.spin_once(timeout_sec=0.005)
-                near.spin_once(timeout_sec=0.005)
-
-        r.wait, r.summary = wait, lambda: r.node._summary()
+        r = start_sensor(name, GENERIC, cell=cell_of(tmp_path, message_type), sensor='mocap')
+        r.points = []
+        r.peer.create_subscription(PointStamped, 'mocap/marker', r.points.append, 100)
         return r
 
-    yield start
-    for r in made:
-        if r.node is not None:
-            r.node.close()
-            r.node.destroy_node()
-        r.peer.destroy_node()
-        rclpy.shutdown(context=r.context)
-    rclpy.try_shutdown()
+    return start
 
 
 @pytest.mark.parametrize(
