@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from rigs.command_line import refusal, remaster, run
+from rigs.command_line import refusal, remaster
 from worlds.robot_descriptions import ROBOTS, Description, xarm7
 
 from remaster_ros.cli import init
@@ -35,9 +35,10 @@ def small(monkeypatch):
 
 @pytest.fixture
 def do(tmp_path):
-    def init_verb(*args, out='cell.yaml'):
-        process = run('init', *args, '--out', tmp_path / out)
-        return process.returncode, process.stdout, process.stderr
+    def init_verb(*args, out='cell.yaml', status=0):
+        printed = remaster('init', *args, '--out', tmp_path / out, status=status)
+        assert status == 0 or printed.stderr.count('\n') == 1
+        return printed
 
     return init_verb
 
@@ -65,9 +66,7 @@ def test_known_arms_go_to_a_finished_plan_without_an_edit(robot, held, do, tmp_p
     is_xacro = robot == 'ur5e'
     path = (macro if is_xacro else written)(tmp_path, description)
     arguments = ['name:=mine'] if is_xacro else []
-    status, out, _ = do(path, *arguments, '--json')
-    assert status == 0
-    found = json.loads(out)
+    found = json.loads(do(path, *arguments, '--json').stdout)
     assert (found['held_joint'] or '') == held
     cell = read_cell(tmp_path / 'cell.yaml')
     assert cell.held_joint == held
@@ -94,7 +93,7 @@ def test_known_arms_go_to_a_finished_plan_without_an_edit(robot, held, do, tmp_p
 
 
 def test_the_held_joint_is_the_one_with_the_most_solutions(do, tmp_path):
-    assert do(written(tmp_path, ROBOTS['iiwa14']()), '--no-plan')[0] == 0
+    do(written(tmp_path, ROBOTS['iiwa14']()), '--no-plan')
     text = (tmp_path / 'cell.yaml').read_text().replace('\n# ', ' ')
     tried = dict(
         part.rsplit(' ', 1)
@@ -123,11 +122,9 @@ def macro(folder, description, package='my_arm'):
 
 def test_xacro_is_expanded_beside_the_cell_with_packages_found_by_their_name(do, tmp_path):
     path = macro(tmp_path, ROBOTS['irb120']())
-    status, _, error = do(path)
-    assert status == 2
+    error = do(path, status=2).stderr
     assert 'Undefined substitution argument name; give it behind the file: name:=VALUE' in error
-    status, _, _ = do(path, 'name:=mine', '--no-plan')
-    assert status == 0
+    do(path, 'name:=mine', '--no-plan')
     cell = read_cell(tmp_path / 'cell.yaml')
     assert cell.robot.urdf == 'robot.urdf'
     assert cell.chain().name == 'mine'
@@ -166,14 +163,13 @@ def test_a_package_that_is_elsewhere_is_asked_for_and_found(do, tmp_path, monkey
     apart.parent.mkdir()
     (elsewhere / 'urdf' / path.name).rename(apart)
     (elsewhere / 'package.xml').rename(elsewhere / 'package.xml.off')
-    status, _, error = do(apart, 'name:=mine')
-    assert status == 2
+    error = do(apart, 'name:=mine', status=2).stderr
     assert 'it needs the ROS package my_arm' in error
     assert '--package-path' in error
     (elsewhere / 'package.xml.off').rename(elsewhere / 'package.xml')
     # Given relative to where the command is run, not to the xacro file.
     monkeypatch.chdir(tmp_path)
-    assert do(apart, 'name:=mine', '--package-path', 'elsewhere', '--no-plan')[0] == 0
+    do(apart, 'name:=mine', '--package-path', 'elsewhere', '--no-plan')
 
 
 def test_meshes_are_found_or_named(do, tmp_path):
@@ -185,8 +181,7 @@ def test_meshes_are_found_or_named(do, tmp_path):
     robot = tmp_path / 'robots' / 'robot.urdf'
     robot.parent.mkdir()
     robot.write_text(urdf)
-    status, out, _ = do(robot, '--no-plan')
-    assert status == 0
+    out = do(robot, '--no-plan').stdout
     assert '1 meshes were not found, such as package://abb/meshes/part.stl' in out
     assert '#   package://abb/meshes/part.stl' in (tmp_path / 'cell.yaml').read_text()
 
@@ -195,10 +190,8 @@ def test_meshes_are_found_or_named(do, tmp_path):
     folder = tmp_path / 'workspace' / 'abb' / 'meshes'
     folder.mkdir(parents=True)
     trimesh.creation.box((0.1, 0.1, 0.2)).export(folder / 'part.stl')
-    status, out, _ = do(
-        robot, '--package-path', tmp_path / 'workspace', '--no-plan', out='found.yaml'
-    )
-    assert 'not found' not in out
+    given = ('--package-path', tmp_path / 'workspace', '--no-plan')
+    assert 'not found' not in do(robot, *given, out='found.yaml').stdout
     cell = read_cell(tmp_path / 'found.yaml')
     assert cell.mesh_path == [str(tmp_path / 'workspace')]
     cell.collision_model(cell.chain())
@@ -213,23 +206,16 @@ def test_what_cannot_be_is_refused_in_one_line(do, tmp_path):
         ([robot, 'name=x'], "'name=x' is not NAME:=VALUE"),
         ([tmp_path / 'nothing.urdf'], 'no such file'),
     ):
-        status, _, error = do(*args)
-        assert status == 2
-        assert error.count('\n') == 1
-        assert words in error
+        assert words in do(*args, status=2).stderr
         assert not (tmp_path / 'cell.yaml').exists()
-    assert do(robot, '--no-plan')[0] == 0
-    status, _, error = do(robot)
-    assert status == 2
-    assert 'already there, and not overwritten' in error
+    do(robot, '--no-plan')
+    assert 'already there, and not overwritten' in do(robot, status=2).stderr
 
 
 def test_a_place_and_both_sensors_can_be_told(do, tmp_path):
     robot = written(tmp_path, ROBOTS['ur5e']())
-    status, _, _ = do(
-        robot, '--sensors', 'mocap,tracker', '--sensor-at', 0, -2.5, 1, '--no-floor', '--no-plan'
-    )
-    assert status == 0
+    both = ('--sensors', 'mocap,tracker', '--sensor-at', 0, -2.5, 1)
+    do(robot, *both, '--no-floor', '--no-plan')
     cell = read_cell(tmp_path / 'cell.yaml')
     assert list(cell.sensors) == ['mocap', 'tracker']
     assert cell.aim_at == 'mocap'
@@ -239,7 +225,7 @@ def test_a_place_and_both_sensors_can_be_told(do, tmp_path):
 
 def test_an_arm_that_lies_on_the_floor_at_zero_is_planned_from_elsewhere(do, tmp_path):
     """A UR's zero is stretched out; no way to anywhere is free from there."""
-    assert do(written(tmp_path, ROBOTS['ur5e']()), '--no-plan')[0] == 0
+    do(written(tmp_path, ROBOTS['ur5e']()), '--no-plan')
     cell = read_cell(tmp_path / 'cell.yaml')
     model = cell.planning_scene(cell.chain()).model
     assert model.reasons(np.zeros((1, 6)))[0] == 'hits the floor'
@@ -257,9 +243,7 @@ def test_a_cell_in_which_fewer_than_ten_poses_can_be_planned_ends_with_status_1(
     text = re.sub('upper="[^"]*"', 'upper="0.2"', ROBOTS['irb120']().urdf)
     robot = tmp_path / 'stiff.urdf'
     robot.write_text(re.sub('lower="[^"]*"', 'lower="-0.2"', text))
-    status, _, error = do(robot, *options)
-    assert status == 1
-    assert error.count('\n') == 1
+    error = do(robot, *options, status=1).stderr
     assert 'poses can be planned in this cell, and a calibration needs 10; correct' in error
     assert (tmp_path / 'cell.yaml').exists()
 
@@ -292,6 +276,7 @@ def gantry(between: str = '') -> str:
     return f'<robot name="gantry">{"".join(parts)}</robot>'
 
 
+NO_WAY = r': a free way leads to 0 of the \d+ poses that were tried in this cell, and'
 WALLS = ''.join(
     f'<collision><origin xyz="{x} 0 1.0"/><geometry><box size="0.02 3 3"/></geometry></collision>'
     for x in (-0.15, 0.15)
@@ -303,13 +288,9 @@ def test_a_gantry_between_walls_ends_with_status_1(do, tmp_path):
     """It could stand beyond them, where all the poses are, and does not get there."""
     robot = tmp_path / 'gantry.urdf'
     robot.write_text(gantry(WALLS))
-    status, printed, error = do(robot)
+    printed, error = do(robot, status=1)
     assert int(re.search(r'to fit: .* at (\d+) poses', printed)[1]) >= 10
-    assert status == 1
-    assert error.count('\n') == 1
-    assert re.search(
-        r': a free way leads to 0 of the \d+ poses that were tried in this cell, and', error
-    )
+    assert re.search(NO_WAY, error)
     assert 'give what slides its collision geometry in the URDF' in error
     assert 'every way, in 3-D' not in printed
 
@@ -322,12 +303,8 @@ def test_poses_that_no_free_way_leads_to_are_none_that_can_be_planned(
     start = np.radians([0.0, 90.0, 60.0, 0.0, 0.0, 0.0])
     for module in (init, plan_verb):
         monkeypatch.setattr(module, 'free_start', lambda model, seed: start)
-    status, _, error = do(written(tmp_path, ROBOTS['irb120']()), *options)
-    assert status == 1
-    assert error.count('\n') == 1
-    assert re.search(
-        r': a free way leads to 0 of the \d+ poses that were tried in this cell, and', error
-    )
+    error = do(written(tmp_path, ROBOTS['irb120']()), *options, status=1).stderr
+    assert re.search(NO_WAY, error)
     assert 'what slides' not in error
     if not options:
         # The verb that it names agrees.
@@ -337,8 +314,8 @@ def test_poses_that_no_free_way_leads_to_are_none_that_can_be_planned(
 
 @pytest.mark.qualify
 def test_an_arm_of_five_axes_is_planned(do, tmp_path):
-    status, printed, error = do(written(tmp_path, ROBOTS['irb120']()), '--tip-link', 'link_5')
-    assert (status, error) == (0, '')
+    printed, error = do(written(tmp_path, ROBOTS['irb120']()), '--tip-link', 'link_5')
+    assert error == ''
     assert '5 joints between base_link and link_5' in printed
     assert 'takes few of all poses' in printed
     assert int(re.search(r'to fit: .* at (\d+) poses', printed)[1]) >= 10
@@ -349,9 +326,7 @@ def test_an_arm_of_five_axes_is_planned(do, tmp_path):
 
 @pytest.mark.skipif(not CASES.is_dir(), reason='the descriptions of ../shared/cases are not here')
 def test_a_five_axis_arm_with_a_gripper_is_prepared_and_planned(do, tmp_path):
-    status, printed, _ = do(CASES / 'so101.urdf', '--json')
-    assert status == 0
-    found = json.loads(printed)
+    found = json.loads(do(CASES / 'so101.urdf', '--json').stdout)
     assert (found['base_link'], found['tip_link']) == ('base_link', 'gripper_frame_link')
     plan = found['plan']
     assert len(plan['expected_std_deg']) == 5
@@ -362,9 +337,7 @@ def test_a_five_axis_arm_with_a_gripper_is_prepared_and_planned(do, tmp_path):
 
 @pytest.mark.skipif(not CASES.is_dir(), reason='the descriptions of ../shared/cases are not here')
 def test_a_scara_is_prepared_and_planned(do, tmp_path):
-    status, printed, _ = do(CASES / 'scara.urdf', '--json')
-    assert status == 0
-    found = json.loads(printed)
+    found = json.loads(do(CASES / 'scara.urdf', '--json').stdout)
     assert (found['base_link'], found['tip_link']) == ('base_link', 'tool0')
     text = (tmp_path / 'cell.yaml').read_text()
     assert 'CHECK: the arm cannot turn its tool to the sensor' in text
@@ -380,8 +353,7 @@ def test_a_rail_is_planned_with_the_arm_where_the_base_link_says_so(do, tmp_path
     # To look for the ways of this one takes minutes, and is for another test.
     monkeypatch.setattr(init, 'with_free_way', lambda *_: (10, 10))
     path = on_rail(tmp_path)
-    status, printed, _ = do(path, '--base-link', 'hall')
-    assert status == 0
+    printed = do(path, '--base-link', 'hall').stdout
     assert 'rail is held at -500 mm, 0 mm, 500 mm' in printed
     cell = read_cell(tmp_path / 'cell.yaml')
     assert cell.held_values_m == [-0.5, 0.0, 0.5]
@@ -413,8 +385,7 @@ def on_rail(folder):
 
 
 def test_a_rail_that_carries_the_arm_is_left_alone_and_said_so(do, tmp_path):
-    status, printed, _ = do(on_rail(tmp_path))
-    assert status == 0
+    printed = do(on_rail(tmp_path), '--no-plan').stdout
     assert '6 joints between base_link and tool0' in printed
     sentence = 'rail carries the whole arm, and is no joint of it here: leave it where it is'
     assert sentence in printed
@@ -432,9 +403,7 @@ def test_a_description_that_was_corrected_is_planned(do, tmp_path):
     corrected = calibrated_urdf(description.urdf, chain, rng.normal(0, 5e-3, 6), geometry=geometry)
     path = tmp_path / 'corrected.urdf'
     path.write_text(corrected)
-    status, printed, _ = do(path, '--json')
-    assert status == 0
-    found = json.loads(printed)
+    found = json.loads(do(path, '--json').stdout)
     assert found['inverse_kinematics']['way'] == 'near closed form'
     assert found['plan']['splits']['optimization']['poses'] >= 10
 
@@ -455,21 +424,20 @@ def test_an_arm_with_its_makers_calibration_is_planned_and_its_table_is_imported
     path.write_text(text)
     calibration.write_text('roll: 0.00179822366464\n')
     argument = f'kinematics_params:={calibration}'
-    status, printed, _ = do(path, argument)
-    assert status == 0
+    printed = do(path, argument, '--no-plan').stdout
     sentence = (
         "All joint solutions of a pose are found by Newton's method from those of the nearest arm "
         'that has a closed form, whose tool is up to '
     )
     assert sentence in printed
     assert sentence in (tmp_path / 'cell.yaml').read_text().replace('\n# ', ' ')
-    status, printed, _ = do(path, argument, '--json', out='again/cell.yaml')
-    found = json.loads(printed)
+    found = json.loads(do(path, argument, '--json', out='again/cell.yaml').stdout)
     solved = found['inverse_kinematics']
     assert solved['way'] == 'near closed form'
     assert 0.0 < solved['closed_form_off_mm'] < 3.0
     assert 0.05 < solved['closed_form_off_deg'] < 0.3
-    nominal = json.loads(do(written(tmp_path, ROBOTS['ur5e']()), '--json', out='nominal.yaml')[1])
+    plain = written(tmp_path, ROBOTS['ur5e']())
+    nominal = json.loads(do(plain, '--json', out='nominal.yaml').stdout)
     assert nominal['inverse_kinematics']['way'] == 'closed form'
     assert abs(found['solutions'] - nominal['solutions']) < 0.1
     assert abs(found['plan']['configurations'] - nominal['plan']['configurations']) < 15
