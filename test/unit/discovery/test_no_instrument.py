@@ -20,7 +20,7 @@ from remaster_ros.types import Session
 
 def computed_from_one_another(seed: int) -> Session:
     """One reading of each pose, and two more markers that are the first one shifted."""
-    session, _ = scene(seed, poses=30, validation=12, sigma_m=3e-5, pose_sigma_m=0.0)
+    session, _ = scene(seed, poses=20, validation=10, sigma_m=3e-5, pose_sigma_m=0.0)
     m = session.measurements
     first = m.select(np.sort(np.unique(m.pose, return_index=True)[1]))
     n = len(first)
@@ -46,7 +46,7 @@ def computed_from_one_another(seed: int) -> Session:
 
 @pytest.fixture(scope='module')
 def fitted() -> FitResult:
-    return fit_session(computed_from_one_another(3), rng=np.random.default_rng(0), draws=1000)
+    return fit_session(computed_from_one_another(3), rng=np.random.default_rng(0), draws=300)
 
 
 def test_a_fit_tells_that_its_model_does_not_hold(fitted):

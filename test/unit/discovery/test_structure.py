@@ -157,7 +157,7 @@ def test_a_marker_that_slips_on_the_tool_is_located():
 
 
 def test_readings_of_the_configuration_before_are_called_wrongly_paired():
-    session = session_with(34)
+    session = session_with(34, poses=25, validation=10)
     m = session.measurements
     order = in_time(session)
     # Within a pose the configuration before has the marker at the same place.
