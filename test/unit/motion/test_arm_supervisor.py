@@ -213,18 +213,6 @@ def test_a_planner_that_does_not_run_stops_the_arm_at_once(rig, state):
     assert [drive.solution for drive in rig.said(Drive)] == [0, PROBE, 0]
 
 
-def test_a_required_sensor_that_is_gone_stops_the_arm(rig):
-    rig.go([0.9, -1.0])
-    rig.waiting_for = 'mocap'
-    rig.do(rig.supervisor.recorder_waits('mocap', rig.wall))
-    assert rig.last(Stop).reason == 'waiting for mocap'
-    rig.run(RULES.resume_alone_s - 1.0)
-    assert len(rig.said(Drive)) == 1
-    rig.waiting_for = ''
-    rig.settles()
-    assert len(rig.said(Drive)) == 2
-
-
 def test_a_reading_goes_on_while_paused_and_no_command_follows_it(rig):
     rig.visit([0.3, 0.0], [0.4, 0.0])
     rig.state = 'paused'

@@ -16,6 +16,7 @@ from remaster_ros.motion.joint_reports import (
 LOWER, UPPER = np.array([-1.0, -np.inf]), np.array([1.0, np.inf])
 VELOCITY = np.array([2.0, np.inf])
 AT = np.array([0.25, 0.5])
+BELIEVED = '', ''
 
 
 class Stream:
@@ -52,17 +53,6 @@ def test_nothing_is_refused_of_what_is_right():
     assert stream.reports.late_s == pytest.approx(0.0, abs=1e-6)
 
 
-@pytest.mark.parametrize('bad', [np.nan, np.inf, -np.inf])
-def test_what_is_not_finite(bad):
-    stream = Stream()
-    assert not stream.next(q=[0.25, bad])
-    assert stream.doubt() == ('not_finite', 'joint_states are not finite')
-    assert stream.reports.refused == {'not_finite': 1}
-    # It counts for nothing: the next is judged by the one before.
-    assert stream.next()
-    assert stream.doubt() == ('', '')
-
-
 def test_what_is_outside_the_limits():
     reports = JointReports(LOWER, UPPER, VELOCITY)
     for q in (1.0 + LIMIT_TOLERANCE_RAD, -1.0 - LIMIT_TOLERANCE_RAD):
@@ -81,20 +71,54 @@ def test_the_joint_that_is_farthest_outside_is_named():
     assert reports.trouble.startswith('joint 2 is reported at -114.6 deg')
 
 
-@pytest.mark.parametrize(('joint', 'speed'), [(0, 3.0), (1, 6.0)])
-@pytest.mark.parametrize('side', [1.0, -1.0])
-def test_faster_than_the_arm_can_be(joint, speed, side):
-    """1.5 times its limit, 4 rad/s where there is none, and 20 ms of doubt about the stamps."""
-    step = np.zeros(2)
-    step[joint] = side * speed * 0.12
+def jump(joint, rad):
+    return {'dt': 0.1, 'q': AT + rad * np.eye(2)[joint]}
+
+
+NOT_FINITE = 'not_finite', 'joint_states are not finite'
+AHEAD = 'joint_states are stamped'
+STAMP = 'stamp', 'the stamps of joint_states do not advance'
+# 1.5 times its limit, 4 rad/s where there is none, and 20 ms of doubt about the stamps.
+REACH_RAD = 3.0 * 0.12, 6.0 * 0.12
+FAST = [
+    ('too_fast', f'joint {i} is reported {deg} deg away after 0.100 s')
+    for i, deg in ((1, 20.6), (2, 41.3))
+]
+
+
+@pytest.mark.parametrize(
+    ('report', 'doubt'),
+    [
+        *(({'q': [0.25, bad]}, NOT_FINITE) for bad in (np.nan, np.inf, -np.inf)),
+        *((jump(i, side * 0.999 * REACH_RAD[i]), BELIEVED) for i in (0, 1) for side in (1, -1)),
+        *((jump(i, side * 1.001 * REACH_RAD[i]), FAST[i]) for i in (0, 1) for side in (1, -1)),
+        *(({'stamp_dt': step}, STAMP) for step in (0.0, -0.02, -3600.0)),
+        # A quarter of a second more than usual: 0.15 s, and 0.1 s for a busy machine.
+        ({'late': 0.245}, BELIEVED),
+        ({'late': 0.255}, ('late', 'joint_states come 0.25 s late')),
+        ({'stamp_dt': 0.02 + 0.245}, BELIEVED),
+        ({'stamp_dt': 0.02 + 0.3}, ('early', f'{AHEAD} 0.30 s ahead of their time')),
+        ({'stamp_dt': 3600.0}, ('early', f'{AHEAD} 3599.98 s ahead of their time')),
+    ],
+)
+def test_what_is_believed_of_a_report(report, doubt):
     stream = Stream()
-    assert not stream.next(0.1, q=AT + 1.001 * step)
-    kind, trouble = stream.doubt()
-    jump = np.rad2deg(1.001 * speed * 0.12)
-    assert kind == 'too_fast'
-    assert trouble == f'joint {joint + 1} is reported {jump:.1f} deg away after 0.100 s'
+    assert stream.next(**report) == (doubt == BELIEVED)
+    assert stream.doubt() == doubt
+    assert stream.reports.refused == ({} if doubt == BELIEVED else {doubt[0]: 1})
+    # One that is refused counts for nothing: the next is judged by the one before.
+    if doubt != BELIEVED:
+        stream.stamp = stream.clock
+        assert stream.next()
+        assert stream.doubt() == BELIEVED
+
+
+def test_how_late_a_report_came_that_is_believed_is_told():
     stream = Stream()
-    assert stream.next(0.1, q=AT + 0.999 * step)
+    stream.next(late=0.125)
+    assert stream.reports.late_s == pytest.approx(0.125, abs=1e-3)
+    stream.next(late=-0.1)
+    assert stream.reports.late_s == 0.0
 
 
 def test_a_joint_is_judged_by_the_last_report_that_was_believed():
@@ -107,38 +131,6 @@ def test_a_joint_is_judged_by_the_last_report_that_was_believed():
     assert stream.next()
     assert not stream.next(q=turned)
     assert stream.next()
-
-
-@pytest.mark.parametrize('step', [0.0, -0.02, -3600.0])
-def test_stamps_that_do_not_advance(step):
-    stream = Stream()
-    assert not stream.next(stamp_dt=step)
-    assert stream.doubt() == ('stamp', 'the stamps of joint_states do not advance')
-    stream.stamp = stream.clock
-    assert stream.next()
-
-
-def test_from_when_on_a_report_is_late():
-    """A quarter of a second more than usual: 0.15 s, and 0.1 s for a busy machine."""
-    assert Stream().next(late=0.245)
-    stream = Stream()
-    assert not stream.next(late=0.255)
-    assert stream.doubt() == ('late', 'joint_states come 0.25 s late')
-    # How late one came that is believed is told.
-    stream.next(late=0.125)
-    assert stream.reports.late_s == pytest.approx(0.125, abs=1e-3)
-    stream.next(late=-0.1)
-    assert stream.reports.late_s == 0.0
-
-
-def test_from_when_on_a_report_is_early():
-    stream = Stream()
-    assert stream.next(stamp_dt=0.02 + 0.245)
-    stream = Stream()
-    assert not stream.next(stamp_dt=0.02 + 0.3)
-    assert stream.doubt() == ('early', 'joint_states are stamped 0.30 s ahead of their time')
-    assert not stream.next(stamp_dt=3600.0)
-    assert stream.reports.kind == 'early'
 
 
 @pytest.mark.parametrize('offset', [-1e9, -3600.0, 0.5, 1e9])
