@@ -2,6 +2,7 @@
 
 from collections import Counter
 from dataclasses import replace
+from functools import cache
 from itertools import groupby
 
 import numpy as np
@@ -42,6 +43,12 @@ def planned(poses, counts=(24, 24), every=0, registration=0):
     return planner.scene, plan_collection(planner, planner.rough_places, start)
 
 
+@cache
+def latin():
+    """Return the plan of all poses of the hypercube, which nothing writes into."""
+    return planned(CellPoses(design=LATIN))
+
+
 def of(plan, split):
     return [visit for visit in plan.visits if visit.split == split]
 
@@ -50,7 +57,7 @@ LATIN = 'latin_hypercube'
 
 
 def test_a_cell_has_by_default_designed_poses_each_in_all_its_free_solutions_nearest_first():
-    _, whole = planned(CellPoses(design=LATIN))
+    _, whole = latin()
     scene, plan = planned(CellPoses())
     assert plan.designed.reached
     assert plan.joint_rms <= max(whole.joint_rms, ENOUGH_RAD)
@@ -88,7 +95,7 @@ def stops(plan):
 
 
 def test_chosen_solutions_reach_what_all_poses_reach_in_the_fewest_minutes_on_free_ways():
-    _, whole = planned(CellPoses(design=LATIN))
+    _, whole = latin()
     stated = np.degrees(whole.joint_rms)
     assert stated < np.degrees(ENOUGH_RAD)
     poses = CellPoses(solutions='chosen', order='fastest', joint_std_deg=stated)
@@ -155,7 +162,7 @@ def test_every_candidate_is_accounted_for():
 
 @pytest.mark.qualify
 def test_the_fastest_order_of_the_same_configurations_takes_less_time():
-    _, nearest = planned(CellPoses(design=LATIN))
+    _, nearest = latin()
     _, fastest = planned(CellPoses(design=LATIN, solutions='chosen', order='fastest'))
     assert fastest.tour.configurations == nearest.tour.configurations
     assert len(fastest.visits) + fastest.unreached == len(nearest.visits) + nearest.unreached
