@@ -286,8 +286,8 @@ def halted(rig, reason, within_s=5.0):
     assert not rig.supervisor.busy
 
 
-def stays_halted(rig, reason):
-    """Neither plans nor a planner that pauses and runs again end a halt."""
+def stays_halted(rig, reason, told=1):
+    """Neither plans nor a planner that pauses and runs again end a halt that was told so often."""
     commands = len(rig.commands)
     rig.plan([0.2, 0.1], [0.3, 0.1])
     rig.state = 'paused'
@@ -296,7 +296,7 @@ def stays_halted(rig, reason):
     rig.run(2.0)
     rig.answer(0)
     assert rig.supervisor.halted == reason
-    assert len(rig.said(Halted)) == 1
+    assert len(rig.said(Halted)) == told
     assert len(rig.commands) == commands
 
 

@@ -213,20 +213,6 @@ def test_a_planner_that_does_not_run_stops_the_arm_at_once(rig, state):
     assert [drive.solution for drive in rig.said(Drive)] == [0, PROBE, 0]
 
 
-def test_a_reading_goes_on_while_paused_and_no_command_follows_it(rig):
-    rig.visit([0.3, 0.0], [0.4, 0.0])
-    rig.state = 'paused'
-    rig.run(2.0)
-    assert not rig.said(Stop)
-    assert rig.supervisor.busy
-    rig.answer(0)
-    rig.run(2.0)
-    assert len(rig.said(Drive)) == 1
-    rig.state = 'running'
-    rig.run(5.0, lambda: len(rig.said(Drive)) == 3)
-    assert [d.solution for d in rig.said(Drive)] == [0, PROBE, 1]
-
-
 # The recorder
 
 

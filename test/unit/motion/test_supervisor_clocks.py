@@ -224,20 +224,6 @@ def test_a_pause_of_this_process_is_nobodys_silence(rig, seconds):
     assert not rig.said(Stop, Failed, Halted), rig.supervisor.halted
 
 
-def test_a_pause_of_this_process_with_an_emergency_stop_in_it(rig):
-    rig.go([0.9, -1.9], 0.5)
-    commands = len(rig.commands)
-    rig.alive.discard('bridge')
-    rig.run(0.5)
-    rig.freeze()
-    rig.run(1.5)
-    rig.alive.add('bridge')
-    rig.halts(5.0)
-    rig.run(5.0)
-    assert len(rig.commands) == commands
-    assert not rig.said(Stop)
-
-
 @pytest.mark.parametrize('where', ['moving', 'settled'])
 def test_after_a_pause_longer_than_a_heartbeat_nobody_has_seen_the_arm(rig, where):
     rig.plan([0.9, -1.9], [-0.9, 1.9])
@@ -292,14 +278,3 @@ def test_a_pause_shorter_than_half_a_second_is_none(rig):
     assert arm.report_age_s(rig.wall + 0.5) == pytest.approx(heard + 0.5)
     arm.tick(rig.wall + 1.25)
     assert arm.report_age_s(rig.wall + 1.25) == pytest.approx(heard + 0.5)
-
-
-def test_a_gap_while_halted_does_not_change_why(rig):
-    rig.do(rig.supervisor.emergency(True, rig.wall))
-    rig.do(rig.supervisor.emergency(False, rig.wall))
-    rig.alive.discard('robot')
-    rig.run(10.0)
-    rig.alive.add('robot')
-    rig.run(2.0)
-    assert rig.supervisor.halted == 'the robot reports an emergency stop'
-    assert len(rig.said(Halted)) == 1

@@ -133,24 +133,3 @@ def test_a_stop_of_an_arm_that_has_hardly_begun_to_move(rig, moved_s, delay_s):
     np.testing.assert_allclose(q, end.q, atol=1e-4)
     assert np.max(np.abs(velocity)) < 1e-3
     assert not rig.said(Halted)
-
-
-def test_a_command_that_the_controller_gives_up_halts(rig):
-    rig.go([0.9, -1.9])
-    rig.do(rig.supervisor.given_up('the controller has given up'))
-    assert rig.last(Halted).reason == rig.supervisor.halted == 'the controller has given up'
-    assert not rig.said(Stop), 'it may be anywhere'
-    rig.run(5.0)
-    assert len(rig.said(Halted)) == 1
-
-
-def test_an_arm_whose_stop_was_refused_is_not_judged_by_that_stop(rig):
-    """The halt keeps the first reason, though the arm does not come to where the stop led."""
-    rig.obey = lambda waypoints: waypoints if len(waypoints) > 1 else ()
-    rig.go([0.9, -1.9], 1.2)
-    rig.do(rig.supervisor.observe('rivals', 'another', rig.wall))
-    assert rig.said(Stop)
-    rig.do(rig.supervisor.given_up('the controller refuses a command'))
-    rig.freeze()
-    rig.run(5.0)
-    assert [halt.reason for halt in rig.said(Halted)] == ['another']

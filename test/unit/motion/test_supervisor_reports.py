@@ -220,24 +220,6 @@ def test_a_halt_that_was_cleared_before_the_planner_came_waits_for_a_person():
     assert rig.supervisor.blocked(rig.wall) == ''
 
 
-def test_a_pause_while_the_arm_settles_commands_nothing(rig):
-    """Its move is over: there is nothing to be stopped, and it is commanded again afterwards."""
-    rig.plan([0.3, 0.0])
-    rig.run(10.0, lambda: rig.said(Drive) and rig.t > rig.commands[0][0] + 2.0)
-    rig.run(5.0, lambda: rig.speed() < 1e-5)
-    assert not rig.said(Settled)
-    before = len(rig.commands)
-    rig.do(rig.supervisor.planner_is('paused', rig.wall))
-    rig.state = 'paused'
-    rig.run(1.5)
-    assert not rig.said(Stop)
-    assert not rig.said(Halted)
-    assert not rig.said(Settled)
-    assert len(rig.commands) == before
-    rig.state = 'running'
-    rig.settles()
-
-
 def test_reports_that_come_late_in_a_pause_do_not_become_the_usual_ones(rig):
     rig.go([0.9, -1.9])
     rig.state = 'paused'

@@ -301,6 +301,95 @@ def stands_beside_the_end_of_its_stop(rig):
     rig.run(5.0)
 
 
+@scene('Drive Drive Drive Settled')
+def is_paused_while_it_settles(rig):
+    """Its move is over: there is nothing to be stopped, and it is commanded again afterwards."""
+    rig.plan([0.3, 0.0])
+    rig.run(10.0, lambda: rig.commands and rig.t > rig.commands[0][0] + 2.0)
+    rig.run(5.0, lambda: rig.speed() < 1e-5)
+    rig.pause()
+    rig.run(1.5)
+    assert len(rig.commands) == 1
+    rig.state = 'running'
+    rig.settles()
+
+
+@scene('Drive Settled Drive Drive Settled')
+def is_paused_while_it_is_measured(rig):
+    """The reading goes on; no command follows it before the collection does."""
+    rig.visit([0.3, 0.0], [0.4, 0.0])
+    rig.pause()
+    rig.run(2.0)
+    rig.answer(0)
+    rig.run(2.0)
+    assert len(rig.commands) == 1
+    rig.state = 'running'
+    rig.run(5.0)
+
+
+@scene('Drive Stop Halted Halted', 'two publishers')
+def is_stopped_by_an_emergency_while_it_is_being_halted(rig):
+    """It does not come to where its stop leads either: that does not hide why it was halted."""
+    rig.go([0.9, -1.9], 1.2)
+    rig.do(rig.supervisor.observe('rivals', 'two publishers', rig.wall))
+    rig.run(0.1)
+    rig.freeze()
+    rig.run(4.0)
+
+
+@scene('Drive Stop Halted', 'another')
+def refuses_the_stop_of_a_halt(rig):
+    """It is not judged by that stop: the halt keeps the first reason."""
+    rig.obey = lambda waypoints: waypoints if len(waypoints) > 1 else ()
+    rig.go([0.9, -1.9], 1.2)
+    rig.do(rig.supervisor.observe('rivals', 'another', rig.wall))
+    rig.do(rig.supervisor.given_up('the controller refuses a command'))
+    rig.freeze()
+    rig.run(5.0)
+
+
+@scene('Drive Halted', 'the controller has given up')
+def is_given_up_by_its_controller(rig):
+    """It may be anywhere: nothing is commanded."""
+    rig.go([0.9, -1.9])
+    rig.do(rig.supervisor.given_up('the controller has given up'))
+    rig.run(5.0)
+
+
+@scene('Halted', 'the robot reports an emergency stop')
+def is_not_seen_while_it_is_halted(rig):
+    rig.do(rig.supervisor.emergency(True, rig.wall))
+    rig.do(rig.supervisor.emergency(False, rig.wall))
+    rig.alive.discard('robot')
+    rig.run(10.0)
+    rig.alive.add('robot')
+    rig.run(2.0)
+
+
+@scene('Drive Halted', STOPPED)
+def is_stopped_by_an_emergency_in_a_pause_of_this_process(rig):
+    rig.go([0.9, -1.9], 0.5)
+    rig.alive.discard('bridge')
+    rig.run(0.5)
+    rig.freeze()
+    rig.run(1.5)
+    rig.alive.add('bridge')
+    rig.run(10.0)
+
+
+@scene('Drive Stop Halted', ASKED + 'a at * deg, +5.73 deg from there; compare *')
+def is_elsewhere_after_a_stop(rig):
+    """The next move begins only where the stop led."""
+    rig.go([0.3, 0.2])
+    rig.pause()
+    rig.run(3.0)
+    rig.alter = lambda t, q: np.add(q, [0.1, 0.0])
+    rig.supervisor.reports.forget()
+    rig.run(1.5)
+    rig.state = 'running'
+    rig.run(2.0)
+
+
 def course(rig, play):
     """Return what was decided in a scene, and when, in radians and without figures in words."""
     play(rig)
@@ -338,7 +427,7 @@ def test_what_becomes_of_an_arm(play):
     assert ' '.join(kind for _, kind, *_ in actions if kind != 'CheckPath') == kinds
     assert fnmatchcase(rig.supervisor.halted, halted)
     if halted:
-        stays_halted(copy.deepcopy(rig), rig.supervisor.halted)
+        stays_halted(copy.deepcopy(rig), rig.supervisor.halted, kinds.count('Halted'))
 
 
 @pytest.mark.parametrize('play', SCENES, ids=lambda play: play.__name__)

@@ -34,20 +34,6 @@ def test_an_emergency_stop_while_it_brakes_halts(trial):
     assert len(rig.said(Drive)) == 1
 
 
-def test_what_halts_an_arm_that_is_being_halted_does_not_hide_why_it_was():
-    """An emergency stop while it brakes, as a second publisher was noticed."""
-    rig = begun()
-    rig.go([0.9, -1.9], 1.2)
-    rig.do(rig.supervisor.observe('rivals', 'two publishers', rig.wall))
-    assert rig.said(Stop)
-    rig.run(0.1)
-    rig.freeze()
-    rig.run(4.0)
-    # Once more, as it does not come to where its stop leads.
-    assert [halt.reason for halt in rig.said(Halted)] == 2 * ['two publishers']
-    assert rig.supervisor.halted == 'two publishers'
-
-
 @pytest.mark.parametrize('rate', [1.0, 10.0])
 def test_a_stop_that_is_long_on_its_way_is_no_emergency_stop(rate):
     """The arm has come to the end of its move meanwhile, stands there and then goes back."""
@@ -150,22 +136,6 @@ def test_a_bridge_that_was_away_for_long_waits_for_a_person(topic):
         rig.plan([0.3, 0.0])
         rig.run(4.0)
         assert bool(rig.said(Drive)) == alone
-
-
-def test_after_a_stop_the_next_move_begins_only_where_the_stop_led():
-    rig = begun()
-    rig.go([0.3, 0.2])
-    rig.state = 'paused'
-    rig.run(3.0)
-    (end,) = rig.last(Stop).admitted.waypoints
-    rig.alter = lambda t, q: np.add(q, [0.1, 0.0])
-    rig.supervisor.reports.forget()
-    rig.run(1.5)
-    rig.state = 'running'
-    rig.run(2.0)
-    at = np.rad2deg(end.q[0] + 0.1)
-    assert rig.last(Halted).reason.startswith(f'{ASKED}a at {at:.2f} deg, +5.73 deg from there')
-    assert len(rig.said(Drive)) == 1
 
 
 def test_frozen_reports_and_a_person_who_clears_the_halt():
