@@ -114,8 +114,8 @@ class Confirmation:
     # Rows of the other session, and those of them that are common to all causes
     rows: int
     rows_common: int
-    # RMS of the 3-D error without causes, with those as found here, and with the same fitted
-    # there; all else, and what this session does not tell, is fitted to the other one
+    # RMS of the 3-D error of the latter: without causes, with those as found here, and with the
+    # same fitted there; all else, and what this session does not tell, is fitted to the other one
     rms_before_m: float
     rms_after_m: float
     rms_own_m: float
@@ -174,27 +174,28 @@ def confirm(discovery: Discovery, session: Session, rng: np.random.Generator) ->
     told = [both.told(group) for group in both.groups]
     causes = tuple(both.judged(best, index, told[index]) for index in range(len(told)))
     every = [i for group in both.groups for i in group]
-    before, after, own = both.error(absent=every), both.error(frozen=every), both.error()
+    seen = np.all([np.ones(rows, dtype=bool), *told], axis=0)
+    error = partial(both.error, rows=seen)
+    before, after, own = error(absent=every), error(frozen=every), error()
     carried = share_of_gain(before, after, own)
-    common = int(np.all([np.ones(rows, dtype=bool), *told], axis=0).sum())
     why = ''
     if causes and all(cause.answer == 'open' for cause in causes):
         why = (
-            f'In {common} of the {rows} rows of the other session all that drives the causes is '
-            'in the range seen here, and it shows none of them either way: nothing is confirmed. '
-            'Measure the arm where this session did.'
+            f'In {seen.sum()} of the {rows} rows of the other session all that drives the causes '
+            'is in the range seen here, and it shows none of them either way: nothing is '
+            'confirmed. Measure the arm where this session did.'
         )
     with_causes = both.here.data.context.joint_offsets + both.alone.values[: both.joints]
     others = tuple(j + 1 for j, c in enumerate(best[: both.joints]) if c == 'own')
     return Confirmation(
         rows=rows,
-        rows_common=common,
+        rows_common=int(seen.sum()),
         rms_before_m=before,
         rms_after_m=after,
         rms_own_m=own,
         rms_frozen_offsets_m=min(
-            both.error(absent=every, joint_offsets=discovery.offsets_before[0]),
-            both.error(frozen=every, joint_offsets=with_causes),
+            error(absent=every, joint_offsets=discovery.offsets_before[0]),
+            error(frozen=every, joint_offsets=with_causes),
         ),
         carried_over=carried,
         effects=causes,
@@ -672,10 +673,11 @@ def in_words(discovery: Discovery, confirmation: Confirmation) -> list[str]:
         else f'{percent(found.carried_over)} of what they could gain there'
     )
     lines = [
-        f'{1e3 * found.rms_before_m:.3f} mm RMS without the causes, {1e3 * found.rms_after_m:.3f} '
-        f'mm with them as found here, {1e3 * found.rms_own_m:.3f} mm with them fitted there: '
-        f'{carried}. In {found.rows_common} of its {found.rows} rows all that drives '
-        'them was seen here; what this session does not tell is fitted to the other one.'
+        f'In {found.rows_common} of its {found.rows} rows all that drives the causes was seen '
+        f'here. In these it is {1e3 * found.rms_before_m:.3f} mm RMS without the causes, '
+        f'{1e3 * found.rms_after_m:.3f} mm with them as found here, '
+        f'{1e3 * found.rms_own_m:.3f} mm with them fitted there: {carried}. What this session '
+        'does not tell is fitted to the other one.'
     ] * bool(found.effects)
     offsets = (
         f'they are {found.offsets_rms_sigmas:.1f} standard deviations apart on the average, and '

@@ -15,6 +15,8 @@ from worlds.path_cells import SPECS, make_cell
 
 from remaster_ros.planning.tour_planner import TourPlanner
 
+# The judge takes minutes of processor time for a cell, which is shared with other tests.
+pytestmark = pytest.mark.timeout(3600)
 SOON = 'LWR 4+, low, 250 mm tool, boxes'
 CELLS = [
     pytest.param(spec, id=spec.name, marks=() if spec.name == SOON else pytest.mark.qualify)

@@ -112,7 +112,7 @@ class InverseJudge:
                     break
                 damped = J.T @ J + min(0.02 * size, 0.1) * np.eye(self.model.nv)
                 step = np.linalg.solve(damped, J.T @ screw)
-                q = q + step * min(1.0, 0.7 / np.max(np.abs(step)))
+                q = q + step * min(1.0, 0.7 / max(np.max(np.abs(step)), 1e-300))
         return np.array(found).reshape(-1, self.model.nq)
 
 

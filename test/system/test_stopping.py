@@ -1,4 +1,4 @@
-"""Ctrl-C at any moment: every process gone within 5 s, the session readable."""
+"""Ctrl-C at any moment: every process gone soon, the session readable."""
 
 import os
 import signal
@@ -7,9 +7,11 @@ from pathlib import Path
 
 import pytest
 import yaml
-from rigs.ros_rig import wait_until
+from rigs.ros_rig import PATIENCE, wait_until
 
 from remaster_ros.session.reader import read_session
+
+LIMIT_S = 5.0 * PATIENCE
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(900)]
 
@@ -57,12 +59,19 @@ def stop(process, signum=signal.SIGINT):
     return time.monotonic() - began, len(pids)
 
 
-@pytest.mark.parametrize(('moment_s', 'signum'), [(0.7, signal.SIGINT), (3.0, signal.SIGTERM)])
-def test_while_it_starts(start, tmp_path, moment_s, signum):
+def imports(pid):
+    """Whether a process has begun to import what the command line needs."""
+    return 'numpy' in Path(f'/proc/{pid}/maps').read_text()
+
+
+@pytest.mark.parametrize(
+    ('moment', 'signum'), [(imports, signal.SIGINT), (children, signal.SIGTERM)]
+)
+def test_while_it_starts(start, tmp_path, moment, signum):
     process = start('remaster_ros.cli.main', 'demo', '--out', tmp_path / 'out')
-    time.sleep(moment_s)
+    wait_until(lambda: moment(process.pid), 30, f'it {moment.__name__}')
     seconds, _ = stop(process, signum)
-    assert seconds < 5.0
+    assert seconds < LIMIT_S
     assert 'Traceback' not in process.stderr.read()
 
 
@@ -80,7 +89,7 @@ def test_while_it_collects(start, tmp_path):
     assert process.poll() is None, process.communicate()
     seconds, processes = stop(process)
     assert processes >= 10
-    assert seconds < 5.0
+    assert seconds < LIMIT_S
     assert process.returncode == 130
     assert 'Traceback' not in process.stderr.read()
     assert (

@@ -138,7 +138,7 @@ def test_the_other_session_is_shown_side_by_side():
     session = found((EFFECT,), Gain(1e-3, 0.3e-3, 0.28e-3, {}), {})
     rows = [compared('compliance_2', 2e-5, 2.1e-5, 0.7)]
     text = summary(session, confirmation(0.93, 0.35e-3, rows))
-    assert 'other session: 0.900 mm RMS without the causes, 0.350 mm with them as found' in text
+    assert '0.900 mm RMS without the causes, 0.350 mm with them as found' in text
     assert '93 % of what they could gain there' in text
     assert '150 of its 200 rows' in text
     assert 'Confirmed: both sessions share it (93 % of what it could gain from it' in text

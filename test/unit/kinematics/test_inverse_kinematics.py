@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.linalg import expm
+from scipy.stats import poisson
 from srs_solver import SrsArm
 from worlds.random_arm import random_arm_urdf
 from worlds.robot_descriptions import Description, iiwa14, irb120, panda, ur5e, xarm6
@@ -381,8 +382,9 @@ def test_arms_without_a_closed_form_keep_all_solutions(make, errors, held, way, 
     assert doubled == 0
     assert max(worst) < 2e-8
     # Where two solutions are about to meet, one in 10,000 may be lost. Many starts miss those to
-    # which few of them lead: of solutions with a chance of 1 in 30 a start, 0.4 %.
-    assert missed <= (1e-3 if way == 'many starts' else 1e-4) * total
+    # which few of them lead: of solutions with a chance of 1 in 30 a start, 0.4 %. With such a
+    # share this fails by chance once in a hundred.
+    assert missed <= poisson.ppf(0.99, (1e-3 if way == 'many starts' else 1e-4) * total)
 
 
 @pytest.mark.parametrize('slides', [(), (0,), (1,), (0, 2)], ids=str)
