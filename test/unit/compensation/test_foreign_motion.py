@@ -255,12 +255,12 @@ def test_true_angles_are_exact_where_the_arm_stands(tmp_path):
     a, b = configurations(compensator.model, 2, 14) * 0.5
     true = TrueAngles(compensator)
     now, worst = 0.0, 0.0
-    for u in np.linspace(0.0, 1.0, 200):
+    for u in np.linspace(0.0, 1.0, 60):
         q = a + u * (b - a)
         worst = max(worst, np.abs(true.at(q, None, now) - compensator.true(q)).max())
         now += 0.01
     # On its way: the way in 20 ms times the slope of the correction, some hundredths.
-    assert worst < 0.1 * 3 * np.abs(b - a).max() / 200
+    assert worst < 0.1 * 3 * np.abs(b - a).max() / 60
     for _ in range(10):
         last = true.at(b, None, now)
         now += 0.01
