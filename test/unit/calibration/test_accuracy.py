@@ -1,7 +1,5 @@
 """The paper's metrics on cases that can be done by hand."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from worlds.measured_rows import measured_rows

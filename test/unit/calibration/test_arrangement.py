@@ -1,7 +1,5 @@
 """Tables whose joints are otherwise than the robot's are recognised, and right ones left alone."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """R-hat, effective sample size and Pareto smoothing: those of arviz, and where they have none."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from arviz_stats.base import array_stats

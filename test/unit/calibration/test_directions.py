@@ -1,7 +1,5 @@
 """Noise along and across the line of sight: found where it is, not where it is not."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import msgspec

@@ -1,7 +1,5 @@
 """A fit with further physical effects: the truth comes back, next to the core parameters."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

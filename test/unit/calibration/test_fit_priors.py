@@ -1,7 +1,5 @@
 """Priors that a user gives take part in the fit, and are reported where they decide."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from worlds.calibration_scenes import scene

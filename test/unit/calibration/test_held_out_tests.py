@@ -1,7 +1,5 @@
 """Held-out poses are held against poses left out of the fit, sensor by sensor."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

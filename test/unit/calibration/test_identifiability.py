@@ -1,7 +1,5 @@
 """The null directions of an LWR 4+ that sensors watch: found, named, fixed."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Held-out configurations that were fitted as well are counted, and prove nothing."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

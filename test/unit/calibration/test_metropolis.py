@@ -4,8 +4,6 @@ KS tests run on draws thinned to independence, with fixed seeds: a correct sampl
 another seed in 1,000.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy import stats

@@ -1,7 +1,5 @@
 """A sensor whose points are mirrored is refused by name, and no other."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

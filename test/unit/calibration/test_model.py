@@ -1,7 +1,5 @@
 """The prediction of a marker, its derivative, and the coordinates with the gauge taken out."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

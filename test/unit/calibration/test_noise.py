@@ -1,7 +1,5 @@
 """One noise engine for fit and discovery: sums, Gram matrices and whitening say the same."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 

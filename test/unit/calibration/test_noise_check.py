@@ -1,7 +1,5 @@
 """Whether noise explains what a fit leaves: by what is stated and by the scatter within poses."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

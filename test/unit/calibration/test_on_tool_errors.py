@@ -3,8 +3,6 @@
 Its place in front of the board, by its readings, has the noise of the orientation at the distance.
 """
 
-from __future__ import annotations
-
 from functools import cache
 
 import numpy as np

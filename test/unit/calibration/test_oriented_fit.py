@@ -1,7 +1,5 @@
 """Orientations in the fit: derivative, gauge, coverage, gross errors, what is refused."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Gross errors: named with their numbers, neighbours and heavy tails left alone."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.stats import chi

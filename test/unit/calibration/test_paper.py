@@ -1,7 +1,5 @@
 """The source paper's estimator: its equations, and that it reports its failure to converge."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

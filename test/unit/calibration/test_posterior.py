@@ -1,7 +1,5 @@
 """The log density against SciPy's, and the linear approximation against the exact density."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

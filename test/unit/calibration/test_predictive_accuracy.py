@@ -1,7 +1,5 @@
 """Section V-C on posteriors whose distances are known."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Structure in the residuals is found, noise is left alone, and the intervals become honest."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Arms with a joint that slides: kinematics against pinocchio, offsets in m, refusals."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

@@ -1,7 +1,5 @@
 """``remaster batch``: rows that stay, workers that die, and what is said over all sessions."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

@@ -1,7 +1,5 @@
 """``remaster check``: the history, what it refuses, and what is printed."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

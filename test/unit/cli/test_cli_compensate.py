@@ -1,7 +1,5 @@
 """``remaster compensate``: a table of joint targets, corrected and back, and what is refused."""
 
-from __future__ import annotations
-
 import csv
 import json
 

@@ -4,8 +4,6 @@ Pinocchio reads URDFs, xacro makes them, urchin reads ``<calibration>``. Of ros2
 transmission_interface there is no wheel: its formula stands here.
 """
 
-from __future__ import annotations
-
 import csv
 import json
 import re

@@ -1,7 +1,5 @@
 """Robot descriptions become cell files in which poses can be planned, without an edit."""
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Whatever a verb raises becomes one line on stderr and an exit status."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Option values that cannot be are refused with one line that names option and value."""
 
-from __future__ import annotations
-
 import argparse
 
 import pytest

@@ -1,7 +1,5 @@
 """``remaster verify``: what a session must tell, and what is printed."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 

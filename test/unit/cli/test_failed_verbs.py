@@ -1,7 +1,5 @@
 """A verb that fails leaves nothing behind, takes nothing away, and can be tried again."""
 
-from __future__ import annotations
-
 import errno
 import os
 import shutil

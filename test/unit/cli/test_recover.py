@@ -1,7 +1,5 @@
 """`remaster recover`: 0 where nothing was lost, 3 where something was (and what), else 2."""
 
-from __future__ import annotations
-
 import json
 import random
 

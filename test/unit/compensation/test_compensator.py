@@ -1,7 +1,5 @@
 """The correction against what each effect is defined to do, and its behaviour at its limits."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

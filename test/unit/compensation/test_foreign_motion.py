@@ -1,7 +1,5 @@
 """What becomes of other planners' trajectories, against what a controller draws of them."""
 
-from __future__ import annotations
-
 import time
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A correction that is made of every command: held against the arm, and where the arm then is."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Where a joint is driven to and what is set there: within its limits, in the pad's digits."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from worlds.robot_descriptions import ROBOTS

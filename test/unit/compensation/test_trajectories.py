@@ -1,7 +1,5 @@
 """What a controller draws through the corrected points, against the wanted path of the tool."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -3,8 +3,6 @@
 Cheap: a few arms of each kind; `make qualify` has the shares over hundreds.
 """
 
-from __future__ import annotations
-
 import os
 from collections import Counter
 from dataclasses import replace

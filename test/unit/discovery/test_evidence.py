@@ -1,7 +1,5 @@
 """Fits of sets of cells: Gram matrices that are kept, cells taken out, noise that is settled."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Lengths and tilts off the drawing: what they do to the offsets, and the robot model of them."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

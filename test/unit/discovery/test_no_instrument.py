@@ -1,7 +1,5 @@
 """Errors that no measuring instrument has are no noise, whatever the search finds in them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

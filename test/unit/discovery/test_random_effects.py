@@ -1,7 +1,5 @@
 """Kinds of errors in one model: those with a name stay, of the others those that show."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from worlds.calibration_scenes import CHAIN

@@ -1,7 +1,5 @@
 """How much of the gain is lost without each cause."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What of the measurement is taken out of what a robot can load."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from worlds.discovery_scenes import session_with

@@ -1,7 +1,5 @@
 """A large session is searched in part, evenly; a small one as it is."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import partial
 

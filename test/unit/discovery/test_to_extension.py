@@ -1,7 +1,5 @@
 """From a search to the model that is sampled: where the zero-offsets may go beside its effects."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What people are told of a cause: its heading, its sentence, and what to do, for every effect."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """A table becomes a session, by the command."""
 
-from __future__ import annotations
-
 import pytest
 from rigs.command_line import remaster
 

@@ -1,7 +1,5 @@
 """Joining two tables, poses by equal goals, fair splits, and what is refused with its row."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A bag of joint states and points becomes rows: one for each standstill and sensor."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from rosbags.rosbag2 import StoragePlugin

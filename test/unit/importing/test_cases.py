@@ -1,7 +1,5 @@
 """Small inputs on which users got stuck: the offsets that made them, or what to do."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Tables of five other programs become sessions, and each session can be fitted."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

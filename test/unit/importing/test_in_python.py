@@ -1,7 +1,5 @@
 """Sessions of arrays, of columns by name, and of files, from Python."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from foreign.tables import measured, text, write

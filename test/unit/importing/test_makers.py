@@ -1,7 +1,5 @@
 """Joints from the text of each maker's controller; what is damaged is read right or refused."""
 
-from __future__ import annotations
-
 import random
 import re
 from collections import Counter

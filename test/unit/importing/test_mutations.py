@@ -1,7 +1,5 @@
 """Plain tables and takes with one thing wrong: read right but for it, or refused."""
 
-from __future__ import annotations
-
 import random
 import re
 from collections import Counter

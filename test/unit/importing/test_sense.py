@@ -1,7 +1,5 @@
 """What import says of rows that do not fit, of too few, and what it proposes."""
 
-from __future__ import annotations
-
 import json
 import re
 import shlex

@@ -1,7 +1,5 @@
 """A take and a log of joints with two clocks become rows: one for each stop that both have."""
 
-from __future__ import annotations
-
 import re
 
 import numpy as np

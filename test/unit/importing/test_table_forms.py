@@ -1,7 +1,5 @@
 """Tables, logs and programs as people really have them: each is read, or refused in one line."""
 
-from __future__ import annotations
-
 import re
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Separators, decimal signs and encodings are found; damaged tables give one clear error."""
 
-from __future__ import annotations
-
 import random
 from contextlib import suppress
 

@@ -1,7 +1,5 @@
 """What the page of `remaster report` decides: the deed, the gain, the colour, what remains."""
 
-from __future__ import annotations
-
 import builtins
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """What the page of `remaster report` tells of the plan of its session."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import msgspec

@@ -1,7 +1,5 @@
 """fit.json keeps its contract, and the three ways to apply offsets do the same."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 

@@ -3,8 +3,6 @@
 The server is a process of its own, with a pipe as stderr that nobody reads meanwhile.
 """
 
-from __future__ import annotations
-
 import contextlib
 import http.client
 import json

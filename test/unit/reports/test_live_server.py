@@ -1,7 +1,5 @@
 """The web server of the live page, read as somebody who is not meant to use it would."""
 
-from __future__ import annotations
-
 import gzip
 import http.client
 import json

@@ -1,7 +1,5 @@
 """The state of the live page: events in, a view out."""
 
-from __future__ import annotations
-
 import json
 
 import msgspec

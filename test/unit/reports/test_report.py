@@ -1,7 +1,5 @@
 """The report is one page that needs nothing else, with the verdict, and of bounded size."""
 
-from __future__ import annotations
-
 import re
 import subprocess
 import sys

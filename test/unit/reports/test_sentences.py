@@ -1,7 +1,5 @@
 """What a fit is worth: never green where anything contradicts it, with the reason in words."""
 
-from __future__ import annotations
-
 import html
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Which frames give a reading of the marker, and why the others do not."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Who gets the lock, who keeps it, and who is never given it; times in seconds of one clock."""
 
-from __future__ import annotations
-
 import pytest
 
 from remaster_ros.sensors.optitrack.frame_gate import (

@@ -1,7 +1,5 @@
 """The driver against the fake tracker over real sockets."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import socket

@@ -1,7 +1,5 @@
 """The driver against scripted peers over real sockets: what no instrument should do."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import socket

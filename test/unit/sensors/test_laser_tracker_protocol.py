@@ -1,7 +1,5 @@
 """The emScon packets: whole, byte by byte, with trailing junk, damaged; no network."""
 
-from __future__ import annotations
-
 import itertools
 import struct
 

@@ -1,7 +1,5 @@
 """The OptiTrack client on real sockets, against the fake server."""
 
-from __future__ import annotations
-
 import socket
 import struct
 from dataclasses import replace

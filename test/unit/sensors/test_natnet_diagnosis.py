@@ -1,7 +1,5 @@
 """Which of address, interface, multicast, port, version or rigid body is wrong."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import pytest

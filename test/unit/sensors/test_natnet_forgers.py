@@ -5,8 +5,6 @@ sends it under the *next* frame number, so that the genuine frame that follows l
 duplicate. It has the server's address and a port of its own.
 """
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import logging

@@ -1,7 +1,5 @@
 """Frames of data: sizes, round trips and damage, for every bitstream version."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import math

@@ -1,7 +1,5 @@
 """Everything but frames: server info, requests, model definitions; whole, cut and damaged."""
 
-from __future__ import annotations
-
 import contextlib
 import struct
 

@@ -1,7 +1,5 @@
 """The OptiTrack client against a server that sends exactly what a test wants sent."""
 
-from __future__ import annotations
-
 import socket
 import time
 

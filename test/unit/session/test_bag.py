@@ -1,7 +1,5 @@
 """Other people's readers open our bags; a killed writer leaves all it wrote; damage is refused."""
 
-from __future__ import annotations
-
 import logging
 import signal
 import subprocess

@@ -1,7 +1,5 @@
 """A bag that goes on after a kill, or is damaged: one bag of several files, or refused."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

@@ -1,7 +1,5 @@
 """Chunks that unpack to more than they state are refused before they are in memory."""
 
-from __future__ import annotations
-
 import struct
 import subprocess
 import sys

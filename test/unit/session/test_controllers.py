@@ -1,7 +1,5 @@
 """How a pad writes the joints is kept in session.yaml, and refused where it cannot be so."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

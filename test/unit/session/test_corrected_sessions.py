@@ -1,7 +1,5 @@
 """Sessions measured with a correction on: what is told of them, and how they are fitted."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -4,8 +4,6 @@ What a crash may leave is in test/faults/crash_states.py, what must hold then in
 beside it.
 """
 
-from __future__ import annotations
-
 import logging
 import os
 import random

@@ -1,7 +1,5 @@
 """Every reader of files, on spoilt files: it reads them or raises `InputError`, nothing else."""
 
-from __future__ import annotations
-
 import logging
 import random
 import shutil

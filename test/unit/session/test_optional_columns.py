@@ -1,7 +1,5 @@
 """Columns and keys that a session may leave out: kept, not there without, refused by place."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

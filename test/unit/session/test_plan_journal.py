@@ -1,7 +1,5 @@
 """A planner that is started again takes up its tour where it was, and refuses another plan."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

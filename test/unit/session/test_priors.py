@@ -1,7 +1,5 @@
 """The file of priors: read strictly, refused in one line, and felt by the fit."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The session reader refuses with one clear line; writer and reader agree to the last bit."""
 
-from __future__ import annotations
-
 import logging
 import math
 import re

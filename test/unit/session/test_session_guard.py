@@ -1,7 +1,5 @@
 """What others do to the files of a session while it is written: restored, said, never sealed."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

@@ -1,7 +1,5 @@
 """The recorder's memory: numbering, results, registration and time across restarts."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

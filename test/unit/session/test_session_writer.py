@@ -1,7 +1,5 @@
 """What `append` returned from is on the disk, whatever happens next."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

@@ -1,7 +1,5 @@
 """The smallest session of docs/session-format.md is one, and can be fitted."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Several sessions of one arm: one set of offsets, registrations and markers of each session."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 

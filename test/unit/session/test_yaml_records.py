@@ -1,7 +1,5 @@
 """Numbers of YAML files are held to the bounds that their records declare."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

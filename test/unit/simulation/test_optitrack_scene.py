@@ -1,7 +1,5 @@
 """What the fake cameras see, statistically, and how the fake server answers."""
 
-from __future__ import annotations
-
 import contextlib
 import socket
 import struct

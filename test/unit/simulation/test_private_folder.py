@@ -1,7 +1,5 @@
 """The fakes meet in a folder of the temporary directory, where anybody may have been before."""
 
-from __future__ import annotations
-
 import os
 import stat
 

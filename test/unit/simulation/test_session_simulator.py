@@ -1,7 +1,5 @@
 """A simulated session is what its truth says, and looks like a recorded one."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Sensors that measure poses, simulated: noise as asked for, and a fit that finds the truth."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """The parts of a simulated workcell: robot, sensors, placement, order of the visits."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

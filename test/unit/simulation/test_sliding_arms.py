@@ -1,7 +1,5 @@
 """Arms with a joint that slides, simulated by the command and fitted: what comes back."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The file of a hidden World: it appears complete, and holds each marker once."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
