@@ -152,18 +152,12 @@ OUTSIDE = {
     'include beside, not a package': '<xacro:include filename="$(find neighbour)/a.xml"/>',
     'YAML above': '<a b="${xacro.load_yaml(\'../SECRET.yaml\')}"/>',
     'YAML above, the old way': '<a b="${load_yaml(\'../SECRET.yaml\')}"/>',
-    'YAML by an absolute name': '<a b="${xacro.load_yaml(xacro.abs_filename('
-    "'../SECRET.yaml'))}\"/>",
+    'YAML by a whole name': '<a b="${load_yaml(xacro.abs_filename(\'../SECRET.yaml\'))}"/>',
 }
 # Name: text, and words of the refusal.
 DESCRIPTIONS = {
     **{
-        f'shell in {place}': (
-            robot(
-                body.replace('CALL', CALL).replace('SHORT', CALL.replace('lambda: ', 'lambda:'))
-            ),
-            'a lambda',
-        )
+        f'shell in {place}': (robot(body.replace('CALL', CALL)), 'a lambda')
         for place, body in CALLED.items()
     },
     **{name: (robot(body), 'lies outside') for name, body in OUTSIDE.items()},
@@ -177,10 +171,7 @@ DESCRIPTIONS = {
         ),
         'which is not a boolean',
     ),
-    'shell in the unit of a number': (
-        robot('<a b="${xacro.load_yaml(\'unit.yaml\')}"/>'),
-        'lambda',
-    ),
+    'shell in a unit': (robot('<a b="${xacro.load_yaml(\'unit.yaml\')}"/>'), 'lambda'),
     '$(eval)': (robot(f'<a b="$(eval {SHELL[:-1]})"/>'), '$(eval'),
     '$(eval) with a lambda': (robot('<a b="$(eval (lambda: 0)()"/>'), '$(eval'),
     '$(env)': (robot('<a b="$(env HOME)"/>'), '$(env HOME): the environment is not read'),
