@@ -369,7 +369,7 @@ def _apart(model: CollisionModel, q: FloatArray, travel: TravelTime) -> list[Int
 
     for index in range(len(q)):
         any(joins(index, int(other)) for other in np.argsort(times[index])[:2])
-    most = int(np.argmax(np.bincount(part)))
+    most = int(np.argmax(np.bincount(part, minlength=1)))
     for number in np.unique(part[part != most]):
         for _ in range(JOINING):
             between = np.where(np.outer(part == number, part == most), times, np.inf)
