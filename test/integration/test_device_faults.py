@@ -42,6 +42,9 @@ def observe(who: str, kind: str, text: str) -> None:
     text = re.sub(r'(system status|status|search at a position) impossible', 'impossible', text)
     lost = 'impossible: (connection lost|the instrument closed the connection)'
     text = re.sub(lost, 'impossible: the connection is lost', text)
+    if 'cut' in kind:
+        # A reset may overtake the first bytes of a packet.
+        text = text.replace('the connection is lost', 'it sent what is not emScon')
     text = re.sub(r'no answer to the [a-z ]+ within', 'no answer within', text)
     text = text[0].upper() + text[1:]
     if who in DEVICES:

@@ -114,7 +114,7 @@ class Cell:
             if name.startswith('vendor_'):
                 sensor = name.removeprefix('vendor_')
                 where = folder / 'world', sensor, *foreign[sensor]
-                return start('foreign_source', *where, cwd=ROOT / 'test')
+                return start('rigs.foreign_source', *where, cwd=ROOT / 'test')
             # By the node's name, which in the file counts more than none.
             values = {f'{name}:{key}': value for key, value in own[name].items()}
             arguments = node_arguments(common, **values)

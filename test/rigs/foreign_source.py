@@ -1,6 +1,6 @@
 """A mocap driver or tracker driver of another package: a process that publishes positions alone.
 
-    python -m foreign_source WORLD SENSOR MESSAGE_TYPE TOPIC
+    python -m rigs.foreign_source WORLD SENSOR MESSAGE_TYPE TOPIC
 
 It has no heartbeat, no events and no parameters of this package. It reads the hidden World for
 where the marker is, as the other fakes do, and these of its faults: ``stopped``, ``slow``,

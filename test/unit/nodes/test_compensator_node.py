@@ -174,8 +174,10 @@ class Rig:
             self.node.close()
             self.node.destroy_node()
         rclpy.try_shutdown()
-        self.peer.destroy_node()
+        if self.peer is not None:
+            self.peer.destroy_node()
         self.context.try_shutdown()
+        self.node = self.peer = None
 
 
 @pytest.fixture
@@ -352,9 +354,12 @@ class ByAction:
             r.peer, f'{CONTROLLER}/follow_joint_trajectory', r.obey, self.hold, time.monotonic
         )
         self.client = ActionClient(r.peer, self.action, 'compensator/follow_joint_trajectory')
-        assert r.run(PATIENCE_S, self.client.server_is_ready)
-        assert r.run(PATIENCE_S, lambda: r.node._client.server_is_ready())
         self.feedback = []
+
+    def is_found(self):
+        """Whether each side has found the other's server."""
+        found = self.client.server_is_ready, self.r.node._client.server_is_ready
+        return all(self.r.run(0.5 * PATIENCE_S, one) for one in found)
 
     def hold(self):
         self.r.drive = None
@@ -386,9 +391,16 @@ class ByAction:
 def by_action(rig):
     # Where it is not installed it is made now; the node looks for it when it starts.
     follow_joint_trajectory()
-    r = ByAction(rig().ready())
-    yield r
-    r.close()
+    for _ in range(3):
+        # Within one process Fast DDS now and then never tells of a server. Users have several.
+        r = ByAction(rig().ready())
+        if r.is_found():
+            yield r
+            r.close()
+            return
+        r.close()
+        r.r.close()
+    pytest.fail('the action was not found by three rigs, one after the other')
 
 
 def test_a_goal_is_corrected_and_its_feedback_and_result_translated_back(by_action):
