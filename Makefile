@@ -2,7 +2,7 @@
 #   make demo     the main job on fake hardware; ends by saying where the report is
 #                 (OUT=folder SEED=n ARGS='--full' are handed on)
 #   make test     the tests, some eleven minutes on two idle cores (PYTEST='-k name' is handed on)
-#   make qualify  all of them, and the campaigns that it leaves out; hours on two cores
+#   make qualify  all of them, and the campaigns that it leaves out; an hour and a half on two cores
 #   make check    lint, types, layers; CI runs this and make test
 #   make bench    the benchmarks, small (BENCH='bench_speed …' chooses, FULL=1 for all sizes)
 #   make docs     the site, build/docs/index.html, and its pages that come from the code
@@ -45,7 +45,7 @@ test: $(VENV)/installed
 	tools/run-tests $(BIN)/python $(PYTEST)
 
 # What make test leaves out as well, in the same two groups: repetitions, sweeps, campaigns, every row
-# of docs/faults.md. Several hours on two cores.
+# of docs/faults.md. An hour and a half on two cores.
 # PYTEST=test/… runs these files alone, PYTEST='-k name' those of all that have the name.
 qualify: $(VENV)/qualify-installed
 	tools/run-tests $(BIN)/python --qualify $(PYTEST)
