@@ -679,9 +679,14 @@ def in_words(discovery: Discovery, confirmation: Confirmation) -> list[str]:
         f'{1e3 * found.rms_own_m:.3f} mm with them fitted there: {carried}. What this session '
         'does not tell is fitted to the other one.'
     ] * bool(found.effects)
+    apart = (
+        'none is known to a fifth of a degree in both'
+        if np.isnan(found.offsets_rms_sigmas)
+        else f'they are {found.offsets_rms_sigmas:.1f} standard deviations apart on the average'
+    )
     offsets = (
-        f'they are {found.offsets_rms_sigmas:.1f} standard deviations apart on the average, and '
-        f'the error is {1e3 * found.rms_frozen_offsets_m:.3f} mm RMS with those found here'
+        f'{apart}, and the error is {1e3 * found.rms_frozen_offsets_m:.3f} mm RMS with those found '
+        'here'
     )
     own = f'{1e3 * min(found.rms_own_m, found.rms_before_m):.3f} mm with its own'
     holds = any(cause.answer == 'confirmed' for cause in found.effects)
