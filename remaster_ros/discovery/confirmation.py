@@ -684,10 +684,8 @@ def in_words(discovery: Discovery, confirmation: Confirmation) -> list[str]:
         if np.isnan(found.offsets_rms_sigmas)
         else f'they are {found.offsets_rms_sigmas:.1f} standard deviations apart on the average'
     )
-    offsets = (
-        f'{apart}, and the error is {1e3 * found.rms_frozen_offsets_m:.3f} mm RMS with those found '
-        'here'
-    )
+    error_mm = 1e3 * found.rms_frozen_offsets_m
+    offsets = f'{apart}, and the error is {error_mm:.3f} mm RMS with those found here'
     own = f'{1e3 * min(found.rms_own_m, found.rms_before_m):.3f} mm with its own'
     holds = any(cause.answer == 'confirmed' for cause in found.effects)
     if not found.same_offsets and not holds and not found.carried_over > 0.5:
