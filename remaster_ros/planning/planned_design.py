@@ -111,8 +111,6 @@ MOST_CANDIDATES = 1500
 """Configurations that it chooses from at most: about a second of choice for each hundred."""
 MOST_TRIES = 5
 """So often a design, or an order, is made anew where a way is not free."""
-JOINING = 2
-"""So many pairs of configurations are tried between two parts, the nearest first."""
 DETOUR = 2.0
 """A way around something counts as so many times the straight one, until it is planned."""
 
@@ -352,7 +350,7 @@ def _apart(model: CollisionModel, q: FloatArray, travel: TravelTime) -> list[Int
     """Return which of some configurations (n, k) no free way leads to from most of them, in parts.
 
     Ways are sought from the two nearest of each, then from the largest part that hangs together to
-    each of the others.
+    each of the others, between the two that are nearest.
     """
     times = travel.between(q)
     np.fill_diagonal(times, np.inf)
@@ -371,11 +369,10 @@ def _apart(model: CollisionModel, q: FloatArray, travel: TravelTime) -> list[Int
         any(joins(index, int(other)) for other in np.argsort(times[index])[:2])
     most = int(np.argmax(np.bincount(part, minlength=1)))
     for number in np.unique(part[part != most]):
-        for _ in range(JOINING):
-            between = np.where(np.outer(part == number, part == most), times, np.inf)
-            pair = np.unravel_index(int(np.argmin(between)), between.shape)
-            if not np.isfinite(between[pair]) or joins(*map(int, pair)):
-                break
+        between = np.where(np.outer(part == number, part == most), times, np.inf)
+        pair = np.unravel_index(int(np.argmin(between)), between.shape)
+        if np.isfinite(between[pair]):
+            joins(*map(int, pair))
     return [np.flatnonzero(part == number) for number in np.unique(part[part != most])]
 
 
