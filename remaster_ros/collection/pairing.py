@@ -7,12 +7,12 @@ bag replayed at any speed gives the same observations.
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from remaster_ros.kinematics.transforms import mean_quaternion_xyzw
+from remaster_ros.kinematics.transforms import inverse_poses, mean_quaternion_xyzw
 from remaster_ros.motion.joint_units import TURNING, JointUnits
 from remaster_ros.types import FloatArray, MarkerReading
 
@@ -79,6 +79,8 @@ class SensorRules:
     # Further markers: of a stream in the same frames; else measured one by one, with a message
     # (NaN) where that failed
     further: tuple[str, ...] = ()
+    # True for a camera on the tool, which measures the pose of what stands
+    on_tool: bool = False
 
     @property
     def allowed_s(self) -> float:
@@ -102,6 +104,12 @@ class PairedReading:
     orientation: FloatArray | None = None
     # Frames of the dwell that are not in the mean: too far from the others
     dropped: int = 0
+
+    def turned_round(self) -> PairedReading:
+        """Return it with the pose of the sensor in what it measures, and back; `std` stays."""
+        assert self.orientation is not None
+        position, turn = inverse_poses(self.position, self.orientation)
+        return replace(self, position=position, orientation=turn)
 
 
 @dataclass(frozen=True)

@@ -62,7 +62,8 @@ class EndedReading:
 
     settled: SettledArm  # Which one
     from_q: FloatArray | None  # Where the arm came from, rad, (k,); None where that is not known
-    # What each sensor gave, a reading of each of its markers that was seen, or why nothing
+    # What each sensor gave, a reading of each of its markers that was seen, or why nothing; a
+    # camera on the tool its own place in the frame of what it sees
     accepted: Sequence[PairedReading]
     rejected: Sequence[Rejection]
     left_out: Sequence[Rejection]  # Markers without a reading, of sensors that gave others
@@ -137,6 +138,7 @@ class Recording:
     ) -> None:
         self._units, self._patient = units, patient
         self._rules, self._tolerance, self._require = rules, motion_tolerance, require
+        self._on_tool = {one.sensor for one in rules if one.on_tool}
         self._plausibility = plausibility
         self.announced: PoseAnnounced | None = None
         self._solutions: FloatArray | None = None
@@ -311,7 +313,8 @@ class Recording:
         at_reference = settled.pose.split == REFERENCE
         accepted: list[PairedReading] = []
         rejected, left_out = [], list(pairing.left_out)
-        for item in pairing.decided.values():
+        for decided in pairing.decided.values():
+            item = self._standing(decided)
             if isinstance(item, Rejection):
                 rejected.append(item)
                 continue
@@ -338,6 +341,15 @@ class Recording:
             max((reading.stamp_s for reading in accepted), default=self.now_s),
             self._temperature_c(settled.stamp_s),
         )
+
+    def _standing(self, item: PairedReading | Rejection) -> PairedReading | Rejection:
+        """Return a reading as one of a sensor that stands: a camera on the tool has its place."""
+        if isinstance(item, Rejection) or item.sensor not in self._on_tool:
+            return item
+        if item.orientation is None:
+            detail = 'the poses have no orientation, without which one on the tool tells nothing'
+            return Rejection(item.sensor, 'device', detail)
+        return item.turned_round()
 
     def _count_unseen(self, accepted: Sequence[PairedReading]) -> None:
         seen = {(reading.sensor, reading.marker) for reading in accepted}

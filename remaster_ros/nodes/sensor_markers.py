@@ -233,7 +233,8 @@ def subscribe_to_source(node: Node, driver: TopicDriver, sensor: CellSensor) -> 
             (node_of(info), info.topic_type) for info in node.get_publishers_info_by_topic(topic)
         ]
 
-    driver.follow(topic, sensor.message_type, sensor.marker, publishers)
+    on_tool = bool(sensor.mounted_on)
+    driver.follow(topic, sensor.message_type, sensor.marker, publishers, on_tool)
     group = MutuallyExclusiveCallbackGroup()
     node.create_subscription(kind, sensor.source, driver.take, ANY, callback_group=group)
 
@@ -298,6 +299,7 @@ class SensorNode(RemasterNode):
             if described.pose_topic
             else None
         )
+        self._on_tool = bool(described.mounted_on)
         self.published = 0
         self.trouble = ''
         self.in_use = threading.Lock()
@@ -388,11 +390,16 @@ class SensorNode(RemasterNode):
         message.header.stamp = stamp_of(reading.stamp_s)
         message.header.frame_id = self.sensor
         position = np.asarray(reading.position, float)
-        message.point.x, message.point.y, message.point.z = map(float, position)
+        place = position
+        if self._on_tool and reading.orientation is not None:
+            # The board's frame is the sensor's: what moves in it is the camera.
+            place, _ = transforms.inverse_poses(position, reading.orientation)
+        message.point.x, message.point.y, message.point.z = map(float, place)
         self._readings[reading.marker].publish(message)
         if self._poses is not None:
             pose = PoseStamped(header=message.header)
-            pose.pose.position = message.point
+            point = pose.pose.position
+            point.x, point.y, point.z = map(float, position)
             turn, xyzw = pose.pose.orientation, reading.orientation
             turn.x, turn.y, turn.z, turn.w = map(float, (np.nan,) * 4 if xyzw is None else xyzw)
             self._poses.publish(pose)

@@ -277,6 +277,8 @@ class SessionJournal:
 
     def _columns(self, reading: PairedReading) -> dict[str, Any]:
         """Return what a row has of a reading; what it left out is counted in the status."""
+        if reading.sensor in self._header.on_tool:
+            reading = reading.turned_round()
         values = vars(replace(reading, stamp_s=reading.stamp_s + self._shift_s))
         return {name: value for name, value in values.items() if name != 'dropped'}
 

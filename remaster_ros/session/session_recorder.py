@@ -114,6 +114,7 @@ def sensor_rules(cell: Workcell, p: Parameters) -> tuple[SensorRules, ...]:
             marker=sensor.marker,
             further=tuple(sensor.further_markers),
             single_shot=sensor.single_shot,
+            on_tool=bool(sensor.mounted_on),
             dwell_s=p.dwell_s,
             min_samples=p.min_samples,
             max_std_m=p.max_std_m,
@@ -138,6 +139,7 @@ def session_header(cell: Workcell, settle_s: float) -> Session:
             if sensor.further_markers
         },
         oriented=frozenset(name for name, sensor in cell.sensors.items() if sensor.pose_topic),
+        on_tool=frozenset(name for name, sensor in cell.sensors.items() if sensor.mounted_on),
         measurements=Measurements.empty(len(chain)),
         marker_std_m=cell.marker_std_m,
         settle_s=settle_s,

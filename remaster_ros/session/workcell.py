@@ -10,7 +10,7 @@ import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping
 from math import degrees, pi, radians
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import msgspec
 import numpy as np
@@ -83,6 +83,9 @@ class CellSensor(msgspec.Struct, forbid_unknown_fields=True):
     further_markers: dict[str, int] = {}
     # One of `MESSAGE_TYPES`, where `topic` is of a node that is not of this package.
     message_type: str = ''
+    # ``tool`` for a camera on the tool, whose poses are those of a board that stands: `marker` is
+    # its own origin on the tool, `rough_position_m` where the board is.
+    mounted_on: Literal['', 'tool'] = ''
     # No key of the file: the topic of such a node, whose readings are published on `topic` anew.
     source: str = ''
 
@@ -123,6 +126,11 @@ class CellSensor(msgspec.Struct, forbid_unknown_fields=True):
         if self.message_type and self.single_shot:
             return (
                 f'{where}.single_shot is for instruments that measure on request; a topic streams'
+            )
+        if self.mounted_on and self.message_type != POSE:
+            return (
+                f'{where}.mounted_on: a sensor on the tool measures how what stands is turned, '
+                f'too; its message_type has to be {POSE}'
             )
         return ''
 
@@ -603,6 +611,12 @@ def _problem(cell: Workcell, chain: SerialChain) -> str:
     for name, sensor in cell.sensors.items():
         if problem := sensor.problem(f'sensors.{name}', cell.markers):
             return problem
+        used = [other for other, its in cell.sensors.items() if sensor.marker in its.markers]
+        if sensor.mounted_on and (used != [name] or sensor.further_markers):
+            return (
+                f'sensors.{name}.marker: of a sensor on the tool it is its own origin there; give '
+                'it one of its own, which no other sensor has, and no further_markers'
+            )
     if cell.aim_at not in cell.sensors:
         meant = did_you_mean(cell.aim_at, cell.sensors)
         return f'aim_at {cell.aim_at!r} is none of the sensors {", ".join(cell.sensors)}{meant}'

@@ -303,9 +303,12 @@ def simulate_workcell(
     depth_sigma_m
         Noise along the line of sight at 1 m, which grows with the square of the distance, m.
     turn_sigma_rad, pose_turn_sigma_rad
-        The same two of orientations, rad per axis; without the first one none are measured.
+        The same two of orientations, rad per axis; without the first one none are measured. These
+        and the depth's are of the sensors that the cell says measure poses; of all where it says
+        so of none.
     on_tool
-        Whether the sensors are on the tool and measure what stands in their places.
+        Whether the sensors are on the tool and measure what stands in their places; in any case
+        those that the cell has there.
     outlier_share
         Share of the observations that are 20 mm off.
     joint_offset_std
@@ -321,8 +324,10 @@ def simulate_workcell(
         No way to solve for the joints of this robot, no pose that it can take, or sensors that
         cannot measure so.
     """
-    if turn_sigma_rad is None and (on_tool or pose_turn_sigma_rad):
-        what = 'on the tool' if on_tool else 'with noise of pose orientations'
+    moving = {name for name, sensor in cell.sensors.items() if on_tool or sensor.mounted_on}
+    posed = {name for name, sensor in cell.sensors.items() if sensor.pose_topic} or {*cell.sensors}
+    if turn_sigma_rad is None and (moving or pose_turn_sigma_rad):
+        what = 'on the tool' if moving else 'with noise of pose orientations'
         raise InputError(
             f'sensors {what} measure poses; state the noise of an orientation as well '
             '(--orientation-noise-deg, in Python orientation_noise_rad)'
@@ -351,10 +356,10 @@ def simulate_workcell(
             further=sensor.further_markers,
             frame_sigma_m=sensor.frame_noise_m,
             single_shot=sensor.single_shot,
-            depth_sigma_m=depth_sigma_m,
-            turn_sigma_rad=turn_sigma_rad,
-            pose_turn_sigma_rad=pose_turn_sigma_rad,
-            on_tool=on_tool,
+            depth_sigma_m=depth_sigma_m if name in posed else 0.0,
+            turn_sigma_rad=turn_sigma_rad if name in posed else None,
+            pose_turn_sigma_rad=pose_turn_sigma_rad if name in posed else 0.0,
+            on_tool=name in moving,
         )
         for name, sensor in cell.sensors.items()
     }

@@ -133,6 +133,7 @@ class TopicDriver(StreamDriver):
         self._frame = self._trouble = ''
         self._hidden = False
         self.topic = self._type = self._marker = ''
+        self._on_tool = False
         self._publishers: Callable[[], Sequence[tuple[str, str]]] = tuple
 
     def follow(
@@ -141,6 +142,7 @@ class TopicDriver(StreamDriver):
         message_type: str,
         marker: str,
         publishers: Callable[[], Sequence[tuple[str, str]]],
+        on_tool: bool = False,
     ) -> None:
         """Learn what is subscribed to.
 
@@ -152,9 +154,11 @@ class TopicDriver(StreamDriver):
             Its name in the cell.
         publishers
             Gives node and message type of each publisher of the topic now.
+        on_tool
+            Whether the sensor is: then a place without an orientation tells nothing.
         """
         self.topic, self._type, self._marker = topic, message_type, self.p.select or marker
-        self._publishers = publishers
+        self._publishers, self._on_tool = publishers, on_tool
 
     def open(self) -> None:
         """Refuse a topic that no node publishes, or with messages of another type."""
@@ -185,7 +189,7 @@ class TopicDriver(StreamDriver):
             self._came_wall = time.monotonic()
             self._age_s = now - stamp_s
             self._frame = self._frame or found.frame
-            reason, self._trouble = self._refused(found.frame, stamp_s)
+            reason, self._trouble = self._refused(found, stamp_s)
             self._hidden = not reason and found.position is None
             if reason or found.position is None:
                 self._counts[reason or 'occluded'] += 1
@@ -195,18 +199,23 @@ class TopicDriver(StreamDriver):
             self._recent.append(reading)
         self._readings.put((reading, now))
 
-    def _refused(self, frame: str, stamp_s: float) -> tuple[str, str]:
+    def _refused(self, found: Sighting, stamp_s: float) -> tuple[str, str]:
         """Return why a message is left out, in a word and as a sentence; '' where it is not."""
-        if frame != self._frame:
+        if found.frame != self._frame:
             return 'other_frame', (
-                f'{self.topic} was in frame {self._frame!r} and is in {frame!r} now; one marker '
-                'needs one frame: start this node again where the new one is meant'
+                f'{self.topic} was in frame {self._frame!r} and is in {found.frame!r} now; one '
+                'marker needs one frame: start this node again where the new one is meant'
             )
         if not -self._early_s <= self._age_s <= self.p.max_age_s:
             way = 'behind' if self._age_s > 0.0 else 'ahead of'
             return 'other_clock', (
                 f'stamps of {self.topic} are {abs(self._age_s):.2f} s {way} the clock of this '
                 'host; synchronise the clocks (chrony), or set the parameter stamps to arrival'
+            )
+        if self._on_tool and found.position is not None and found.orientation is None:
+            return 'no_orientation', (
+                f'the poses on {self.topic} have no orientation, without which a sensor on the '
+                'tool tells nothing; have its driver publish it'
             )
         if stamp_s <= self._stamp_s:
             # The last measurement once more, or out of order: counted, and no trouble.

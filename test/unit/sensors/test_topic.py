@@ -234,6 +234,20 @@ def test_without_stamps_arrival_counts(rig):
     assert [reading.stamp_s for reading in r.read()] == [10.0]
 
 
+def test_a_camera_on_the_tool_needs_orientations(rig):
+    r = rig(((OURS[0], POSE),))
+    r.driver.follow('/tool', POSE, 'lens', lambda: (), on_tool=True)
+    r.driver.take(pose((0.0, 0.0, 0.0, 0.0)))
+    state = r.driver.state()
+    assert not state.ready
+    assert state.values['dropped_no_orientation'] == 1
+    assert 'the poses on /tool have no orientation' in state.trouble
+    assert not r.read()
+    r.driver.take(pose((0.0, 0.6, 0.0, 0.8)))
+    assert r.driver.state().ready
+    assert len(r.read()) == 1
+
+
 def test_another_frame_is_refused(rig):
     r = rig()
     r.stream(20)

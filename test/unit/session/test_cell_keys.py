@@ -35,6 +35,11 @@ def of_type(kind, name='mocap'):
     return topic, f'    topic: /vrpn/tool\n    message_type: geometry_msgs/msg/{kind}'
 
 
+def on_tool():
+    old, new = of_type('PoseStamped')
+    return old, f'{new}\n    mounted_on: tool'
+
+
 def refused(folder, *changes, file='cell.yaml'):
     """Return the one line that refuses a cell."""
     path = cell_file(folder, *changes)
@@ -87,6 +92,18 @@ def test_wrong_keys_of_poses_are_one_line(tmp_path, keys, message):
             'sensors.mocap.source is no key; write it as topic, and give its message_type',
         ),
         ([of_type('PointStamped', 'tracker')], 'sensors.tracker.single_shot is for instruments'),
+        (
+            [(TOPIC, f'    mounted_on: tool\n{TOPIC}')],
+            'sensors.mocap.mounted_on: a sensor on the tool measures how what stands is turned',
+        ),
+        (
+            [on_tool(), ('    marker: smr\n', '    marker: sir\n')],
+            'sensors.mocap.marker: of a sensor on the tool it is its own origin there',
+        ),
+        (
+            [on_tool(), (BAR, f'{BAR}    further_markers: {{smr: 2}}\n')],
+            'and no further_markers',
+        ),
         (markers('{b: 2, z: 3}'), "has 'z'; markers has b, c, sir, smr"),
         (markers('{sir: 2}'), "has 'sir', which is its marker already"),
         (markers('{b: 2, c: 2}'), 'two markers have the number 2'),

@@ -10,6 +10,7 @@ from rigs.parallel import in_parallel
 from scipy.spatial.transform import Rotation
 from scipy.stats import binom
 from worlds.calibration_scenes import CHAIN, MARKERS, URDF, random_poses, sensors
+from worlds.simple_cells import edited_cell
 
 import remaster_ros
 from remaster_ros.calibration.fit import fit_session
@@ -202,6 +203,35 @@ def test_the_command_writes_what_a_recorder_would_and_the_truth(tmp_path):
     assert noise['orientation_sigma_deg'] == pytest.approx(0.05)
     assert noise['pose_orientation_sigma_deg'] == pytest.approx(0.1)
     assert list(truth['bodies']) == ['sir']
+
+
+def test_the_cell_says_which_of_its_sensors_measure_poses(tmp_path):
+    cell = edited_cell(
+        tmp_path / 'cell.yaml',
+        (
+            '    topic: optitrack/marker',
+            '    topic: /board\n    message_type: geometry_msgs/msg/PoseStamped\n'
+            '    mounted_on: tool',
+        ),
+    )
+    options = ('--cell', cell, '--poses', '25', '--validation', '0', '--quiet', '--seed', '5')
+    line = refusal('simulate', tmp_path / 'none', *options)
+    assert 'state the noise of an orientation as well (--orientation-noise-deg' in line
+    noise = ('--orientation-noise-deg', '0.02', '--depth-noise-mm', '0.2')
+    remaster('simulate', tmp_path / 'both', *options, *noise)
+    both = read_session(tmp_path / 'both')
+    assert both.on_tool == both.oriented == {'mocap'}
+    assert set(both.sensors) == {'mocap', 'tracker'}
+    posed = both.measurements.sensor == both.sensor_names.index('mocap')
+    assert np.isnan(both.measurements.orientation[~posed]).all()
+    found = remaster_ros.fit(both)
+    truth = json.loads((tmp_path / 'both' / 'truth.json').read_text())
+    true = np.radians([one['offset_deg'] for one in truth['joint_offsets']])
+    known = found.identifiable
+    off = (found.joint_offsets - true)[known] / found.joint_offsets_std[known]
+    print(off)
+    # Of five, four beyond are less than one in 100,000.
+    assert np.sum(np.abs(off) > 2.6) < 3
 
 
 def test_without_the_options_the_files_of_a_seed_are_the_same_to_the_byte(tmp_path):
