@@ -323,11 +323,9 @@ class FitResult:
     def _too_large(self) -> list[tuple[str, str, str]]:
         """Return the joints whose known offset is too large, with it and the limit as text."""
         limit, found = LARGEST_OFFSET * self.chain.per_radian, []
-        for i in np.flatnonzero(self.identifiable & (np.abs(self.joint_offsets) > limit)):
-            amount = f'{np.degrees(self.joint_offsets[i]):.2f} degrees'
-            largest = f'{np.degrees(LARGEST_OFFSET):.0f}'
-            if self.chain.slides[i]:
-                amount, largest = f'{1e3 * self.joint_offsets[i]:.1f} mm', f'{1e3 * limit[i]:.0f}'
+        for i in np.flatnonzero(self.identifiable & (np.abs(self.joint_offsets) > limit)).tolist():
+            amount = self.chain.shown_offset(i, self.joint_offsets[i]).replace('deg', 'degrees')
+            largest = f'{self.chain.shown_scale[i] * limit[i]:.0f}'
             found.append((self.joint_names[i], amount, largest))
         return found
 

@@ -15,11 +15,11 @@ from remaster_ros.calibration.orientation_accuracy import METRICS as ORIENTATION
 from remaster_ros.cli.console import progress_bar, tell
 from remaster_ros.cli.sessions import read_to_fit
 from remaster_ros.kinematics.serial_chain import SerialChain
-from remaster_ros.reports.fit_json import joint_offsets_rad, read_fit, require_own
+from remaster_ros.reports.fit_json import joint_offsets_of, read_fit, require_own
 from remaster_ros.reports.schemas import Fit
 from remaster_ros.reports.sentences import METRICS
 from remaster_ros.session.files import make_folder, undone_on_failure, write_atomically
-from remaster_ros.types import Session
+from remaster_ros.types import FloatArray, Session
 from remaster_ros.version import __version__
 
 FORMAT = 'remaster-accuracy/1'
@@ -53,8 +53,8 @@ def run(args: argparse.Namespace) -> int:
     """Judge the offsets, print a table, write JSON with --out."""
     session = read_to_fit(args.session)
     fit = read_fit(args.offsets)
-    chain = SerialChain.from_urdf(session.urdf, session.base_link, session.tip_link)
-    offsets, std = joint_offsets_rad(fit, chain.joint_names)
+    chain = SerialChain.from_urdf(session.urdf, session.base_link, session.tip_link, sliding=True)
+    offsets, std = joint_offsets_of(fit, chain)
     warn_of_another_urdf(fit, session, args.offsets)
     if args.out is not None and args.out.exists():
         require_own(args.out, FORMAT)
@@ -67,7 +67,7 @@ def run(args: argparse.Namespace) -> int:
         'version': __version__,
         'session': str(args.session),
         'offsets': str(args.offsets),
-        'joint_offsets_deg': dict(zip(chain.joint_names, np.rad2deg(offsets).tolist())),
+        **shown_offsets(chain, offsets),
         'accuracy': judged.accuracy,
         'left_out': [{'observation': row, 'why': why} for row, why in judged.left_out],
     }
@@ -77,6 +77,15 @@ def run(args: argparse.Namespace) -> int:
             write_atomically(args.out, json.dumps(content, indent=2) + '\n')
     tell(args, content, table(judged), '' if args.out is None else f'written: {args.out}')
     return 0
+
+
+def shown_offsets(chain: SerialChain, offsets: FloatArray) -> dict[str, dict[str, float]]:
+    """Return the offsets in degrees and, where joints slide, theirs in mm."""
+    found: dict[str, dict[str, float]] = {'joint_offsets_deg': {}}
+    shown = (chain.shown_scale * offsets).tolist()
+    for name, unit, value in zip(chain.joint_names, chain.shown_units, shown, strict=True):
+        found.setdefault(f'joint_offsets_{unit}', {})[name] = value
+    return found
 
 
 def warn_of_another_urdf(fit: Fit, session: Session, path: Path) -> None:

@@ -299,8 +299,7 @@ def _of_check(job: Job, session: Any) -> dict[str, Any]:
     measured = measured_of(session)
     found = judge(baseline.model, [measured])
     iso = visited(baseline.model, measured, session.measurements.wanted)
-    names = baseline.model.chain.joint_names
-    return content_of(found, names, [Path(job.session).name], 1e3 * SMALLEST_M, iso)
+    return content_of(found, baseline.model.chain, [Path(job.session).name], 1e3 * SMALLEST_M, iso)
 
 
 # Who works

@@ -13,10 +13,11 @@ from remaster_ros.calibration.gauge_words import listed
 from remaster_ros.cli.console import tell
 from remaster_ros.cli.options import number
 from remaster_ros.cli.verify import require_same_arm
-from remaster_ros.compensation.checking import SMALLEST_M, Checked, Measured, judge
+from remaster_ros.compensation.checking import SMALLEST_M, Checked, JointCheck, Measured, judge
 from remaster_ros.compensation.file import Compensation, read_compensation
 from remaster_ros.compensation.iso9283 import Visited, visited
 from remaster_ros.errors import InputError
+from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.reports.check_page import write_check_page
 from remaster_ros.session.journal import Journal, format_record
 from remaster_ros.session.reader import read_session
@@ -68,7 +69,7 @@ def run(args: argparse.Namespace) -> int:
     """Read, add to the history, judge, print."""
     session, baseline = read_session(args.session), read_compensation(args.baseline)
     require_same_arm(session, baseline, args.session)
-    measured = measured_of(session)
+    measured, chain = measured_of(session), baseline.model.chain
     iso = visited(baseline.model, measured, session.measurements.wanted)
     _require_history(args.history)
     history = Journal(args.history)
@@ -86,7 +87,9 @@ def run(args: argparse.Namespace) -> int:
                 )
         else:
             try:
-                measured = measured.as_before(checks[0]) if checks else measured.merged()
+                measured = (
+                    measured.as_before(checks[0], chain) if checks else measured.merged(chain)
+                )
             except InputError as error:
                 raise InputError(f'{args.session}: {error}') from None
             checks, names = [*checks, measured], [*names, args.session.name]
@@ -96,7 +99,7 @@ def run(args: argparse.Namespace) -> int:
     finally:
         history.close()
     found = judge(baseline.model, checks, 1e-3 * args.smallest_mm)
-    content = content_of(found, baseline.model.chain.joint_names, names, args.smallest_mm, iso)
+    content = content_of(found, chain, names, args.smallest_mm, iso)
     if args.out is not None:
         write_check_page(args.out, content, found.series_m, names)
     tell(args, content, _text(content), '' if args.out is None else f'written: {args.out}')
@@ -181,7 +184,7 @@ def _before(
 
 def content_of(
     found: Checked,
-    joint_names: tuple[str, ...],
+    chain: SerialChain,
     names: list[str],
     smallest_mm: float,
     iso: Visited,
@@ -192,6 +195,13 @@ def content_of(
         return scale * float(value) if np.isfinite(value) else None
 
     degree = float(np.degrees(1.0))
+
+    def own(one: JointCheck, unit: str) -> dict[str, Any]:
+        if unit == 'mm':
+            # What it does at the tool is its own change.
+            return {'change_deg': None, 'std_deg': None, 'std_mm': known(one.std, 1e3)}
+        return {'change_deg': known(one.change, degree), 'std_deg': known(one.std, degree)}
+
     return {
         'format': FORMAT,
         'verdict': found.verdict,
@@ -199,15 +209,17 @@ def content_of(
         'joints': [
             {
                 'joint': name,
-                'change_deg': known(one.change_rad, degree),
-                'std_deg': known(one.std_rad, degree),
-                'change_mm': known(one.change_rad * one.lever_m, 1e3),
+                'unit': unit,
+                **own(one, unit),
+                'change_mm': known(one.change * one.lever_m, 1e3),
                 'detectable_mm': known(one.detectable_m, 1e3),
                 'evidence': one.evidence,
             }
-            for name, one in zip(joint_names, found.joints, strict=True)
+            for name, one, unit in zip(
+                chain.joint_names, found.joints, chain.shown_units, strict=True
+            )
         ],
-        'changed': [joint_names[joint] for joint in found.changed],
+        'changed': [chain.joint_names[joint] for joint in found.changed],
         'tool_moved': found.tool_moved,
         'since': None if found.since is None else names[found.since],
         'since_check': None if found.since is None else found.since + 1,
@@ -221,7 +233,7 @@ def content_of(
             'repeatability_mm': (1e3 * iso.repeatability_m).tolist(),
             'text': iso.text(),
         },
-        'text': in_words(found, joint_names, names),
+        'text': in_words(found, chain.joint_names, names),
     }
 
 
@@ -233,7 +245,7 @@ def in_words(found: Checked, joint_names: tuple[str, ...], names: list[str]) -> 
         alike = [joint_names[joint] for joint in found.changed]
         who = ' or '.join(alike)
         several = ': these look alike in the poses of the check' if len(alike) > 1 else ''
-        size = 1e3 * abs(found.joints[found.changed[0]].change_rad)
+        size = 1e3 * abs(found.joints[found.changed[0]].change)
         size *= found.joints[found.changed[0]].lever_m
         return (
             f'Changed since check {_named(found, names)}: {who}{several}; {size:.2f} mm at the '
@@ -268,7 +280,7 @@ def in_words(found: Checked, joint_names: tuple[str, ...], names: list[str]) -> 
     beyond = [
         name
         for name, one in zip(joint_names, found.joints, strict=True)
-        if len(names) > 1 and abs(one.change_rad) * one.lever_m > one.detectable_m
+        if len(names) > 1 and abs(one.change) * one.lever_m > one.detectable_m
     ]
     if beyond:
         return (
@@ -292,10 +304,12 @@ def _text(content: dict[str, Any]) -> str:
         if one['detectable_mm'] is None:
             lines.append(f'  {one["joint"]}: looks like a sensor that was moved; not checked')
             continue
-        change = f'{one["change_deg"]:+.4f}'
-        std = '' if one['std_deg'] is None else f' ± {one["std_deg"]:.4f}'
+        unit, digits = one['unit'], 3 if one['unit'] == 'mm' else 4
+        std = one[f'std_{unit}']
+        change = f'{one[f"change_{unit}"]:+.{digits}f}'
+        change += f'{"" if std is None else f" ± {std:.{digits}f}"} {unit}'
         lines.append(
-            f'  {one["joint"]}: {change}{std} deg, {one["change_mm"]:+.3f} mm at the tool; '
+            f'  {one["joint"]}: {change}, {one["change_mm"]:+.3f} mm at the tool; '
             f'{one["detectable_mm"]:.2f} mm would be seen'
         )
     lines.append(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import csv
 import io
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,13 +20,14 @@ from remaster_ros.errors import InputError
 from remaster_ros.importing.columns import Columns, Told, find_columns
 from remaster_ros.importing.text_table import TextTable, read_table
 from remaster_ros.importing.units import ANGLES
-from remaster_ros.importing.values import angle_unit, numbers, times
+from remaster_ros.importing.values import joint_values, numbers, times
+from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.session.files import write_atomically
 from remaster_ros.types import FloatArray
 
 FORMAT = 'remaster-compensate/1'
 # A hundred-thousandth of a degree is a fifth of a micrometre a metre away.
-DIGITS = {'deg': 6, 'rad': 8}
+DIGITS = {'deg': 6, 'rad': 8, 'mm': 5}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -59,7 +61,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar='DEG',
         type=number(0.0, 90.0, 'degrees'),
         default=2.0,
-        help='refuse where a joint would change by more (default 2)',
+        help='refuse where a joint would change by more (default 2); one that slides by more '
+        'than 4.36 mm for each degree',
     )
     parser.add_argument('--json', action='store_true', help='print what was done as JSON')
 
@@ -71,20 +74,26 @@ def run(args: argparse.Namespace) -> int:
         raise InputError(f'{args.out}: is the table itself; name another file for --out')
     table = read_table(args.table)
     chain = compensation.model.chain
-    columns = find_columns(table, chain.joint_names, Told(joints=args.joints))
+    sliding = np.flatnonzero(chain.slides).tolist()
+    columns = find_columns(table, chain.joint_names, Told(joints=args.joints), sliding)
     if len(columns.joints) != len(chain):
         raise InputError(
             f'{args.table}: {len(columns.joints)} columns are joint angles, but the arm of '
             f'{args.compensation} has {len(chain)} ({", ".join(chain.joint_names)}); name them, '
             'base to tip, with --joints'
         )
-    unit, known = angle_unit(table, columns, args.angles or '')
-    if known == 'guessed':
+    given, units, scale = joint_values(table, columns, chain, args.angles or '')
+    for joint, (_, known) in enumerate(units):
+        if chain.slides[joint] and known != 'header':
+            raise InputError(
+                f'{args.table}: the header states no unit of {chain.joint_names[joint]}, which '
+                'slides; write it there, such as [mm]'
+            )
+    if any(known == 'guessed' for _, known in units):
         raise InputError(
             f'{args.table}: the header states no unit of the joint angles; say --angles deg or '
             '--angles rad'
         )
-    given = numbers(table, columns.joints) * ANGLES[unit]
     temperature = _temperature(table, columns, args.temperature)
     compensator = compensation.compensator
     if args.inverse:
@@ -94,11 +103,17 @@ def run(args: argparse.Namespace) -> int:
         done = compensator.correct(given, temperature)
         result = done.command
     _refuse_beyond(table, columns, given, result, done, compensator, args)
-    write_atomically(args.out, _text(table, columns, result / ANGLES[unit], DIGITS.get(unit, 8)))
+    digits = [DIGITS.get(unit, 8) for unit, _ in units]
+    write_atomically(args.out, _text(table, columns, result / scale, digits))
     wanted = result if args.inverse else given
     facts = _facts(compensation, given, result, wanted, done, times(table, columns))
     tell(args, facts, _summary(facts, args.out))
     return 0
+
+
+def _shown(chain: SerialChain, joint: int, value: float, digits: int = 2) -> str:
+    """Return a place or change of a joint with its unit."""
+    return chain.shown_offset(joint, value, digits).replace('deg', 'degrees')
 
 
 def _temperature(table: TextTable, columns: Columns, told: float | None) -> FloatArray | None:
@@ -118,37 +133,36 @@ def _refuse_beyond(
     args: argparse.Namespace,
 ) -> None:
     """Refuse changes that no correction makes, and commands beyond the joints' limits."""
-    change = np.abs(np.degrees(result - given))
-    joints = compensator.joint_names
-    for row, j in np.argwhere(change > args.max_change_deg)[:1]:
+    chain, joints = compensator.model.chain, compensator.joint_names
+    change, most = np.abs(result - given), np.radians(args.max_change_deg) * chain.per_radian
+    for row, j in np.argwhere(change > most)[:1]:
         raise InputError(
             f'{table.path}, line {table.lines[row]}: {joints[j]} would change by '
-            f'{change[row, j]:.2f} degrees, more than {args.max_change_deg:g}; is it the '
+            f'{_shown(chain, j, change[row, j])}, more than '
+            f'{_shown(chain, j, most[j])}; is it the '
             'compensation of this arm, and the unit right? (--max-change-deg)'
         )
-    chain = compensator.model.chain
     beyond = (done.command < chain.lower) | (done.command > chain.upper)
     for row, j in np.argwhere(beyond)[:1]:
         raise InputError(
             f'{table.path}, line {table.lines[row]}, column '
             f'{table.names[columns.joints[j]]}: the command of {joints[j]} is '
-            f'{np.degrees(done.command[row, j]):.3f} degrees, beyond its limits '
-            f'({np.degrees(chain.lower[j]):.1f} to {np.degrees(chain.upper[j]):.1f}); keep '
-            'further away from them'
+            f'{_shown(chain, j, done.command[row, j], 3)}, beyond its limits '
+            f'({chain.shown_limits(j)}); keep further away from them'
         )
 
 
-def _text(table: TextTable, columns: Columns, angles: FloatArray, digits: int) -> str:
-    """Return the table with other joint angles, all else as it was."""
+def _text(table: TextTable, columns: Columns, joints: FloatArray, digits: Sequence[int]) -> str:
+    """Return the table with other joint positions, all else as it was."""
     separator = table.separator if len(table.separator) == 1 else ','
     text = io.StringIO()
     writer = csv.writer(text, delimiter=separator, lineterminator='\n')
     if table.has_header:
         writer.writerow(table.names)
-    for cells, row in zip(table.rows, angles, strict=True):
+    for cells, row in zip(table.rows, joints, strict=True):
         new = list(cells)
-        for column, angle in zip(columns.joints, row, strict=True):
-            new[column] = f'{angle:.{digits}f}'.replace('.', table.decimal or '.')
+        for column, place, behind in zip(columns.joints, row, digits, strict=True):
+            new[column] = f'{place:.{behind}f}'.replace('.', table.decimal or '.')
         writer.writerow(new)
     return text.getvalue()
 
@@ -161,8 +175,11 @@ def _facts(
     done: Correction,
     times_s: FloatArray | None,
 ) -> dict[str, Any]:
-    joints = compensation.compensator.joint_names
-    change = np.degrees(np.abs(result - given).max(axis=0, initial=0.0))
+    chain, joints = compensation.model.chain, compensation.compensator.joint_names
+    shown = chain.shown_scale * np.abs(result - given).max(axis=0, initial=0.0)
+    change: dict[str, dict[str, float]] = {'change_deg': {}}
+    for joint, unit, most in zip(joints, chain.shown_units, shown.tolist(), strict=True):
+        change.setdefault(f'change_{unit}', {})[joint] = most
     added: dict[str, float | None] = dict.fromkeys(joints)
     if times_s is not None and len(times_s) > 1 and np.all(np.diff(times_s) > 0.0):
         step = np.diff(times_s)[:, None]
@@ -180,7 +197,7 @@ def _facts(
             'rms': float(np.sqrt(np.mean(residual_mm**2))),
             'max': float(residual_mm.max()),
         },
-        'change_deg': dict(zip(joints, change.tolist(), strict=True)),
+        **change,
         'added_speed_percent': added,
         'faded_rows': (np.flatnonzero(done.faded) + 1).tolist(),
         'outside_range_rows': (np.flatnonzero(done.outside_range) + 1).tolist(),
@@ -189,11 +206,13 @@ def _facts(
 
 
 def _summary(facts: dict[str, Any], out: Path) -> str:
-    most = max(facts['change_deg'], key=lambda joint: facts['change_deg'][joint])
-    residual = facts['residual_mm']
+    residual, most = facts['residual_mm'], []
+    for unit in ('deg', 'mm'):
+        if of_joints := facts.get(f'change_{unit}'):
+            joint = max(of_joints, key=lambda name: of_joints[name])
+            most.append(f'{joint} changes most, by {of_joints[joint]:.3f} {unit}')
     lines = [
-        f'{counted(facts["rows"], "row")}; {most} changes most, by '
-        f'{facts["change_deg"][most]:.3f} deg',
+        '; '.join([counted(facts['rows'], 'row'), *most]),
         f'left of the correction: {residual["rms"]:.3f} mm RMS, {residual["max"]:.3f} mm at most; '
         f'expected error of the marker {facts["expected_error_mm"]:.3f} mm RMS',
     ]

@@ -100,9 +100,6 @@ def run(args: argparse.Namespace) -> int:
     if args.out is not None:
         check_plan_page(args.out)
     cell = read_cell(args.cell)
-    if args.check is not None:
-        # Of the arm's joints none may slide: what is checked are angles. Said before all the work.
-        cell.chain()
     scene = cell.planning_scene(cell.chain(sliding=True))
     with progress_bar(args.quiet or args.json) as progress:
         progress('planning', 0.0)
@@ -139,7 +136,7 @@ def _check(
     cell: Workcell, scene: PlanningScene, plan: CollectionPlan, args: argparse.Namespace
 ) -> tuple[dict[str, Any], str]:
     """Choose and write the configurations of a check; return what is expected, and in words."""
-    chain = cell.chain()
+    chain = scene.model.chain
     q = np.unique([visit.q for visit in plan.visits], axis=0)
     if len(q) < CHECK_POSES:
         raise InsufficientDataError(

@@ -15,7 +15,7 @@ from remaster_ros.compensation.file import Compensation, read_compensation
 from remaster_ros.compensation.verification import Estimate, Verdict, Verified, Visits, verify
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.serial_chain import SerialChain
-from remaster_ros.motion.joint_units import TURNING
+from remaster_ros.motion.joint_units import JointUnits
 from remaster_ros.planning.tour_order import nearest_solution
 from remaster_ros.session.reader import HEADER, ROWS, read_session
 from remaster_ros.types import BoolArray, Correction, FloatArray, IntArray, Session
@@ -74,23 +74,27 @@ def visits(session: Session, folder: Path) -> Visits:
     return Visits(
         wanted,
         on,
-        _together(m.configuration, wanted),
+        _together(m.configuration, wanted, JointUnits.of(_chain(session))),
         tuple(session.sensor_names[i] for i in m.sensor.tolist()),
         tuple(session.marker_names[i] for i in m.marker.tolist()),
         m.position,
     )
 
 
-def _together(configuration: IntArray, wanted: FloatArray) -> IntArray:
+def _together(configuration: IntArray, wanted: FloatArray, units: JointUnits) -> IntArray:
     """Return the configurations, (n,), those that were visited again as the first time."""
     found, firsts = configuration.copy(), dict[int, FloatArray]()
     for one in dict.fromkeys(configuration.tolist()):
         mine = configuration == one
         q = wanted[mine][0]
-        near = nearest_solution(np.array(list(firsts.values())), q, TURNING) if firsts else None
+        near = nearest_solution(np.array(list(firsts.values())), q, units) if firsts else None
         same = one if near is None else list(firsts)[near]
         found[mine], firsts[same] = same, firsts.get(same, q)
     return found
+
+
+def _chain(session: Session) -> SerialChain:
+    return SerialChain.from_urdf(session.urdf, session.base_link, session.tip_link, sliding=True)
 
 
 def _on(session: Session, folder: Path) -> BoolArray:
@@ -128,8 +132,7 @@ def _wanted(session: Session, folder: Path, on: BoolArray) -> FloatArray:
 
 def require_same_arm(session: Session, compensation: Compensation, folder: Path) -> None:
     """Refuse a session of another arm, and the one that the correction was made of."""
-    chain = SerialChain.from_urdf(session.urdf, session.base_link, session.tip_link)
-    robot = compensation.content.robot
+    chain, robot = _chain(session), compensation.content.robot
     for what, own, other in (
         ('joints', list(chain.joint_names), robot.joint_names),
         ('base link', session.base_link, robot.base_link),

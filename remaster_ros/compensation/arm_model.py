@@ -5,6 +5,9 @@ With q the reported angles, δ the zero-offsets and τ gravity's torques at q + 
     true angle of joint j = q_j + δ_j + Σ terms of joint j
     tool = base turn · Π_j (T_j · shift_j · turn_j · Rot(axis_j, true angle_j)) · T_tool
 
+A joint that slides has metres for radians, the shift along its axis for Rot, and for gravity's
+torque the force along it, N.
+
 T_j is the nominal origin of joint j. Shifts are in the frame of the link that the joint before
 moves, turns in the joint's own frame, and both may grow with the temperature. A link whose bearing
 gives way is turned about its joint's origin by gravity's moment across the joint's axis.
@@ -54,7 +57,7 @@ class Function:
     # Of splines, in the driver's unit; beyond the ends the end value holds
     knots: FloatArray = field(default_factory=lambda: np.zeros(0))
     degree: int = 0
-    # The driver is brought to the turn that begins there, rad; NaN where it is not
+    # The driver is brought to the turn that begins there, rad; NaN where it is not, as of a slide
     turn_start: float = np.nan
 
     @property
@@ -104,7 +107,7 @@ class JointTerm:
 
     joint: int  # Its index
     effect: str  # The physical cause, as in discovery.json
-    # Of its driver, rad, (m,)
+    # Of its driver, rad or m, (m,)
     function: Function
     coefficients: FloatArray
 
@@ -146,7 +149,7 @@ class Drivers:
 
     q: FloatArray  # Reported angles, rad, (n, k)
     warming: FloatArray  # Temperature above that at which nothing has grown, K, (n,)
-    torque: FloatArray  # Gravity's, N m, (n, k); zeros where no term takes it
+    torque: FloatArray  # Gravity's, N m or N, (n, k); zeros where no term takes it
     base_moment: FloatArray  # Gravity's about the origin of R, N m, (n, 3); likewise
     moment: FloatArray  # Gravity's on each link about its joint, N m, (n, k, 3); likewise
 
@@ -255,7 +258,9 @@ class ArmModel:
             mass = np.cumsum(chain.masses[::-1])[::-1]
             arms = carried - mass[:, None] * frames[..., :3, 3]
             moment = np.cross(arms, GRAVITY)
-            torque = np.sum(chain.axes_in_base(frames) * moment, axis=-1)
+            force = mass[:, None] * np.array(GRAVITY)
+            turning = np.where(chain.slides[:, None], force, moment)
+            torque = np.sum(chain.axes_in_base(frames) * turning, axis=-1)
         return Drivers(q, warming, torque, base, moment)
 
     def added_angles(self, drivers: Drivers) -> FloatArray:
@@ -268,22 +273,24 @@ class ArmModel:
 
     def somewhere(self) -> FloatArray:
         """Return angles all over the limits, the same each time, rad, (n, k)."""
-        low, high = (np.clip(end, -np.pi, np.pi) for end in (self.chain.lower, self.chain.upper))
+        low, high = self.chain.usual_range
         return np.random.default_rng(0).uniform(low, high, (LOOKED_AT, self.joints))
 
     def steepest(self) -> float:
         """Return by how much offsets and terms change with the reported angles at the most.
 
-        Largest sum of a joint's changes, rad per rad, at angles all over the limits. Below 1 there
-        is one command for each wanted angle, and the fixed point goes to it (Banach).
+        Largest sum of a joint's changes, rad per rad, at angles all over the limits; what slides
+        is counted by `SerialChain.per_radian`. Below 1 there is one command for each wanted angle,
+        and the fixed point goes to it (Banach).
         """
-        k, warming = self.joints, np.zeros(LOOKED_AT)
+        k, warming, unit = self.joints, np.zeros(LOOKED_AT), self.chain.per_radian
         q = self.somewhere()
         here = self.added_angles(self.drivers(q, warming))
         slopes = np.zeros((LOOKED_AT, k))
         for j in range(k):
-            there = self.added_angles(self.drivers(q + SLOPE_STEP * np.eye(k)[j], warming))
-            slopes += np.abs(there - here) / SLOPE_STEP
+            step = SLOPE_STEP * np.diag(unit)[j]
+            there = self.added_angles(self.drivers(q + step, warming))
+            slopes += np.abs(there - here) / unit / SLOPE_STEP
         return float(slopes.max())
 
     def state(self, q: FloatArray, temperature_c: FloatArray | float | None = None) -> State:
@@ -301,9 +308,7 @@ class ArmModel:
     def _state(self, drivers: Drivers) -> State:
         n, k = drivers.q.shape
         angles = drivers.q + self.added_angles(drivers)
-        turned = transform(
-            rotation_vector_to_matrix(angles[..., None] * self.chain.axes), np.zeros(3)
-        )
+        turned = self.chain.motions(angles)
         origins = self._origins(drivers.warming)
         before, frames = np.empty((n, k, 4, 4)), np.empty((n, k, 4, 4))
         frame = transform(rotation_vector_to_matrix(self._base_turn(drivers)), np.zeros(3))
@@ -388,19 +393,25 @@ class ArmModel:
     @cached_property
     def parameter_units(self) -> tuple[str, ...]:
         """Units of the parameters."""
-        units = {
-            'joint_offset': 'rad',
-            'marker': 'm',
-            'lateral_compliance': 'rad/(N m)',
-        }
+        chain, units = (
+            self.chain,
+            {
+                'marker': 'm',
+                'lateral_compliance': 'rad/(N m)',
+            },
+        )
         found = []
         for name in self.parameter_names:
             kind, _, rest = name.partition('.')
             if kind in units:
                 found.append(units[kind])
-            elif kind in ('joint_term', 'base_term'):
-                terms = self.joint_terms if kind == 'joint_term' else self.base_terms
-                found.append(unit_of(terms[int(rest.split('.')[0])].function))
+            elif kind == 'joint_offset':
+                found.append(chain.units[chain.joint_names.index(rest)])
+            elif kind == 'joint_term':
+                term = self.joint_terms[int(rest.split('.')[0])]
+                found.append(unit_of(term.function, chain, chain.units[term.joint]))
+            elif kind == 'base_term':
+                found.append(unit_of(self.base_terms[int(rest.split('.')[0])].function, chain))
             else:
                 unit = 'rad' if rest.rpartition('.')[2] in _TURNS else 'm'
                 found.append(f'{unit}/K' if kind == 'growth' else unit)
@@ -464,9 +475,8 @@ class ArmModel:
         """Return the derivative of a marker's place, in R as `sensor` has it, (n, 3, p)."""
         n, k, drivers = len(state.angles), self.joints, state.drivers
         points = apply(state.tool, self.markers[marker])
-        axes = np.einsum('nkij,kj->nki', state.frames[..., :3, :3], self.chain.axes)
         arms = points[:, None, :] - state.frames[..., :3, 3]
-        by_joint = np.swapaxes(np.cross(axes, arms), 1, 2)
+        by_joint = self.chain.velocities(state.frames, points)
         parts = [by_joint]
         for name in self.T_R_N:
             mine = np.zeros((n, 3, 6))
@@ -506,15 +516,19 @@ class ArmModel:
 
 
 _TURNS = ('rx', 'ry', 'rz')
-_UNITS = {'angle': 'rad', 'gravity_torque': '(N m)', 'gravity_moment': '(N m)', 'temperature': 'K'}
+_UNITS = {'gravity_moment': '(N m)', 'temperature': 'K'}
 
 
-def unit_of(function: Function) -> str:
-    """Return the unit of a function's coefficients."""
-    if function.form in ('linear', 'quadratic'):
-        power = '^2' if function.form == 'quadratic' else ''
-        return f'rad/{_UNITS[function.driver]}{power}'
-    return 'rad'
+def unit_of(function: Function, chain: SerialChain, of: str = 'rad') -> str:
+    """Return the unit of a function's coefficients; ``of``: that of what they add to."""
+    if function.form not in ('linear', 'quadratic'):
+        return of
+    unit = _UNITS.get(function.driver, '')
+    if function.driver == 'angle':
+        unit = chain.units[function.joint]
+    elif function.driver == 'gravity_torque':
+        unit = chain.torque_units[function.joint]
+    return f'{of}/{unit}{"^2" if function.form == "quadratic" else ""}'
 
 
 def _turned(axes: FloatArray, arms: FloatArray) -> FloatArray:

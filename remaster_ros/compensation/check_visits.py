@@ -29,17 +29,18 @@ TABLE_LIMIT = 1_000_000
 class CheckVisits:
     """Configurations in the order of the visits, and what a check of them finds."""
 
-    joint_names: tuple[str, ...]  # Of k joints
-    q: FloatArray  # rad, (n, k)
+    chain: SerialChain  # Of k joints
+    q: FloatArray  # rad, m of joints that slide, (n, k)
     noise_m: float  # That the cell file states for its sensor, of one axis, m
     # The smallest change of each joint that one check finds at that noise, m at the tool, (k,);
     # NaN where a moved sensor looks the same
     detectable_m: FloatArray
 
     def table(self) -> str:
-        """Return the text of the table, degrees."""
-        lines = [','.join(f'{name} [deg]' for name in self.joint_names)]
-        lines += [','.join(f'{angle:.6f}' for angle in row) for row in np.degrees(self.q)]
+        """Return the text of the table, degrees, mm of joints that slide."""
+        lines = [','.join(columns_of(self.chain))]
+        shown = self.chain.shown_scale * self.q
+        lines += [','.join(f'{value:.6f}' for value in row) for row in shown]
         return '\n'.join(lines) + '\n'
 
     def seconds(self, travel: TravelTime) -> float:
@@ -61,7 +62,7 @@ class CheckVisits:
         return [
             f'{name}: '
             + ('none: looks like a sensor that was moved' if np.isnan(m) else f'{1e3 * m:.2f} mm')
-            for name, m in zip(self.joint_names, self.detectable_m, strict=True)
+            for name, m in zip(self.chain.joint_names, self.detectable_m, strict=True)
         ]
 
 
@@ -77,7 +78,7 @@ def chosen_visits(
     Parameters
     ----------
     q
-        To choose from, rad, (c, k), c >= `CHECK_POSES`.
+        To choose from, rad or m, (c, k), c >= `CHECK_POSES`.
     travel
         What the order goes by; None to keep that of `q`, as it was chosen before.
     rng
@@ -94,7 +95,13 @@ def chosen_visits(
             left = [i for i in range(len(rows)) if i not in order]
             order.append(min(left, key=lambda i: float(between[order[-1], i])))
     noise = float(np.hypot(sensor.noise_m, sensor.pose_noise_m))
-    return CheckVisits(chain.joint_names, q[rows][order], noise, noise * sizes)
+    return CheckVisits(chain, q[rows][order], noise, noise * sizes)
+
+
+def columns_of(chain: SerialChain) -> list[str]:
+    """Return the header of a table of configurations."""
+    names = zip(chain.joint_names, chain.shown_units, strict=True)
+    return [f'{name} [{unit}]' for name, unit in names]
 
 
 def read_visits(path: Path, cell: Workcell, chain: SerialChain) -> CheckVisits:
@@ -103,7 +110,7 @@ def read_visits(path: Path, cell: Workcell, chain: SerialChain) -> CheckVisits:
     Raises
     ------
     InputError
-        One line: no such file, of another arm, or not as many finite angles within its limits.
+        One line: no such file, of another arm, or not as many finite places within its limits.
     """
     try:
         text = read_limited(
@@ -114,7 +121,7 @@ def read_visits(path: Path, cell: Workcell, chain: SerialChain) -> CheckVisits:
             f'{path}: is no text; give the table of `remaster plan --check`'
         ) from None
     header, *rows = [row for row in csv.reader(text.splitlines()) if row] or [[]]
-    named = [f'{name} [deg]' for name in chain.joint_names]
+    named = columns_of(chain)
     if header != named:
         raise InputError(f'{path}, line 1: is not {",".join(named)}; choose the poses of this arm')
     if len(rows) != CHECK_POSES:
@@ -122,10 +129,10 @@ def read_visits(path: Path, cell: Workcell, chain: SerialChain) -> CheckVisits:
     q = np.empty((len(rows), len(chain)))
     for number, row in enumerate(rows, 2):
         try:
-            q[number - 2] = np.radians([float(cell) for cell in row])
+            q[number - 2] = np.array([float(cell) for cell in row]) / chain.shown_scale
         except ValueError:
             raise InputError(
-                f'{path}, line {number}: does not have {len(chain)} angles in degrees'
+                f'{path}, line {number}: does not have {len(chain)} numbers'
             ) from None
         if not bool(chain.within_limits(q[number - 2][None])[0]):
             raise InputError(f"{path}, line {number}: is outside the joints' limits")

@@ -30,6 +30,7 @@ from remaster_ros.calibration.gauge_words import counted
 from remaster_ros.calibration.registration import register_points
 from remaster_ros.compensation.arm_model import ArmModel
 from remaster_ros.errors import InputError, InsufficientDataError
+from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.transforms import apply
 from remaster_ros.types import BoolArray, FloatArray
 
@@ -61,26 +62,26 @@ TELLING = 20.0
 class Measured:
     """A check: n readings of k joints."""
 
-    q: FloatArray  # Reported joints, rad, (n, k)
+    q: FloatArray  # Reported joints, rad, m of joints that slide, (n, k)
     # Names, (n,)
     sensor: tuple[str, ...]
     marker: tuple[str, ...]
     position: FloatArray  # In the sensor's frame, m, (n, 3)
 
-    def merged(self) -> Measured:
+    def merged(self, chain: SerialChain) -> Measured:
         """Return the mean of the readings of each pose by each sensor of each marker."""
         rows: list[int] = []
         for row in range(len(self.q)):
-            apart = np.abs(self.q[rows] - self.q[row]).max(axis=1)
-            same = [rows[i] for i in np.flatnonzero(apart <= SAME_RAD)]
+            same = [rows[i] for i in np.flatnonzero(together(chain, self.q[rows], self.q[row]))]
             seen_by = self.sensor[row], self.marker[row]
             if seen_by not in [(self.sensor[one], self.marker[one]) for one in same]:
                 rows.append(row)
         sensor = tuple(self.sensor[row] for row in rows)
         marker = tuple(self.marker[row] for row in rows)
-        return self.as_before(Measured(self.q[rows], sensor, marker, self.position[rows]))
+        first = Measured(self.q[rows], sensor, marker, self.position[rows])
+        return self.as_before(first, chain)
 
-    def as_before(self, first: Measured) -> Measured:
+    def as_before(self, first: Measured, chain: SerialChain) -> Measured:
         """Return the readings of the poses of the first check, in its order.
 
         Raises
@@ -90,17 +91,16 @@ class Measured:
         """
         rows = []
         for i, (sensor, marker) in enumerate(zip(first.sensor, first.marker, strict=True)):
-            apart = np.abs(self.q - first.q[i]).max(axis=1)
             same = [
                 row
-                for row in np.flatnonzero(apart <= SAME_RAD)
+                for row in np.flatnonzero(together(chain, self.q, first.q[i]))
                 if (self.sensor[row], self.marker[row]) == (sensor, marker)
             ]
             if not same:
-                joints = ', '.join(f'{angle:.2f}' for angle in np.degrees(first.q[i]))
+                at = ', '.join(chain.shown_offset(j, one) for j, one in enumerate(first.q[i]))
                 raise InputError(
-                    f'no reading of {marker} by {sensor} at the joints {joints} deg, where the '
-                    'first check has one: measure the same poses, or begin another history'
+                    f'no reading of {marker} by {sensor} at the joints {at}, where the first '
+                    'check has one: measure the same poses, or begin another history'
                 )
             rows.append(same)
         position = np.array([self.position[same].mean(axis=0) for same in rows])
@@ -108,12 +108,19 @@ class Measured:
         return Measured(q, first.sensor, first.marker, position)
 
 
+def together(chain: SerialChain, q: FloatArray, place: FloatArray) -> BoolArray:
+    """Return which configurations (n, k) are of the same pose as one, (n,)."""
+    apart: FloatArray = np.abs(q - place) / chain.per_radian
+    return np.asarray(apart.max(axis=1) <= SAME_RAD)
+
+
 @dataclass(frozen=True, eq=False)
 class Seen:
     """What a check says beside where its sensors stand."""
 
     rest: FloatArray  # Errors that a moved sensor cannot explain, m, (3 n,)
-    # What a radian of each joint, and a metre of each marker, adds, (3 n, k), (3 n, 3 m)
+    # What a radian of each joint (a metre where it slides), and a metre of each marker, adds,
+    # (3 n, k), (3 n, 3 m)
     joints: FloatArray
     tool: FloatArray
     # What one standard deviation of each thing not known of the correction adds, (3 n, r)
@@ -293,14 +300,14 @@ def wander(x: FloatArray, at: int) -> float:
 
 @dataclass(frozen=True)
 class JointCheck:
-    """What is known of one joint; angles in rad, of the tool in m.
+    """What is known of one joint; angles in rad, m of a joint that slides, of the tool in m.
 
     The change is that since the check that is named, or that of the newest check. All but the
     lever is NaN where a moved sensor looks the same, and the evidence 1.
     """
 
-    change_rad: float
-    std_rad: float
+    change: float
+    std: float
     detectable_m: float
     lever_m: float
     evidence: float

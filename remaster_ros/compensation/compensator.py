@@ -6,6 +6,8 @@ Newton steps on the full pose, with the nominal Jacobian. Near a singularity a p
 only along the directions in which the arm can move: each of them fades smoothly to nothing where
 it needs too much joint motion. There the errors of the joint angles are still taken off.
 
+What slides has metres for radians, and counts by `SerialChain.per_radian`.
+
 A shift counts in levers of the arm: a small arm is no nearer to its singularities than a large one
 of its shape. A direction of size s that fades below b takes off the share 3 u² − 2 u³ of an error
 ε, u = s / b: its motion (3 u − 2 u²) ε / b has the curvature 4 ε / b³ over s, and s changes by no
@@ -95,14 +97,16 @@ class Compensator:
         return np.minimum(FADES_BELOW / lever, wide)[:, None]
 
     def _nominal(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the nominal tool poses, (n, 4, 4), and Jacobians in R, m and rad, (n, 6, k)."""
+        """Return the nominal tool poses, (n, 4, 4), and Jacobians in R, m and rad, (n, 6, k).
+
+        Of a radian of each joint, or of what counts as one.
+        """
         chain = self.model.chain
         frames = chain.frames(q)
         target = frames[:, -1] @ chain.T_fixed[-1]
-        axes = chain.axes_in_base(frames)
-        arms = target[:, None, :3, 3] - frames[..., :3, 3]
-        both = np.concatenate((np.cross(axes, arms), axes), axis=2)
-        return target, both.swapaxes(1, 2)
+        axes = chain.axes_in_base(frames) * ~chain.slides[:, None]
+        shifts = chain.velocities(frames, target[:, :3, 3])
+        return target, chain.per_radian * np.concatenate((shifts, axes.swapaxes(1, 2)), axis=1)
 
     def _angles_taken_off(self, wanted: FloatArray, warming: FloatArray) -> FloatArray:
         model, command = self.model, wanted.copy()
@@ -250,7 +254,7 @@ class Compensator:
         self, wanted: FloatArray, warming: FloatArray
     ) -> tuple[FloatArray, FloatArray, BoolArray]:
         """Return commands (n, k), what is left of each pose (n, 6), and which rows are faded."""
-        model, k = self.model, self.model.joints
+        model, k, unit = self.model, self.model.joints, self.model.chain.per_radian
         in_levers = np.repeat((1.0 / self._typical[0], 1.0), 3)
         command = self._angles_taken_off(wanted, warming)
         target, jacobian = self._nominal(wanted)
@@ -261,13 +265,13 @@ class Compensator:
         if k > 6:
             # It acts on all of the change, whose size is another than that of what it leaves.
             kept = _faded(sizes, KEPT_BELOW)
-            command = wanted + self._smallest(command - wanted, right, kept)
+            command = wanted + unit * self._smallest((command - wanted) / unit, right, kept)
         for step in range(NEWTON_STEPS + 1):
             error = _pose_error(target, model._state(model.drivers(command, warming)).tool)
             if step == NEWTON_STEPS:
                 break
             along = np.einsum('nij,ni->nj', left, in_levers * error) * factor
-            command = command - np.einsum('nij,ni->nj', right, along)
+            command = command - unit * np.einsum('nij,ni->nj', right, along)
         return command, error, np.asarray(fade.min(axis=1) < 1.0)
 
     @staticmethod

@@ -59,6 +59,8 @@ from remaster_ros.types import FloatArray
 Form = Literal['urdf', 'ur', 'ros2_control', 'rising', 'pad', 'json', 'csv']
 FORMS: tuple[Form, ...] = get_args(Form)
 WITH_GEOMETRY = frozenset({'urdf', 'ur', 'json', 'csv'})
+# Those whose numbers are of joints that turn.
+OF_TURNS = frozenset({'ur', 'json', 'csv'})
 KINEMATICS_FORMAT = 'remaster-kinematics/1'
 # Configurations in the measured range over which a form is compared with the whole correction.
 COMPARED = 400
@@ -158,7 +160,7 @@ def held(compensation: Compensation, form: Form, rng: np.random.Generator) -> He
         growth=Geometry.none(k),
         lateral_compliance=np.zeros(k),
     )
-    low, high = np.array([part.range_rad for part in content.joints]).T
+    low, high = content.per_joint('range', model.chain).T
     q = rng.uniform(low, high, (COMPARED, k))
     sensor, marker = next(iter(model.T_R_N)), next(iter(model.markers))
 
@@ -262,6 +264,12 @@ def exported(
     InputError
         The file that is to be changed is not of this arm, or has not what is to be changed.
     """
+    chain = compensation.model.chain
+    for joint in np.flatnonzero(chain.slides)[:1] if form in OF_TURNS else ():
+        raise InputError(
+            f"joint '{chain.joint_names[joint]}' slides, for which --to {form} has no place; use "
+            '--to urdf'
+        )
     offsets = _offsets(compensation, one)
     notes = written_notes(offsets, one.words)
     if form == 'urdf':

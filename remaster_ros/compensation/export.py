@@ -192,11 +192,8 @@ def remaster_text(
                'description.')
               if words else ()),
             '',
-            *(('Afterwards measure ten new poses, import and fit them with the robot model that',
-               'is then in use: the offsets must be zero within their intervals. "remaster',
-               'verify" does not take an arm with a joint that slides.') if slides else
-              ('Afterwards measure ten new poses and run "remaster verify": it shows whether the',
-               'offsets are in use, once.')),
+            'Afterwards measure ten new poses and run "remaster verify": it shows whether the',
+            'offsets are in use, once.',
             '',
         ]
     )  # fmt: skip

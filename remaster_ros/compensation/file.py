@@ -81,19 +81,22 @@ class TermPart(Struct):
     driver_at: Literal['reported', 'with_offset'] | UnsetType = UNSET
     order: int | UnsetType = UNSET
     knots_rad: list[float] | UnsetType = UNSET
+    knots_m: list[float] | UnsetType = UNSET
     knots: list[float] | UnsetType = UNSET
     degree: int | UnsetType = UNSET
     turn_start_rad: float | UnsetType = UNSET
 
 
-class JointPart(Struct):
-    """What adds to a joint's angle."""
+class JointPart(Struct, kw_only=True):
+    """What adds to a joint's angle, or to the place of one that slides."""
 
     joint: str
-    offset_rad: float
+    offset_rad: float | UnsetType = UNSET
+    offset_m: float | UnsetType = UNSET
     identifiable: bool
     why: str
-    range_rad: tuple[float, float]
+    range_rad: tuple[float, float] | UnsetType = UNSET
+    range_m: tuple[float, float] | UnsetType = UNSET
     terms: list[TermPart]
 
 
@@ -193,6 +196,11 @@ class CompensationPart(Struct):
     temperature: TemperaturePart | None = None
     controller: Controller | None = None
 
+    def per_joint(self, what: str, chain: SerialChain) -> FloatArray:
+        """Return offset or range of every joint, rad, m of those that slide, (k, ...)."""
+        parts = zip(self.joints, chain.units, strict=True)
+        return np.array([getattr(part, f'{what}_{unit}') for part, unit in parts])
+
 
 @dataclass(frozen=True, eq=False)
 class Compensation:
@@ -283,16 +291,17 @@ def written(
         state=dict(state),
         joints=[
             JointPart(
-                name,
-                float(model.joint_offsets[j]),
-                described.identifiable[j],
-                described.why[j],
-                _pair(described.range_rad[j]),
-                [
-                    _term(term.effect, term.function, term.coefficients, names)
+                joint=name,
+                identifiable=described.identifiable[j],
+                why=described.why[j],
+                terms=[
+                    _term(term.effect, term.function, term.coefficients, chain)
                     for term in model.joint_terms
                     if term.joint == j
                 ],
+                **_in_unit(
+                    chain.units[j], float(model.joint_offsets[j]), _pair(described.ranges[j])
+                ),
             )
             for j, name in enumerate(names)
         ],
@@ -308,7 +317,7 @@ def written(
         ],
         gravity_m_s2=GRAVITY,
         base_terms=[
-            _term(term.effect, term.function, term.coefficients, names)
+            _term(term.effect, term.function, term.coefficients, chain)
             for term in model.base_terms
         ],
         temperature=TemperaturePart(model.reference_c, model.mean_c, _origins(model.growth, names))
@@ -349,6 +358,10 @@ def written(
     return '{\n' + ',\n'.join(lines) + '\n}\n'
 
 
+def _in_unit(unit: str, offset: float, both: tuple[float, float]) -> dict[str, Any]:
+    return {f'offset_{unit}': offset, f'range_{unit}': both}
+
+
 def _triangle(root: FloatArray) -> tuple[IntArray, list[list[float]]]:
     """Return which parameters a root (r, p) has, and its rows from the diagonal on."""
     kept = np.flatnonzero(np.any(root != 0.0, axis=0))
@@ -360,22 +373,22 @@ def _taken_at(driver: Driver) -> Literal['reported', 'with_offset']:
     return 'with_offset' if driver.startswith('gravity') else 'reported'
 
 
+def _knots_key(driver: Driver, joint: int, chain: SerialChain) -> str:
+    return f'knots_{chain.units[joint]}' if driver == 'angle' else 'knots'
+
+
 def _term(
-    effect: str, function: Function, coefficients: FloatArray, names: Sequence[str]
+    effect: str, function: Function, coefficients: FloatArray, chain: SerialChain
 ) -> TermPart:
     part = TermPart(effect, function.driver, function.form, coefficients.tolist())
     if function.driver != 'none':
         part.driver_at = _taken_at(function.driver)
     if function.joint >= 0:
-        part.driver_joint = names[function.joint]
+        part.driver_joint = chain.joint_names[function.joint]
     if function.order:
         part.order = function.order
     if function.form == 'bspline':
-        knots = function.knots.tolist()
-        if function.driver == 'angle':
-            part.knots_rad = knots
-        else:
-            part.knots = knots
+        setattr(part, _knots_key(function.driver, function.joint, chain), function.knots.tolist())
         part.degree = function.degree
         if not np.isnan(function.turn_start):
             part.turn_start_rad = float(function.turn_start)
@@ -458,7 +471,7 @@ def _model(content: CompensationPart) -> ArmModel:
     robot = content.robot
     if hashlib.sha256(robot.urdf.encode()).hexdigest() != robot.urdf_sha256:
         raise _broken('robot.urdf', 'is not the text whose hash is urdf_sha256')
-    chain = SerialChain.from_urdf(robot.urdf, robot.base_link, robot.tip_link)
+    chain = SerialChain.from_urdf(robot.urdf, robot.base_link, robot.tip_link, sliding=True)
     names = chain.joint_names
     for where, given in (
         ('robot.joint_names', robot.joint_names),
@@ -474,6 +487,9 @@ def _model(content: CompensationPart) -> ArmModel:
             _triple(chain.centers_of_mass[index]),
         ):
             raise _broken(f'masses of {part.joint}', 'are not those of its URDF')
+    for joint, unit in zip(content.joints, chain.units, strict=True):
+        if UNSET in (getattr(joint, f'offset_{unit}'), getattr(joint, f'range_{unit}')):
+            raise _broken(f'joints.{joint.joint}', f'has no offset_{unit} or no range_{unit}')
     pad = {} if content.controller is None else content.controller.joints
     told = [*pad, *(other for joint in pad.values() for other in joint.coupling)]
     if any(name not in names for name in told):
@@ -483,18 +499,18 @@ def _model(content: CompensationPart) -> ArmModel:
     if content.gravity_m_s2 != GRAVITY:
         raise _broken('gravity_m_s2', f'is not {GRAVITY}')
     joint_terms = tuple(
-        JointTerm(j, term.effect, *_function(term, f'joints.{part.joint}.terms.{i}', names, 1))
+        JointTerm(j, term.effect, *_function(term, f'joints.{part.joint}.terms.{i}', chain, 1))
         for j, part in enumerate(content.joints)
         for i, term in enumerate(part.terms)
     )
     base_terms = tuple(
-        BaseTerm(term.effect, *_function(term, f'base_terms.{i}', names, 3))
+        BaseTerm(term.effect, *_function(term, f'base_terms.{i}', chain, 3))
         for i, term in enumerate(content.base_terms)
     )
     warm = content.temperature
     model = ArmModel(
         chain=chain,
-        joint_offsets=np.array([part.offset_rad for part in content.joints]),
+        joint_offsets=content.per_joint('offset', chain),
         joint_terms=joint_terms,
         base_terms=base_terms,
         geometry=_geometry(content.geometry.origins, names),
@@ -552,9 +568,9 @@ def _root(
 
 
 def _function(
-    part: TermPart, where: str, names: Sequence[str], axes: int
+    part: TermPart, where: str, chain: SerialChain, axes: int
 ) -> tuple[Function, FloatArray]:
-    joint = -1
+    joint, names = -1, chain.joint_names
     if part.driver in ('angle', 'gravity_torque'):
         if part.driver_joint not in names:
             raise _broken(f'{where}.driver_joint', 'names no joint of the arm')
@@ -568,7 +584,7 @@ def _function(
         raise _broken(f'{where}.driver', 'gravity_moment drives only the base, and linearly')
     knots, degree = np.zeros(0), 0
     if part.form == 'bspline':
-        given = part.knots_rad if part.driver == 'angle' else part.knots
+        given = getattr(part, _knots_key(part.driver, joint, chain))
         if given is UNSET or part.degree is UNSET:
             raise _broken(where, 'is a bspline without knots or degree')
         assert not isinstance(given, UnsetType)

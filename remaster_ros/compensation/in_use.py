@@ -89,6 +89,11 @@ class CorrectionInUse:
         most_deg: float = MOST_DEG,
     ) -> None:
         found = read_compensation(path)
+        for joint in np.flatnonzero(found.model.chain.slides)[:1]:
+            raise InputError(
+                f"{path}: joint '{found.model.chain.joint_names[joint]}' slides, and no node "
+                'corrects what such an arm is commanded; give its planner the corrected URDF'
+            )
         self.path, self.sha256 = path, found.sha256
         self._compensation = found
         self.compensator: Compensator = found.compensator

@@ -14,7 +14,7 @@ import numpy as np
 
 from remaster_ros.calibration.registration import register_points
 from remaster_ros.compensation.arm_model import ArmModel
-from remaster_ros.compensation.checking import SAME_RAD, Measured
+from remaster_ros.compensation.checking import Measured, together
 from remaster_ros.kinematics.transforms import apply
 from remaster_ros.types import FloatArray
 
@@ -73,9 +73,10 @@ def visited(model: ArmModel, measured: Measured, wanted: FloatArray | None) -> V
     visits: list[list[list[int]]] = []
     last = -1
     for row, angles in enumerate(q):
-        near = [at for at, place in enumerate(places) if np.abs(angles - place).max() <= SAME_RAD]
-        at = near[0] if near else len(places)
-        if not near:
+        known = np.array(places).reshape(-1, len(angles))
+        near = np.flatnonzero(together(model.chain, known, angles))
+        at = int(near[0]) if len(near) else len(places)
+        if not len(near):
             places.append(angles)
             visits.append([])
         if at == last:

@@ -82,8 +82,8 @@ class Described:
     # Of each joint's offset, as of `FitResult`
     identifiable: tuple[bool, ...]
     why: tuple[str, ...]
-    # Least and largest reported angle of each joint in the rows fitted, (k, 2)
-    range_rad: FloatArray
+    # Least and largest reported angle of each joint in the rows fitted, rad or m, (k, 2)
+    ranges: FloatArray
     not_corrected: tuple[NotCorrected, ...] = ()  # What is left
     notes: tuple[str, ...] = field(default=())
 

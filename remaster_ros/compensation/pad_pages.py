@@ -106,8 +106,9 @@ def motor_text(offsets: ZeroOffsets, motors: Mapping[str, MotorNumber]) -> str:
         if motor is None:
             continue
         coupled = pad.coupled(i) or any(i in pad.coupled(j) for j in range(len(shown)))
-        if coupled or not offsets.identifiable[i]:
+        if offsets.chain.slides[i] or coupled or not offsets.identifiable[i]:
             why = 'it is coupled to another joint' if coupled else 'it is not determined'
+            why = 'it slides, and counts are per degree' if offsets.chain.slides[i] else why
             lines.append(f'{name}: no number, since {why}')
             continue
         new = motor.old + motor.direction * motor.counts_per_degree * shown[i]

@@ -153,6 +153,21 @@ class SerialChain:
         """The unit of each joint's position, k names: rad or m."""
         return tuple('m' if slides else 'rad' for slides in self.slides)
 
+    @property
+    def torque_units(self) -> tuple[str, ...]:
+        """The unit of `gravity_torque` of each joint, k names: (N m) or N."""
+        return tuple('N' if slides else '(N m)' for slides in self.slides)
+
+    @property
+    def shown_units(self) -> tuple[str, ...]:
+        """The unit in which people read each joint's position, k names: deg or mm."""
+        return tuple('mm' if slides else 'deg' for slides in self.slides)
+
+    @cached_property
+    def shown_scale(self) -> FloatArray:
+        """How many of `shown_units` each joint's own unit has, (k,)."""
+        return np.where(self.slides, 1e3, np.degrees(1.0))
+
     @cached_property
     def usual_range(self) -> tuple[FloatArray, FloatArray]:
         """Limits, (k,) each; a turn from -pi to pi of joints that turn farther or without end."""
@@ -161,8 +176,7 @@ class SerialChain:
 
     def shown_limits(self, joint: int) -> str:
         """Return the limits of a joint as people read them, without a unit: degrees or mm."""
-        factor = 1e3 if self.slides[joint] else np.degrees(1.0)
-        ends = (self.lower[joint], self.upper[joint])
+        factor, ends = self.shown_scale[joint], (self.lower[joint], self.upper[joint])
         return ' to '.join(f'{factor * e:.0f}' if np.isfinite(e) else 'without end' for e in ends)
 
     def shown_offset(self, joint: int, value: float, digits: int = 2) -> str:
@@ -170,9 +184,8 @@ class SerialChain:
 
         A thousandth of a metre is about as much as a tenth of a degree: one digit less.
         """
-        if self.slides[joint]:
-            return f'{1e3 * value:.{max(digits - 1, 0)}f} mm'
-        return f'{np.degrees(value):.{digits}f} deg'
+        digits = max(digits - bool(self.slides[joint]), 0)
+        return f'{self.shown_scale[joint] * value:.{digits}f} {self.shown_units[joint]}'
 
     def with_offsets(self, joint_offsets: FloatArray) -> SerialChain:
         """Return the arm with zero-offsets (rad, (k,)) built in: it takes reported angles.
@@ -405,9 +418,8 @@ def _require_kind(joint: UrdfJoint, sliding: bool) -> None:
     if joint.kind == 'prismatic':
         if not sliding:
             raise InputError(
-                f"URDF: joint '{joint.name}' is prismatic; an arm with a joint that slides can be "
-                'planned, measured by the nodes, simulated, imported and fitted, no more: this '
-                'needs joints that turn, between other links'
+                f"URDF: joint '{joint.name}' is prismatic; every command but discover takes an "
+                'arm with a joint that slides: this needs joints that turn, between other links'
             )
     elif joint.kind not in ('revolute', 'continuous'):
         raise InputError(

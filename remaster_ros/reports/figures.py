@@ -141,15 +141,10 @@ def arm_lines(chain: SerialChain, q: FloatArray, offsets: FloatArray | None = No
     return np.concatenate((np.zeros((len(q), 1, 3)), joints, tips), axis=1)
 
 
-def shown_scale(result: FitResult) -> FloatArray:
-    """Return degrees per rad, or mm per m where a joint slides, (k,)."""
-    return np.where(result.chain.slides, 1e3, 180.0 / np.pi)
-
-
 def posteriors(result: FitResult) -> Figure:
     """Draw the marginal posterior of each joint's offset with mean and 95 % interval (Fig. 4)."""
     figure, axes = _joint_panels(result, 1.55, left=0.1, top=0.3)
-    scale = shown_scale(result)
+    scale = result.chain.shown_scale
     draws = scale * result.joint_offset_draws
     for i, ax in enumerate(axes):
         sample = draws[..., i].ravel()
@@ -189,7 +184,7 @@ def traces(result: FitResult) -> Figure:
         if joint not in columns:
             _write_instead(ax, _short(result.why[i]))
             continue
-        values = shown_scale(result)[i] * result.trace[:, ::step, columns[joint]]
+        values = result.chain.shown_scale[i] * result.trace[:, ::step, columns[joint]]
         for chain in range(chains):
             color = CHAINS[chain % len(CHAINS)]
             ax.plot(x, values[chain], color=color, alpha=0.8, label=f'chain {chain + 1}')

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import msgspec
 import numpy as np
+from msgspec import UNSET
 
 from remaster_ros.calibration.predictions import predict
 from remaster_ros.compensation.arm_model import Geometry
@@ -28,6 +29,7 @@ from remaster_ros.compensation.of_result import (
 )
 from remaster_ros.discovery.geometry_model import GeometryModel, geometry_model, mean_length
 from remaster_ros.errors import InputError
+from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.transforms import quaternion_xyzw
 from remaster_ros.reports import schemas
 from remaster_ros.reports.rows_csv import RESIDUALS_FILE
@@ -90,23 +92,26 @@ def estimates(result: FitResult) -> dict[str, Any]:
 
 
 def _offsets(result: FitResult) -> list[dict[str, Any]]:
-    """Return a row for each joint's offset, of one that slides in mm."""
-    rows = table_rows(
-        joint=result.joint_names,
-        mean_deg=np.degrees(result.joint_offsets),
-        std_deg=np.degrees(result.joint_offsets_std),
-        interval95_deg=np.degrees(result.joint_offsets_interval95),
-        identifiable=result.identifiable,
-        why=result.why,
+    rows = table_rows(joint=result.joint_names, identifiable=result.identifiable, why=result.why)
+    values = of_joints(
+        result.chain,
+        mean=result.joint_offsets,
+        std=result.joint_offsets_std,
+        interval95=result.joint_offsets_interval95,
     )
-    for joint in np.flatnonzero(result.chain.slides):
-        rows[joint] |= {
-            **dict.fromkeys(('mean_deg', 'std_deg', 'interval95_deg')),
-            'unit': 'mm',
-            'mean_mm': 1e3 * result.joint_offsets[joint],
-            'std_mm': 1e3 * result.joint_offsets_std[joint],
-            'interval95_mm': 1e3 * result.joint_offsets_interval95[joint],
-        }
+    return [{**row, **value} for row, value in zip(rows, values, strict=True)]
+
+
+def of_joints(chain: SerialChain, **columns: FloatArray) -> list[dict[str, Any]]:
+    """Return a row for each joint of values in rad or m, (k, ...): in degrees or mm.
+
+    A column x is x_deg, and of a joint that slides x_mm, where x_deg is null.
+    """
+    rows = []
+    for joint, (unit, scale) in enumerate(zip(chain.shown_units, chain.shown_scale)):
+        row: dict[str, Any] = {'unit': unit, **{f'{name}_deg': None for name in columns}}
+        row |= {f'{name}_{unit}': scale * values[joint] for name, values in columns.items()}
+        rows.append(row)
     return rows
 
 
@@ -279,11 +284,10 @@ def fit_content(result: FitResult) -> schemas.Fit:
         ]
         content['intervals'] = 'robust' if result.other_errors else 'model'
         model = result.joint_offsets_std / result.widening
-        for row, std, times in zip(content['joint_offsets'], model, result.widening, strict=True):
-            if times > 1.0 and row['mean_deg'] is None:
-                row['model_std_mm'] = 1e3 * std
-            elif times > 1.0:
-                row['model_std_deg'] = np.degrees(std)
+        shown = result.chain.shown_scale * model
+        for row, std, times in zip(content['joint_offsets'], shown, result.widening, strict=True):
+            if times > 1.0:
+                row[f'model_std_{row["unit"]}'] = std
     if result.orientations is not None:
         content['orientation'] = _orientation(result, result.orientations)
     if (geometry := geometry_of(result)) is not None:
@@ -363,34 +367,40 @@ def read_result(
         ) from None
 
 
-def joint_offsets_rad(
-    fit: schemas.Fit, joint_names: Sequence[str]
-) -> tuple[FloatArray, FloatArray]:
+def joint_offsets_of(fit: schemas.Fit, chain: SerialChain) -> tuple[FloatArray, FloatArray]:
     """Return the offsets of a fit.json in the order of a robot's joints, with their std.
 
     Returns
     -------
     offsets, std
-        rad, (k,) each; the std of a joint that is not identifiable is 0.
+        rad, m of joints that slide, (k,) each; the std of one that is not identifiable is 0.
 
     Raises
     ------
     InputError
-        The offsets are for other joints, or are no angles.
+        The offsets are for other joints, in another unit, or no offsets of any arm.
     """
     rows = {row.joint: row for row in fit.joint_offsets}
+    joint_names = chain.joint_names
     if set(rows) != set(joint_names) or len(rows) < len(fit.joint_offsets):
         raise InputError(
             f'the offsets are for the joints {", ".join(rows)}, '
             f'the robot has {", ".join(joint_names)}; use the fit of this robot'
         )
     ordered = [rows[name] for name in joint_names]
-    for row in ordered:
-        if row.mean_deg is None or row.std_deg is None:
-            raise InputError(f'{row.joint} slides, its offset is in mm; this takes angles alone')
-        for key, value, low in (('mean_deg', row.mean_deg, -360.0), ('std_deg', row.std_deg, 0.0)):
-            if not low <= value <= 360.0:
-                raise InputError(f'{row.joint}: {key} is {value:g}, not {low:g} to 360; fit again')
+    most = 2.0 * np.pi * chain.per_radian * chain.shown_scale
+    for row, unit, high in zip(ordered, chain.shown_units, most.round().tolist(), strict=True):
+        if row.unit != unit or getattr(row, f'mean_{unit}') in (None, UNSET):
+            raise InputError(
+                f'{row.joint}: its offset is in {row.unit}, the robot has it in {unit}; use the '
+                'fit of this robot'
+            )
+        for key, low in ((f'mean_{unit}', -high), (f'std_{unit}', 0.0)):
+            value = getattr(row, key)
+            if not low <= value <= high:
+                raise InputError(
+                    f'{row.joint}: {key} is {value:g}, not {low:g} to {high:g}; fit again'
+                )
     means, stds = np.array([row.mean_and_std for row in ordered]).T
     return means, np.where([row.identifiable for row in ordered], stds, 0.0)
 

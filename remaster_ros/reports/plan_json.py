@@ -162,9 +162,8 @@ def _expected_std(
     found: dict[str, dict[str, float | None]] = {'expected_std_deg': {}}
     if chain.slides.any():
         found['expected_std_mm'] = {}
-    for (name, std), slides in zip(joint_std.items(), chain.slides):
-        key, factor = ('mm', 1e3) if slides else ('deg', float(np.degrees(1.0)))
-        found[f'expected_std_{key}'][name] = None if std is None else factor * std
+    for (name, std), unit, scale in zip(joint_std.items(), chain.shown_units, chain.shown_scale):
+        found[f'expected_std_{unit}'][name] = None if std is None else float(scale) * std
     return found
 
 

@@ -187,12 +187,11 @@ def _dropped(plan: CollectionPlan) -> dict[str, tuple[int, int]]:
 
 
 def _joints(plan: CollectionPlan, chain: SerialChain) -> list[dict[str, Any]]:
-    factors = np.where(chain.slides, 1e3, np.degrees(1.0))
-    q = factors * np.array([visit.q for visit in plan.visits])
+    q = chain.shown_scale * np.array([visit.q for visit in plan.visits])
     return [
         {
             'name': f'{name} (mm)' if chain.slides[joint] else name,
-            'std': None if std is None else float(factors[joint] * std),
+            'std': None if std is None else float(chain.shown_scale[joint] * std),
             'low': float(q[:, joint].min()),
             'high': float(q[:, joint].max()),
             'limits': _limits(chain, joint),

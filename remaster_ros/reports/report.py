@@ -10,7 +10,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 from xml.etree import ElementTree
 
 import msgspec
@@ -305,9 +305,10 @@ class PlannedRow(NamedTuple):
 
 
 class StdRow(NamedTuple):
-    """Standard deviation of a joint's offset, degrees: expected, and of the fit; None for none."""
+    """Standard deviation of a joint's offset: expected, and of the fit; None for none."""
 
     joint: str
+    unit: Literal['deg', 'mm']
     expected: float | None
     fit: float | None
 
@@ -399,10 +400,12 @@ def _stds(inputs: Inputs, plan: RecordedPlan) -> tuple[StdRow, ...]:
     rows = []
     for row in inputs.fit.joint_offsets:
         # Of the model alone, as what is expected: where other errors are left it is wider.
-        std = row.std_deg if row.model_std_deg is UNSET else row.model_std_deg
+        std = getattr(row, f'model_std_{row.unit}')
+        std = getattr(row, f'std_{row.unit}') if std is UNSET else std
         before = expected.get(row.joint)
-        degrees = None if before is None else float(np.degrees(before))
-        rows.append(StdRow(row.joint, degrees, std if row.identifiable else None))
+        scale = 1e3 if row.unit == 'mm' else float(np.degrees(1.0))
+        shown = None if before is None else scale * before
+        rows.append(StdRow(row.joint, row.unit, shown, std if row.identifiable else None))
     return tuple(rows)
 
 
@@ -433,7 +436,15 @@ def plan_to_dict(plan: PlanFacts) -> dict[str, Any]:
         'minutes': plan.minutes,
         'dropped': {reason: counts[0] for reason, counts in plan.dropped.items()},
         'dropped_configurations': {reason: counts[1] for reason, counts in plan.dropped.items()},
-        'std_deg': {row.joint: {'expected': row.expected, 'fit': row.fit} for row in plan.stds},
+        **{
+            f'std_{unit}': {
+                row.joint: {'expected': row.expected, 'fit': row.fit}
+                for row in plan.stds
+                if row.unit == unit
+            }
+            for unit in ('deg', 'mm')
+            if unit == 'deg' or any(row.unit == unit for row in plan.stds)
+        },
     }
 
 
@@ -578,7 +589,7 @@ def answer_html(subject: Subject, drawings: dict[str, Markup], printing: bool = 
 
 def _chain(inputs: Inputs) -> SerialChain:
     session = inputs.session
-    return SerialChain.from_urdf(session.urdf, session.base_link, session.tip_link)
+    return SerialChain.from_urdf(session.urdf, session.base_link, session.tip_link, sliding=True)
 
 
 def _how_sure(inputs: Inputs, answer: Answer) -> list[str]:

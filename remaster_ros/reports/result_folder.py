@@ -106,9 +106,7 @@ def save_fit(result: FitResult, folder: str | os.PathLike[str], figures: bool = 
     files = exports(result)
     if (geometry := geometry_of(result)) is not None and geometry.is_better:
         files[MODEL_FILE] = model_text(result, geometry)
-    # Its terms and limits are of angles.
-    if not result.chain.slides.any():
-        files[COMPENSATION_FILE] = compensation_text(result, result_sha256)
+    files[COMPENSATION_FILE] = compensation_text(result, result_sha256)
     _write_applied(folder, files)
     if not figures:
         _remove_report(folder)

@@ -646,7 +646,7 @@ def fit_lines(fit: Fit) -> list[str]:
     if any(row.unit == 'mm' for row in fit.joint_offsets):
         lines.append(
             'of an arm with a joint that slides neither lengths and tilts off their drawing nor '
-            'other causes are looked for, and there is no compensation.json'
+            'other causes are looked for'
         )
     if isinstance(fit.session, Struct) and fit.session.times == 'none':
         lines.append(f'the session is {NO_TIMES}')

@@ -14,7 +14,7 @@ from worlds import robot_descriptions
 
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.transforms import rotation_vector_to_matrix, transform
-from remaster_ros.reports.fit_json import joint_offsets_rad, read_fit
+from remaster_ros.reports.fit_json import joint_offsets_of, read_fit
 from remaster_ros.session.reader import write_session
 from remaster_ros.simulation.simulated_workcell import simulate_session
 from remaster_ros.simulation.truth import SimulatedSensor
@@ -65,6 +65,10 @@ def shifted(session: Session, shift: np.ndarray) -> Session:
     )
 
 
+def chain_of(session: Session) -> SerialChain:
+    return SerialChain.from_urdf(session.urdf, session.base_link, session.tip_link)
+
+
 def through_the_urdf(session: Session, apply: Path) -> Session:
     return replace(session, urdf=(apply / 'robot_calibrated.urdf').read_text(encoding='utf-8'))
 
@@ -74,13 +78,13 @@ def through_the_layer(session: Session, apply: Path) -> Session:
     content = yaml.safe_load((apply / 'offset_layer.yaml').read_text(encoding='utf-8'))
     layer = content['/**']['ros__parameters']
     by_name = dict(zip(layer['joint_names'], layer['joint_offsets'], strict=True))
-    chain = SerialChain.from_urdf(session.urdf, session.base_link, session.tip_link)
+    chain = chain_of(session)
     return shifted(session, np.array([by_name.get(name, 0.0) for name in chain.joint_names]))
 
 
 def through_the_pad(session: Session, apply: Path) -> Session:
     """Read as a person does: a joint is driven to an angle, and set to show another, or zero."""
-    chain = SerialChain.from_urdf(session.urdf, session.base_link, session.tip_link)
+    chain = chain_of(session)
     shift = np.zeros(len(chain))
     for line in (apply / 'remaster.txt').read_text(encoding='utf-8').splitlines():
         words = line.split()
@@ -112,8 +116,7 @@ def before(request, tmp_path_factory):
     session = simulated(robot, seed=5)
     out = fitted(session, tmp_path_factory.mktemp(request.param))
     fit = read_fit(out / 'fit.json')
-    names = [row.joint for row in fit.joint_offsets]
-    offsets, std = joint_offsets_rad(fit, names)
+    offsets, std = joint_offsets_of(fit, chain_of(session))
     known = np.array([row.identifiable for row in fit.joint_offsets])
     # What is to be corrected is there, and the outer two joints are not to be told.
     assert np.abs(offsets[known]).max() > 10 * std[known].max()
@@ -137,8 +140,7 @@ COMBINATIONS = [
 def test_a_refit_after_applying_finds_nothing(before, form, tmp_path):
     session, out, _, known, std = before
     again = read_fit(fitted(FORMS[form](session, out / 'apply'), tmp_path) / 'fit.json')
-    names = [row.joint for row in again.joint_offsets]
-    left, _ = joint_offsets_rad(again, names)
+    left, _ = joint_offsets_of(again, chain_of(session))
     # The same measurements: what is left is the draws' error and the rounding of four digits.
     assert np.all(np.abs(left[known]) < 0.3 * std[known] + np.radians(1e-4)), np.degrees(left)
 

@@ -141,7 +141,6 @@ def test_an_offset_in_mm_is_recovered_from_a_table(measured, tmp_path):
         assert abs(error) < 4.5 * rows[joint]['std_deg']
     page = (out / 'apply' / 'remaster.txt').read_text()
     assert f'{slide["mean_mm"]:+.4f} mm' in page
-    assert not (out / 'apply' / 'compensation.json').exists()
 
 
 def test_the_zero_of_a_slide_at_a_fixed_direction_is_the_registrations(tmp_path):
@@ -170,7 +169,6 @@ def test_the_zero_of_a_slide_at_a_fixed_direction_is_the_registrations(tmp_path)
     'verb',
     [
         ['discover', 'SESSION', '--out', 'OUT'],
-        ['report', 'SESSION', '--out', 'OUT'],
         ['fit', 'SESSION', '--sampler', 'paper', '--out', 'OUT'],
         ['import', 'SESSION', '--out', 'OUT'],
     ],

@@ -66,7 +66,7 @@ def test_an_arm_that_cannot_stand_at_a_configuration_is_sent_to_none(planner):
     [
         (lambda text: text.replace('joint_2', 'elbow', 1), 'line 1: is not joint_1'),
         (lambda text: text[: text.rindex('\n', 0, -1) + 1], 'has 7 configurations, and a check'),
-        (lambda text: text[:-1] + ',1.0\n', 'line 9: does not have 7 angles'),
+        (lambda text: text[:-1] + ',1.0\n', 'line 9: does not have 7 numbers'),
         (lambda text: text.replace(text.splitlines()[3], ','.join('0' * 6 + 'x')), 'line 4: does'),
         (lambda text: text.replace(text.splitlines()[2], ','.join(['nan'] * 7)), 'line 3: is out'),
         (lambda text: text.replace(text.splitlines()[2], ','.join(['400'] * 7)), 'line 3: is out'),

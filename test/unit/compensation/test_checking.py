@@ -77,11 +77,9 @@ def test_a_changed_joint_is_found_and_named(name):
         assert abs(found.since - BEFORE) <= 1
         if found.changed == (joint,):
             others = [one for i, one in enumerate(found.joints) if i not in (0, joint)]
-            assert all(abs(one.change_rad) < 4.5 * one.std_rad for one in others)
+            assert all(abs(one.change) < 4.5 * one.std for one in others)
         one = found.joints[joint]
-        assert one.change_rad * one.lever_m == pytest.approx(
-            2e-4, abs=4 * one.std_rad * one.lever_m
-        )
+        assert one.change * one.lever_m == pytest.approx(2e-4, abs=4 * one.std * one.lever_m)
 
 
 def test_a_marker_that_was_moved_is_no_joint():
@@ -144,6 +142,6 @@ def test_several_readings_of_a_pose_are_one():
         one.sensor + two.sensor,
         one.marker + two.marker,
         np.concatenate((one.position, two.position)),
-    ).merged()
+    ).merged(arm.found.chain)
     np.testing.assert_allclose(both.position, 0.5 * (one.position + two.position))
     assert both.sensor == one.sensor

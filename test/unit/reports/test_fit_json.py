@@ -7,6 +7,7 @@ import msgspec
 import numpy as np
 import pytest
 import yaml
+from worlds.arms import planar_arm
 
 from remaster_ros.calibration.residual_structure import ResidualStructure, StructureTest
 from remaster_ros.compensation.export import (
@@ -20,7 +21,7 @@ from remaster_ros.compensation.export import (
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.transforms import matrix_from_quaternion_xyzw, matrix_from_rpy
-from remaster_ros.reports.fit_json import fit_content, joint_offsets_rad, read_fit
+from remaster_ros.reports.fit_json import fit_content, joint_offsets_of, read_fit
 from remaster_ros.reports.report import fit_html
 from remaster_ros.reports.result_folder import prepare_folder, save_fit
 
@@ -31,7 +32,7 @@ def test_fit_json_is_the_fit(fit_result, tmp_path):
     assert fit == fit_content(fit_result)
     assert fit.format == 'remaster-fit/1'
     assert [row.joint for row in fit.joint_offsets] == list(fit_result.joint_names)
-    offsets, std = joint_offsets_rad(fit, fit_result.joint_names)
+    offsets, std = joint_offsets_of(fit, fit_result.chain)
     np.testing.assert_allclose(offsets, fit_result.joint_offsets, atol=1e-14)
     known = np.where(fit_result.identifiable, fit_result.joint_offsets_std, 0.0)
     np.testing.assert_allclose(std, known, atol=1e-14)
@@ -56,7 +57,10 @@ def test_fit_json_is_the_fit(fit_result, tmp_path):
 def test_offsets_of_another_robot_are_refused(fit_result):
     fit = fit_content(fit_result)
     with pytest.raises(InputError, match='use the fit of this robot'):
-        joint_offsets_rad(fit, ['joint_1', 'joint_2'])
+        joint_offsets_of(fit, planar_arm(2))
+    rail = replace(fit_result.chain, slides=np.arange(len(fit_result.chain)) == 2)
+    with pytest.raises(InputError, match='joint_3: its offset is in deg, the robot has it in mm'):
+        joint_offsets_of(fit, rail)
 
 
 @pytest.mark.parametrize(
@@ -66,7 +70,7 @@ def test_offsets_that_are_no_angles_are_refused(fit_result, key, value):
     fit = fit_content(fit_result)
     setattr(fit.joint_offsets[2], key, value)
     with pytest.raises(InputError, match=f'joint_3: {key} is {value:g}, not '.replace('+', r'\+')):
-        joint_offsets_rad(fit, fit_result.joint_names)
+        joint_offsets_of(fit, fit_result.chain)
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ from hostile.files import check_read, read_urdf, spoil_and_read
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.urdf import parse_urdf
 from remaster_ros.reports import schemas
-from remaster_ros.reports.fit_json import fit_content, joint_offsets_rad, read_fit
+from remaster_ros.reports.fit_json import fit_content, joint_offsets_of, read_fit
 from remaster_ros.session.reader import read_session, write_session
 from remaster_ros.session.workcell import read_cell
 from remaster_ros.session.yaml_records import YamlError, load_yaml
@@ -54,7 +54,7 @@ def test_a_spoilt_file_is_read_or_refused(session, fit_result, tmp_path, rng, na
         'session': lambda: read_session(folder),
         'robots': lambda: read_urdf(path),
         'cells': lambda: read_cell(path),
-        'fit.json': lambda: joint_offsets_rad(read_fit(fit), fit_result.joint_names),
+        'fit.json': lambda: joint_offsets_of(read_fit(fit), fit_result.chain),
     }
     taken, refused = spoil_and_read(path, readers[name.partition('/')[0]], rng, TIMES)
     assert refused > TIMES // 10
