@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import re
+import string
 from collections import defaultdict
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field
 from itertools import chain as flat
 
@@ -14,7 +15,7 @@ from remaster_ros.importing.units import ANGLES, LENGTHS, split_unit
 
 AXES = ('x', 'y', 'z')
 _TOKEN = re.compile(r'[^\W\d_]+|\d+|#')
-_CAMEL = re.compile(r'(?<=[a-z])(?=[A-Z])')
+_CAMEL = re.compile(r'(?<=[a-z])(?=[A-Z])|(?<=[XYZ])(?=[A-Z][a-z])')
 # Words for the coordinates of surveyors: east, north and up are right-handed, as X, Y and Z.
 _AXIS_WORDS = {
     **dict.fromkeys(('rechtswert', 'easting', 'east', 'e', 'ost', 'ostwert'), 'x'),
@@ -29,7 +30,10 @@ _JOINT_WORDS = {
     *('achse', 'gelenk', 'eje', 'axe', 'asse', 'angle', 'position', 'positions', 'pos'),
     *('robot', 'lbr', 'rad', 'deg', 'state', 'states'),
 }
-_REPORTED = {'actual', 'act', 'measured', 'meas', 'ist', 'reported', 'encoder', 'real'}
+_REPORTED = {
+    *('actual', 'act', 'measured', 'meas', 'ist', 'reported', 'encoder', 'real', 'istwert'),
+    *('istposition', 'gemessen', 'aktuell', 'mesuré', 'mesure', 'medido', 'misurato', 'actuel'),
+}
 _OTHER_JOINTS = {
     *('target', 'command', 'commanded', 'cmd', 'goal', 'desired', 'soll', 'setpoint', 'nominal'),
     *('velocity', 'vel', 'qd', 'speed', 'current', 'torque', 'effort', 'moment', 'tau', 'temp'),
@@ -44,15 +48,23 @@ _PENDANTS = tuple(
         'base hombro codo muñeca1 muñeca2 muñeca3',
         'base épaule coude poignet1 poignet2 poignet3',
         'base spalla gomito polso1 polso2 polso3',
+        '基座 肩部 肘部 手腕1 手腕2 手腕3',
         's l u r b t',
         's l e u r b t',
     )
 )
 _SPREAD = {'std', 'stdev', 'stddev', 'sigma', 'sd', 'uncertainty', 'rms'}
 _TOOL = {
-    *('target', 'nominal', 'command', 'goal', 'desired', 'soll', 'tcp', 'tool', 'flange', 'robot'),
-    *('error', 'err', 'dev', 'deviation', 'delta', 'd', 'diff', 'rot', 'normal', 'offset', 'r'),
-    *('w', 'v', 'a', 'vel', 'velocity', 'force', 'f', 'orientation', 'quaternion', 'rotation'),
+    *('target', 'goal', 'tcp', 'tool', 'flange', 'robot', 'ref', 'reference', 'plan', *'rwvaf'),
+}
+# Of columns that are no place that was measured.
+_NOT_MEASURED = {
+    *('nominal', 'nom', 'command', 'desired', 'soll', 'nennwert', 'sollwert', 'cad', 'planned'),
+    *('theo', 'théorique', 'theoretical', 'teorico', 'teórico', 'nominale', 'expected', 'prog'),
+    *('error', 'err', 'dev', 'deviation', 'delta', 'd', 'diff', 'rot', 'normal', 'offset'),
+    *('vel', 'velocity', 'force', 'orientation', 'quaternion', 'rotation', 'tol', 'tolerance'),
+    *('abw', 'abweichung', 'differenz', 'fehler', 'écart', 'ecart', 'desv', 'desviación'),
+    *('scarto', 'residual', 'toleranz'),
 }
 _WORDS = {
     'name': {
@@ -63,8 +75,8 @@ _WORDS = {
         *('time', 'timestamp', 'stamp', 't', 'zeit', 'datetime', 'zeitstempel', 'secs'),
         *('epoch', 'ts'),
     },
-    'date': {'date', 'datum'},
-    'clock': {'uhrzeit', 'clock'},
+    'date': {'date', 'datum', 'fecha'},
+    'clock': {'uhrzeit', 'clock', 'heure', 'hora', 'ora'},
     'pose': {'pose', 'goal', 'poses', 'ziel', 'zielpose'},
     'configuration': {'configuration', 'config', 'konfiguration'},
     'split': {'split', 'subset', 'partition'},
@@ -270,7 +282,7 @@ def _joints(
         found.from_joints = complete[came_from[0]]
         _take(found, found.from_joints, taken)
     usable = [stem for stem in complete if not _OTHER_JOINTS & set(stem) and stem not in came_from]
-    known = [stem for stem in usable if set(stem) <= _JOINT_WORDS | _REPORTED | {'*', '='}]
+    known = [stem for stem in usable if set(stem) <= _JOINT_WORDS | _REPORTED | {*'*=#'}]
     best = [stem for stem in known if '=' in stem or _REPORTED & set(stem)] or known or usable
     sets = [complete[stem] for stem in best]
     sets = [columns for columns in sets if len(columns) == len(joint_names)] or sets
@@ -297,8 +309,12 @@ def _joint_of(
         for short in (name, name[:-1] if name[-1:] == ('joint',) else name):
             for start in range(len(words) - len(short) + 1):
                 if words[start : start + len(short)] == short:
-                    rest = (*words[:start], '=', *words[start + len(short) :])
-                    return i + 1, rest
+                    # `J4 wrist 1` has the number of the joint beside its name.
+                    around = [
+                        ['#' if word == str(i + 1) else word for word in part]
+                        for part in (words[:start], words[start + len(short) :])
+                    ]
+                    return i + 1, (*around[0], '=', *around[1])
     digits = [i for i, word in enumerate(words) if word.isdigit()]
     if len(digits) != 1 or len(words) < 2:
         return None, ()
@@ -345,8 +361,10 @@ def _label(table: TextTable, columns: Sequence[int]) -> str:
     return f'marker_{rest}' if rest.isdigit() or not rest else rest
 
 
-def _groups(headers: Sequence[_Header], taken: set[int]) -> dict[tuple[str, ...], tuple[int, ...]]:
-    """Return words around the axis -> columns X, Y and Z, where all three are there."""
+def _groups(
+    headers: Sequence[_Header], taken: set[int], fewest: int = 3
+) -> dict[tuple[str, ...], tuple[int, ...]]:
+    """Return words around the axis -> columns X, Y and Z, where so many of them are there."""
     groups: dict[tuple[str, ...], dict[str, int]] = defaultdict(dict)
     for i, header in enumerate(headers):
         if i in taken or (header.unit and header.unit not in LENGTHS):
@@ -357,9 +375,9 @@ def _groups(headers: Sequence[_Header], taken: set[int]) -> dict[tuple[str, ...]
             stem = tuple('*' if word in AXES else word for word in words)
             groups[stem].setdefault(axes[0], i)
     return {
-        stem: tuple(columns[axis] for axis in AXES)
+        stem: tuple(columns[axis] for axis in AXES if axis in columns)
         for stem, columns in groups.items()
-        if len(columns) == 3
+        if len(columns) >= fewest
     }
 
 
@@ -375,12 +393,25 @@ def _points(
         return chosen
     complete = _groups(headers, taken)
     spreads = [stem for stem in complete if _SPREAD & set(stem) or 's' in stem]
-    usable = [stem for stem in complete if stem not in spreads]
-    best = [stem for stem in usable if not _TOOL & set(stem)] or usable
+    lettered = _lettered(complete)
+    usable = [stem for stem in complete if stem not in spreads and not _NOT_MEASURED & set(stem)]
+    best = [stem for stem in usable if stem in lettered or not _TOOL & set(stem)] or usable
     best = [stem for stem in best if _REPORTED & set(stem)] or best
     sets = [complete[stem] for stem in best]
-    # Names that differ in their numbers alone are several markers: `x1 y1 z1 x2 …`, `m1_x`.
-    if len({tuple(word for word in stem if not word.isdigit()) for stem in best}) > 1:
+    partial = [
+        columns
+        for stem, columns in _groups(headers, taken, 1).items()
+        if _REPORTED & set(stem) and len(columns) < len(AXES)
+    ]
+    if best and partial and not any(_REPORTED & set(stem) for stem in best):
+        raise InputError(
+            f'{table.path}: {", ".join(table.names[i] for i in partial[0])} without the others of '
+            'X, Y and Z; correct the header, or name the three of the measured point with --points'
+        )
+    # Names that differ in their numbers alone are several markers: `x1 y1 z1 x2 …`, `m1_x`; or in
+    # letters from A on.
+    unlike = {tuple(word for word in stem if not word.isdigit()) for stem in best}
+    if len(unlike) > 1 and not {*best} <= lettered:
         _only_one(table, sets, 'the measured points', _NAME_POINTS)
     markers = _markers(table, sets)
     _take(found, tuple(flat.from_iterable(sets)), taken)
@@ -391,6 +422,21 @@ def _points(
                 found.stds.setdefault(marker, complete[stem])
                 _take(found, complete[stem], taken)
     return markers
+
+
+def _lettered(stems: Iterable[tuple[str, ...]]) -> set[tuple[str, ...]]:
+    """Return the words that differ in one letter alone, which is A, B and so on."""
+    alike: dict[tuple[str, ...], dict[str, tuple[str, ...]]] = defaultdict(dict)
+    for stem in stems:
+        for i, word in enumerate(stem):
+            if len(word) == 1 and word.isalpha():
+                alike[(*stem[:i], '?', *stem[i + 1 :])][word] = stem
+    return {
+        stem
+        for found in alike.values()
+        if len(found) > 1 and sorted(found) == [*string.ascii_lowercase[: len(found)]]
+        for stem in found.values()
+    }
 
 
 _NAME_POINTS = (
@@ -447,6 +493,9 @@ def _by_place(table: TextTable, found: Columns, joints: int) -> Columns:
         for lead in ([], first):
             if need_joints + need_point and len(numeric) - len(lead) == need_joints + need_point:
                 places = numeric[len(lead) :]
+                if free.index(places[-1]) - free.index(places[0]) >= len(places):
+                    # Text between them: this is no table of that kind.
+                    continue
                 if need_joints:
                     found.joints = tuple(places[:need_joints])
                 if need_point:

@@ -8,6 +8,7 @@ import string
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from datetime import datetime
 from pathlib import Path
 from typing import Any, Literal, cast
 
@@ -16,7 +17,8 @@ import numpy as np
 from remaster_ros.errors import InputError
 from remaster_ros.importing.columns import AXES, Columns, Table, Told, find_columns
 from remaster_ros.importing.makers import kuka
-from remaster_ros.importing.standstills import some, stopped
+from remaster_ros.importing.makers.named import some
+from remaster_ros.importing.standstills import stopped
 from remaster_ros.importing.text_table import (
     TABLE_LIMIT,
     TextTable,
@@ -251,9 +253,8 @@ def _by_time(points: Table, joints: Table, within_s: float) -> Pairs | None:
     table = points[0]
     if not near.any():
         raise InputError(
-            f'{table.path}: its times ({when.min():.1f} to {when.max():.1f} s) are not those of '
-            f'{joints[0].path} ({reported.min():.1f} to {reported.max():.1f} s); set the clocks '
-            'equal, or join by name or by order (--join)'
+            f'{table.path}: its times ({_span(when)}) are not those of {joints[0].path} '
+            f'({_span(reported)}); set the clocks equal, or join by name or by order (--join)'
         )
     # Where both neighbours are near, the joints are a stream: it tells whether the arm moved.
     q = numbers(joints[0], joints[1].joints)
@@ -274,6 +275,14 @@ def _by_time(points: Table, joints: Table, within_s: float) -> Pairs | None:
     if not kept.any():
         raise InputError(f'{table.path}: every point was measured while the arm moved')
     return Pairs(np.flatnonzero(kept), order[nearer[kept]], 'by time', tuple(left_out))
+
+
+def _span(times_s: FloatArray) -> str:
+    """Return the first and the last time, as dates where they are such."""
+    ends = times_s.min(), times_s.max()
+    if ends[0] < WITHOUT_DATE_S:
+        return f'{ends[0]:.1f} to {ends[1]:.1f} s'
+    return ' to '.join(datetime.fromtimestamp(end).isoformat(' ', 'seconds') for end in ends)
 
 
 def _refuse_equal_times(

@@ -9,7 +9,7 @@ rightly, its modelled points differ from the measured ones by little.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -19,6 +19,7 @@ from remaster_ros.calibration.arrangement import linear_fit
 from remaster_ros.collection.pairing import SensorRules, are_too_many, of_the_marker
 from remaster_ros.errors import InputError
 from remaster_ros.importing.columns import Table
+from remaster_ros.importing.makers.named import some
 from remaster_ros.importing.units import ANGLES, LENGTHS
 from remaster_ros.importing.values import angle_unit, length_unit, numbers, times
 from remaster_ros.kinematics.serial_chain import SerialChain
@@ -410,12 +411,6 @@ def between(stream: Stream, begin: float, end: float) -> slice:
     """Return the values of a stream from where the arm no longer swings."""
     first, last = np.searchsorted(stream.stamps, (begin + SWING_S, end))
     return slice(int(first), int(last))
-
-
-def some(names: Sequence[str]) -> str:
-    """Return the first five names, and how many more there are."""
-    more = f' and {len(names) - 5} more' if len(names) > 5 else ''
-    return f'{", ".join(names[:5])}{more}'
 
 
 # Tables that are streams (a take, a log of joints) as tables of standstills, one row each.

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import csv
+import gzip
+import io
 import re
+import zlib
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -13,9 +16,10 @@ import numpy as np
 
 from remaster_ros.errors import InputError
 from remaster_ros.importing.makers import READERS
-from remaster_ros.importing.makers.named import Named
+from remaster_ros.importing.makers.named import Named, some
 from remaster_ros.importing.units import bare, is_unit, split_unit
 from remaster_ros.session.files import read_limited
+from remaster_ros.types import IntArray
 
 TABLE_LIMIT = 256 * 1024**2
 # In this order where several explain a table equally well; blanks come last.
@@ -47,6 +51,23 @@ _NEVER = re.compile(r'(?!)')
 _BLANKS = re.compile(r'\s+(?![\[(])')
 # A row of the table has the joints of the smallest arm at least.
 _FEWEST_NUMBERS = 2
+# A later separator is right where it gives so many times as many numbers: titles give some.
+_MORE = 1.25
+# Words that name a line which sums up those above it.
+_SUMS = {
+    *('mean', 'average', 'avg', 'median', 'min', 'minimum', 'max', 'maximum', 'range', 'rms'),
+    *('std', 'stdev', 'stddev', 'dev', 'deviation', 'sigma', 'sum', 'total', 'value', 'error'),
+    *('mittelwert', 'mittel', 'summe', 'spannweite', 'standardabweichung', 'moyenne', 'somme'),
+    *('media', 'promedio', 'suma', 'somma'),
+}
+# First words of other lines that are no rows: of pages, and at the end.
+_PAGES = {
+    *('page', 'seite', 'pagina', 'página', 'sheet', 'blatt', 'end', 'ende', 'fin', 'fine', 'eof'),
+    *('report', 'bericht', 'rapport', 'number', 'count', 'anzahl', 'nombre', 'points', 'punkte'),
+    *('printed', 'gedruckt', 'created', 'erstellt', 'total', 'summe'),
+}
+_WORD = re.compile(r'[^\W\d_]+')
+_SHOWN = 40
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -124,6 +145,8 @@ def read_table(
         One line naming file, line and remedy: no text, no numbers, or rows of unequal length.
     """
     data = read_limited(path, TABLE_LIMIT, 'name the table')
+    if data.startswith(b'\x1f\x8b'):
+        data = _unpacked(data, path)
     text, encoding = decode(data, path, encoding)
     for read in READERS:
         try:
@@ -151,10 +174,10 @@ def read_table(
     split = _without_lists(
         [(number, line, _split(line, separator, path, number)) for number, line in lines]
     )
-    width, first = _first_row(split, path, comment)
-    header, preamble, named = _header(split[:first], width, separator)
+    width, first, usual = _first_row(split, path, comment)
+    header, preamble, named = _header(split[:first], width, separator, path)
     written = [cells for _, _, cells in split[:named]]
-    rows, at = [], []
+    rows, at, left = [], [], []
     # Titles may hold numbers; below the names, and where there are none, that is a damaged row.
     above = [entry for entry in split[named:first] if not comment.match(entry[1])]
     damaged = [
@@ -172,6 +195,9 @@ def read_table(
         # A separator at the end of a line is no further column.
         while len(cells) > width and not cells[-1]:
             cells = cells[:-1]
+        if _is_no_row(cells, usual, width):
+            left.append(f'{number} ({line.strip()[:_SHOWN]})')
+            continue
         if len(cells) != width:
             raise InputError(
                 f'{path}, line {number}: {len(cells)} columns, where most rows have {width}; '
@@ -198,7 +224,21 @@ def read_table(
         lines=tuple(at),
         preamble=preamble,
         has_header=bool(header),
+        notes=(f'{path}, line{"s" * (len(left) > 1)} {some(left)}: no row, left out',)
+        * bool(left),
     )
+
+
+def _unpacked(data: bytes, path: Path) -> bytes:
+    """Return what gzip packed, as PolyScope packs its programs."""
+    try:
+        with gzip.GzipFile(fileobj=io.BytesIO(data)) as packed:
+            unpacked = packed.read(TABLE_LIMIT + 1)
+    except (OSError, EOFError, zlib.error):
+        raise InputError(f'{path}: packed with gzip, and damaged; take another copy') from None
+    if len(unpacked) > TABLE_LIMIT:
+        raise InputError(f'{path}: unpacked it is larger than {TABLE_LIMIT // 1024**2} MiB')
+    return unpacked
 
 
 def decode(data: bytes, path: Path, encoding: str = '') -> tuple[str, str]:
@@ -332,7 +372,7 @@ def _find_separator(lines: Sequence[str]) -> str:
         count = sum(
             sum(map(_count, cells)) for cells in split if len(cells) == width and width > 1
         )
-        if count > most:
+        if count > _MORE * most:
             best, most = separator, count
     return best
 
@@ -350,10 +390,34 @@ def _is_row(cells: Sequence[str]) -> bool:
     return sum(map(_is_number, cells)) >= _FEWEST_NUMBERS
 
 
+def _is_no_row(cells: Sequence[str], usual: IntArray, width: int) -> bool:
+    """Return whether a line below the names sums up others, or is text between them or behind.
+
+    `usual` are the columns that have numbers in most rows. What is left of a row that was cut off
+    has some of them.
+    """
+    if not len(usual):
+        return False
+    title = next(filter(None, cells), '').lower()
+    words = _WORD.findall(title)
+    if words and {*words} <= _SUMS and not any(map(str.isdigit, title)):
+        return True
+    page = bool(words) and words[0] in _PAGES
+    if len(cells) == width and not page and _is_number(cells[usual[0]]):
+        return False
+    found = [cells[i] for i in usual if i < len(cells)]
+    if len(cells) == width and all(is_missing(cell) or _is_number(cell) for cell in found):
+        return page and not any(map(_is_number, found))
+    return page or not any(is_missing(cell) or _is_number(cell) for cell in found)
+
+
 def _first_row(
     split: list[tuple[int, str, list[str]]], path: Path, comment: re.Pattern[str]
-) -> tuple[int, int]:
-    """Return the number of columns, and the index of the first line that is a row."""
+) -> tuple[int, int, IntArray]:
+    """Return the number of columns, the index of the first line that is a row, and its numbers.
+
+    The third are the columns that have numbers in most rows.
+    """
     rows = [
         (i, cells)
         for i, (_, line, cells) in enumerate(split)
@@ -368,26 +432,28 @@ def _first_row(
     full = [(i, [*map(_is_number, cells)]) for i, cells in rows if len(cells) == width]
     # A title of as many words has its numbers elsewhere.
     usual = 2 * np.sum([numbers for _, numbers in full], axis=0) > len(full)
-    return width, next(
+    first = next(
         (i for i, numbers in full if 2 * np.sum(usual & numbers) > usual.sum()), full[0][0]
     )
+    return width, first, np.flatnonzero(usual)
 
 
 def _header(
-    above: list[tuple[int, str, list[str]]], width: int, separator: str
+    above: list[tuple[int, str, list[str]]], width: int, separator: str, path: Path
 ) -> tuple[list[str], str, int]:
     """Return the names of the columns, empty where there are none, and the lines above them.
 
     The third is how many lines there are down to the names, 0 where there are none.
     """
     names: list[str] = []
+    over: list[str] = []
     preamble = []
     named = 0
     for at, (number, line, cells) in enumerate(above, start=1):
         mark = _COMMENT.match(line)
         if mark:
             # NumPy and many trackers write the names into a comment.
-            cells = _split(line[mark.end() :], separator, Path(), number)
+            cells = _split(line[mark.end() :], separator, path, number)
             if len(cells) == width and not cells[0]:
                 cells[0] = line.strip()[0]
         while len(cells) > width and not cells[-1]:
@@ -395,14 +461,32 @@ def _header(
         given = [cell for cell in cells if cell]
         if len(cells) != width or len(given) < _FEWEST_NUMBERS or (_is_row(cells) and not mark):
             preamble.append(line)
+            over = cells if len(cells) <= width and not _is_row(cells) else []
         elif names and all(map(is_unit, given)):
             names = [
                 f'{name} [{bare(unit)}]' if unit else name for name, unit in zip(names, cells)
             ]
             named = at
+        elif names and 2 * sum(map(is_unit, given)) > len(given):
+            wrong = next(cell for cell in given if not is_unit(cell))
+            raise InputError(
+                f'{path}, line {number}: {wrong!r}, where a unit is expected, as beside it'
+            )
         else:
-            names, named = cells, at
+            names, named, over = _below(over or names, cells), at, []
     return names, '\n'.join(preamble), named
+
+
+def _below(over: Sequence[str], names: list[str]) -> list[str]:
+    """Return names that are unlike, by what stands above the first of each group of them."""
+    group, groups = '', []
+    for cell in (*over, *[''] * (len(names) - len(over))):
+        group = cell or group
+        groups.append(group)
+    return [
+        f'{group} {name}' if name and group and names.count(name) > 1 else name
+        for group, name in zip(groups, names)
+    ]
 
 
 def _find_decimal(rows: Sequence[Sequence[str]]) -> str:

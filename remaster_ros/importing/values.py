@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import warnings
+from collections.abc import Sequence
 from dataclasses import replace
 from datetime import datetime
 
@@ -28,6 +29,48 @@ _SERIAL, _SERIAL_DAYS = (34_700.0, 80_000.0), 30.0
 _SERIAL_OF_1970, DAY_S = 25_569.0, 86_400.0
 # Times of day without a date are those of 1 January 2000.
 WITHOUT_DATE_S = 946_684_800.0
+# A date and a time without signs between them.
+_COMPACT = re.compile(r'(?:19|20)\d\d[01]\d[0-3]\d[0-2]\d[0-5]\d[0-5]\d')
+_CLOCK = re.compile(r'(\d\d?)\.(\d\d)\.\d\d')
+# Numbers that are no date.
+_SHORT = re.compile(r'[^:]?\d*[.,\s-]*\d*')
+# Two numbers of a date and the sign between them; dates that begin with the year are not meant.
+_DATE = re.compile(r'\D*(\d\d?)([./-])(\d\d?)\2\d\d(?:\d\d)?(?!\d)')
+_MOST_MONTHS = 12
+_WORD = re.compile(r'([^\W\d_]+)\b\.?')
+# Hours, minutes and seconds between points or strokes: before AM and PM, or behind a date.
+_POINTS = re.compile(
+    r'(?<![\d.-])(\d\d?)[.-](\d\d)[.-](\d\d)(?=[.,\d]*\s*[AaPp]\.?[Mm]\b)'
+    r'|(?<=\d )(\d\d?)[.-](\d\d)[.-](\d\d)(?![\d.-]*\d{3})'
+)
+# Thousandths behind a fourth colon.
+_FOURTH = re.compile(r'(\d:\d\d:\d\d):(\d{1,6})$')
+_ZONES = {
+    name: 3600 * hours
+    for hours, names in ((0, 'WET'), (1, 'CET MEZ BST WEST'), (2, 'CEST MESZ EET'))
+    for name in names.split()
+}
+# Names of months of other languages, and words that are left out.
+_MONTHS = {
+    word: f' {month} '
+    for month, words in {
+        'Jan': 'januar jänner janvier janv enero ene gennaio gen',
+        'Feb': 'februar février févr fevrier febrero febbraio',
+        'Mar': 'märz maerz mrz mär mars marzo',
+        'Apr': 'april avril avr abril abr aprile',
+        'May': 'mai mayo maggio mag',
+        'Jun': 'juni juin junio giugno giu',
+        'Jul': 'juli juillet juil julio luglio lug',
+        'Aug': 'august août aout agosto ago',
+        'Sep': 'september sept septembre septiembre settembre set',
+        'Oct': 'oktober okt octobre octubre ottobre ott',
+        'Nov': 'november novembre noviembre',
+        'Dec': 'dezember dez décembre déc decembre diciembre dic dicembre',
+        '': 'um uhr at à le de montag dienstag mittwoch donnerstag freitag samstag sonntag mo di '
+        'mi do fr sa so lundi mardi mercredi jeudi vendredi samedi dimanche',
+    }.items()
+    for word in words.split()
+}
 # More than one turn each way: no arm reports that in radians.
 _LARGEST_RAD = 2.1 * np.pi
 
@@ -164,9 +207,14 @@ def times(table: TextTable, columns: Columns) -> FloatArray | None:
     day = date if date not in (None, column) else None
     unit = columns.units.get(column, '')
     result = np.empty(len(table.rows))
-    for row, cells in enumerate(table.rows):
-        text = cells[column] if day is None else f'{cells[day]} {cells[column]}'
-        value = _time(text, table.decimal)
+    texts = [
+        cells[column] if day is None else f'{cells[day]} {cells[column]}' for cells in table.rows
+    ]
+    if _are_clocks(texts):
+        texts = [text.replace('.', ':') for text in texts]
+    day_first = _is_day_first(texts)
+    for row, text in enumerate(texts):
+        value = _time(text, table.decimal, day_first)
         if value is None:
             raise table.fault(row, column, 'is no time; correct it, or say --time none')
         result[row] = value
@@ -182,14 +230,18 @@ def times(table: TextTable, columns: Columns) -> FloatArray | None:
     return result * TIMES[unit]
 
 
-def _time(text: str, decimal: str) -> float | None:
+def _time(text: str, decimal: str, day_first: bool) -> float | None:
     number = parse_number(text, decimal)
-    if number is not None:
+    if number is not None and not _COMPACT.fullmatch(text):
         return number
     try:
+        if _COMPACT.fullmatch(text):
+            return datetime.strptime(text, '%Y%m%d%H%M%S').timestamp()
         return datetime.fromisoformat(text).timestamp()
     except ValueError:
         pass
+    if _SHORT.fullmatch(text):
+        return None
     # Imported where it is needed: few tables are so.
     from dateutil import parser
 
@@ -197,7 +249,37 @@ def _time(text: str, decimal: str) -> float | None:
         with warnings.catch_warnings():
             # A letter that is no time zone.
             warnings.simplefilter('error')
-            moment = parser.parse(text, dayfirst='.' in text, default=datetime(2000, 1, 1))
+            moment = parser.parse(
+                _in_english(text),
+                dayfirst=day_first,
+                default=datetime(2000, 1, 1),
+                tzinfos=_ZONES,
+            )
         return float(moment.timestamp())
     except (ValueError, OverflowError, RuntimeWarning):
         return None
+
+
+def _in_english(text: str) -> str:
+    """Return a time with English months, without days of the week, and with colons."""
+    text = _WORD.sub(lambda word: _MONTHS.get(word[1].casefold(), word[0]), text)
+    text = re.sub(r'[年月]', '-', text).replace('日', ' ')
+    text = re.sub(r'([AaPp])\. ?([Mm])\.', r'\1\2', text)
+    text = _POINTS.sub(lambda time: ':'.join(filter(None, time.groups())), text)
+    return _FOURTH.sub(r'\1.\2', text)
+
+
+def _are_clocks(texts: Sequence[str]) -> bool:
+    """Return whether times of day are written with points: there are months up to 12 only."""
+    found = [_CLOCK.fullmatch(text) for text in texts]
+    return all(found) and any(not 0 < int(match[2]) <= _MOST_MONTHS for match in found if match)
+
+
+def _is_day_first(texts: Sequence[str]) -> bool:
+    """Return whether dates have the day before the month: all of a column are written so."""
+    found = [match for match in map(_DATE.match, texts) if match]
+    first, second = [int(match[1]) for match in found], [int(match[3]) for match in found]
+    if any(match[2] == '.' for match in found) or max(first, default=0) > _MOST_MONTHS:
+        return True
+    # Days pass in a session, but no months.
+    return len({*first}) > 1 and len({*second}) == 1

@@ -118,6 +118,54 @@ def yaskawa(names, q):
     return '\n'.join(lines) + '\n'
 
 
+def fanuc_registers(names, q):
+    lines = [
+        f'[*POSREG*]$POSREG  Storage: SHADOW  Access: RW  : ARRAY[1,{len(q) + 2}] OF Position Reg'
+    ]
+    for i, row in enumerate(q, 1):
+        axes = [f'J{j} = {value:9.4f} deg' for j, value in enumerate(row, 1)]
+        lines += [f"    [1,{i}] =   'calib {i}'   Group: 1"]
+        lines += [f'  {"   ".join(axes[:3])} ', f'  {"   ".join(axes[3:])} ', '']
+    lines += [f"    [1,{len(q) + 1}] =   '' Uninitialized", f"    [1,{len(q) + 2}] =   'away' "]
+    lines += [
+        '  Group: 1   Config: N U T, 0, 0, 0',
+        '  X:  -820.507   Y:  2309.503   Z:   945.836',
+    ]
+    return '\n'.join([*lines, '  W:    90.594   P:    -1.149   R:  -160.248', ''])
+
+
+def kawasaki(names, q):
+    lines = ['.PROGRAM calib()', *(f'  JMOVE #{name}' for name in names), '.END', '.JOINTS']
+    lines += [f'#{n} {" ".join(f"{v:.6f}" for v in row)}' for n, row in zip(names, q)]
+    return '\n'.join([*lines, '.END', '.TRANS', 't1 500.0 0.0 600.0 0.0 180.0 0.0', '.END', ''])
+
+
+def doosan(names, q):
+    lines = [f'{n} = posj({", ".join(f"{v:.4f}" for v in row)})' for n, row in zip(names, q)]
+    lines += ['away = posx(400, 0, 500, 0, 180, 0)']
+    return '\n'.join([*lines, *(f'movej({name}, v=30, a=30)' for name in names), ''])
+
+
+def polyscope(names, q):
+    lines = ['<?xml version="1.0"?>', '<URProgram name="calib">', '<children>']
+    for name, row in zip(names, np.deg2rad(q)):
+        lines += [f'<Waypoint type="Fixed" name="{name}">', '<position>']
+        lines += [f'<JointAngles angles="{", ".join(f"{v:.8f}" for v in row)}"/>']
+        lines += ['<TCPOffset pose="0.0, 0.0, 0.0, 0.0, 0.0, 0.0"/>', '</position>', '</Waypoint>']
+    return '\n'.join([*lines, '</children>', '</URProgram>', ''])
+
+
+def calls(names, q):
+    rows = (', '.join(f'{value:.4f}' for value in row) for row in q)
+    return '\n'.join(f'MoveJoints({row})\nDelay(2)' for row in rows) + '\n'
+
+
+def rapid_named_log(names, q):
+    unused = ','.join(['9E+09'] * 6)
+    rows = (','.join(f'{value:.4f}' for value in row) for row in q)
+    return '\n'.join(f'{n}: [[{row}],[{unused}]]' for n, row in zip(names, rows)) + '\n'
+
+
 KINDS = {
     'kuka_dat': Kind(kuka_dat, comment=';'),
     'kuka_src': Kind(kuka_src, named=False, comment=';'),
@@ -129,6 +177,12 @@ KINDS = {
     'staubli': Kind(staubli, one_line=False),
     'kuka_named_log': Kind(kuka_named_log, comment=';'),
     'yaskawa': Kind(yaskawa),
+    'fanuc_registers': Kind(fanuc_registers, one_line=False),
+    'kawasaki': Kind(kawasaki, comment=';'),
+    'doosan': Kind(doosan, comment='#'),
+    'ur_polyscope': Kind(polyscope, one_line=False),
+    'calls': Kind(calls, named=False),
+    'rapid_named_log': Kind(rapid_named_log),
     'ur_script': Kind(ur_script, comment='#'),
     'ur_moves': Kind(ur_moves, named=False, comment='#'),
 }
@@ -136,4 +190,5 @@ KINDS = {
 
 def names_of(kind: str, count: int) -> list[str]:
     """Return what a kind calls its positions."""
-    return [f'P[{i}]' if kind == 'fanuc' else f'P{i}' for i in range(1, count + 1)]
+    name = {'fanuc': 'P[{}]', 'fanuc_registers': 'PR[{}]'}.get(kind, 'P{}')
+    return [name.format(i) for i in range(1, count + 1)]

@@ -119,3 +119,27 @@ def take_of(
 def arm_of(rows: int = 24, seed: int = 0) -> Measured:
     """Return a small arm that is measured at so many configurations."""
     return measured(rows=rows, seed=seed)
+
+
+def capture_of(run: Run, rate_hz: float = 60.0, objects: bool = True) -> str:
+    """Return a capture of Vicon: objects with quaternions (Tracker), or two markers (Nexus)."""
+    time_s = np.arange(0.0, run.end[-1], 1.0 / rate_hz)
+    tool = 1e3 * seen(run, time_s, 1, 1e-4)
+    still = np.tile([500.0, 100.0, 1000.0], (len(tool), 1))
+    turned = np.tile([0.0, 0.0, 0.0, 1.0], (len(tool), 1))
+    if objects:
+        columns = [turned, tool, turned, still]
+        axes, units = 'RX,RY,RZ,RW,TX,TY,TZ', ',,,,mm,mm,mm'
+        names = [f'Global Angle {name}:{name},,,,,,' for name in ('tool', 'base')]
+    else:
+        columns, axes, units = [tool, still], 'X,Y,Z', 'mm,mm,mm'
+        names = [f'arm:{name},,' for name in ('tool', 'base')]
+    head = ['Objects' if objects else 'Trajectories', f'{rate_hz:g}', f',,{",".join(names)}']
+    head += [f'Frame,Sub Frame,{axes},{axes}', f',,{units},{units}']
+    rows = [
+        f'{i},0,{",".join(f"{v:.4f}" for v in row)}'
+        for i, row in enumerate(np.column_stack(columns), 1)
+    ]
+    before = [] if objects else ['Model Outputs', '60', ',,arm:CoM,,', 'Frame,Sub Frame,X,Y,Z']
+    before += [] if objects else [',,mm,mm,mm', '1,0,1,2,3', '']
+    return '\n'.join([*before, *head, *rows, ''])

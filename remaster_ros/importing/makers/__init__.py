@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from remaster_ros.importing.makers import (
+    doosan,
     fanuc,
     gsi,
     inform,
+    kawasaki,
     kuka,
     listed,
     motive,
@@ -15,15 +17,20 @@ from remaster_ros.importing.makers import (
     ros_echo,
     staubli,
     ur_script,
+    vicon,
 )
 from remaster_ros.importing.makers.named import Named
 
 # Each returns None where a text is not of its kind.
 READERS: tuple[Callable[[str], Named | None], ...] = (
     motive.read,
+    vicon.read,
     fanuc.read,
     kuka.read,
     inform.read,
+    kawasaki.read,
+    # Before URScript, whose moves are called so too.
+    doosan.read,
     ur_script.read,
     # Before RAPID, whose logs have two lists in brackets.
     listed.read,

@@ -1,4 +1,4 @@
-"""FANUC's teach pendant programs as text (.ls): the positions at their end.
+"""FANUC's texts: positions at the end of a program (.ls), and position registers (posreg.va).
 
 FANUC counts J3 from the horizontal: what the axis itself turns is J3 + J2.
 """
@@ -11,19 +11,31 @@ from remaster_ros.errors import InputError
 from remaster_ros.importing.makers.named import NUMBER, Named, axes_in_order, unexpected
 
 _OPEN = re.compile(r'\s*(PR?\[\d+)(?:\s*:\s*"[^"]*")?\]\s*\{\s*')
+_INCREMENT = re.compile(r'\s*\d+:\s*[JLC]\s+PR?\[.*\bINC\b', re.IGNORECASE)
 _CLOSE = re.compile(r'\s*\}\s*;?\s*')
 _GROUP = re.compile(r'\s*GP(\d+)\s*:')
 _IGNORED = re.compile(r"\s*(?:U[FT]\s*:\s*\w+|CONFIG\s*:\s*'[^']*')\s*,?\s*")
-_JOINT = re.compile(rf'\s*(J\d|E\d)\s*=\s*({NUMBER.pattern})\s+(deg|mm)\s*,?\s*')
-_PLACE = re.compile(rf'\s*[XYZWPR]\s*=\s*{NUMBER.pattern}\s*(?:mm|deg)\s*,?\s*')
+# What was never taught is shown so.
+_UNTAUGHT = r'\*{2,}'
+_JOINT = re.compile(
+    rf'\s*(J\d|E(?:XT)?\d)\s*[=:]\s*({NUMBER.pattern}|{_UNTAUGHT})\s+(deg|mm)\s*,?\s*'
+)
+_PLACE = re.compile(
+    rf'\s*[XYZWPR]\s*[=:]\s*(?:{NUMBER.pattern}|{_UNTAUGHT})\s*(?:mm|deg)?\s*,?\s*'
+)
+# A register of a motion group: group, number, and what follows its comment.
+_REGISTER = re.compile(r"\s*\[(\d+),(\d+)\]\s*=\s*'[^']*'\s*(.*?)\s*")
+_OF_GROUP = re.compile(r'\s*(?:Group\s*:\s*(\d+))?\s*(?:Config\s*:\s*([^:=]*))?\s*')
 
 
 def read(text: str) -> Named | None:
     """Return the joint positions of a program of FANUC's; None for anything else."""
+    if re.search(r'\$POSREG\b.*\bARRAY\b', text):
+        return _registers(text)
     if not re.search(r'^\s*/PROG\b|^\s*PR?\[\d+[^\n]*\]\s*\{', text, re.MULTILINE):
         return None
     found: list[tuple[int, str, dict[str, str]]] = []
-    name, opened, place, places = '', 0, False, 0
+    name, opened, place, places, untaught = '', 0, False, 0, 0
     values: dict[str, str] = {}
     # Of a motion group, such as a positioner, beside that of the arm.
     group, other, others = '', False, set[str]()
@@ -33,6 +45,8 @@ def read(text: str) -> Named | None:
             if not opened:
                 begin = _OPEN.match(line, at)
                 if begin is None:
+                    if _INCREMENT.match(line):
+                        raise unexpected(number, line, 'a position, not an increment (INC),')
                     if re.match(r'\s*(?:PR?\s*\[|[JE]\d\s*=|GP\d+\s*:|U[FT]\s*:|\})', line[at:]):
                         raise unexpected(number, line, 'P[1]{ before it')
                     break
@@ -56,6 +70,8 @@ def read(text: str) -> Named | None:
             elif (end := _CLOSE.match(line, at)) and (values or place):
                 if place:
                     places += 1
+                elif '*' in ''.join(values.values()):
+                    untaught += 1
                 else:
                     found.append((opened, name, values))
                 opened, at = 0, end.end()
@@ -67,13 +83,72 @@ def read(text: str) -> Named | None:
         raise InputError(f'line {opened}: {name} does not end with }};, as is expected')
     if not found:
         raise InputError('line 1: there is no position of joints in it (P[1]{ … J1= … deg … };)')
+    return _positions('positions of a FANUC program', found, places, untaught, bool(others))
+
+
+def _registers(text: str) -> Named:
+    """Return the position registers of `posreg.va` that are in joints, of the first group."""
+    found: list[tuple[int, str, dict[str, str]]] = []
+    places, untaught, others = set[int](), set[int](), False
+    values: dict[str, str] | None = None
+    opened = 0
+    for number, line in enumerate(text.splitlines(), 1):
+        code = re.sub(r'</?[A-Za-z!][^<>]*>', '', line)
+        if register := _REGISTER.fullmatch(code):
+            rest = register[3]
+            values, opened = {}, number
+            if rest.lower() == 'uninitialized':
+                values = None
+                continue
+            if not _OF_GROUP.fullmatch(rest):
+                raise unexpected(number, line, "[1,1] = '…' Group: 1")
+            if register[1] != '1':
+                others, values = True, {}
+            else:
+                found.append((number, f'PR[{register[2]}]', values))
+            continue
+        at = 0
+        while at < len(code.rstrip()):
+            if values is None or not opened:
+                if re.search(r'\b[JXYZWPR]\d?\s*[=:]\s*[-+.\d*]', code):
+                    raise unexpected(number, line, "[1,1] = '…' Group: 1 before it")
+                break
+            if joint := _JOINT.match(code, at):
+                if joint[1] in values or (joint[1][0] == 'J' and joint[3] != 'deg' and not others):
+                    raise unexpected(number, line, 'each axis once, in deg,')
+                values[joint[1].replace('XT', '')] = joint[2]
+                if '*' in joint[2]:
+                    untaught.add(opened)
+                at = joint.end()
+            elif place := _PLACE.match(code, at):
+                places.add(opened)
+                at = place.end()
+            elif (of := _OF_GROUP.match(code, at)) and of.end() > at:
+                at = of.end()
+            else:
+                raise unexpected(number, line, 'J1 = … deg and so on')
+    left = places | untaught
+    found = [entry for entry in found if entry[0] not in left]
+    for number, name, values in found:
+        if not values:
+            raise InputError(f'line {number}: {name} has no axes, J1 = … deg is expected')
+    if not found:
+        raise InputError('line 1: no position register is in joints (J1 = … deg); record them so')
+    return _positions(
+        'position registers of FANUC', found, len(places), len(untaught - places), others
+    )
+
+
+def _positions(
+    kind: str,
+    found: list[tuple[int, str, dict[str, str]]],
+    places: int,
+    untaught: int,
+    others: bool,
+) -> Named:
     notes = (f'{places} Cartesian positions were left out',) * bool(places)
-    notes += ('the axes of other motion groups were left out',) * bool(others)
+    notes += (f'{untaught} positions that were never taught were left out',) * bool(untaught)
+    notes += ('the axes of other motion groups were left out',) * others
     return axes_in_order(
-        'positions of a FANUC program',
-        found,
-        ('J', 'E'),
-        maker='FANUC',
-        coupling={'J3': ('J2', 1)},
-        notes=notes,
+        kind, found, ('J', 'E'), maker='FANUC', coupling={'J3': ('J2', 1)}, notes=notes
     )

@@ -11,7 +11,8 @@ _AGGREGATE = re.compile(r'\{([^{}]*)\}')
 _AXES = re.compile(r'\b(?:E6)?AXIS\b|\$AXIS_ACT', re.IGNORECASE)
 _PLACE = re.compile(r'\bE6POS\b|\bPOS\b|\bFRAME\b|[{:,]\s*X\s+[-+.\d]', re.IGNORECASE)
 _ENTRY = re.compile(rf'\s*(?:(?:E6)?AXIS\s*:)?\s*([AE]\d)\s+({NUMBER.pattern})\s*', re.IGNORECASE)
-_AXIS = re.compile(r'\bA\d\s+[-+.\d]')
+_AXIS = re.compile(r'\bA\d\s+[-+.\d]', re.IGNORECASE)
+_RELATIVE = re.compile(r'\bS?PTP_REL\b', re.IGNORECASE)
 _MOVE_TO = re.compile(r'\bS?PTP\s*\{', re.IGNORECASE)
 _NO_NAMES = ('AXIS_ACT', 'PTP', 'SPTP')
 _MOVE = re.compile(r'\s*S?(?:PTP|LIN)\s+([A-Za-z]\w*)', re.IGNORECASE)
@@ -24,14 +25,16 @@ _EXPECTED = '{E6AXIS: A1 …, A2 …} with a number for each axis'
 
 def read(text: str) -> Named | None:
     """Return the axis positions in a text of KUKA's; None for anything else."""
-    if not (re.search(r'\{[^{}]*\bA1\s+[-+.\d]', text) or _PROGRAM.match(text)):
+    if not (re.search(r'\{[^{}]*\b[Aa]1\s+[-+.\d]', text) or _PROGRAM.match(text)):
         return None
     found: list[tuple[int, str, dict[str, str]]] = []
     places = []
     for number, line in enumerate(text.splitlines(), 1):
         code = line.partition(';')[0]
         aggregates = [*_AGGREGATE.finditer(code)]
-        axes = [a for a in aggregates if re.search(r'\bA\d\b', a[1])]
+        axes = [a for a in aggregates if re.search(r'\b[Aa]\d\b', a[1])]
+        if axes and _RELATIVE.search(code):
+            raise unexpected(number, line, 'a position, not a way from one to another,')
         if axes:
             for aggregate in axes:
                 found.append((number, *_position(number, line, code, aggregate)))

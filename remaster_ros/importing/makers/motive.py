@@ -10,8 +10,13 @@ import csv
 import re
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
 
 from remaster_ros.importing.makers.named import Named, unexpected
+from remaster_ros.importing.units import LENGTHS
+from remaster_ros.types import BoolArray, FloatArray, IntArray
 
 _UNITS = {
     **dict.fromkeys(('millimeters', 'millimetres', 'mm'), 'mm'),
@@ -29,6 +34,8 @@ _NUMBER = re.compile(r'[+-]?\d+(?:[.,]\d+)?(?:[eE][+-]?\d+)?', re.ASCII)
 _MOST_HEAD_LINES = 12
 # A marker that moves by less than this share of what others move is not on the arm.
 _STATIC = 0.02
+# Markers are further apart, m; a piece that begins later than that, s, may be of any marker.
+_SAME_M, _LOST_S = 0.01, 0.5
 # What a tool carries, the likeliest kind first: the points of a body are of one solution.
 _KINDS = ('Rigid Body', 'Marker', 'Rigid Body Marker')
 
@@ -40,6 +47,8 @@ def _likeliness(kind: str) -> int:
 def read(text: str) -> Named | None:
     """Return the columns of a take; None for anything else."""
     start = _START.match(text) or _HEADLESS.match(text)
+    if start is None and _HEADLESS.match(text.partition('\n')[2]):
+        raise unexpected(1, text.partition('\n')[0], 'Format Version')
     if start is None:
         return None
     lines = [(i, line) for i, line in enumerate(text.splitlines(), 1) if line.strip(' \t,;')]
@@ -114,15 +123,29 @@ def read(text: str) -> Named | None:
     commas = start[1] != ',' and any(',' in cell for row in frames[:100] for cell in row)
     table = [tuple(row[i].strip() for i in used) for row in frames]
     notes: tuple[str, ...] = ()
-    if not labelled and (one := _one_of(groups, table)):
-        # Whoever loses sight of a marker without a label sees another one afterwards.
-        where = groups[one[0]]
-        for i, cells in enumerate(table):
-            seen = next((groups[label] for label in one if cells[groups[label][0]]), where)
-            moved = dict(zip(where, seen, strict=True))
-            table[i] = tuple(cells[moved.get(c, c)] for c in range(len(cells)))
-        chosen = [one[0], *(label for label in groups if label not in one)]
-        notes = (f'{len(one)} markers without a label, of which never two are seen, are one',)
+    if not labelled:
+        for (number, line), cells in zip(lines[at + 1 :], table):
+            if not all(_NUMBER.fullmatch(cell) for cell in cells if cell):
+                raise unexpected(number, line, 'a number in each cell that is not empty')
+        tracks, left = _tracks(groups, table, commas, unit)
+        if not tracks:
+            raise unexpected(
+                *lines[at],
+                'a body or labels, as pieces of several markers without a label cannot be put '
+                'together: label them in Motive, or make them a rigid body; this',
+            )
+        for track in tracks:
+            where = groups[track.labels[0]]
+            # The cells of each piece go into the columns of the first one.
+            for i in np.flatnonzero(track.of > 0).tolist():
+                moved = dict(zip(where, groups[track.labels[track.of[i]]], strict=True))
+                table[i] = tuple(table[i][moved.get(c, c)] for c in range(len(used)))
+        chosen = [track.labels[0] for track in tracks]
+        pieces = sum(len(track.labels) for track in tracks)
+        if pieces > len(tracks):
+            notes = (f'{pieces} pieces of markers without a label are of {len(tracks)}',)
+        if left:
+            notes += (f'{left} pieces of markers without a label were left out',)
     version = (
         f'format {take.get("Format Version", "?").strip()}' if take else 'without its first line'
     )
@@ -139,20 +162,87 @@ def read(text: str) -> Named | None:
     )
 
 
-def _one_of(groups: Mapping[str, tuple[int, ...]], table: Sequence[tuple[str, ...]]) -> list[str]:
-    """Return the markers that move, where each frame has one of them at most; else []."""
-    seen = {
-        label: [i for i, row in enumerate(table) if row[places[0]]]
-        for label, places in groups.items()
-    }
+@dataclass(eq=False)
+class _Track:
+    """Pieces of one marker: where it is, NaN where unseen, and of which piece, -1 for none."""
+
+    labels: list[str]
+    places: FloatArray
+    of: IntArray
+
+    @property
+    def seen(self) -> BoolArray:
+        return self.of >= 0
+
+    def extent(self) -> float:
+        """Return the longest side of the box around it."""
+        return float(np.ptp(self.places[self.seen], axis=0).max())
+
+    def apart(self, places: FloatArray, time_s: FloatArray) -> float:
+        """Return how far a piece is from where this one is or would be, inf if it is too late."""
+        seen = np.isfinite(places[:, 0])
+        both = seen & self.seen
+        if both.any():
+            apart = np.linalg.norm((places - self.places)[both], axis=1)
+            return float(np.quantile(apart, 0.5, method='lower'))
+        first = int(np.argmax(seen))
+        own = np.flatnonzero(self.seen[:first])
+        if not len(own) or time_s[first] - time_s[own[-1]] > _LOST_S:
+            return np.inf
+        way = 0.0
+        if len(own) > 1:
+            step = np.linalg.norm(self.places[own[-1]] - self.places[own[-2]])
+            way = float(step) * (first - own[-1]) / (own[-1] - own[-2])
+        return max(0.0, float(np.linalg.norm(places[first] - self.places[own[-1]])) - 2.0 * way)
+
+    def add(self, label: str, places: FloatArray) -> None:
+        """Take a piece where nothing was seen before."""
+        fresh = np.isfinite(places[:, 0]) & ~self.seen
+        self.places[fresh] = places[fresh]
+        self.of[fresh] = len(self.labels)
+        self.labels.append(label)
+
+
+def _tracks(
+    groups: Mapping[str, tuple[int, ...]],
+    table: Sequence[tuple[str, ...]],
+    commas: bool,
+    unit: str,
+) -> tuple[list[_Track], int]:
+    """Return the markers that move, of their pieces, and how many pieces are left out.
+
+    Motive gives a marker that it lost another number. A piece belongs to what was last seen, or is
+    seen, in the same place. None where several remain and none of them is there most of the time.
+    """
+
+    def column(i: int) -> FloatArray:
+        cells = (row[i].replace(',', '.') if commas else row[i] for row in table)
+        return np.array([float(cell) if cell else np.nan for cell in cells])
+
+    time_s = column(1)
+    pieces = {label: np.column_stack([column(i) for i in own]) for label, own in groups.items()}
+    pieces = {label: own for label, own in pieces.items() if np.isfinite(own[:, 0]).any()}
+    tracks: list[_Track] = []
+    same = _SAME_M / LENGTHS[unit or 'm']
+    for label in sorted(pieces, key=lambda name: int(np.argmax(np.isfinite(pieces[name][:, 0])))):
+        own = pieces[label]
+        apart = [track.apart(own, time_s) for track in tracks]
+        if not apart or min(apart) > same:
+            none = np.full(len(table), -1)
+            tracks.append(_Track([], np.full(own.shape, np.nan), none))
+            apart.append(0.0)
+        tracks[int(np.argmin(apart))].add(label, own)
     # What stays in its place is not on the arm.
-    extents = {label: _extent(table, groups[label], rows) for label, rows in seen.items() if rows}
-    moving = [label for label, size in extents.items() if size > _STATIC * max(extents.values())]
-    frames = [i for label in moving for i in seen[label]]
-    return moving if len(moving) > 1 and len({*frames}) == len(frames) else []
-
-
-def _extent(table: Sequence[tuple[str, ...]], places: Sequence[int], rows: Sequence[int]) -> float:
-    """Return the longest side of the box around a marker, in the unit of the take."""
-    sides = [[float(table[i][place].replace(',', '.')) for i in rows] for place in places]
-    return max(max(side) - min(side) for side in sides)
+    largest = max(track.extent() for track in tracks) if tracks else 0.0
+    moving = [track for track in tracks if track.extent() > _STATIC * largest]
+    seen = np.sum([track.seen for track in moving], axis=0)
+    if len(moving) > 1 and seen.max() == 1:
+        # Never two of them: one, which was lost for longer.
+        for track in moving[1:]:
+            for i, label in enumerate(track.labels):
+                of_piece = np.where((track.of == i)[:, None], track.places, np.nan)
+                moving[0].add(label, of_piece)
+        moving = moving[:1]
+    elif len(moving) > 1:
+        moving = [track for track in moving if 2 * track.seen.sum() > (seen > 0).sum()]
+    return moving, len(pieces) - sum(len(track.labels) for track in moving)

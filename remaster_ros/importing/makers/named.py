@@ -49,6 +49,12 @@ def unexpected(number: int, line: str, expected: str) -> InputError:
     return InputError(f'line {number}: {shown!r}, where {expected} is expected')
 
 
+def some(names: Sequence[str]) -> str:
+    """Return the first five names, and how many more there are."""
+    more = f' and {len(names) - 5} more' if len(names) > 5 else ''
+    return f'{", ".join(names[:5])}{more}'
+
+
 def axes_in_order(
     kind: str,
     found: Sequence[tuple[int, str, Mapping[str, str]]],

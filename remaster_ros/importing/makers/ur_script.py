@@ -1,4 +1,4 @@
-"""Joint positions of a program in URScript: those of movej, and waypoints called …_q."""
+"""Joint positions of a program of UR's: those of movej, waypoints called …_q, and of a .urp."""
 
 from __future__ import annotations
 
@@ -23,7 +23,11 @@ _EXPECTED = 'a list of the joints in rad, [0.1, -1.5, …],'
 
 def read(text: str) -> Named | None:
     """Return the joint positions of a program in URScript; None for anything else."""
-    if not re.search(r'\bmove[jlp]\s*\(|^\s*(?:global\s+)?\w+_q\s*=\s*\[', text, re.MULTILINE):
+    if re.search(r'<JointAngles\b', text):
+        return _waypoints(text)
+    if not re.search(
+        r'\b(?:move[jlp]|servoj)\s*\(|^\s*(?:global\s+)?\w+_q\s*=\s*\[', text, re.MULTILINE
+    ):
         return None
     named = {*re.findall(r'\bmovej\s*\(\s*([A-Za-z]\w*)\s*[,)]', text)}
     found: list[tuple[int, str, dict[str, str]]] = []
@@ -77,6 +81,30 @@ def read(text: str) -> Named | None:
     return axes_in_order(
         'joint positions of URScript', found, ('J',), maker='UR', notes=notes, unit='rad'
     )
+
+
+_WAYPOINT = re.compile(r'<Waypoint\b[^<>]*\bname="([^"<>]*)"|<JointAngles\b([^<>]*)(?:>|$)')
+_ANGLES = re.compile(r'\s*angles="([^"<>]*)"\s*/?\s*')
+
+
+def _waypoints(text: str) -> Named:
+    """Return the waypoints of a program as PolyScope saves it (.urp), which is XML."""
+    found = []
+    name = ''
+    for number, line in enumerate(text.splitlines(), 1):
+        matches = [*_WAYPOINT.finditer(line)]
+        count = sum(match[1] is None for match in matches)
+        if any(len(re.findall(word, line)) != count for word in ('JointAngles', 'angles')):
+            raise unexpected(number, line, '<JointAngles angles="…"/>')
+        for match in matches:
+            if match[1] is not None:
+                name = match[1]
+                continue
+            angles = _ANGLES.fullmatch(match[2])
+            if angles is None:
+                raise unexpected(number, line, '<JointAngles angles="…"/>')
+            found.append((number, name, _joints(number, line, angles[1])))
+    return axes_in_order('waypoints of PolyScope', found, ('J',), maker='UR', unit='rad')
 
 
 def _joints(number: int, line: str, listed: str) -> dict[str, str]:

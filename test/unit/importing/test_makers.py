@@ -39,7 +39,7 @@ def test_joints_and_names_are_those_that_were_written(kind, tmp_path):
     table = read_table(write(tmp_path, 'program.txt', KINDS[kind].write(names, q)))
     found = find_columns(table, JOINTS)
     unit, how = angle_unit(table, found, '')
-    assert how == 'header'
+    assert how == ('guessed' if kind == 'calls' else 'header')
     got = np.rad2deg(numbers(table, found.joints) * ANGLES[unit])
     np.testing.assert_allclose(got, q, atol=1e-6)
     if KINDS[kind].named:
@@ -237,6 +237,8 @@ def test_a_mutated_text_is_read_right_or_refused(kind, count, seed, tmp_path):
         if changed and not (kind.startswith('ur') and changed not in broken):
             number = re.escape(changed.partition('[')[0] or changed)
             stands = rf'(?<![\w.]){number}(?![\w.])|X{number}\b|{number}_q'
+            if kind == 'fanuc_registers' and changed.startswith('PR'):
+                stands = rf'\[1,{changed[3:-1]}\]'
             assert re.search(stands, broken), (changed, broken)
         lost = [*(true - rows).elements()]
         if not may_lose and len(lost) > len(other):

@@ -6,7 +6,7 @@ from collections import Counter
 
 import numpy as np
 import pytest
-from foreign.streams import arm_of, run_of, take_of
+from foreign.streams import arm_of, run_of, seen, take_of
 from foreign.tables import text
 from test_makers import JOINTS, changed_cell, joints_of, mutated
 
@@ -52,7 +52,41 @@ def take():
     return take_of(run_of(arm_of(4)), ends_s=0.4, rate_hz=20.0)
 
 
+def report():
+    """A report of nominal and measured points in two lines of names, with pages and a footer."""
+    rows = [';'.join(f'{v:.4f}' for v in (*row, *(row + 0.125))) for row in points_of()]
+    lines = [f'{name};{row}' for name, row in zip(NAMES, rows, strict=True)]
+    head = ['Report;;;;;;', ';Nominal;;;Measured;;', 'Point;X;Y;Z;X;Y;Z', ';mm;mm;mm;mm;mm;mm']
+    foot = ['RMS;0.1', 'End of report']
+    return '\n'.join([*head, *lines[:4], 'Page 1 of 2', *head[2:3], *lines[4:], *foot, ''])
+
+
+def capture():
+    run = run_of(arm_of(4))
+    rows = 1e3 * seen(run, np.arange(0.0, 0.4, 0.05), 1, 1e-4)
+    head = ['Trajectories', '20', ',,arm:tool,,', 'Frame,Sub Frame,X,Y,Z', ',,mm,mm,mm']
+    lines = [f'{i},0,{",".join(f"{v:.4f}" for v in row)}' for i, row in enumerate(rows, 1)]
+    return '\n'.join([*head, *lines, ''])
+
+
+def pieces():
+    """A take of two pieces of one marker, which overlap."""
+    run = run_of(arm_of(4))
+    rows = 1e3 * seen(run, np.arange(0.0, 0.4, 0.05), 1, 1e-4)
+    head = ['Format Version,1.23,Length Units,Millimeters', ',Type' + 6 * ',Marker']
+    head += [',Name' + 3 * ',Unlabeled 1' + 3 * ',Unlabeled 2', ',' + 6 * ',Position']
+    lines = []
+    for i, row in enumerate(rows):
+        cells = [f'{v:.4f}' for v in row]
+        parts = [*(cells if i < 6 else 3 * ['']), *(cells if i > 2 else 3 * [''])]
+        lines.append(f'{i},{i / 20:.3f},{",".join(parts)}')
+    return '\n'.join([*head, 'Frame,Time (Seconds),X,Y,Z,X,Y,Z', *lines, ''])
+
+
 KINDS = {
+    'report': (report, True),
+    'capture': (capture, True),
+    'pieces': (pieces, False),
     'leica': (leica, True),
     'spatial_analyzer': (spatial_analyzer, True),
     'one_table': (one_table, True),

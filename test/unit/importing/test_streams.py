@@ -1,10 +1,11 @@
 """A take and a log of joints with two clocks become rows: one for each stop that both have."""
 
+import itertools
 import re
 
 import numpy as np
 import pytest
-from foreign.streams import arm_of, log_of, run_of, seen, take_of
+from foreign.streams import arm_of, capture_of, log_of, run_of, seen, take_of
 from foreign.tables import text, write
 
 from remaster_ros.errors import InputError
@@ -67,6 +68,77 @@ def test_a_point_of_a_take_is_taken_by_its_name(arm, run, tmp_path):
     rows = rows_of(tmp_path, arm, take, log)
     named = rows_of(tmp_path, arm, take, log, told=Told(points=('tool:Marker1',)))
     np.testing.assert_allclose(named.position - rows.position, 1e-3, atol=1e-6)
+
+
+@pytest.mark.parametrize('objects', [True, False])
+def test_a_capture_of_vicon(objects, arm, run, tmp_path):
+    rows = rows_of(tmp_path, arm, capture_of(run, objects=objects), log_of(run, UNIX_S))
+    assert_stops(rows, arm)
+    assert {*rows.labels['marker']} == {'tool' if objects else 'arm:tool'}
+    assert (rows.orientation is not None) == objects
+    left = 'sections left out' if not objects else 'base stays in its place'
+    assert left in ' '.join(rows.warnings)
+
+
+@pytest.mark.parametrize(
+    ('old', 'new', 'words'),
+    [
+        ('\n60\n', '\n\n', "line 2: '', where the number of frames per second"),
+        ('Objects', 'Forces', 'line 1: .*a section Objects'),
+        ('mm,mm,mm\n', 'mm,mm,\n', 'line 5: .*the unit of each column'),
+        ('\n7,0', '\n5,0', 'line 12: .*a frame after 5'),
+        ('\n7,0,', '\n7,0;', 'line 12: .*a frame, a sub frame and 14 more cells'),
+    ],
+)
+def test_a_damaged_capture_names_its_line(old, new, words, arm, run, tmp_path):
+    capture = capture_of(run)
+    assert old in capture
+    with pytest.raises(InputError, match=words):
+        rows_of(tmp_path, arm, capture.replace(old, new, 1), log_of(run))
+
+
+def pieces_of(run, markers, pieces, overlap, seed=2):
+    """Return a take of markers whose labels were lost: each in pieces, and a reflex at rest."""
+    rng = np.random.default_rng(seed)
+    time_s = np.arange(0.0, run.end[-1], 1.0 / 60.0)
+    tool = 1e3 * seen(run, time_s, 1, 1e-4)
+    columns = []
+    for i in range(markers):
+        ends = np.linspace(0, len(tool), pieces + 1).astype(int) + 7 * i
+        for begin, end in itertools.pairwise(ends):
+            part = np.full(tool.shape, np.nan)
+            part[begin : end + overlap] = (tool + [0.0, 40.0 * i, 0.0])[begin : end + overlap]
+            columns.append(part)
+    columns.append(np.tile([500.0, 100.0, 1000.0], (len(tool), 1)))
+    names = [f'Unlabeled {1000 + i}' for i in range(len(columns))]
+    order = rng.permutation(len(columns))
+    head = ['Format Version,1.23,Length Units,Millimeters', f',Type{3 * len(names) * ",Marker"}']
+    head += [',Name' + ''.join(3 * f',{names[i]}' for i in range(len(names)))]
+    head += [f',{3 * len(names) * ",Position"}', f'Frame,Time (Seconds){len(names) * ",X,Y,Z"}']
+    values = np.column_stack([columns[i] for i in order])
+    rows = [
+        f'{i},{t:.6f},{",".join("" if np.isnan(v) else f"{v:.4f}" for v in row)}'
+        for i, (t, row) in enumerate(zip(time_s, values))
+    ]
+    return '\n'.join([*head, *rows, ''])
+
+
+@pytest.mark.parametrize(('markers', 'overlap'), [(1, 20), (1, -5), (2, -5)])
+def test_pieces_of_markers_without_labels(markers, overlap, arm, run, tmp_path):
+    take = pieces_of(run, markers, 5, overlap)
+    rows = rows_of(tmp_path, arm, take, log_of(run, UNIX_S))
+    of = rows.labels.get('marker', [''] * len(rows.q))
+    labels = [*dict.fromkeys(of)]
+    assert len(labels) == markers
+    assert f'{5 * markers} pieces of markers without a label are of {markers}' in rows.warnings
+    assert min(of.count(label) for label in labels) >= len(arm.q) - 1
+    if markers == 1:
+        assert_stops(rows, arm)
+
+
+def test_pieces_that_belong_to_none_are_refused(arm, run, tmp_path):
+    with pytest.raises(InputError, match=r'line 5: .*label them in Motive, or make them a rigid'):
+        rows_of(tmp_path, arm, pieces_of(run, 2, 5, -60), log_of(run))
 
 
 def test_visits_that_are_all_alike_are_told_apart_by_the_robot(arm, tmp_path):

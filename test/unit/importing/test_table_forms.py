@@ -1,9 +1,11 @@
 """Tables, logs and programs as people really have them: each is read, or refused in one line."""
 
+import gzip
 import re
 
 import numpy as np
 import pytest
+from foreign.makers import KINDS
 from foreign.streams import arm_of, log_of, run_of, take_of
 from foreign.tables import measured, text, write
 
@@ -320,6 +322,21 @@ PROGRAMS = {
     'array of NumPy': lambda q: (
         '[' + '\n '.join('[' + ' '.join(f'{v: .8f}' for v in row) + ']' for row in q) + ']\n'
     ),
+    'calls of Mecademic': lambda q: ''.join(f'MoveJoints({listed(row)})\nDelay(2)\n' for row in q),
+    'braces of Comau': lambda q: (
+        'PROGRAM calib\nBEGIN\n'
+        + ''.join(f'  MOVE TO {{{listed(row)}}}\n' for row in q)
+        + 'END calib\n'
+    ),
+    'Python for a UR': lambda q: ''.join(
+        f'rtde_c.moveJ([{listed(row, False)}], 1.05, 1.4)\n' for row in q
+    ),
+    'moves of Doosan': lambda q: ''.join(f'movej(posj({listed(row)}), vel=30)\n' for row in q),
+    'points of Kawasaki': lambda q: ''.join(
+        f'  POINT #P{i} = #PPOINT({listed(row)})\n' for i, row in enumerate(q, 1)
+    ),
+    'YAML': lambda q: 'poses:\n' + ''.join(f'  - [{listed(row, False)}]\n' for row in q),
+    'small letters of KUKA': lambda q: ''.join(f'ptp {{{axes_of(row, "a")}}}\n' for row in q),
     'degrees of a Yaskawa job': lambda q: (
         '/JOB\n//NAME C\n//POS\n///NPOS 12,0,0,0,0,0\n///POSTYPE ANGLE\n///ANGLE\n'
         + ''.join(f'C{i:05d}={listed(row)}\n' for i, row in enumerate(q, 1))
@@ -338,6 +355,12 @@ PROGRAMS = {
 }
 
 
+WITHOUT_NAMES = (
+    *('log of a call', 'array of NumPy', 'calls of Mecademic', 'braces of Comau', 'YAML'),
+    *('Python for a UR', 'moves of Doosan', 'small letters of KUKA'),
+)
+
+
 @pytest.mark.parametrize('form', PROGRAMS)
 def test_joints_of_programs_and_logs(form, arm, tmp_path):
     content = PROGRAMS[form](arm.q)
@@ -345,10 +368,60 @@ def test_joints_of_programs_and_logs(form, arm, tmp_path):
         arm, tmp_path, text(['X', 'Y', 'Z'], [*millimetres(arm)]), content, join='order'
     )
     assert_rows(rows, arm)
-    if form not in ('log of a call', 'array of NumPy'):
+    if form not in WITHOUT_NAMES:
         first = 0 if form in ('Staubli without keys', 'list of URScript') else 1
         names = range(first, COUNT + first)
         assert_rows(rows_of(arm, tmp_path, points_table(arm, names), content), arm)
+
+
+@pytest.mark.parametrize(
+    ('form', 'line', 'expected'),
+    [
+        ('calls of Mecademic', 'MoveLin(1, 2, 3, 4, 5, 6)', 'of one call'),
+        ('calls of Mecademic', 'MoveJoints(1, 2, 3, 4, 5)', 'a list of 6 numbers'),
+        ('Python for a UR', 'rtde_c.moveL([1, 2, 3, 4, 5, 6], 1, 2)', 'of one call'),
+        ('YAML', '  - p[1, 2, 3, 4, 5, 6]', 'of one call'),
+        ('moves of Doosan', 'movej(posj(1, 2, 3, 4, 5, 6), mod=DR_MV_MOD_REL)', 'an angle in deg'),
+        ('moves of Doosan', 'movej(posj(*home), vel=30)', 'an angle in degrees for each joint'),
+        (
+            'points of Kawasaki',
+            'POINT #P13 = #PPOINT(1, 2, a, 4, 5, 6)',
+            'an angle for each joint',
+        ),
+        ('small letters of KUKA', 'PTP_REL {A1 1, A2 2, A3 3, A4 4, A5 5, A6 6}', 'a position'),
+    ],
+)
+def test_what_is_no_position_of_joints_is_refused(form, line, expected, arm, tmp_path):
+    program = PROGRAMS[form](arm.q) + line + '\n'
+    number = program.count('\n')
+    with pytest.raises(InputError, match=f'line {number}: .*{expected}'):
+        rows_of(arm, tmp_path, points_table(arm), program)
+
+
+def test_a_program_that_polyscope_packed(arm, tmp_path):
+    names = [f'P{i}' for i in range(1, COUNT + 1)]
+    path = tmp_path / 'calib.urp'
+    packed = gzip.compress(KINDS['ur_polyscope'].write(names, np.rad2deg(arm.q)).encode())
+    path.write_bytes(packed)
+    points = write(tmp_path, 'points.csv', points_table(arm))
+    assert_rows(read_rows([points, path], arm.chain, TableOptions()), arm)
+    path.write_bytes(packed[:-9])
+    with pytest.raises(InputError, match='packed with gzip, and damaged'):
+        read_rows([points, path], arm.chain, TableOptions())
+
+
+def test_positions_that_were_never_taught_or_are_ways(arm, tmp_path):
+    pad = np.rad2deg(arm.q)
+    names = [f'P[{i}]' for i in range(1, COUNT + 1)]
+    program = KINDS['fanuc'].write(names, pad)
+    untaught = ',\t'.join(f'J{i}= ******** deg' for i in range(1, 7))
+    more = program.replace('/END', f'P[13]{{\n   GP1:\n\t{untaught}\n}};\n/END')
+    rows = rows_of(arm, tmp_path, points_table(arm, names), more)
+    assert_rows(rows, arm)
+    assert '1 positions that were never taught were left out' in rows.warnings
+    ways = program.replace('FINE    ;', 'FINE INC ;', 1)
+    with pytest.raises(InputError, match=r'line 5: .*not an increment \(INC\)'):
+        rows_of(arm, tmp_path, points_table(arm, names), ways)
 
 
 @pytest.mark.parametrize(
@@ -383,8 +456,12 @@ def test_a_log_with_times(arm, tmp_path):
     table = points_table(arm, times, 'time')
     assert_rows(rows_of(arm, tmp_path, table, content), arm)
     lines = content.splitlines()
-    damaged = '\n'.join([*lines[:2], 'stopped', *lines[2:]])
-    with pytest.raises(InputError, match="line 3: 'stopped', where a list of 6 numbers"):
+    between = '\n'.join([*lines[:2], 'stopped', *lines[2:]])
+    rows = rows_of(arm, tmp_path, table, between)
+    assert_rows(rows, arm)
+    assert '1 lines without a list were left out' in rows.warnings
+    damaged = '\n'.join([*lines[:2], lines[2].rstrip(']'), *lines[3:]])
+    with pytest.raises(InputError, match=r'line 3: .*, where a list of 6 numbers'):
         rows_of(arm, tmp_path, table, damaged)
 
 
@@ -416,6 +493,109 @@ def test_coordinates_of_a_total_station(width, unit, scale, arm, tmp_path):
     np.testing.assert_allclose(rows.position, arm.points, atol=0.51 / scale)
 
 
+# Lines that are no rows, and columns of reports
+
+
+@pytest.mark.parametrize(
+    'lines',
+    [
+        ['End of report'],
+        ['Number of points: 12', 'RMS 0.031 mm'],
+        ['Mittelwert;1.5;2.5;3.5', 'Max;9.5;9.5;9.5', 'Std. Dev.;0.5;0.5;0.5'],
+        ['Summe;12 Punkte;;', ';;;', 'Ende des Berichts;;;'],
+        ['Seite 1 von 2', 'Point;X;Y;Z'],
+    ],
+    ids=['end', 'text', 'sums', 'short', 'page'],
+)
+@pytest.mark.parametrize('separator', [';', '\t'])
+def test_footers_and_pages_are_left_out_and_listed(lines, separator, arm, tmp_path):
+    table = points_table(arm).replace(',', ';').splitlines()
+    content = '\n'.join([*table[:5], *lines[-2:], *table[5:], *lines, '']).replace(';', separator)
+    rows = rows_of(arm, tmp_path, content, joints_table(arm))
+    assert_rows(rows, arm)
+    assert 'no row, left out' in ' '.join(rows.warnings)
+
+
+@pytest.mark.parametrize('cut', [1, 2])
+def test_a_row_that_was_cut_off_is_refused(cut, arm, tmp_path):
+    lines = points_table(arm).splitlines()
+    broken = '\n'.join([*lines[:-1], lines[-1].rsplit(',', cut)[0], ''])
+    with pytest.raises(InputError, match=r'line 13: . columns, where most rows have 4'):
+        rows_of(arm, tmp_path, broken, joints_table(arm))
+
+
+def test_a_title_with_many_numbers_between_blanks(arm, tmp_path):
+    title = 'AT960-MR\tS/N 750123\tTemp 20.8\tPress 1013.2\tHum 45\n'
+    columns = [*millimetres(arm), *3 * [[0.004] * COUNT]]
+    table = text(['Point', 'X', 'Y', 'Z', 'Sx', 'Sy', 'Sz'], [POINTS, *columns], '\t')
+    assert_rows(rows_of(arm, tmp_path, title + table, joints_table(arm)), arm)
+
+
+@pytest.mark.parametrize(
+    ('nominal', 'measured_', 'deviation'),
+    [
+        ('{} Nennwert', '{} Istwert', '{} Abweichung'),
+        ('{}Soll', '{}Ist', '{}Diff'),
+        ('{} théorique', '{} mesuré', '{} écart'),
+        ('{}_ref', '{}', 'd{}'),
+        ('CAD {}', '{}', 'Err {}'),
+    ],
+)
+def test_the_measured_ones_of_a_report(nominal, measured_, deviation, arm, tmp_path):
+    header = [form.format(axis) for form in (nominal, measured_, deviation) for axis in 'XYZ']
+    off = [column + 0.5 for column in millimetres(arm)]
+    columns = [*off, *millimetres(arm), *3 * [[0.5] * COUNT]]
+    table = text(['Point', *header], [POINTS, *columns], ';')
+    assert_rows(rows_of(arm, tmp_path, table, joints_table(arm)), arm)
+    # Nominal points alone are none that was measured.
+    wrong = table.replace(measured_.format('Z'), 'Height over all', 1)
+    if measured_ == '{}':
+        return
+    with pytest.raises(InputError, match='--points'):
+        rows_of(arm, tmp_path, wrong, joints_table(arm))
+
+
+def test_names_in_two_lines(arm, tmp_path):
+    over = ';Joints;;;;;;Ball 1;;;Ball 2;;\n'
+    header = ['Point', *AXES, *2 * 'XYZ', '']
+    beside = [column + 10.0 for column in millimetres(arm)]
+    table = text(header[:-1], [POINTS, *degrees(arm), *millimetres(arm), *beside], ';')
+    rows = rows_of(arm, tmp_path, over + table, told=Told(points=('Ball 1',)))
+    assert_rows(rows, arm)
+    both = rows_of(arm, tmp_path, over + table)
+    assert {*both.labels['marker']} == {'Ball 1', 'Ball 2'}
+    units = 'text;' + 'deg;' * 6 + 'mm;' * 5
+    with pytest.raises(InputError, match="line 3: 'm9', where a unit is expected"):
+        rows_of(
+            arm,
+            tmp_path,
+            f'{over}{table.replace(chr(10), f"{chr(10)};{units[5:]}m9{chr(10)}", 1)}',
+        )
+
+
+@pytest.mark.parametrize('letters', ['ABC', '123'])
+def test_markers_with_letters(letters, arm, tmp_path):
+    header = ['Point', *AXES, *(f'Marker {letter} {axis}' for letter in letters for axis in 'XYZ')]
+    table = text(header, [POINTS, *degrees(arm), *3 * millimetres(arm)], ';')
+    rows = rows_of(arm, tmp_path, table)
+    assert {*rows.labels['marker']} == {f'Marker {letter}' for letter in letters}
+
+
+def test_a_pendants_words_with_numbers(tmp_path):
+    arm = measured('ur5e', rows=COUNT)
+    words = ['base', 'shoulder', 'elbow', 'wrist 1', 'wrist 2', 'wrist 3']
+    for form in ('J{} {}', 'Joint {} ({})'):
+        header = ['Point', *(form.format(i, word) for i, word in enumerate(words, 1)), *'XYZ']
+        content = text(header, [POINTS, *degrees(arm), *millimetres(arm)])
+        assert_rows(rows_of(arm, tmp_path, content), arm)
+
+
+def test_text_between_numbers_without_a_header_is_no_table(arm, tmp_path):
+    columns = [*degrees(arm)[:3], ['x'] * COUNT, *degrees(arm)[3:]]
+    with pytest.raises(InputError, match='no header, and 6 columns of numbers'):
+        rows_of(arm, tmp_path, points_table(arm), text([], [POINTS, *columns]))
+
+
 # Streams
 
 
@@ -441,7 +621,7 @@ def test_takes_of_other_settings(form, run, tmp_path):
     rows = rows_of(run.arm, tmp_path, '\r\n'.join(lines), log_of(run))
     assert_stops(rows, run.arm)
     if form == 'a marker alone':
-        assert '3 markers without a label' in ' '.join(rows.warnings)
+        assert '3 pieces of markers without a label are of 1' in ' '.join(rows.warnings)
 
 
 def fragments(lines):

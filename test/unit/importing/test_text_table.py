@@ -153,6 +153,17 @@ def test_comments_titles_and_units(content, wanted, tmp_path):
         ('Timestamp', ['2026-05-04 10:00:00', '2026-05-04T10:00:01.5'], [0.0, 1.5]),
         ('Zeit', ['04.05.2026 10:00:00', '05.05.2026 10:00:00'], [0.0, 86400.0]),
         ('DateTime', ['5/4/2026 1:00:00 PM', '5/4/2026 1:00:02 PM'], [0.0, 2.0]),
+        ('Time', ['11.59.59 AM 3/5/2026', '12.00.01 PM 3/5/2026'], [0.0, 2.0]),
+        ('Zeit', ['5. März 2026 10:00:00', '5. Mrz. 2026 10:00:02 Uhr'], [0.0, 2.0]),
+        ('Zeit', ['Do., 5. März 2026 um 10:00', 'Fr, 6. März 2026 um 10:00'], [0.0, 86400.0]),
+        ('Heure', ['5 août 2026 10:00:00', '1 septembre 2026 10:00:00'], [0.0, 27 * 86400.0]),
+        ('Time', ['20260305235959', '20260306000001'], [0.0, 2.0]),
+        ('Time', ['2026-03-05 23-59-59', '2026-03-06 00-00-01'], [0.0, 2.0]),
+        ('Time', ['05.03.2026 10.05.13', '05.03.2026 10.06.13'], [0.0, 60.0]),
+        ('Time', ['12/03/2026 23:59:59', '13/03/2026 00:00:01'], [0.0, 2.0]),
+        ('Time', ['06/03/2026 23:59:59', '07/03/2026 00:00:01'], [0.0, 2.0]),
+        ('Time', ['2026-03-05 10:00:00.5 UTC', '2026-03-05 10:00:02.5 UTC'], [0.0, 2.0]),
+        ('Time', ['2026-03-05 10:00:00:250', '2026-03-05 10:00:01:750'], [0.0, 1.5]),
     ],
 )
 def test_times(column, cells, seconds, tmp_path):
@@ -161,6 +172,22 @@ def test_times(column, cells, seconds, tmp_path):
     found = times(table, find_columns(table, JOINTS))
     assert np.ptp(found) == pytest.approx(seconds[1] - seconds[0])
     assert '2026' in cells[0] or found.tolist() == seconds
+
+
+@pytest.mark.parametrize('cells', [['10.05.13', '10.13.13'], ['10.00.00', '10.01.00']])
+def test_times_of_day_between_points_are_no_dates(cells, tmp_path):
+    """10.05.13 would be a day of May."""
+    content = text(['Time', 'X', 'Y', 'Z'], [cells, *[[0.5, 1.5]] * 3], ';')
+    table = read_table(write(tmp_path, 't.csv', content))
+    assert np.ptp(times(table, find_columns(table, JOINTS))) < 3600.0
+
+
+@pytest.mark.parametrize('cell', ['10,5', '20261305100000', '1 5', '٣'])
+def test_what_is_no_time(cell, tmp_path):
+    content = text(['Time', 'X', 'Y', 'Z'], [[cell, '11:00'], *[[0.5, 1.5]] * 3], ';')
+    table = read_table(write(tmp_path, 't.csv', content))
+    with pytest.raises(InputError, match='is no time'):
+        times(table, find_columns(table, JOINTS))
 
 
 def test_a_date_and_a_time_in_two_columns(tmp_path):
