@@ -103,11 +103,10 @@ def fit_session(
     started = clock() if clock is not None else np.nan
     problem = Problem.of(session, priors)
     slides = list(compress(problem.chain.joint_names, problem.chain.slides))
-    if slides and (sampler == 'paper' or extension is not None):
+    if slides and sampler == 'paper':
         raise InputError(
-            f"joint '{slides[0]}' slides, which {'the paper sampler' if extension is None else ''}"
-            f'{"a fit with further effects" if extension is not None else ""} does not take; fit '
-            'with the fast sampler, without effects'
+            f"joint '{slides[0]}' slides, which the paper sampler does not take; fit with the "
+            'fast sampler'
         )
     if sampler == 'paper':
         sampled = fit_paper(

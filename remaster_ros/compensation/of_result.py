@@ -45,7 +45,10 @@ EXACT_STEPS = 2
 _DRIVERS: dict[str, Driver] = {
     'own_angle': 'angle',
     'angle': 'angle',
+    'own_place': 'angle',
+    'place': 'angle',
     'gravity_torque': 'gravity_torque',
+    'gravity_force': 'gravity_torque',
     'temperature': 'temperature',
 }
 
@@ -495,7 +498,7 @@ def _left(
         key = (cell.name, cell.joints, cell.of_measurement or cell.place == 'marker')
         moved = data.columns([cell]) @ theta[where]
         together[key] = together[key] + moved if key in together else moved
-        remedies[key] = EFFECTS[cell.name].remedy.format(driver=cell.driver.replace('_', ' '))
+        remedies[key] = EFFECTS[cell.name].remedy_of(cell)
     for (name, joints, of_measurement), moved in together.items():
         size = float(np.sqrt(np.mean(np.sum(moved**2, axis=-1))))
         if round(1e3 * size, 3) == 0.0:

@@ -337,7 +337,8 @@ class _Both:
         """Fit both sessions with some choices."""
         here, there, k, m = self.here, self.there, self.joints, len(self.precision)
         first, second = here.size + m, there.size
-        prior = block_diag(np.diag(_natural(second, k)), self.precision)
+        per_radian = self.fit.model.chain.per_radian
+        prior = block_diag(np.diag(_natural(second, per_radian)), self.precision)
         to = np.concatenate((np.arange(k), np.full(second - k, -1), here.size + np.arange(m)))
         own = [np.arange(k, second)]
         wheres = [*np.arange(k)[:, None], *(second + self.where(group) for group in self.groups)]
@@ -349,7 +350,7 @@ class _Both:
             to[where] = at + np.arange(len(where))
             at += len(where)
         blocks = [prior[np.ix_(where, where)] for where in own]
-        H = block_diag(np.diag(_natural(here.size, k)), self.precision, *blocks)
+        H = block_diag(np.diag(_natural(here.size, per_radian)), self.precision, *blocks)
         h = np.zeros(at)
         H[:first, :first] += here.products[:-1, :-1]
         h[:first] += here.products[:-1, -1]
@@ -444,7 +445,7 @@ class _Both:
             where = where[told[where]]
             held[size + where] = values[where]
         free, fixed = np.isnan(held), ~np.isnan(held)
-        H = there.plain[:-1, :-1] + block_diag(np.diag(_natural(size, 0)), self.precision)
+        H = there.plain[:-1, :-1] + block_diag(np.diag(_natural(size)), self.precision)
         h = there.plain[:-1, -1][free] - H[np.ix_(free, fixed)] @ held[fixed]
         held[free] = _solved(H[np.ix_(free, free)], h)
         data = there.data
@@ -460,15 +461,16 @@ class _Both:
     def offsets_side_by_side(self, discovery: Discovery, best: Choices) -> tuple[Compared, ...]:
         """Compare the zero-offsets that both sessions determine, the causes as they are best."""
         rows: list[Compared] = []
-        offsets = self.here.data.context.joint_offsets
+        chain, offsets = discovery.fit.chain, self.here.data.context.joint_offsets
         for joint, name in enumerate(discovery.fit.joint_names):
             fit = self.fitted(_with(best, joint, 'own'))
             where = np.array([joint, fit.there[joint]])
             covariance = fit.covariance(where)
-            known = np.sqrt(np.diag(covariance).max()) < WEAK_ANGLE
+            scale, unit = chain.shown_scale[joint], chain.shown_units[joint]
+            known = np.sqrt(np.diag(covariance).max()) < WEAK_ANGLE * chain.per_radian[joint]
             if known and discovery.fit.identifiable[joint] and not self.fit.gauge.why[joint]:
-                pair = np.degrees(offsets[joint] + fit.values[where])
-                rows += _compared([name], 'deg', pair, np.degrees(np.degrees(covariance)))
+                pair = scale * (offsets[joint] + fit.values[where])
+                rows += _compared([name], unit, pair, scale**2 * covariance)
         return tuple(rows)
 
     def _side_by_side(self, group: Sequence[int], own: _Fitted) -> tuple[Compared, ...]:
@@ -478,7 +480,8 @@ class _Both:
             cell, wide, where = self.found[i], self.cells[i], self.where([i])
             names, heights = list(cell.parameters), np.eye(wide.size)
             if cell.curve is not None and wide.curve is not None:
-                there = _driver(cell).value(self.there.data.part)
+                driver = _driver(self.here.data.context, cell)
+                there = driver.value(self.there.data.part)
                 places = cell.curve.places
                 seen = cell.curve.seen(places, 0.5) & cell.curve.among(there).seen(places, 0.5)
                 axes = cell.size // len(places)
@@ -545,12 +548,15 @@ def _by_itself(data: Residuals, causes: Sequence[Cell]) -> tuple[Noise, list[_We
     ]
 
 
-def _natural(size: int, k: int) -> FloatArray:
-    """Return the prior precision of natural parameters: of zero-offsets, then of all others.
+def _natural(size: int, per_radian: FloatArray | None = None) -> FloatArray:
+    """Return the prior precision of natural parameters: of zero-offsets if any, then of others.
 
     Registrations and markers are known to a metre and a radian: to nothing that counts.
     """
-    return np.where(np.arange(size) < k, STEP_STD**-2.0, 1.0)
+    found = np.ones(size)
+    if per_radian is not None:
+        found[: len(per_radian)] = (STEP_STD * per_radian) ** -2.0
+    return found
 
 
 def _solved(matrix: FloatArray, right: FloatArray) -> FloatArray:
@@ -574,8 +580,8 @@ def _prior(discovery: Discovery, cell: Cell, wide: Cell) -> FloatArray:
     return np.eye(cell.size) / float(np.mean(fit.theta[chosen] ** 2 + fit.theta_std[chosen] ** 2))
 
 
-def _driver(cell: Cell) -> Driver:
-    driver = driver_named(cell.driver, cell.joints[-1] if cell.joints else 0)
+def _driver(context: Context, cell: Cell) -> Driver:
+    driver = driver_named(context, cell.driver, cell.joints[-1] if cell.joints else 0)
     assert driver is not None
     return driver
 
@@ -584,7 +590,7 @@ def widened(cell: Cell, mine: Context, theirs: Context) -> Cell:
     """Return a cell whose free form reaches over both sessions, with its mean zero over this."""
     if cell.curve is None or cell.place != 'joint_angle':
         return cell
-    driver = _driver(cell)
+    driver = _driver(mine, cell)
     values = np.concatenate([driver.value(mine), driver.value(theirs)])
     curve = Curve.of(values, 0.0, cell.curve.step, not np.isnan(cell.curve.start))
     curve = replace(curve, weights=curve.splines(driver.value(mine)).mean(axis=0))
@@ -599,7 +605,7 @@ def _free(context: Context, joint: int, driver: Driver, curve: Curve) -> Design:
 
 def _seen(cell: Cell, mine: Context) -> Callable[[Context], BoolArray]:
     """Return what tells in which rows of another session a cell's driver was seen here."""
-    driver = driver_named(cell.driver, cell.joints[-1] if cell.joints else 0)
+    driver = driver_named(mine, cell.driver, cell.joints[-1] if cell.joints else 0)
     if driver is not None:
         if cell.curve is not None:
             curve = cell.curve

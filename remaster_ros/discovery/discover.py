@@ -55,7 +55,6 @@ from remaster_ros.discovery.to_extension import (
     offsets_of,
 )
 from remaster_ros.errors import InsufficientDataError
-from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.linear_algebra import one_thread
 from remaster_ros.types import FloatArray, IntArray, Session
 
@@ -180,8 +179,6 @@ def discover_session(
     report('offsets', 0.0)
     # What causes do to orientations is not modelled.
     session = session.positions_alone()
-    # The causes, and the functions that residuals are tested for, suppose joints that turn.
-    SerialChain.from_urdf(session.urdf, session.base_link, session.tip_link)
     before = sound_estimate(session)
     found, residuals, pool = _to_search(session, before, rng)
     untestable = {

@@ -29,6 +29,7 @@ from remaster_ros.discovery.words import (
     KIND_OF_SUBJECT,
     clock_time,
     joint_words,
+    place_words,
     sentence_case,
     titled,
 )
@@ -263,7 +264,7 @@ def _described(
         cause=in_words(group, data.part) + _also_called(alike),
         size_m=size_of(data, members, group),
         share=share,
-        remedy=EFFECTS[first.name].remedy.format(driver=first.driver.replace('_', ' ')),
+        remedy=EFFECTS[first.name].remedy_of(first),
         title=titled(first, _joints(group)),
         in_robot_model=all(cell.model_change is not None for cell in group),
         of_measurement=first.of_measurement,
@@ -381,12 +382,12 @@ def in_words(group: Sequence[Cell], context: Context) -> str:
     whose = the(KIND_OF_SUBJECT.get(first.place, ''), first.subject) if first.subject else ''
     subject = whose or joint_words(joints[:1] if effect.driven_by_joint else joints)
     other = f'joint {joints[1]}' if len(joints) > 1 else ''
-    place = first.place.replace('_', ' ')
+    place = place_words(first)
     if first.joints:
         place += f' of joint {first.joints[0]}'
     if whose:
         place += f' of {whose}'
-    sentence = effect.sentence.format(
+    sentence = effect.sentence_of(group).format(
         subject=subject,
         other=other,
         driver=first.driver.replace('_', ' '),

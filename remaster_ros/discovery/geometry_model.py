@@ -51,13 +51,13 @@ class GeometryModel:
     # Standard deviation of each before it is measured, as RMS displacement of the marker, m, (m,)
     std_m: FloatArray
     # What one such standard deviation of each does to each zero-offset of the fit that takes the
-    # arm to be its drawing, rad, (k, m)
+    # arm to be its drawing, rad, m of joints that slide, (k, m)
     offset_moves: FloatArray
     # Of each joint's origin, in the frame of the link before, m, and of its frame, a rotation
     # vector, rad, (k, 3) each
     shifts: FloatArray
     turns: FloatArray
-    # Zero-offsets fitted together with it, those that the gauge holds at 0, rad, (k,)
+    # Zero-offsets fitted together with it, those that the gauge holds at 0, rad or m, (k,)
     joint_offsets: FloatArray
     # Measured minus predicted position of every row of the session, m, (n, 3), with this geometry
     # and on the drawing
@@ -96,7 +96,7 @@ class GeometryModel:
         return replace(self, drawing_errors=alone.residuals_after, judged=self.judged & counts)
 
     def offsets_std(self, std: FloatArray) -> FloatArray:
-        """Return stds of offsets, given the drawing (k,), as they are if it is not exact, rad."""
+        """Return stds of offsets, given the drawing (k,), as they are if it is not exact."""
         moved: FloatArray = np.hypot(std, np.linalg.norm(self.offset_moves, axis=1))
         return moved
 
@@ -111,7 +111,7 @@ class GeometryModel:
         Returns
         -------
         Cell, float
-            The length or tilt, and the change of the offset, rad.
+            The length or tilt, and the change of the offset, rad or m.
         """
         moves = np.abs(self.offset_moves[joint]) * (self.tolerance_m / self.std_m)
         most = int(np.argmax(moves))
@@ -229,8 +229,11 @@ def _without_open_offsets(found: Estimate) -> Estimate:
     Lengths and tilts linearised at an offset that is not there would be those of another arm.
     """
     _, std = offsets_of(found)
-    names = found.problem.chain.joint_names
-    unknown = {names[i]: (0.0, TIGHTEST_PRIOR) for i in np.flatnonzero(std > OPEN_ANGLE)}
+    chain = found.problem.chain
+    unknown = {
+        chain.joint_names[i]: (0.0, TIGHTEST_PRIOR)
+        for i in np.flatnonzero(std > OPEN_ANGLE * chain.per_radian)
+    }
     if not unknown:
         return found
     priors = found.problem.priors
@@ -255,7 +258,7 @@ def _tilts(context: Context) -> list[Cell]:
 
 
 def _offset_moves(found: Estimate, data: Residuals, families: Sequence[Family]) -> FloatArray:
-    """Return what a weight of each member does to the zero-offsets, rad per m, (k, m)."""
+    """Return what a weight of each member does to the zero-offsets, rad or m per m, (k, m)."""
     free = found.posterior.free
     known = data.full_jacobian[data.rows.source][:, :, free]
     x = found.model.natural(found.mode.z)

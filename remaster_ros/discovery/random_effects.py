@@ -81,7 +81,9 @@ class Family:
             design = member.columns(data.part)
             of_a_height = np.inf
             if design.at is not None:
-                moved, of_a_height = lever * design.values[:, None, :], lever
+                # What slides counts by the angle that it counts as.
+                of_a_height = lever / data.part.chain.per_radian[design.at]
+                moved = of_a_height * design.values[:, None, :]
             if member.penalty is None:
                 square = np.sum(moved**2, axis=(0, 1)) / len(data)
                 unit = np.sqrt(np.where(parts, square, 1.0))
@@ -118,7 +120,7 @@ class Family:
 def _lever(data: Residuals, members: Sequence[Cell]) -> float:
     """Return the RMS displacement of the marker by a radian of the joints of some cells, m."""
     joints = sorted({member.joints[0] - 1 for member in members if member.place == 'joint_angle'})
-    jacobian = data.part.jacobian[:, :, joints]
+    jacobian = (data.part.jacobian * data.part.chain.per_radian)[:, :, joints]
     return float(np.sqrt(np.sum(jacobian**2) / max(1, len(jacobian) * len(joints))))
 
 

@@ -107,7 +107,8 @@ class Residuals:
         full_base = full_jacobian @ combinations
         step_precision = np.zeros(model.size)
         free = found.posterior.free
-        step_precision[free[free < model.joints]] = STEP_STD**-2.0
+        joints = free[free < model.joints]
+        step_precision[joints] = (STEP_STD * problem.chain.per_radian[joints]) ** -2.0
         split = found.posterior.noise_model.of_points.split
         noise_model = NoiseModel.of(rows, model.reference, split)
         noise = robust_noise(rows, full_errors[rows.source], np.ones(len(rows), bool))

@@ -72,9 +72,9 @@ def moved_by_open_offsets(found: Estimate, data: Residuals, solution: Solution) 
     )
     covariance = root @ root[joints].T
     free = covariance[joints]
-    held = np.linalg.inv(
-        np.linalg.inv(free) + (STEP_STD**-2.0 - OFFSET_STD**-2.0) * np.eye(len(joints))
-    )
+    taken = STEP_STD**-2.0 - OFFSET_STD**-2.0
+    per_radian = found.problem.chain.per_radian[found.posterior.free[joints]]
+    held = np.linalg.inv(np.linalg.inv(free) + np.diag(taken / per_radian**2))
     variance, less = np.diag(free), np.diag(free) - np.diag(held)
     noticeable = less > NOTICEABLE * variance
     moves = np.zeros((found.model.size + len(solution.parameters), int(noticeable.sum())))

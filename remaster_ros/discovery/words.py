@@ -19,6 +19,9 @@ SHOWN_UNITS = {
     'rad/rad': ('′/°', 60.0),
     'm': ('mm', 1e3),
     'm/m': ('mm/m', 1e3),
+    'm/N': ('µm/N', 1e6),
+    'm/rad': ('mm/°', 1e3 * np.pi / 180.0),
+    'rad/m': ('′/m', 60.0 * 180.0 / np.pi),
     'm/s': ('mm/h', 3.6e6),
     '1/K': ('µm/(m K)', 1e6),
     '1/s': ('µm/(m h)', 3.6e9),
@@ -74,13 +77,18 @@ def titled(cell: Cell, joints: Sequence[int]) -> str:
     elif cell.name == NO_NAME.name:
         whose = joint or (the(kind, cell.subject) if cell.subject else '')
         driver = cell.driver.replace('_', ' ')
-        words = cell.place.replace('_', ' ') + (f' of {whose}' if whose else '')
+        words = place_words(cell) + (f' of {whose}' if whose else '')
         words += f': an error that follows {driver}'
     else:
         words = called(cell.name, joints)
         if cell.subject.lower() not in ('', kind):
             words += f' of {cell.subject}'
     return words[:1].upper() + words[1:]
+
+
+def place_words(cell: Cell) -> str:
+    """Return where an error enters: 'joint angle', 'joint position' of one that slides."""
+    return 'joint position' if cell.slide else cell.place.replace('_', ' ')
 
 
 def sentence_case(title: str) -> str:

@@ -418,8 +418,8 @@ def _require_kind(joint: UrdfJoint, sliding: bool) -> None:
     if joint.kind == 'prismatic':
         if not sliding:
             raise InputError(
-                f"URDF: joint '{joint.name}' is prismatic; every command but discover takes an "
-                'arm with a joint that slides: this needs joints that turn, between other links'
+                f"URDF: joint '{joint.name}' is prismatic; this needs joints that turn, between "
+                'other links'
             )
     elif joint.kind not in ('revolute', 'continuous'):
         raise InputError(

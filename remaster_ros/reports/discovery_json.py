@@ -41,8 +41,8 @@ from remaster_ros.reports.fit_json import (
     correction_text,
     estimates,
     model_text,
+    of_joints,
     read_result,
-    table_rows,
 )
 from remaster_ros.reports.schemas import Discovered, Loadable
 from remaster_ros.reports.sentences import judgement
@@ -84,11 +84,14 @@ def discovery_content(
         },
         'untestable': discovery.untestable,
         'unexplained': discovery.unexplained,
-        'joint_offsets_before': table_rows(
-            joint=discovery.fit.joint_names,
-            mean_deg=np.degrees(before),
-            std_deg=np.degrees(before_std),
-        ),
+        'joint_offsets_before': [
+            {'joint': name, **row}
+            for name, row in zip(
+                discovery.fit.joint_names,
+                of_joints(discovery.fit.chain, mean=before, std=before_std),
+                strict=True,
+            )
+        ],
         'joint_offsets_after': fit['joint_offsets'],
         'sampler': fit['sampler'],
         'registration': fit['registration'],
@@ -144,7 +147,7 @@ def _covariance(discovery: Discovery) -> dict[str, Any]:
     names = [fit.theta_names[i] for i in causes]
     return {
         'names': [*(fit.joint_names[i] for i in known), *names],
-        'units': [*('rad' for _ in known), *(units[name] for name in names)],
+        'units': [*(fit.chain.units[i] for i in known), *(units[name] for name in names)],
         'matrix': [[float(f'{value:.5e}') for value in row] for row in matrix],
     }
 

@@ -538,10 +538,14 @@ def drivers(discovery: Discovery) -> Figure:
     """Draw, joint by joint, the errors along the joint's motion against every driver."""
     data = discovery.residuals
     context = data.part
+    shown = context.chain.shown_scale
+    angle, torque, move = 'angle (°)', 'torque (N m)', '(°)'
+    if context.chain.slides.any():
+        angle, torque, move = 'angle (°) or place (mm)', 'torque (N m) or force (N)', '(°, mm)'
     candidates: list[tuple[bool, str, Callable[[int], FloatArray]]] = [
-        (True, 'own angle (°)', lambda j: np.degrees(context.measurements.q[:, j])),
-        (context.has_gravity, 'gravity torque (N m)', lambda j: context.gravity_torque[:, j]),
-        (context.has_approach, 'last move (°)', lambda j: np.degrees(context.last_move[:, j])),
+        (True, f'own {angle}', lambda j: shown[j] * context.measurements.q[:, j]),
+        (context.has_gravity, f'gravity {torque}', lambda j: context.gravity_torque[:, j]),
+        (context.has_approach, f'last move {move}', lambda j: shown[j] * context.last_move[:, j]),
         (context.has_time, 'time (h)', lambda j: context.elapsed_s / 3600.0),
         (context.has_temperature, 'temperature (K)', lambda j: context.warming),
     ]
@@ -694,7 +698,7 @@ def _driver(context: Context, cell: Cell, features: FloatArray) -> tuple[str, Fl
 
     What is no single number is drawn by what it adds per unit of its first parameter.
     """
-    driver = driver_named(cell.driver, cell.joints[-1])
+    driver = driver_named(context, cell.driver, cell.joints[-1])
     if driver is None:
         name = cell.driver.replace('_', ' ')
         return f'{name} (per unit of {cell.parameters[0]})', features[:, 0], 1.0
@@ -703,7 +707,7 @@ def _driver(context: Context, cell: Cell, features: FloatArray) -> tuple[str, Fl
 
 
 def _cause(ax: Axes, discovery: Discovery, cell: Cell) -> None:
-    """Draw one cause at a joint's angle, in arc minutes."""
+    """Draw one cause at a joint's angle, in arc minutes, or at the place of one that slides."""
     data, solution = discovery.residuals, discovery.solution
     whole = len(data.context) <= MOST_DRAWN
     context = data.context if whole else data.part
@@ -711,10 +715,11 @@ def _cause(ax: Axes, discovery: Discovery, cell: Cell) -> None:
     fitted = np.ones(len(context), dtype=bool)
     if whole:
         fitted = np.isin(np.arange(len(context)), data.rows.source)
-    parameters = _estimate(discovery, cell) / ARC_MINUTE
+    one, unit = (1e-3, 'mm') if context.slides(cell.joints[0]) else (ARC_MINUTE, 'arc minutes')
+    parameters = _estimate(discovery, cell) / one
     index = {name: i for i, name in enumerate(discovery.fit.theta_names)}
     chosen = [index[name] for name in cell.parameters]
-    draws = discovery.fit.theta_draws[..., chosen].reshape(-1, len(chosen)) / ARC_MINUTE
+    draws = discovery.fit.theta_draws[..., chosen].reshape(-1, len(chosen)) / one
     mean = draws.mean(axis=0)
     draws = draws[:: max(1, len(draws) // 400)]
     columns = cell.columns(context)
@@ -729,7 +734,7 @@ def _cause(ax: Axes, discovery: Discovery, cell: Cell) -> None:
     # What is left, as an angle of this joint: only where the marker is far from its axis.
     square = np.sum(motion**2, axis=1)
     far = fitted & (square > 0.1 * np.median(square))
-    angle = np.sum(motion * left, axis=1)[far] / square[far] / ARC_MINUTE
+    angle = np.sum(motion * left, axis=1)[far] / square[far] / one
     shown = slice(None, None, max(1, int(far.sum()) // CAUSE_POINTS))
     points = (values[far] @ parameters + angle)[shown]
     if cell.driver.startswith('approach'):
@@ -766,7 +771,7 @@ def _cause(ax: Axes, discovery: Discovery, cell: Cell) -> None:
     limit = np.quantile(np.abs(points), 0.99)
     ax.set_ylim(-1.2 * limit, 1.2 * limit)
     ax.set_xlabel(label)
-    ax.set_ylabel('arc minutes')
+    ax.set_ylabel(unit)
     name = 'slip' if cell.happened else cell.name.replace('_', ' ')
     ax.set_title(f'joint {cell.joints[0]}: {name}')
 

@@ -117,11 +117,8 @@ def of_joints(chain: SerialChain, **columns: FloatArray) -> list[dict[str, Any]]
 
 @lru_cache(maxsize=2)
 def geometry_of(result: FitResult) -> GeometryModel | None:
-    """Return the lengths and tilts that the session of a fit shows; None without an estimate.
-
-    They are not looked for where a joint slides.
-    """
-    if result.found is None or result.chain.slides.any():
+    """Return the lengths and tilts that the session of a fit shows; None without an estimate."""
+    if result.found is None:
         return None
     geometry = geometry_model(result.found)
     gross = [row for check in result.noise_checks for row in check.gross]
@@ -193,7 +190,8 @@ def _geometry(result: FitResult, geometry: GeometryModel) -> dict[str, Any]:
                 'cause': member.name,
                 'of': member.joints[0],
                 'axis': member.variant,
-                'deg': float(np.degrees(moved)),
+                'deg': None,
+                result.chain.shown_units[index]: float(result.chain.shown_scale[index] * moved),
             }
         )
     return {
@@ -292,10 +290,10 @@ def fit_content(result: FitResult) -> schemas.Fit:
         content['orientation'] = _orientation(result, result.orientations)
     if (geometry := geometry_of(result)) is not None:
         content['geometry'] = _geometry(result, geometry)
-        wider = np.degrees(geometry.offsets_std(result.joint_offsets_std))
+        wider = result.chain.shown_scale * geometry.offsets_std(result.joint_offsets_std)
         for row, std in zip(content['joint_offsets'], wider, strict=True):
             if row['identifiable']:
-                row['std_with_geometry_deg'] = std
+                row[f'std_with_geometry_{row["unit"]}'] = std
     return schemas.checked(content, schemas.Fit)
 
 

@@ -19,6 +19,7 @@ from remaster_ros.calibration.identifiability import GaugeDirection
 from remaster_ros.calibration.predictions import Coverage
 from remaster_ros.discovery.explain import UNCERTAIN, LookAlike, Parameter, clearest
 from remaster_ros.discovery.thinning import Thinning
+from remaster_ros.kinematics.serial_chain import LEVER_M
 
 FIT_FORMAT = 'remaster-fit/1'
 DISCOVERY_FORMAT = 'remaster-discovery/1'
@@ -81,6 +82,7 @@ class JointOffset(Struct):
     model_std_mm: float | UnsetType = UNSET
     model_std_deg: float | UnsetType = UNSET
     std_with_geometry_deg: float | UnsetType = UNSET
+    std_with_geometry_mm: float | UnsetType = UNSET
 
     @property
     def mean_and_std(self) -> tuple[float, float]:
@@ -272,14 +274,29 @@ class StructureTest(Struct):
 class Imitation(Struct):
     """Which length or tilt moves a joint's offset most: by ``deg`` if it is the tolerance off.
 
-    ``joint`` is the joint's name; ``link_length`` ``of`` 2 is that of the link after joint 2.
+    ``joint`` is the joint's name; ``link_length`` ``of`` 2 is that of the link after joint 2. Of a
+    joint that slides it is ``mm``, and ``deg`` is null.
     """
 
     joint: str
     cause: Literal['link_length', 'joint_axis_tilt']
     of: int
     axis: str
-    deg: float
+    deg: float | None
+    mm: float | UnsetType = UNSET
+
+    @property
+    def as_angle(self) -> float:
+        """How much it is, what slides by the angle that it counts as, rad."""
+        if self.deg is not None:
+            return math.radians(self.deg)
+        assert self.mm is not UNSET
+        return 1e-3 * self.mm / LEVER_M
+
+    @property
+    def shown(self) -> str:
+        """How much it is, as people read it."""
+        return f'{self.mm:.3f} mm' if self.deg is None else f'{self.deg:.3f} deg'
 
 
 class FittedGeometry(Struct):
@@ -440,11 +457,17 @@ class NoiseOfDiscovery(Struct):
 
 
 class OffsetBefore(Struct):
-    """A joint's zero-offset without the effects; None where nothing bounds it."""
+    """A joint's zero-offset without the effects; None where nothing bounds it.
+
+    Of a joint that slides as `JointOffset` has it.
+    """
 
     joint: str
-    mean_deg: float
+    mean_deg: float | None
     std_deg: float | None
+    unit: Literal['deg', 'mm'] = 'deg'
+    mean_mm: float | UnsetType = UNSET
+    std_mm: float | UnsetType | None = UNSET
 
 
 class Compared(Struct):

@@ -266,16 +266,14 @@ def _dominated(result: FitResult, unexplained: Sequence[NoiseCheck]) -> str:
         return 'Whether noise explains what is left, this session cannot show.'
     if result.structure is not None and result.structure.too_few:
         return 'Noise does not explain what is left; so few poses do not show what does.'
-    deed = f'{SEARCH}.'
-    if result.chain.slides.any():
-        deed = '"remaster discover" does not take an arm with a joint that slides.'
     if any(check.is_of_no_instrument for check in unexplained):
         return 'But what is left is no noise of any instrument: the model does not hold.'
     if not any(check.noise_m is not None for check in unexplained):
         return (
-            'But what is left has structure, which noise has not: other errors dominate; ' + deed
+            'But what is left has structure, which noise has not: other errors dominate; '
+            f'{SEARCH}.'
         )
-    return f'But noise does not explain what is left: other errors dominate; {deed}'
+    return f'But noise does not explain what is left: other errors dominate; {SEARCH}.'
 
 
 def _compared(check: NoiseCheck) -> str:
@@ -568,7 +566,7 @@ def as_drawn(geometry: FittedGeometry, imitations: Sequence[Imitation]) -> str:
     """Return what lengths and tilts off their drawing do to the offsets."""
     moved = '; '.join(
         f'{"link" if one.cause == "link_length" else "the axis of joint"} {one.of} is '
-        f'{one.deg:.3f} deg at {one.joint}'
+        f'{one.shown} at {one.joint}'
         for one in imitations
     )
     return (
@@ -640,14 +638,9 @@ def fit_lines(fit: Fit) -> list[str]:
                 lines.append(f'… orientation: {before:.4f} deg before, {after:.4f} deg after')
     lines += [fit.judgement.headline, *fit.judgement.points]
     if isinstance(fit.geometry, Struct) and (moved := fit.geometry.imitations):
-        lines.append(as_drawn(fit.geometry, [max(moved, key=lambda one: one.deg)]))
+        lines.append(as_drawn(fit.geometry, [max(moved, key=lambda one: one.as_angle)]))
         if fit.geometry.file:
             lines += _to_load(loadable_of_fit(fit.geometry))
-    if any(row.unit == 'mm' for row in fit.joint_offsets):
-        lines.append(
-            'of an arm with a joint that slides neither lengths and tilts off their drawing nor '
-            'other causes are looked for'
-        )
     if isinstance(fit.session, Struct) and fit.session.times == 'none':
         lines.append(f'the session is {NO_TIMES}')
     if fit.left_out:

@@ -9,7 +9,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from remaster_ros.errors import InputError
-from remaster_ros.simulation.hidden_effects import KINDS, NAMED, DrawContext, HiddenEffect
+from remaster_ros.simulation.hidden_effects import (
+    KINDS,
+    NAMED,
+    DrawContext,
+    HiddenEffect,
+    in_own_units,
+)
 from remaster_ros.simulation.truth import SessionTruth
 from remaster_ros.simulation.world_model import WorldModel
 
@@ -102,8 +108,11 @@ def draw_effect(
     )
     best, best_size = None, 0.0
     for _ in range(TRIES if joint is None else TRIES * stage.arm.joints):
-        effect = KINDS[kind].draw(kind, context)
-        if joint is not None and effect.joints != (joint,):
+        drawn = KINDS[kind].draw(kind, context)
+        if joint is not None and drawn.joints != (joint,):
+            continue
+        effect = in_own_units(drawn, stage.circumstances.per_radian)
+        if effect is None:
             continue
         if len(effect.joints) > 1:
             effect = _balanced(stage, effect)
@@ -112,6 +121,11 @@ def draw_effect(
             best, best_size = effect, largest
         if largest >= size_m:
             break
+    slides = stage.arm.slides
+    if joint is not None and slides[joint - 1] and KINDS[kind].power is None:
+        raise InputError(
+            f'{kind} at joint {joint}: that joint slides, and has none; give one that turns'
+        )
     if best is None or best_size < 1e-6:
         where = '' if joint is None else f' at joint {joint}'
         raise InputError(f'{kind}{where} cannot be seen on these visits, whatever its size')

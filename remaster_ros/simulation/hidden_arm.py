@@ -102,7 +102,7 @@ class ChainArm:
 
     def __init__(self, chain: SerialChain) -> None:
         self._chain = chain
-        self.joints = len(chain)
+        self.joints, self.slides = len(chain), chain.slides
 
     def state(self, q: FloatArray) -> ArmState:
         """Where every joint is for true joint angles q, rad, (n, k)."""
@@ -112,8 +112,10 @@ class ChainArm:
         carriers = np.concatenate(
             (np.broadcast_to(np.eye(3), (len(q), 1, 3, 3)), frames[:, :-1, :3, :3]), axis=1
         )
+        # What slides has left the place where it was before its move.
+        moved = np.where(chain.slides, q, 0.0)[..., None] * chain.axes_in_base(frames)
         return ArmState(
-            origin=frames[..., :3, 3],
+            origin=frames[..., :3, 3] - moved,
             before=carriers @ chain.T_fixed[:-1, :3, :3],
             after=frames[..., :3, :3],
             axis=chain.axes_in_base(frames),

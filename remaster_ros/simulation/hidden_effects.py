@@ -4,6 +4,9 @@ Nothing here is shared with the code that estimates (`discovery.effects`). An ef
 its values: `HiddenEffect.values` times what its rule adds to a `Deviation`. A rule reads the
 `Circumstances` of every configuration. `NAMED` are the effects with a name, `UNNAMED` those
 without one. Compliance and thermal growth are drawn with the sign of physics.
+
+A joint that slides has metres for radians and, for a torque, the force along it; a radian of what
+is drawn counts as `SLIDE_M` there.
 """
 
 from __future__ import annotations
@@ -22,13 +25,15 @@ from remaster_ros.types import FloatArray
 ARC_MINUTE = np.deg2rad(1.0 / 60.0)
 # A joint that moved less than this, rad, keeps the flank of its gears that it had.
 SLACK_RAD = 2e-4
+# An error of a slide is as large as that of an angle at this distance.
+SLIDE_M = 0.25
 
 
 @dataclass(frozen=True, eq=False)
 class Circumstances:
     """What effects may depend on at n configurations of k joints."""
 
-    # Reported joint angles, and how far each joint came by its last move, rad, (n, k)
+    # Reported joint angles, and how far each joint came by its last move, rad or m, (n, k)
     q: FloatArray
     move: FloatArray
     # Direction of each joint's last move that was a move at all, -1, 0 or 1, (n, k)
@@ -36,12 +41,13 @@ class Circumstances:
     # Since the first measurement, (n,); the arm's temperature above its first, K, (n,)
     time_s: FloatArray
     warming_k: FloatArray
-    # Gravity's torque about each joint, (n, k), and about the base, N m, (n, 3)
+    # Gravity's torque about each joint, or force along it, (n, k), and about the base, N m, (n, 3)
     torque: FloatArray
     base_moment: FloatArray
     segments: FloatArray  # From each joint to the next, in the frame between, m, (k + 1, 3)
     axes: FloatArray  # Axis of each joint in its own frame, (k, 3)
     tool: FloatArray  # Rotation of the tool, (n, 3, 3)
+    per_radian: FloatArray  # How much of each joint's unit counts as a radian, (k,)
 
 
 @dataclass(eq=False)
@@ -50,7 +56,7 @@ class Deviation:
 
     sensors: tuple[str, ...]
     markers: tuple[str, ...]
-    angle: FloatArray  # Added to the true joint angles, rad, (n, k)
+    angle: FloatArray  # Added to the true joint angles, rad or m, (n, k)
     # Added to each segment, in the frame after its joint (0: the base), m, (n, k + 1, 3)
     shift: FloatArray
     tilt: FloatArray  # Turns each joint's frame before its own turn, rad, (n, k, 3)
@@ -251,7 +257,28 @@ class HiddenKind:
     draw: Draw
     # What discovery should find; none where it has no parameters that could be compared one by one
     parts: tuple[Part, ...] = ()
+    # To which power its values have the unit of what drives, in a denominator: where a joint
+    # slides they are drawn smaller by it. None for what no joint that slides has
+    power: int | None = 0
     answers: tuple[str, ...] = ()  # Names of discovery.json that name it too, beside its own
+
+
+def in_own_units(effect: HiddenEffect, per_radian: FloatArray) -> HiddenEffect | None:
+    """Return an effect as drawn, in rad, in the units of its joints; None where it has no form.
+
+    ``per_radian``: how much of each joint's unit counts as a radian, (k,).
+    """
+    kind = KINDS[effect.kind]
+    by = effect.detail.get('by')
+    own = per_radian[np.array(effect.joints, dtype=int) - 1]
+    driver = own if by is None else per_radian[by - 1]
+    if kind.place != 'joint_angle' or (np.all(own == 1.0) and np.all(driver == 1.0)):
+        return effect
+    wave = effect.detail.get('form') == 'sin/cos'
+    if kind.power is None or (wave and driver != 1.0):
+        return None
+    power = 0 if wave else kind.power
+    return replace(effect, values=effect.values * own * driver ** -float(power))
 
 
 # Draws of effects that need more than a size and a sign.
@@ -359,11 +386,12 @@ def _kind(
     *parts: Part,
     answers: tuple[str, ...] = (),
     name: str = '',
+    power: int | None = 0,
 ) -> Callable[[Rule], Rule]:
     """Put the kind of a rule into a table, by the rule's name or another one."""
 
     def take(rule: Rule) -> Rule:
-        table[name or rule.__name__] = HiddenKind(place, driver, rule, draw, parts, answers)
+        table[name or rule.__name__] = HiddenKind(place, driver, rule, draw, parts, power, answers)
         return rule
 
     return take
@@ -376,14 +404,15 @@ def _after(e: HiddenEffect, c: Circumstances) -> FloatArray:
     return (c.time_s > e.detail['moment_s']).astype(float)
 
 
-@_named('joint_angle', 'gravity_torque', _draw_compliance, Part('compliance_{j}'))
+# A torque is a force at a lever: its unit is in it once more.
+@_named('joint_angle', 'gravity_torque', _draw_compliance, Part('compliance_{j}'), power=-1)
 def joint_compliance(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
     """δq_j = values_j τ_j for each of the joints, rad/(N m)."""
     for value, j in zip(e.values, e.joints, strict=True):
         d.angle[:, j - 1] += value * c.torque[:, j - 1]
 
 
-@_named('joint_angle', 'joint_angle', _draw_eccentricity, *WAVES)
+@_named('joint_angle', 'joint_angle', _draw_eccentricity, *WAVES, power=None)
 def encoder_eccentricity(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
     """Per order o in detail: δq = a sin(o q) + b cos(o q), rad."""
     q = c.q[:, e.joints[0] - 1]
@@ -391,13 +420,13 @@ def encoder_eccentricity(e: HiddenEffect, d: Deviation, c: Circumstances) -> Non
         d.angle[:, e.joints[0] - 1] += a * np.sin(order * q) + b * np.cos(order * q)
 
 
-@_named('joint_angle', 'joint_angle', one_value(5e-3), Part('scale_{j}'))
+@_named('joint_angle', 'joint_angle', one_value(5e-3), Part('scale_{j}'), power=1)
 def encoder_scale(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
     """δq = s q."""
     d.angle[:, e.joints[0] - 1] += e.values[0] * c.q[:, e.joints[0] - 1]
 
 
-_named('joint_angle', 'joint_angle', _draw_gear, *WAVES, name='gear_periodic')(
+_named('joint_angle', 'joint_angle', _draw_gear, *WAVES, name='gear_periodic', power=None)(
     encoder_eccentricity
 )
 
@@ -405,7 +434,7 @@ _named('joint_angle', 'joint_angle', _draw_gear, *WAVES, name='gear_periodic')(
 @_named('joint_angle', 'joint_angle', _draw_curve)
 def joint_error_curve(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
     """A sum of waves of many orders, none of them slow enough for an eccentricity."""
-    q = c.q[:, e.joints[0] - 1]
+    q = (c.q / c.per_radian)[:, e.joints[0] - 1]
     waves = sum(
         a * np.cos(order * q + phase)
         for order, a, phase in zip(
@@ -426,7 +455,7 @@ def backlash(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
     d.angle[:, e.joints[0] - 1] += 0.5 * e.values[0] * c.approach[:, e.joints[0] - 1]
 
 
-@_named('joint_angle', 'last_move', one_value(3e-3, positive=True), Part('settling_{j}'))
+@_named('joint_angle', 'last_move', one_value(3e-3, positive=True), Part('settling_{j}'), power=1)
 def settling(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
     """δq = −s (q − q before the move): the arm has not come all the way yet."""
     d.angle[:, e.joints[0] - 1] -= e.values[0] * c.move[:, e.joints[0] - 1]
@@ -439,6 +468,7 @@ def settling(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
     Part('coupling_{j}_by_{by}', detail={'form': 'linear'}),
     Part('sin_{j}_by_{by}', (1.0, 0.0), {'form': 'sin/cos'}),
     Part('cos_{j}_by_{by}', (0.0, 1.0), {'form': 'sin/cos'}),
+    power=1,
 )
 def joint_coupling(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
     """δq_j = s q_i, or a sin q_i + b cos q_i."""
@@ -518,6 +548,7 @@ def sensor_distortion(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
     'gravity_torque',
     two_joints(4e-4),
     Part('joint_{j}_by_gravity_torque_of_joint_{by}'),
+    power=-1,
 )
 def foreign_torque(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
     """δq_j = s τ_i: joint j gives way to another joint's torque."""
@@ -544,7 +575,7 @@ def warm_joint(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
     d.angle[:, e.joints[0] - 1] += e.values[0] * c.warming_k
 
 
-@_unnamed('joint_angle', 'angle', two_joints(3e-3))
+@_unnamed('joint_angle', 'angle', two_joints(3e-3), power=2)
 def bent_coupling(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
     """δq_j = s q_i²: neither a line nor a wave of the other joint."""
     d.angle[:, e.joints[0] - 1] += e.values[0] * c.q[:, e.detail['by'] - 1] ** 2

@@ -113,11 +113,6 @@ def make_world(
     """
     settings = yaml.safe_load(config_path('fake_world.yaml').read_text())
     chain = cell.chain(sliding=True)
-    if hidden and chain.slides.any():
-        raise InputError(
-            f"joint '{chain.joint_names[int(np.argmax(chain.slides))]}' slides, and of such an "
-            'arm nothing but zero-offsets is hidden: remaster discover takes none'
-        )
     missing = sorted(set(cell.sensors) - set(settings['sensors']))
     if missing:
         raise InputError(f'fake_world.yaml places no sensor {", ".join(missing)}')

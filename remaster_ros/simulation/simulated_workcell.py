@@ -139,12 +139,6 @@ def simulate_session(
     Raises InputError: solutions of the wrong shape, no poses, a sensor that follows no known
     marker, or an effect that this arm cannot show.
     """
-    if len(effects) and chain.slides.any():
-        sliding = chain.joint_names[int(np.argmax(chain.slides))]
-        raise InputError(
-            f"--effect: joint '{sliding}' slides, and of such an arm nothing but "
-            'zero-offsets is simulated, as remaster discover takes none; leave --effect out'
-        )
     for name, sensor in sensors.items():
         for marker in sensor.markers:
             if marker not in markers:

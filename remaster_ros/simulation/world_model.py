@@ -17,20 +17,21 @@ from scipy.spatial.transform import Rotation
 
 from remaster_ros.simulation.hidden_effects import (
     SLACK_RAD,
+    SLIDE_M,
     Circumstances,
     Deviation,
     HiddenEffect,
     add_effect,
 )
 from remaster_ros.simulation.truth import SimulatedSensor
-from remaster_ros.types import FloatArray
+from remaster_ros.types import BoolArray, FloatArray
 
 
 @dataclass(frozen=True, eq=False)
 class ArmState:
     """The arm at n configurations, everything in the base frame R."""
 
-    origin: FloatArray  # Origin of every joint, m, (n, k, 3)
+    origin: FloatArray  # Origin of every joint, before its own move, m, (n, k, 3)
     # Rotation of each joint's frame before and after its own turn, (n, k, 3, 3)
     before: FloatArray
     after: FloatArray
@@ -44,6 +45,7 @@ class Arm(Protocol):
     """Kinematics and gravity of an arm of k joints as drawn."""
 
     joints: int
+    slides: BoolArray  # Which of them slide, (k,)
 
     def state(self, q: FloatArray) -> ArmState:
         """Where every joint is for true joint angles q, rad, (n, k)."""
@@ -78,12 +80,12 @@ class Round:
 
 def circumstances(arm: Arm, visited: Round, joint_offsets: FloatArray) -> Circumstances:
     """Return what effects may depend on, per configuration."""
-    q = visited.q + joint_offsets
+    q, per_radian = visited.q + joint_offsets, np.where(arm.slides, SLIDE_M, 1.0)
     move = visited.q - visited.came_from
     approach = np.zeros_like(q)
     last = np.zeros(arm.joints)
     for i, step in enumerate(move):
-        last = np.where(np.abs(step) > SLACK_RAD, np.sign(step), last)
+        last = np.where(np.abs(step) > SLACK_RAD * per_radian, np.sign(step), last)
         approach[i] = last
     state = arm.state(q)
     return Circumstances(
@@ -97,6 +99,7 @@ def circumstances(arm: Arm, visited: Round, joint_offsets: FloatArray) -> Circum
         segments=arm.segments(),
         axes=np.einsum('kji,kj->ki', state.after[0], state.axis[0]),
         tool=state.tool,
+        per_radian=per_radian,
     )
 
 
@@ -233,7 +236,8 @@ class WorldModel:
         for s, marker in seen:
             point = placed(state, self.markers[marker], None)
             turns = np.cross(state.axis, point[:, None] - state.origin)
-            offsets = np.swapaxes(turns, 1, 2)
+            moves = np.where(self.arm.slides[:, None], state.axis, turns)
+            offsets = np.swapaxes(moves, 1, 2)
             centered = point - point.mean(axis=0)
             turned = np.stack([np.cross(axis, centered) for axis in np.eye(3)], axis=-1)
             shifted = np.broadcast_to(np.eye(3), (len(point), 3, 3))

@@ -42,12 +42,7 @@ def test_a_missing_cell_file(start, tmp_path):
 @pytest.mark.parametrize(
     ('node', 'parameters', 'why'),
     [
-        (
-            'demo',
-            {'apply': True},
-            'can be planned, measured by the nodes, simulated, imported and fitted',
-        ),
-        ('demo', {'hide': 'backlash@2'}, 'of such an arm nothing but zero-offsets is hidden'),
+        ('demo', {'apply': True}, 'this needs joints that turn'),
         ('robot_bridge', {'compensation': 'c.json'}, 'leave the parameter compensation empty'),
         ('pose_planner', {'compensation': 'c.json'}, 'compensation is for arms whose joints all'),
         ('pose_planner', {'separate': 'd.json'}, 'separate is for arms whose joints all turn'),

@@ -35,6 +35,8 @@ class PinocchioArm:
         self._data = self.model.createData()
         self._tip = self.model.getFrameId(tip_link)
         self.joints = self.model.nq
+        names = [joint.shortname() for joint in self.model.joints.tolist()[1:]]
+        self.slides = np.array([name.startswith('JointModelP') for name in names])
 
     def state(self, q: FloatArray) -> ArmState:
         """Where every joint is for true joint angles q, rad, (n, k)."""
@@ -43,15 +45,19 @@ class PinocchioArm:
         before, after = np.empty((n, k, 3, 3)), np.empty((n, k, 3, 3))
         tool_origin, tool = np.empty((n, 3)), np.empty((n, 3, 3))
         for i, angles in enumerate(q):
-            # Joint Jacobians in the world frame: their lower half is the axes.
-            axis[i] = pin.computeJointJacobians(self.model, data, angles)[3:].T
+            # Joint Jacobians in the world frame: their lower half is the axes, the upper one that
+            # of what slides.
+            columns = pin.computeJointJacobians(self.model, data, angles).T
+            axis[i] = np.where(self.slides[:, None], columns[:, :3], columns[:, 3:])
             placed = pin.updateFramePlacement(self.model, data, self._tip)
             tool_origin[i], tool[i] = placed.translation, placed.rotation
             for j in range(k):
                 origin[i, j] = data.oMi[j + 1].translation
                 after[i, j] = data.oMi[j + 1].rotation
-                carrier = data.oMi[self.model.parents[j + 1]].rotation
-                before[i, j] = carrier @ self.model.jointPlacements[j + 1].rotation
+                stands = data.oMi[self.model.parents[j + 1]] * self.model.jointPlacements[j + 1]
+                before[i, j] = stands.rotation
+                if self.slides[j]:
+                    origin[i, j] = stands.translation
         return ArmState(origin, before, after, axis, tool_origin, tool)
 
     def gravity_torque(self, q: FloatArray) -> FloatArray:

@@ -174,7 +174,10 @@ class HiddenWorld(WorldModel):
         marker_std_m: float = MARKER_STD_M,
     ) -> None:
         m, k = visits.q.shape
-        joint_offsets = np.deg2rad(0.3) * rng.standard_normal(k)
+        arm = PinocchioArm(urdf)
+        # 1.3 mm of what slides.
+        size = np.where(arm.slides, 0.25, 1.0) * np.deg2rad(0.3)
+        joint_offsets = size * rng.standard_normal(k)
         true_markers = {
             name: position + marker_std_m * rng.standard_normal(3)
             for name, position in markers.items()
@@ -189,7 +192,7 @@ class HiddenWorld(WorldModel):
         swing = rng.uniform(0.5, 1.5) * np.sin(2 * np.pi * since / rng.uniform(1500.0, 6000.0))
         self.temperature_c = 21.0 + warming + swing + 0.05 * rng.standard_normal(m)
         super().__init__(
-            PinocchioArm(urdf),
+            arm,
             Round(visits.q, visits.home, since, warming + swing),
             sensors,
             true_markers,

@@ -6,13 +6,14 @@ from collections.abc import Iterator
 
 from remaster_ros.discovery.effects.base import Cell, Effect, needs_approach
 from remaster_ros.discovery.effects.context import Context
-from remaster_ros.discovery.effects.sizes import angle
+from remaster_ros.discovery.effects.sizes import of_joint
 from remaster_ros.types import FloatArray
 
 
 def cells(context: Context) -> Iterator[Cell]:
     """One cell per joint: δq_j = b_j sign(q_j - from_q_j)."""
     return EFFECT.at_joints(
+        context,
         context.moving,
         lambda context, joint: [context.approach[:, joint - 1]],
         ['half_backlash_{joint}'],
@@ -21,7 +22,8 @@ def cells(context: Context) -> Iterator[Cell]:
 
 
 def _play(context: Context, cell: Cell, draws: FloatArray) -> str:
-    return f'joint {cell.joints[0]} stops {angle(2.0 * draws[:, 0])} apart, side by side'
+    joint = cell.joints[0]
+    return f'joint {joint} stops {of_joint(context, joint, 2.0 * draws[:, 0])} apart, side by side'
 
 
 EFFECT = Effect(
@@ -37,6 +39,10 @@ EFFECT = Effect(
     sentence='Where a move of {subject} ends depends on the side it comes from (gear play).',
     separate_by='each pose approached from both sides, by small and by large moves',
     remedy='Approach every pose from the same side, and have the play of the gearbox adjusted.',
+    slide_sentence='Where a move of {subject} ends depends on the side it comes from (play of a '
+    'screw, rack or belt).',
+    slide_remedy='Approach every pose from the same side, and have the play of the drive '
+    'adjusted.',
     size=_play,
     cells=cells,
     needs=needs_approach,

@@ -1,7 +1,8 @@
 """A cell: where an error enters, what drives it, in which form; and a named effect made of such.
 
 The true joint angle is the reported one plus the zero-offset plus effects at the place
-``joint_angle``. Everything else displaces the marker.
+``joint_angle``. Everything else displaces the marker. Of a joint that slides the angle is its
+place, in m, and a torque the force along it.
 """
 
 from __future__ import annotations
@@ -14,7 +15,9 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from remaster_ros.discovery.effects.context import Context
+from remaster_ros.discovery.effects.drivers import driver_at
 from remaster_ros.discovery.effects.splines import Curve
+from remaster_ros.kinematics.serial_chain import LEVER_M
 from remaster_ros.types import FloatArray
 
 Place = Literal[
@@ -23,6 +26,13 @@ Place = Literal[
 PLACES: tuple[Place, ...] = get_args(Place)
 # RMS displacement of the marker that a cause without a plausible range is taken to have at most.
 LARGEST_M = 10e-3
+# Of a unit of effects at joints that turn: that at a joint that slides, and how much of it counts
+# as one. A torque is a force at `LEVER_M`.
+AT_A_SLIDE = {
+    'rad': ('m', LEVER_M),
+    'rad/rad': ('m/m', 1.0),
+    'rad/(N m)': ('m/N', LEVER_M**2),
+}
 # Form of a cell that is all members of a kind of error.
 RANDOM = 'random'
 NO_TIMES = 'the session has no times (times: none), only the order of its rows'
@@ -33,7 +43,7 @@ class Design:
     """What one unit of each of m parameters does to each of n rows."""
 
     at: int | None  # Index of the joint whose angle it adds to; None where it displaces the marker
-    # Added joint angle, rad per unit, (n, m), or displacement in R, m per unit, (n, 3, m)
+    # Added joint angle, rad or m per unit, (n, m), or displacement in R, m per unit, (n, 3, m)
     values: FloatArray
 
     @property
@@ -95,6 +105,7 @@ class Cell:
     # Of a penalised cell: standard deviation of the weights at a penalty of 1 that its smoothness
     # does not go below, in ``unit``; 0 for none
     least: float = 0.0
+    slide: bool = False  # It is about the place of a joint that slides
 
     @property
     def size(self) -> int:
@@ -180,6 +191,9 @@ class Effect:
     reported_as: str = ''
     # False for structure that is located without a cause: it is reported as unexplained
     is_cause: bool = True
+    # In place of sentence and remedy where it is about joints that slide; '' where these are right
+    slide_sentence: str = ''
+    slide_remedy: str = ''
     # For what happened at one moment: its cells in all gaps between rows that reach between two
     # moments, s since the first row
     between: Callable[[Context, float, float], Iterable[Cell]] | None = None
@@ -193,8 +207,18 @@ class Effect:
         own['largest'] = self.plausible[1] if self.plausible else None
         return Cell(columns=columns, parameters=tuple(parameters), **{**own, **more})
 
+    def sentence_of(self, cells: Iterable[Cell]) -> str:
+        """Return its sentence about some cells."""
+        return (all(cell.slide for cell in cells) and self.slide_sentence) or self.sentence
+
+    def remedy_of(self, cell: Cell) -> str:
+        """Return what to do about a cell and others like it."""
+        remedy = (cell.slide and self.slide_remedy) or self.remedy
+        return remedy.format(driver=cell.driver.replace('_', ' '))
+
     def at_joints(
         self,
+        context: Context,
         joints: Iterable[int],
         features: Callable[[Context, int], Sequence[FloatArray]],
         parameters: Sequence[str],
@@ -202,16 +226,23 @@ class Effect:
     ) -> Iterator[Cell]:
         """Give a cell for each of some joints (1-based), which adds to that joint's angle.
 
-        ``joints``: which; ``features``: context and joint to m added angles, rad per unit, (n,)
-        each; ``parameters``: names of the m parameters, with ``{joint}`` for the joint; ``more``:
-        further arguments of `Cell`.
+        ``joints``: which of the context's; ``features``: context and joint to m added angles, rad
+        or m per unit, (n,) each; ``parameters``: names of the m parameters, with ``{joint}`` for
+        the joint; ``more``: further arguments of `Cell`.
         """
         for joint in joints:
+            own: dict[str, Any] = {}
+            if context.slides(joint):
+                unit, counts = AT_A_SLIDE[self.unit]
+                own = {'unit': unit, 'driver': driver_at(context, joint, self.driver)}
+                own |= {'slide': True}
+                if self.plausible:
+                    own['largest'] = counts * self.plausible[1]
             yield self.cell(
                 partial(_added, joint=joint, features=features),
                 [name.format(joint=joint) for name in parameters],
                 joints=(joint,),
-                **more,
+                **{**own, **more},
             )
 
 

@@ -13,7 +13,8 @@ from remaster_ros.kinematics.transforms import apply
 from remaster_ros.types import BoolArray, FloatArray, IntArray, Measurements
 
 GRAVITY = (0.0, 0.0, -9.81)
-# A joint that moved less than this stays on the flank of its gears that it was on.
+# A joint that moved less than this stays on the flank of its gears that it was on. One that slides
+# has `SerialChain.per_radian` as much, in m, here and below.
 STILL_RAD = 1e-4
 # A joint that turns less than this in all stands still.
 LEAST_TURN_RAD = 1e-2
@@ -37,7 +38,7 @@ class Context:
     # In the order of those indices
     sensor_names: tuple[str, ...]
     marker_names: tuple[str, ...]
-    joint_offsets: FloatArray  # As fitted, rad, (k,)
+    joint_offsets: FloatArray  # As fitted, rad, m of joints that slide, (k,)
     markers: FloatArray  # As fitted, in the tool frame, m, (markers, 3)
     T_R_N: FloatArray  # As fitted, (sensors, 4, 4)
     timed: bool = field(default=True, kw_only=True)  # False where the rows' times only order them
@@ -63,7 +64,7 @@ class Context:
 
     @cached_property
     def q(self) -> FloatArray:
-        """Joint angles with the zero-offsets, rad, (n, k)."""
+        """Joint positions with the zero-offsets, rad or m, (n, k)."""
         return self.measurements.q + self.joint_offsets
 
     @cached_property
@@ -83,12 +84,12 @@ class Context:
 
     @cached_property
     def jacobian(self) -> FloatArray:
-        """Velocity of the marker about each joint, m/rad, (n, 3, k)."""
+        """Velocity of the marker by each joint, m/rad or m/m, (n, 3, k)."""
         return self.chain.position_jacobian(self.q, self.markers[self.marker])
 
     @cached_property
     def gravity_torque(self) -> FloatArray:
-        """Gravity's torque about each joint, N m, (n, k)."""
+        """Gravity's torque about each joint, N m, or force along it, N, (n, k)."""
         return self.chain.gravity_torque(self.q, GRAVITY)
 
     @cached_property
@@ -115,13 +116,14 @@ class Context:
 
     @cached_property
     def last_move(self) -> FloatArray:
-        """How far each joint moved to get here, rad, (n, k); 0 where unknown."""
+        """How far each joint moved to get here, rad or m, (n, k); 0 where unknown."""
         return np.nan_to_num(self.measurements.q - self.measurements.from_q, nan=0.0)
 
     @cached_property
     def approach(self) -> FloatArray:
         """Sign of each joint's last move that was a move at all, (n, k); 0 before the first."""
-        sign = np.where(np.abs(self.last_move) > STILL_RAD, np.sign(self.last_move), 0.0)
+        still = STILL_RAD * self.chain.per_radian
+        sign = np.where(np.abs(self.last_move) > still, np.sign(self.last_move), 0.0)
         order = np.argsort(self.measurements.stamp_s, kind='stable')
         # The last row in time at or before each row at which the joint moved.
         moved = np.where(sign[order] != 0.0, np.arange(len(self))[:, None], -1)
@@ -238,13 +240,24 @@ class Context:
 
     def turns_over(self, joint: int) -> bool:
         """Return whether a joint (1-based) can turn on past a whole turn: it is then the same."""
-        return bool(self.chain.upper[joint - 1] - self.chain.lower[joint - 1] > MORE_THAN_A_TURN)
+        range_ = self.chain.upper[joint - 1] - self.chain.lower[joint - 1]
+        return bool(range_ > MORE_THAN_A_TURN) and not self.slides(joint)
+
+    def slides(self, joint: int) -> bool:
+        """Return whether a joint (1-based) slides."""
+        return bool(self.chain.slides[joint - 1])
 
     @cached_property
     def moving(self) -> tuple[int, ...]:
-        """Joints (1-based) that take more than one angle in the rows to fit."""
+        """Joints (1-based) that take more than one place in the rows to fit."""
         span = np.ptp(self.measurements.q[self.to_fit], axis=0)
-        return tuple(int(joint) + 1 for joint in np.flatnonzero(span > LEAST_TURN_RAD))
+        least = LEAST_TURN_RAD * self.chain.per_radian
+        return tuple(int(joint) + 1 for joint in np.flatnonzero(span > least))
+
+    @property
+    def turning(self) -> tuple[int, ...]:
+        """Those of `moving` that turn."""
+        return tuple(joint for joint in self.moving if not self.slides(joint))
 
     def links(self) -> Sequence[int]:
         """Return the links, 1-based, whose geometry can matter: from joint j to joint j + 1.

@@ -39,6 +39,9 @@ class Driver:
         return Curve.of(self.value(context)[chosen], share, finest, turns_over)
 
 
+# What people read of joints that turn, and of those that slide: the unit, and how much of rad or m
+# makes one.
+_SHOWN = {False: ('°', np.radians(1.0)), True: ('mm', 1e-3)}
 TIME = Driver('time', 's', lambda context: context.elapsed_s, 'time', 'h', 3600.0)
 TEMPERATURE = Driver(
     'temperature', 'K', lambda context: context.warming, 'temperature above the first', 'K'
@@ -51,33 +54,48 @@ def slow_drivers(context: Context) -> list[Driver]:
     return found + ([TEMPERATURE] if context.has_temperature else [])
 
 
-def angle_of(joint: int, name: str = 'own_angle') -> Driver:
-    """Return the angle of a joint (1-based)."""
+# What drives where a joint turns, and its name where it slides.
+_OF_SLIDES = {
+    'own_angle': 'own_place',
+    'angle': 'place',
+    'gravity_torque': 'gravity_force',
+}
+
+
+def driver_at(context: Context, joint: int, name: str) -> str:
+    """Return the name of a driver of a joint (1-based), as ``angle`` or ``angle_of_joint_2``."""
+    stem, of, number = name.partition('_of_joint_')
+    return _OF_SLIDES.get(stem, stem) + of + number if context.slides(joint) else name
+
+
+def angle_of(context: Context, joint: int, name: str = 'own_angle') -> Driver:
+    """Return the angle of a joint (1-based), or the place of one that slides."""
+    slides = context.slides(joint)
     return Driver(
-        name,
-        'rad',
+        driver_at(context, joint, name),
+        context.chain.units[joint - 1],
         lambda context: context.measurements.q[:, joint - 1],
-        f'angle of joint {joint}',
-        '°',
-        np.radians(1.0),
+        f'{"place" if slides else "angle"} of joint {joint}',
+        *_SHOWN[slides],
         joint,
         is_angle=True,
     )
 
 
-def torque_of(joint: int, name: str = 'gravity_torque') -> Driver:
-    """Return gravity's torque about a joint."""
+def torque_of(context: Context, joint: int, name: str = 'gravity_torque') -> Driver:
+    """Return gravity's torque about a joint, or its force along one that slides."""
+    slides = context.slides(joint)
     return Driver(
-        name,
-        '(N m)',
+        driver_at(context, joint, name),
+        context.chain.torque_units[joint - 1],
         lambda context: context.gravity_torque[:, joint - 1],
-        f'gravity torque on joint {joint}',
-        'N m',
+        f'gravity {"force" if slides else "torque"} on joint {joint}',
+        'N' if slides else 'N m',
         joint=joint,
     )
 
 
-def approach_of(joint: int, name: str) -> Driver:
+def approach_of(context: Context, joint: int, name: str) -> Driver:
     """Return the side that a joint came from."""
     return Driver(
         name,
@@ -88,34 +106,36 @@ def approach_of(joint: int, name: str) -> Driver:
     )
 
 
-def last_move_of(joint: int, name: str) -> Driver:
+def last_move_of(context: Context, joint: int, name: str) -> Driver:
     """Return how far a joint moved to get here."""
     return Driver(
         name,
-        'rad',
+        context.chain.units[joint - 1],
         lambda context: context.last_move[:, joint - 1],
         f'last move of joint {joint}',
-        '°',
-        np.radians(1.0),
+        *_SHOWN[context.slides(joint)],
         joint,
     )
 
 
-_OF_JOINTS: dict[str, Callable[[int, str], Driver]] = {
+_OF_JOINTS: dict[str, Callable[[Context, int, str], Driver]] = {
     'own_angle': angle_of,
+    'own_place': angle_of,
     'angle': angle_of,
+    'place': angle_of,
     'gravity_torque': torque_of,
+    'gravity_force': torque_of,
     'approach': approach_of,
     'last_move': last_move_of,
 }
 
 
-def driver_named(name: str, joint: int) -> Driver | None:
+def driver_named(context: Context, name: str, joint: int) -> Driver | None:
     """Return the driver of a cell by its name; None where it is no single number.
 
     ``joint`` (1-based) is that of a name which has none.
     """
     stem, _, given = name.partition('_of_joint_')
     if stem in _OF_JOINTS:
-        return _OF_JOINTS[stem](int(given or joint), name)
+        return _OF_JOINTS[stem](context, int(given or joint), name)
     return next((driver for driver in (TIME, TEMPERATURE) if driver.name == name), None)

@@ -20,7 +20,8 @@ def cells(context: Context) -> Iterator[Cell]:
     """Sine and cosine of the joint's own angle."""
     for orders in ORDERS:
         yield from EFFECT.at_joints(
-            context.moving,
+            context,
+            context.turning,
             partial(_waves, orders=orders),
             [f'{wave}{order}_{{joint}}' for order in orders for wave in ('sin', 'cos')],
             drawn_from=context.joints * len(ORDERS),

@@ -1,4 +1,4 @@
-"""Encoder scale: a joint turns a little more than it reports, in proportion."""
+"""Encoder scale: a joint turns or slides a little more than it reports, in proportion."""
 
 from __future__ import annotations
 
@@ -8,13 +8,14 @@ import numpy as np
 
 from remaster_ros.discovery.effects.base import Cell, Effect
 from remaster_ros.discovery.effects.context import Context
-from remaster_ros.discovery.effects.sizes import along_mean, angle, number
+from remaster_ros.discovery.effects.sizes import along_mean, number, of_joint, span_of
 from remaster_ros.types import FloatArray
 
 
 def cells(context: Context) -> Iterator[Cell]:
     """One cell per joint: δq_j = s_j q_j."""
     return EFFECT.at_joints(
+        context,
         context.moving,
         lambda context, joint: [context.measurements.q[:, joint - 1]],
         ['scale_{joint}'],
@@ -26,10 +27,13 @@ def _scaled(context: Context, cell: Cell, draws: FloatArray) -> str:
     joint, scale = cell.joints[0], draws[:, 0]
     more = 'more' if scale.mean() >= 0.0 else 'less'
     span = np.ptp(context.measurements.q[:, joint - 1])
-    share = 100.0 * np.abs(scale.mean())
+    # Of a slide in mm a metre, as screws and scales are specified.
+    times, unit = (1e3, ' mm a metre') if cell.slide else (100.0, ' %')
+    share = number(times * np.abs(scale.mean()), times * scale.std(), unit)
     return (
-        f'joint {joint} turns {number(share, 100.0 * scale.std(), " %")} {more} than it reports, '
-        f'{angle(along_mean(draws[:, :1]) * span)} over the {np.degrees(span):.0f}° that it took'
+        f'joint {joint} {"slides" if cell.slide else "turns"} {share} {more} than it reports, '
+        f'{of_joint(context, joint, along_mean(draws[:, :1]) * span)} over the '
+        f'{span_of(context, joint, span)} that it took'
     )
 
 
@@ -45,6 +49,10 @@ EFFECT = Effect(
     sentence='The true turn of {subject} is not what is reported (gear ratio or encoder scale).',
     separate_by='poses that turn the joint through its whole range',
     remedy='Check the gear ratio and the encoder resolution that are set in the controller.',
+    slide_sentence='The true way of {subject} is not what is reported (lead of the screw, pinion '
+    'of the rack, or scale).',
+    slide_remedy='Check the lead, the gear ratio and the resolution of the scale that are set in '
+    'the controller.',
     size=_scaled,
     cells=cells,
     family='encoder scales',

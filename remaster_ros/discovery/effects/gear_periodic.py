@@ -23,7 +23,8 @@ def cells(context: Context) -> Iterator[Cell]:
     orders = range(LOWEST_ORDER, highest + 1)
     for order in orders:
         yield from EFFECT.at_joints(
-            context.moving,
+            context,
+            context.turning,
             partial(_waves, order=order),
             [f'sin{order}_{{joint}}', f'cos{order}_{{joint}}'],
             drawn_from=context.joints * len(orders),

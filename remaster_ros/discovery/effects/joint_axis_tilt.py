@@ -36,8 +36,10 @@ def cells(context: Context) -> Iterator[Cell]:
 
 
 def _tilted(context: Context, joint: int, axes: list[FloatArray]) -> Design:
-    turn = context.link_rotation(joint - 1) @ context.chain.T_fixed[joint - 1][:3, :3]
-    return turned(context, [turn @ axis for axis in axes], context.joint_origin(joint))
+    # Where the joint is before its own move: one that slides carries its frame's origin along.
+    before = context.frames[:, joint - 2] @ context.chain.T_fixed[joint - 1]
+    turn = before[:, :3, :3]
+    return turned(context, [turn @ axis for axis in axes], before[:, :3, 3])
 
 
 def tilt_directions(context: Context, joint: int) -> dict[str, FloatArray]:

@@ -6,13 +6,14 @@ from collections.abc import Iterator
 
 from remaster_ros.discovery.effects.base import Cell, Effect, needs_gravity
 from remaster_ros.discovery.effects.context import Context
-from remaster_ros.discovery.effects.sizes import angle, largest
+from remaster_ros.discovery.effects.sizes import largest, of_joint
 from remaster_ros.types import FloatArray
 
 
 def cells(context: Context) -> Iterator[Cell]:
     """One cell per joint: δq_j = c_j τ_j."""
     return EFFECT.at_joints(
+        context,
         range(1, context.joints + 1),
         lambda context, joint: [context.gravity_torque[:, joint - 1]],
         ['compliance_{joint}'],
@@ -23,7 +24,9 @@ def cells(context: Context) -> Iterator[Cell]:
 def _turned(context: Context, cell: Cell, draws: FloatArray) -> str:
     joint = cell.joints[0]
     torque = largest(context.gravity_torque[:, joint - 1])
-    return f'joint {joint} turns {angle(draws[:, 0] * torque)} under {torque:.0f} N m'
+    moved = of_joint(context, joint, draws[:, 0] * torque)
+    verb, unit = ('slides', 'N') if cell.slide else ('turns', 'N m')
+    return f'joint {joint} {verb} {moved} under {torque:.0f} {unit}'
 
 
 EFFECT = Effect(
@@ -40,6 +43,9 @@ EFFECT = Effect(
     separate_by='the same poses with and without a payload on the tool',
     remedy='Have the gearbox and the bearing of the joint checked for play and wear; correct '
     'what is left by the torque, and state the payload.',
+    slide_sentence='The weight carried pushes {subject} along (a soft belt, rack or screw).',
+    slide_remedy='Have belt, rack or screw and its bearings checked for play and wear; correct '
+    'what is left by the force, and state the payload.',
     size=_turned,
     cells=cells,
     needs=needs_gravity,

@@ -9,28 +9,39 @@ import numpy as np
 
 from remaster_ros.discovery.effects.base import Cell, Design, Effect
 from remaster_ros.discovery.effects.context import Context
+from remaster_ros.discovery.effects.drivers import driver_at
 from remaster_ros.discovery.effects.sizes import up_to
+from remaster_ros.types import FloatArray
+
+# Of what is plausible the most.
+LARGEST = 1e-2
 
 
 def cells(context: Context) -> Iterator[Cell]:
-    """Joint j by every other joint l: linear, or sine and cosine."""
+    """Joint j by every other joint l: linear, or sine and cosine of one that turns."""
+    units, counts = context.chain.units, context.chain.per_radian
     count = 2 * context.joints * max(1, len(context.moving) - 1)
     for joint in range(1, context.joints + 1):
         for other in context.moving:
             if other == joint:
                 continue
             pair = f'{joint}_by_{other}'
-            for form, unit, parameters in (
-                ('linear', 'rad/rad', [f'coupling_{pair}']),
-                ('sin/cos', 'rad', [f'sin_{pair}', f'cos_{pair}']),
+            own, of = units[joint - 1], units[other - 1]
+            for form, unit, parameters, counted in (
+                ('linear', f'{own}/{of}', [f'coupling_{pair}'], 1.0 / counts[other - 1]),
+                ('sin/cos', own, [f'sin_{pair}', f'cos_{pair}'], 1.0),
             ):
+                if form == 'sin/cos' and context.slides(other):
+                    continue
                 yield EFFECT.cell(
                     partial(_followed, joint=joint, other=other, form=form),
                     parameters,
                     joints=(joint, other),
-                    driver=f'angle_of_joint_{other}',
+                    driver=driver_at(context, other, f'angle_of_joint_{other}'),
                     form=form,
                     unit=unit,
+                    largest=LARGEST * counts[joint - 1] * counted,
+                    slide=context.slides(joint) or context.slides(other),
                     drawn_from=count,
                 )
 
@@ -41,6 +52,11 @@ def _followed(context: Context, joint: int, other: int, form: str) -> Design:
     return Design(joint - 1, np.stack(features, axis=-1))
 
 
+def _coupled(context: Context, cell: Cell, draws: FloatArray) -> str:
+    verb = 'slides' if context.slides(cell.joints[0]) else 'turns'
+    return up_to(f'joint {{joint}} {verb} with joint {{other}}')(context, cell, draws)
+
+
 EFFECT = Effect(
     name='joint_coupling',
     place='joint_angle',
@@ -49,12 +65,15 @@ EFFECT = Effect(
     equation='δq_j = c q_l, or a sin q_l + b cos q_l, l ≠ j',
     source='Sciavicco & Siciliano 2000, Modelling and Control, sec. 5 (coupled transmissions)',
     unit='rad/rad',
-    plausible=(1e-6, 1e-2),
+    plausible=(1e-6, LARGEST),
     sentence='The angle of {subject} follows the angle of {other} (coupled drives).',
     separate_by='poses that turn one of the two joints and hold the other',
     remedy='Check the coupling that is set in the controller for these joints; correct what '
     'is left by the angle of the other joint.',
-    size=up_to('joint {joint} turns with joint {other}'),
+    slide_sentence='The position of {subject} follows that of {other} (coupled drives).',
+    slide_remedy='Check the coupling that is set in the controller for these joints; correct what '
+    'is left by the position of the other joint.',
+    size=_coupled,
     cells=cells,
     cause_per='joints',
     driven_by_joint=True,

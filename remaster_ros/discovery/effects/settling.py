@@ -4,17 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-import numpy as np
-
 from remaster_ros.discovery.effects.base import Cell, Effect, needs_approach
 from remaster_ros.discovery.effects.context import Context
-from remaster_ros.discovery.effects.sizes import angle, largest
+from remaster_ros.discovery.effects.sizes import largest, of_joint, span_of
 from remaster_ros.types import FloatArray
 
 
 def cells(context: Context) -> Iterator[Cell]:
     """One cell per joint: δq_j = -s_j (q_j - from_q_j)."""
     return EFFECT.at_joints(
+        context,
         context.moving,
         lambda context, joint: [-context.last_move[:, joint - 1]],
         ['settling_{joint}'],
@@ -25,7 +24,8 @@ def cells(context: Context) -> Iterator[Cell]:
 def _short(context: Context, cell: Cell, draws: FloatArray) -> str:
     joint = cell.joints[0]
     move = largest(context.last_move[:, joint - 1])
-    return f'joint {joint} is {angle(draws[:, 0] * move)} short after {np.degrees(move):.0f}°'
+    short = of_joint(context, joint, draws[:, 0] * move)
+    return f'joint {joint} is {short} short after {span_of(context, joint, move)}'
 
 
 EFFECT = Effect(

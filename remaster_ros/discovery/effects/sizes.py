@@ -52,6 +52,17 @@ def length(values: FloatArray) -> str:
     return number(float(np.mean(values) / MM), float(np.std(values) / MM), ' mm')
 
 
+def of_joint(context: Context, joint: int, values: FloatArray) -> str:
+    """Return what adds to the position of a joint (1-based), rad or m: as angle or length."""
+    return length(values) if context.slides(joint) else angle(values)
+
+
+def span_of(context: Context, joint: int, span: float) -> str:
+    """Return how far a joint (1-based) goes, rad or m: '90°' or '600 mm'."""
+    shown = context.chain.shown_scale[joint - 1] * span
+    return f'{shown:.0f} mm' if context.slides(joint) else f'{shown:.0f}°'
+
+
 def along_mean(draws: FloatArray) -> FloatArray:
     """Return what draws (draws, c) have along the direction of their mean, (draws,).
 
@@ -69,7 +80,7 @@ def largest(values: FloatArray) -> float:
 
 
 def at_most(context: Context, cell: Cell, draws: FloatArray) -> str:
-    """Return the largest angle that a cell adds, less its mean, or its largest displacement.
+    """Return the most that a cell adds to a joint, less its mean, or its largest displacement.
 
     In the row where the mean of the draws has it: the largest of each draw would be larger.
     """
@@ -77,7 +88,7 @@ def at_most(context: Context, cell: Cell, draws: FloatArray) -> str:
     if columns.at is not None:
         turns = columns.values - columns.values.mean(axis=0)
         row = int(np.argmax(np.abs(turns @ draws.mean(axis=0))))
-        return angle(along_mean(draws @ turns[[row]].T))
+        return of_joint(context, columns.at + 1, along_mean(draws @ turns[[row]].T))
     row = int(np.argmax(np.linalg.norm(columns.values @ draws.mean(axis=0), axis=1)))
     return length(along_mean(draws @ columns.values[row].T))
 

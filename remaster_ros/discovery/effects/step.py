@@ -22,7 +22,7 @@ from remaster_ros.discovery.effects.base import (
     needs_time,
 )
 from remaster_ros.discovery.effects.context import Context
-from remaster_ros.discovery.effects.sizes import along_mean, angle, length
+from remaster_ros.discovery.effects.sizes import along_mean, angle, length, of_joint
 from remaster_ros.types import FloatArray
 
 MOMENTS = 40
@@ -72,8 +72,9 @@ def _in(context: Context, gaps: FloatArray) -> Iterator[Cell]:
                 partial(_slipped, joint=joint, gap=gap),
                 [f'joint_{joint}_step'],
                 joints=(joint,),
-                unit='rad',
-                largest=LARGEST_RAD,
+                unit=context.chain.units[joint - 1],
+                largest=LARGEST_RAD * context.chain.per_radian[joint - 1],
+                slide=context.slides(joint),
             )
         for index, name in enumerate(context.marker_names):
             yield at(
@@ -138,7 +139,7 @@ LARGEST_RAD = 2e-2
 
 def _jump(context: Context, cell: Cell, draws: FloatArray) -> str:
     if cell.place == 'joint_angle':
-        return f'joint {cell.joints[0]} by {angle(draws[:, 0])}'
+        return f'joint {cell.joints[0]} by {of_joint(context, cell.joints[0], draws[:, 0])}'
     way = length(along_mean(draws[:, :3]))
     turn = f' and {angle(along_mean(draws[:, 3:]))}' if cell.size > 3 else ''
     mean = draws[:, :3].mean(axis=0)

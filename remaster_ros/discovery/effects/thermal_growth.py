@@ -67,7 +67,7 @@ def needs_warming(context: Context) -> str:
 
 def _grown_by(context: Context, cell: Cell, draws: FloatArray) -> str:
     part = f'of link {cell.joints[0]}' if cell.joints else 'of the arm'
-    driver = driver_named(cell.driver, 0)
+    driver = driver_named(context, cell.driver, 0)
     assert driver is not None
     span = float(np.ptp(driver.value(context)))
     grows = 'grows' if draws.mean() >= 0.0 else 'shrinks'

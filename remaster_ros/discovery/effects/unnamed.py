@@ -36,7 +36,7 @@ from remaster_ros.types import BoolArray, FloatArray
 # All causes without a name together are this many times less likely than one that has a name.
 RARITY = 3
 # What an angle errs by is no larger without a name than with one, rad.
-LARGEST_RAD = max(joint_error_curve.EFFECT.plausible or ())
+LARGEST_RAD = joint_error_curve.LARGEST_RAD
 # Knots of a free form over the range of its driver.
 FREE_KNOTS = 10
 
@@ -135,29 +135,32 @@ def _joint_forms(context: Context, joint: int) -> Iterator[tuple[tuple[int, ...]
         return ((joints, form) for form in _forms(context, driver, *names))
 
     if joint in context.moving:
-        yield from by(angle_of(joint), 'quadratic')
+        yield from by(angle_of(context, joint), 'quadratic')
         if context.has_approach:
             # The other sign has a name: backlash and settling.
             for driver, sign in (
-                (approach_of(joint, 'approach'), -1),
-                (last_move_of(joint, 'last_move'), 1),
+                (approach_of(context, joint, 'approach'), -1),
+                (last_move_of(context, joint, 'last_move'), 1),
             ):
                 for joints, form in by(driver, 'linear'):
                     yield joints, replace(form, sign=sign)
     for driver in slow_drivers(context):
         yield from by(driver, 'linear', 'quadratic', 'free')
     if context.has_gravity:
-        yield from by(torque_of(joint), 'quadratic', 'free')
+        yield from by(torque_of(context, joint), 'quadratic', 'free')
     for other in range(1, context.joints + 1):
         if other == joint:
             continue
         if other in context.moving:
-            yield from by(angle_of(other, f'angle_of_joint_{other}'), 'quadratic', 'free')
+            driver = angle_of(context, other, f'angle_of_joint_{other}')
+            yield from by(driver, 'quadratic', 'free')
         if context.has_gravity:
-            yield from by(torque_of(other, f'gravity_torque_of_joint_{other}'), 'linear')
+            driver = torque_of(context, other, f'gravity_torque_of_joint_{other}')
+            yield from by(driver, 'linear')
         if context.has_approach and other in context.moving:
-            yield from by(approach_of(other, f'approach_of_joint_{other}'), 'linear')
-            yield from by(last_move_of(other, f'last_move_of_joint_{other}'), 'linear')
+            yield from by(approach_of(context, other, f'approach_of_joint_{other}'), 'linear')
+            driver = last_move_of(context, other, f'last_move_of_joint_{other}')
+            yield from by(driver, 'linear')
 
 
 def _joint_angles(context: Context) -> Iterator[Cell]:
@@ -168,7 +171,14 @@ def _joint_angles(context: Context) -> Iterator[Cell]:
             columns = partial(_at, joint=joint, form=form)
             unit = 1.0 if form.curve is not None else _rms(form.features(context))
             yield _cell(
-                'joint_angle', form, [stem], 'rad', columns, joints, largest=LARGEST_RAD / unit
+                'joint_angle',
+                form,
+                [stem],
+                context.chain.units[joint - 1],
+                columns,
+                joints,
+                largest=LARGEST_RAD * context.chain.per_radian[joint - 1] / unit,
+                slide=context.slides(joint),
             )
 
 
@@ -254,7 +264,10 @@ def _line_of_sight(context: Context, sensor: int, power: int) -> Design:
 def _frames(context: Context) -> Iterator[Cell]:
     """Base, markers and sensors: over time, by temperature, gravity, joint 1, range."""
     slow = [form for driver in slow_drivers(context) for form in _forms(context, driver, 'linear')]
-    for form in (*slow, *_forms(context, angle_of(1, 'angle_of_joint_1'), 'sin/cos')):
+    first = angle_of(context, 1, 'angle_of_joint_1')
+    # Of a rail what twists and bends it.
+    names = ('linear', 'quadratic') if context.slides(1) else ('sin/cos',)
+    for form in (*slow, *_forms(context, first, *names)):
         columns = partial(_rotated, turn=_base_turn, about=_base_origin, form=form)
         yield _cell('base_rotation', form, [f'base_r{axis}' for axis in 'xyz'], 'rad', columns)
     for index, marker in enumerate(context.marker_names):

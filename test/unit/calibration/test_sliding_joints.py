@@ -10,7 +10,6 @@ from worlds.arms import jointed_arm as arm
 from remaster_ros.calibration.fit import fit_session
 from remaster_ros.compensation.export import calibrated_urdf
 from remaster_ros.compensation.mastering import mastering
-from remaster_ros.discovery.discover import discover_session
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.session.reader import read_session
@@ -168,7 +167,6 @@ def test_the_zero_of_a_slide_at_a_fixed_direction_is_the_registrations(tmp_path)
 @pytest.mark.parametrize(
     'verb',
     [
-        ['discover', 'SESSION', '--out', 'OUT'],
         ['fit', 'SESSION', '--sampler', 'paper', '--out', 'OUT'],
         ['import', 'SESSION', '--out', 'OUT'],
     ],
@@ -180,11 +178,9 @@ def test_what_supposes_angles_refuses_a_slide_in_one_line(verb, measured, tmp_pa
     assert 'slides' in error
 
 
-def test_nothing_but_who_says_so_takes_a_slide(measured):
+def test_nothing_but_who_says_so_takes_a_slide():
     with pytest.raises(InputError, match="'j3' is prismatic"):
         SerialChain.from_urdf(STANFORD)
-    with pytest.raises(InputError, match="'j3' is prismatic"):
-        discover_session(read_session(measured[0] / 's'), rng=np.random.default_rng(0))
 
 
 def test_a_session_that_has_rad_for_a_slide_is_refused(measured, tmp_path):

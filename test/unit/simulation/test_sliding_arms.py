@@ -116,16 +116,25 @@ def test_intervals_hold_as_often_as_they_say(made, sessions):
         assert low <= np.mean(held) <= high
 
 
-def test_nothing_else_is_hidden_in_such_an_arm_and_discover_says_why_not(made, tmp_path):
+def test_an_effect_of_a_slide_is_hidden_in_metres_and_found(made, tmp_path):
+    size = ('--poses', '80', '--validation', '30', '--seed', '3', '--quiet')
+    cell = ('--cell', made / 'cell.yaml')
+    remaster('simulate', tmp_path / 's', *cell, *size, '--effect', 'backlash@3:0.4')
+    (hidden,) = json.loads((tmp_path / 's/truth.json').read_text())['effects']
+    assert (hidden['kind'], hidden['joints']) == ('backlash', [3])
+    remaster('discover', tmp_path / 's', '--out', tmp_path / 'd', '--no-figures', '--quiet')
+    (effect,) = json.loads((tmp_path / 'd/discovery.json').read_text())['effects']
+    assert (effect['name'], effect['joints']) == ('backlash', [3])
+    (found,) = effect['parameters']
+    assert found['unit'] == 'm'
+    assert abs(found['value'] - 0.5 * hidden['values'][0]) < 4.0 * found['std']
+
+
+def test_what_such_an_arm_cannot_show_is_refused(made, tmp_path):
     args = ('simulate', tmp_path / 'o', '--cell', made / 'cell.yaml', '--poses', 8)
-    error = refusal(*args, '--validation', 0, '--effect', 'backlash@2')
-    assert "joint 'j3' slides" in error
-    assert 'leave --effect out' in error
+    error = refusal(*args, '--validation', 0, '--effect', 'encoder_eccentricity@3')
+    assert 'encoder_eccentricity at joint 3: that joint slides, and has none' in error
     error = refusal(*args, '--orientation-noise-deg', 0.1)
     assert "joint 'j3' slides" in error
     assert 'no fit takes orientations of such an arm; leave their noise out' in error
     assert not (tmp_path / 'o').exists()
-    error = refusal('discover', made / 's', '--out', tmp_path / 'd')
-    assert "joint 'j3' is prismatic" in error
-    assert 'every command but discover takes' in error
-    assert not (tmp_path / 'd').exists()
