@@ -374,7 +374,7 @@ def with_directions(mode: Mode, stating: Sequence[int] = ()) -> Mode:
             other = noise_mode(tried)
             ratio = 2.0 * (other.log_evidence - mode.log_evidence)
             if sensor in stating or ratio > DIRECTION_LIMITS[more]:
-                mode, split = find_mode(tried, other.eta), [*split, sensor]
+                mode, split = find_mode(tried, other), [*split, sensor]
         except InsufficientDataError:
             continue
     return mode

@@ -106,19 +106,19 @@ class Mode:
         return root.T @ root
 
 
-def find_mode(posterior: Posterior, eta: FloatArray | None = None) -> Mode:
+def find_mode(posterior: Posterior, begun: Mode | None = None) -> Mode:
     """Find the mode by Gauss–Newton steps, the noise at the peak of its marginal density.
 
-    ``posterior``: with ``reference`` near the mode (see `initial_guess.robust_start`); ``eta``:
-    where to begin the search of the noise, (e,); from the errors at the reference where None.
+    ``posterior``: with ``reference`` near the mode (see `initial_guess.robust_start`); ``begun``:
+    the `noise_mode` there; the noise is guessed from the errors at the reference where None.
     Raises InsufficientDataError: when the steps do not settle: the rows do not determine the free
     parameters. The message names those along which they go.
     """
     z = posterior.reference
-    eta = _noise_guess(posterior) if eta is None else eta
+    eta = _noise_guess(posterior) if begun is None else begun.eta
     size, step = np.inf, np.zeros(len(posterior.free))
     previous, damping = step, 1.0
-    linearisation = linearise(posterior, z)
+    linearisation = linearise(posterior, z) if begun is None else begun.linearisation
     try:
         for count in range(MOST_STEPS):
             # Far from the mode the noise need not be exact.
@@ -209,8 +209,8 @@ def _bend(linearisation: Linearisation, step: FloatArray, eta: FloatArray) -> Fl
         second = (before - 2.0 * here + after) / BENT**2
         return np.concatenate((model.jacobian(z, rows)[:, :, free], second[:, :, None]), axis=2)
 
-    grams = posterior.noise_model.gram(joined, f + 1, f)
-    pull = (1.0 / posterior.variances(eta)) @ grams[:, 0, :f]
+    grams = posterior.noise_model.gram(joined, f + 1)
+    pull = (1.0 / posterior.variances(eta)) @ grams[:, f, :f]
     return np.asarray(-0.5 * np.linalg.solve(linearisation.gram(eta)[:f, :f], pull))
 
 

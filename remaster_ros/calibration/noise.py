@@ -288,15 +288,34 @@ class NoiseModel:
         sums = np.zeros((*errors.shape[:-2], len(self.error_groups)))
         for index, part in self._parts(self.rows, values, 0):
             sums[..., index] = np.einsum('ni...,ni...->...', part, part)
-        for index, parts in self._contained.items():
+        for index, parts in self.contained.items():
             sums[..., index] -= sums[..., parts].sum(axis=-1)
         # Cancellation may leave a value just below zero.
         return np.maximum(sums, 0.0)
 
-    def gram(
-        self, features: Callable[[Rows, slice], FloatArray], width: int, known: int = 0
-    ) -> FloatArray:
-        """Return the Gram matrix of features in each error group, (error groups, rows, width).
+    def gram(self, features: Callable[[Rows, slice], FloatArray], width: int) -> FloatArray:
+        """Return the Gram matrix of features in each error group, (error groups, width, width).
+
+        Parameters
+        ----------
+        features
+            As of `parts`.
+        width
+            Number of features.
+        """
+        result = np.zeros((len(self.error_groups), width, width))
+        for index, part in self.parts(features):
+            result[index] += part.T @ part
+        for index, others in self.contained.items():
+            result[index] -= result[others].sum(axis=0)
+        return result
+
+    def parts(
+        self, features: Callable[[Rows, slice], FloatArray]
+    ) -> Iterator[tuple[int, FloatArray]]:
+        """Give error groups with columns whose products are those of features, (r, width).
+
+        Each several times, less the products of what is `contained` in it.
 
         Parameters
         ----------
@@ -304,12 +323,7 @@ class NoiseModel:
             Rows, and where they are among all rows, to features (rows, 3, width), vectors in the
             coordinates of `Rows.target`; called with some thousand rows at a time, so that memory
             does not grow with their number.
-        width
-            Number of features.
-        known
-            The rows of so many first features are left out.
         """
-        result = np.zeros((len(self.error_groups), width - known, width))
         for first, last in self.rows.blocks(GRAM_ROWS):
             rows = self.rows.of_groups(first, last)
             start = int(self.rows.group_start[first])
@@ -318,18 +332,14 @@ class NoiseModel:
             if self.frames is not None:
                 values = self.frames[where] @ values
             for index, part in self._parts(rows, values, first):
-                flat = part.reshape(-1, width)
-                result[index] += flat[:, known:].T @ flat
-        for index, parts in self._contained.items():
-            result[index] -= result[parts].sum(axis=0)
-        return result
+                yield index, part.reshape(-1, values.shape[2])
 
     def _parts(
         self, rows: Rows, values: FloatArray, first: int
     ) -> Iterator[tuple[int, FloatArray]]:
         """Return of each error group the vectors whose squares its sum is made of.
 
-        Of 'frames' those of the means themselves, which contain the poses' means (`_contained`).
+        Of 'frames' those of the means themselves, which contain the poses' means (`contained`).
 
         ``rows``: n of the rows, whole groups from the one with index ``first`` on; ``values``:
         vectors in the axes of the channels, (n, 3, ...).
@@ -354,7 +364,7 @@ class NoiseModel:
                 yield index, values[span, axes] - mean[span]
 
     @cached_property
-    def _contained(self) -> dict[int, list[int]]:
+    def contained(self) -> dict[int, list[int]]:
         """Error groups of kind 'frames' -> those whose sums theirs contains at first."""
         return {
             index: [

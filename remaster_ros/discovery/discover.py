@@ -459,11 +459,12 @@ def by_names(found: Estimate, beside: _Beside) -> tuple[Solution, FloatArray]:
     data = beside.search.data
     members = by_members(beside.named, beside.search.families)
     weights = {} if beside.fit is None else beside.fit.weight_precisions()
-    shown = [family.cell for family in beside.kinds if family.cell in weights]
-    if not shown:
-        return members, np.zeros((found.model.size + len(members.parameters), 0))
-    unseen = [data.columns([cell]) * weights[cell] ** -0.5 for cell in shown]
-    return members, moved_by(found, data, members, np.concatenate(unseen, axis=2))
+    unseen = (
+        data.columns([family.cell]) * weights[family.cell] ** -0.5
+        for family in beside.kinds
+        if family.cell in weights
+    )
+    return members, moved_by(found, data, members, unseen)
 
 
 def _judged(

@@ -13,6 +13,10 @@ from scipy.linalg.lapack import dtpttr, dtrttp
 
 from remaster_ros.types import FloatArray, IntArray
 
+# Columns whose products are computed at once: what is beyond the diagonal is for nothing, and each
+# time the other columns are read again.
+TILE = 128
+
 
 def length(size: int) -> int:
     """Return how many numbers a matrix of so many rows takes."""
@@ -29,6 +33,15 @@ def of_rows(rows: FloatArray, first: int) -> FloatArray:
     size = rows.shape[-1]
     up_to_diagonal = np.arange(size) <= np.arange(first, size)[:, None]
     return rows[..., up_to_diagonal]
+
+
+def add_products(matrix: FloatArray, columns: FloatArray, first: int) -> None:
+    """Add to a packed matrix the products of columns (r, size), from its row ``first`` on."""
+    size = columns.shape[1]
+    for start in range(first, size, TILE):
+        end = min(start + TILE, size)
+        rows = columns[:, start:end].T @ columns[:, :end]
+        matrix[length(start) : length(end)] += of_rows(rows, start)
 
 
 def picked(matrices: FloatArray, order: IntArray) -> FloatArray:

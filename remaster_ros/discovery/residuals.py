@@ -247,12 +247,15 @@ class Residuals:
         joined = np.concatenate(columns, axis=2)
         norms = np.sqrt(np.einsum('nim,nim->m', joined, joined))
         joined[:, :, p + 1 :] /= units(cells, norms[p + 1 :])
-        more = self.noise_model.gram(lambda _, where: joined[where], len(norms), known)
-        # Matrices of a thousand columns are most of what a search holds: none is copied twice.
-        grams = np.empty((len(more), packed.length(len(norms))))
-        grams[:, : packed.length(known)] = first
-        for whole, rows in zip(grams, more, strict=True):
-            whole[packed.length(known) :] = packed.of_rows(rows, known)
+        # Matrices of a thousand columns are most of what a search holds: none is there twice.
+        model, done = self.noise_model, packed.length(known)
+        grams = np.zeros((len(model.error_groups), packed.length(len(norms))))
+        grams[:, :done] = first
+        for index, part in model.parts(lambda _, where: joined[where]):
+            packed.add_products(grams[index], part, known)
+        for index, others in model.contained.items():
+            for other in others:
+                grams[index, done:] -= grams[other, done:]
         # Fits are given parts of them.
         grams.setflags(write=False)
         return norms, grams

@@ -12,6 +12,7 @@ It chooses which cells are fitted; the evidence of the fits decides.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -170,8 +171,7 @@ def screen(
     adds nothing to the set.
     """
     project = _Projection(data, given)
-    white = data.noise_model.whitened(data.errors, given.noise).reshape(-1, 1)
-    residual = project.residual(white)
+    residual = project.residual(_white(data, data.errors, given.noise))
     total = float(np.sum(residual**2))
     residual = (residual / np.sqrt(total)).astype(np.float32)
     n_eff = 3 * len(data) - data.base.shape[2]
@@ -198,14 +198,19 @@ def rises(data: Residuals, given: Solution, cells: Sequence[Cell]) -> list[bool]
     ½ (|X'P y|² − tr X'P X), with P the precision of the rows (Patterson & Thompson 1971).
     """
     project = _Projection(data, given)
-    white = data.noise_model.whitened(data.errors, given.noise).reshape(-1, 1)
-    residual = project.residual(white).astype(np.float32)
+    errors = _white(data, data.errors, given.noise)
+    residual = project.residual(errors).astype(np.float32)
     found = []
     for cell in cells:
-        columns = data.noise_model.whitened(data.columns([cell]), given.noise)
-        left = project.residual(columns.reshape(len(white), -1).astype(np.float32))
+        columns = _white(data, data.columns([cell]), given.noise)
+        left = project.residual(columns.astype(np.float32))
         found.append(bool(np.sum((left.T @ residual) ** 2) > np.sum(left**2)))
     return found
+
+
+def _white(data: Residuals, values: NDArray[Any], noise: Noise) -> NDArray[Any]:
+    """Return vectors (n, 3, …) in units of the noise, (3n, c)."""
+    return data.noise_model.whitened(values, noise).reshape(3 * len(data), -1)
 
 
 class _Projection:
@@ -215,17 +220,21 @@ class _Projection:
     """
 
     def __init__(self, data: Residuals, given: Solution) -> None:
-        columns = data.columns(given.cells)
-        joined = np.concatenate((data.base, columns), axis=2)
-        white = data.noise_model.whitened(joined, given.noise).reshape(3 * len(data), -1)
+        p = data.base.shape[2]
+        edges = p + np.cumsum([0, *(cell.size for cell in given.cells)])
+        white = np.empty((3 * len(data), edges[-1]))
+        # One after the other: of a thousand columns every copy counts.
+        white[:, :p] = _white(data, data.base, given.noise)
+        for cell, (start, end) in zip(given.cells, itertools.pairwise(edges), strict=True):
+            white[:, start:end] = _white(data, data.columns([cell]), given.noise)
         # The factor of H, which is that of a fit: much less work than that of all the rows.
         H = white.T @ white
-        p = data.base.shape[2]
         H[:p, :p] += data.base_precision
         H[p:, p:] += given.prior_precision()
         scale = np.sqrt(np.diag(H))
         root = np.linalg.cholesky(H / np.outer(scale, scale))
-        top = solve_triangular(root, (white / scale).T, lower=True, check_finite=False).T
+        white /= scale
+        top = solve_triangular(root, white.T, lower=True, check_finite=False, overwrite_b=True).T
         # What the priors hold back.
         values, vectors = np.linalg.eigh(np.eye(len(H)) - top.T @ top)
         self.top, self.held = top, (vectors * np.sqrt(np.maximum(values, 0.0))).T
@@ -253,7 +262,7 @@ def _products(
     """Return the products of the columns of a batch, from what they displace in every row."""
     count, m = len(batch), int(catalogue.sizes[batch[0]])
     block = catalogue.block(catalogue.columns(batch))
-    white = data.noise_model.whitened(block, noise).reshape(3 * len(data), -1)
+    white = _white(data, block, noise)
     norm = np.linalg.norm(white, axis=0).reshape(count, m)
     if catalogue.penalised[batch[0]]:
         # The penalty compares neighbours: one unit for all of a cell's splines.

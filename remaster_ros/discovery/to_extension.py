@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
 
 from remaster_ros.calibration.estimate import Estimate
@@ -101,13 +103,17 @@ def _solved(
 
 
 def moved_by(
-    found: Estimate, data: Residuals, solution: Solution, displacements: FloatArray
+    found: Estimate, data: Residuals, solution: Solution, displacements: Iterable[FloatArray]
 ) -> FloatArray:
-    """Return how displacements (n, 3, c), m, beside the model move all fitted, (size + m, c)."""
+    """Return how displacements (n, 3, …), m, beside the model move all fitted, (size + m, c)."""
     white, root, where = _solved(found, data, solution)
-    others = data.noise_model.whitened(displacements, solution.noise).reshape(3 * len(data), -1)
-    moves = np.zeros((found.model.size + len(solution.parameters), others.shape[1]))
-    moves[where] = root @ (root.T @ (white.T @ others))
+    parts = [np.zeros((len(root), 0))]
+    for some in displacements:
+        others = data.noise_model.whitened(some, solution.noise).reshape(3 * len(data), -1)
+        parts.append(root @ (root.T @ (white.T @ others)))
+    together = np.concatenate(parts, axis=1)
+    moves = np.zeros((found.model.size + len(solution.parameters), together.shape[1]))
+    moves[where] = together
     return moves
 
 

@@ -147,7 +147,7 @@ def test_a_search_of_the_noise_that_begins_at_zero_does_not_stay_there(found) ->
     begun = found.mode.eta.copy()
     begun[2:] = 0.0
     assert np.all(found.mode.eta[2:] > 0.5)
-    again = find_mode(found.posterior, begun)
+    again = find_mode(found.posterior, replace(found.mode, eta=begun))
     np.testing.assert_allclose(again.eta, found.mode.eta, atol=1e-3)
 
 

@@ -39,3 +39,14 @@ def test_further_rows_follow_those_that_are_packed(first):
     whole = symmetric(6, 2, 5)
     parts = packed.of_rows(whole[:, :first, :first], 0), packed.of_rows(whole[:, first:], first)
     assert np.array_equal(np.concatenate(parts, axis=1), packed.of_rows(whole, 0))
+
+
+def test_products_are_added_row_by_row_and_in_tiles() -> None:
+    size, first = packed.TILE + 40, 17
+    columns = np.random.default_rng(4).standard_normal((30, size))
+    wanted = packed.of_rows((columns.T @ columns)[None], 0)[0]
+    matrix = wanted.copy()
+    packed.add_products(matrix, columns, first)
+    known = packed.length(first)
+    assert np.array_equal(matrix[:known], wanted[:known])
+    np.testing.assert_allclose(matrix[known:], 2.0 * wanted[known:], rtol=1e-12, atol=1e-12)
