@@ -28,6 +28,7 @@ from remaster_ros.importing.columns import Told
 from remaster_ros.importing.rows import RawRows, TableOptions, from_tool, read_rows
 from remaster_ros.importing.sense import Sense, check_sense
 from remaster_ros.importing.sessions import Stretch, arrangement_of, mended
+from remaster_ros.importing.turns import oriented
 from remaster_ros.importing.units import ANGLES, LENGTHS
 from remaster_ros.kinematics.pad_angles import pad_in_words
 from remaster_ros.kinematics.serial_chain import SerialChain
@@ -273,10 +274,11 @@ def run(args: argparse.Namespace) -> int:
         chain = SerialChain.from_urdf(urdf, base, args.tip_link or cell.robot.tip_link)
     with progress_bar(args.quiet or args.json) as progress:
         progress('reading', 0.0)
-        rows = _read(args, chain).in_order()
+        told = _session_options(args, cell)
+        rows = oriented(_read(args, chain).in_order(), chain, told)
         if args.on_tool:
             rows = from_tool(rows)
-        options, counted = as_counted(rows, chain, _session_options(args, cell))
+        options, counted = as_counted(rows, chain, told)
         notes = f'imported from {", ".join(path.name for path in args.files)}'
         rng = np.random.default_rng(args.seed)
         session, how = assemble(rows, urdf, chain, options, rng, notes)

@@ -64,7 +64,7 @@ _NOT_MEASURED = {
     *('error', 'err', 'dev', 'deviation', 'delta', 'd', 'diff', 'rot', 'normal', 'offset'),
     *('vel', 'velocity', 'force', 'orientation', 'quaternion', 'rotation', 'tol', 'tolerance'),
     *('abw', 'abweichung', 'differenz', 'fehler', 'écart', 'ecart', 'desv', 'desviación'),
-    *('scarto', 'residual', 'toleranz'),
+    *('scarto', 'residual', 'toleranz', 'quat', 'rotvec', 'rvec', 'euler'),
 }
 _WORDS = {
     'name': {
@@ -105,6 +105,9 @@ class Columns:
     points: dict[str, tuple[int, ...]] = field(default_factory=dict)
     stds: dict[str, tuple[int, ...]] = field(default_factory=dict)
     orientations: dict[str, tuple[int, ...]] = field(default_factory=dict)
+    # Columns of an orientation that do not tell how it turns: three angles, or a quaternion
+    # without letters.
+    turned: tuple[int, ...] = ()
     # Kind (``name``, ``time``, ``pose``, …) -> columns.
     others: dict[str, list[int]] = field(default_factory=lambda: defaultdict(list))
     # Column -> unit of its header.
@@ -445,26 +448,59 @@ _NAME_POINTS = (
 
 
 def _orientations(headers: Sequence[_Header], taken: set[int], found: Columns) -> None:
-    """Find the quaternions that were measured beside the points."""
+    """Find the orientations that were measured beside the points of one marker."""
     groups: dict[tuple[str, ...], dict[str, int]] = defaultdict(dict)
     for i, header in enumerate(headers):
-        words = header.words
-        for at, word in enumerate(words):
-            axis = re.fullmatch(r'(?:q|quat|orientation)?_?([xyzw])', word)
-            turned = axis and (
-                len(word) > 1 or {'quaternion', 'orientation', 'rotation'} & set(words)
-            )
-            if turned and axis and i not in taken:
-                rest = (*words[:at], *words[at + 1 :])
-                groups[tuple(word for word in rest if word not in _TURNED)][axis[1]] = i
-    complete = [columns for columns in groups.values() if len(columns) == 4]
-    if len(found.points) == 1 and len(complete) == 1:
-        (marker,) = found.points
-        found.orientations[marker] = tuple(complete[0][axis] for axis in 'xyzw')
-        _take(found, found.orientations[marker], taken)
+        if i not in taken and header.unit in ('', *ANGLES):
+            rest, axis = _turn_of(header.words)
+            if axis:
+                groups[rest].setdefault(axis, i)
+    if len(found.points) != 1:
+        return
+    (marker,) = found.points
+    complete = [
+        tuple(columns[axis] for axis in names)
+        for columns in groups.values()
+        for names in ('xyzw', *_ANGLES, '0123', '1234')
+        if {*columns} == {*names}
+    ]
+    if len(complete) == 1:
+        _take(found, complete[0], taken)
+        if {*'xyzw'} in map(set, groups.values()):
+            found.orientations[marker] = complete[0]
+        else:
+            found.turned = complete[0]
 
 
-_TURNED = {'quaternion', 'quat', 'orientation', 'rotation', 'q'}
+_TURNED = {
+    *('quaternion', 'quat', 'orientation', 'rotation', 'rot', 'q', 'rotvec', 'rvec', 'euler'),
+}
+# Names of three angles, in their order.
+_ANGLES = (
+    ('roll', 'pitch', 'yaw'),
+    ('omega', 'phi', 'kappa'),
+    ('alpha', 'beta', 'gamma'),
+    *(tuple('xyz'), tuple('abc'), tuple('wpr')),
+)
+_AS_AXIS = {'i': 'x', 'j': 'y', 'k': 'z', 'r': 'w'}
+
+
+def _turn_of(words: tuple[str, ...]) -> tuple[tuple[str, ...], str]:
+    """Return the words around the name of an angle, or of a number of a quaternion, and that."""
+    turned = {*words} & _TURNED
+    for at, word in enumerate(words):
+        rest = tuple(w for w in (*words[:at], *words[at + 1 :]) if w not in _TURNED)
+        if any(word in names for names in _ANGLES[:3]):
+            return rest, word
+        if axis := re.fullmatch(r'(?:q|quat|orientation|rot|r)_?([xyz])|(?:q|quat)_?w', word):
+            return rest, axis[1] or 'w'
+        if axis := re.fullmatch(r'q([ijkr])', word):
+            return rest, _AS_AXIS[axis[1]]
+        if turned and re.fullmatch(r'[xyzw]|[0-4]', word):
+            return rest, word
+        if len(words) == 1 and word in 'abcwpr':
+            return rest, word
+    return (), ''
 
 
 def _with_axis(words: Sequence[str]) -> tuple[str, ...]:

@@ -18,6 +18,7 @@ from remaster_ros.importing.assemble import (
 )
 from remaster_ros.importing.rows import RawRows, TableOptions, read_rows
 from remaster_ros.importing.sense import check_sense
+from remaster_ros.importing.turns import oriented
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.types import FloatArray, Session
 
@@ -57,7 +58,7 @@ def of_files(
 ) -> Session:
     """Return the session of one table or of two that are joined; see `import_table`."""
     urdf, chain = robot
-    rows = read_rows(paths, chain, options).in_order()
+    rows = oriented(read_rows(paths, chain, options).in_order(), chain, corrections)
     notes = f'imported from {", ".join(path.name for path in paths)}'
     return _made(rows, urdf, chain, corrections, seed, notes)
 

@@ -365,6 +365,11 @@ class RawRows:
     # Quaternion x, y, z, w of the marker in the sensor's frame, (n, 4), NaN where unknown; None
     # where none was measured
     orientation: FloatArray | None = None
+    # Columns of one that do not tell how it turns, (n, 3) or (n, 4), their unit, '' where none is
+    # stated, and their names
+    turned: FloatArray | None = None
+    turned_unit: str = ''
+    turned_columns: str = ''
     # Joint column -> (another one, 1 or -1), as the controller of this file counts
     coupling: Mapping[str, tuple[str, Literal[1, -1]]] = field(default_factory=dict)
     maker: str = ''  # Of the controller; '' where it is not known
@@ -610,6 +615,15 @@ def _values(
         angle_unit=cast(AngleUnit | None, angle),
         reading=row if several else None,
         orientation=turns[marker, row] if columns.orientations else None,
+        turned=numbers(table, columns.turned, optional=True)[row] if columns.turned else None,
+        turned_unit=columns.units.get(columns.turned[0], '') if columns.turned else '',
+        turned_columns=', '.join(
+            table.names[i]
+            for i in (
+                *columns.turned,
+                *itertools.chain.from_iterable(columns.orientations.values()),
+            )
+        ),
         coupling=joints[0].coupling,
         maker=joints[0].maker,
     )
@@ -705,6 +719,8 @@ def _meaning(
             return f'standard deviation of {AXES[spread.index(i)]} of {of}, {length}'
         if length and i in turned:
             return f'{"xyzw"[turned.index(i)]} of the quaternion of {of}{by_place}'
+    if length and i in columns.turned:
+        return f'orientation of the marker{by_place}'
     for kind, places in columns.others.items():
         if i in places:
             return f'{kind}{by_place}'

@@ -630,7 +630,7 @@ def _means(
                 rows=tuple(rows),
                 lines=tuple(lines),
             ),
-            replace(columns, stds=spread, others=defaultdict(list, others)),
+            replace(columns, stds=spread, others=defaultdict(list, others), turned=()),
         ),
         unsteady,
     )

@@ -1,0 +1,181 @@
+"""Orientations whose columns do not say how they turn: the one that turns as the arm did.
+
+Euler angles have 24 orders, a quaternion two; a rotation vector looks like angles. From one row to
+another the tool turned as the measured body did, but for how that stands on the tool, and the
+sensor in the room. The points tell the latter as well. Only the right way to read the columns
+agrees with both.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from remaster_ros.importing.assemble import SessionOptions, controller_of
+from remaster_ros.importing.rows import RawRows
+from remaster_ros.kinematics.pad_angles import PadAngles
+from remaster_ros.kinematics.serial_chain import SerialChain
+from remaster_ros.kinematics.transforms import inverse_poses
+from remaster_ros.types import FloatArray
+
+# Orientations that agree so well with the nominal arm are computed from its joints, rad; rounded
+# to a hundredth of a degree they do.
+OWN_RAD = 2e-4
+# Zero-offsets of some degrees turn the tool by so much, rad; others that agree so well beside the
+# best one leave it open.
+AGREE_RAD, OTHER_RAD = 0.1, 0.02
+# Largest difference of how the sensor stands, by the points and by the orientations, rad.
+SENSOR_RAD = 0.2
+# Of fewer rows nothing is told.
+FEWEST_ROWS = 8
+# At half a turn a rotation vector may as well be its opposite, rad.
+_HALF_TURN_RAD = 2.9
+_REFERENCES = 5
+
+
+def oriented(rows: RawRows, chain: SerialChain, options: SessionOptions) -> RawRows:
+    """Return rows with what their columns of an orientation mean, or without it, and say so."""
+    if (rows.turned is None and rows.orientation is None) or chain.slides.any():
+        return rows
+    joints = [
+        PadAngles.of(controller_of(rows, chain, one), chain.joint_names).to_urdf(rows.q)
+        for one in (options, replace(options, couple=(*options.couple, *rows.coupling.items())))
+    ]
+    arms = [chain.forward(q) for q in joints]
+    if rows.turned is None:
+        assert rows.orientation is not None
+        if options.on_tool or len(np.unique(rows.labels.get('marker', ['']))) > 1:
+            return rows
+        anyhow = _apart(rows, rows.orientation, arms, False, anyhow=True)
+        if anyhow < OWN_RAD:
+            return _without(rows, _OF_THE_ROBOT)
+        if anyhow < AGREE_RAD < _apart(rows, rows.orientation, arms, False):
+            return _without(rows, 'are in another frame than the points')
+        return rows
+    found = [
+        (_apart(rows, xyzw, arms, options.on_tool), words, xyzw)
+        for words, xyzw in _readings(rows.turned, rows.turned_unit)
+    ]
+    if not found:
+        return _without(rows, 'are no quaternions')
+    found.sort(key=lambda one: one[0])
+    error, words, xyzw = found[0]
+    others = [
+        other for apart, _, other in found[1:] if apart < max(2.0 * error, error + OTHER_RAD)
+    ]
+    if min(_apart(rows, one, arms, options.on_tool, anyhow=True) for *_, one in found) < OWN_RAD:
+        return _without(rows, _OF_THE_ROBOT)
+    if error > AGREE_RAD:
+        return _without(rows, 'turn otherwise than the arm, however they are read')
+    if any(_different(xyzw, other) for other in others):
+        return _without(rows, 'can be read in several ways, which fit the arm alike')
+    return replace(
+        rows,
+        orientation=xyzw,
+        turned=None,
+        warnings=(
+            *rows.warnings,
+            f'{rows.turned_columns}: read as {words}, which turns as the arm did to '
+            f'{np.degrees(error):.2f} degrees',
+        ),
+    )
+
+
+_OF_THE_ROBOT = 'are how the robot itself believes its tool to be turned, not measured'
+
+
+def _without(rows: RawRows, why: str) -> RawRows:
+    note = f'{rows.turned_columns or "the orientations"} {why}; left out'
+    return replace(rows, orientation=None, turned=None, warnings=(*rows.warnings, note))
+
+
+def _readings(values: FloatArray, unit: str) -> Iterator[tuple[str, FloatArray]]:
+    """Give the ways to read columns (n, 3) or (n, 4), in words, and their quaternions (n, 4)."""
+    known = np.isfinite(values).all(axis=1)
+    if values.shape[1] == len('xyzw'):
+        lengths = np.linalg.norm(values[known], axis=1)
+        if np.all(np.abs(lengths - 1.0) < 0.01):
+            yield 'a quaternion w, x, y, z', values[:, [1, 2, 3, 0]]
+            yield 'a quaternion x, y, z, w', values
+        return
+    largest = np.abs(values[known]).max(initial=0.0)
+    units = [unit] if unit else ['deg'] if largest > 2.1 * np.pi else ['rad', 'deg']
+    for name in units:
+        angles = np.deg2rad(values[known]) if name == 'deg' else values[known]
+        ways = [(f'a rotation vector, {name}', Rotation.from_rotvec(angles))]
+        for axes in itertools.product('xyz', repeat=3):
+            order = ''.join(axes)
+            if axes[0] != axes[1] != axes[2]:
+                ways += [
+                    (
+                        f'angles about fixed axes {order}, {name}',
+                        Rotation.from_euler(order, angles),
+                    ),
+                    (
+                        f"angles about turned axes {order[0]}, {order[1]}', {order[2]}'', {name}",
+                        Rotation.from_euler(order.upper(), angles),
+                    ),
+                ]
+        for words, turned in ways:
+            xyzw = np.full((len(values), 4), np.nan)
+            xyzw[known] = turned.as_quat()
+            yield words, xyzw
+
+
+def _apart(
+    rows: RawRows, xyzw: FloatArray, arms: list[FloatArray], on_tool: bool, anyhow: bool = False
+) -> float:
+    """Return by how much measured turns differ from those of the arm, rad (median).
+
+    The arm's tool poses are (n, 4, 4) each. If not `anyhow`, it is inf where the sensor stands
+    otherwise than the points say.
+    """
+    known = np.flatnonzero(np.isfinite(xyzw).all(axis=1))
+    if len(known) < FEWEST_ROWS:
+        return np.inf
+    position, xyzw = rows.position[known], xyzw[known]
+    if on_tool:
+        position, xyzw = inverse_poses(position, xyzw)
+    measured = Rotation.from_quat(xyzw)
+    errors = []
+    for T in arms:
+        arm = Rotation.from_matrix(T[known, :3, :3])
+        by_points = _sensor_turn(position, T[known])
+        for first in range(min(_REFERENCES, len(known))):
+            a = (measured * measured[first].inv()).as_rotvec()
+            b = (arm * arm[first].inv()).as_rotvec()
+            size = np.maximum(np.linalg.norm(a, axis=1), np.linalg.norm(b, axis=1))
+            used = (size < _HALF_TURN_RAD) & (np.arange(len(a)) != first)
+            if used.sum() < FEWEST_ROWS - 2:
+                continue
+            sensor = Rotation.align_vectors(a[used], b[used])[0]
+            if anyhow or (sensor.inv() * by_points).magnitude() < SENSOR_RAD:
+                errors.append(np.median(np.linalg.norm(a - sensor.apply(b), axis=1)[used]))
+    return float(min(errors, default=np.inf))
+
+
+def _sensor_turn(position: FloatArray, T: FloatArray) -> Rotation:
+    """Return how the base is turned in the sensor's frame, by the points of one marker.
+
+    B p + e - R m = t is linear in the 15 numbers of B, e and m; B is the inverse turn.
+    """
+    n = len(T)
+    A = np.zeros((3 * n, 15))
+    for axis in range(3):
+        A[axis::3, 3 * axis : 3 * axis + 3] = position
+        A[axis::3, 9 + axis] = 1.0
+    A[:, 12:] = -T[:, :3, :3].reshape(3 * n, 3)
+    B = np.linalg.lstsq(A, T[:, :3, 3].ravel(), rcond=None)[0][:9].reshape(3, 3)
+    u, _, vt = np.linalg.svd(B.T)
+    return Rotation.from_matrix(u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt)
+
+
+def _different(xyzw: FloatArray, other: FloatArray) -> bool:
+    """Return whether two readings are of different orientations."""
+    known = np.isfinite(xyzw).all(axis=1)
+    between = Rotation.from_quat(xyzw[known]).inv() * Rotation.from_quat(other[known])
+    return bool(np.median(between.magnitude()) > OTHER_RAD / 4.0)
