@@ -389,9 +389,7 @@ def plan(
     workcell = read_cell(os.fspath(cell))
     counts = {'optimization': poses, 'validation': validation_poses}
     rng = np.random.default_rng(seed)
-    return plan_tour(
-        workcell.chain(sliding=True), workcell, None, counts, rng, without_meshes=False
-    )
+    return plan_tour(workcell.chain(), workcell, None, counts, rng, without_meshes=False)
 
 
 def read_compensation(path: str | os.PathLike[str]) -> Compensation:

@@ -79,9 +79,7 @@ class Problem:
         InsufficientDataError
             Too few observations, of one sensor or of all.
         """
-        chain = SerialChain.from_urdf(
-            session.urdf, session.base_link, session.tip_link, sliding=True
-        )
+        chain = SerialChain.from_urdf(session.urdf, session.base_link, session.tip_link)
         given = session.measurements
         if given.q.shape[1:] != (len(chain),):
             raise InputError(

@@ -164,7 +164,7 @@ def sound_estimate(session: Session, priors: Priors | None = None) -> Estimate:
 
 
 def _named(session: Session, mistakes: Mistakes, what: str) -> MistakeFoundError:
-    chain = SerialChain.from_urdf(session.urdf, session.base_link, session.tip_link, sliding=True)
+    chain = SerialChain.from_urdf(session.urdf, session.base_link, session.tip_link)
     columns = Columns(chain.joint_names, chain.joint_names)
     sentence, options = in_a_sentence(mistakes, session, columns)
     return MistakeFoundError(f'{what}; {sentence}', options)

@@ -53,7 +53,7 @@ def run(args: argparse.Namespace) -> int:
     """Judge the offsets, print a table, write JSON with --out."""
     session = read_to_fit(args.session)
     fit = read_fit(args.offsets)
-    chain = SerialChain.from_urdf(session.urdf, session.base_link, session.tip_link, sliding=True)
+    chain = SerialChain.from_urdf(session.urdf, session.base_link, session.tip_link)
     offsets, std = joint_offsets_of(fit, chain)
     warn_of_another_urdf(fit, session, args.offsets)
     if args.out is not None and args.out.exists():

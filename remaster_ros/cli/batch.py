@@ -16,7 +16,7 @@ import multiprocessing
 import os
 import threading
 import urllib.parse
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import (
     FIRST_COMPLETED,
     CancelledError,
@@ -260,14 +260,17 @@ def _of_fit(path: Path) -> dict[str, Any]:
             side: None if not held_out.get(side) else held_out[side]['mean_mm']
             for side in ('before', 'after')
         },
-        'joints': [
-            {
-                'joint': one['joint'],
-                'mean_deg': one['mean_deg'] if one['identifiable'] else None,
-                'std_deg': one['std_deg'] if one['identifiable'] else None,
-            }
-            for one in content['joint_offsets']
-        ],
+        'joints': [_offset(one) for one in content['joint_offsets']],
+    }
+
+
+def _offset(one: Mapping[str, Any]) -> dict[str, Any]:
+    """Return an offset of fit.json, in degrees, or in mm where it has no degrees."""
+    known, unit = one['identifiable'], one.get('unit', 'deg')
+    row = {'joint': one['joint'], 'mean_deg': None, 'std_deg': None}
+    row |= {} if unit == 'deg' else {'unit': unit}
+    return row | {
+        f'{key}_{unit}': one[f'{key}_{unit}'] if known else None for key in ('mean', 'std')
     }
 
 

@@ -59,9 +59,7 @@ def run(args: argparse.Namespace) -> int:
         require_other_session(session, other)
     pairs: tuple[tuple[Named, Named], ...] = ()
     if args.decide is not None:
-        chain = SerialChain.from_urdf(
-            session.urdf, session.base_link, session.tip_link, sliding=True
-        )
+        chain = SerialChain.from_urdf(session.urdf, session.base_link, session.tip_link)
         pairs = earlier_pairs(args.decide, chain.joint_names)
     with undone_on_failure(), progress_bar(args.quiet or args.json) as progress:
         prepare_folder(args.out, DISCOVERY_FILE)

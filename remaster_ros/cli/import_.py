@@ -324,7 +324,7 @@ def _mend(args: argparse.Namespace) -> int:
     if args.points and points not in ([*'xyz'], [*'yxz'], ['y_m', 'x_m', 'z_m']):
         raise InputError('--points: of a session X and Y can be exchanged; give y_m,x_m,z_m')
     session = read_session(folder, within_limits=False)
-    chain = SerialChain.from_urdf(session.urdf, session.base_link, session.tip_link, sliding=True)
+    chain = SerialChain.from_urdf(session.urdf, session.base_link, session.tip_link)
     for joint in np.flatnonzero(chain.slides)[:1]:
         raise InputError(
             f"{folder}: joint '{chain.joint_names[joint]}' slides, and a session of such an arm "

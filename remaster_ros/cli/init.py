@@ -115,7 +115,7 @@ def run(args: argparse.Namespace) -> int:
         planned: dict[str, Any] = {}
         text = ''
         if args.no_plan:
-            scene = cell.planning_scene(cell.chain(sliding=True), without_meshes=missing)
+            scene = cell.planning_scene(cell.chain(), without_meshes=missing)
             tour = Tour(scene.model.chain, {FITTED: tried}, model=scene.model)
             reached, of = _reached(scene, tour, args.seed)
         else:
@@ -162,7 +162,7 @@ def _propose(
         tips = likely_tips(model, base)
         tip = tips[0] if args.tip_link is None else args.tip_link
         before = moving_before(model, base)
-        chain = SerialChain.from_urdf(text, base, tip, sliding=True)
+        chain = SerialChain.from_urdf(text, base, tip)
         reach = reach_of(chain, rng)
         place = args.sensor_at or [
             reach.reach_m + SENSOR_BEHIND_M,
@@ -262,7 +262,7 @@ def _plan(
 
     Returns it as JSON, in words, and what `with_free_way` does.
     """
-    chain = cell.chain(sliding=True)
+    chain = cell.chain()
     scene = cell.planning_scene(chain, without_meshes=without_meshes)
     counts = {'optimization': CANDIDATES, 'validation': CANDIDATES}
     try:

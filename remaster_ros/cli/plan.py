@@ -100,7 +100,7 @@ def run(args: argparse.Namespace) -> int:
     if args.out is not None:
         check_plan_page(args.out)
     cell = read_cell(args.cell)
-    scene = cell.planning_scene(cell.chain(sliding=True))
+    scene = cell.planning_scene(cell.chain())
     with progress_bar(args.quiet or args.json) as progress:
         progress('planning', 0.0)
         plan = planned(cell, scene, args, lambda share: progress('planning', share))

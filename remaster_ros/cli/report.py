@@ -48,7 +48,7 @@ def run(args: argparse.Namespace) -> int:
     """Read or fit, write the page, print the answer in a few lines."""
     fit_path, found_path = parts(args.results)
     session = read_to_fit(args.session)
-    chain = SerialChain.from_urdf(session.urdf, session.base_link, session.tip_link, sliding=True)
+    chain = SerialChain.from_urdf(session.urdf, session.base_link, session.tip_link)
     plan = read_plan(args.session, chain)
     out = args.out or Path(f'{args.session.resolve().name}-report')
     # Matplotlib takes a second to import: after what may be refused at once.

@@ -94,7 +94,7 @@ def _together(configuration: IntArray, wanted: FloatArray, units: JointUnits) ->
 
 
 def _chain(session: Session) -> SerialChain:
-    return SerialChain.from_urdf(session.urdf, session.base_link, session.tip_link, sliding=True)
+    return SerialChain.from_urdf(session.urdf, session.base_link, session.tip_link)
 
 
 def _on(session: Session, folder: Path) -> BoolArray:

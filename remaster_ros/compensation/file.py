@@ -471,7 +471,7 @@ def _model(content: CompensationPart) -> ArmModel:
     robot = content.robot
     if hashlib.sha256(robot.urdf.encode()).hexdigest() != robot.urdf_sha256:
         raise _broken('robot.urdf', 'is not the text whose hash is urdf_sha256')
-    chain = SerialChain.from_urdf(robot.urdf, robot.base_link, robot.tip_link, sliding=True)
+    chain = SerialChain.from_urdf(robot.urdf, robot.base_link, robot.tip_link)
     names = chain.joint_names
     for where, given in (
         ('robot.joint_names', robot.joint_names),

@@ -68,7 +68,7 @@ def check_sense(session: Session, rows: RawRows, progress: Callable[[str, float]
     """
     # The marker is left free: one that is firm at a wrong place would bend the fit.
     part = replace(session, marker_std_m=UNKNOWN_MARKER_STD_M)
-    chain = SerialChain.from_urdf(session.urdf, session.base_link, session.tip_link, sliding=True)
+    chain = SerialChain.from_urdf(session.urdf, session.base_link, session.tip_link)
     if too_few := _too_few(session, len(chain)):
         return Sense(False, too_few)
     progress('trying', 0.1)

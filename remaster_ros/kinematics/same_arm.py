@@ -97,7 +97,7 @@ def _read(chain: SerialChain, description: str) -> tuple[SerialChain, bool, bool
         last = links[chain.joint_names[-1]]
         has_tip = model.carrier(chain.tip_link, [last])[0] == last
         tip = chain.tip_link if has_tip else last
-        other = SerialChain.from_urdf(description, base, tip, sliding=True)
+        other = SerialChain.from_urdf(description, base, tip)
     except InputError as error:
         return str(error)
     if other.joint_names != chain.joint_names:

@@ -3,9 +3,8 @@
 The true joint angle is the reported one plus the zero-offset, everywhere. All methods take any
 number of leading dimensions in ``q``, ``points`` and ``joint_offsets``, and broadcast them.
 
-A joint that slides (prismatic) has metres where others have radians, in all of these arrays. Some
-of what takes a chain supposes angles (causes of errors, their correction), so
-`SerialChain.from_urdf` refuses such a joint unless its caller states that it takes them.
+A joint that slides (prismatic) has metres where others have radians, in all of these arrays: its
+unit is that of `SerialChain.units`, for people that of `shown_units`.
 """
 
 from __future__ import annotations
@@ -66,8 +65,6 @@ class SerialChain:
         text: str,
         base_link: str | None = None,
         tip_link: str | None = None,
-        *,
-        sliding: bool = False,
     ) -> SerialChain:
         """Read the chain from URDF text.
 
@@ -82,8 +79,6 @@ class SerialChain:
             Frame R; the root link where None.
         tip_link
             Frame T; where None, the only link that carries no other.
-        sliding
-            Whether the caller takes metres where a joint slides; else such an arm is refused.
 
         Raises
         ------
@@ -107,7 +102,7 @@ class SerialChain:
         for joint in joints:
             T_fixed[-1] = T_fixed[-1] @ joint.origin
             if joint.kind != 'fixed':
-                _require_kind(joint, sliding)
+                _require_kind(joint)
                 moving.append(joint)
                 T_fixed.append(np.eye(4))
         if not moving:
@@ -414,14 +409,8 @@ def _joints_between(model: UrdfModel, base_link: str, tip_link: str) -> list[Urd
     return joints[::-1]
 
 
-def _require_kind(joint: UrdfJoint, sliding: bool) -> None:
-    if joint.kind == 'prismatic':
-        if not sliding:
-            raise InputError(
-                f"URDF: joint '{joint.name}' is prismatic; this needs joints that turn, between "
-                'other links'
-            )
-    elif joint.kind not in ('revolute', 'continuous'):
+def _require_kind(joint: UrdfJoint) -> None:
+    if joint.kind not in ('revolute', 'continuous', 'prismatic'):
         raise InputError(
             f"URDF: joint '{joint.name}' is {joint.kind}; "
             'only revolute, continuous, prismatic and fixed joints are supported between base and '

@@ -375,7 +375,7 @@ def enough_candidates(cell: Workcell, seed: int, asked: int) -> int:
 
     `asked` as well where `MOST_CANDIDATES` do not leave so many: then the planner says why.
     """
-    scene = cell.planning_scene(cell.chain(sliding=True))
+    scene = cell.planning_scene(cell.chain())
     for count in range(asked, MOST_CANDIDATES + 1):
         if TourPlanner(scene, {'optimization': count}, seed).left_to_fit >= TO_FIT:
             return count
@@ -419,9 +419,13 @@ class Demo:
         # Refused before anything is written.
         self.requests = [EffectSpec.parse(text) for text in self.p.hide.split(',') if text]
         cell = read_cell(self.p.cell)
-        if self.p.apply:
-            # No joint may slide: what is corrected are angles.
-            cell.chain()
+        chain = cell.chain()
+        if self.p.apply and chain.slides.any():
+            sliding = chain.joint_names[int(np.argmax(chain.slides))]
+            raise InputError(
+                f"apply: joint '{sliding}' slides, and no node corrects what such an arm is "
+                'commanded; leave it out'
+            )
         self.candidates = enough_candidates(cell, self.p.seed, self.p.candidates)
         if self.candidates > self.p.candidates:
             self.console.print(

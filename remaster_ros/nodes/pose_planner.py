@@ -115,8 +115,6 @@ class FurtherMeasuring:
             return '' if under_way else None, None
         if self._journal.tour is not None and self._journal.tour.judges:
             return 'it was no calibration; name a new session folder', None
-        if self._tours.model.chain.slides.any():
-            return 'causes of an arm with a joint that slides are not looked for', None
         # Imported when it is needed, as it takes a while.
         from remaster_ros.reports.discovery_json import read_causes
         from remaster_ros.reports.fit_json import DISCOVERY_FILE
@@ -259,13 +257,12 @@ class Parameters(JudgingParameters):
 
     def refuse_what_supposes_angles(self, chain: SerialChain) -> None:
         """Raise `InputError` for a parameter that is for arms alone whose joints all turn."""
-        for name in ('separate', 'compensation'):
-            if getattr(self, name) and chain.slides.any():
-                sliding = chain.joint_names[int(np.argmax(chain.slides))]
-                raise InputError(
-                    f"pose_planner: joint '{sliding}' slides, and {name} is for arms whose joints "
-                    'all turn; leave that parameter empty'
-                )
+        if self.compensation and chain.slides.any():
+            sliding = chain.joint_names[int(np.argmax(chain.slides))]
+            raise InputError(
+                f"pose_planner: joint '{sliding}' slides, and compensation is for arms whose "
+                'joints all turn; leave that parameter empty'
+            )
 
     def causes(self, joint_names: Sequence[str]) -> tuple[FoundCause, ...]:
         """Return the causes that the plan is to separate; errors as of `read_causes`."""
@@ -631,7 +628,7 @@ class PosePlanner(RemasterNode):
         super().__init__('pose_planner')
         self.p = declare(self, Parameters)
         self.cell = read_cell(self.p.cell)
-        self.chain = self.cell.chain(sliding=True)
+        self.chain = self.cell.chain()
         self._order = JointOrder(self.chain.joint_names)
         self._q: FloatArray | None = None
         self.p.refuse_what_supposes_angles(self.chain)

@@ -292,7 +292,7 @@ class Recorder(RemasterNode):
         super().__init__('recorder')
         self.p = declare(self, Parameters)
         self.cell = read_cell(self.p.cell)
-        chain = self.cell.chain(sliding=True)
+        chain = self.cell.chain()
         self.base_link = chain.base_link
         self._was_waiting = False
         self._records: Counter[str] = Counter()

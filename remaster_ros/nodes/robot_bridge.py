@@ -329,7 +329,7 @@ class RobotBridge(RemasterNode):
                 'shipped one, is for the fakes)'
             )
         cell = read_cell(self.p.cell)
-        self.chain = cell.chain(sliding=True)
+        self.chain = cell.chain()
         self._correction = correction = self.p.correction(cell, self.chain)
         true_arm, unknown_rad, self._shifts = self.chain, None, None
         if correction is not None:

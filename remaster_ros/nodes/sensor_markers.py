@@ -88,7 +88,7 @@ class MeasureService:
         if len(self._markers_T) > 1:
             # Which of them the beam is on shows by their places alone, and a node that was
             # started again in the middle of a pose has not heard of the pose.
-            self._chain = cell.chain(sliding=True)
+            self._chain = cell.chain()
             self._joint_order = JointOrder(self._chain.joint_names)
             node.create_subscription(JointState, 'joint_states', self._on_joints, NEWEST)
         else:

@@ -101,7 +101,7 @@ class Watch(RemasterNode):
         super().__init__('watch')
         self.p = declare(self, Parameters)
         cell = read_cell(self.p.cell)
-        self.chain = cell.chain(sliding=True)
+        self.chain = cell.chain()
         self._order = JointOrder(self.chain.joint_names)
         markers = {
             name: {marker: np.array(cell.markers[marker]) for marker in sensor.markers}

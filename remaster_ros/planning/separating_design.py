@@ -43,7 +43,8 @@ MOST_FURTHER = 25
 MOST_CANDIDATES = 1500
 """Configurations that are chosen from at most: about as many for each pose."""
 ELBOW_STEPS = np.radians([-60.0, -30.0, 0.0, 30.0, 60.0])
-"""Held joints are tried so far from their values in the cell file, rad."""
+"""Held joints are tried so far from their values in the cell file, rad; one that slides by as much
+as counts as that."""
 DECIDED = 6.0
 """Standard deviations between two causes that decide: odds of more than 1,000 to 1 are left of
 them where the true one needs three parameters more, with a reserve for a smaller size."""
@@ -94,13 +95,14 @@ def further_scene(scene: PlanningScene) -> PlanningScene:
     Other arms' postures at the same poses separate what the plan's own do not.
     """
     chain = scene.model.chain
-    low, high = chain.lower + scene.limit_margin_rad, chain.upper - scene.limit_margin_rad
+    margin = scene.limit_margin_rad * chain.per_radian
+    low, high = chain.lower + margin, chain.upper - margin
     held = {
         joint: sorted(
             {
                 float(np.clip(value + step, low[joint], high[joint]))
                 for value in values
-                for step in ELBOW_STEPS
+                for step in ELBOW_STEPS * chain.per_radian[joint]
             }
         )
         for joint, values in scene.inverse_kinematics.held.items()

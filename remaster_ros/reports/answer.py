@@ -400,7 +400,7 @@ def _on_the_pad(
 ) -> tuple[tuple[MasteringStep, ...], ...]:
     return mastering(
         session.controller,
-        SerialChain.from_urdf(session.urdf, session.base_link, session.tip_link, sliding=True),
+        SerialChain.from_urdf(session.urdf, session.base_link, session.tip_link),
         np.array([row.mean_and_std[0] for row in offsets]),
         np.array([row.mean_and_std[1] for row in offsets]),
         np.array([row.identifiable for row in offsets]),

@@ -57,11 +57,11 @@ def summary_of(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         if one['differs']:
             lines.append(
                 f'{one["robot"]}, {one["joint"]}: {", ".join(one["differs"])} differ from the '
-                f'median {one["median_deg"]:+.4f} deg'
+                f'median {_shown(one, "median")}'
             )
         if one['since']:
             lines.append(
-                f'{one["robot"]}, {one["joint"]}: changed by {one["change_deg"]:+.4f} deg along '
+                f'{one["robot"]}, {one["joint"]}: changed by {_shown(one, "change")} along '
                 f'the sessions, since {one["since"]}'
             )
     for row in rows:
@@ -98,22 +98,28 @@ def differing(values: FloatArray, level: float) -> list[int]:
     return sorted(out[:differ])
 
 
+def _shown(one: Mapping[str, Any], key: str) -> str:
+    """Return a number of a joint with its unit."""
+    return f'{one[key + "_" + one["unit"]]:+.4f} {one["unit"]}'
+
+
 def _joint(
     robot: str, name: str, index: int, rows: Sequence[Mapping[str, Any]], level: float
 ) -> dict[str, Any]:
-    known = [row for row in rows if row['fit']['joints'][index]['mean_deg'] is not None]
-    mean = np.array([row['fit']['joints'][index]['mean_deg'] for row in known])
-    std = np.array([row['fit']['joints'][index]['std_deg'] for row in known])
+    unit = rows[0]['fit']['joints'][index].get('unit', 'deg')
+    known = [row for row in rows if row['fit']['joints'][index].get(f'mean_{unit}') is not None]
+    mean = np.array([row['fit']['joints'][index][f'mean_{unit}'] for row in known])
+    std = np.array([row['fit']['joints'][index][f'std_{unit}'] for row in known])
     names = [Path(row['session']).name for row in known]
     found: dict[str, Any] = {
         'robot': robot, 'joint': name, 'sessions': len(known), 'median_deg': None,
-        'spread_deg': None, 'differs': [], 'since': '', 'change_deg': None,
+        'spread_deg': None, 'differs': [], 'since': '', 'change_deg': None, 'unit': unit,
     }  # fmt: skip
     if not len(mean):
         return found
     median = float(np.median(mean))
     spread = MAD_STD * float(np.median(np.abs(mean - median)))
-    found |= {'median_deg': median, 'spread_deg': spread}
+    found |= {f'median_{unit}': median, f'spread_{unit}': spread}
     if len(mean) < FEW:
         return found
     sure = np.abs(mean - median) > OWN_STD * std
@@ -121,7 +127,7 @@ def _joint(
     # Along the sessions in the order given, as for checks; one that differs alone is no change.
     along = change(mean)
     if along.evidence >= ALARM and abs(along.size) > along.half:
-        found |= {'since': names[along.at], 'change_deg': along.size}
+        found |= {'since': names[along.at], f'change_{unit}': along.size}
     return found
 
 

@@ -589,7 +589,7 @@ def answer_html(subject: Subject, drawings: dict[str, Markup], printing: bool = 
 
 def _chain(inputs: Inputs) -> SerialChain:
     session = inputs.session
-    return SerialChain.from_urdf(session.urdf, session.base_link, session.tip_link, sliding=True)
+    return SerialChain.from_urdf(session.urdf, session.base_link, session.tip_link)
 
 
 def _how_sure(inputs: Inputs, answer: Answer) -> list[str]:

@@ -122,7 +122,7 @@ def read_robot(
     check_data(sums, path, data)
     urdf = decode_text(data, path)
     robot = header.robot
-    return urdf, read_chain(urdf, path, robot.base_link, robot.tip_link, sliding=True)
+    return urdf, read_chain(urdf, path, robot.base_link, robot.tip_link)
 
 
 def write_session(folder: str | os.PathLike[str], session: Session) -> None:
@@ -134,9 +134,7 @@ def write_session(folder: str | os.PathLike[str], session: Session) -> None:
         The folder holds files or cannot be written to, or the session breaks the format.
     """
     folder = Path(folder)
-    chain = read_chain(
-        session.urdf, folder / URDF, session.base_link, session.tip_link, sliding=True
-    )
+    chain = read_chain(session.urdf, folder / URDF, session.base_link, session.tip_link)
     header = write_header(session, URDF, session.exit_status)
     parsed = parse_header(header.encode(), folder / HEADER)
     require_known_joints(parsed, chain.joint_names, folder / HEADER)
@@ -162,11 +160,9 @@ def all_rows(session: Session) -> Measurements:
     return merged.select(np.argsort(merged.observation, kind='stable'))
 
 
-def read_chain(
-    urdf: str, path: Path, base_link: str, tip_link: str, *, sliding: bool = False
-) -> SerialChain:
+def read_chain(urdf: str, path: Path, base_link: str, tip_link: str) -> SerialChain:
     """Return the arm of a session; an `InputError` names the URDF file at `path`."""
     try:
-        return SerialChain.from_urdf(urdf, base_link, tip_link, sliding=sliding)
+        return SerialChain.from_urdf(urdf, base_link, tip_link)
     except InputError as error:
         raise InputError(f'{path}: {error}') from None

@@ -154,7 +154,7 @@ def read_arm(
         names = _words(tables)
         base = likely_base(model, names) if base_link is None else base_link
         tip = likely_tip(model, base, names) if tip_link is None else tip_link
-        return urdf, SerialChain.from_urdf(urdf, base, tip, sliding=True)
+        return urdf, SerialChain.from_urdf(urdf, base, tip)
     except InputError as error:
         raise InputError(f'{path}: {error}') from None
 

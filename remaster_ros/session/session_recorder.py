@@ -126,7 +126,7 @@ def sensor_rules(cell: Workcell, p: Parameters) -> tuple[SensorRules, ...]:
 
 def session_header(cell: Workcell, settle_s: float) -> Session:
     """Return a session of this cell without observations."""
-    chain = cell.chain(sliding=True)
+    chain = cell.chain()
     return Session(
         urdf=cell.urdf_text,
         base_link=chain.base_link,
@@ -224,7 +224,7 @@ class SessionRecorder:
 
     def __init__(self, cell: Workcell, p: Parameters, keeper: Keeper, outlet: Outlet) -> None:
         self.cell, self.keeper, self._outlet = cell, keeper, outlet
-        self.chain = cell.chain(sliding=True)
+        self.chain = cell.chain()
         self._order = JointOrder(self.chain.joint_names)
         self.required = RequiredSensors(cell.sensors, p.require)
         self.counts: Counter[str] = Counter()

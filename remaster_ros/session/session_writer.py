@@ -293,7 +293,7 @@ class SessionWriter:
         self.folder = Path(folder)
         self._rows_path = self.folder / ROWS
         self._chain = read_chain(
-            header.urdf, self.folder / URDF, header.base_link, header.tip_link, sliding=True
+            header.urdf, self.folder / URDF, header.base_link, header.tip_link
         )
         self._names = header.sensor_names, header.marker_names
         # Columns for what may come: of frames with several markers, of bodies' orientations.

@@ -396,10 +396,10 @@ class Workcell(msgspec.Struct, forbid_unknown_fields=True):
     # Where it was read from; nothing a plan depends on.
     file: str = ''
 
-    def chain(self, *, sliding: bool = False) -> SerialChain:
-        """Build the arm's kinematic chain; ``sliding`` as of `SerialChain.from_urdf`."""
+    def chain(self) -> SerialChain:
+        """Build the arm's kinematic chain."""
         ends = self.robot.base_link, self.robot.tip_link
-        return SerialChain.from_urdf(self.urdf_text, *ends, sliding=sliding)
+        return SerialChain.from_urdf(self.urdf_text, *ends)
 
     def fingerprint(self) -> str:
         """Return a checksum of all that a plan depends on."""
@@ -584,7 +584,7 @@ def parse_cell(data: bytes, path: Path) -> Workcell:
 def _check(path: Path, cell: Workcell, text: str) -> None:
     """Refuse names that point nowhere and values that contradict each other."""
     try:
-        chain = cell.chain(sliding=True)
+        chain = cell.chain()
     except InputError as error:
         raise InputError(f'{path.parent / cell.robot.urdf}: {error}') from None
     if problem := _problem(cell, chain):

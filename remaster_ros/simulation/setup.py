@@ -112,7 +112,7 @@ def make_world(
         on them.
     """
     settings = yaml.safe_load(config_path('fake_world.yaml').read_text())
-    chain = cell.chain(sliding=True)
+    chain = cell.chain()
     missing = sorted(set(cell.sensors) - set(settings['sensors']))
     if missing:
         raise InputError(f'fake_world.yaml places no sensor {", ".join(missing)}')

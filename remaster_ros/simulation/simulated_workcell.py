@@ -403,7 +403,7 @@ def choose_robot(
     cell.robot.base_link = base_link or cell.robot.base_link
     cell.robot.tip_link = tip_link or cell.robot.tip_link
     try:
-        chain = cell.chain(sliding=True)
+        chain = cell.chain()
     except InputError as error:
         raise InputError(f'{cell.robot.urdf}: {error}') from None
     if robot is not None and (

@@ -68,9 +68,7 @@ class World:
         self.folder = folder
         self.truth, self.seed, self.rate = content.truth, content.seed, content.rate
         self.clock = WorldClock(folder, content.rate)
-        self.chain = SerialChain.from_urdf(
-            content.urdf, content.base_link, content.tip_link, sliding=True
-        )
+        self.chain = SerialChain.from_urdf(content.urdf, content.base_link, content.tip_link)
         self._capsules = LinkCapsules(self.chain, content.link_radius_m)
         self.start_q = content.start_q
         self._motion = Motion(START_S, self.start_q)

@@ -53,7 +53,7 @@ UNITS = {
 def world(arm: str, seed: int) -> HiddenWorld:
     """Return the arm at configurations all over its limits, before a tracker."""
     urdf, _, _ = ARMS[arm]
-    low, high = SerialChain.from_urdf(urdf, tip_link='tool', sliding=True).usual_range
+    low, high = SerialChain.from_urdf(urdf, tip_link='tool').usual_range
     rng = np.random.default_rng(seed)
     margin = 0.05 * (high - low)
     q = rng.uniform(low + margin, high - margin, (POSES, len(low)))
@@ -146,7 +146,7 @@ def _added(hidden: HiddenWorld, effects: tuple[HiddenEffect, ...]) -> np.ndarray
 
 
 def test_what_needs_a_turn_is_not_tried_at_a_slide():
-    arm = SerialChain.from_urdf(rail(), tip_link='tool', sliding=True)
+    arm = SerialChain.from_urdf(rail(), tip_link='tool')
     hidden = world('rail', 1)
     session, _ = hidden.measure((), NOISE, np.random.default_rng(2))
     context = Context(

@@ -33,7 +33,7 @@ URDF = jointed_arm(
     ('revolute', '0 0 1', '0 0.05 0', '-1.5708 0 0'),
     ('revolute', '0 0 1', '0 0 0.1', '1.5708 0 0'),
 )
-CHAIN = SerialChain.from_urdf(URDF, sliding=True)
+CHAIN = SerialChain.from_urdf(URDF)
 OFFSETS = np.array([0.004, -0.006, 2.4e-3, 0.005, 0.007, -0.003])
 KNOWN = np.array([False, True, True, True, True, False])
 TURN = pin.exp3(np.array([0.3, -0.8, 1.1]))

@@ -186,9 +186,7 @@ class Cell:
 
     def check(self, session, lost=0):
         """Each row once, where the truth has its marker; so many configurations may be lost."""
-        chain = SerialChain.from_urdf(
-            session.urdf, session.base_link, session.tip_link, sliding=True
-        )
+        chain = SerialChain.from_urdf(session.urdf, session.base_link, session.tip_link)
         m, truth = session.measurements, self.world.truth
         for index, name in enumerate(session.sensor_names):
             mine = m.sensor == index

@@ -42,10 +42,9 @@ def test_a_missing_cell_file(start, tmp_path):
 @pytest.mark.parametrize(
     ('node', 'parameters', 'why'),
     [
-        ('demo', {'apply': True}, 'this needs joints that turn'),
+        ('demo', {'apply': True}, 'no node corrects what such an arm is commanded'),
         ('robot_bridge', {'compensation': 'c.json'}, 'leave the parameter compensation empty'),
         ('pose_planner', {'compensation': 'c.json'}, 'compensation is for arms whose joints all'),
-        ('pose_planner', {'separate': 'd.json'}, 'separate is for arms whose joints all turn'),
     ],
 )
 def test_what_an_arm_with_a_joint_that_slides_is_not_for(node, parameters, why, start, tmp_path):

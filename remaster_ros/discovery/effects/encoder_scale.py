@@ -47,7 +47,7 @@ EFFECT = Effect(
     unit='rad/rad',
     plausible=(1e-6, 1e-2),
     sentence='The true turn of {subject} is not what is reported (gear ratio or encoder scale).',
-    separate_by='poses that turn the joint through its whole range',
+    separate_by='poses that move the joint through its whole range',
     remedy='Check the gear ratio and the encoder resolution that are set in the controller.',
     slide_sentence='The true way of {subject} is not what is reported (lead of the screw, pinion '
     'of the rack, or scale).',

@@ -67,7 +67,7 @@ EFFECT = Effect(
     unit='rad/rad',
     plausible=(1e-6, LARGEST),
     sentence='The angle of {subject} follows the angle of {other} (coupled drives).',
-    separate_by='poses that turn one of the two joints and hold the other',
+    separate_by='poses that move one of the two joints and hold the other',
     remedy='Check the coupling that is set in the controller for these joints; correct what '
     'is left by the angle of the other joint.',
     slide_sentence='The position of {subject} follows that of {other} (coupled drives).',

@@ -39,7 +39,7 @@ SLIDE = 2
 
 
 def chain_of(urdf: str) -> SerialChain:
-    return SerialChain.from_urdf(urdf, sliding=True)
+    return SerialChain.from_urdf(urdf)
 
 
 def poses(urdf: str, q: np.ndarray) -> np.ndarray:
@@ -176,11 +176,6 @@ def test_what_supposes_angles_refuses_a_slide_in_one_line(verb, measured, tmp_pa
     error = refusal(*(names.get(word, word) for word in verb))
     assert 'j3' in error
     assert 'slides' in error
-
-
-def test_nothing_but_who_says_so_takes_a_slide():
-    with pytest.raises(InputError, match="'j3' is prismatic"):
-        SerialChain.from_urdf(STANFORD)
 
 
 def test_a_session_that_has_rad_for_a_slide_is_refused(measured, tmp_path):

@@ -336,6 +336,23 @@ def test_who_differs_and_which_joint_changes_along_the_sessions():
     assert json.dumps(found)
 
 
+def test_what_a_slide_is_off_by_is_summed_up_in_mm():
+    offsets = 0.02 * np.random.default_rng(3).standard_normal((12, 3))
+    offsets[6:, 1] += 0.3
+    rows = [made_row(f's{i}', row) for i, row in enumerate(offsets.tolist())]
+    for row in rows:
+        one = row['fit']['joints'][1]
+        one |= {'unit': 'mm', 'mean_mm': one['mean_deg'], 'std_mm': 0.01}
+        one |= {'mean_deg': None, 'std_deg': None}
+    found = summary_of(rows)
+    j0, j1, _ = found['joints']
+    assert (j0['unit'], j1['unit']) == ('deg', 'mm')
+    assert (j1['median_deg'], j1['change_deg']) == (None, None)
+    assert j1['change_mm'] == pytest.approx(0.3, abs=0.05)
+    (line,) = (line for line in found['lines'] if 'j1: changed by' in line)
+    assert ' mm along the sessions, since s6' in line
+
+
 @pytest.mark.parametrize('arms', [5, 12])
 def test_arms_that_scatter_are_not_said_to_differ(arms):
     """100 pages, any named on 1 % of them: more than 6 by chance once in 14,000."""

@@ -31,7 +31,7 @@ UNITS = JointUnits((True, False, False))
 
 
 def chain_of(urdf):
-    return SerialChain.from_urdf(urdf, 'base_link', 'tool', sliding=True)
+    return SerialChain.from_urdf(urdf, 'base_link', 'tool')
 
 
 @pytest.mark.parametrize(
@@ -134,7 +134,7 @@ def test_what_is_known_of_a_slide_is_in_millimetres(measured):
 
 def test_the_live_page_has_the_offset_of_a_slide_in_millimetres(measured):
     cell = read_cell(measured[0])
-    chain = cell.chain(sliding=True)
+    chain = cell.chain()
     view = LiveView(chain, {'mocap': {'sir': np.array(cell.markers['sir'])}})
     means = dict.fromkeys(chain.joint_names, 1e-3)
     view.take_offsets(means, dict.fromkeys(chain.joint_names, 2e-4))

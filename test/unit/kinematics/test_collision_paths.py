@@ -67,7 +67,7 @@ def test_a_way_of_joints_that_slide_is_bounded_and_swept():
     print('seed', seed)
     rng = np.random.default_rng(seed)
     text = random_arm_urdf(rng, 5, slides=(0, 2)).replace('"-3" upper="3"', '"-0.8" upper="0.8"')
-    chain = SerialChain.from_urdf(text, tip_link='tool', sliding=True)
+    chain = SerialChain.from_urdf(text, tip_link='tool')
     boxes = [obstacle(f'box {i}', rng.normal(0, 0.7, 3), [0.2, 0.3, 0.2]) for i in range(3)]
     model = capsules(chain, 0.03, *boxes)
     q = rng.uniform(chain.lower, chain.upper, (300, 5))
@@ -95,7 +95,7 @@ def test_a_way_of_joints_that_slide_is_bounded_and_swept():
 def test_what_leads_a_joint_that_slides_is_a_body():
     """A rail along all of the way where the base has no shape; else a rod that slides along."""
     text = random_arm_urdf(np.random.default_rng(4), 4, slides=(0, 2))
-    chain = SerialChain.from_urdf(text, tip_link='tool', sliding=True)
+    chain = SerialChain.from_urdf(text, tip_link='tool')
     bodies = {body.name: body for body in arm_bodies(chain, [], 0.05)}
     rail, rod = bodies['the rail'], bodies['the rod of joint_3']
     assert (rail.link, rod.link) == (0, 3)

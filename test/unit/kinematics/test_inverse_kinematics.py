@@ -399,7 +399,7 @@ def test_arms_with_few_or_sliding_joints_keep_all_solutions(joints, slides, pose
     print('seed', seed)
     rng = np.random.default_rng(seed)
     urdf = random_arm_urdf(rng, joints, slides)
-    chain = SerialChain.from_urdf(urdf, tip_link='tool', sliding=True)
+    chain = SerialChain.from_urdf(urdf, tip_link='tool')
     ik = InverseKinematics(chain)
     judge = InverseJudge(urdf, chain.base_link, chain.tip_link, chain.joint_names, {})
 

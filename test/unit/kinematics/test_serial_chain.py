@@ -189,7 +189,6 @@ def test_a_fixed_joint_has_no_axis_and_an_expanded_xacro_may_say_where_it_is_fro
 LOOP = '<link name="b"/><link name="c"/>' + fixed('j', 'b', 'c') + fixed('k', 'c', 'b')
 HEAVY = '<link name="x"><inertial><mass value="-1"/></inertial></link>'
 BAD = {
-    'prismatic': (arm(kind='prismatic'), "'joint_1' is prismatic"),
     'planar': (arm(kind='planar'), "'joint_1' is planar"),
     'mimic': (arm(joint='<mimic joint="x"/>'), "'joint_1' mimics"),
     'no limit': (arm(limit=''), "'joint_1' has no position limits"),

@@ -23,7 +23,7 @@ def arm(request):
             turns = f'<joint name="{name}" type="revolute">'
             assert text.count(turns) == 1
             text = text.replace(turns, turns.replace('revolute', 'prismatic'))
-    chain = SerialChain.from_urdf(text, sliding=True)
+    chain = SerialChain.from_urdf(text)
     assert chain.slides.sum() == (2 if request.param == 'slides' else 0)
     rng = np.random.default_rng(4)
     # The third body has no points at all.

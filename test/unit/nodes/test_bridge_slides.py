@@ -33,7 +33,7 @@ def sliding(rig, tmp_path):
     def make(name, **parameters):
         urdf, home = ARMS[name]
         cell = sliding_cell(tmp_path, urdf())
-        chain = read_cell(cell).chain(sliding=True)
+        chain = read_cell(cell).chain()
         made = rig(home=np.array(home), chain=chain, cell=cell, **parameters)
         made.chain, made.home = chain, np.array(home)
         return made
@@ -139,7 +139,7 @@ def test_a_bridge_that_is_started_again_compares_where_the_slide_is(rig, tmp_pat
     """Half a millimetre is where it was led; one millimetre is not, and a person is asked."""
     urdf, home = ARMS['rail']
     cell = sliding_cell(tmp_path, urdf())
-    chain = read_cell(cell).chain(sliding=True)
+    chain = read_cell(cell).chain()
     r = rig(home=np.array(home), chain=chain, cell=cell)
     r.alter = lambda message: shifted(message, 'rail', 1e-3)
     r.plan(np.array(home) + np.where(chain.slides, 0.1, 0.0))
@@ -167,7 +167,7 @@ def test_a_compensation_is_refused_by_name(rig, tmp_path):
     cell = sliding_cell(tmp_path, urdf())
     demo = read_cell('demo')
     file = save(tmp_path, arm(demo.urdf_text, 'base_link', 'tool'), demo.urdf_text)
-    chain = read_cell(cell).chain(sliding=True)
+    chain = read_cell(cell).chain()
     with pytest.raises(InputError, match=r"joint 'rail' slides, .* no compensation\.json"):
         rig(ready=False, home=np.array(home), chain=chain, cell=cell, compensation=file)
 

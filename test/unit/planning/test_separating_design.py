@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from worlds.sliding_cells import rail, sliding_cell
 
 from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.planning import separating_design as module
@@ -162,6 +163,14 @@ def test_other_postures_of_a_held_joint_are_candidates():
     )
     wide = separated(sag(), pool=planned(60, 2, further))
     assert wide.pairs[0].after > separated(sag()).pairs[0].after
+
+
+def test_a_rail_is_held_elsewhere_by_as_much_as_an_elbow_counts(tmp_path):
+    held = {'held_joint': 'rail', 'held_values_deg': [], 'held_values_m': [0.0]}
+    cell = read_cell(sliding_cell(tmp_path, rail(), **held))
+    further = further_scene(cell.planning_scene(cell.chain()))
+    steps = 0.25 * np.radians([-60, -30, 0, 30, 60])
+    np.testing.assert_allclose(further.inverse_kinematics.held[0], steps, atol=1e-9)
 
 
 def session_rows(seed=5):

@@ -62,7 +62,7 @@ def test_the_truth_of_a_slide_is_in_mm_and_is_what_made_the_rows(made):
     assert all('offset_mm' not in other for other in truth['joint_offsets'] if other is not row)
     assert ',q3_m,' in (made / 's' / 'observations.csv').read_text().partition('\n')[0]
     session = read_session(made / 's')
-    chain = SerialChain.from_urdf(session.urdf, 'base', 'tool0', sliding=True)
+    chain = SerialChain.from_urdf(session.urdf, 'base', 'tool0')
     m = session.measurements
     # A pose is what all its solutions share, so the slide has more than one place.
     assert np.ptp(m.q[:, SLIDE]) > 0.1
@@ -85,7 +85,7 @@ def test_the_truth_of_a_slide_is_in_mm_and_is_what_made_the_rows(made):
 def test_intervals_hold_as_often_as_they_say(made, sessions):
     """Of four offsets of each session, as if half of them were independent."""
     session = read_session(made / 's')
-    chain = SerialChain.from_urdf(session.urdf, 'base', 'tool0', sliding=True)
+    chain = SerialChain.from_urdf(session.urdf, 'base', 'tool0')
     m = session.measurements
     fitted = [m.q[(m.pose == pose) & ~m.is_validation] for pose in np.unique(m.pose)]
     inside, slides, errors = [], [], []
