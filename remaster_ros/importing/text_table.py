@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from remaster_ros.errors import InputError
+from remaster_ros.importing import by_axis
 from remaster_ros.importing.makers import READERS
 from remaster_ros.importing.makers.named import Named, some
 from remaster_ros.importing.units import bare, is_unit, split_unit
@@ -210,6 +211,17 @@ def read_table(
     rows = [row[:width] for row in rows]
     rows, header = _without_units(_without_groups(rows), header)
     names = tuple(header[:width]) if header else tuple(map(str, range(1, width + 1)))
+    try:
+        report = by_axis.wide(names, rows, at, lambda cell: _is_number(cell) or not cell)
+    except InputError as error:
+        raise InputError(f'{path}, {error}') from None
+    if report is not None and not header:
+        raise InputError(
+            f'{path}: rows of X, Y and Z, and no header that tells which column was measured; give '
+            'it one, such as name;axis;nominal;measured'
+        )
+    if report is not None:
+        names, rows, at = tuple(report[0]), report[1], report[2]
     for name in names:
         if name and names.count(name) > 1:
             raise InputError(f'{path}: two columns are named {name!r}; name them differently')

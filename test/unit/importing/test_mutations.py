@@ -61,6 +61,15 @@ def report():
     return '\n'.join([*head, *lines[:4], 'Page 1 of 2', *head[2:3], *lines[4:], *foot, ''])
 
 
+def inspection():
+    """A report with a row for each of X, Y and Z."""
+    lines = ['Name\tAxis\tNominal\tMeasured\tDeviation']
+    for name, row in zip(NAMES, points_of(), strict=True):
+        for axis, v in zip('XYZ', row, strict=True):
+            lines.append(f'{name}\t{axis}\t{v - 0.125:.4f}\t{v:.4f}\t0.1250')
+    return '\n'.join([*lines, ''])
+
+
 def capture():
     run = run_of(arm_of(4))
     rows = 1e3 * seen(run, np.arange(0.0, 0.4, 0.05), 1, 1e-4)
@@ -85,6 +94,7 @@ def pieces():
 
 KINDS = {
     'report': (report, True),
+    'inspection': (inspection, False),
     'capture': (capture, True),
     'pieces': (pieces, False),
     'leica': (leica, True),

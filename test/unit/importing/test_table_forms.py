@@ -555,6 +555,52 @@ def test_the_measured_ones_of_a_report(nominal, measured_, deviation, arm, tmp_p
         rows_of(arm, tmp_path, wrong, joints_table(arm))
 
 
+def inspected(arm, names=POINTS, once=False, suffix=False):
+    """Return the lines of a report that has a row for each axis."""
+    lines = ['Name;Control;Nom;Meas;Tol;Dev;Test']
+    for name, point in zip(names, np.column_stack(millimetres(arm))):
+        for axis, value in zip('XYZ', point):
+            shown = f'{name}.{axis};Koord.' if suffix else f'{name};{axis}'
+            shown = f';{axis}' if once and axis != 'X' else shown
+            lines.append(f'{shown};{value + 0.5:.6f};{value:.6f};\u00b10.5;-0.500000;Pass')
+    return lines
+
+
+@pytest.mark.parametrize('form', ['', 'once', 'suffix'])
+def test_a_report_with_a_row_for_each_axis(form, arm, tmp_path):
+    lines = inspected(arm, **({form: True} if form else {}))
+    if form != 'suffix':
+        # Of each point its distance as well.
+        lines = [
+            lines[0],
+            *(x for i in range(1, 37, 3) for x in (*lines[i : i + 3], _distance(i))),
+        ]
+    rows = rows_of(arm, tmp_path, '\n'.join([*lines, '']), joints_table(arm))
+    assert_rows(rows, arm)
+    assert [*rows.points.values()] == [('Meas X', 'Meas Y', 'Meas Z')]
+
+
+def _distance(i):
+    return f'P{(i + 2) // 3};3D;0.0;0.5;\u00b10.5;0.5;Pass'
+
+
+@pytest.mark.parametrize(
+    ('change', 'words'),
+    [
+        (lambda lines: lines[:20] + lines[21:], 'line 21: Z of P7, where Y is expected'),
+        (lambda lines: lines[:-1], 'line 36: the last one, where Z is expected'),
+        (
+            lambda lines: [*lines[:20], lines[20].replace('P7', 'P8'), *lines[21:]],
+            'line 21: Y of P8, where Y of P7 is expected',
+        ),
+    ],
+    ids=['lost', 'cut', 'name'],
+)
+def test_a_report_that_lost_an_axis_is_refused(change, words, arm, tmp_path):
+    with pytest.raises(InputError, match=words):
+        rows_of(arm, tmp_path, '\n'.join([*change(inspected(arm)), '']), joints_table(arm))
+
+
 def test_names_in_two_lines(arm, tmp_path):
     over = ';Joints;;;;;;Ball 1;;;Ball 2;;\n'
     header = ['Point', *AXES, *2 * 'XYZ', '']
