@@ -217,7 +217,7 @@ def read_table(
         raise InputError(f'{path}, {error}') from None
     if report is not None and not header:
         raise InputError(
-            f'{path}: rows of X, Y and Z, and no header that tells which column was measured; give '
+            f'{path}: rows of X, Y and Z, and no header that tells which is measured; give '
             'it one, such as name;axis;nominal;measured'
         )
     if report is not None:

@@ -160,6 +160,11 @@ def calls(names, q):
     return '\n'.join(f'MoveJoints({row})\nDelay(2)' for row in rows) + '\n'
 
 
+def keyed(names, q):
+    rows = (', '.join(f'J{i} = {v:.4f} deg' for i, v in enumerate(row, 1)) for row in q)
+    return 'calibration\n' + ''.join(f'{name}: {row}\n' for name, row in zip(names, rows))
+
+
 def rapid_named_log(names, q):
     unused = ','.join(['9E+09'] * 6)
     rows = (','.join(f'{value:.4f}' for value in row) for row in q)
@@ -182,6 +187,7 @@ KINDS = {
     'doosan': Kind(doosan, comment='#'),
     'ur_polyscope': Kind(polyscope, one_line=False),
     'calls': Kind(calls, named=False),
+    'keyed': Kind(keyed),
     'rapid_named_log': Kind(rapid_named_log),
     'ur_script': Kind(ur_script, comment='#'),
     'ur_moves': Kind(ur_moves, named=False, comment='#'),

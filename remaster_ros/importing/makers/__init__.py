@@ -10,6 +10,7 @@ from remaster_ros.importing.makers import (
     gsi,
     inform,
     kawasaki,
+    keyed,
     kuka,
     listed,
     motive,
@@ -38,4 +39,5 @@ READERS: tuple[Callable[[str], Named | None], ...] = (
     staubli.read,
     gsi.read,
     ros_echo.read,
+    keyed.read,
 )

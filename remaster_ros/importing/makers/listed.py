@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 
-from remaster_ros.importing.makers.named import NUMBER, Named, unexpected
+from remaster_ros.importing.makers.named import NUMBER, Named, leading, unexpected
 
 # In square brackets or braces, or in round ones alone; behind them arguments of a call, or the
 # external axes of RAPID. Each has one way to match: a line of a large log that is none of them is
@@ -23,7 +23,6 @@ _PLACES = re.compile(r'lin|pose|cart|tcp|move_?[lcp]\b|frame|trans', re.IGNORECA
 _RAPID = ('jointtarget', 'moveabsj')
 _UNUSED = 9e9
 _BETWEEN = re.compile(r'\s*[,;]\s*|\s+')
-_TIME = re.compile(r'\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d(?:[.,]\d+)?|\d{5,}\.\d+')
 # What a name is set apart by, and what it is set before.
 _APART = ' \t:;,="\'('
 _FEWEST, _MOST = 2, 12
@@ -72,16 +71,13 @@ def read(text: str) -> Named | None:
         rows.append(cells)
         before.append(words)
         numbers_of.append(number)
-    stamps = [_TIME.search(words) for words in before]
-    lead: list[str] = []
-    if all(stamps):
-        lead, before = ['time'], [stamp[0].replace(',', '.') for stamp in stamps if stamp]
-    elif 2 * len({*before}) > len(before) and any(before):
-        lead = ['name']
+    lead, before = leading(before)
+    # External axes are of RAPID, which counts in degrees.
+    joints = [f'J{i}{" [deg]" * rapid}' for i in range(1, len(rows[0]) + 1)]
+    is_point = len(rows[0]) == len('XYZ')
     return Named(
-        kind='lists of joints',
-        # External axes are of RAPID, which counts in degrees.
-        names=(*lead, *(f'J{i}{" [deg]" * rapid}' for i in range(1, len(rows[0]) + 1))),
+        kind='lists of points' if is_point else 'lists of joints',
+        names=(*lead, *('XYZ' if is_point else joints)),
         rows=tuple(
             (*([words] if lead else []), *cells) for words, cells in zip(before, rows, strict=True)
         ),

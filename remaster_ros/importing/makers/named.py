@@ -11,6 +11,7 @@ from remaster_ros.errors import InputError
 
 SHOWN = 60
 NUMBER = re.compile(r'[+-]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][+-]?\d+)?', re.ASCII)
+_TIME = re.compile(r'\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d(?:[.,]\d+)?|\d{5,}\.\d+')
 # An arm that this program calibrates has more than one joint.
 _FEWEST_AXES = 2
 
@@ -53,6 +54,17 @@ def some(names: Sequence[str]) -> str:
     """Return the first five names, and how many more there are."""
     more = f' and {len(names) - 5} more' if len(names) > 5 else ''
     return f'{", ".join(names[:5])}{more}'
+
+
+def leading(before: list[str]) -> tuple[list[str], list[str]]:
+    """Return the name of what stands before the numbers of each line, and its cells; [] of none.
+
+    They are times, or names where most are unlike.
+    """
+    stamps = [_TIME.search(words) for words in before]
+    if all(stamps):
+        return ['time'], [stamp[0].replace(',', '.') for stamp in stamps if stamp]
+    return ['name'] * (2 * len({*before}) > len(before) and any(before)), before
 
 
 def axes_in_order(

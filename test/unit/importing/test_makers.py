@@ -236,7 +236,10 @@ def test_a_mutated_text_is_read_right_or_refused(kind, count, seed, tmp_path):
         changed = changed_cell(other, true, broken)
         if changed and not (kind.startswith('ur') and changed not in broken):
             number = re.escape(changed.partition('[')[0] or changed)
-            stands = rf'(?<![\w.]){number}(?![\w.])|X{number}\b|{number}_q'
+            stands = rf'(?<![\w.]){number}(?![\w.])|X{number}\b|{number}(?:_q|deg)'
+            if kind == 'keyed' and changed.startswith('P'):
+                # Of the name all that stands before the first axis.
+                stands = number
             if kind == 'fanuc_registers' and changed.startswith('PR'):
                 stands = rf'\[1,{changed[3:-1]}\]'
             assert re.search(stands, broken), (changed, broken)

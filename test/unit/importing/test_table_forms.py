@@ -524,6 +524,22 @@ def test_a_row_that_was_cut_off_is_refused(cut, arm, tmp_path):
         rows_of(arm, tmp_path, broken, joints_table(arm))
 
 
+@pytest.mark.parametrize(
+    'form',
+    [
+        '{} X={:.6f} Y={:.6f} Z={:.6f}',
+        '{}, X: {:.6f} mm, Y: {:.6f} mm, Z: {:.6f} mm',
+        '<Point name="{}" x="{:.6f}" y="{:.6f}" z="{:.6f}"/>',
+        '{};({:.6f}, {:.6f}, {:.6f})',
+    ],
+)
+def test_points_with_their_axes_or_in_brackets(form, arm, tmp_path):
+    points = np.column_stack(millimetres(arm))
+    lines = [form.format(name, *point) for name, point in zip(POINTS, points)]
+    rows = rows_of(arm, tmp_path, '\n'.join([*lines, '']), joints_table(arm))
+    assert_rows(rows, arm)
+
+
 def test_a_title_with_many_numbers_between_blanks(arm, tmp_path):
     title = 'AT960-MR\tS/N 750123\tTemp 20.8\tPress 1013.2\tHum 45\n'
     columns = [*millimetres(arm), *3 * [[0.004] * COUNT]]
