@@ -51,6 +51,7 @@ from remaster_ros.discovery.thinning import Thinning, draw_rows, judge_by_others
 from remaster_ros.discovery.to_extension import (
     extension_of,
     moved_by,
+    moved_by_names,
     moved_by_open_offsets,
     offsets_of,
 )
@@ -379,7 +380,7 @@ def _sampled(
     if solution is None:
         solution, unmodelled = by_names(found, beside)
     else:
-        unmodelled = np.zeros((found.model.size + len(solution.parameters), 0))
+        unmodelled = moved_by_names(found, data, beside.members, solution)
     if solution.cells:
         unmodelled = np.concatenate(
             (unmodelled, moved_by_open_offsets(found, data, solution)), axis=1
@@ -406,11 +407,15 @@ class _Beside:
     named: Solution
 
     @cached_property
+    def members(self) -> Solution:
+        """The causes by members."""
+        return by_members(self.named, self.search.families)
+
+    @cached_property
     def kinds(self) -> list[Family]:
         """All kinds of errors without the members that have a name."""
         search = self.search
-        members = by_members(self.named, search.families).cells
-        return kinds(search.data, search.cells, members)
+        return kinds(search.data, search.cells, self.members.cells)
 
     @cached_property
     def fit(self) -> Solution | None:

@@ -105,15 +105,11 @@ class FoundEffect:
     ) -> FoundEffect:
         """Return the effect with its parameters as the extended model's posterior has them.
 
-        With its cells and the rows that they were fitted to, its sizes as well. Another kind may
-        have a part of it there: by what the search has it otherwise it is uncertain as well.
+        With its cells and the rows that they were fitted to, its sizes as well.
         """
         found = self
         index = {name: i for i, name in enumerate(result.theta_names)}
-        theta, std = result.theta, result.theta_std.copy()
-        for one in self.parameters:
-            if (i := index.get(one.name)) is not None:
-                std[i] = np.hypot(std[i], one.value - theta[i])
+        theta, std = result.theta, result.theta_std
         parameters = tuple(
             replace(one, value=float(theta[index[one.name]]), std=float(std[index[one.name]]))
             if one.name in index
@@ -121,8 +117,7 @@ class FoundEffect:
             for one in self.parameters
         )
         if data is not None and group:
-            wider = std / np.where(result.theta_std > 0.0, result.theta_std, 1.0)
-            draws = theta + wider * (result.theta_draws.reshape(-1, len(index)) - theta)
+            draws = result.theta_draws.reshape(-1, len(index))
             wheres = [[index[name] for name in cell.parameters] for cell in group]
             sizes = tuple(
                 EFFECTS[cell.name].size(data.part, cell, draws[:, where])

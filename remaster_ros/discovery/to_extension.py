@@ -117,6 +117,31 @@ def moved_by(
     return moves
 
 
+def moved_by_names(
+    found: Estimate, data: Residuals, named: Solution, every: Solution
+) -> FloatArray:
+    """Return how all fitted moves if each cause has its size, of which kinds have a part.
+
+    In a model of all kinds of errors another one may take over what a cause explains: a curve has
+    the mean of a scale in the zero-offset beside it. Which of them it is these data do not tell.
+    Predictions stay. Of all natural parameters and the m of the model of all kinds, (size + m, c).
+    """
+    places = {name: i for i, name in enumerate(n for c in every.cells for n in c.parameters)}
+    kept = [
+        (cell, named.parameters[where], [places[name] for name in cell.parameters])
+        for cell, where in zip(named.cells, named.slices(), strict=True)
+        if places.keys() >= {*cell.parameters}
+    ]
+    missing = [values - every.parameters[at] for _, values, at in kept]
+    shifts = (
+        data.columns([cell]) @ less for (cell, _, _), less in zip(kept, missing, strict=True)
+    )
+    moves = -moved_by(found, data, every, shifts)
+    for column, ((_, _, at), less) in enumerate(zip(kept, missing, strict=True)):
+        moves[found.model.size + np.array(at), column] += less
+    return moves
+
+
 def root_of_inverse(precision: FloatArray) -> FloatArray:
     """Return L with L L' the inverse of a matrix of parameters in units far apart, (P, P)."""
     unit = np.maximum(np.diag(precision), np.finfo(float).tiny) ** -0.5
