@@ -24,11 +24,20 @@ from remaster_ros.importing.standstills import (
 )
 from remaster_ros.importing.units import LENGTHS
 from remaster_ros.kinematics.serial_chain import SerialChain
+from remaster_ros.kinematics.transforms import mean_quaternion_xyzw
 from remaster_ros.session.bag import BagReader, jazzy_types
+from remaster_ros.session.observations import LENGTH_TOLERANCE
 from remaster_ros.types import FARTHEST_M, FloatArray
 
 JOINT_STATE = 'sensor_msgs/msg/JointState'
-POINT = 'geometry_msgs/msg/PointStamped'
+# What holds a point or a pose, the likeliest first, and where in the message it is.
+PLACES = {
+    'geometry_msgs/msg/PointStamped': 'point',
+    'geometry_msgs/msg/PoseStamped': 'pose',
+    'geometry_msgs/msg/TransformStamped': 'transform',
+    'geometry_msgs/msg/PoseWithCovarianceStamped': 'pose.pose',
+    'nav_msgs/msg/Odometry': 'pose.pose',
+}
 SUFFIXES = ('.mcap', '.db3', '.bag')
 
 
@@ -49,8 +58,25 @@ class _Topic:
     values: list[Any] = field(default_factory=list)
 
     def stream(self, scale: float = 1.0) -> Stream:
-        """Return them in the order of their stamps."""
-        return Stream.of(np.array(self.stamps), scale * np.array(self.values, dtype=float))
+        """Return them in the order of their stamps, the first three columns times a scale."""
+        values = np.array(self.values, dtype=float)
+        values[:, :3] *= scale
+        return Stream.of(np.array(self.stamps), values)
+
+
+def _place(message: Any, where: str) -> tuple[float, ...]:
+    """Return x, y and z, and of a pose its quaternion x, y, z, w; NaN where that is none."""
+    for name in where.split('.'):
+        message = getattr(message, name)
+    place = getattr(message, 'position', getattr(message, 'translation', message))
+    turn = getattr(message, 'orientation', getattr(message, 'rotation', None))
+    if turn is None:
+        return place.x, place.y, place.z
+    quaternion = np.array([turn.x, turn.y, turn.z, turn.w])
+    length = np.linalg.norm(quaternion)
+    if abs(length - 1.0) > LENGTH_TOLERANCE:
+        quaternion[:] = np.nan
+    return place.x, place.y, place.z, *quaternion
 
 
 def read_bag(
@@ -79,25 +105,33 @@ def read_bag(
     """
     refuse_sliding(chain, path)
     joints: dict[str, _Topic] = defaultdict(_Topic)
-    points: dict[str, _Topic] = defaultdict(_Topic)
+    found: dict[str, dict[str, _Topic]] = {kind: defaultdict(_Topic) for kind in PLACES}
     seen: dict[str, str] = {}
     for topic, kind, message, log_s in _messages(path, seen):
         stamp = message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec or log_s
-        if kind == POINT and (not point_topics or topic in point_topics):
-            place = message.point
-            points[topic].stamps.append(stamp)
-            points[topic].values.append((place.x, place.y, place.z))
+        if kind in PLACES and (not point_topics or topic in point_topics):
+            found[kind][topic].stamps.append(stamp)
+            found[kind][topic].values.append(_place(message, PLACES[kind]))
         elif kind == JOINT_STATE and (not joint_topics or topic in joint_topics):
             position = dict(zip(message.name, message.position))
             if all(name in position for name in chain.joint_names):
                 joints[topic].stamps.append(stamp)
                 joints[topic].values.append([position[name] for name in chain.joint_names])
     joint_topic = _joint_topic(path, joints, seen, chain)
-    if not points:
-        raise InputError(f'{path}: no geometry_msgs/PointStamped; it has {_topics(seen)}')
+    kind = next((kind for kind in PLACES if found[kind]), '')
+    if not kind:
+        raise InputError(
+            f'{path}: no geometry_msgs/PointStamped or PoseStamped; it has {_topics(seen)}'
+        )
+    points = found[kind]
+    if len(points) > 1 and not point_topics and kind != next(iter(PLACES)):
+        # One of them may well be where the robot believes its tool to be.
+        raise InputError(
+            f'{path}: poses on {", ".join(sorted(points))}; name those of the sensor with --points'
+        )
     rows = _Rows(path, chain, joints[joint_topic].stream(), joint_topic, clock_offset_s)
-    for topic, found in sorted(points.items()):
-        rows.add(topic, found.stream(LENGTHS[length or 'm']))
+    for topic, own in sorted(points.items()):
+        rows.add(topic, own.stream(LENGTHS[length or 'm']))
     return rows.raw(sorted(points), length or 'm', seen)
 
 
@@ -106,7 +140,7 @@ def _messages(path: Path, seen: dict[str, str]) -> Iterator[tuple[str, str, Any,
     # Imported here: it takes a quarter of a second, which tables need not wait for.
     from rosbags.highlevel import AnyReader
 
-    wanted = (JOINT_STATE, POINT)
+    wanted = (JOINT_STATE, *PLACES)
     if path.suffix == '.mcap' or (path.is_dir() and any(path.glob('*.mcap'))):
         bag = BagReader(path)
         seen.update(bag.topics)
@@ -165,7 +199,7 @@ class _Rows:
         self._path, self._chain, self._joint_topic = path, chain, joint_topic
         self._still = joint_standstills(joints)
         self._clock_offset_s = clock_offset_s
-        self._rows: list[tuple[int, str, FloatArray, FloatArray, int]] = []
+        self._rows: list[tuple[int, str, FloatArray, FloatArray, int, FloatArray]] = []
         self._unsteady = self._dropped = 0
         self._matched: list[str] = []
 
@@ -174,7 +208,8 @@ class _Rows:
         still = self._still
         if not len(still) or not len(stream.stamps):
             return
-        seen = point_visits(stream)
+        points = Stream(stream.stamps, stream.values[:, :3])
+        seen = point_visits(points)
         offset = self._clock_offset_s or 0.0
         if self._clock_offset_s is None and len(seen):
             names = f'{self._path}, {topic}', self._joint_topic
@@ -186,14 +221,16 @@ class _Rows:
             part = between(stream, still.begin[j] - offset, still.end[j] - offset)
             if part.start == part.stop:
                 continue
-            reading = reading_of(stream.values[part])
+            reading = reading_of(points.values[part])
             if reading is None:
                 self._unsteady += 1
                 continue
             place, std, kept = reading
             if np.isfinite(std).all():
                 self._dropped += part.stop - part.start - len(kept)
-            self._rows.append((j, topic, place, std, len(kept)))
+            turns = stream.values[part][kept, 3:]
+            turn = mean_quaternion_xyzw(turns) if turns.size else np.full(4, np.nan)
+            self._rows.append((j, topic, place, std, len(kept), turn))
 
     def raw(self, topics: Sequence[str], length: str, seen: dict[str, str]) -> RawRows:
         """Return the rows."""
@@ -205,7 +242,8 @@ class _Rows:
                 'are the clocks of both the same?'
             )
         self._rows.sort(key=lambda row: row[:2])
-        at, sensors, places, std, samples = zip(*self._rows, strict=True)
+        at, sensors, places, std, samples, turns = zip(*self._rows, strict=True)
+        orientation = np.array(turns)
         ends, q = self._still.end[[*at]], self._still.mean[[*at]]
         position = np.array(places)
         if np.abs(position).max() > FARTHEST_M:
@@ -216,7 +254,8 @@ class _Rows:
         names = {topic: topic.strip('/').split('/')[0] for topic in topics}
         if len(set(names.values())) < len(names):
             names = {topic: topic.strip('/').replace('/', '_') for topic in topics}
-        columns = {topic: f'points of sensor {names[topic]}, {length}' for topic in topics} | {
+        what = 'points' if np.isnan(orientation).all() else 'poses'
+        columns = {topic: f'{what} of sensor {names[topic]}, {length}' for topic in topics} | {
             joint_topic: f'joint angles ({", ".join(chain.joint_names)}), rad'
         }
         columns |= {topic: 'not used' for topic in seen if topic not in columns}
@@ -240,6 +279,7 @@ class _Rows:
                 *self._matched,
             ),
             length_unit=length,
+            orientation=orientation if np.isfinite(orientation).any() else None,
             warnings=(
                 *((unsteady,) if self._unsteady else ()),
                 *((dropped,) if self._dropped else ()),

@@ -461,14 +461,15 @@ def read_rows(paths: Sequence[Path], chain: SerialChain, options: TableOptions) 
             unused = ', '.join(table.names[i] for i in columns.point)
             warnings.append(f'{table.path}: {unused} left out, the points are in {points[0].path}')
     stamp = None
-    told = options.join or options.told.time == 'none'
+    in_order = options.join == 'order'
+    told = options.join in ('name', 'time') or options.told.time == 'none'
     still = None
     # A clock that was told is that of two streams.
     if options.clock_offset_s is not None or (
-        not told and not (joints is not points and common_names(points, joints))
+        not told and (in_order or joints is points or not common_names(points, joints))
     ):
         still = stopped(
-            points, joints, chain, options.angles, options.length, options.clock_offset_s
+            points, joints, chain, options.angles, options.length, options.clock_offset_s, in_order
         )
     if still is not None:
         points, joints, stamp = still.points, still.joints, still.stamp_s

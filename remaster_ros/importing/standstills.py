@@ -440,18 +440,20 @@ def stopped(
     angles: str = '',
     length: str = '',
     clock_offset_s: float | None = None,
+    in_order: bool = False,
 ) -> Stopped | None:
     """Return tables of which one is a stream of joints, a row a standstill; None for others.
 
-    An `InputError` for a stream that never stands still, or standstills that do not match.
+    `in_order`: points belong to standstills by their order, as told. An `InputError` for a stream
+    that never stands still, or standstills that do not match.
     """
     reported = times(*joints)
     if reported is None or not is_stream(reported):
         return None
     same = points[0] is joints[0]
-    when = reported if same else times(*points)
-    if when is None:
+    if in_order and (same or len(points[0].rows) == len(joints[0].rows)):
         return None
+    when = reported if same else times(*points)
     refuse_sliding(chain, joints[0].path)
     unit = ANGLES[angle_unit(*joints, angles)[0]]
     q = Stream.of(reported, unit * numbers(joints[0], joints[1].joints, optional=True))
@@ -464,6 +466,9 @@ def stopped(
             f'{joints[0].path}: the joints never stand still for {SWING_S:g} s, and only what is '
             'measured at a standstill belongs to one configuration; let the arm stop at each pose'
         )
+    names = points[0].path.name, joints[0].path.name
+    if when is None or in_order:
+        return _by_order(points, joints, chain, still, reported, unit, names, in_order)
     markers = {
         name: Stream.of(when, numbers(points[0], columns, optional=True))
         for name, columns in points[1].points.items()
@@ -472,7 +477,6 @@ def stopped(
     if not len(first.stamps):
         raise InputError(f'{points[0].path}: it has no point that was measured')
     dense = same or is_stream(first.stamps)
-    names = points[0].path.name, joints[0].path.name
     # Where the points are in the time of their own table, for each standstill of the joints.
     windows = np.column_stack((still.begin, still.end))
     how = f'{len(still)} standstills'
@@ -515,6 +519,48 @@ def stopped(
             * bool(unsteady),
             *_lost(len(still), at, names[1]),
         ),
+    )
+
+
+def _by_order(
+    points: Table,
+    joints: Table,
+    chain: SerialChain,
+    still: Standstills,
+    reported: FloatArray,
+    unit: float,
+    names: tuple[str, str],
+    told: bool,
+) -> Stopped:
+    """Return points without times beside as many standstills, where the robot agrees or `told`."""
+    raw = numbers(points[0], points[1].point, optional=True)
+    rows = np.flatnonzero(np.isfinite(raw).any(axis=1))
+    if len(rows) != len(still):
+        raise InputError(
+            f'{names[0]}: {len(rows)} points, and {len(still)} standstills in {names[1]}; only '
+            'equally many can be joined by their order: remove what has no standstill, or give '
+            'the points the times at which they were measured'
+        )
+    order = np.arange(len(still))
+    if not told:
+        of_first = raw[rows, : len('xyz')]
+        known = np.flatnonzero(np.isfinite(of_first).all(axis=1))
+        error = np.inf
+        if len(known) >= _FEWEST_FOR_ROBOT:
+            error = float(linear_fit(chain, still.mean[known][None], of_first[known])[0][0])
+        if error > _LARGEST_ERROR:
+            raise InputError(
+                f'{names[0]} has no times, and by their order its points are not those of the '
+                f'standstills in {names[1]}; give them the times at which they were measured, or '
+                'say --join order if they are right so'
+            )
+    what = 'by their order, as told' if told else 'by their order, with which the robot fits'
+    return Stopped(
+        (points[0].select(rows.tolist()), points[1]),
+        _at_rest(joints, still, order, reported, unit),
+        still.end,
+        (f'{len(rows)} points of {names[0]} match the standstills of {names[1]} {what}',),
+        (),
     )
 
 

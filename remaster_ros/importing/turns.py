@@ -48,7 +48,8 @@ def oriented(rows: RawRows, chain: SerialChain, options: SessionOptions) -> RawR
     arms = [chain.forward(q) for q in joints]
     if rows.turned is None:
         assert rows.orientation is not None
-        if options.on_tool or len(np.unique(rows.labels.get('marker', ['']))) > 1:
+        several = any(len({*rows.labels.get(what, [''])}) > 1 for what in ('marker', 'sensor'))
+        if options.on_tool or several:
             return rows
         anyhow = _apart(rows, rows.orientation, arms, False, anyhow=True)
         if anyhow < OWN_RAD:

@@ -13,6 +13,7 @@ from remaster_ros.session.bag_writer import BagWriter
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 JOINT_STATE, POINT = 'sensor_msgs/msg/JointState', 'geometry_msgs/msg/PointStamped'
+POSE, TRANSFORM = 'geometry_msgs/msg/PoseStamped', 'geometry_msgs/msg/TransformStamped'
 STOPS = np.array([[0.1, -0.4], [0.5, 0.2], [-0.7, 1.0]])
 START_S = 1_700_000_000.0
 
@@ -93,7 +94,9 @@ def test_one_topic_can_be_told(bag, chain):
 
 
 def test_what_is_missing_is_named(bag, session, chain, tmp_path):
-    with pytest.raises(InputError, match=r'no geometry_msgs/PointStamped; it has /joint_states'):
+    with pytest.raises(
+        InputError, match=r'no geometry_msgs/PointStamped or PoseStamped; it has /joint_states'
+    ):
         read_bag(bag, chain, point_topics=('/elsewhere',))
     urdf = session.urdf.replace('"joint_2"', '"elbow"')
     other = SerialChain.from_urdf(urdf, session.base_link, session.tip_link)
@@ -103,6 +106,60 @@ def test_what_is_missing_is_named(bag, session, chain, tmp_path):
     file.write_bytes(file.read_bytes()[:1000])
     with pytest.raises(InputError, match='bag'):
         read_bag(bag, chain)
+
+
+def pose(time_s, topic, kind, xyz, xyzw):
+    turn = STORE.types['geometry_msgs/msg/Quaternion'](*xyzw)
+    if kind == POSE:
+        place = STORE.types['geometry_msgs/msg/Point'](*xyz)
+        message = STORE.types['geometry_msgs/msg/Pose'](place, turn)
+        return topic, kind, STORE.types[kind](header(time_s), message), time_s
+    place = STORE.types['geometry_msgs/msg/Vector3'](*xyz)
+    message = STORE.types['geometry_msgs/msg/Transform'](place, turn)
+    return topic, kind, STORE.types[kind](header(time_s), 'body', message), time_s
+
+
+def poses(kind, topics=('/vrpn/tool',), points=False):
+    """Give the joints, and poses in the place of the points: a quarter turn more at each stop."""
+    rng = np.random.default_rng(1)
+    for topic, other, message, time_s in messages():
+        if topic != '/optitrack/marker' or points:
+            yield topic, other, message, time_s
+        if topic == '/optitrack/marker':
+            stop, _ = divmod(time_s - START_S, 4.0)
+            half = 0.25 * np.pi * stop + rng.normal(0.0, 1e-5)
+            sign = rng.choice([-1.0, 1.0])
+            xyzw = sign * np.array([0.0, 0.0, np.sin(half), np.cos(half)])
+            for name in topics:
+                yield pose(time_s, name, kind, [stop, 1.0, 2.0], xyzw)
+
+
+def written(folder, content):
+    with BagWriter(folder) as writer:
+        for topic, kind, message, time_s in content:
+            if topic != '/laser_tracker/marker':
+                data = bytes(STORE.serialize_cdr(message, kind))
+                writer.write(topic, kind, data, int(1e9 * time_s))
+    return folder
+
+
+@pytest.mark.parametrize('kind', [POSE, TRANSFORM])
+def test_poses_have_the_mean_of_their_orientations(kind, chain, tmp_path):
+    rows = read_bag(written(tmp_path / 'bag', poses(kind)), chain)
+    np.testing.assert_allclose(rows.position[:, 0], [0.0, 1.0, 2.0], atol=1e-5)
+    half = 0.25 * np.pi * np.arange(3)
+    wanted = np.column_stack((0.0 * half, 0.0 * half, np.sin(half), np.cos(half)))
+    np.testing.assert_allclose(np.abs(rows.orientation), np.abs(wanted), atol=1e-5)
+
+
+def test_points_go_before_poses_and_one_of_several_is_asked_for(chain, tmp_path):
+    both = written(tmp_path / 'both', poses(POSE, points=True))
+    assert read_bag(both, chain).orientation is None
+    several = written(tmp_path / 'several', poses(POSE, ('/tcp_pose', '/vrpn/tool')))
+    with pytest.raises(InputError, match='poses on /tcp_pose, /vrpn/tool; name those of the se'):
+        read_bag(several, chain)
+    told = read_bag(several, chain, point_topics=('/vrpn/tool',))
+    assert told.labels['sensor'] == ['vrpn'] * 3
 
 
 def test_the_command_makes_a_session_of_it(bag, session, imported):

@@ -190,6 +190,25 @@ def test_shots_at_times_of_their_own_are_paired_by_order_where_the_robot_agrees(
     assert_stops(rows, arm)
 
 
+@pytest.mark.parametrize('told', ['', 'order'])
+def test_points_without_times_belong_to_the_standstills_by_order(told, arm, run, tmp_path):
+    points = seen(run, 0.5 * (run.begin + run.end), 2, 3e-5)
+    names = [f'M{i}' for i in range(len(points))]
+    log = log_of(run, 5.0)
+
+    def table(points):
+        return text(['name', 'X', 'Y', 'Z'], [names[: len(points)], *points.T])
+
+    rows = rows_of(tmp_path, arm, table(points), log, join=told)
+    assert_stops(rows, arm)
+    assert rows.stamp_s is not None
+    with pytest.raises(InputError, match=r'23 points, and 24 standstills in log.csv; only'):
+        rows_of(tmp_path, arm, table(points[1:]), log, join=told)
+    if not told:
+        with pytest.raises(InputError, match=r'take.csv has no times, and by their order'):
+            rows_of(tmp_path, arm, table(points[::-1]), log)
+
+
 def test_a_stream_that_never_stands_still_is_refused(arm, tmp_path):
     time_s = np.arange(0.0, 20.0, 0.05)
     q = np.sin(0.5 * time_s[:, None] + np.arange(6.0))
