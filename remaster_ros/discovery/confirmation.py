@@ -128,10 +128,12 @@ class Confirmation:
     joint_offsets: tuple[Compared, ...]  # Zero-offsets that both sessions determine, side by side
     # More than half carries over, and the zero-offsets agree; not where nothing can be told
     confirmed: bool
-    same_offsets: bool  # Whether the evidence has both sessions share all zero-offsets
+    same_offsets: bool  # Whether no zero-offset that both sessions determine is another one
     why: str = ''  # Why nothing can be compared; '' where it can
     # 1-based joints whose zero-offset is another one there, by the evidence
     other_joints: tuple[int, ...] = ()
+    # The same of those that the sessions do not determine: what the causes leave out moves them
+    open_joints: tuple[int, ...] = ()
 
     @property
     def gone(self) -> bool:
@@ -186,7 +188,8 @@ def confirm(discovery: Discovery, session: Session, rng: np.random.Generator) ->
             'confirmed. Measure the arm where this session did.'
         )
     with_causes = both.here.data.context.joint_offsets + both.alone.values[: both.joints]
-    others = tuple(j + 1 for j, c in enumerate(best[: both.joints]) if c == 'own')
+    others = tuple(j + 1 for j in both.own(best) if both.offsets(best, j) is not None)
+    undetermined = tuple(j + 1 for j in both.own(best) if both.offsets(best, j) is None)
     return Confirmation(
         rows=rows,
         rows_common=int(seen.sum()),
@@ -204,6 +207,7 @@ def confirm(discovery: Discovery, session: Session, rng: np.random.Generator) ->
         same_offsets=not others,
         why=why,
         other_joints=others,
+        open_joints=undetermined,
     )
 
 
@@ -284,7 +288,8 @@ class _Both:
     """Both sessions with the cells of the arm's errors on their rows.
 
     As found and as wide as both need them, and which make each cause; what each session knows;
-    precision of the prior on their m parameters, (m, m); the other session fitted without causes.
+    precision of the prior on their m parameters, (m, m); the other session fitted without causes;
+    which zero-offsets this one determines, (k,).
     """
 
     found: tuple[Cell, ...]
@@ -294,6 +299,7 @@ class _Both:
     there: _Measured
     precision: FloatArray
     fit: Estimate
+    identifiable: BoolArray
 
     @classmethod
     def of(cls, discovery: Discovery, fit: Estimate, rng: np.random.Generator) -> _Both:
@@ -320,6 +326,7 @@ class _Both:
             _Measured.of(theirs, noise, cells, alone),
             np.reshape(block_diag(*priors), [sum(cell.size for cell in cells)] * 2),
             fit,
+            np.asarray(discovery.fit.identifiable),
         )
 
     @property
@@ -458,19 +465,33 @@ class _Both:
             judged = judged & rows
         return rms(left, judged)
 
+    def own(self, best: Choices) -> list[int]:
+        """Return the joints of which each session has its own zero-offset."""
+        return [joint for joint, choice in enumerate(best[: self.joints]) if choice == 'own']
+
+    def offsets(self, best: Choices, joint: int) -> tuple[FloatArray, FloatArray] | None:
+        """Return the two zero-offsets of a joint, rad or m, (2,), and their covariance, (2, 2).
+
+        The causes as they are best; None where one of the sessions does not determine it.
+        """
+        fit = self.fitted(_with(best, joint, 'own'))
+        where = np.array([joint, fit.there[joint]])
+        covariance = fit.covariance(where)
+        weak = WEAK_ANGLE * self.fit.model.chain.per_radian[joint]
+        known = self.identifiable[joint] and not self.fit.gauge.why[joint]
+        if not known or np.sqrt(np.diag(covariance).max()) >= weak:
+            return None
+        return self.here.data.context.joint_offsets[joint] + fit.values[where], covariance
+
     def offsets_side_by_side(self, discovery: Discovery, best: Choices) -> tuple[Compared, ...]:
         """Compare the zero-offsets that both sessions determine, the causes as they are best."""
         rows: list[Compared] = []
-        chain, offsets = discovery.fit.chain, self.here.data.context.joint_offsets
+        chain = discovery.fit.chain
         for joint, name in enumerate(discovery.fit.joint_names):
-            fit = self.fitted(_with(best, joint, 'own'))
-            where = np.array([joint, fit.there[joint]])
-            covariance = fit.covariance(where)
-            scale, unit = chain.shown_scale[joint], chain.shown_units[joint]
-            known = np.sqrt(np.diag(covariance).max()) < WEAK_ANGLE * chain.per_radian[joint]
-            if known and discovery.fit.identifiable[joint] and not self.fit.gauge.why[joint]:
-                pair = scale * (offsets[joint] + fit.values[where])
-                rows += _compared([name], unit, pair, scale**2 * covariance)
+            pair = self.offsets(best, joint)
+            if pair is not None:
+                scale, unit = chain.shown_scale[joint], chain.shown_units[joint]
+                rows += _compared([name], unit, scale * pair[0], scale**2 * pair[1])
         return tuple(rows)
 
     def _side_by_side(self, group: Sequence[int], own: _Fitted) -> tuple[Compared, ...]:
@@ -685,13 +706,10 @@ def in_words(discovery: Discovery, confirmation: Confirmation) -> list[str]:
         f'{1e3 * found.rms_own_m:.3f} mm with them fitted there: {carried}. What this session '
         'does not tell is fitted to the other one.'
     ] * bool(found.effects)
-    apart = (
-        'none is known to a fifth of a degree in both'
-        if np.isnan(found.offsets_rms_sigmas)
-        else f'they are {found.offsets_rms_sigmas:.1f} standard deviations apart on the average'
+    offsets = (
+        f'they are {found.offsets_rms_sigmas:.1f} standard deviations apart on the average, and '
+        f'the error is {1e3 * found.rms_frozen_offsets_m:.3f} mm RMS with those found here'
     )
-    error_mm = 1e3 * found.rms_frozen_offsets_m
-    offsets = f'{apart}, and the error is {error_mm:.3f} mm RMS with those found here'
     own = f'{1e3 * min(found.rms_own_m, found.rms_before_m):.3f} mm with its own'
     holds = any(cause.answer == 'confirmed' for cause in found.effects)
     if not found.same_offsets and not holds and not found.carried_over > 0.5:
@@ -707,6 +725,11 @@ def in_words(discovery: Discovery, confirmation: Confirmation) -> list[str]:
         )
     elif found.joint_offsets:
         lines.append(f'The zero-offsets are the same, {offsets}: it is the same arm.')
+    if found.open_joints:
+        lines.append(
+            f'The zero-offset of {joint_words(found.open_joints)} fits better as another one '
+            'there, but the sessions do not determine it: what the causes leave out may do that.'
+        )
     lines += [
         f'{effect.title}{_said(cause)}'
         for effect, cause in zip(discovery.effects, found.effects, strict=False)

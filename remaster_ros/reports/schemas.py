@@ -520,6 +520,7 @@ class Confirmed(Struct):
     parameters_rms_sigmas: float | UnsetType | None = UNSET
     why: str | UnsetType = UNSET
     other_joints: list[int] | UnsetType = UNSET
+    open_joints: list[int] | UnsetType = UNSET
 
 
 class PredictedRegions(Struct):

@@ -134,13 +134,12 @@ def confirmation(share, frozen, parameters, **more):
     return Confirmation(**{**given, **more})
 
 
-def test_offsets_that_cannot_be_compared_are_said_so_in_words():
+def test_an_offset_that_no_session_determines_is_no_other_one():
     session = found((EFFECT,), Gain(1e-3, 0.3e-3, 0.28e-3, {}), {})
     rows = [compared('compliance_2', 2e-5, 2.1e-5, 0.7)]
-    more = {'joint_offsets': (), 'same_offsets': False, 'other_joints': (5,)}
-    text = summary(session, confirmation(0.93, 0.35e-3, rows, **more))
-    assert 'Of joint 5 the zero-offset is another one there: none is known to a fifth' in text
-    assert 'nan' not in text
+    text = summary(session, confirmation(0.93, 0.35e-3, rows, open_joints=(5,)))
+    assert 'it is the same arm' in text
+    assert 'The zero-offset of joint 5 fits better as another one there, but the sessions' in text
 
 
 def test_the_other_session_is_shown_side_by_side():
