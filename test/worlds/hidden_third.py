@@ -17,7 +17,6 @@ from remaster_ros.calibration.extension import Term
 from remaster_ros.calibration.predictions import Predictions, predict
 from remaster_ros.discovery.discover import Discovery
 from remaster_ros.discovery.effects.context import Context, PartOfContext
-from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.kinematics.transforms import apply, inverse
 from remaster_ros.reports.discovery_json import predictions_of
 from remaster_ros.simulation.hidden_effects import HiddenEffect
@@ -80,9 +79,11 @@ def predictions_elsewhere(found: Discovery, third: Session) -> Predictions:
         terms, displacement0 = [], np.zeros((len(third.measurements), 3))
         # By their place: two cells without a name may call their parameters alike.
         solution = found.solution
+        named = {name for group in found.groups for one in group for name in one.parameters}
         for cell, where in zip(solution.cells, solution.slices(), strict=True):
-            if cell.driver == 'time' and not EFFECTS[cell.name].is_cause:
-                # Errors that follow each other belong to the readings, not to the poses.
+            if cell.driver == 'time' and cell.of_measurement and not named & {*cell.parameters}:
+                # Errors that follow each other belong to the readings, not to the poses; a drift
+                # without a name beside a wander is a part of it.
                 continue
             columns = cell.columns(context)
             terms.append(Term(where, columns.at, columns.values))

@@ -16,11 +16,14 @@ from remaster_ros.types import FloatArray
 def cells(context: Context) -> Iterator[Cell]:
     """Each sensor's frame shifts steadily, or shifts and turns."""
     for index, name in enumerate(context.sensor_names):
+        mine = context.seen_by(index) & context.to_fit
+        # The registration is that of the middle of the readings.
+        middle = float(context.elapsed_s[mine].mean()) if mine.any() else 0.0
         shifts = [f'drift_{axis}_{name}' for axis in 'xyz']
         turns = [f'drift_r{axis}_{name}' for axis in 'xyz']
         for variant, parameters in (('shift', shifts), ('shift and turn', shifts + turns)):
             yield EFFECT.cell(
-                partial(_crept, sensor=index, turning=parameters != shifts),
+                partial(_crept, sensor=index, middle=middle, turning=parameters != shifts),
                 parameters,
                 drawn_from=2 * len(context.sensor_names),
                 variant=variant,
@@ -28,8 +31,8 @@ def cells(context: Context) -> Iterator[Cell]:
             )
 
 
-def _crept(context: Context, sensor: int, turning: bool) -> Design:
-    amount = (context.elapsed_s * context.seen_by(sensor))[:, None]
+def _crept(context: Context, sensor: int, middle: float, turning: bool) -> Design:
+    amount = ((context.elapsed_s - middle) * context.seen_by(sensor))[:, None]
     axes = [context.sensor_turn[:, :, axis] for axis in range(3)]
     shifts = [amount * axis for axis in axes]
     if turning:
@@ -50,7 +53,7 @@ EFFECT = Effect(
     place='sensor_frame',
     driver='time',
     form='linear',
-    equation='δp = v t (+ ω t × (p − centroid)), in the sensor frame N',
+    equation='δp = v (t − t̄) (+ ω (t − t̄) × (p − centroid)), in the sensor frame N',
     source='tripod and mount creep; ISO 10360-10 drift checks',
     unit='m/s',
     plausible=(1e-10, 2e-6),

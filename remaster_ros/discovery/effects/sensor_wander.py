@@ -1,7 +1,8 @@
 """Sensor wander: errors that remember, from one reading to the next or over the whole session.
 
 A shift of the sensor frame that is an Ornstein-Uhlenbeck process over the readings in their
-order, by linear interpolation between knots. It has no cause: a mount that creeps back and forth,
+order, by linear interpolation between knots, less its mean: the registration is that of the whole
+session. It has no cause: a mount that creeps back and forth,
 air that warms up, a tracker that filters; where it is fast, noise with memory.
 """
 
@@ -35,13 +36,15 @@ RARITY = 3
 def cells(context: Context) -> Iterator[Cell]:
     """Each sensor, with a long, a middling and a short memory."""
     for index, name in enumerate(context.sensor_names):
-        if np.sum(context.seen_by(index)) < FEWEST_READINGS:
+        mine = context.seen_by(index)
+        if np.sum(mine) < FEWEST_READINGS:
             continue
         for variant, length in LENGTHS.items():
             knots = np.linspace(0.0, 1.0, 1 + int(np.ceil(KNOTS_PER_LENGTH / length)))
             correlation = np.exp(-np.abs(knots[:, None] - knots) / length)
+            mean = _between(context, knots)[mine & context.to_fit].mean(axis=0)
             yield EFFECT.cell(
-                partial(_wandered, sensor=index, knots=knots),
+                partial(_wandered, sensor=index, knots=knots, mean=mean),
                 [
                     f'wander_{axis}_{variant}_{name}_{i}'
                     for i in range(len(knots))
@@ -55,11 +58,15 @@ def cells(context: Context) -> Iterator[Cell]:
             )
 
 
-def _wandered(context: Context, sensor: int, knots: FloatArray) -> Design:
+def _between(context: Context, knots: FloatArray) -> FloatArray:
     # Linear: the splines' own knots stand once more at both ends.
     padded = np.concatenate((knots[:1], knots, knots[-1:]))
-    features = scipy.interpolate.BSpline.design_matrix(context.progress, padded, 1).toarray()
-    features = features * context.seen_by(sensor)[:, None]
+    matrix = scipy.interpolate.BSpline.design_matrix(context.progress, padded, 1)
+    return np.asarray(matrix.toarray())
+
+
+def _wandered(context: Context, sensor: int, knots: FloatArray, mean: FloatArray) -> Design:
+    features = (_between(context, knots) - mean) * context.seen_by(sensor)[:, None]
     return displaced(*along_axes(features, context.sensor_turn))
 
 
