@@ -54,6 +54,8 @@ _PENDANTS = tuple(
     )
 )
 _SPREAD = {'std', 'stdev', 'stddev', 'sigma', 'sd', 'uncertainty', 'rms'}
+# Of an expanded uncertainty, U(95), which is no standard deviation.
+_EXPANDED = {'u', '95'}
 _TOOL = {
     *('target', 'goal', 'tcp', 'tool', 'flange', 'robot', 'ref', 'reference', 'plan', *'rwvaf'),
 }
@@ -398,6 +400,7 @@ def _points(
     spreads = [stem for stem in complete if _SPREAD & set(stem) or 's' in stem]
     lettered = _lettered(complete)
     usable = [stem for stem in complete if stem not in spreads and not _NOT_MEASURED & set(stem)]
+    usable = [stem for stem in usable if not _EXPANDED <= set(stem)]
     best = [stem for stem in usable if stem in lettered or not _TOOL & set(stem)] or usable
     best = [stem for stem in best if _REPORTED & set(stem)] or best
     sets = [complete[stem] for stem in best]

@@ -445,6 +445,10 @@ def read_rows(paths: Sequence[Path], chain: SerialChain, options: TableOptions) 
         'the joint angles',
         '--joints',
     )
+    warnings = [note for table in tables for note in table.notes]
+    joints, unused = _without_idle(joints, len(chain))
+    if unused:
+        warnings.append(f'{joints[0].path}: {", ".join(unused)} left out: 0 in every row')
     if len(joints[1].joints) != len(chain):
         table, columns = joints
         given = [table.names[i] for i in columns.joints]
@@ -455,7 +459,6 @@ def read_rows(paths: Sequence[Path], chain: SerialChain, options: TableOptions) 
             'with --base-link and --tip-link'
         )
     description = [table.describe() for table in tables]
-    warnings = [note for table in tables for note in table.notes]
     for table, columns in with_points:
         if table is not points[0]:
             unused = ', '.join(table.names[i] for i in columns.point)
@@ -485,6 +488,19 @@ def read_rows(paths: Sequence[Path], chain: SerialChain, options: TableOptions) 
         points = points[0].select(pairs.points), points[1]
         joints = joints[0].select(pairs.joints), joints[1]
     return _values(points, joints, chain, options, stamp, tuple(description), tuple(warnings))
+
+
+def _without_idle(joints: Table, count: int) -> tuple[Table, list[str]]:
+    """Return joints without axes behind so many that are 0 throughout, and the names of these.
+
+    A controller that has seven axes writes 0 for the seventh of an arm with six.
+    """
+    table, columns = joints
+    beyond = columns.joints[count:]
+    if not beyond or np.any(numbers(table, beyond)):
+        return joints, []
+    kept = replace(columns, joints=columns.joints[:count])
+    return (table, kept), [table.names[i] for i in beyond]
 
 
 def _complete(points: Table, joints: Table) -> tuple[Table, Table, tuple[str, ...]]:

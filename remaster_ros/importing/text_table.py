@@ -196,7 +196,8 @@ def read_table(
         # A separator at the end of a line is no further column.
         while len(cells) > width and not cells[-1]:
             cells = cells[:-1]
-        if _is_no_row(cells, usual, width):
+        numbered = not (named or rows) and _are_counted(cells)
+        if numbered or _is_no_row(cells, usual, width):
             left.append(f'{number} ({line.strip()[:_SHOWN]})')
             continue
         if len(cells) != width:
@@ -487,6 +488,12 @@ def _header(
         else:
             names, named, over = _below(over or names, cells), at, []
     return names, '\n'.join(preamble), named
+
+
+def _are_counted(cells: Sequence[str]) -> bool:
+    """Return whether cells are the numbers of their columns from 0 on, as programs name them."""
+    given = [cell for cell in cells[:1] if cell] + [*cells[1:]]
+    return len(given) >= _FEWEST_NUMBERS and given == [str(i) for i in range(len(given))]
 
 
 def _below(over: Sequence[str], names: list[str]) -> list[str]:

@@ -19,11 +19,13 @@ _LINE = re.compile(
 # An array of targets: its name, and how many there are.
 _ARRAY = re.compile(r'\s*([A-Za-z]\w*)\s*\{\s*(\d+)\s*\}\s*:=\s*\[')
 _TARGET = re.compile(r'\bjointtarget\b', re.IGNORECASE)
+# Rokae's, which may end without a semicolon.
+_ROKAE = re.compile(r'\bjointtarget\s+\w+\s*=\s*J\s*:', re.IGNORECASE)
 _LISTED = re.compile(r'^\s*\[\s*\[', re.MULTILINE)
 _MOVE = re.compile(r'\bMoveAbsJ\s*\[', re.IGNORECASE)
 _ASSIGNED = re.compile(r'\s*([A-Za-z]\w*)\s*:?=\s*')
 _VALUE = re.compile(
-    r'\s*(?:[A-Za-z]\w*\s*:)?\s*[\[{]?\s*[\[{]([^\[\]{}]*)[\]}]\s*,?\s*(?:(?:[A-Za-z]\w*\s*:)?\s*[\[{]([^\[\]{}]*)[\]}])?\s*[\]}]?'
+    r'\s*(?:[A-Za-z]\w*\s*:)?\s*[\[{]?\s*[\[{]([^\[\]{}]*)[\]}]\s*,?\s*(?:(?:[A-Za-z]\w*\s*:)?\s*[\[{](?:EJ\s)?([^\[\]{}]*)[\]}])?\s*[\]}]?'
 )
 _LISTED_AXES = re.compile(r'\[\s*\[([^\[\]]*)\]\s*,\s*\[([^\[\]]*)\]\s*\]')
 _ELEMENT = re.compile(r'\s*([A-Za-z]\w*(?:\s*\{\s*\d+\s*\})?)\s*:=\s*')
@@ -110,7 +112,7 @@ def _statements(text: str) -> list[tuple[int, str]]:
                 start = start if parts else number
                 parts.append(piece)
         # A log has a target in each line, with or without a semicolon.
-        if listed and parts:
+        if (listed or _ROKAE.search(code)) and parts:
             statements.append((start, ' '.join(parts)))
             parts = []
     return [*statements, (start, ' '.join(parts))] if parts else statements

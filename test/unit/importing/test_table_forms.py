@@ -244,6 +244,19 @@ def test_quaternions_beside_the_joints(arm, tmp_path):
         rows_of(arm, tmp_path, content)
 
 
+def test_expanded_uncertainties_and_columns_that_a_program_counted(arm, tmp_path):
+    header = ['X [mm]', 'Y [mm]', 'Z [mm]', 'U(95) X [mm]', 'U(95) Y [mm]', 'U(95) Z [mm]']
+    shots = text(header, [*millimetres(arm), *np.full((3, COUNT), 0.01)])
+    joints = text([str(i) for i in range(6)], degrees(arm))
+    rows = rows_of(arm, tmp_path, shots, joints, join='order')
+    assert_rows(rows, arm)
+    assert any('line 1 (0,1,2,3,4,5): no row' in line for line in rows.warnings)
+    # With the number of each row beside them.
+    joints = text(['', *map(str, range(6))], [range(COUNT), *degrees(arm)])
+    told = Told(joints=('2', '3', '4', '5', '6', '7'))
+    assert_rows(rows_of(arm, tmp_path, shots, joints, told=told, join='order'), arm)
+
+
 def test_surveyors_letters(arm, tmp_path):
     header = ['Point Id', 'Easting [m]', 'Northing [m]', 'Ortho. Height [m]']
     for names in (header, ['Pt', 'E', 'N', 'H']):
@@ -297,6 +310,10 @@ PROGRAMS = {
         + f'{UNUSED}];\n  PROC init()\n'
         + ''.join(f'    p{i}:=[[{listed(row)}],{UNUSED}];\n' for i, row in enumerate(q, 1))
         + '  ENDPROC\nENDMODULE\n'
+    ),
+    'Rokae without semicolons': lambda q: ''.join(
+        f'LOCAL VAR jointtarget j{i} = j:{{{listed(row)}\t\t,0}}\t{{EJ 0,0,0,0,0,0}}\n'
+        for i, row in enumerate(q, 1)
     ),
     'Staubli without keys': lambda q: (
         '<dataList><jointRxData name="jPos" public="true">\n'
