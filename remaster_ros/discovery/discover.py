@@ -445,7 +445,7 @@ def of_all_kinds(beside: _Beside) -> Solution | None:
     of_a_name = {name for cell in members for name in cell.parameters}
     unnamed = [family for family in every if of_a_name.isdisjoint(family.parameters)]
     whole = fit_kinds(data, own, [one for one in every if one not in unnamed], unnamed)
-    # Errors that only have a place are no kind of the arm's: what they explain tells nothing of it.
+    # What only has a place is no kind of error of the arm: what it explains tells nothing of that.
     located = search.fit([cell for cell in named.cells if not EFFECTS[cell.name].is_cause])
     if whole is None or located is None or whole.log_evidence < located.log_evidence + NAMED:
         return None

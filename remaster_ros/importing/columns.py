@@ -400,7 +400,7 @@ def _points(
     spreads = [stem for stem in complete if _SPREAD & set(stem) or 's' in stem]
     lettered = _lettered(complete)
     usable = [stem for stem in complete if stem not in spreads and not _NOT_MEASURED & set(stem)]
-    usable = [stem for stem in usable if not _EXPANDED <= set(stem)]
+    usable = [stem for stem in usable if not set(stem) >= _EXPANDED]
     best = [stem for stem in usable if stem in lettered or not _TOOL & set(stem)] or usable
     best = [stem for stem in best if _REPORTED & set(stem)] or best
     sets = [complete[stem] for stem in best]
