@@ -446,9 +446,9 @@ def read_rows(paths: Sequence[Path], chain: SerialChain, options: TableOptions) 
         '--joints',
     )
     warnings = [note for table in tables for note in table.notes]
-    joints, unused = _without_idle(joints, len(chain))
-    if unused:
-        warnings.append(f'{joints[0].path}: {", ".join(unused)} left out: 0 in every row')
+    joints, idle = _without_idle(joints, len(chain))
+    if idle:
+        warnings.append(f'{joints[0].path}: {", ".join(idle)} left out: 0 in every row')
     if len(joints[1].joints) != len(chain):
         table, columns = joints
         given = [table.names[i] for i in columns.joints]

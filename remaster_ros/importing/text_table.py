@@ -178,7 +178,8 @@ def read_table(
     width, first, usual = _first_row(split, path, comment)
     header, preamble, named = _header(split[:first], width, separator, path)
     written = [cells for _, _, cells in split[:named]]
-    rows, at, left = [], [], []
+    rows: list[tuple[str, ...]] = []
+    at, left = [], []
     # Titles may hold numbers; below the names, and where there are none, that is a damaged row.
     above = [entry for entry in split[named:first] if not comment.match(entry[1])]
     damaged = [
