@@ -132,7 +132,9 @@ class Priors:
     Attributes
     ----------
     joint_offsets
-        Joint name -> mean and standard deviation, rad.
+        Joint name -> mean and standard deviation, rad; m of those in ``in_m``.
+    in_m
+        Names of the joints whose priors are lengths: of those that slide.
     markers
         Marker name -> position in the tool frame T, m, (3,), and standard deviation per axis, m.
     base
@@ -146,6 +148,7 @@ class Priors:
     markers: Mapping[str, tuple[FloatArray, float]] = field(default_factory=dict)
     base: Mapping[str, BasePrior] = field(default_factory=dict)
     geometry_tolerance_m: float = 1e-4
+    in_m: frozenset[str] = frozenset()
 
 
 @dataclass(frozen=True)

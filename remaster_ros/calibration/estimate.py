@@ -86,12 +86,6 @@ class Problem:
                 f'the session has {given.q.shape[-1]} joints, '
                 f'the URDF from {session.base_link} to {session.tip_link} has {len(chain)}'
             )
-        if chain.slides.any() and given.orientation is not None:
-            raise InputError(
-                f"joint '{chain.joint_names[int(np.argmax(chain.slides))]}' slides, and "
-                'orientations are fitted for arms whose joints all turn; leave the columns of the '
-                'orientation out'
-            )
         if len(chain) < 2:
             raise InsufficientDataError(
                 'the robot has one joint: its zero-offset and the registration cannot be separated'
@@ -132,9 +126,11 @@ class Problem:
                         f'{", ".join(names)}; correct the name or leave it out'
                     )
         for name, slides in zip(chain.joint_names, chain.slides, strict=True):
-            if slides and name in priors.joint_offsets:
+            if name in priors.joint_offsets and slides != (name in priors.in_m):
                 raise InputError(
-                    f"the prior on joint '{name}' is an angle, but that joint slides; leave it out"
+                    f"the prior on joint '{name}' is {'an angle' if slides else 'a length'}, but "
+                    f'that joint {"slides" if slides else "turns"}; write '
+                    f'{"mean_mm and std_mm" if slides else "mean_deg and std_deg"}'
                 )
         places = [
             priors.markers.get(name, (session.markers[name], session.marker_std_m))

@@ -38,11 +38,11 @@ METRICS = ('relative_orientation', 'post_registration_orientation')
 class TurnsTell:
     """What the orientations tell of the offsets of k joints."""
 
-    # Of the offsets by the positions alone, rad, (k,); 0 where held, infinite where those do not
-    # determine them
+    # Of the offsets by the positions alone, rad or m, (k,); 0 where held, infinite where those do
+    # not determine them
     std_without: FloatArray
-    # By how much the orientations move the offsets, rad, (k,); 0 where held or where the positions
-    # alone determine nothing
+    # By how much the orientations move the offsets, rad or m, (k,); 0 where held or where the
+    # positions alone determine nothing
     shift: FloatArray
     p_value: float  # Of so large a shift, or a larger one, by noise
 

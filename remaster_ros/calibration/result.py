@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import Any
@@ -152,8 +152,8 @@ class Orientations:
     std_rad: Mapping[str, FloatArray] = field(default_factory=dict)
     tell: TurnsTell | None = None  # What they tell of the offsets
 
-    def words(self, joint_names: Sequence[str], std: FloatArray) -> str:
-        """Return what orientations did to offsets with these std (k,), rad, a sentence."""
+    def words(self, chain: SerialChain, std: FloatArray) -> str:
+        """Return what orientations did to offsets with these std (k,), a sentence."""
         if self.why_not or self.tell is None:
             return self.why_not
         noises = ' and '.join(
@@ -166,10 +166,11 @@ class Orientations:
         gain = np.where(held, 0.0, self.tell.std_without / np.where(held, 1.0, std))
         joint = int(np.argmax(gain))
         if not np.isfinite(gain[joint]):
-            return f'{text}; the positions alone do not determine {joint_names[joint]}'
+            return f'{text}; the positions alone do not determine {chain.joint_names[joint]}'
+        scale, unit = chain.shown_scale[joint], chain.shown_units[joint]
         return (
-            f'{text}; {joint_names[joint]} is known to {np.degrees(std[joint]):.4f} deg with '
-            f'them, to {np.degrees(self.tell.std_without[joint]):.4f} by the positions alone'
+            f'{text}; {chain.joint_names[joint]} is known to {scale * std[joint]:.4f} {unit} with '
+            f'them, to {scale * self.tell.std_without[joint]:.4f} by the positions alone'
         )
 
 
@@ -303,7 +304,7 @@ class FitResult:
         if self.orientations is None:
             return ''
         std = np.where(self.identifiable, self.joint_offsets_std / self.widening, 0.0)
-        return self.orientations.words(self.joint_names, std)
+        return self.orientations.words(self.chain, std)
 
     @property
     def other_errors(self) -> bool:

@@ -229,16 +229,21 @@ def _orientation(result: FitResult, found: Orientations) -> dict[str, Any]:
             for name, R_T_B in found.R_T_B.items()
         },
         'p_value': None if tell is None else tell.p_value,
-        'std_positions_deg': {}
-        if tell is None
-        else {
-            joint: float(np.degrees(std)) if np.isfinite(std) else None
-            for joint, std, known in zip(
-                result.joint_names, tell.std_without, result.identifiable, strict=True
-            )
-            if known
-        },
+        **_by_positions(result),
     }
+
+
+def _by_positions(result: FitResult) -> dict[str, dict[str, float | None]]:
+    """Return the std of each offset by the positions alone, in degrees and, of slides, in mm."""
+    found: dict[str, dict[str, float | None]] = {'std_positions_deg': {}}
+    tell = None if result.orientations is None else result.orientations.tell
+    if tell is None:
+        return found
+    for joint in np.flatnonzero(result.identifiable).tolist():
+        std = float(result.chain.shown_scale[joint] * tell.std_without[joint])
+        own = found.setdefault(f'std_positions_{result.chain.shown_units[joint]}', {})
+        own[result.joint_names[joint]] = std if np.isfinite(std) else None
+    return found
 
 
 def fit_content(result: FitResult) -> schemas.Fit:

@@ -210,8 +210,8 @@ class Orientation(Struct):
     """What came of measured orientations.
 
     ``p_value`` is that positions and orientations agree on the offsets; ``std_positions_deg`` is
-    what the positions alone would know of each (None: nothing). Where they are not fitted ``why``
-    has the reason.
+    what the positions alone would know of each (None: nothing), ``std_positions_mm`` the same of
+    joints that slide. Where they are not fitted ``why`` has the reason.
     """
 
     fitted: bool
@@ -221,6 +221,7 @@ class Orientation(Struct):
     bodies: dict[str, Body]
     p_value: float | None = None
     std_positions_deg: dict[str, float | None] = {}
+    std_positions_mm: dict[str, float | None] | UnsetType = UNSET
 
 
 class NoiseCheck(Struct):

@@ -360,8 +360,25 @@ class _Strict(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class _OffsetPrior(_Strict):
-    mean_deg: Annotated[float, Bounds(-180.0, 180.0, 'degrees')]
-    std_deg: Annotated[float, Bounds(0.0, 180.0, 'degrees', above=True)]
+    """In degrees, or in mm of a joint that slides."""
+
+    mean_deg: Annotated[float | None, Bounds(-180.0, 180.0, 'degrees')] = None
+    std_deg: Annotated[float | None, Bounds(0.0, 180.0, 'degrees', above=True)] = None
+    mean_mm: Annotated[float | None, Bounds(-1000.0, 1000.0, 'mm')] = None
+    std_mm: Annotated[float | None, Bounds(0.0, 1000.0, 'mm', above=True)] = None
+
+    def known(self, where: str) -> tuple[float, float, bool]:
+        """Return mean and std, rad or m, and whether it is m; an `InputError` without a unit."""
+        degrees, lengths = (self.mean_deg, self.std_deg), (self.mean_mm, self.std_mm)
+        in_m = degrees == (None, None)
+        mean, std = lengths if in_m else degrees
+        if mean is None or std is None or not (in_m or lengths == (None, None)):
+            raise InputError(
+                f'{where} has not both of mean_deg and std_deg, or of mean_mm and std_mm where '
+                'the joint slides, and nothing else'
+            )
+        scale = 1e-3 if in_m else float(np.radians(1.0))
+        return scale * mean, scale * std, in_m
 
 
 class _MarkerPrior(_Strict):
@@ -380,7 +397,7 @@ class _Priors(_Strict):
 
     ::
 
-        joint_offsets: {joint_2: {mean_deg: 0.1, std_deg: 0.05}}
+        joint_offsets: {joint_2: {mean_deg: 0.1, std_deg: 0.05}, rail: {mean_mm: 1, std_mm: 0.5}}
         markers: {sir: {position_m: [0.1, 0.0, 0.02], std_m: 1.0e-4}}
         base: {mocap: {translation_m: [2.0, 0.0, 1.0], rotation_xyzw: [0, 0, 0, 1],
                        std_m: 1.0e-3, std_rad: 1.0e-3}}
@@ -407,11 +424,13 @@ def read_priors(path: str | os.PathLike[str]) -> Priors:
     for sensor, base in content.base.items():
         if problem := base.problem(f'base.{sensor}'):
             raise InputError(f'{path}: {problem}')
+    known = {
+        joint: prior.known(f'{path}: joint_offsets.{joint}')
+        for joint, prior in content.joint_offsets.items()
+    }
     return Priors(
-        joint_offsets={
-            joint: (np.radians(prior.mean_deg), np.radians(prior.std_deg))
-            for joint, prior in content.joint_offsets.items()
-        },
+        joint_offsets={joint: (mean, std) for joint, (mean, std, _) in known.items()},
+        in_m=frozenset(joint for joint, (_, _, in_m) in known.items() if in_m),
         markers={
             marker: (np.array(prior.position_m), prior.std_m)
             for marker, prior in content.markers.items()

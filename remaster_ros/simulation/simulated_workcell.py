@@ -326,12 +326,6 @@ def simulate_workcell(
             f'sensors {what} measure poses; state the noise of an orientation as well '
             '(--orientation-noise-deg, in Python orientation_noise_rad)'
         )
-    if turn_sigma_rad is not None and chain.slides.any():
-        sliding = chain.joint_names[int(np.argmax(chain.slides))]
-        raise InputError(
-            f"joint '{sliding}' slides, and no fit takes orientations of such an arm; leave their "
-            'noise out (--orientation-noise-deg, in Python orientation_noise_rad)'
-        )
     own = [marker for sensor in cell.sensors.values() for marker in sensor.markers]
     if on_tool and not len(cell.sensors) == len(own) == len(set(own)):
         raise InputError(

@@ -59,12 +59,14 @@ def make_session(
     """Draw an arm's truth and measure it.
 
     ``common`` is the error that the rows of a pose share over the one of each, of a tracker.
-    Neither the place of the body on the tool nor how it stands there is known.
+    Neither the place of the body on the tool nor how it stands there is known. ``arm`` is the name
+    of a shipped one, or a URDF.
     """
-    urdf = (ROBOTS / f'{arm or rng.choice(ARMS)}.urdf').read_text()
+    urdf = arm or str(rng.choice(ARMS))
+    urdf = urdf if urdf.startswith('<') else (ROBOTS / f'{urdf}.urdf').read_text()
     chain = SerialChain.from_urdf(urdf, *_ends(urdf))
     k, n = len(chain), poses * solutions
-    offsets = np.radians(0.3) * rng.standard_normal(k)
+    offsets = np.radians(0.3) * rng.standard_normal(k) * chain.per_radian
     tool = transform(Rotation.random(rng=rng).as_matrix(), rng.uniform(-0.1, 0.1, 3))
     direction = rng.uniform(-np.pi, np.pi)
     place = np.array([0.6 * np.cos(direction), 0.6 * np.sin(direction), 0.4])
@@ -204,12 +206,12 @@ class Held(NamedTuple):
     gross: int
 
 
-def one_session(seed: int, kind: str, poses: int = 30) -> Held:
+def one_session(seed: int, kind: str, poses: int = 30, arm: str | None = None) -> Held:
     """Make a session with this seed, fit it, and look which intervals hold."""
     rng = np.random.default_rng(seed)
     common = rng.choice((0.0, 1.0, 3.0))
     made = make_session(
-        kind, rng, poses=poses, solutions=3 if kind == 'tracker' else 2, common=common
+        kind, rng, poses=poses, solutions=3 if kind == 'tracker' else 2, common=common, arm=arm
     )
     fit = fit_session(made.session, rng=rng, draws=1000)
     assert fit.orientations is not None

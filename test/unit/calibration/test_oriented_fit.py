@@ -8,12 +8,19 @@ from rigs.parallel import in_parallel
 from scipy.spatial.transform import Rotation
 from scipy.stats import binom
 from worlds.oriented_sessions import KINDS, Problem, estimate, make_session, one_session
+from worlds.sliding_cells import LWR, rail, telescope
 
 from remaster_ros.calibration.fit import fit_session
 from remaster_ros.reports.fit_json import fit_content
 from remaster_ros.reports.sentences import fit_lines
 
 ERROR_RATE = 1e-3
+# What slides is the first joint, one amid the arm, and the last one.
+SLIDING = {
+    'rail': rail(),
+    'telescope': telescope(),
+    'last': LWR.replace('name="joint_7" type="revolute"', 'name="joint_7" type="prismatic"'),
+}
 
 
 def held(seed_and_kind):
@@ -22,9 +29,13 @@ def held(seed_and_kind):
     return one_session(seed, kind)
 
 
-@pytest.mark.parametrize('kind', KINDS)
-def test_the_derivative_is_that_of_the_prediction(kind):
-    found = estimate(Problem.of(make_session(kind, np.random.default_rng(1), poses=8).session))
+@pytest.mark.parametrize(
+    ('kind', 'arm'), [*((kind, None) for kind in KINDS), ('tracker', 'rail'), ('tracker', 'last')]
+)
+def test_the_derivative_is_that_of_the_prediction(kind, arm):
+    given = {'arm': SLIDING[arm]} if arm else {}
+    made = make_session(kind, np.random.default_rng(1), poses=8, **given)
+    found = estimate(Problem.of(made.session))
     model, rows = found.model, found.posterior.rows
     assert len(rows) == 2 * rows.points
     # Far from the mode, where nothing is small.
@@ -54,6 +65,18 @@ def test_the_outer_joints_stay_a_gauge_and_the_last_takes_the_body_along(kind):
     assert any(name.startswith('marker.body.') for name in last)
     assert not any(name.startswith('registration') for name in last)
     assert 'turned on the tool about the axis of' in gauge.why[-1]
+
+
+@pytest.mark.parametrize('arm', SLIDING)
+@pytest.mark.parametrize('sessions', [4, pytest.param(100, marks=pytest.mark.qualify)])
+def test_intervals_of_an_arm_that_slides_hold_as_often_as_they_say(arm, sessions):
+    found = [
+        one_session(seed, 'tracker', arm=SLIDING[arm]) for seed in range(9500, 9500 + sessions)
+    ]
+    inside = np.concatenate([one.inside for one in found])
+    low, high = binom.ppf((0.5 * ERROR_RATE, 1.0 - 0.5 * ERROR_RATE), len(inside) // 2, 0.95)
+    assert low <= inside.mean() * (len(inside) // 2) <= high
+    assert np.abs(np.concatenate([one.scaled for one in found])).max() < 4.5
 
 
 @pytest.mark.parametrize('sessions', [2, pytest.param(200, marks=pytest.mark.qualify)])

@@ -1,6 +1,7 @@
 """Arms with a joint that slides: kinematics against pinocchio, offsets in m, refusals."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from remaster_ros.compensation.mastering import mastering
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.session.reader import read_session
+from remaster_ros.types import Priors
 
 pin = pytest.importorskip('pinocchio', reason='needs the judge: pip install pin')
 
@@ -183,3 +185,22 @@ def test_a_session_that_has_rad_for_a_slide_is_refused(measured, tmp_path):
         (tmp_path / file.name).write_text(file.read_text().replace('q3_m', 'q3_rad'))
     with pytest.raises(InputError, match='joint 3 of the URDF slides, so its column is q3_m'):
         read_session(tmp_path)
+
+
+def test_what_is_known_of_a_slide_is_a_length(measured):
+    session = read_session(measured[0] / 's')
+    known = Priors({'j3': (4e-3, 1e-6)}, in_m=frozenset({'j3'}))
+    fit = fit_session(session, rng=np.random.default_rng(1), priors=known)
+    assert abs(fit.joint_offsets[SLIDE] - 4e-3) < 1e-5
+    for wrong, words in (
+        (
+            Priors({'j3': (4e-3, 1e-6)}),
+            "joint 'j3' is an angle, but that joint slides; write mean_mm",
+        ),
+        (
+            replace(known, joint_offsets={'j2': (0.0, 1.0)}, in_m=frozenset({'j2'})),
+            'is a length, but',
+        ),
+    ):
+        with pytest.raises(InputError, match=words):
+            fit_session(session, rng=np.random.default_rng(1), priors=wrong)

@@ -9,7 +9,7 @@ from remaster_ros.errors import InputError
 from remaster_ros.session.session_yaml import read_priors
 
 GOOD = """
-joint_offsets: {joint_2: {mean_deg: 0.1, std_deg: 0.05}}
+joint_offsets: {joint_2: {mean_deg: 0.1, std_deg: 0.05}, lift: {mean_mm: 2.0, std_mm: 0.5}}
 markers: {sir: {position_m: [0.1, 0.0, 0.02], std_m: 1e-4}}
 base:
   mocap: {translation_m: [2.0, 0.0, 1.0], rotation_xyzw: [0, 0, 0, 1], std_m: 1e-3, std_rad: 2e-3}
@@ -26,6 +26,8 @@ def write(folder: Path, text: str) -> Path:
 def test_every_key_is_read(tmp_path) -> None:
     priors = read_priors(write(tmp_path, GOOD))
     assert priors.joint_offsets['joint_2'] == pytest.approx(np.radians([0.1, 0.05]))
+    assert priors.joint_offsets['lift'] == pytest.approx((2e-3, 5e-4))
+    assert priors.in_m == {'lift'}
     position, std = priors.markers['sir']
     assert position.tolist() == [0.1, 0.0, 0.02]
     assert std == 1e-4
@@ -44,6 +46,9 @@ def test_every_key_is_read(tmp_path) -> None:
         ('std_deg: 0.05', 'std_deg: .nan', r'joint_2.std_deg: nan is not a finite number'),
         ('mean_deg: 0.1', 'mean_deg: 1000', r'joint_2.mean_deg is 1000'),
         ('mean_deg: 0.1', 'mean_deg: much', r'mean_deg'),
+        ('mean_mm: 2.0, ', '', r'joint_offsets.lift has not both of mean_deg and std_deg'),
+        ('mean_mm: 2.0', 'mean_deg: 2.0', r'joint_offsets.lift has not both of mean_deg'),
+        ('std_mm: 0.5', 'std_mm: 0.5, std_deg: 1.0', r'joint_offsets.lift has not both'),
         ('std_m: 1e-4', 'std_m: -1', r'markers.sir.std_m is -1'),
         ('[0.1, 0.0, 0.02]', '[0.1, 0.0]', r'position_m'),
         ('[0.1, 0.0, 0.02]', '[100, 0.0, 20]', r'markers.sir.position_m'),
