@@ -11,7 +11,7 @@ from itertools import chain as flat
 
 from remaster_ros.errors import InputError
 from remaster_ros.importing.text_table import TextTable
-from remaster_ros.importing.units import ANGLES, LENGTHS, split_unit
+from remaster_ros.importing.units import ANGLES, LENGTHS, other_unit, split_unit
 
 AXES = ('x', 'y', 'z')
 _TOKEN = re.compile(r'[^\W\d_]+|\d+|#')
@@ -175,6 +175,13 @@ def find_columns(
         found.joints = _joints(table, headers, joint_names, sliding, taken, found)
     if not found.points:
         found.points = _points(table, headers, taken, found)
+    for i in (*found.joints, *found.point):
+        if unit := other_unit(table.names[i]):
+            raise InputError(
+                f'{table.path}, column {table.names[i]}: {unit}, where one of '
+                f'{", ".join(ANGLES if i in found.joints else LENGTHS)} is expected; convert the '
+                'column'
+            )
     _orientations(headers, taken, found)
     for i, header in enumerate(headers):
         if i in taken:

@@ -40,6 +40,19 @@ _COORDINATE_IN_M = re.compile(r'(?:^|.*[ _.-])[xyz]_m$', re.IGNORECASE)
 _MM_AT_ONCE = re.compile(r'[xyz]mm', re.IGNORECASE)
 
 
+# What tables are written in as well, and nothing here converts.
+_OTHERS = {
+    *('mrad', 'arcmin', 'arcsec', 'rev', 'turns', 'counts', 'pulses', 'pulse', 'inc', 'ticks'),
+    *('ft', 'feet', 'foot', 'yd', 'mil', 'mils', 'thou', 'dm', 'km', 'nm', 'px', 'pixel'),
+}
+
+
+def other_unit(header: str) -> str:
+    """Return the unit at the end of a header that nothing converts; '' where there is none."""
+    found = _IN_BRACKETS.search(header) or _AT_END.search(header)
+    return found[1] if found and found[1].lower() in _OTHERS else ''
+
+
 def unit_of(text: str) -> str:
     """Return the unit that a text stands for, as `SI` has it; '' where it stands for none."""
     word = bare(text).lower()

@@ -1,4 +1,4 @@
-"""Logs in which each number has its name before it: `P1 X=1.5 Y=2.5 Z=3.5`, `A1="10.0" A2="…"`."""
+"""Logs in which each number has its name before it: `P1 X=1.5 Y=2.5 Z=3.5`, `A1 10.0 A2 …`."""
 
 from __future__ import annotations
 
@@ -7,10 +7,12 @@ import re
 from remaster_ros.importing.makers.named import NUMBER, Named, leading, unexpected
 
 _PAIR = re.compile(
-    rf'(?<![\w.$])([A-Za-z]\w*)\s*[=:]\s*"?({NUMBER.pattern})"?'
+    rf'(?<![\w.$])([A-Za-z]\w*)(?:\s*[=:]\s*"?|\s+)({NUMBER.pattern})"?'
     r'(?:\s*(°|(?:deg|rad|mm|m)\b))?(?![\w.])\s*[,;/>)]*\s*'
 )
 _FEWEST = 3
+_SEEN = 50
+_NUMBERS = re.compile(r'\d+(?:\.\d*)?')
 # Text between has fewer numbers.
 _MOST_BESIDE = 2
 _APART = ' \t:;,=<("'
@@ -19,7 +21,9 @@ _APART = ' \t:;,=<("'
 def read(text: str) -> Named | None:
     """Return the numbers by their names; None for anything else."""
     lines = [(i, line) for i, line in enumerate(text.splitlines(), 1) if line.strip()]
-    if not lines or not any(_is_keyed(line) for _, line in lines[:2]):
+    seen = [line for _, line in lines[:_SEEN] if len(_NUMBERS.findall(line)) >= _FEWEST]
+    # Titles have such words as well.
+    if not seen or 2 * sum(map(_is_keyed, seen)) <= len(seen):
         return None
     keys: list[str] = []
     rows: list[tuple[str, ...]] = []
@@ -28,7 +32,7 @@ def read(text: str) -> Named | None:
     beside = 0
     for number, line in lines:
         pairs = [*_PAIR.finditer(line)]
-        if len(pairs) < _FEWEST and len(re.findall(r'\d+(?:\.\d*)?', line)) <= _MOST_BESIDE:
+        if len(pairs) < _FEWEST and len(_NUMBERS.findall(line)) <= _MOST_BESIDE:
             beside += 1
             continue
         own = [f'{pair[1]} [{pair[3]}]' if pair[3] else pair[1] for pair in pairs]
@@ -52,4 +56,5 @@ def read(text: str) -> Named | None:
 
 
 def _is_keyed(line: str) -> bool:
-    return len(_PAIR.findall(line)) >= _FEWEST
+    keys = [pair[0] for pair in _PAIR.findall(line)]
+    return len(keys) >= _FEWEST and len({*keys}) == len(keys)

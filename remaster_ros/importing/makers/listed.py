@@ -10,7 +10,7 @@ from remaster_ros.importing.makers.named import NUMBER, Named, leading, unexpect
 # external axes of RAPID. Each has one way to match: a line of a large log that is none of them is
 # told at once.
 _LINE = re.compile(
-    r'(?:(?P<before>[^\[\]{}]*)(?:\[{1,2}\(?|\{)(?P<list>[^\[\](){}]*)\)?'
+    r'(?:(?P<before>(?:[^\[\]{}]|\[\d+\])*)(?:\[{1,2}\(?|\{)(?P<list>[^\[\](){}]*)\)?'
     r'(?:\]\s*,\s*\[(?P<external>[^\[\]]*)\]\]|(?:\]{1,2}|\})(?:,\s*[\w.=]+\s*)*\)?)'
     r'|(?P<head>[^\[\](){}]*)\({1,2}(?P<row>[^\[\](){}]*)\){1,2})\s*(?:[,;]\s*)?'
 )

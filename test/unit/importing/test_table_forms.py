@@ -348,6 +348,12 @@ PROGRAMS = {
     'Python for a UR': lambda q: ''.join(
         f'rtde_c.moveJ([{listed(row, False)}], 1.05, 1.4)\n' for row in q
     ),
+    'source of VAL 3': lambda q: (
+        'begin\n' + ''.join(f'  jP[{i}]={{{listed(row)}}}\n' for i, row in enumerate(q)) + 'end\n'
+    ),
+    'names and numbers': lambda q: ''.join(
+        f'P{i} {axes_of(row).replace(",", "")}\n' for i, row in enumerate(q, 1)
+    ),
     'moves of Doosan': lambda q: ''.join(f'movej(posj({listed(row)}), vel=30)\n' for row in q),
     'points of Kawasaki': lambda q: ''.join(
         f'  POINT #P{i} = #PPOINT({listed(row)})\n' for i, row in enumerate(q, 1)
@@ -386,7 +392,7 @@ def test_joints_of_programs_and_logs(form, arm, tmp_path):
     )
     assert_rows(rows, arm)
     if form not in WITHOUT_NAMES:
-        first = 0 if form in ('Staubli without keys', 'list of URScript') else 1
+        first = 0 if form in ('Staubli without keys', 'list of URScript', 'source of VAL 3') else 1
         names = range(first, COUNT + first)
         assert_rows(rows_of(arm, tmp_path, points_table(arm, names), content), arm)
 
@@ -632,6 +638,14 @@ def _distance(i):
 def test_a_report_that_lost_an_axis_is_refused(change, words, arm, tmp_path):
     with pytest.raises(InputError, match=words):
         rows_of(arm, tmp_path, '\n'.join([*change(inspected(arm)), '']), joints_table(arm))
+
+
+@pytest.mark.parametrize('unit', ['mrad', 'counts'])
+def test_a_unit_that_is_not_converted_is_refused(unit, arm, tmp_path):
+    header = ['Point', *(f'{axis} [{unit}]' for axis in AXES)]
+    table = text(header, [POINTS, *degrees(arm)])
+    with pytest.raises(InputError, match=rf'column A1 \[{unit}\]: {unit}, where one of rad, deg'):
+        rows_of(arm, tmp_path, points_table(arm), table)
 
 
 def test_names_in_two_lines(arm, tmp_path):
