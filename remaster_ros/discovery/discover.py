@@ -446,7 +446,9 @@ def of_all_kinds(beside: _Beside) -> Solution | None:
     unnamed = [family for family in every if of_a_name.isdisjoint(family.parameters)]
     whole = fit_kinds(data, own, [one for one in every if one not in unnamed], unnamed)
     # What only has a place is no kind of error of the arm: what it explains tells nothing of that.
-    located = search.fit([cell for cell in named.cells if not EFFECTS[cell.name].is_cause])
+    located = search.fit(
+        [one for one in named.cells if one.name in EFFECTS and not EFFECTS[one.name].is_cause]
+    )
     if whole is None or located is None or whole.log_evidence < located.log_evidence + NAMED:
         return None
     if whole.log_evidence < named.log_evidence:
