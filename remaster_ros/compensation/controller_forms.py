@@ -12,6 +12,7 @@ With q the reported angles of k joints::
           S = Rz(q + theta) · Tx(a) · Rx(alpha) · Ry(beta)                hayati
     POE:  tool = exp([s_1] q_1) · … · exp([s_k] q_k) · home,  s = (w, v), in the base frame
 
+A joint that slides adds q along z, Tz(q), in place of its turn, and w of its screw is 0.
 A step between joints whose nominal axes are parallel is Hayati's, since ``d`` has no bounds there.
 Base and end are x y z in m and roll pitch yaw in rad, Rz(yaw) · Ry(pitch) · Rx(roll).
 """
@@ -59,8 +60,6 @@ from remaster_ros.types import FloatArray
 Form = Literal['urdf', 'ur', 'ros2_control', 'rising', 'pad', 'json', 'csv']
 FORMS: tuple[Form, ...] = get_args(Form)
 WITH_GEOMETRY = frozenset({'urdf', 'ur', 'json', 'csv'})
-# Those whose numbers are of joints that turn.
-OF_TURNS = frozenset({'ur', 'json', 'csv'})
 KINEMATICS_FORMAT = 'remaster-kinematics/1'
 # Configurations in the measured range over which a form is compared with the whole correction.
 COMPARED = 400
@@ -265,10 +264,10 @@ def exported(
         The file that is to be changed is not of this arm, or has not what is to be changed.
     """
     chain = compensation.model.chain
-    for joint in np.flatnonzero(chain.slides)[:1] if form in OF_TURNS else ():
+    for joint in np.flatnonzero(chain.slides)[:1] if form == 'ur' else ():
         raise InputError(
-            f"joint '{chain.joint_names[joint]}' slides, for which --to {form} has no place; use "
-            '--to urdf'
+            f"joint '{chain.joint_names[joint]}' slides, for which a UR's kinematics file has no "
+            'place; use --to urdf'
         )
     offsets = _offsets(compensation, one)
     notes = written_notes(offsets, one.words)
@@ -474,6 +473,7 @@ def _json(compensation: Compensation, one: Held) -> str:
             'dh': 'Rz(q + theta) Tz(d) Tx(a) Rx(alpha)',
             'hayati': 'Rz(q + theta) Tx(a) Rx(alpha) Ry(beta)',
             'tool': 'base, the steps, Rz(q + theta) of the last joint, end',
+            'slides': 'Rz(theta) Tz(q) in place of Rz(q + theta); of the last joint Tz(q + d)',
             'poe': 'exp of each screw (w, v) times its q, base to tip, then home',
             'base, end, home': 'x y z in m, roll pitch yaw in rad: Rz(yaw) Ry(pitch) Rx(roll)',
         },
@@ -525,7 +525,10 @@ def tables(model: ArmModel) -> list[Row]:
             delta = found[parameter] - value
             if turn:
                 delta = float(np.angle(np.exp(1j * delta)))
-            unit = 'rad' if turn else '' if parameter.startswith('w') else 'm'
+            slides = part in names and model.chain.slides[names.index(part)]
+            unit = 'rad' if turn else 'm'
+            if parameter.startswith('w') or (parameter.startswith('v') and slides):
+                unit = ''
             rows.append(Row(table, part, parameter, unit, value, delta))
     return rows
 
@@ -541,7 +544,8 @@ class _Axes:
         first = with_z_along(model.chain.axes[0])
         self.base = transform(before[0, :3, :3] @ first, before[0, :3, 3])
         self.tool = state.tool[0]
-        self.last_turn = float(model.joint_offsets[-1])
+        self.last = float(model.joint_offsets[-1])
+        self.slides = model.chain.slides
 
 
 def _dh(
@@ -573,15 +577,18 @@ def _dh(
             values = {'theta': theta, 'd': d, 'a': a, 'alpha': alpha}
         rows.append(('hayati' if parallel[i] else 'dh', name, values))
         frame = frame @ transform(rotation_vector_to_matrix(theta * Z), np.zeros(3)) @ step
-    turned = frame @ transform(rotation_vector_to_matrix(axes.last_turn * Z), np.zeros(3))
-    rows.append(('dh', names[-1], {'theta': axes.last_turn}))
-    return [*rows, ('dh', 'end', _placed(inverse(turned) @ axes.tool))]
+    moved = transform(rotation_vector_to_matrix(axes.last * Z), np.zeros(3))
+    if axes.slides[-1]:
+        moved = transform(np.eye(3), axes.last * Z)
+    rows.append(('dh', names[-1], {'d' if axes.slides[-1] else 'theta': axes.last}))
+    return [*rows, ('dh', 'end', _placed(inverse(frame @ moved) @ axes.tool))]
 
 
 def _poe(axes: _Axes, names: Sequence[str]) -> list[tuple[str, str, dict[str, float]]]:
     rows = []
-    for name, w, point in zip(names, axes.along, axes.points, strict=True):
-        screw = [*w.tolist(), *np.cross(point, w).tolist()]
+    for name, w, point, slides in zip(names, axes.along, axes.points, axes.slides, strict=True):
+        turns = [*w.tolist(), *np.cross(point, w).tolist()]
+        screw = [0.0, 0.0, 0.0, *w.tolist()] if slides else turns
         keys = ('wx', 'wy', 'wz', 'vx', 'vy', 'vz')
         rows.append(('poe', name, dict(zip(keys, screw, strict=True))))
     return [*rows, ('poe', 'home', _placed(axes.tool))]

@@ -104,9 +104,8 @@ def test_each_form_holds_the_offset_in_mm(folder, tmp_path):
     )
     assert line.count(' mm') == 4
     assert 'deg' not in line
-    for form in ('json', 'csv', 'ur'):
-        error = refusal('export', file, '--to', form, '--out', tmp_path / form)
-        assert "joint 'j3' slides" in error
+    error = refusal('export', file, '--to', 'ur', '--out', tmp_path / 'ur')
+    assert "joint 'j3' slides" in error
 
 
 def test_the_corrected_model_leaves_nothing_to_fit(folder, tmp_path):

@@ -16,12 +16,14 @@ import yaml
 from rigs.command_line import refusal, remaster
 from worlds.compensation_files import arm, save
 from worlds.robot_descriptions import ROBOTS
+from worlds.sliding_cells import LWR, lift, rail, telescope
 
 pytest.importorskip('pinocchio', reason='needs the judge: pip install pin')
 
 import pinocchio
 
 from remaster_ros.compensation.arm_model import Function, Geometry, JointTerm
+from remaster_ros.compensation.file import read_compensation
 from remaster_ros.session.robot_description import read_description
 from remaster_ros.types import Controller, PadJoint
 
@@ -203,16 +205,41 @@ def se3(values):
     return pinocchio.SE3(turn, np.array([values[key] for key in KEYS[:3]]))
 
 
-def by_dh(rows, which, q):
+@pytest.mark.parametrize('name', ['rail', 'lift', 'telescope', 'last'])
+def test_tables_of_an_arm_that_slides(tmp_path, name):
+    """Before all other joints, upright before a parallel one, amid them, and the last."""
+    last = LWR.replace('name="joint_7" type="revolute"', 'name="joint_7" type="prismatic"')
+    urdf = {'rail': rail(), 'lift': lift(), 'telescope': telescope(), 'last': last}[name]
+    plain, rng = arm(urdf), np.random.default_rng(5)
+    k = plain.joints
+    geometry = Geometry.none(k)
+    geometry.shifts[:k], geometry.turns[:k] = 1e-3 * rng.standard_normal((2, k, 3))
+    offsets = 5e-3 * rng.standard_normal(k) * plain.chain.per_radian
+    file = save(tmp_path, arm(urdf, joint_offsets=offsets, geometry=geometry), urdf)
+    model, chain = read_compensation(file).model, plain.chain
+    rows = json.loads((export(file, 'json', tmp_path / 'o') / 'kinematics.json').read_text())
+    q = configurations(k)
+    for which, truth in (('calibrated', model.state(q).tool), ('nominal', chain.forward(q))):
+        same(by_dh(rows['rows'], which, q, chain), truth)
+        same(by_poe(rows['rows'], which, q, chain.joint_names), truth)
+    slide = chain.joint_names[int(np.argmax(chain.slides))]
+    units = {row['parameter']: row['unit'] for row in rows['rows'] if row['part'] == slide}
+    assert (units['wx'], units['vx']) == ('', '')
+
+
+def by_dh(rows, which, q, chain=None):
     """Read with pinocchio: a model of joints about Z, with what stands between them."""
+    names = NAMES if chain is None else chain.joint_names
+    slides = np.zeros(len(names), bool) if chain is None else chain.slides
     model = pinocchio.Model()
     tables = ('dh', 'hayati')
     before, parent = se3(numbers(rows, tables, 'base', which)), 0
-    for name in NAMES:
-        parent = model.addJoint(parent, pinocchio.JointModelRZ(), before, name)
+    for name, slide in zip(names, slides, strict=True):
+        kind = pinocchio.JointModelPZ() if slide else pinocchio.JointModelRZ()
+        parent = model.addJoint(parent, kind, before, name)
         v = numbers(rows, tables, name, which)
         turns = (
-            pinocchio.utils.rotate('z', v['theta']),
+            pinocchio.utils.rotate('z', v.get('theta', 0.0)),
             pinocchio.utils.rotate('x', v.get('alpha', 0.0))
             @ pinocchio.utils.rotate('y', v.get('beta', 0.0)),
         )
@@ -227,11 +254,11 @@ def by_dh(rows, which, q):
     return np.array(places)
 
 
-def by_poe(rows, which, q):
+def by_poe(rows, which, q, names=NAMES):
     places = []
     for row in q:
         at = pinocchio.SE3.Identity()
-        for name, angle in zip(NAMES, row, strict=True):
+        for name, angle in zip(names, row, strict=True):
             v = numbers(rows, ('poe',), name, which)
             w = np.array([v['wx'], v['wy'], v['wz']])
             linear = np.array([v['vx'], v['vy'], v['vz']])
