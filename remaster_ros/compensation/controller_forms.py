@@ -141,7 +141,9 @@ class Held:
 def held(compensation: Compensation, form: Form, rng: np.random.Generator) -> Held:
     """Return what of a correction a form holds, and what it leaves out."""
     model, content = compensation.model, compensation.content
-    known = np.array([part.identifiable for part in content.joints])
+    # A UR's kinematics file has no place for what carries the arm.
+    beside = model.chain.slides if form == 'ur' else np.zeros(model.joints, dtype=bool)
+    known = np.array([part.identifiable for part in content.joints]) & ~beside
     k = model.joints
     geometry, with_geometry = Geometry.none(k), form in WITH_GEOMETRY and model.geometry.is_any
     if with_geometry:
@@ -150,6 +152,7 @@ def held(compensation: Compensation, form: Form, rng: np.random.Generator) -> He
             model.geometry.shifts[:k],
             model.geometry.turns[:k],
         )
+        geometry.shifts[:k][beside] = geometry.turns[:k][beside] = 0.0
     plain = replace(
         model,
         joint_offsets=np.where(known, model.joint_offsets, 0.0),
@@ -171,7 +174,8 @@ def held(compensation: Compensation, form: Form, rng: np.random.Generator) -> He
     free[:k] = known
     for where in (*plain.registration(sensor), plain.marker(marker)):
         free[where] = True
-    of_geometry = np.array([_is_of_a_joint(name) for name in plain.parameter_names])
+    own = set(np.array(model.chain.joint_names)[~beside])
+    of_geometry = np.array([_of_geometry(name) in own for name in plain.parameter_names])
     free |= of_geometry & with_geometry
     total = np.zeros(len(free))
     for _ in range(STEPS):
@@ -204,10 +208,10 @@ def held(compensation: Compensation, form: Form, rng: np.random.Generator) -> He
     )
 
 
-def _is_of_a_joint(name: str) -> bool:
-    """Whether a parameter is a length or tilt before a joint, and not of the tool."""
+def _of_geometry(name: str) -> str:
+    """Return of which joint a parameter is a length or tilt, or of the tool; '' for others."""
     kind, _, rest = name.partition('.')
-    return kind == 'geometry' and rest.rpartition('.')[0] != 'tool'
+    return rest.rpartition('.')[0] if kind == 'geometry' else ''
 
 
 def _without(model: ArmModel, form: Form) -> list[tuple[str, ArmModel]]:
@@ -229,6 +233,13 @@ def _without(model: ArmModel, form: Form) -> list[tuple[str, ArmModel]]:
         rest_of[joint] = 0.0
         what = f'the soft bearing of {names[joint]}'
         found.append((what, replace(model, lateral_compliance=rest_of)))
+    for joint in np.flatnonzero(model.chain.slides).tolist() if form == 'ur' else ():
+        offsets = model.joint_offsets.copy()
+        shifts, turns = model.geometry.shifts.copy(), model.geometry.turns.copy()
+        if offsets[joint] or np.any(shifts[joint]) or np.any(turns[joint]):
+            offsets[joint], shifts[joint], turns[joint] = 0.0, 0.0, 0.0
+            rest_of_it = replace(model, joint_offsets=offsets, geometry=Geometry(shifts, turns))
+            found.append((f'zero and place of {names[joint]}', rest_of_it))
     if form not in WITH_GEOMETRY and model.geometry.is_any:
         found.append(('lengths and tilts', replace(model, geometry=none)))
     return found
@@ -263,12 +274,6 @@ def exported(
     InputError
         The file that is to be changed is not of this arm, or has not what is to be changed.
     """
-    chain = compensation.model.chain
-    for joint in np.flatnonzero(chain.slides)[:1] if form == 'ur' else ():
-        raise InputError(
-            f"joint '{chain.joint_names[joint]}' slides, for which a UR's kinematics file has no "
-            'place; use --to urdf'
-        )
     offsets = _offsets(compensation, one)
     notes = written_notes(offsets, one.words)
     if form == 'urdf':
@@ -362,7 +367,9 @@ def _ur_yaml(
     nominal = {joint.name: joint for joint in _joints(compensation.content.robot.urdf)}
     changed = parsed_xml(_urdf(compensation, offsets, one, ()))
     origins = {joint.get('name'): joint.find('origin') for joint in changed.findall('joint')}
-    for name in offsets.chain.joint_names:
+    for name, slides in zip(offsets.chain.joint_names, offsets.chain.slides, strict=True):
+        if slides:
+            continue
         link = next((link for end, link in UR_LINKS.items() if name.endswith(end)), '')
         numbers = links.get(link)
         keys = ('x', 'y', 'z', 'roll', 'pitch', 'yaw')

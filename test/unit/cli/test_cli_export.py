@@ -99,6 +99,13 @@ def as_xacro(folder: Path) -> tuple[Path, Path, str]:
     return path, own, read_description(path, {'kinematics_params': str(own)})
 
 
+RAIL = (
+    '<link name="hall"/><joint name="rail" type="prismatic"><parent link="hall"/>'
+    '<child link="world"/><axis xyz="1 0 0"/>'
+    '<limit lower="-1" upper="1" velocity="1" effort="1"/></joint></robot>'
+)
+
+
 # All at once, and by themselves those whose angles have another order of turns behind them.
 @pytest.mark.parametrize('joint', [None, 1, 4])
 def test_a_ur_with_half_a_degree_at_each_joint(tmp_path, joint):
@@ -119,6 +126,28 @@ def test_a_ur_with_half_a_degree_at_each_joint(tmp_path, joint):
         reached(urdf, q + offsets),
     )
     assert 'nothing that can be corrected' in (out / 'left_out.txt').read_text()
+
+
+@pytest.mark.parametrize('rail_m', [0.0, 2e-3])
+def test_a_ur_on_a_rail(tmp_path, rail_m):
+    """Its own file has no place for the rail's zero, which is left out and said."""
+    xacro, own, urdf = as_xacro(tmp_path)
+    carried = urdf.replace('</robot>', RAIL)
+    q = np.column_stack((np.linspace(-0.5, 0.5, 40), configurations()))
+    offsets = np.array([rail_m, *(6 * [HALF_DEGREE])])
+    model = arm(carried, base='hall', tip='tool0', joint_offsets=offsets)
+    out = tmp_path / 'out'
+    export(save(tmp_path, model, carried), 'ur', out, '--base', own)
+    told = {'kinematics_params': str(out / own.name)}
+    made = read_description(xacro, told).replace('</robot>', RAIL)
+    names = ['rail', *NAMES]
+    same(
+        reached(made, q, names, base='hall'),
+        reached(carried, q + [0.0, *offsets[1:]], names, base='hall'),
+    )
+    said = (out / 'left_out.txt').read_text()
+    assert ('zero and place of rail' in said) == (rail_m > 0.0)
+    assert ('nothing that can be corrected' in said) == (rail_m == 0.0)
 
 
 def test_the_makers_description_of_a_ur(tmp_path):
