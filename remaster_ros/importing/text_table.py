@@ -47,6 +47,7 @@ _ORNAMENT = re.compile(r'[\s|+:=-]+')
 _NUMBERS = re.compile(r'(?<![\w.,])[+-]?\d+(?:[.,]\d*)?(?!\w)')
 _LIST = re.compile(r'[\[(]([^\[\]()]*)[\])]')
 _JSON = re.compile(r'\s*(?:\{\s*"|\[\s*\{)')
+_MARKUP = re.compile(r'\s*<(?:!DOCTYPE|\?xml|html|table)\b', re.IGNORECASE)
 _NEVER = re.compile(r'(?!)')
 # Blanks, but not those before a unit in brackets: `X [mm]  Y [mm]`.
 _BLANKS = re.compile(r'\s+(?![\[(])')
@@ -160,6 +161,8 @@ def read_table(
         raise InputError(
             f'{path}: this is JSON, not a table; save it as CSV, a row for each configuration'
         )
+    if _MARKUP.match(text):
+        raise InputError(f'{path}: this is HTML or XML, not a table; save it as CSV')
     text = text.replace('\r\n', '\n').replace('\r', '\n').replace('\u2212', '-')
     lines = [
         (number, line)

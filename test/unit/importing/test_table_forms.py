@@ -496,6 +496,9 @@ def test_what_tells_no_joints_says_what_to_give(arm, tmp_path):
         (job.replace('POSTYPE ANGLE', 'POSTYPE BASE'), 'no position of joints in this job'),
         (module, 'there is no joint target in it'),
         ('[{"q": [1, 2], "p": [3, 4, 5]}]', 'this is JSON, not a table'),
+        ('<table>\n<tr><td>1.5</td><td>2.5</td></tr>\n</table>', 'this is HTML or XML'),
+        ('[*POSREG*]$POSREG  Storage: CMOS  : ARRAY[1,1] OF Position Reg\n', 'record them so'),
+        ('.JOINTS\n.END\n', 'line 1: there are no joint displacements in it'),
         ('header:\n  stamp:\nname:\n- a\nposition:\n- 1.0\n---\n', 'ros2 topic echo --csv'),
         ('*110001+00000000000000P1 21.102+0000000012345678\r\n', 'export coordinates'),
     ):
