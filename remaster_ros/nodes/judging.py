@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
 from rclpy.node import Node
 from std_msgs.msg import String
 
@@ -95,6 +96,13 @@ class Judging:
             sha256 = read_compensation(file).sha256
         except InputError as error:
             return str(error)
+        chain = self._tours.model.chain
+        if kind == 'verify' and chain.slides.any():
+            return (
+                f"joint '{chain.joint_names[int(np.argmax(chain.slides))]}' slides, and "
+                'robot_bridge corrects no such arm: measure ten poses through what does, and run '
+                '`remaster verify`'
+            )
         if bridge is None:
             return 'no sign of robot_bridge: is it running in this ROS domain?'
         if kind == 'verify' and bridge.correction != sha256:

@@ -255,15 +255,6 @@ class Parameters(JudgingParameters):
         design = cell.design_settings()
         return TourPlanner(scene, counts, self.seed, self.reference_every, design, travel, causes)
 
-    def refuse_what_supposes_angles(self, chain: SerialChain) -> None:
-        """Raise `InputError` for a parameter that is for arms alone whose joints all turn."""
-        if self.compensation and chain.slides.any():
-            sliding = chain.joint_names[int(np.argmax(chain.slides))]
-            raise InputError(
-                f"pose_planner: joint '{sliding}' slides, and compensation is for arms whose "
-                'joints all turn; leave that parameter empty'
-            )
-
     def causes(self, joint_names: Sequence[str]) -> tuple[FoundCause, ...]:
         """Return the causes that the plan is to separate; errors as of `read_causes`."""
         if not self.separate:
@@ -631,7 +622,6 @@ class PosePlanner(RemasterNode):
         self.chain = self.cell.chain()
         self._order = JointOrder(self.chain.joint_names)
         self._q: FloatArray | None = None
-        self.p.refuse_what_supposes_angles(self.chain)
         causes = self.p.causes(self.chain.joint_names)
         self._tours = self.p.tour_planner(self.cell, self.chain, causes)
         settings = self.p.plan_settings(self.cell, causes)

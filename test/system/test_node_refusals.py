@@ -44,7 +44,6 @@ def test_a_missing_cell_file(start, tmp_path):
     [
         ('demo', {'apply': True}, 'no node corrects what such an arm is commanded'),
         ('robot_bridge', {'compensation': 'c.json'}, 'leave the parameter compensation empty'),
-        ('pose_planner', {'compensation': 'c.json'}, 'compensation is for arms whose joints all'),
     ],
 )
 def test_what_an_arm_with_a_joint_that_slides_is_not_for(node, parameters, why, start, tmp_path):

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from worlds.sliding_cells import rail, sliding_cell
 
 from remaster_ros.compensation.check_visits import CHECK_POSES, chosen_visits, read_visits
 from remaster_ros.errors import InputError
@@ -52,6 +53,24 @@ def test_what_was_written_is_visited_in_its_order_and_expected_alike(planner, vi
         seen.append(q)
         assert (stop.split, stop.correction) == ('validation', '')
     np.testing.assert_array_equal(seen, again.q)
+
+
+def test_a_slide_of_a_check_is_written_and_read_in_mm(tmp_path):
+    held = {'held_joint': 'rail', 'held_values_deg': [], 'held_values_m': [-0.3, 0.3]}
+    cell = read_cell(sliding_cell(tmp_path, rail(), **held))
+    chain = cell.chain()
+    scene = cell.planning_scene(chain)
+    poses = scene.plan(60, scene.rough_R, np.random.default_rng(2)).poses
+    q = np.array([pose.solutions[0] for pose in poses])
+    visits = chosen_visits(cell, chain, q, None, np.random.default_rng(1))
+    path = tmp_path / 'check.csv'
+    path.write_text(visits.table())
+    assert visits.table().startswith('rail [mm],joint_1 [deg],')
+    again = read_visits(path, cell, chain)
+    np.testing.assert_allclose(again.q, visits.q, atol=1e-8)
+    assert set(np.abs(again.q[:, 0]).round(9)) == {0.3}
+    planner = TourPlanner(scene, {}, 0, travel=TravelTime.of(scene.model))
+    assert planner.check(again.q).judges == 'check'
 
 
 def test_an_arm_that_cannot_stand_at_a_configuration_is_sent_to_none(planner):

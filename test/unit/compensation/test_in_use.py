@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from worlds.compensation_files import arm, save
 from worlds.hidden_tours import robot
+from worlds.sliding_cells import rail
 
 from remaster_ros.compensation.arm_model import ArmModel, Function, Geometry, JointTerm
 from remaster_ros.compensation.compensator import Compensator
@@ -187,3 +188,10 @@ def test_what_must_hold_for_it_is_told(tmp_path):
         remarks = in_use(path).remarks
         assert len(remarks) == count
         assert all('(pad), which must still be on' in line for line in remarks)
+
+
+def test_no_node_corrects_what_an_arm_that_slides_is_commanded(tmp_path):
+    """Its bounds are of angles."""
+    path = save(tmp_path, arm(rail()), rail())
+    with pytest.raises(InputError, match="joint 'rail' slides, and no node corrects what"):
+        CorrectionInUse(str(path))
