@@ -333,6 +333,28 @@ def test_columns_and_errors_of_a_part_are_those_of_the_whole():
     )
 
 
+@pytest.mark.parametrize('seed', [43, 44, 45, 46, 47])
+def test_readings_that_remember_say_nothing_of_the_arm(seed):
+    """Compared with nothing at all, a wander let in kinds of errors of the arm beside it."""
+
+    def remembering(session: Session) -> np.ndarray:
+        rng = np.random.default_rng(seed)
+        left = 0.15e-3 * rng.standard_normal((len(session.measurements), 3))
+        for row in range(1, len(left)):
+            left[row] = 0.97 * left[row - 1] + np.sqrt(1.0 - 0.97**2) * left[row]
+        return left
+
+    session = session_with(seed, sensor=remembering, pose_sigma_m=0.0)
+    found = discover_session(session, rng=np.random.default_rng(0))
+    assert not found.effects
+    assert found.verdict == 'unexplained'
+    assert {cell.name for cell in found.solution.cells} == {'sensor_wander'}
+    # The registration is that of the whole session, not of its first reading.
+    (cell,) = found.solution.cells
+    shift = found.residuals.columns([cell]) @ found.solution.parameters
+    assert np.linalg.norm(shift.mean(axis=0)) < 0.02 * np.linalg.norm(shift, axis=1).mean()
+
+
 # Causes of one session in another
 
 
