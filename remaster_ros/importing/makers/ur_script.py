@@ -33,16 +33,15 @@ def read(text: str) -> Named | None:
     found: list[tuple[int, str, dict[str, str]]] = []
     defined: set[str] = set()
     places = 0
-    for number, line in enumerate(text.splitlines(), 1):
-        code = line.partition('#')[0]
-        if len(_SIX.findall(code)) > 1 and (several := _SEVERAL.fullmatch(code)):
+    for number, line in _whole_lists(text):
+        if len(_SIX.findall(line)) > 1 and (several := _SEVERAL.fullmatch(line)):
             for i, one in enumerate(_LIST.finditer(several[2])):
                 found.append((number, f'{several[1]}[{i}]', _joints(number, line, one[1])))
             defined.add(several[1])
             continue
-        if len(_SIX.findall(code)) > 1:
+        if len(_SIX.findall(line)) > 1:
             raise unexpected(number, line, 'one move or waypoint a line')
-        assigned, move = _ASSIGNED.match(code), _MOVE.search(code)
+        assigned, move = _ASSIGNED.match(line), _MOVE.search(line)
         name = ''
         if assigned and (assigned[1].endswith('_q') or assigned[1] in named):
             name, start = re.sub(r'_q$', '', assigned[1]), assigned.end()
@@ -50,20 +49,20 @@ def read(text: str) -> Named | None:
         elif move:
             start = move.end()
         else:
-            if _SIX.search(code) and not (_LISTED.match(code) or _OTHERS.search(code)):
+            if _SIX.search(line) and not (_LISTED.match(line) or _OTHERS.search(line)):
                 raise unexpected(number, line, 'movej([…])')
             continue
-        if re.match(r'p\[|pose_|get_inverse_kin', code[start:]):
+        if re.match(r'p\[|pose_|get_inverse_kin', line[start:]):
             places += 1
             continue
         if (
             move
             and not assigned
-            and re.match(r'[A-Za-z]\w*(?:\[\s*\w+\s*\])?\s*[,)]', code[start:])
+            and re.match(r'[A-Za-z]\w*(?:\[\s*\w+\s*\])?\s*[,)]', line[start:])
         ):
             # A waypoint, which stands above.
             continue
-        listed = _LIST.match(code, start)
+        listed = _LIST.match(line, start)
         if listed is None:
             raise unexpected(number, line, _EXPECTED)
         found.append((number, name, _joints(number, line, listed[1])))
@@ -81,6 +80,20 @@ def read(text: str) -> Named | None:
     return axes_in_order(
         'joint positions of URScript', found, ('J',), maker='UR', notes=notes, unit='rad'
     )
+
+
+def _whole_lists(text: str) -> list[tuple[int, str]]:
+    """Return the lines without comments, those of one list together, and where each begins."""
+    lines: list[tuple[int, str]] = []
+    opened = 0
+    for number, line in enumerate(text.splitlines(), 1):
+        code = line.partition('#')[0]
+        if opened > 0:
+            lines[-1] = lines[-1][0], f'{lines[-1][1]} {code.strip()}'
+        else:
+            lines.append((number, code))
+        opened = max(opened, 0) + code.count('[') - code.count(']')
+    return lines
 
 
 _WAYPOINT = re.compile(r'<Waypoint\b[^<>]*\bname="([^"<>]*)"|<JointAngles\b([^<>]*)(?:>|$)')

@@ -330,6 +330,11 @@ PROGRAMS = {
         + ', '.join(f'[{listed(row, False)}]' for row in q)
         + ']\n  movej(poses[0], a=1)\nend\n'
     ),
+    'list of URScript in lines': lambda q: (
+        'def calib():\n  poses = [\n'
+        + ',\n'.join(f'    [{listed(row, False)}]' for row in q)
+        + '\n  ] # all\n  movej(poses[0], a=1)\nend\n'
+    ),
     'log with names': lambda q: ''.join(
         f'P{i}: [{listed(row, False)}]\n' for i, row in enumerate(q, 1)
     ),
@@ -392,7 +397,7 @@ def test_joints_of_programs_and_logs(form, arm, tmp_path):
     )
     assert_rows(rows, arm)
     if form not in WITHOUT_NAMES:
-        first = 0 if form in ('Staubli without keys', 'list of URScript', 'source of VAL 3') else 1
+        first = 0 if form.startswith(('Staubli', 'list of URScript', 'source')) else 1
         names = range(first, COUNT + first)
         assert_rows(rows_of(arm, tmp_path, points_table(arm, names), content), arm)
 
