@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from remaster_ros.importing.makers import (
+    axis_lines,
     doosan,
     fanuc,
     gsi,
@@ -40,4 +41,5 @@ READERS: tuple[Callable[[str], Named | None], ...] = (
     gsi.read,
     ros_echo.read,
     keyed.read,
+    axis_lines.read,
 )

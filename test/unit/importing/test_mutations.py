@@ -70,6 +70,14 @@ def inspection():
     return '\n'.join([*lines, ''])
 
 
+def axis_lines():
+    """Names, and below each the number of each axis."""
+    lines = ['Feature report']
+    for name, row in zip(NAMES, points_of(), strict=True):
+        lines += [f'Point {name}', *(f'{axis}\t{v:.4f}' for axis, v in zip('XYZ', row))]
+    return '\n'.join([*lines, ''])
+
+
 def capture():
     run = run_of(arm_of(4))
     rows = 1e3 * seen(run, np.arange(0.0, 0.4, 0.05), 1, 1e-4)
@@ -95,6 +103,7 @@ def pieces():
 KINDS = {
     'report': (report, True),
     'inspection': (inspection, False),
+    'axis_lines': (axis_lines, False),
     'capture': (capture, True),
     'pieces': (pieces, False),
     'leica': (leica, True),

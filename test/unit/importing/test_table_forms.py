@@ -627,6 +627,26 @@ def test_a_report_with_a_row_for_each_axis(form, arm, tmp_path):
     assert [*rows.points.values()] == [('Meas X', 'Meas Y', 'Meas Z')]
 
 
+@pytest.mark.parametrize(
+    'form',
+    [
+        '{0}.X;{1}\n{0}.Y;{2}\n{0}.Z;{3}',
+        '{0}\n X  {1}\n Y  {2}\n Z  {3}',
+        '{0};X;{1}\n{0};Y;{2}\n{0};Z;{3}',
+    ],
+)
+@pytest.mark.parametrize('sign', '.,')
+def test_a_report_with_one_number_a_line(form, sign, arm, tmp_path):
+    points = np.column_stack(millimetres(arm))
+    shown = [[f'{v:.6f}'.replace('.', sign) for v in point] for point in points]
+    lines = ['Element;Ist', *(form.format(p, *cells) for p, cells in zip(POINTS, shown))]
+    content = '\n'.join([*lines, ''])
+    assert_rows(rows_of(arm, tmp_path, content, joints_table(arm)), arm)
+    lost = content.replace(shown[3][1], 'lost')
+    with pytest.raises(InputError, match=r't0.txt, line \d+: .*Y'):
+        rows_of(arm, tmp_path, lost, joints_table(arm))
+
+
 def _distance(i):
     return f'P{(i + 2) // 3};3D;0.0;0.5;\u00b10.5;0.5;Pass'
 
