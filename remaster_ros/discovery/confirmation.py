@@ -10,7 +10,9 @@ zeros and ones from the parameters of both sessions to those of the choice, and:
 
 with Λ the precision of Gaussian priors and s the zero-offsets of this session less those that the
 other one is linearised at. The evidence decides, from all shared on, by the best change at a time;
-what another choice for a cause then loses is what is told of it.
+what another choice for a cause then loses is what is told of it. One such choice is how much of
+the variance of the arm's errors is the other session's own (`SHARES`): with δ of the precision
+Λ / share beside the parameters there, which is integrated out of D and h of that session.
 """
 
 from __future__ import annotations
@@ -62,6 +64,9 @@ HALF = 0.5
 LEAST_GAIN = 0.01
 # Sessions of one arm have no reading in common; copies of one have most, even with some left out.
 SAME_ROWS = 0.1
+# Of the variance of the arm's errors what may be a session's own: no model is the arm, and what it
+# lacks is not the same elsewhere. Of each size at most a tenth: what changes by more has changed.
+SHARES = (0.001, 0.003, 0.01)
 
 
 @dataclass(frozen=True)
@@ -134,6 +139,8 @@ class Confirmation:
     other_joints: tuple[int, ...] = ()
     # The same of those that the sessions do not determine: what the causes leave out moves them
     open_joints: tuple[int, ...] = ()
+    # Of the size of each of the arm's errors, what is the other session's own
+    differ_by: float = 0.0
 
     @property
     def gone(self) -> bool:
@@ -171,7 +178,7 @@ def confirm(discovery: Discovery, session: Session, rng: np.random.Generator) ->
     """
     require_other_session(discovery.fit.session, session)
     both = _Both.of(discovery, estimate(Problem.of(session)), rng)
-    best = both.most_likely()
+    both, best = both.most_likely()
     rows = len(both.there.data.context)
     told = [both.told(group) for group in both.groups]
     causes = tuple(both.judged(best, index, told[index]) for index in range(len(told)))
@@ -208,6 +215,7 @@ def confirm(discovery: Discovery, session: Session, rng: np.random.Generator) ->
         why=why,
         other_joints=others,
         open_joints=undetermined,
+        differ_by=float(np.sqrt(both.share)),
     )
 
 
@@ -262,6 +270,17 @@ class _Measured:
         """Number of natural parameters."""
         return int(self.data.full_jacobian.shape[2])
 
+    def apart(self, precision: FloatArray) -> tuple[FloatArray, float]:
+        """Return the products where the arm's errors are others, by this precision, (m, m).
+
+        And what the log evidence loses by that.
+        """
+        where = slice(self.size, self.size + len(precision))
+        across = self.products[where]
+        own = across[:, where] + precision
+        loss = 0.5 * (np.linalg.slogdet(own)[1] - np.linalg.slogdet(precision)[1])
+        return self.products - across.T @ _solved(own, across), float(loss)
+
 
 @dataclass(frozen=True, eq=False)
 class _Fitted:
@@ -300,6 +319,8 @@ class _Both:
     precision: FloatArray
     fit: Estimate
     identifiable: BoolArray
+    # Of the variance of each of the arm's errors, what is the other session's own
+    share: float = 0.0
 
     @classmethod
     def of(cls, discovery: Discovery, fit: Estimate, rng: np.random.Generator) -> _Both:
@@ -361,36 +382,48 @@ class _Both:
         h = np.zeros(at)
         H[:first, :first] += here.products[:-1, :-1]
         h[:first] += here.products[:-1, -1]
+        products, loss = self._of_the_other
         # Both sessions' zero-offsets count from those that this one is linearised at.
-        known = there.products[:-1, :-1]
+        known = products[:-1, :-1]
         steps = here.data.context.joint_offsets - there.data.context.joint_offsets
-        pull = there.products[:-1, -1] - known[:, :k] @ steps
+        pull = products[:-1, -1] - known[:, :k] @ steps
         kept = to >= 0
         H[np.ix_(to[kept], to[kept])] += known[np.ix_(kept, kept)]
         h[to[kept]] += pull[kept]
         root = cholesky(H)
         values = cho_solve((root, False), h)
+        square = products[-1, -1] - steps @ (2.0 * pull[:k] + known[:k, :k] @ steps)
         evidence = 0.5 * (h @ values + sum(np.linalg.slogdet(block)[1] for block in blocks))
+        evidence -= 0.5 * square + loss
         return _Fitted(float(evidence - np.sum(np.log(np.diag(root)))), values, root, to)
 
-    def most_likely(self) -> Choices:
+    @cached_property
+    def _of_the_other(self) -> tuple[FloatArray, float]:
+        """Products of the other session beside what is its own of all errors, and its price."""
+        if self.share == 0.0:
+            return self.there.products, 0.0
+        return self.there.apart(self.precision / self.share)
+
+    def most_likely(self) -> tuple[_Both, Choices]:
         """Return what single changes reach from all shared, each at odds of twenty to one."""
         # What happened once is no matter of the other session.
         possible = [CHOICES[:2]] * self.joints
         possible += [CHOICES if group else ('shared',) for group in self.groups]
-        best: Choices = tuple(choices[0] for choices in possible)
-        value = self.fitted(best).log_evidence
+        both, best = self, tuple(choices[0] for choices in possible)
+        others = [self, *(replace(self, share=share) for share in SHARES)]
+        value = both.fitted(best).log_evidence
         while True:
-            tried = [
-                _with(best, i, choice)
+            tried = [(other, best) for other in others if other is not both]
+            tried += [
+                (both, _with(best, i, choice))
                 for i, choices in enumerate(possible)
                 for choice in choices
                 if choice != best[i]
             ]
-            values = [self.fitted(choices).log_evidence for choices in tried]
+            values = [other.fitted(choices).log_evidence for other, choices in tried]
             if max(values) < value + NEEDED:
-                return best
-            value, best = max(values), tried[int(np.argmax(values))]
+                return both, best
+            value, (both, best) = max(values), tried[int(np.argmax(values))]
 
     def judged(self, best: Choices, index: int, rows: BoolArray) -> ConfirmedCause:
         """Judge one cause, everything else as it is best; errors are those of some rows."""
@@ -706,6 +739,11 @@ def in_words(discovery: Discovery, confirmation: Confirmation) -> list[str]:
         f'{1e3 * found.rms_own_m:.3f} mm with them fitted there: {carried}. What this session '
         'does not tell is fitted to the other one.'
     ] * bool(found.effects)
+    if found.differ_by and lines:
+        lines[0] += (
+            f' Both are compared as sessions in which each error of the arm may differ by '
+            f'{percent(found.differ_by)} of its size: no model is the arm.'
+        )
     offsets = (
         f'they are {found.offsets_rms_sigmas:.1f} standard deviations apart on the average, and '
         f'the error is {1e3 * found.rms_frozen_offsets_m:.3f} mm RMS with those found here'

@@ -522,6 +522,7 @@ class Confirmed(Struct):
     why: str | UnsetType = UNSET
     other_joints: list[int] | UnsetType = UNSET
     open_joints: list[int] | UnsetType = UNSET
+    differ_by: float | UnsetType = UNSET
 
 
 class PredictedRegions(Struct):

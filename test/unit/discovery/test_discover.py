@@ -405,6 +405,23 @@ def test_a_cause_of_another_size_is_told_though_more_than_half_of_it_carries_ove
         )
 
 
+@pytest.mark.parametrize(
+    ('times', 'answer', 'differs'),
+    [(1.0, 'confirmed', False), (1.06, 'confirmed', True), (1.3, 'changed', False)],
+)
+def test_no_model_is_the_arm_so_that_sessions_may_differ_by_a_tenth(times, answer, differs):
+    quiet = {'sigma_m': 0.03e-3}
+    session = session_with(21, sagging, pose_sigma_m=0.02e-3, **quiet)
+    found = discover_session(session, rng=np.random.default_rng(0))
+    session = session_with(21, lambda s: times * sagging(s), pose_sigma_m=0.025e-3, **quiet)
+    other = confirm(found, session, np.random.default_rng(0))
+    (cause,) = other.effects
+    assert cause.answer == answer
+    assert (other.differ_by > 0.0) == differs
+    assert ('each error of the arm may differ by' in in_words(found, other)[0]) == differs
+    assert (other.parameters_rms_sigmas > 3.0) == (answer == 'changed')
+
+
 def test_a_session_that_does_not_show_a_cause_leaves_it_open():
     """The arm is measured where gravity hardly turns what gives way."""
     found = sagging_arm()
