@@ -15,6 +15,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from remaster_ros.calibration.arrangement import linear_fit
 from remaster_ros.importing.assemble import SessionOptions, controller_of
 from remaster_ros.importing.rows import RawRows
 from remaster_ros.kinematics.pad_angles import PadAngles
@@ -28,6 +29,8 @@ OWN_RAD = 2e-4
 # Zero-offsets of some degrees turn the tool by so much, rad; others that agree so well beside the
 # best one leave it open.
 AGREE_RAD, OTHER_RAD = 0.1, 0.02
+# A robot whose joints are right leaves so much of the points' extent.
+FITS = 0.03
 # Largest difference of how the sensor stands, by the points and by the orientations, rad.
 SENSOR_RAD = 0.2
 # Of fewer rows nothing is told.
@@ -56,6 +59,11 @@ def oriented(rows: RawRows, chain: SerialChain, options: SessionOptions) -> RawR
             return _without(rows, _OF_THE_ROBOT)
         if anyhow < AGREE_RAD < _apart(rows, rows.orientation, arms, False):
             return _without(rows, 'are in another frame than the points')
+        # Where the joints are wrong they tell nothing: those are seen to afterwards.
+        known = np.isfinite(rows.orientation).all(axis=1)
+        fits = linear_fit(chain, np.array(joints), rows.position)[0].min() < FITS
+        if anyhow > AGREE_RAD and known.sum() >= FEWEST_ROWS and fits:
+            return _without(rows, 'turn otherwise than the arm')
         return rows
     found = [
         (_apart(rows, xyzw, arms, options.on_tool), words, xyzw)

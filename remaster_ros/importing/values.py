@@ -263,7 +263,7 @@ def _time(text: str, decimal: str, day_first: bool) -> float | None:
 def _in_english(text: str) -> str:
     """Return a time with English months, without days of the week, and with colons."""
     text = _WORD.sub(lambda word: _MONTHS.get(word[1].casefold(), word[0]), text)
-    text = re.sub(r'[年月]', '-', text).replace('日', ' ')
+    text = re.sub(r'[年月]', '-', text).replace('日', ' ').replace('_', ' ')
     text = re.sub(r'([AaPp])\. ?([Mm])\.', r'\1\2', text)
     text = _POINTS.sub(lambda time: ':'.join(filter(None, time.groups())), text)
     return _FOURTH.sub(r'\1.\2', text)

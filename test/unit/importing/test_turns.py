@@ -86,6 +86,7 @@ def test_letters_tell_it(names, arm, tmp_path, imported):
         (('A', 'B', 'C'), "angles about turned axes z, y', x'', deg", 'robot', 'the robot itself'),
         (('qx', 'qy', 'qz', 'qw'), 'a quaternion x, y, z, w', 'robot', 'the robot itself'),
         (('qx', 'qy', 'qz', 'qw'), 'a quaternion x, y, z, w', 'other', 'in another frame'),
+        (('qx', 'qy', 'qz', 'qw'), 'a quaternion x, y, z, w', 'nobody', 'otherwise than the arm'),
         (('rx', 'ry', 'rz'), 'a rotation vector, rad', 'other', 'turn otherwise than the arm'),
         (('rx', 'ry', 'rz'), 'a rotation vector, rad', 'nobody', 'turn otherwise than the arm'),
         (('q1', 'q2', 'q3', 'q4'), 'a rotation vector, rad', 'nobody', 'are no quaternions'),
