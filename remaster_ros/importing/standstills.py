@@ -43,6 +43,8 @@ _QUIETEST = 0.01
 # Largest difference of begins and ends, s: those of a log of 10 Hz, and a clock that is 50 parts
 # in a million fast over an hour.
 _TOLERANCE_S = 0.3
+# Begins and ends of one clock that are found in two streams differ by less, s.
+_SAME_CLOCK_S = 0.05
 # Offsets that are looked at, the likeliest first.
 _MOST_OFFSETS = 60
 # With so many pairs the 15 unknowns of the linear problem leave more equations than that over.
@@ -327,17 +329,17 @@ def _matching(
     a, b = np.array(rows, dtype=np.int64), np.array(of, dtype=np.int64)
     if points.shots or not len(a):
         return _judged(a, b, offset, None, error_of)
-    apart = np.concatenate(
-        (
-            (joints.begin[b] - points.begin[a])[joints.opened[b] & points.opened[a]],
-            (joints.end[b] - points.end[a])[joints.closed[b] & points.closed[a]],
-        )
-    )
-    if not len(apart):
+    begins = (joints.begin[b] - points.begin[a])[joints.opened[b] & points.opened[a]]
+    ends = (joints.end[b] - points.end[a])[joints.closed[b] & points.closed[a]]
+    if not len(begins) + len(ends):
         return _judged(a, b, offset, None, error_of)
-    # Clocks that are the same but for how the standstills are found stay so.
-    refined = offset if offset == 0.0 else float(np.median(apart))
-    return _judged(a, b, refined, float(np.median(np.abs(apart - refined))), error_of)
+    # What is found to stand still for longer begins earlier and ends later: that is no offset.
+    refined = float(np.mean([np.median(one) for one in (begins, ends) if len(one)]))
+    if offset == 0.0 and abs(refined) <= _SAME_CLOCK_S:
+        # Clocks that are the same but for how the standstills are found stay so.
+        refined = 0.0
+    apart = np.abs(np.concatenate((begins, ends)) - refined)
+    return _judged(a, b, refined, float(np.median(apart)), error_of)
 
 
 def _judged(

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from foreign.tables import MARKER, Measured, measured, text
+from scipy.spatial.transform import Rotation
 
 from remaster_ros.kinematics.transforms import apply, transform
 
@@ -35,17 +36,28 @@ def run_of(arm: Measured, seed: int = 0, alike: bool = False) -> Run:
     return Run(arm, begin, begin + stop)
 
 
-def seen(run: Run, time_s: np.ndarray, seed: int, noise_m: float) -> np.ndarray:
-    """Return where the marker of a run is seen, in the frame in which the arm's points are, m."""
-    arm = run.arm
-    # The frame that took the arm's true points to those measured.
+def sensor_of(arm: Measured) -> np.ndarray:
+    """Return the frame that takes the arm's true points to those measured, (4, 4)."""
     true = arm.chain.positions(arm.q, MARKER, arm.offsets)
     a, b = true - true.mean(axis=0), arm.points - arm.points.mean(axis=0)
     u, _, vt = np.linalg.svd(a.T @ b)
     R = (u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt).T
-    T_N_R = transform(R, arm.points.mean(axis=0) - R @ true.mean(axis=0))
-    points = apply(T_N_R, arm.chain.positions(run.joints(time_s), MARKER, arm.offsets))
+    return transform(R, arm.points.mean(axis=0) - R @ true.mean(axis=0))
+
+
+def seen(run: Run, time_s: np.ndarray, seed: int, noise_m: float) -> np.ndarray:
+    """Return where the marker of a run is seen, in the frame in which the arm's points are, m."""
+    arm = run.arm
+    points = arm.chain.positions(run.joints(time_s), MARKER, arm.offsets)
+    points = apply(sensor_of(arm), points)
     return points + np.random.default_rng(seed).normal(0.0, noise_m, points.shape)
+
+
+def turned(run: Run, time_s: np.ndarray) -> np.ndarray:
+    """Return how the tool of a run is turned in that frame, quaternions x, y, z, w, (n, 4)."""
+    arm = run.arm
+    T = sensor_of(arm) @ arm.chain.forward(run.joints(time_s) + arm.offsets)
+    return Rotation.from_matrix(T[:, :3, :3]).as_quat()
 
 
 def log_of(run: Run, start_s: float = 0.0, rate_hz: float = 30.0, decimal: str = '.') -> str:
@@ -74,7 +86,7 @@ def take_of(
     rng = np.random.default_rng(seed)
     time_s = np.arange(begins_s, min(ends_s, run.end[-1]), 1.0 / rate_hz)
     scale = {'Millimeters': 1e3, 'Meters': 1.0}[unit]
-    tool = seen(run, time_s, seed, noise_m) * scale
+    tool, quaternions = seen(run, time_s, seed, noise_m) * scale, turned(run, time_s)
     base = (np.array([0.5, 0.1, 1.0]) + rng.normal(0.0, noise_m, tool.shape)) * scale
     assets = [('Rigid Body', 'tool', tool), ('Rigid Body', 'base', base)]
     assets += [('Rigid Body Marker', 'tool:Marker1', tool + 1e-3 * scale)]
@@ -93,6 +105,8 @@ def take_of(
                     row.append(cell)
                 axes.append(letter.strip())
                 values = points[:, i] if quantity == 'Position' else np.full(len(points), 0.5)
+                if quantity == 'Rotation' and name == 'tool':
+                    values = quaternions[:, i]
                 gone = lost if 'tool' in name else np.zeros(len(time_s), bool)
                 columns.append(['' if g else f'{v:.6f}' for v, g in zip(values, gone)])
     if version < '1.24':
@@ -126,9 +140,9 @@ def capture_of(run: Run, rate_hz: float = 60.0, objects: bool = True) -> str:
     time_s = np.arange(0.0, run.end[-1], 1.0 / rate_hz)
     tool = 1e3 * seen(run, time_s, 1, 1e-4)
     still = np.tile([500.0, 100.0, 1000.0], (len(tool), 1))
-    turned = np.tile([0.0, 0.0, 0.0, 1.0], (len(tool), 1))
     if objects:
-        columns = [turned, tool, turned, still]
+        level = np.tile([0.0, 0.0, 0.0, 1.0], (len(tool), 1))
+        columns = [turned(run, time_s), tool, level, still]
         axes, units = 'RX,RY,RZ,RW,TX,TY,TZ', ',,,,mm,mm,mm'
         names = [f'Global Angle {name}:{name},,,,,,' for name in ('tool', 'base')]
     else:

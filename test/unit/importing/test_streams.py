@@ -166,6 +166,18 @@ def test_where_several_offsets_do_and_no_robot_decides_it_is_asked_for(arm, tmp_
     assert_stops(told, arm, slice(4, -4))
 
 
+@pytest.mark.parametrize('offset', [0.02, 0.1, 0.4, -0.6])
+def test_clocks_that_differ_by_less_than_a_stop_are_not_the_same(offset, arm, run, tmp_path):
+    """Every standstill overlaps with its own at once, but the means would hold motion."""
+    rows = rows_of(tmp_path, arm, take_of(run), log_of(run, offset, rate_hz=10.0))
+    assert_stops(rows, arm)
+    words = ' '.join(rows.description)
+    assert ('the clocks are the same' in words) == (abs(offset) < 0.05)
+    if abs(offset) > 0.05:
+        found = float(re.search(r'take.csv ([-+0-9.]+) s', words)[1])
+        assert found == pytest.approx(offset, abs=0.06)
+
+
 def test_shots_are_paired_with_a_log_of_another_clock(arm, run, tmp_path):
     shots = 0.5 * (run.begin + run.end)
     shots = np.delete(shots, [3, 7])
