@@ -42,11 +42,14 @@ _REFERENCES = 5
 
 def oriented(rows: RawRows, chain: SerialChain, options: SessionOptions) -> RawRows:
     """Return rows with what their columns of an orientation mean, or without it, and say so."""
-    if (rows.turned is None and rows.orientation is None) or chain.slides.any():
+    if rows.turned is None and rows.orientation is None:
         return rows
+    ways = [options]
+    if rows.coupling and not chain.slides.any():
+        ways.append(replace(options, couple=(*options.couple, *rows.coupling.items())))
     joints = [
         PadAngles.of(controller_of(rows, chain, one), chain.joint_names).to_urdf(rows.q)
-        for one in (options, replace(options, couple=(*options.couple, *rows.coupling.items())))
+        for one in ways
     ]
     arms = [chain.forward(q) for q in joints]
     if rows.turned is None:

@@ -4,6 +4,9 @@ import numpy as np
 import pytest
 from foreign.tables import MARKER, measured, text, write
 from scipy.spatial.transform import Rotation
+from worlds.sliding_cells import rail
+
+from remaster_ros.kinematics.serial_chain import SerialChain
 
 ROWS = 24
 AXES = [f'A{i}' for i in range(1, 7)]
@@ -106,3 +109,22 @@ def test_what_is_not_the_bodys_is_left_out(names, way, whose, words, arm, tmp_pa
     assert words in out
     assert 'left out' in out
     assert session.measurements.orientation is None
+
+
+def test_an_arm_on_a_rail(tmp_path, imported):
+    chain = SerialChain.from_urdf(rail(), 'base_link', 'tool')
+    rng = np.random.default_rng(2)
+    q = rng.uniform(
+        np.maximum(chain.lower, -1.5), np.minimum(chain.upper, 1.5), (ROWS, len(chain))
+    )
+    T = chain.forward(q + rng.normal(0.0, 3e-3, len(chain)) * ~chain.slides)
+    tool = Rotation.from_matrix(T[:, :3, :3])
+    place = SENSOR.apply(T[:, :3, 3] + tool.apply(MARKER)) + [2.0, 1.0, 0.5]
+    names = [f'{n} [{"m" if s else "rad"}]' for n, s in zip(chain.joint_names, chain.slides)]
+    angles = (SENSOR * tool * ON_TOOL).as_euler('xyz', degrees=True)
+    header = [*names, 'X [m]', 'Y [m]', 'Z [m]', 'roll', 'pitch', 'yaw']
+    table = write(tmp_path, 't.csv', text(header, [*q.T, *place.T, *angles.T], ';'))
+    links = ('--base-link', 'base_link', '--tip-link', 'tool')
+    (out, _), session = imported(rail(), table, *links)
+    assert 'read as angles about fixed axes xyz, deg' in out
+    assert session.measurements.orientation is not None
