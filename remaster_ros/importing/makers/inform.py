@@ -38,7 +38,7 @@ def read(text: str) -> Named | None:
                 found.append((number, position[1], axes))
             else:
                 places += 1
-        elif '=' in line or not line.strip().startswith('/'):
+        elif line.strip() and ('=' in line or not line.strip().startswith('/')):
             raise unexpected(number, line, 'a position such as C00001=…')
     if pulses and not found:
         raise InputError(

@@ -383,6 +383,22 @@ PROGRAMS = {
 }
 
 
+@pytest.mark.parametrize('form', PROGRAMS)
+@pytest.mark.parametrize(
+    'change',
+    [
+        lambda text: text.replace('\n', '\r\n'),
+        lambda text: text.replace('\n', '   \n'),
+        lambda text: text.replace('\n', '\n\n'),
+    ],
+    ids=['line ends', 'blanks', 'empty lines'],
+)
+def test_programs_that_an_editor_has_touched(change, form, arm, tmp_path):
+    content = change(PROGRAMS[form](arm.q))
+    points = text(['X', 'Y', 'Z'], [*millimetres(arm)])
+    assert_rows(rows_of(arm, tmp_path, points, content, join='order'), arm)
+
+
 WITHOUT_NAMES = (
     *('log of a call', 'array of NumPy', 'calls of Mecademic', 'braces of Comau', 'YAML'),
     *('Python for a UR', 'moves of Doosan', 'small letters of KUKA'),
