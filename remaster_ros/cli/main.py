@@ -94,7 +94,7 @@ def _keep_freed_memory() -> None:
     c_library = ctypes.CDLL(None)
     # Of other systems' libraries none has it.
     if hasattr(c_library, 'mallopt'):
-        c_library.mallopt(TRIM_THRESHOLD, 1 << 28)
+        c_library.mallopt(TRIM_THRESHOLD, 1 << 27)
         c_library.mallopt(MMAP_THRESHOLD, 1 << 25)
 
 

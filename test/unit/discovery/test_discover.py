@@ -313,7 +313,7 @@ def test_held_out_poses_decide_where_the_model_of_all_kinds_does_not_hold(seed):
         ('joint_compliance', (2,))
     ]
     # With all kinds 0.077, 0.114 and 0.159 mm.
-    assert found.gain.held_out_rms_after_m < 0.065e-3
+    assert found.gain.held_out_rms_after_m < 0.07e-3
     assert {cell.name for cell in found.solution.cells} == {'joint_compliance'}
 
 

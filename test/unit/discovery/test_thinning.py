@@ -121,7 +121,9 @@ def test_a_part_tells_the_cause_and_the_other_rows_confirm_it(monkeypatch):
     assert thinning.others_rms_after_m < 0.8 * thinning.others_rms_before_m
     (parameter,), (other,) = part.effects[0].parameters, whole.effects[0].parameters
     assert abs(parameter.value - 5e-5) < 4.0 * parameter.std
-    assert parameter.std > other.std, 'fewer rows know less, and say so'
+    # Fewer rows were searched; what was found is fitted to all of them.
+    assert abs(parameter.value - other.value) < other.std
+    assert 0.8 < parameter.std / other.std < 1.25
 
 
 @pytest.mark.qualify
