@@ -1,7 +1,7 @@
 # Everything from a fresh clone on a Linux machine with Python 3.11+ and pip:
 #   make demo     the main job on fake hardware; ends by saying where the report is
 #                 (OUT=folder SEED=n ARGS='--full' are handed on)
-#   make test     the tests, some eight minutes on two idle cores (PYTEST='-k name' is handed on)
+#   make test     the tests, some nine minutes on two idle cores (PYTEST='-k name' is handed on)
 #   make qualify  all of them, and the campaigns that it leaves out; an hour and a half on two cores
 #   make check    lint, types, layers; CI runs this and make test
 #   make bench    the benchmarks, small (BENCH='bench_speed …' chooses, FULL=1 for all sizes)

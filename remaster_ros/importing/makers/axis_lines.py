@@ -13,12 +13,14 @@ _LINE = re.compile(
 )
 _AXES = 'XYZ'
 _SEEN = 60
+# A name, an axis and a number are no longer; what is repeated for longer takes ever more ways.
+_LONGEST = 200
 
 
 def read(text: str) -> Named | None:
     """Return the points of such a report; None for anything else."""
     lines = [(i, line) for i, line in enumerate(text.splitlines(), 1) if line.strip()]
-    seen = [match['axis'] for _, line in lines[:_SEEN] if (match := _LINE.fullmatch(line))]
+    seen = [match['axis'] for _, line in lines[:_SEEN] if (match := _match(line))]
     if len(seen) < 2 * len(_AXES) or 2 * len(seen) <= len(lines[:_SEEN]):
         return None
     names: list[str] = []
@@ -26,7 +28,7 @@ def read(text: str) -> Named | None:
     at: list[int] = []
     above, values = '', list[str]()
     for number, line in lines:
-        match = _LINE.fullmatch(line)
+        match = _match(line)
         if match is None:
             # Of a point in the middle nothing else may stand there.
             if values or len(re.findall(r'\d+(?:[.,]\d+)?', line)) > 1:
@@ -54,3 +56,7 @@ def read(text: str) -> Named | None:
         lines=tuple(at),
         decimal=decimal,
     )
+
+
+def _match(line: str) -> re.Match[str] | None:
+    return _LINE.fullmatch(line) if len(line) <= _LONGEST else None
