@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from rigs.command_line import refusal, remaster
-from worlds.arms import jointed_arm
+from worlds.arms import STANFORD as URDF
 from worlds.measured_rows import measured_rows
 
 from remaster_ros.compensation.file import read_compensation
@@ -24,15 +24,6 @@ SEED = 23
 NOISE_M = 3e-5
 SLIDE = 2
 MARKER = np.array([0.03, -0.02, 0.12])
-# A Stanford arm: its third joint slides behind two that turn.
-URDF = jointed_arm(
-    ('revolute', '0 0 1', '0 0 0.4', '0 0 0'),
-    ('revolute', '0 0 1', '0 0.15 0', '-1.5708 0 0'),
-    ('prismatic', '0.1 0 1', '0 0 0.1', '1.5708 0.1 0'),
-    ('revolute', '0 0 1', '0 0 0', '0 0 0'),
-    ('revolute', '0 0 1', '0 0.05 0', '-1.5708 0 0'),
-    ('revolute', '0 0 1', '0 0 0.1', '1.5708 0 0'),
-)
 CHAIN = SerialChain.from_urdf(URDF)
 OFFSETS = np.array([0.004, -0.006, 2.4e-3, 0.005, 0.007, -0.003])
 KNOWN = np.array([False, True, True, True, True, False])

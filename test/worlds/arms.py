@@ -36,3 +36,14 @@ def jointed_arm(*joints: tuple[str, str, str, str]) -> str:
         )
         parent = child
     return f'<robot name="slider">{"".join(parts)}</robot>'
+
+
+# A Stanford arm: its third joint slides behind two that turn, along an axis that is tilted.
+STANFORD = jointed_arm(
+    ('revolute', '0 0 1', '0 0 0.4', '0 0 0'),
+    ('revolute', '0 0 1', '0 0.15 0', '-1.5708 0 0'),
+    ('prismatic', '0.1 0 1', '0 0 0.1', '1.5708 0.1 0'),
+    ('revolute', '0 0 1', '0 0 0', '0 0 0'),
+    ('revolute', '0 0 1', '0 0.05 0', '-1.5708 0 0'),
+    ('revolute', '0 0 1', '0 0 0.1', '1.5708 0 0'),
+)

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from rigs.command_line import refusal, remaster
+from worlds.arms import STANFORD
 from worlds.arms import jointed_arm as arm
 
 from remaster_ros.calibration.fit import fit_session
@@ -22,15 +23,6 @@ MARKER = np.array([0.03, -0.02, 0.12])
 NOISE_M = 3e-5
 
 
-# A Stanford arm: the third joint slides behind two that turn.
-STANFORD = arm(
-    ('revolute', '0 0 1', '0 0 0.4', '0 0 0'),
-    ('revolute', '0 0 1', '0 0.15 0', '-1.5708 0 0'),
-    ('prismatic', '0.1 0 1', '0 0 0.1', '1.5708 0.1 0'),
-    ('revolute', '0 0 1', '0 0 0', '0 0 0'),
-    ('revolute', '0 0 1', '0 0.05 0', '-1.5708 0 0'),
-    ('revolute', '0 0 1', '0 0 0.1', '1.5708 0 0'),
-)
 SCARA = arm(
     ('revolute', '0 0 1', '0 0 0.2', '0 0 0'),
     ('revolute', '0 0 1', '0.35 0 0', '0 0 0'),
