@@ -480,6 +480,8 @@ NEAR = 0.5
 WIDE_GAP = 1.0 / 30.0
 # Nor is anything else across such a share.
 EMPTY = 1.0 / 8.0
+# A part of that range that is no wider is a place.
+PLACE = 0.01
 
 
 def draw_discovery(discovery: Discovery) -> dict[str, str]:
@@ -758,6 +760,7 @@ def _cause(ax: Axes, discovery: Discovery, cell: Cell) -> None:
         if cell.curve is None:
             # Nor a straight band: a curve's own is known everywhere.
             holes = np.flatnonzero(gap)
+            _at_places(ax, at / per_shown, middle, spread, holes)
             around = np.insert(at, holes, at[holes])
             middle, spread = (np.insert(v, holes, np.nan) for v in (middle, spread))
         else:
@@ -774,6 +777,20 @@ def _cause(ax: Axes, discovery: Discovery, cell: Cell) -> None:
     ax.set_ylabel(unit)
     name = 'slip' if cell.happened else cell.name.replace('_', ' ')
     ax.set_title(f'joint {cell.joints[0]}: {name}')
+
+
+def _at_places(
+    ax: Axes, at: FloatArray, middle: FloatArray, spread: FloatArray, holes: IntArray
+) -> None:
+    """Draw an estimate and its band where a joint stood at single places, as a rail is held at.
+
+    ``at``: the driver of the rows, sorted, in parts that begin at ``holes``; a line or a band
+    within a part without width is not seen.
+    """
+    for part in np.split(np.arange(len(at)), holes):
+        if len(part) and np.ptp(at[part]) <= PLACE * np.ptp(at):
+            x, y, band = at[part[0]], middle[part[0]], spread[part[0]]
+            ax.errorbar(x, y, band, fmt='_', color=AFTER, markersize=14, elinewidth=4, alpha=0.6)
 
 
 def _sides(

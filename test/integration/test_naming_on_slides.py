@@ -14,16 +14,19 @@ pytest.importorskip('pinocchio', reason='needs the judge: pip install pin')
 
 from judges.hidden_effects import judge
 from worlds.hidden_world import HiddenWorld, Noise, Visits
-from worlds.sliding_cells import rail, telescope
+from worlds.sliding_cells import rail, sliding_cell, telescope
 
 from remaster_ros.compensation.file import read_compensation
 from remaster_ros.discovery.discover import Discovery, discover_session
 from remaster_ros.discovery.effects.context import Context
 from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.kinematics.serial_chain import SerialChain
+from remaster_ros.reports.figures import causes
 from remaster_ros.reports.result_folder import save_discovery
-from remaster_ros.simulation.effect_sampling import draw_effect
+from remaster_ros.session.workcell import read_cell
+from remaster_ros.simulation.effect_sampling import EffectSpec, draw_effect
 from remaster_ros.simulation.hidden_effects import HiddenEffect
+from remaster_ros.simulation.simulated_workcell import simulate_workcell
 from remaster_ros.simulation.truth import SimulatedSensor, place_sensor
 from remaster_ros.simulation.world_model import deviation
 
@@ -185,3 +188,24 @@ def test_the_page_of_it_has_no_angle_of_a_slide(tmp_path):
     (row,) = (row for row in page.split('<tr>') if row.startswith('<td>half_backlash_1</td>'))
     assert 'mm' in row
     assert '′' not in row
+
+
+def test_what_is_held_at_single_places_is_drawn_at_each_of_them(tmp_path):
+    """A line or a band between places where nothing was measured is not drawn."""
+    held = [-0.4, 0.0, 0.4]
+    path = sliding_cell(tmp_path, rail(), held_joint='rail', held_values_m=held)
+    cell = read_cell(path)
+    run = simulate_workcell(
+        cell,
+        cell.chain(),
+        np.random.default_rng(3),
+        poses=25,
+        validation_poses=12,
+        effects=[EffectSpec.parse('encoder_scale@1:0.5')],
+    )
+    found = discover_session(run.session, rng=np.random.default_rng(3))
+    assert [effect.name for effect in found.effects] == ['encoder_scale']
+    (ax,) = (one for one in causes(found).axes if 'encoder scale' in one.get_title())
+    drawn = sorted(tuple(bar.lines[0].get_xydata()[0]) for bar in ax.containers)
+    (scale,) = found.effects[0].parameters
+    np.testing.assert_allclose(drawn, [(1e3 * x, 1e3 * x * scale.value) for x in held], atol=0.02)
