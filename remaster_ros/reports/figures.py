@@ -784,13 +784,15 @@ def _at_places(
 ) -> None:
     """Draw an estimate and its band where a joint stood at single places, as a rail is held at.
 
-    ``at``: the driver of the rows, sorted, in parts that begin at ``holes``; a line or a band
-    within a part without width is not seen.
+    ``at``: the driver of the rows, sorted, in parts that begin at ``holes``; nothing where any of
+    them has a width, in which a line and a band are seen.
     """
-    for part in np.split(np.arange(len(at)), holes):
-        if len(part) and np.ptp(at[part]) <= PLACE * np.ptp(at):
-            x, y, band = at[part[0]], middle[part[0]], spread[part[0]]
-            ax.errorbar(x, y, band, fmt='_', color=AFTER, markersize=14, elinewidth=4, alpha=0.6)
+    parts = np.split(np.arange(len(at)), holes)
+    if any(np.ptp(at[part]) > PLACE * np.ptp(at) for part in parts):
+        return
+    for first in (part[0] for part in parts):
+        x, y, band = at[first], middle[first], spread[first]
+        ax.errorbar(x, y, band, fmt='_', color=AFTER, markersize=14, elinewidth=4, alpha=0.6)
 
 
 def _sides(
