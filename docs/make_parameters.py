@@ -69,7 +69,8 @@ def row(field: dataclasses.Field[Any]) -> str:
         f'`{field.name}`',
         f'`{json.dumps(field.default)}`',
         meta['unit'],
-        limits(meta['low'], meta['high'], meta['choices']),
+        limits(meta['low'], meta['high'], meta['choices'])
+        + ('' if meta['off'] is None else f', or {meta["off"]:g}'),
         meta['description'],
     )
     return f'| {" | ".join(cells)} |'

@@ -19,6 +19,7 @@ def parameter(
     unit: str = '',
     low: float | None = None,
     high: float | None = None,
+    off: float | None = None,
     choices: tuple[str, ...] = (),
     live: bool = False,
 ) -> Any:
@@ -32,6 +33,8 @@ def parameter(
         For the user; shown by ``ros2 param describe``.
     low, high
         Smallest and largest allowed value, both included.
+    off
+        The value outside of them by which it is switched off; None where there is none.
     choices
         The allowed words of a text parameter.
     live
@@ -42,6 +45,7 @@ def parameter(
         'unit': unit,
         'low': low,
         'high': high,
+        'off': off,
         'choices': choices,
         'live': live,
     }
@@ -74,13 +78,14 @@ def check(owner: str, field: dataclasses.Field[Any], value: Any) -> Any:
         value = float(value)
     if type(value) is not wanted:
         raise InputError(f'{where} is {value!r}; it must be of type {wanted.__name__}')
-    low, high = field.metadata['low'], field.metadata['high']
+    low, high, off = (field.metadata[key] for key in ('low', 'high', 'off'))
     too_low = low is not None and not value >= low
     too_high = high is not None and not value <= high
-    if too_low or too_high:
+    if (too_low or too_high) and not (off is not None and value == off):
         unit = f' {field.metadata["unit"]}' if field.metadata['unit'] else ''
         limits = f'{"-inf" if low is None else low} to {"inf" if high is None else high}'
-        raise InputError(f'{where} is {value}; it must lie in {limits}{unit}')
+        none = '' if off is None else f', or be {off:g} for no such limit'
+        raise InputError(f'{where} is {value}; it must lie in {limits}{unit}{none}')
     choices = field.metadata['choices']
     if choices and value not in choices:
         raise InputError(f'{where} is {value!r}; it must be one of {", ".join(choices)}')

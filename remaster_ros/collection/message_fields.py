@@ -38,7 +38,8 @@ class JointOrder:
 
     def __init__(self, names: Sequence[str]) -> None:
         self.names = tuple(names)
-        self._seen: tuple[str, ...] = ()
+        # None before the first: a message without names is none of the arm's.
+        self._seen: tuple[str, ...] | None = None
         self._columns: list[int] = []
 
     def concerns(self, message: Any) -> bool:

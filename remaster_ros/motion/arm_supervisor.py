@@ -292,6 +292,10 @@ class ArmSupervisor:
         # Where a stop was refused the arm is not judged by it any more.
         return self._step(Event.GIVEN_UP) if self.halted else self._halt(why, Event.GIVEN_UP)
 
+    def fault(self, why: str, wall_s: float) -> list[Action]:
+        """Process that this program has failed in a step, which may be half done."""
+        return [] if self.halted else self._halt_braking(why, wall_s)
+
     def interrupted(self, since_wall_s: float) -> None:
         """Process since when a bridge before this one has been gone, s of wall time."""
         self._interlocks.interrupted(since_wall_s)

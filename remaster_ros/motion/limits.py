@@ -14,6 +14,12 @@ from remaster_ros.types import FloatArray
 UNKNOWN_VELOCITY = 1.0
 """Where a robot model has no velocity limit, rad/s: slow for any arm. Here and below a joint that
 slides has `SerialChain.per_radian` (0.25 m) times as much, in metres."""
+SLOWEST_M_S = 1e-3
+"""Least limit of the speed of the fastest point, m/s: at it an arm of a metre takes an hour for
+half a turn. A smaller one is a slip of the keyboard: no time that it leads to fits a message."""
+LONGEST_S = 86_400.0
+"""No motion of the bridge takes longer, s: a day. The slowest probe of an arm with seven joints,
+at `SLOWEST_M_S` from anywhere within its limits, takes some ten hours. A message holds decades."""
 ACCELERATION = 5.0
 """Largest joint acceleration where a cell file gives none, rad/s².
 

@@ -17,10 +17,11 @@ from itertools import pairwise
 import numpy as np
 
 from remaster_ros.errors import RemasterError
-from remaster_ros.motion.limits import MotionLimits
+from remaster_ros.motion.limits import LONGEST_S, MotionLimits
 from remaster_ros.motion.path_check import FreePath, PointSpeeds
-from remaster_ros.motion.stopping import stop_on_line
+from remaster_ros.motion.stopping import STOP_S, stop_on_line
 from remaster_ros.motion.trajectory import (
+    HEADROOM,
     RAMP_S,
     Line,
     Trajectory,
@@ -157,6 +158,9 @@ class MotionGate:
             point_m = float(np.sum(way * self._speeds.reach_m))
             times.append(CUBIC_PEAK * point_m / limits.tool_speed)
         time_s = max(times)
+        if not time_s <= LONGEST_S:
+            self.refused += 1
+            raise MotionRefusedError(_too_long())
         start, end = path.points
         # A line that takes as long; what the controller is sent is its end alone.
         trajectory = Trajectory((Line(start, end, 1.0 / (time_s - RAMP_S)),))
@@ -226,6 +230,8 @@ class MotionGate:
                 raise MotionRefusedError(
                     f'the move leaves the path found free by {text} between two waypoints'
                 )
+        if not points[-1].time_s <= LONGEST_S:
+            raise MotionRefusedError(_too_long())
 
     def _check_point_speed(self, piece: Cubic, limits: MotionLimits) -> None:
         if self._speeds is None or not np.isfinite(limits.tool_speed):
@@ -312,6 +318,21 @@ class ForeignGate:
         _check_rate('acceleration', largest, limits.acceleration, 's2', limits)
         return Admitted(tuple(waypoints), None, is_straight)
 
+    def brake(self, q: FloatArray, velocity: FloatArray) -> Admitted:
+        """Return an even stop of an arm that goes on in its direction meanwhile.
+
+        The controller is to hold it at once where the stop would lead beyond a limit.
+
+        ``q, velocity``: where the arm is, rad or m, and how fast, (k,).
+        """
+        limits = self.limits
+        hardest = float(np.max(np.abs(velocity) / limits.acceleration))
+        time_s = max(STOP_S, hardest / HEADROOM)
+        end = q + 0.5 * time_s * velocity
+        if np.any((end < limits.lower) | (end > limits.upper)):
+            return Admitted(())
+        return Admitted((Waypoint(time_s, end, np.zeros_like(end)),))
+
     def _check_start(self, first: Waypoint, q: FloatArray, velocity: FloatArray) -> None:
         """Look whether the controller could begin there at once: it would jump there."""
         off, units = np.abs(first.q - q), self.limits.units
@@ -321,6 +342,10 @@ class ForeignGate:
             raise StartMovedError(f'it begins {text} from where {self.limits.names[joint]} is')
         if not units.largest(velocity) <= SLOW_RAD_S:
             raise StartMovedError('it begins at once while the arm moves')
+
+
+def _too_long() -> str:
+    return f'it would take longer than {LONGEST_S / 3600.0:.0f} h with these limits of speed'
 
 
 def _way_out_limits(limits: MotionLimits) -> MotionLimits:

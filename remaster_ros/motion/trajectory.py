@@ -14,7 +14,7 @@ from itertools import pairwise
 import numpy as np
 
 from remaster_ros.motion.joint_units import TURNING, JointUnits
-from remaster_ros.motion.limits import MotionLimits
+from remaster_ros.motion.limits import LONGEST_S, MotionLimits
 from remaster_ros.types import FloatArray
 
 RAMP_S = 0.5
@@ -65,8 +65,9 @@ class Line:
         rate = float(np.min(speeds / way))
         if peak_m > 0.0:
             rate = min(rate, limits.tool_speed / peak_m)
-        # A short way is over before the cruising speed is reached.
-        return cls(start, end, min(HEADROOM * rate, 1.0 / RAMP_S))
+        # A short way is over before the cruising speed is reached. At a limit of next to nothing
+        # the time is that of a move that the gate refuses.
+        return cls(start, end, min(max(HEADROOM * rate, 0.1 / LONGEST_S), 1.0 / RAMP_S))
 
     @property
     def way(self) -> FloatArray:

@@ -115,10 +115,16 @@ class BagRecorder:
             self.taken[name] = 0
 
         def take(data: bytes, info: Mapping[str, Any]) -> None:
+            message = None
+            if receive is not None:
+                try:
+                    message = deserialize_message(data, kind)
+                except Exception as error:
+                    # Bytes that are no message: rclpy raises whatever the middleware does.
+                    raise InputError(f'not a {type_name} ({type(error).__name__})') from None
             # Raw, because serialising again can leave uninitialised bytes behind the message.
             self._write(name, type_name, data)
             if receive is not None:
-                message = deserialize_message(data, kind)
                 receive(message, info) if with_info else receive(message)
                 self.taken[name] += 1
 

@@ -35,7 +35,7 @@ from remaster_ros.nodes.messages import duration_of
 from remaster_ros.nodes.parameters import declare, parameter
 from remaster_ros.nodes.rivals import JOINTS, ArmStates, OnlyPublisher
 from remaster_ros.nodes.robot_bridge import DESCRIPTION, DESCRIPTION_QOS, NEWEST_STATES
-from remaster_ros.nodes.running import RemasterNode, run
+from remaster_ros.nodes.running import RemasterNode, fault_of_this_program, run
 from remaster_ros.nodes.status import LEASED, RELIABLE
 from remaster_ros.types import FloatArray
 
@@ -45,6 +45,8 @@ One for another time would begin where nobody has looked."""
 NEARER = 0.5
 """A description holds the correction if its axes are turned from those of the corrected arm by
 less than this share of what they are from the nominal one's: its form may leave out a part."""
+FARTHEST_RAD = 200.0 * np.pi
+"""A joint is reported no further from zero, rad: a hundred turns."""
 WATCH_S = 0.1
 """How often it is looked at whether it may begin, s of wall time."""
 HOLD_S = 3.0
@@ -109,6 +111,9 @@ class _Goal:
 class CompensatorNode(RemasterNode):
     """See the module's text."""
 
+    # Without it nobody stops what it has passed on: it does so itself, and stays.
+    outlives_faults = True
+
     def __init__(self) -> None:
         super().__init__('compensator')
         self.p = declare(self, Parameters)
@@ -135,6 +140,8 @@ class CompensatorNode(RemasterNode):
         self._temperature_c: float | None = None
         self._warm_wall_s = -np.inf
         self._end_s = -np.inf
+        # Why nothing is passed on before a person calls ~/enable: this program has failed; ''.
+        self._halted = ''
         self._said: dict[str, float] = {}
         self._told = ''
         self._goals: list[_Goal] = []
@@ -174,6 +181,24 @@ class CompensatorNode(RemasterNode):
 
         return CorrectionInUse(self.p.compensation, most_deg=self.p.max_change_deg)
 
+    def on_fault(self, error: Exception) -> None:
+        """Stop the arm, and pass nothing on before a person has looked at it."""
+        super().on_fault(error)
+        if not hasattr(self, '_steady'):
+            # It is being made: nothing has been passed on.
+            return
+        self._halted = f'{fault_of_this_program(error)}; look at the arm, then call ~/enable'
+        self._end_s = -np.inf
+        for goal in list(self._goals):
+            goal.cancelled = True
+            if goal.sent is not None:
+                goal.sent.cancel_goal_async()
+        present = self._present
+        moves = present.is_known and present.is_fresh(time.monotonic()) and not present.stands
+        if moves and self._on is not None:
+            stop = self._gate.brake(present.q, present.velocity)
+            self._commands.publish(self._message(stop))
+
     # Whether it may pass anything on
 
     def _on_description(self, message: String) -> None:
@@ -204,6 +229,8 @@ class CompensatorNode(RemasterNode):
     def _trouble(self) -> str:
         """Return why nothing is passed on; ''."""
         topic = self.resolve_topic_name(JOINTS)
+        if self._halted:
+            return self._halted
         if self._description is None:
             self._described = self._described_trouble()
         chained = f'{self._commands_topic.rpartition("/")[0]}/joint_states'
@@ -259,6 +286,8 @@ class CompensatorNode(RemasterNode):
             except InputError as error:
                 why = str(error)
         response.success = not why
+        if on and not why:
+            self._halted = ''
         response.message = why or self._turn(on)
         self._tell(self._trouble())
         return response
@@ -319,8 +348,10 @@ class CompensatorNode(RemasterNode):
         except InputError as error:
             self._say(str(error))
             return
-        if q is None or not np.all(np.isfinite(q)):
-            self._say(f'{self.resolve_topic_name(JOINTS)}: a position is no finite number')
+        if q is None or not np.all(np.abs(q) <= FARTHEST_RAD):
+            self._say(
+                f'{self.resolve_topic_name(JOINTS)}: a position is no number, or of no joint'
+            )
             return
         stamp_s = seconds(message.header.stamp)
         self._present.take(stamp_s, q, time.monotonic())

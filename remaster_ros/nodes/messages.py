@@ -15,11 +15,16 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 from remaster_ros.collection.message_fields import refuse_repeated
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics import transforms
-from remaster_ros.types import FloatArray
+from remaster_ros.types import FARTHEST_M, FloatArray
 
 if TYPE_CHECKING:
     # It loads all of the planning.
     from remaster_ros.planning.tour_order import PoseVisit
+
+
+LARGEST_PART = 1e6
+"""The largest part of a quaternion is no larger, nor smaller than the reciprocal: any program
+leaves it nearer to 1, and the squares are numbers."""
 
 
 def stamp_of(time_s: float) -> Time:
@@ -41,12 +46,18 @@ def write_place(T: FloatArray, position: Any, turn: Any) -> None:
 
 
 def read_place(position: Any, turn: Any) -> FloatArray:
-    """Undo `write_place`; returns (4, 4)."""
+    """Undo `write_place`; returns (4, 4).
+
+    Raises InputError: no rotation, or a place that is not finite or farther than `FARTHEST_M`.
+    """
+    place = np.array([position.x, position.y, position.z])
     quaternion = np.array([turn.x, turn.y, turn.z, turn.w])
-    return transforms.transform(
-        transforms.matrix_from_quaternion_xyzw(quaternion),
-        np.array([position.x, position.y, position.z]),
-    )
+    if not np.all(np.abs(place) <= FARTHEST_M):
+        raise InputError(f'a place at {place.tolist()} m is none')
+    # Of any length: others do not give it as exactly as this package does.
+    if not 1.0 / LARGEST_PART <= np.max(np.abs(quaternion)) <= LARGEST_PART:
+        raise InputError(f'the quaternion {quaternion.tolist()} is no rotation')
+    return transforms.transform(transforms.matrix_from_quaternion_xyzw(quaternion), place)
 
 
 def transform_message(parent: str, child: str, T_parent_child: FloatArray) -> TransformStamped:

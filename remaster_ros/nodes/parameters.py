@@ -21,6 +21,7 @@ from rcl_interfaces.msg import (
 from rclpy.node import Node
 
 from remaster_ros.errors import InputError
+from remaster_ros.nodes.running import RemasterNode, fault_of_this_program
 from remaster_ros.parameters import check, parameter, parameter_fields
 
 __all__ = ['check', 'declare', 'parameter']
@@ -64,6 +65,12 @@ def declare(node: Node, kind: type[T], on_change: Callable[[T], None] | None = N
                 on_change(new)
         except InputError as error:
             return SetParametersResult(successful=False, reason=str(error))
+        except Exception as error:
+            # rclpy would end the process, and whoever asks would wait for ever.
+            reason = str(fault_of_this_program(error))
+            if isinstance(node, RemasterNode):
+                node.on_fault(error)
+            return SetParametersResult(successful=False, reason=reason)
         current = new
         return SetParametersResult(successful=True)
 
@@ -96,6 +103,10 @@ def _descriptor(field: dataclasses.Field[Any]) -> ParameterDescriptor:
         additional_constraints='one of ' + ', '.join(meta['choices']) if meta['choices'] else '',
     )
     low, high = meta['low'], meta['high']
+    if meta['off'] is not None:
+        # ROS has one range: the hole in it is looked at by `check`.
+        descriptor.additional_constraints = f'{meta["off"]:g}, or at least {low:g}'
+        low = min(low, meta['off'])
     if low is not None or high is not None:
         if isinstance(field.default, float):
             bounds = FloatingPointRange(

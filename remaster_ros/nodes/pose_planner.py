@@ -54,6 +54,7 @@ from remaster_ros.collection.tour_progress import PlanMemory, TourProgress
 from remaster_ros.errors import InputError, RemasterError
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.motion.joint_units import JointUnits
+from remaster_ros.motion.limits import SLOWEST_M_S
 from remaster_ros.motion.preflight import preflight
 from remaster_ros.nodes.background import Background, PlanningThread
 from remaster_ros.nodes.judging import KINDS, Judging, JudgingParameters, Kind
@@ -233,7 +234,12 @@ class Parameters(JudgingParameters):
         high=1.0,
     )
     cartesian_speed_limit_m_s: float = parameter(
-        0.25, 'as of robot_bridge, likewise; 0 means no such limit', unit='m/s', low=0.0, high=10.0
+        0.25,
+        'as of robot_bridge, likewise; 0 means no such limit',
+        unit='m/s',
+        low=SLOWEST_M_S,
+        high=10.0,
+        off=0.0,
     )
 
     def tour_planner(

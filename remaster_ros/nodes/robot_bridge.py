@@ -51,7 +51,7 @@ from remaster_ros.motion.actions import (
 from remaster_ros.motion.arm_supervisor import ArmSupervisor
 from remaster_ros.motion.joint_reports import JointReport, JointReports
 from remaster_ros.motion.joint_units import JointUnits
-from remaster_ros.motion.limits import MotionLimits
+from remaster_ros.motion.limits import SLOWEST_M_S, MotionLimits
 from remaster_ros.motion.motion_gate import PROBE_S, Admitted, MotionGate
 from remaster_ros.motion.move_queue import PROBE
 from remaster_ros.motion.path_check import PointSpeeds
@@ -68,7 +68,7 @@ from remaster_ros.nodes.controller_link import (
 from remaster_ros.nodes.messages import duration_of, stamp_of, waypoints_by_solution
 from remaster_ros.nodes.parameters import declare, parameter
 from remaster_ros.nodes.rivals import JOINTS, ArmStates, OnlyPublisher
-from remaster_ros.nodes.running import RemasterNode, run
+from remaster_ros.nodes.running import RemasterNode, fault_of_this_program, run
 from remaster_ros.nodes.simulated_clock import ReportsTaken, SteadyTime
 from remaster_ros.nodes.status import RELIABLE, NodeStatus, Summary, listen
 from remaster_ros.parameters import SimulationParameters
@@ -121,8 +121,9 @@ class Parameters(SimulationParameters):
         'largest speed of the fastest point of arm and tool; 0.25 is customary in manual mode, '
         '0 means no such limit; while a collection runs it can be lowered',
         unit='m/s',
-        low=0.0,
+        low=SLOWEST_M_S,
         high=10.0,
+        off=0.0,
         live=True,
     )
     limit_margin_deg: float = parameter(
@@ -320,6 +321,9 @@ class EmergencyLink:
 class RobotBridge(RemasterNode):
     """See the module's text."""
 
+    # Without it nobody looks at the arm: it stops and halts the arm, and stays.
+    outlives_faults = True
+
     def __init__(self) -> None:
         super().__init__('robot_bridge')
         self.p = declare(self, Parameters, self._on_parameters)
@@ -436,6 +440,24 @@ class RobotBridge(RemasterNode):
             f'speed_share is {p.speed_share:g}, cartesian_speed_limit_m_s '
             f'{p.cartesian_speed_limit_m_s:g}'
         )
+
+    def on_fault(self, error: Exception) -> None:
+        """Stop and halt the arm: what this process knows of it may be half done."""
+        why = str(fault_of_this_program(error))
+        super().on_fault(error)
+        if not hasattr(self, '_closing'):
+            # It is being made: nothing has been commanded.
+            return
+        try:
+            self._do(self.supervisor.fault(why, self.steady_s()))
+        except Exception as again:
+            # Nothing else follows; the arm completes what is checked, or is held where it is.
+            super().on_fault(again)
+            self.supervisor.halted = self.supervisor.halted or why
+            if self._controller is not None:
+                self._controller.cancel()
+        # Also where the first attempt has failed on its way.
+        self._disk.submit(partial(self._halt_file.write, self.supervisor.halted), self._on_written)
 
     # What comes in
 
@@ -598,10 +620,10 @@ class RobotBridge(RemasterNode):
                     # must not move any more.
                     self._do(self.supervisor.not_sent(action, self.steady_s()))
                 case Drive():
-                    self._publish(action.admitted)
+                    self._send(action)
                     self._on_commanded(action)
-                case Stop(admitted, reason):
-                    self._publish(admitted, stop=True)
+                case Stop(_, reason):
+                    self._send(action)
                     self.counts['stopped'] += 1
                     self.status.event(events.ArmStopped(stamp=self._pose_stamp, reason=reason))
                     self.get_logger().info(f'stopping the arm: {reason}')
@@ -638,6 +660,14 @@ class RobotBridge(RemasterNode):
             self.get_logger().error(
                 f'{self._command_file.path}: where the arm was led last is not kept ({result})'
             )
+
+    def _send(self, command: Drive | Stop) -> None:
+        """Publish a command; the supervisor is told where that fails."""
+        try:
+            self._publish(command.admitted, stop=isinstance(command, Stop))
+        except Exception:
+            self._do(self.supervisor.not_sent(command, self.steady_s()))
+            raise
 
     def _publish(self, admitted: Admitted, *, stop: bool = False) -> None:
         """Publish what the gate has admitted; nothing else is ever published to a controller."""

@@ -10,9 +10,11 @@ import time
 import traceback
 from collections.abc import Callable
 from functools import wraps
+from pathlib import Path
 from typing import Any
 
 import rclpy
+from rcl_interfaces.msg import SetParametersResult
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.executors import (
     Executor,
@@ -27,11 +29,17 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.subscription import Subscription
 from std_srvs.srv import Trigger
 
-from remaster_ros.errors import InsufficientDataError, RemasterError
+from remaster_ros.errors import InputError, InsufficientDataError, RemasterError
 from remaster_ros.nodes.runtime_files import NameLock
 
 TRACEBACK = 'REMASTER_TRACEBACK'
 """Environment variable: also print where in this program a fault came from."""
+
+PACKAGE = Path(__file__).parents[1]
+LONGEST_TEXT = 300
+"""Characters of an exception that are shown: it may quote a message of a megabyte."""
+MOST_FAULTS = 100
+"""So many different faults are written to the log: whoever provokes them must not fill a disk."""
 
 ANSWERS_DELIVERED_S = 3.0
 """How long a node that has failed, and is closed, waits for its last answers to arrive, s."""
@@ -46,11 +54,12 @@ class RemasterNode(Node):
     # Set, from any thread, to end the process with this error, or with status 0.
     failure: RemasterError | None = None
     finished = False
-    # A fault of this program in one of its services ends it otherwise: a node that others count on
-    # is better gone, which they notice and hold the arm for, than there in an unforeseen state.
+    # A fault of this program in one of its callbacks ends it otherwise: a node that others count
+    # on is better gone, which they notice and hold the arm for, than there in an unforeseen state.
     outlives_faults = False
 
     def __init__(self, node_name: str, **options: Any) -> None:
+        self._faults: set[str] = set()
         super().__init__(node_name, **options)
         self._name_lock = NameLock(self.context.get_domain_id(), self.get_fully_qualified_name())
 
@@ -68,12 +77,18 @@ class RemasterNode(Node):
         kwargs.setdefault('event_callbacks', PublisherEventCallbacks(use_default_callbacks=False))
         return super().create_publisher(*args, **kwargs)
 
-    def create_subscription(self, *args: Any, **kwargs: Any) -> Subscription:
-        """As in rclpy, without default event handlers."""
+    def create_subscription(
+        self, msg_type: Any, topic: str, callback: Callable[..., Any], *args: Any, **kwargs: Any
+    ) -> Subscription:
+        """As in rclpy, without default event handlers.
+
+        A message for which the callback raises InputError is left out, with a line in the log.
+        """
         kwargs.setdefault(
             'event_callbacks', SubscriptionEventCallbacks(use_default_callbacks=False)
         )
-        return super().create_subscription(*args, **kwargs)
+        taking = _leaving_out(self, topic, callback)
+        return super().create_subscription(msg_type, topic, taking, *args, **kwargs)
 
     def create_service(
         self, srv_type: Any, srv_name: str, callback: Callable[..., Any], **kwargs: Any
@@ -84,6 +99,7 @@ class RemasterNode(Node):
         The answer of such a call is that of `failed`: no success, and one line.
         """
         if srv_type is not Trigger:  # Those of rclpy itself, for parameters.
+            callback = _refusing(self, srv_name, callback)
             return super().create_service(srv_type, srv_name, callback, **kwargs)
         return super().create_service(srv_type, srv_name, _answering(self, callback), **kwargs)
 
@@ -91,12 +107,30 @@ class RemasterNode(Node):
         """Return a Trigger response with the reason why a service has failed, in one line."""
         response.success, response.message = False, str(error)
         if not isinstance(error, RemasterError):
-            fault = fault_of_this_program(error)
-            response.message = str(fault)
-            self.get_logger().error(str(fault))
-            if not self.outlives_faults:
-                self.failure = fault
+            response.message = str(fault_of_this_program(error))
+            self.on_fault(error)
         return response
+
+    def on_fault(self, error: Exception) -> None:
+        """Process an exception that a callback has not caught: it is reported with its place.
+
+        A node that leads an arm stops and halts the arm here, and lives on.
+        """
+        fault = fault_of_this_program(error)
+        # The same message may come a thousand times a second.
+        if str(fault) not in self._faults and len(self._faults) < MOST_FAULTS:
+            self._faults.add(str(fault))
+            self.get_logger().error(str(fault))
+        if not self.outlives_faults:
+            self.failure = fault
+
+    def on_unreadable(self, name: str, error: Exception) -> None:
+        """Report a message, request or answer of which nothing can be read: it is left out."""
+        text = str(error)[:LONGEST_TEXT] if isinstance(error, RemasterError) else ''
+        why = f'{name}: a message is left out: {text or type(error).__name__}'
+        if why not in self._faults and len(self._faults) < MOST_FAULTS:
+            self._faults.add(why)
+            self.get_logger().error(why)
 
     def now_s(self) -> float:
         """Time of the node's clock, s; simulated where use_sim_time is set."""
@@ -120,10 +154,22 @@ def fault_of_this_program(error: Exception) -> RemasterError:
     """Return the error to report for an exception that was not foreseen."""
     if os.environ.get(TRACEBACK):
         traceback.print_exception(error)
+    text = ' '.join(str(error).split())
+    text = text if len(text) <= LONGEST_TEXT else f'{text[:LONGEST_TEXT]} …'
     return RemasterError(
-        f'a fault of this program, please report it: {type(error).__name__}: {error} '
-        f'(set {TRACEBACK}=1 to see where)'
+        f'a fault of this program, please report it: {type(error).__name__}: {text} '
+        f'({_place_of(error)}; set {TRACEBACK}=1 to see the whole way there)'
     )
+
+
+def _place_of(error: Exception) -> str:
+    """Return file, line and function of the innermost frame of this package, for a report."""
+    frames = traceback.extract_tb(error.__traceback__)
+    ours = [frame for frame in frames if PACKAGE in Path(frame.filename).parents]
+    if not frames:
+        return 'at no known place'
+    frame = (ours or list(frames))[-1]
+    return f'{Path(frame.filename).name}, line {frame.lineno}, {frame.name}'
 
 
 def _answering(node: RemasterNode, callback: Callable[..., Any]) -> Callable[..., Any]:
@@ -140,7 +186,77 @@ def _answering(node: RemasterNode, callback: Callable[..., Any]) -> Callable[...
     return serve
 
 
-class _Executor(MultiThreadedExecutor):
+def _leaving_out(
+    node: RemasterNode, topic: str, callback: Callable[..., Any]
+) -> Callable[..., Any]:
+    """Return the callback of a topic, which leaves out a message that it refuses."""
+
+    @wraps(callback)
+    def take(*message: Any) -> Any:
+        try:
+            return callback(*message)
+        except InputError as error:
+            node.on_unreadable(topic, error)
+            return None
+
+    return take
+
+
+def _refusing(node: RemasterNode, name: str, callback: Callable[..., Any]) -> Callable[..., Any]:
+    """Return the callback of a service of rclpy, which refuses a request that it cannot read.
+
+    Such as a parameter of a type that does not exist. What is done with the values is in callbacks
+    of this package, which catch what they raise.
+    """
+
+    @wraps(callback)
+    def serve(request: Any, response: Any) -> Any:
+        try:
+            return callback(request, response)
+        except Exception as error:
+            node.on_unreadable(name, error)
+            answer = type(response)()
+            why = SetParametersResult(successful=False, reason=f'not a request: {error}'[:1000])
+            if hasattr(answer, 'results') and hasattr(request, 'parameters'):
+                answer.results = [why] * len(request.parameters)
+            elif hasattr(answer, 'result'):
+                answer.result = why
+            return answer
+
+    return serve
+
+
+class _Takes(Executor):
+    """Takes messages, requests and answers; what cannot be read is a fault of its sender.
+
+    rclpy raises out of its own bookkeeping there, and never takes from that topic again.
+    """
+
+    def _take_subscription(self, sub: Any) -> Any:
+        return self._taken(super()._take_subscription, sub, sub.topic_name)
+
+    def _take_client(self, client: Any) -> Any:
+        return self._taken(super()._take_client, client, client.srv_name)
+
+    def _take_service(self, srv: Any) -> Any:
+        return self._taken(super()._take_service, srv, srv.srv_name)
+
+    def _taken(self, take: Callable[[Any], Any], entity: Any, name: str) -> Any:
+        try:
+            return take(entity)
+        except Exception as error:
+            # It is the sender's, and nothing of it was processed.
+            for node in self.get_nodes():
+                if isinstance(node, RemasterNode):
+                    node.on_unreadable(name, error)
+            return None
+
+
+class OneThread(_Takes, SingleThreadedExecutor):
+    """rclpy's executor of one thread; see `_Takes`."""
+
+
+class _Threads(_Takes, MultiThreadedExecutor):
     """rclpy's, but it waits for the callbacks under way before it takes their guards away."""
 
     def shutdown(self, timeout_sec: float | None = None) -> bool:
@@ -172,11 +288,11 @@ def run(
     try:
         rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
         node = make_node()
-        executor: Executor = SingleThreadedExecutor() if threads == 1 else _Executor(threads)
+        executor: Executor = OneThread() if threads == 1 else _Threads(threads)
         try:
             executor.add_node(node)
             while not (stopping or node.finished or node.failure) and rclpy.ok():
-                executor.spin_once(timeout_sec=0.2)
+                spin_once(executor, node, 0.2)
         except ExternalShutdownException:
             pass
         finally:
@@ -192,8 +308,27 @@ def run(
         return 0
     except RemasterError as error:
         return report(error)
+    except Exception as error:
+        return report(fault_of_this_program(error))
     finally:
         rclpy.try_shutdown()
+
+
+def spin_once(executor: Executor, node: RemasterNode, timeout_s: float) -> None:
+    """Execute what is due; what a callback has not caught goes to the node's `on_fault`."""
+    try:
+        executor.spin_once(timeout_sec=timeout_s)
+    except ExternalShutdownException:
+        raise
+    except RemasterError as error:
+        # What the user can mend is no fault of this program, but where it comes out here nobody
+        # has processed it.
+        if node.outlives_faults:
+            node.on_fault(error)
+        else:
+            node.failure = error
+    except Exception as error:
+        node.on_fault(error)
 
 
 def report(error: RemasterError) -> int:

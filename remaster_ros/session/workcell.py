@@ -386,9 +386,7 @@ class Workcell(msgspec.Struct, forbid_unknown_fields=True):
     marker_radius_m: Annotated[float, Bounds(0.0, unit='m', above=True)] = 0.02
     clearance_m: Annotated[float, CLEARANCE] = 0.008
     unknown_offset_deg: Annotated[float, Bounds(0.0, 10.0, 'degrees')] = 1.0
-    acceleration_limit_rad_s2: Annotated[
-        float | list[float], Bounds(0.0, unit='rad/s²', above=True)
-    ] = 5.0
+    acceleration_limit_rad_s2: Annotated[float | list[float], Bounds(0.01, 1000.0, 'rad/s²')] = 5.0
     mesh_path: list[str] = []
     # Whether the nodes show their plan and wait for /remaster/confirm before the arm moves.
     confirm: bool = False

@@ -120,16 +120,17 @@ class Motion:
             self._responses[0]
         ]
         x, v = self.at(start_s)
-        reference, velocity, begin = x, v, start_s
+        reference, velocity, begin_s = x, v, 0.0
         for waypoint in waypoints:
-            end = start_s + waypoint.time_s
-            piece = spline(reference, velocity, waypoint.q, waypoint.velocity, end - begin)
-            response = _Response.of(begin, piece, x, v)
+            # Differences of times from the start: in world time those of a message may vanish.
+            duration_s = waypoint.time_s - begin_s
+            piece = spline(reference, velocity, waypoint.q, waypoint.velocity, duration_s)
+            response = _Response.of(start_s + begin_s, piece, x, v)
             self._responses.append(response)
-            x, v = response.at(end)
-            reference, begin = waypoint.q, end
+            x, v = response.at(start_s + waypoint.time_s)
+            reference, begin_s = waypoint.q, waypoint.time_s
             velocity = np.zeros_like(x) if waypoint.velocity is None else waypoint.velocity
-        self._responses.append(_Response.of(begin, reference[None], x, v))
+        self._responses.append(_Response.of(start_s + begin_s, reference[None], x, v))
         # The past is read back for seconds at most; memory stays bounded over hours of collection.
         del self._responses[:-16]
 

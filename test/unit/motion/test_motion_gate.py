@@ -384,3 +384,17 @@ def test_cubics_that_are_less_than_cubic(v, low, high):
     assert (least[0], most[0]) == (low, high)
     assert piece.largest_speed()[0] == abs(v[0])
     assert piece.largest_acceleration()[0] == 2 * abs(v[0])
+
+
+@pytest.mark.parametrize('speed', [3e-6, 1e-300, 0.0])
+def test_a_move_that_takes_days_is_refused_before_it_is_a_message(speed):
+    """A limit of speed of next to nothing: its time fits no message."""
+    limits = dataclasses.replace(LIMITS, velocity=np.full(2, speed))
+    gate = MotionGate(limits)
+    why = 'longer than 24 h' if speed > 1e-9 else 'longer than 24 h|would have a speed of'
+    with np.errstate(divide='ignore'):
+        with pytest.raises(MotionRefusedError, match=why):
+            gate.admit(path(ZERO, [0.3, 0.3]), ZERO)
+        with pytest.raises(MotionRefusedError, match='longer than 24 h'):
+            gate.admit_probe(path(ZERO, [1e-6, 1e-6]), ZERO, np.ones(2, bool))
+    assert gate.refused == 2

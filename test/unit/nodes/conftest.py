@@ -48,3 +48,25 @@ def start_sensor(own_nodes, monkeypatch, tmp_path):
         bench.node.close()
         bench.node.destroy_node()
     rclpy.try_shutdown()
+
+
+@pytest.fixture
+def compensator(monkeypatch, tmp_path):
+    """Return a function that makes a compensator's rig of an arm and parameters."""
+    import rclpy
+    from compensator_rig import Rig, erring
+
+    monkeypatch.setenv('ROS_HOME', str(tmp_path))
+    monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+    made = []
+
+    def make(model=None, **options):
+        made.append(Rig(tmp_path, erring() if model is None else model, **options))
+        return made[-1]
+
+    yield make
+    try:
+        for one in made:
+            one.close()
+    finally:
+        rclpy.try_shutdown()

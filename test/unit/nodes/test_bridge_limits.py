@@ -5,7 +5,7 @@ import pytest
 
 pytest.importorskip('rclpy', reason='needs ROS 2 Jazzy or its wheels')
 
-from bridge_places import AWAY, POST, correction, turned
+from bridge_places import AWAY, POST, TARGET, correction, turned
 from bridge_rig import CHAIN, HOME
 from rclpy.parameter import Parameter
 from worlds.simple_cells import write_cell
@@ -208,3 +208,14 @@ def test_reports_are_judged_by_the_limits_of_the_robot(rig):
     np.testing.assert_allclose(reports._lower, CHAIN.lower - 0.05)
     np.testing.assert_allclose(reports._upper, CHAIN.upper + 0.05)
     np.testing.assert_allclose(reports._speed, 1.5 * CHAIN.velocity_limits)
+
+
+@pytest.mark.parametrize('value', [1e-300, 1e-4, -1.0, float('nan'), 20.0])
+def test_a_limit_of_next_to_nothing_is_none(rig, value):
+    """Lowered is not always slower: no time fits a message at such a speed."""
+    r = rig()
+    (answer,) = r.bridge.set_parameters([Parameter('cartesian_speed_limit_m_s', value=value)])
+    assert not answer.successful
+    assert r.bridge.p.cartesian_speed_limit_m_s == 0.5
+    r.settle(TARGET)
+    assert not r.halted()

@@ -18,7 +18,7 @@ RANGES = {
     'simulated_clock_rate': (0.0, 0.0, 100.0, ''),
     'cell': ('', None, None, ''),
     'speed_share': (0.3, 0.01, 1.0, ''),
-    'cartesian_speed_limit_m_s': (0.25, 0.0, 10.0, 'm/s'),
+    'cartesian_speed_limit_m_s': (0.25, 1e-3, 10.0, 'm/s'),
     'limit_margin_deg': (0.5, 0.0, 45.0, 'deg'),
     'compensation': ('', None, None, ''),
     'settle_s': (3.0, 0.1, 60.0, 's'),

@@ -81,7 +81,7 @@ def test_without_a_floor_and_with_one_acceleration_for_all(tmp_path):
         ({'floor_z_m': 'ground'}, 'floor_z_m'),
         ({'marker_radius_m': 0.0}, 'marker_radius_m is 0; it must be above 0 m'),
         ({'acceleration_limit_rad_s2': [5.0, 5.0]}, 'has 2 values; .* 7 joints'),
-        ({'acceleration_limit_rad_s2': 0.0}, 'it must be above 0 rad/s²'),
+        ({'acceleration_limit_rad_s2': 0.0}, 'it must be from 0.01 to 1000 rad/s²'),
     ],
 )
 def test_wrong_keys_are_named(tmp_path, keys, message):
