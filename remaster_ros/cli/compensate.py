@@ -14,8 +14,8 @@ import numpy as np
 from remaster_ros.calibration.gauge_words import counted
 from remaster_ros.cli.console import tell
 from remaster_ros.cli.options import names, number
-from remaster_ros.compensation.compensator import Compensator, Correction
-from remaster_ros.compensation.file import Compensation, read_compensation
+from remaster_ros.compensation.compensator import ROUNDING_RAD, Compensator, Correction
+from remaster_ros.compensation.file import read_compensation
 from remaster_ros.errors import InputError
 from remaster_ros.importing.columns import Columns, Told, find_columns
 from remaster_ros.importing.text_table import TextTable, read_table
@@ -61,8 +61,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar='DEG',
         type=number(0.0, 90.0, 'degrees'),
         default=2.0,
-        help='refuse where a joint would change by more (default 2); one that slides by more '
-        'than 4.36 mm for each degree',
+        help='largest change of a joint (default 2); one that slides by 4.36 mm for each degree; '
+        'refused where the error of a joint alone is more',
     )
     parser.add_argument('--json', action='store_true', help='print what was done as JSON')
 
@@ -95,7 +95,7 @@ def run(args: argparse.Namespace) -> int:
             '--angles rad'
         )
     temperature = _temperature(table, columns, args.temperature)
-    compensator = compensation.compensator
+    compensator = Compensator(compensation.model, float(np.radians(args.max_change_deg)))
     if args.inverse:
         result = compensator.true(given, temperature)
         done = compensator.correct(result, temperature)
@@ -106,7 +106,7 @@ def run(args: argparse.Namespace) -> int:
     digits = [DIGITS.get(unit, 8) for unit, _ in units]
     write_atomically(args.out, _text(table, columns, result / scale, digits))
     wanted = result if args.inverse else given
-    facts = _facts(compensation, given, result, wanted, done, times(table, columns))
+    facts = _facts(compensator, given, result, wanted, done, times(table, columns))
     tell(args, facts, _summary(facts, args.out))
     return 0
 
@@ -135,7 +135,7 @@ def _refuse_beyond(
     """Refuse changes that no correction makes, and commands beyond the joints' limits."""
     chain, joints = compensator.model.chain, compensator.joint_names
     change, most = np.abs(result - given), np.radians(args.max_change_deg) * chain.per_radian
-    for row, j in np.argwhere(change > most)[:1]:
+    for row, j in np.argwhere(change > most + ROUNDING_RAD)[:1]:
         raise InputError(
             f'{table.path}, line {table.lines[row]}: {joints[j]} would change by '
             f'{_shown(chain, j, change[row, j])}, more than '
@@ -168,14 +168,14 @@ def _text(table: TextTable, columns: Columns, joints: FloatArray, digits: Sequen
 
 
 def _facts(
-    compensation: Compensation,
+    compensator: Compensator,
     given: FloatArray,
     result: FloatArray,
     wanted: FloatArray,
     done: Correction,
     times_s: FloatArray | None,
 ) -> dict[str, Any]:
-    chain, joints = compensation.model.chain, compensation.compensator.joint_names
+    chain, joints = compensator.model.chain, compensator.joint_names
     shown = chain.shown_scale * np.abs(result - given).max(axis=0, initial=0.0)
     change: dict[str, dict[str, float]] = {'change_deg': {}}
     for joint, unit, most in zip(joints, chain.shown_units, shown.tolist(), strict=True):
@@ -187,8 +187,7 @@ def _facts(
         for j, joint in enumerate(joints):
             if before[j] > 0.0:
                 added[joint] = 100.0 * float(after[j] / before[j] - 1.0)
-    covariance = compensation.uncertainty(wanted)
-    square = np.trace(covariance, axis1=1, axis2=2) + done.residual_m**2
+    square = np.trace(compensator.uncertainty(wanted), axis1=1, axis2=2)
     residual_mm = 1e3 * done.residual_m
     return {
         'format': FORMAT,
@@ -199,7 +198,7 @@ def _facts(
         },
         **change,
         'added_speed_percent': added,
-        'faded_rows': (np.flatnonzero(done.faded) + 1).tolist(),
+        'faded_rows': (np.flatnonzero(done.incomplete) + 1).tolist(),
         'outside_range_rows': (np.flatnonzero(done.outside_range) + 1).tolist(),
         'expected_error_mm': 1e3 * float(np.sqrt(np.mean(square))),
     }
@@ -217,7 +216,7 @@ def _summary(facts: dict[str, Any], out: Path) -> str:
         f'expected error of the marker {facts["expected_error_mm"]:.3f} mm RMS',
     ]
     for key, what in (
-        ('faded_rows', 'near a singularity, where not all of the pose is corrected'),
+        ('faded_rows', 'in which not all of the pose is corrected, near a singularity'),
         ('outside_range_rows', 'beyond the angles at which a curve was measured'),
     ):
         if facts[key]:

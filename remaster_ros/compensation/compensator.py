@@ -1,19 +1,13 @@
 """What to command so that the tool comes to where the nominal robot would have it, and back.
 
-The tool pose that is wanted is that of the *nominal* robot at the wanted joints. First the errors
-of the joint angles are taken off, by fixed point; what lengths and tilts leave is taken off by
-Newton steps on the full pose, with the nominal Jacobian. Near a singularity a pose is corrected
-only along the directions in which the arm can move: each of them fades smoothly to nothing where
-it needs too much joint motion. There the errors of the joint angles are still taken off.
+The tool pose that is wanted is that of the *nominal* robot at the wanted joints. Newton steps lead
+to it, within a budget: no joint is changed by more than `MOST_RAD`, or by what its own errors are
+where these are more. Near a singularity the budget does not suffice, and the best pose on its
+bound is taken. Of all changes that do equally well the smallest is made: seven joints change no
+more than they must.
 
-What slides has metres for radians, and counts by `SerialChain.per_radian`.
-
-A shift counts in levers of the arm: a small arm is no nearer to its singularities than a large one
-of its shape. A direction of size s that fades below b takes off the share 3 u² − 2 u³ of an error
-ε, u = s / b: its motion (3 u − 2 u²) ε / b has the curvature 4 ε / b³ over s, and s changes by no
-more than one a radian of all k joints together. So what is added to an acceleration stays within
-that of joints that go over a radian for b³ = 4 k ε: where errors are small, directions fade later.
-None fades above `FADES_BELOW`, whatever the errors: a trajectory makes up for the rest by time.
+What slides has metres for radians, and counts by `SerialChain.per_radian`. A shift counts in
+levers of the arm, so that a small arm is commanded as a large one of its shape.
 """
 
 from __future__ import annotations
@@ -26,20 +20,23 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from remaster_ros.compensation.arm_model import BLOCK_ROWS, ArmModel
-from remaster_ros.kinematics.transforms import matrix_to_rotation_vector
-from remaster_ros.types import BoolArray, FloatArray
+from remaster_ros.compensation.bounded_poses import nearest
+from remaster_ros.kinematics.transforms import apply, matrix_to_rotation_vector
+from remaster_ros.types import BoolArray, FloatArray, IntArray
 
-# Shift of the tool for a radian below which a direction fades at the most, m/rad.
-FADES_BELOW = 0.2
-# The same of what seven joints do without their tool, in levers for a radian.
-KEPT_BELOW = 0.2
-# The fixed point converges by the largest slope of the terms, some hundredths; the pose by the
-# square of the errors.
+# Largest change of a joint, rad: zeros are off by fractions of 2 degrees, and an arm that is off
+# by more was dismounted or has another model.
+MOST_RAD = float(np.deg2rad(2.0))
+# A command less what was wanted is a change to so much, rad.
+ROUNDING_RAD = 1e-9
+# Size of a tool in levers of its arm: where not all of a pose is corrected, a turn counts by what
+# it shifts at such a distance. A tool of 5 cm at a metre: tip and marker 10 cm away err alike.
+TOOL_SIZE = 0.05
+# The fixed point begins the Newton steps. It converges by the largest slope of the terms, some
+# hundredths.
 FIXED_POINT_STEPS = 2
-NEWTON_STEPS = 2
-# Back to the wanted joints: fixed point of the command, up to this, rad.
-BACK_TO = 1e-12
-MOST_STEPS_BACK = 60
+# A pose counts as corrected where no more of it is left, m and rad: sensors see no less.
+CORRECTED = 1e-5
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +47,7 @@ class Correction:
     # How far the tool remains from where it is wanted, if the model is right, (n,)
     residual_m: FloatArray
     residual_rad: FloatArray
-    faded: BoolArray  # Rows near a singularity, in which not all of the pose is corrected, (n,)
+    incomplete: BoolArray  # Rows in which not all of the pose is corrected, (n,)
     # Rows beyond the angles at which a curve was measured: its end value holds, (n,)
     outside_range: BoolArray
 
@@ -62,57 +59,30 @@ class Compensator:
     ----------
     model
         The arm as it was found to be.
+    most_rad
+        Largest change of a joint, rad.
     """
 
-    def __init__(self, model: ArmModel) -> None:
-        self.model = model
+    def __init__(self, model: ArmModel, most_rad: float = MOST_RAD) -> None:
+        self.model, self.most_rad = model, most_rad
 
     @cached_property
-    def _typical(self) -> tuple[float, tuple[float, ...]]:
-        """The longest lever, m, and how large errors are that joints leave all over the limits.
-
-        Their mean square as a polynomial of the warming, three coefficients, levers² and rad².
-        """
-        model = self.model
-        q = model.somewhere()
-        target, jacobian = self._nominal(q)
-        lever = float(np.linalg.norm(jacobian[:, :3], axis=1).max())
-        errors = []
-        for kelvin in (0.0, 1.0):
-            warming = np.full(len(q), kelvin)
-            command = self._angles_taken_off(q, warming)
-            error = _pose_error(target, model._state(model.drivers(command, warming)).tool)
-            errors.append(error / np.repeat((lever, 1.0), 3))
-        cold, a_kelvin = errors[0], errors[1] - errors[0]
-        parts = ((1.0, cold, cold), (2.0, cold, a_kelvin), (1.0, a_kelvin, a_kelvin))
-        return lever, tuple(float(c * np.mean(np.sum(a * b, axis=1))) for c, a, b in parts)
-
-    def _fades_below(self, warming: FloatArray) -> FloatArray:
-        """Return the size of a direction below which it fades, in levers and rad, (n, 1)."""
-        lever, parts = self._typical
-        square = parts[0] + warming * (parts[1] + warming * parts[2])
-        # No error is known to be smaller than what rounding leaves.
-        typical = np.sqrt(np.maximum(square, np.finfo(float).eps ** 2))
-        wide = np.cbrt(4.0 * self.model.joints * typical)
-        return np.minimum(FADES_BELOW / lever, wide)[:, None]
-
-    def _nominal(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the nominal tool poses, (n, 4, 4), and Jacobians in R, m and rad, (n, 6, k).
-
-        Of a radian of each joint, or of what counts as one.
-        """
+    def weights(self) -> FloatArray:
+        """What a metre and a radian of a pose error count, (6,)."""
         chain = self.model.chain
-        frames = chain.frames(q)
-        target = frames[:, -1] @ chain.T_fixed[-1]
-        axes = chain.axes_in_base(frames) * ~chain.slides[:, None]
-        shifts = chain.velocities(frames, target[:, :3, 3])
-        return target, chain.per_radian * np.concatenate((shifts, axes.swapaxes(1, 2)), axis=1)
+        frames = chain.frames(self.model.somewhere())
+        tips = (frames[:, -1] @ chain.T_fixed[-1])[:, :3, 3]
+        shifts = chain.per_radian * chain.velocities(frames, tips)
+        lever = float(np.linalg.norm(shifts, axis=1).max())
+        return np.repeat((1.0 / lever, TOOL_SIZE), 3)
 
-    def _angles_taken_off(self, wanted: FloatArray, warming: FloatArray) -> FloatArray:
-        model, command = self.model, wanted.copy()
+    def angle_errors(self, q: FloatArray, warming: FloatArray | None = None) -> FloatArray:
+        """Return the change that takes off the errors of the joint angles alone, rad, (n, k)."""
+        warming = self.model.warming(len(q), None) if warming is None else warming
+        command = q
         for _ in range(FIXED_POINT_STEPS):
-            command = wanted - model.added_angles(model.drivers(command, warming))
-        return command
+            command = q - self.model.added_angles(self.model.drivers(command, warming))
+        return command - q
 
     @property
     def joint_names(self) -> tuple[str, ...]:
@@ -139,40 +109,29 @@ class Compensator:
     def true(self, q: ArrayLike, temperature_c: ArrayLike | None = None) -> FloatArray:
         """Return the joint angles at which the nominal robot has its tool where the arm has it.
 
-        The inverse of `command`: ``true(command(q))`` is q, also near singularities.
+        The inverse of `command`, ``true(command(q))`` is q, wherever all of a pose is corrected.
 
         Parameters
         ----------
         q, temperature_c
             Reported joint angles, rad, (..., k), and as in `command`.
         """
-
-        def back(rows: FloatArray, warming: FloatArray) -> FloatArray:
-            wanted = rows.copy()
-            for _ in range(MOST_STEPS_BACK):
-                step = rows - self._solved(wanted, warming)[0]
-                wanted += step
-                if np.abs(step).max(initial=0.0) < BACK_TO:
-                    break
-            return wanted
-
-        return self._rows(back, q, temperature_c)
+        return self._rows(lambda rows, warm: rows + self._way_back(rows, warm), q, temperature_c)
 
     def correct(self, q: ArrayLike, temperature_c: ArrayLike | None = None) -> Correction:
-        """Return commands (n, k) with what remains, and which rows are faded or out of range."""
+        """Return commands (n, k) with what remains, and which rows are out of range."""
         wanted = self._checked(q).reshape(-1, self.model.joints)
         warming = self.model.warming(len(wanted), _given(temperature_c))
-        parts = [self._solved(wanted[rows], warming[rows]) for rows in _blocks(len(wanted))] or [
-            self._solved(wanted, warming)
-        ]
-        command, left, faded = (np.concatenate(part) for part in zip(*parts, strict=True))
-        return Correction(
-            command,
-            np.linalg.norm(left[:, :3], axis=1),
-            np.linalg.norm(left[:, 3:], axis=1),
-            faded,
-            self.model.outside(command),
-        )
+        command, error = np.empty_like(wanted), np.empty((len(wanted), 6))
+        for rows in _blocks(len(wanted)):
+            command[rows], error[rows] = self._solved(wanted[rows], warming[rows])
+        return self.correction(command, error)
+
+    def correction(self, command: FloatArray, error: FloatArray) -> Correction:
+        """Return what commands (n, k) do that leave pose errors of m and rad, (n, 6)."""
+        shift, turn = (np.linalg.norm(part, axis=1) for part in np.split(error, 2, axis=1))
+        incomplete = np.maximum(shift, turn) > CORRECTED
+        return Correction(command, shift, turn, incomplete, self.model.outside(command))
 
     def tool(self, q: ArrayLike, temperature_c: ArrayLike | None = None) -> FloatArray:
         """Return where the arm has its tool at reported joint angles, T_R_T, (..., 4, 4)."""
@@ -182,14 +141,19 @@ class Compensator:
         return found.reshape(*q.shape[:-1], 4, 4)
 
     def uncertainty(
-        self, q: ArrayLike, sensor: str | None = None, marker: str | None = None
+        self,
+        q: ArrayLike,
+        sensor: str | None = None,
+        marker: str | None = None,
+        temperature_c: ArrayLike | None = None,
     ) -> FloatArray:
-        """Return the covariance of where the marker is, m², (..., 3, 3), along the axes of R.
+        """Return the mean square error of where the marker is, m², (..., 3, 3), along axes of R.
 
         Of its place in the frame of the sensor, at wanted joint angles after correction, as the
         file's base frame and tool have it: uncertainty of offsets, causes, registration and marker
-        together, widened as poses that were left out have shown. Where zero-offsets alone are
-        corrected it is the mean square of the error: with the lengths and tilts left as drawn.
+        together, widened as poses that were left out have shown, and what of each pose the command
+        leaves. Where zero-offsets alone are corrected, lengths and tilts that stay as drawn are in
+        it too.
 
         Parameters
         ----------
@@ -197,31 +161,42 @@ class Compensator:
             rad, (..., k).
         sensor, marker
             Which of the file's; the first where None.
+        temperature_c
+            As of `command`.
         """
         q = self._checked(q)
-        spread = self.spread(q, sensor, marker)
+        spread = self.spread(q, sensor, marker, temperature_c)
         found: FloatArray = spread @ np.swapaxes(spread, -1, -2)
         return found
 
     def spread(
-        self, q: ArrayLike, sensor: str | None = None, marker: str | None = None
+        self,
+        q: ArrayLike,
+        sensor: str | None = None,
+        marker: str | None = None,
+        temperature_c: ArrayLike | None = None,
     ) -> FloatArray:
-        """Return L, (..., 3, r), with L L' the covariance of all rows together; see `uncertainty`.
+        """Return L, (..., 3, r), with L L' the second moments of all rows; see `uncertainty`.
 
-        One column is one thing that is not known, and what it does to each row.
+        One column is one thing that is not known, and what it does to each row; the last one what
+        the commands leave.
         """
         model = self.model
         q = self._checked(q)
         rows = q.reshape(-1, model.joints)
+        warming = model.warming(len(rows), self._temperature(q, temperature_c))
         sensor = next(iter(model.T_R_N)) if sensor is None else sensor
         marker = next(iter(model.markers)) if marker is None else marker
         root = model.widening * model.root if model.error_root is None else model.error_root
-        parts = [
-            model.derivative(model.state(rows[block]), sensor, marker) @ root.T
-            for block in _blocks(len(rows))
-        ]
-        found = np.concatenate(parts) if parts else np.zeros((0, 3, len(root)))
-        return found.reshape(*q.shape[:-1], 3, len(root))
+        place, found = model.markers[marker], np.zeros((len(rows), 3, len(root) + 1))
+        for block in _blocks(len(rows)):
+            state = model._state(model.drivers(rows[block], warming[block]))
+            found[block, :, :-1] = model.derivative(state, sensor, marker) @ root.T
+            command = self._solved(rows[block], warming[block])[0]
+            wanted = model.chain.forward(rows[block])
+            reached = model._state(model.drivers(command, warming[block])).tool
+            found[block, :, -1] = apply(reached, place) - apply(wanted, place)
+        return found.reshape(*q.shape[:-1], 3, len(root) + 1)
 
     def _rows(
         self,
@@ -250,42 +225,92 @@ class Compensator:
             raise ValueError('a joint angle is not a finite number')
         return q
 
-    def _solved(
-        self, wanted: FloatArray, warming: FloatArray
-    ) -> tuple[FloatArray, FloatArray, BoolArray]:
-        """Return commands (n, k), what is left of each pose (n, 6), and which rows are faded."""
-        model, k, unit = self.model, self.model.joints, self.model.chain.per_radian
-        in_levers = np.repeat((1.0 / self._typical[0], 1.0), 3)
-        command = self._angles_taken_off(wanted, warming)
-        target, jacobian = self._nominal(wanted)
-        left, sizes, right = np.linalg.svd(in_levers[:, None] * jacobian, full_matrices=False)
-        fade = _faded(sizes, self._fades_below(warming))
-        # A direction of no size has nothing to divide by, and fades to nothing.
-        factor = np.divide(fade, sizes, out=np.zeros_like(sizes), where=sizes > 0.0)
-        if k > 6:
-            # It acts on all of the change, whose size is another than that of what it leaves.
-            kept = _faded(sizes, KEPT_BELOW)
-            command = wanted + unit * self._smallest((command - wanted) / unit, right, kept)
-        for step in range(NEWTON_STEPS + 1):
-            error = _pose_error(target, model._state(model.drivers(command, warming)).tool)
-            if step == NEWTON_STEPS:
-                break
-            along = np.einsum('nij,ni->nj', left, in_levers * error) * factor
-            command = command - unit * np.einsum('nij,ni->nj', right, along)
-        return command, error, np.asarray(fade.min(axis=1) < 1.0)
+    def _solved(self, wanted: FloatArray, warming: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return commands (n, k) and what is left of each pose, m and rad, (n, 6)."""
+        problem = PoseProblem(self, wanted, warming)
+        budget = problem.budget
+        change = nearest(problem.of_rows, problem.own, (-budget, budget))
+        return wanted + self.model.chain.per_radian * change, problem.left(change)
 
-    @staticmethod
-    def _smallest(change: FloatArray, right: FloatArray, fade: FloatArray) -> FloatArray:
-        """Return the part of changes (n, k) that moves the tool; at a singularity all of it.
+    def problem(self, q: FloatArray, temperature_c: float | None = None) -> PoseProblem:
+        """Return what changes of the joints leave of the poses at wanted angles (n, k)."""
+        return PoseProblem(self, q, self.model.warming(len(q), temperature_c))
 
-        There the direction in which the arm moves without its tool is not distinguished from the
-        one that has become singular: both have the same weight.
+    def _way_back(self, reported: FloatArray, warming: FloatArray) -> FloatArray:
+        """Return what to add to reported angles for those of the nominal robot, rad, (n, k)."""
+        added = self.model.added_angles(self.model.drivers(reported, warming))
+        added /= self.model.chain.per_radian
+        budget = np.maximum(self.most_rad, np.abs(added))
+        return self.nominal_within(reported, warming, (-budget, budget), added)
+
+    def nominal_within(
+        self,
+        reported: FloatArray,
+        warming: FloatArray,
+        bounds: tuple[FloatArray, FloatArray],
+        start: FloatArray,
+    ) -> FloatArray:
+        """Return what to add to reported angles for the nominal robot's, rad, (n, k).
+
+        ``reported``: joint angles, rad, (n, k); ``warming``: K, (n,); ``bounds``: least and
+        largest of what is added, rad or `SerialChain.per_radian`, (n, k) each; ``start``: within
+        the bounds, (n, k).
         """
-        moving = np.einsum('nij,nj->ni', right, change)
-        of_tool = np.einsum('nij,ni->nj', right, moving)
-        of_itself = 1.0 - fade.min(axis=1)
-        smallest: FloatArray = of_tool + of_itself[:, None] * (change - of_tool)
-        return smallest
+        model, unit, weights = self.model, self.model.chain.per_radian, self.weights
+        state = model._state(model.drivers(reported, warming))
+        # A command has no part that moves no tool at that command: nor has what leads back.
+        right = np.linalg.svd(self.jacobian(state.frames, state.tool), full_matrices=False)[2]
+        idle = np.eye(model.joints) - right.swapaxes(1, 2) @ right
+
+        def errors(change: FloatArray, rows: IntArray) -> tuple[FloatArray, FloatArray]:
+            frames = model.chain.frames(reported[rows] + unit * change)
+            tool = frames[:, -1] @ model.chain.T_fixed[-1]
+            error = _pose_error(state.tool[rows], tool)
+            return weights * error, weights[:, None] * self.jacobian(frames, tool)
+
+        return unit * nearest(errors, start, bounds, idle)
+
+    def jacobian(self, frames: FloatArray, tool: FloatArray) -> FloatArray:
+        """Return the change of a tool pose in R, m and rad, for a radian of each joint, (n, 6, k).
+
+        Or for what counts as one.
+        """
+        chain = self.model.chain
+        axes = chain.axes_in_base(frames) * ~chain.slides[:, None]
+        shifts = chain.velocities(frames, tool[:, :3, 3])
+        return chain.per_radian * np.concatenate((shifts, axes.swapaxes(1, 2)), axis=1)
+
+
+class PoseProblem:
+    """The poses that a nominal robot has at n wanted angles, and what changes leave of them.
+
+    Changes count in radians, or in what slides has for them (`SerialChain.per_radian`); errors by
+    `Compensator.weights`.
+    """
+
+    def __init__(self, compensator: Compensator, wanted: FloatArray, warming: FloatArray) -> None:
+        self._compensator, self._model = compensator, compensator.model
+        self.wanted, self._warming = wanted, warming
+        self._target = self._model.chain.forward(wanted)
+        # The change that takes off the errors of the joint angles alone, and the largest, (n, k)
+        self.own = compensator.angle_errors(wanted, warming) / self._model.chain.per_radian
+        self.budget = np.maximum(compensator.most_rad, np.abs(self.own))
+
+    def of_rows(self, change: FloatArray, rows: IntArray) -> tuple[FloatArray, FloatArray]:
+        """Return weighted errors (m, 6) and Jacobians (m, 6, k) at changes (m, k) of some rows."""
+        model, weights = self._model, self._compensator.weights
+        command = self.wanted[rows] + model.chain.per_radian * change
+        state = model._state(model.drivers(command, self._warming[rows]))
+        jacobian = self._compensator.jacobian(state.frames, state.tool)
+        return weights * _pose_error(self._target[rows], state.tool), weights[:, None] * jacobian
+
+    def errors(self, change: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the same of all rows."""
+        return self.of_rows(change, np.arange(len(self.wanted)))
+
+    def left(self, change: FloatArray) -> FloatArray:
+        """Return what is left of each pose, m and rad, (n, 6)."""
+        return self.errors(change)[0] / self._compensator.weights
 
 
 def _pose_error(target: FloatArray, reached: FloatArray) -> FloatArray:
@@ -293,12 +318,6 @@ def _pose_error(target: FloatArray, reached: FloatArray) -> FloatArray:
     turn = reached[:, :3, :3] @ np.swapaxes(target[:, :3, :3], 1, 2)
     shift = reached[:, :3, 3] - target[:, :3, 3]
     return np.concatenate((shift, matrix_to_rotation_vector(turn)), axis=1)
-
-
-def _faded(sizes: FloatArray, below: FloatArray | float) -> FloatArray:
-    """Return the share of each direction that is taken off, by its size."""
-    share = np.minimum(sizes / below, 1.0)
-    return np.asarray(share**2 * (3.0 - 2.0 * share))
 
 
 def _blocks(rows: int) -> list[slice]:

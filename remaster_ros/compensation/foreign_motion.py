@@ -16,6 +16,7 @@ import numpy as np
 from remaster_ros.compensation.compensator import Compensator
 from remaster_ros.compensation.in_use import CorrectionInUse
 from remaster_ros.compensation.trajectories import (
+    Now,
     corrected_points,
     corrected_trajectory,
     largest_speeds,
@@ -40,11 +41,16 @@ REST_RAD_S = 1e-7
 resolution of a float)."""
 NEAR_RAD = 2e-4
 """So near to angles whose correction is known it is taken as it is there, rad: it changes by some
-hundredths of the way."""
+hundredths of the way. So near to the end of a trajectory the arm has arrived: it stands still."""
 KNOWN_RAD = 1e-7
 """It is known where a further step changes less, rad: an encoder of 23 bits reads 7e-7."""
 EVERY_S = 0.02
 """While the arm moves the correction of reported angles is found anew so often, s."""
+ADDED_RAD_S = 0.5
+"""So fast it changes at the most, rad/s: from one bound of its budget to the other in 0.14 s. It
+changes by some hundredths of the way, and joints go at a few radians a second."""
+MOST_REACH_S = 0.2
+"""What was found longer ago is changed no further at once, s: reports that failed to come."""
 
 
 @dataclass(frozen=True)
@@ -64,6 +70,8 @@ class Passed:
     admitted: Admitted  # What the gate has let pass
     end_s: float  # When it ends, from its start
     notes: tuple[str, ...] = ()  # What a person is to know of it, a line each
+    # What is commanded at its end, and what was wanted there, rad, (k,); None where it is held
+    end: tuple[FloatArray, FloatArray] | None = None
 
 
 class Present:
@@ -124,6 +132,10 @@ class Present:
 class TrueAngles:
     """Angles of the nominal arm with its tool where the arm has it, report by report.
 
+    They go on from report to report: near singularities, where several do, no other ones are told
+    while the arm moves on. Where the arm comes to rest at the end of a trajectory they are what
+    the planner wanted there.
+
     ``compensator``: the correction.
     """
 
@@ -135,22 +147,39 @@ class TrueAngles:
         self._warm: float | None = None
         self._found_s = -np.inf
         self._is_known = False
+        # Where the last trajectory leads: what is commanded there, and what was wanted, (k,)
+        self._end: tuple[FloatArray, FloatArray] | None = None
+
+    def lead(self, passed: Passed) -> None:
+        """Take what is sent to the controller: there the planner expects what it has wanted."""
+        self._end, self._is_known = passed.end, False
 
     def at(self, q: FloatArray, temperature_c: float | None, now_s: float) -> FloatArray:
         """Return them for reported angles, rad, (k,).
 
-        The correction found for the report before is brought up to date by one step of the fixed
-        point, at most every `EVERY_S` while the arm moves and until it is known where it stands.
-        Between, it is off by the way in that time times the slope of the correction.
+        What is added is found anew at most every `EVERY_S` while the arm moves and until it is
+        known where it stands, and goes there at `ADDED_RAD_S` at the most. Between, it is off by
+        the way in that time times the slope of the correction.
         """
         if self._at is None:
-            wanted = self._compensator.true(q, temperature_c)
-            self.added, self._is_known = wanted - q, True
+            self.added, self._is_known = self._compensator.true(q, temperature_c) - q, True
         else:
             is_near = np.abs(q - self._at).max() <= NEAR_RAD and temperature_c == self._warm
-            if (is_near and self._is_known) or 0.0 <= now_s - self._found_s < EVERY_S:
+            since_s = now_s - self._found_s
+            if (is_near and self._is_known) or 0.0 <= since_s < EVERY_S:
                 return q + self.added
-            step = q - self._compensator.command(q + self.added, temperature_c)
+            model = self._compensator.model
+            unit = model.chain.per_radian
+            reach = ADDED_RAD_S * min(max(since_s, EVERY_S), MOST_REACH_S)
+            if self._end is not None and np.abs(q - self._end[0]).max() <= NEAR_RAD:
+                aim = self._end[1] - self._end[0]
+                step = np.clip(aim - self.added, -reach * unit, reach * unit)
+            else:
+                here = (self.added / unit)[None]
+                found = self._compensator.nominal_within(
+                    q[None], model.warming(1, temperature_c), (here - reach, here + reach), here
+                )
+                step = found[0] - self.added
             self.added = self.added + step
             self._is_known = bool(np.abs(step).max() <= KNOWN_RAD)
         self._at, self._warm, self._found_s = q, temperature_c, now_s
@@ -164,6 +193,7 @@ def passed_on(
     correction: CorrectionInUse,
     tolerance_m: float,
     temperature_c: float | None = None,
+    told: FloatArray | None = None,
 ) -> Passed:
     """Return what to send to the controller for a planner's trajectory.
 
@@ -174,13 +204,16 @@ def passed_on(
     ``wanted``: the trajectory, which begins at once; of no points: the arm is to be held; ``arm``:
     where it is now; ``gate``: checks what is sent; ``correction``: may be one that corrects
     nothing; ``tolerance_m``: how far the tool may leave the wanted path between points, m;
-    ``temperature_c``: of the arm.
+    ``temperature_c``: of the arm; ``told``: where the planner was told that the arm is, rad, (k,);
+    as `Compensator.true` has it where None.
     Raises InputError: the trajectory is refused; one line.
     """
     if not len(wanted.times_s):
         return Passed(gate.admit((), arm.q, arm.velocity), 0.0)
     _refuse_bad_numbers(wanted)
-    t, q, v, notes = _corrected(wanted, arm, gate, correction, tolerance_m, temperature_c)
+    if told is None:
+        told = correction.compensator.true(arm.q, temperature_c)
+    t, q, v, notes = _corrected(wanted, arm, gate, correction, tolerance_m, temperature_c, told)
     velocities = np.zeros_like(q) if v is None else v.copy()
     if np.abs(velocities[-1]).max() <= REST_RAD_S:
         velocities[-1] = 0.0
@@ -196,7 +229,7 @@ def passed_on(
                 'them, and begin where the arm stands'
             )
         raise InputError(f'{error}{hint}') from None
-    return Passed(admitted, float(t[-1]), tuple(notes))
+    return Passed(admitted, float(t[-1]), tuple(notes), (q[-1], wanted.positions[-1]))
 
 
 def _refuse_bad_numbers(wanted: Trajectory) -> None:
@@ -227,6 +260,7 @@ def _corrected(
     correction: CorrectionInUse,
     tolerance_m: float,
     temperature_c: float | None,
+    told: FloatArray,
 ) -> tuple[FloatArray, FloatArray, FloatArray | None, list[str]]:
     """Return times, positions, velocities and notes of what is to be sent."""
     compensator, t, q, v = (
@@ -235,12 +269,13 @@ def _corrected(
     notes: list[str] = []
     begins_at_once = t[0] <= 0.0
     if not (arm.stands or begins_at_once):
-        done, v = corrected_points(compensator, q, v, temperature_c)
+        now = Now(arm.q, told, arm.velocity)
+        limits = gate.limits.acceleration
+        done, v = corrected_points(compensator, t, q, v, now, limits, temperature_c)
         _refuse_too_large(correction, done.command - q)
-        return t, done.command, v, _notes(done.faded, done.outside_range)
+        return t, done.command, v, _notes(done.residual_m, done.incomplete, done.outside_range)
     if not begins_at_once:
-        start = compensator.true(arm.q, temperature_c)
-        t, q = np.concatenate(([0.0], t)), np.concatenate((start[None], q))
+        t, q = np.concatenate(([0.0], t)), np.concatenate((told[None], q))
         v = None if v is None else np.concatenate((np.zeros((1, q.shape[1])), v))
     if len(t) == 1:
         raise InputError('it has a single point, for now: give it a time_from_start')
@@ -254,6 +289,7 @@ def _corrected(
         velocity_limits=gate.limits.velocity,
         acceleration_limits=gate.limits.acceleration,
         temperature_c=temperature_c,
+        begins=q[0] + (arm.q - told),
     )
     _refuse_too_large(correction, found.change)
     if found.stretched > 1.0:
@@ -261,7 +297,7 @@ def _corrected(
             f'slowed down to {100.0 / found.stretched:.1f} %: it would pass a limit of speed or '
             'acceleration'
         )
-    notes += _notes(found.faded, found.outside_range)
+    notes += _notes(found.residual_m, found.incomplete, found.outside_range)
     # A controller begins where the arm is by itself.
     sent = slice(0 if begins_at_once else 1, None)
     speeds = None if found.velocities is None else found.velocities[sent]
@@ -274,13 +310,16 @@ def _refuse_too_large(correction: CorrectionInUse, change: FloatArray) -> None:
         raise InputError(next(iter(refused.values())))
 
 
-def _notes(faded: BoolArray, outside_range: BoolArray) -> list[str]:
+def _notes(residual_m: FloatArray, incomplete: BoolArray, outside: BoolArray) -> list[str]:
     notes = []
-    if count := int(np.sum(faded)):
-        notes.append(f'{count} of {len(faded)} points near a singularity: not all is corrected')
-    if count := int(np.sum(outside_range)):
+    if count := int(np.sum(incomplete)):
         notes.append(
-            f'{count} of {len(outside_range)} points beyond the angles at which a curve was '
-            'measured: its end value is taken'
+            f'{count} of {len(incomplete)} points near a singularity: up to '
+            f'{1e3 * residual_m.max():.3f} mm is not corrected'
+        )
+    if count := int(np.sum(outside)):
+        notes.append(
+            f'{count} of {len(outside)} points beyond the angles at which a curve was measured: '
+            'its end value is taken'
         )
     return notes

@@ -16,22 +16,19 @@ from functools import cached_property
 import numpy as np
 
 from remaster_ros.compensation.arm_model import ArmModel
-from remaster_ros.compensation.compensator import Compensator
+from remaster_ros.compensation.compensator import MOST_RAD, ROUNDING_RAD, Compensator
 from remaster_ros.compensation.file import Compensation, read_compensation
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.transforms import inverse, matrix_to_rotation_vector
 from remaster_ros.types import BoolArray, Correction, FloatArray
 
-MOST_DEG = 2.0
-"""A joint is changed by so much at most, degrees: zeros are off by fractions of one, and an arm
-that is off by more was dismounted or has another model."""
+MOST_DEG = float(np.degrees(MOST_RAD))
+"""A joint is changed by so much at most, degrees."""
 KNOWN_OFFSET_RAD = float(np.deg2rad(0.1))
 """What may still be wrong with a joint whose offset is in use, for the clearance of paths."""
 OFFSET_STDS = 3.0
 """Or so many standard deviations of the offset that is known least."""
-NOTED = 1e-5
-"""What of a pose is not corrected is said where it is more, m or rad: sensors see no less."""
 SAMPLED = 2000
 """Configurations in which largest changes are looked for: they are smooth in the angles, and of
 seven joints some hundreds come near each extreme."""
@@ -49,7 +46,7 @@ class Commands:
     refused: dict[int, str]  # Row -> why it must not be commanded
     notes: tuple[str, ...]  # What a person is to know of a row, a line each
     # As of a `compensator.Correction`, (n,)
-    faded: BoolArray
+    incomplete: BoolArray
     outside_range: BoolArray
 
 
@@ -96,7 +93,7 @@ class CorrectionInUse:
             )
         self.path, self.sha256 = path, found.sha256
         self._compensation = found
-        self.compensator: Compensator = found.compensator
+        self.compensator = Compensator(found.model, float(np.radians(most_deg)))
         if chain is None:
             chain = found.model.chain
         else:
@@ -104,7 +101,7 @@ class CorrectionInUse:
         self._names = chain.joint_names
         self._most_deg = most_deg
         self._sampled = _sampled(chain)
-        change = np.abs(self.compensator.command(self._sampled) - self._sampled).max(axis=0)
+        change = np.abs(self.compensator.angle_errors(self._sampled)).max(axis=0)
         if np.any(change > np.radians(self._most_deg)):
             joint = int(np.argmax(change))
             raise InputError(
@@ -118,7 +115,8 @@ class CorrectionInUse:
         other = copy.copy(self)
         for name in ('true_arm', 'shifts', '_bends'):
             other.__dict__.pop(name, None)
-        other.compensator = Compensator(ArmModel.nominal(self.compensator.model.chain))
+        nominal = ArmModel.nominal(self.compensator.model.chain)
+        other.compensator = Compensator(nominal, self.compensator.most_rad)
         return other
 
     @cached_property
@@ -184,7 +182,8 @@ class CorrectionInUse:
         """Return which rows change a joint by too much, and how, for changes (n, k), rad."""
         refused = {}
         most = np.abs(change).max(axis=1, initial=0.0)
-        for row in map(int, np.flatnonzero(most > np.radians(self._most_deg))):
+        # A change at the bound is at it to rounding.
+        for row in map(int, np.flatnonzero(most > np.radians(self._most_deg) + ROUNDING_RAD)):
             joint = int(np.argmax(np.abs(change[row])))
             refused[row] = (
                 f'the correction would change {self._names[joint]} by '
@@ -202,7 +201,7 @@ class CorrectionInUse:
         notes = []
         for row in map(int, np.flatnonzero(finite)):
             left = done.residual_m[row], done.residual_rad[row]
-            if done.faded[row] and max(left) > NOTED:
+            if done.incomplete[row]:
                 notes.append(
                     f'solution {row} is near a singularity: of its pose '
                     f'{1e3 * left[0]:.3f} mm and {np.degrees(left[1]):.4f} degrees are not '
@@ -216,8 +215,8 @@ class CorrectionInUse:
         command = done.command.copy()
         # No check lets it pass either.
         command[list(refused)] = np.nan
-        faded, outside = done.faded & finite, done.outside_range & finite
-        return Commands(command, change, refused, tuple(notes), faded, outside)
+        incomplete, outside = done.incomplete & finite, done.outside_range & finite
+        return Commands(command, change, refused, tuple(notes), incomplete, outside)
 
 
 def _refuse_another_arm(

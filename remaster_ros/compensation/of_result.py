@@ -260,8 +260,8 @@ def _described(
     fitted = measurements.q[~measurements.is_validation]
     model = replace(model, root=root, joint_offsets=mean)
     if cells and fit.found is not None:
-        measured = [where for cell, where in left if cell.of_measurement]
-        model = _as_predicted(model, fit, fit.found.problem, measured)
+        # What has no place in the arm bends nothing of it: backlash no less than a sensor's scale.
+        model = _as_predicted(model, fit, fit.found.problem, [where for _, where in left])
     return Described(
         model,
         tuple(bool(known) for known in fit.identifiable),
@@ -273,9 +273,9 @@ def _described(
 
 
 def _as_predicted(
-    model: ArmModel, fit: FitResult, problem: Problem, measured: Sequence[slice]
+    model: ArmModel, fit: FitResult, problem: Problem, without: Sequence[slice]
 ) -> ArmModel:
-    """Return the arm that predicts the fitted rows as the fit does, errors of measuring left out.
+    """Return the arm that predicts the fitted rows as the fit does without some parameters.
 
     The fit has lengths, tilts and the like to first order, about the zero-offsets that were found
     without them; this model has them exactly. The difference is undone within what the posterior
@@ -283,7 +283,7 @@ def _as_predicted(
     (J' J / σ²)⁻¹, and the largest eigenvalue of J C J' is σ².
     """
     z = fit.predictive.after.copy()
-    for where in measured:
+    for where in without:
         z[fit.predictive.model.core :][where] = 0.0
     rows = of_spread_poses(problem.measurements, problem.fitted)
     m = problem.measurements.select(rows)

@@ -2,8 +2,10 @@
 
 Between points a trajectory controller draws a straight line where they have positions alone, a
 cubic where they have velocities too. The correction is not what it draws: so points are added
-where its path would leave the wanted one by more than a tolerance. Where the corrected trajectory
-passes a limit all of it is slowed down; the path stays.
+where its path would leave the wanted one by more than a tolerance. At both ends the correction is
+that of a single target; between them as much is corrected as the limits of acceleration allow
+(`smooth_changes`). Where the corrected trajectory still passes a limit all of it is slowed down;
+the path stays.
 """
 
 from __future__ import annotations
@@ -15,8 +17,9 @@ import scipy
 from numpy.typing import ArrayLike
 
 from remaster_ros.compensation.compensator import Compensator, Correction
+from remaster_ros.compensation.smooth_changes import Ends, Limits, SmoothChanges, smooth_changes
 from remaster_ros.errors import InputError
-from remaster_ros.types import BoolArray, FloatArray
+from remaster_ros.types import BoolArray, FloatArray, IntArray
 
 # Waves of the correction are seen with eight points each, and turns of the arm by half a radian
 # where it has none.
@@ -28,9 +31,25 @@ LONGEST_STEP_RAD = 0.5
 COMPARED = {True: np.array([0.5]), False: np.array([0.25, 0.5, 0.75])}
 # Controllers run at up to a kilohertz: no more points than that.
 SHORTEST_S = 1e-3
-# Along a path the correction is differentiated over so much motion: errors of its second order are
-# below 1e-9, those of rounding below 1e-11.
-STEP_RAD = 1e-4
+# Times of messages are whole nanoseconds.
+LEAST_S = 0.9e-9
+# The correction of points nearer to each other than this is drawn through some of them, s: it is
+# as smooth as an arm's accelerations are.
+KNOTS_S = 0.02
+# A correction may make a trajectory so much slower before less is corrected.
+SLOWER = 1.05
+# Of the limit of acceleration, what corrected points take that are sent one by one while the arm
+# moves: where it then is is known to some milliradians.
+SHARE_OF_STREAM = 0.9
+
+
+@dataclass(frozen=True, eq=False)
+class Now:
+    """Where an arm of k joints is."""
+
+    q: FloatArray  # Reported, rad, (k,)
+    told: FloatArray  # Where the nominal robot would be, rad, (k,)
+    velocity: FloatArray  # rad/s, (k,)
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +69,8 @@ class CorrectedTrajectory:
     added_speed: FloatArray
     added_acceleration: FloatArray
     # As of a `Correction`, (n,)
-    faded: BoolArray
+    residual_m: FloatArray
+    incomplete: BoolArray
     outside_range: BoolArray
 
 
@@ -64,13 +84,15 @@ def corrected_trajectory(
     velocity_limits: ArrayLike | None = None,
     acceleration_limits: ArrayLike | None = None,
     temperature_c: float | None = None,
+    begins: FloatArray | None = None,
 ) -> CorrectedTrajectory:
     """Return the trajectory to send for a wanted one of the nominal robot.
 
     ``compensator``: the correction; ``times_s``: ascending, (n,), n >= 2; ``positions,
     velocities``: wanted, rad and rad/s, (n, k); ``tolerance_m``: of the tool between points;
     ``velocity_limits, acceleration_limits``: rad/s and rad/s², (k,); those of the URDF, and none,
-    where None; ``temperature_c``: of the arm.
+    where None; ``temperature_c``: of the arm; ``begins``: what is commanded at the start, rad,
+    (k,); the best command there where None.
     Raises InputError: numbers that are not finite, times that do not ascend, other shapes, or a
     path whose correction no point per millisecond follows.
     """
@@ -78,13 +100,26 @@ def corrected_trajectory(
     wanted = _Path(t, q, v)
     if velocity_limits is None:
         velocity_limits = compensator.model.chain.velocity_limits
-    times = _spread(compensator, wanted)
+    speed_limits = np.broadcast_to(np.asarray(velocity_limits, dtype=float), q.shape[1:])
+    acceleration_limits = (
+        None if acceleration_limits is None else np.asarray(acceleration_limits, dtype=float)
+    )
+    before = wanted.largest()
+    limits = _allowed(before, speed_limits, acceleration_limits)
+    ends = compensator.command(q[[0, -1]], temperature_c)
+    first = ends[0] if begins is None else begins
+    unit = compensator.model.chain.per_radian
+    fixed = Ends(
+        (first - q[0]) / unit, (ends[1] - q[-1]) / unit, wanted.rests(0), wanted.rests(-1)
+    )
+    times, apart_s = _spread(compensator, wanted), KNOTS_S
+    changes: SmoothChanges | None = None
     while True:
-        sent, done = _sent(compensator, wanted, times, temperature_c)
-        compared = COMPARED[v is not None]
-        middle = times[:-1, None] + np.diff(times)[:, None] * compared
-        exact = compensator.command(wanted.at(middle.ravel()), temperature_c)
-        off = _distance(compensator, sent.at(middle.ravel()), exact).reshape(middle.shape)
+        knots = _thinned(times, apart_s)
+        sent, done, changes = _corrected(
+            compensator, wanted, times, knots, limits, fixed, temperature_c, changes
+        )
+        off = _between(compensator, wanted, sent, knots, temperature_c)
         far = off.max(axis=1) > tolerance_m
         if not far.any():
             break
@@ -95,11 +130,11 @@ def corrected_trajectory(
                 'point per millisecond; go slower there, or give velocities'
             )
         times = np.sort(np.concatenate((times, 0.5 * (times[:-1] + times[1:])[far])))
+        apart_s *= 0.5
     speed, acceleration = sent.largest()
-    before = wanted.largest()
-    stretched = max(1.0, float(np.max(speed / np.asarray(velocity_limits, dtype=float))))
+    stretched = max(1.0, float(np.max(speed / speed_limits)))
     if acceleration_limits is not None and sent.v is not None:
-        ratio = np.max(acceleration / np.asarray(acceleration_limits, dtype=float))
+        ratio = np.max(acceleration / acceleration_limits)
         stretched = max(stretched, float(np.sqrt(ratio)))
     return CorrectedTrajectory(
         times[0] + (times - times[0]) * stretched,
@@ -110,7 +145,8 @@ def corrected_trajectory(
         float(off.max()),
         _added(before[0], speed),
         _added(before[1], acceleration),
-        done.faded,
+        done.residual_m,
+        done.incomplete,
         done.outside_range,
     )
 
@@ -140,16 +176,28 @@ class _Path:
         assert self._cubic is not None
         return np.asarray(self._cubic(times, 1))
 
+    def rests(self, end: int) -> bool:
+        """Return whether it rests at its first (0) or last (-1) point, as a cubic can."""
+        return self.v is not None and not np.any(self.v[end])
+
+    def accelerations(self) -> FloatArray:
+        """Return those at the start and the end of each interval, (n - 1, 2, k); 0 of lines."""
+        h = np.diff(self.t)[:, None]
+        if self.v is None:
+            return np.zeros((len(h), 2, self.q.shape[1]))
+        slope, first, last = np.diff(self.q, axis=0) / h, self.v[:-1], self.v[1:]
+        start = (6.0 * slope - 4.0 * first - 2.0 * last) / h
+        return np.stack((start, (2.0 * first + 4.0 * last - 6.0 * slope) / h), axis=1)
+
     def largest(self) -> tuple[FloatArray, FloatArray]:
         """Return the largest speed and acceleration of each joint, (k,) each."""
         h = np.diff(self.t)[:, None]
-        slope = np.diff(self.q, axis=0) / h
         if self.v is None:
+            slope = np.diff(self.q, axis=0) / h
             return np.abs(slope).max(axis=0), np.full(self.q.shape[1], np.nan)
-        first, last = self.v[:-1], self.v[1:]
+        first = self.v[:-1]
         # Of a cubic the acceleration is linear, and the speed has a vertex where it is none.
-        start = (6.0 * slope - 4.0 * first - 2.0 * last) / h
-        end = (2.0 * first + 4.0 * last - 6.0 * slope) / h
+        start, end = self.accelerations().swapaxes(0, 1)
         change = start - end
         share = np.divide(start, change, out=np.zeros_like(start), where=change != 0.0)
         inside = np.clip(share, 0.0, 1.0)
@@ -176,7 +224,7 @@ def _checked(
             )
     if not all(np.all(np.isfinite(one)) for one in (t, q, v) if one is not None):
         raise InputError('trajectory: a number is not finite; correct it')
-    if len(t) < 2 or np.any(np.diff(t) <= 0.0):
+    if len(t) < 2 or np.any(np.diff(t) < LEAST_S):
         raise InputError('trajectory: needs two points or more, at times that ascend')
     return t, q, v
 
@@ -200,41 +248,145 @@ def _spread(compensator: Compensator, wanted: _Path) -> FloatArray:
     return np.concatenate([*parts, wanted.t[-1:]])
 
 
-def _sent(
-    compensator: Compensator, wanted: _Path, times: FloatArray, temperature_c: float | None
-) -> tuple[_Path, Correction]:
+def _allowed(
+    wanted: tuple[FloatArray, FloatArray],
+    speed_limits: FloatArray,
+    acceleration_limits: FloatArray | None,
+) -> tuple[FloatArray, FloatArray]:
+    """Return the largest speeds and accelerations of a corrected path, (k,) each.
+
+    Those at which it is slowed down by `SLOWER`, beside what the wanted path has to be slowed down
+    itself. Without limits of acceleration, twice the largest of the wanted path, or of joints that
+    go over a radian at its speed.
+    """
+    speed, acceleration = wanted
+    slower = max(1.0, float(np.max(speed / speed_limits)))
+    if acceleration_limits is None or np.isnan(acceleration).any():
+        largest = max(float(np.nan_to_num(acceleration).max()), float(speed.max()) ** 2)
+        # A path that rests has no acceleration to compare with.
+        allowed = np.nan_to_num(acceleration) + max(largest, np.finfo(float).eps)
+    else:
+        slower = max(slower, float(np.sqrt(np.max(acceleration / acceleration_limits))))
+        allowed = acceleration_limits * (SLOWER * slower) ** 2
+    return speed_limits * SLOWER * slower, allowed
+
+
+def _thinned(times: FloatArray, apart_s: float) -> IntArray:
+    """Return the indices of times of which each is so far behind the one before, both ends too."""
+    chosen = [0]
+    last = len(times) - 1
+    while chosen[-1] < last:
+        following = int(np.searchsorted(times, times[chosen[-1]] + apart_s))
+        chosen.append(min(max(following, chosen[-1] + 1), last))
+    return np.array(chosen)
+
+
+def _corrected(
+    compensator: Compensator,
+    wanted: _Path,
+    times: FloatArray,
+    knots: IntArray,
+    limits: tuple[FloatArray, FloatArray],
+    ends: Ends,
+    temperature_c: float | None,
+    before: SmoothChanges | None,
+) -> tuple[_Path, Correction, SmoothChanges]:
     """Return the corrected path through points at these times, and what was done to them."""
+    q = wanted.at(times)
     v = None if wanted.v is None else wanted.speed(times)
-    done, speeds = corrected_points(compensator, wanted.at(times), v, temperature_c)
-    return _Path(times, done.command, speeds), done
+    path = _Path(times, q, v)
+    unit = compensator.model.chain.per_radian
+    problem = compensator.problem(q[knots], temperature_c)
+    speeds = np.zeros_like(q) if v is None else v
+    changes = smooth_changes(
+        problem.errors,
+        times[knots],
+        problem.own,
+        (_largest_between(path.accelerations(), knots) / unit, speeds[knots] / unit),
+        Limits(limits[1] / unit, limits[0] / unit, problem.budget),
+        ends,
+        before,
+    )
+    change, added = changes.at(times)
+    command = q + unit * change
+    every = problem if len(knots) == len(times) else compensator.problem(q, temperature_c)
+    done = compensator.correction(command, every.left(change))
+    return _Path(times, command, None if v is None else v + unit * added), done, changes
+
+
+def _largest_between(accelerations: FloatArray, knots: IntArray) -> FloatArray:
+    """Return the largest acceleration between knots, of either sign, at both ends, (m, 2, k).
+
+    ``accelerations``: at both ends of each interval, (n, 2, k), as they are where no interval lies
+    between two knots but one.
+    """
+    ends = accelerations.reshape(-1, accelerations.shape[2])
+    first = 2 * knots[:-1]
+    high, low = (np.asarray(one.reduceat(ends, first)) for one in (np.maximum, np.minimum))
+    largest = np.where(high > -low, high, low)
+    found = np.stack((largest, largest), axis=1)
+    single = np.diff(knots) == 1
+    found[single] = accelerations[knots[:-1][single]]
+    return found
+
+
+def _between(
+    compensator: Compensator,
+    wanted: _Path,
+    sent: _Path,
+    knots: IntArray,
+    temperature_c: float | None,
+) -> FloatArray:
+    """Return how far the tool is off in each interval beside what it is at knots, m, (n - 1, m).
+
+    What is not corrected at two knots is expected to go from the one to the other in a line.
+    """
+    times, share = sent.t, COMPARED[sent.v is not None]
+    inside = times[:-1, None] + np.diff(times)[:, None] * np.concatenate((share, [1.0]))
+    at = np.concatenate((times[knots], inside.ravel()))
+    model = compensator.model
+    nominal = model.chain.forward(wanted.at(at))[:, :3, 3]
+    off = compensator.tool(sent.at(at), temperature_c)[:, :3, 3] - nominal
+    off, between = np.split(off, [len(knots)])
+    expected = [np.interp(inside.ravel(), times[knots], one) for one in off.T]
+    beside = np.linalg.norm(between - np.stack(expected, axis=1), axis=1)
+    return np.asarray(beside.reshape(inside.shape))
 
 
 def corrected_points(
     compensator: Compensator,
+    times_s: FloatArray,
     q: FloatArray,
     v: FloatArray | None,
+    now: Now,
+    acceleration_limits: FloatArray,
     temperature_c: float | None = None,
 ) -> tuple[Correction, FloatArray | None]:
-    """Return what to command for points, and their velocities.
+    """Return what to command for the points of an arm that moves, and their velocities.
 
-    ``compensator, temperature_c``: as of `corrected_trajectory`; ``q, v``: wanted, rad and rad/s,
-    (n, k); None where there are no velocities.
+    ``compensator, temperature_c, acceleration_limits``: as of `corrected_trajectory`;
+    ``times_s``: from now on, above 0, (n,); ``q, v``: wanted, rad and rad/s, (n, k), None where
+    there are no velocities; ``now``: where the arm is.
     """
-    done = compensator.correct(q, temperature_c)
-    if v is None:
-        return done, None
-    # The correction is a function of the joints: its change along the way there.
-    size = np.abs(v).max(axis=1, keepdims=True)
-    step = STEP_RAD * np.divide(v, size, out=np.zeros_like(v), where=size > 0.0)
-    both = compensator.command(np.concatenate((q + step, q - step)), temperature_c)
-    ahead, behind = both[: len(q)], both[len(q) :]
-    return done, (ahead - behind) * size / (2.0 * STEP_RAD)
-
-
-def _distance(compensator: Compensator, a: FloatArray, b: FloatArray) -> FloatArray:
-    """Return how far the tool is apart at joints (n, k), m, (n,)."""
-    tools = [compensator.model.chain.forward(q)[:, :3, 3] for q in (a, b)]
-    return np.asarray(np.linalg.norm(tools[0] - tools[1], axis=1))
+    unit = compensator.model.chain.per_radian
+    times, q = np.concatenate(([0.0], times_s)), np.concatenate((now.told[None], q))
+    speeds = None if v is None else np.concatenate((now.velocity[None], v))
+    problem = compensator.problem(q, temperature_c)
+    limits = Limits(
+        SHARE_OF_STREAM * acceleration_limits / unit, np.full(len(unit), np.inf), problem.budget
+    )
+    found = smooth_changes(
+        problem.errors,
+        times,
+        problem.own,
+        (_Path(times, q, speeds).accelerations() / unit, np.zeros_like(q)),
+        limits,
+        # The controller goes on from the speed of the arm, whatever part the correction has in it.
+        Ends((now.q - now.told) / unit, None, True, v is not None and not np.any(v[-1])),
+    )
+    command = (q + unit * found.change)[1:]
+    done = compensator.correction(command, problem.left(found.change)[1:])
+    return done, None if v is None else v + unit * found.speed[1:]
 
 
 def _added(before: FloatArray, after: FloatArray) -> FloatArray:

@@ -386,7 +386,9 @@ class CompensatorNode(RemasterNode):
             self._in_use,
             1e-3 * self.p.tolerance_mm,
             self._warm,
+            self._present.q + self._true.added if self._on else None,
         )
+        self._true.lead(passed)
         for note in passed.notes:
             self.get_logger().info(note)
         self._end_s = self.now_s() + passed.end_s

@@ -516,7 +516,7 @@ class RobotBridge(RemasterNode):
                 for why in way.refused.values():
                     refused[number] = f'on its way {why}'
             refused |= done.refused
-            self.counts['corrected_near_singularity'] += int(done.faded.sum())
+            self.counts['corrected_near_singularity'] += int(done.incomplete.sum())
             self.counts['corrected_outside_range'] += int(done.outside_range.sum())
             for note in done.notes:
                 self.get_logger().info(note)

@@ -27,7 +27,7 @@ IN_95 = 7.815
 
 @dataclass(frozen=True)
 class Judged:
-    """Errors of the marker at poses away from singularities; at all where there are none such.
+    """Errors of the marker at all poses of a tour.
 
     Attributes
     ----------
@@ -60,20 +60,14 @@ def judged(hidden: HiddenSession, compensator: Compensator, tour: Visits) -> Jud
     wanted = apply(inverse(T), apply(nominal, place))
     effects = [effect for effect in hidden.truth.effects if effect.kind in ARM_KINDS]
     seen = hidden.world.on(replace(tour, q=found.command)).seen(effects)
-    # A small arm's Jacobian has a direction that fades everywhere: judged where it is, then.
-    whole = ~found.faded if not found.faded.all() else found.faded
-    error = (seen - wanted)[whole]
-    spread = T[:3, :3].T @ compensator.spread(tour.q[whole])
+    error = seen - wanted
+    spread = T[:3, :3].T @ compensator.spread(tour.q, temperature_c=warm)
     covariance = spread @ np.swapaxes(spread, 1, 2)
-    # What a command leaves near a singularity is stated beside it.
-    reached = apply(model.state(found.command, warm).tool, place)
-    stated = (apply(inverse(T), reached) - wanted)[whole]
-    covariance += stated[:, :, None] * stated[:, None, :]
     square = np.einsum('ni,ni->n', error, np.linalg.solve(covariance, error[..., None])[..., 0])
     own = np.zeros((len(error), 3, 9))
     own[:, :, :3] = np.eye(3)
-    own[:, :, 3:6] = np.cross(np.eye(3), wanted[whole][:, None, :]).swapaxes(1, 2)
-    own[:, :, 6:] = T[:3, :3].T @ nominal[whole, :3, :3]
+    own[:, :, 3:6] = np.cross(np.eye(3), wanted[:, None, :]).swapaxes(1, 2)
+    own[:, :, 6:] = T[:3, :3].T @ nominal[:, :3, :3]
     columns = own.reshape(-1, 9)
     left = error.ravel() - columns @ np.linalg.lstsq(columns, error.ravel(), rcond=None)[0]
     return Judged(

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import scipy
 from worlds.calibration_scenes import scene
 from worlds.compensation_files import arm as arm_of
 from worlds.discovery_scenes import residuals_of
@@ -11,7 +12,7 @@ from worlds.hidden_tours import robot
 from worlds.sliding_cells import rail, telescope
 
 from remaster_ros.compensation.arm_model import ArmModel, Function, Geometry, JointTerm
-from remaster_ros.compensation.compensator import FADES_BELOW, Compensator
+from remaster_ros.compensation.compensator import Compensator
 from remaster_ros.compensation.of_result import placed
 from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.kinematics.transforms import apply, matrix_to_rotation_vector
@@ -159,39 +160,78 @@ def test_derivative_is_that_of_the_model(name):
     np.testing.assert_allclose(change, derivative @ (step * units), rtol=0, atol=4e-10)
 
 
+BUDGET_RAD = np.radians(2.0)
+# What a pose that is reached may be off, m and rad.
+REACHED = 1e-5
+
+
+def pose_errors(model: ArmModel, q: np.ndarray, command: np.ndarray) -> np.ndarray:
+    """Return shift, m, and turn, rad, of the tool from that of the nominal robot, (n, 2)."""
+    wanted, reached = model.chain.forward(q), model.state(command).tool
+    turn = reached[:, :3, :3] @ np.swapaxes(wanted[:, :3, :3], 1, 2)
+    shift = reached[:, :3, 3] - wanted[:, :3, 3]
+    both = (shift, matrix_to_rotation_vector(turn))
+    return np.stack([np.linalg.norm(one, axis=1) for one in both], axis=1)
+
+
 @pytest.mark.parametrize('name', ['six', 'lwr4plus', 'iiwa14', *SLIDING])
 def test_the_tool_is_where_the_nominal_robot_has_it(name):
+    """Wherever two degrees a joint suffice; elsewhere what is left is stated."""
     model = erring(name, 4)
-    compensator = Compensator(model)
+    compensator, unit = Compensator(model), model.chain.per_radian
     q = configurations(model, 400, 5)
     found = compensator.correct(q)
-    wanted = model.chain.forward(q)
-    reached = compensator.tool(found.command)
-    off = np.linalg.norm(reached[:, :3, 3] - wanted[:, :3, 3], axis=1)
-    turned = np.linalg.norm(
-        matrix_to_rotation_vector(reached[:, :3, :3] @ np.swapaxes(wanted[:, :3, :3], 1, 2)),
-        axis=1,
-    )
-    np.testing.assert_allclose(found.residual_m, off, atol=1e-12)
-    np.testing.assert_allclose(found.residual_rad, turned, atol=1e-9)
-    alone = compensator.tool(q)
-    before = np.linalg.norm(alone[:, :3, 3] - wanted[:, :3, 3], axis=1)
-    sizes = np.linalg.svd(geometric_jacobian(model.chain, q), compute_uv=False)[:, -1]
-    whole = sizes >= FADES_BELOW
-    if name in SLIDING:
-        # Their smallest directions turn as much as they shift, and a shift is in levers.
-        assert np.mean(whole == ~found.faded) > 0.9
-        whole = ~found.faded
-    assert np.array_equal(~whole, found.faded)
-    if whole.any():
-        assert off[whole].max() < 2e-5
-        assert turned[whole].max() < 1e-4
-    # Never astray, wherever.
-    assert off.max() < before.max()
-    assert np.abs(found.command - q).max() < 0.1
-    np.testing.assert_allclose(compensator.true(found.command), q, rtol=0, atol=1e-9)
-    if name != 'six':
-        assert whole.mean() > 0.1
+    off, before = pose_errors(model, q, found.command), pose_errors(model, q, q)
+    np.testing.assert_allclose(found.residual_m, off[:, 0], atol=1e-12)
+    np.testing.assert_allclose(found.residual_rad, off[:, 1], atol=1e-9)
+    assert np.array_equal(found.incomplete, off.max(axis=1) > REACHED)
+    # By a fade of singular directions 0.96 of an LWR's were left.
+    assert found.incomplete.mean() < 0.2
+    rms = [np.sqrt(np.mean(one[:, 0] ** 2)) for one in (off, before)]
+    assert rms[0] < 0.1e-3 < 0.03 * rms[1]
+    own = np.abs(compensator.angle_errors(q) / unit)
+    most = np.abs((found.command - q) / unit).max(axis=1)
+    assert np.all(most <= np.maximum(BUDGET_RAD, own.max(axis=1)) + 1e-9)
+    whole = ~found.incomplete
+    # But for poses out of reach: an arm is not stretched further by more motion.
+    assert np.mean(most[~whole] > 0.99 * BUDGET_RAD) > 0.5
+    back = compensator.true(found.command)
+    np.testing.assert_allclose(back[whole], q[whole], rtol=0, atol=5e-5)
+    # The way back of what is not reached: the nominal robot where the tool then is.
+    told = model.chain.forward(back) @ np.linalg.inv(model.state(found.command).tool)
+    assert np.mean(np.abs(told - np.eye(4)).max(axis=(1, 2)) < REACHED) > 0.8
+
+
+@pytest.mark.parametrize('budget_deg', [2.0, 0.5])
+def test_on_the_bound_there_is_no_better_pose(budget_deg):
+    """Against a general solver, of another method, from the found point and from others."""
+    model, rng = erring('lwr4plus', 4), np.random.default_rng(9)
+    compensator = Compensator(model, np.radians(budget_deg))
+    q = configurations(model, 300, 5)
+    found = compensator.correct(q)
+    own = compensator.angle_errors(q)
+    bound = np.maximum(np.radians(budget_deg), np.abs(own))
+    frames = model.chain.frames(model.somewhere())
+    lever = np.linalg.norm(
+        model.chain.velocities(frames, (frames[:, -1] @ model.chain.T_fixed[-1])[:, :3, 3]), axis=1
+    ).max()
+
+    def weighted(change, row):
+        wanted = model.chain.forward(q[row])
+        reached = model.state((q[row] + change)[None]).tool[0]
+        turn = matrix_to_rotation_vector(reached[:3, :3] @ wanted[:3, :3].T)
+        return np.concatenate(((reached - wanted)[:3, 3] / lever, 0.05 * turn))
+
+    rows = np.flatnonzero(found.incomplete)[:12]
+    assert len(rows) == 12
+    for row in rows:
+        here = found.command[row] - q[row]
+        error = np.linalg.norm(weighted(here, row))
+        for start in (0.999 * here, rng.uniform(-0.5, 0.5, 7) * bound[row]):
+            other = scipy.optimize.least_squares(
+                weighted, start, bounds=(-bound[row], bound[row]), args=(row,)
+            )
+            assert error <= np.sqrt(2.0 * other.cost) * 1.02 + 1e-8
 
 
 def geometric_jacobian(chain, q):
@@ -208,28 +248,9 @@ def test_seven_joints_change_no_more_than_they_must():
     model = erring('lwr4plus', 6)
     q = configurations(model, 200, 7)
     found = Compensator(model).correct(q)
-    jacobian = geometric_jacobian(model.chain, q)
-    null = np.linalg.svd(jacobian, full_matrices=True)[2][:, -1]
-    along = np.abs(np.sum(null * (found.command - q), axis=1))
-    assert along[~found.faded].max() < 1e-4
-
-
-@pytest.mark.parametrize('name', ['six', 'lwr4plus'])
-def test_nothing_jumps_on_a_path_through_a_singularity(name):
-    """The added speed is a small share, and finer steps add nothing to it."""
-    model = erring(name, 8)
-    start, end = configurations(model, 2, 9)
-    # The wrist stretched midway: two axes in one line.
-    wrist = 4 if name == 'six' else 5
-    start[wrist], end[wrist] = -0.6, 0.6
-    added = []
-    for count in (2_001, 8_001):
-        path = start + np.linspace(0.0, 1.0, count)[:, None] * (end - start)
-        change = Compensator(model).command(path) - path
-        speed = np.abs(np.diff(change, axis=0)) * (count - 1)
-        added.append(speed.max() / np.abs(end - start).max())
-    assert added[0] < 0.25
-    assert added[1] < 1.05 * added[0]
+    null = np.linalg.svd(geometric_jacobian(model.chain, found.command), full_matrices=True)[2]
+    along = np.abs(np.sum(null[:, -1] * (found.command - q), axis=1))
+    assert along[~found.incomplete].max() < 1e-3
 
 
 def test_beyond_the_range_of_a_curve_its_end_holds_and_the_row_is_marked():
@@ -284,8 +305,8 @@ def test_a_quarter_of_an_arm_is_commanded_as_the_whole_one(name):
     q = configurations(model, 200, 5)
     whole = Compensator(replace(model, geometry=slight)).correct(q)
     part = Compensator(small).correct(q)
-    np.testing.assert_allclose(part.command, whole.command, atol=1e-12)
-    np.testing.assert_allclose(part.residual_m, 0.25 * whole.residual_m, atol=1e-12)
+    np.testing.assert_allclose(part.command, whole.command, atol=1e-9)
+    np.testing.assert_allclose(part.residual_m, 0.25 * whole.residual_m, atol=1e-9)
     # Most directions are those of a tool that goes where it is wanted.
     assert np.median(whole.residual_m) < 1e-5
 
@@ -293,7 +314,7 @@ def test_a_quarter_of_an_arm_is_commanded_as_the_whole_one(name):
 @pytest.mark.parametrize(('name', 'wrist'), [('six', 4), ('lwr4plus', 5)])
 @pytest.mark.parametrize('warmer_k', [0.0, 40.0])
 def test_an_arm_that_only_grows_is_not_sent_astray_at_a_singularity(name, wrist, warmer_k):
-    """Cold it has no error at all: what fades must not follow from that when it is warm."""
+    """Cold it has no error at all; at a singularity a direction has no size."""
     model = arm(name)
     turns = np.zeros((model.joints + 1, 3))
     share = np.random.default_rng(1).uniform(0.0, 2.4e-5, (model.joints + 1, 1))
@@ -304,7 +325,8 @@ def test_an_arm_that_only_grows_is_not_sent_astray_at_a_singularity(name, wrist,
     compensator, warm = Compensator(model), model.reference_c + warmer_k
     found = compensator.correct(q, warm)
     before = compensator.tool(q, warm)[:, :3, 3] - model.chain.forward(q)[:, :3, 3]
-    assert np.abs(found.command - q).max() < np.radians(0.5 if warmer_k else 1e-6)
+    most = np.abs(found.command - q).max()
+    assert most <= (BUDGET_RAD + 1e-12 if warmer_k else np.radians(1e-6))
     assert found.residual_m.max() < 1e-9 + np.linalg.norm(before, axis=1).max()
     if warmer_k:
-        assert np.median(found.residual_m) < 0.5 * np.median(np.linalg.norm(before, axis=1))
+        assert np.median(found.residual_m) < 0.1 * np.median(np.linalg.norm(before, axis=1))

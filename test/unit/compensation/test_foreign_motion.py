@@ -9,7 +9,6 @@ from worlds.compensation_files import save
 from worlds.drawn_moves import drawn, line
 from worlds.hidden_tours import robot
 
-from remaster_ros.compensation.compensator import FADES_BELOW
 from remaster_ros.compensation.foreign_motion import (
     Passed,
     Present,
@@ -50,14 +49,14 @@ def points(passed: Passed):
 @pytest.mark.parametrize('name', ['six', 'lwr4plus'])
 @pytest.mark.parametrize('seed', [1, pytest.param(2, marks=pytest.mark.qualify)])
 def test_paths_through_singularities_keep_the_limits_and_the_tool_its_path(tmp_path, name, seed):
-    """Along lines whose middle is singular, planned up to the limits."""
+    """Along lines whose middle is singular, planned up to the limits, each from the one before."""
     print('seed', seed)
     correction = correction_of(tmp_path, name, seed)
     compensator = correction.compensator
     chain = compensator.model.chain
     gate = gate_of(correction)
     rng = np.random.default_rng(100 + seed)
-    crossed, slowest, cpu_s, sent_points = 0, 1.0, 0.0, 0
+    crossed, slowest, cpu_s, sent_points, left = 0, 1.0, 0.0, 0, []
     for _ in range(16):
         middle = configurations(compensator.model, 1, int(rng.integers(1 << 30)))[0]
         middle[4 if name == 'six' else 3] = 0.0
@@ -72,12 +71,12 @@ def test_paths_through_singularities_keep_the_limits_and_the_tool_its_path(tmp_p
         tip = (frames[:, -1] @ chain.T_fixed[-1])[:, None, :3, 3]
         axes = chain.axes_in_base(frames)
         jacobian = np.concatenate((np.cross(axes, tip - frames[..., :3, 3]), axes), axis=2)[0]
-        assert np.linalg.svd(jacobian, compute_uv=False).min() < 0.1 * FADES_BELOW
+        assert np.linalg.svd(jacobian, compute_uv=False).min() < 0.02
         crossed += 1
         wanted = line(start, end, ACCELERATION, chain, share=1.0)
         at = compensator.command(start)
         began_s = time.process_time()
-        passed = passed_on(wanted, standing(at), gate, correction, TOLERANCE_M)
+        passed = passed_on(wanted, standing(at), gate, correction, TOLERANCE_M, told=start)
         cpu_s += time.process_time() - began_s
         assert isinstance(passed.admitted, Admitted)
         t, q, v = points(passed)
@@ -92,15 +91,22 @@ def test_paths_through_singularities_keep_the_limits_and_the_tool_its_path(tmp_p
         slope = np.diff(q, axis=0) / T
         ends = [(6 * slope - 4 * v[:-1] - 2 * v[1:]) / T, (2 * v[:-1] + 4 * v[1:] - 6 * slope) / T]
         assert np.max(np.abs(ends)) < ACCELERATION * 1.001
-        # Time may be stretched, the path is that of the wanted one.
+        # Time may be stretched, the path of the tool is that of the wanted one.
         faster = dense * wanted.times_s[-1] / t[-1]
-        exact = compensator.command(drawn(*_parts(wanted), faster))
-        off = [chain.forward(one)[:, :3, 3] for one in (sent, exact)]
-        assert np.linalg.norm(off[0] - off[1], axis=1).max() < 1.3 * TOLERANCE_M
+        path = drawn(*_parts(wanted), faster)
+        nominal = chain.forward(path)[:, :3, 3]
+        off, before = (
+            np.linalg.norm(compensator.tool(one)[:, :3, 3] - nominal, axis=1)
+            for one in (sent, path)
+        )
+        left.append(off)
+        assert off.max() < before.max()
         slowest, sent_points = max(slowest, t[-1] / wanted.times_s[-1]), sent_points + len(t)
     assert crossed > 3
     # A correction of fractions of a degree does not make an arm much slower.
-    assert 1.0 < slowest < 1.3
+    assert 1.0 < slowest < 1.1
+    # Where the accelerations are the planner's to the last, as much as they leave.
+    assert np.median(np.concatenate(left)) < 0.1e-3
     print(
         f'{name}: {crossed} paths, {slowest:.3f} times as long at most; '
         f'{1e3 * cpu_s / crossed:.1f} ms for {sent_points / crossed:.0f} points'
@@ -160,11 +166,11 @@ def test_lines_and_single_points_and_a_hold(tmp_path):
     # The tool is on the line of the nominal arm all the way.
     dense = np.linspace(0.0, 8.0, 500)
     start = compensator.true(at)
-    exact = compensator.command(start + dense[:, None] / 8.0 * (target - start))
-    sent = drawn(np.r_[0.0, t], np.vstack((at, q)), None, dense)
-    chain = compensator.model.chain
-    off = [chain.forward(one)[:, :3, 3] for one in (sent, exact)]
-    assert np.linalg.norm(off[0] - off[1], axis=1).max() < 1.3 * TOLERANCE_M
+    nominal = compensator.model.chain.forward(start + dense[:, None] / 8.0 * (target - start))
+    reached = compensator.tool(drawn(np.r_[0.0, t], np.vstack((at, q)), None, dense))
+    off = np.linalg.norm(reached[:, :3, 3] - nominal[:, :3, 3], axis=1)
+    assert np.median(off) < TOLERANCE_M
+    assert off.max() < 0.2e-3
     none = Trajectory(np.zeros(0), np.zeros((0, 6)), None)
     assert passed_on(none, arm, gate, correction, TOLERANCE_M).admitted.waypoints == ()
 
@@ -184,7 +190,9 @@ def test_while_the_arm_moves_its_points_are_corrected(tmp_path):
     to = there + 0.1 * speed
     wanted = Trajectory(np.array([0.1]), to[None], np.zeros((1, 6)))
     _, q, v = points(passed_on(wanted, arm, gate, correction, TOLERANCE_M))
-    np.testing.assert_allclose(q, compensator.command(to)[None], atol=1e-12)
+    # A tenth of a second on: the change goes there as far as the accelerations of so short a
+    # way allow.
+    assert np.abs(q - to - (arm.q - there)).max() < 0.5 * ACCELERATION * 0.1**2 / 4
     assert np.all(v == 0.0)
     wanted = Trajectory(np.array([0.1, 0.4]), np.array([to, to]), None)
     assert passed_on(wanted, arm, gate, correction, TOLERANCE_M).admitted.is_straight

@@ -40,8 +40,9 @@ def test_one_joint_of_the_wrong_sign_is_named(name):
     verdicts = [one.verdict for one in found.joints.values()]
     assert verdicts[2] == 'wrong_sign'
     assert verdicts.count('wrong_sign') == 1
-    # Base and marker take up what the outermost joints do.
-    assert verdicts[0] == verdicts[-1] == 'unclear'
+    # Base and marker take up a constant change of the outermost joints: nothing tells of it but
+    # that seven joints share changes, which go with the configuration.
+    assert {verdicts[0], verdicts[-1]} <= {'unclear', 'in_use'}
 
 
 def test_what_is_too_small_is_unclear_with_the_poses_that_would_do():
