@@ -173,14 +173,24 @@ def _job(folder: Path, out: Path, seed: int, baseline: str) -> Job:
         path for path in folder.glob('*') if path.suffix in _READ or path.name == MANIFEST
     )
     for path in [*files, *([Path(baseline)] if baseline else [])]:
-        try:
-            content = path.read_bytes()
-        except OSError:
-            content = b''
-        made_of.update(f'\0{path.name}\0{len(content)}\0'.encode() + content)
+        made_of.update(f'\0{path.name}\0{_digest(path)}\0'.encode())
     key = made_of.hexdigest()
     place = hashlib.sha256(str(folder).encode()).hexdigest()[:8]
     return Job(key, str(folder), str(out / f'{folder.name}-{place}'), seed, baseline)
+
+
+def _digest(path: Path) -> str:
+    """Return the SHA-256 of a file; '' of anything but a regular file that can be read.
+
+    A pipe has no end for a reader whose writer never comes, nor has a device.
+    """
+    try:
+        if not path.is_file():
+            return ''
+        with path.open('rb') as file:
+            return hashlib.file_digest(file, 'sha256').hexdigest()
+    except OSError:
+        return ''
 
 
 _READ = ('.yaml', '.csv', '.urdf', '.xml')

@@ -136,6 +136,8 @@ def _require_history(path: Path) -> None:
     """Refuse another file before it is opened, which drops what is no whole line of a journal."""
     start = format_record({'format': HISTORY})[: len(f'{{"format":"{HISTORY}"')]
     try:
+        if path.exists() and not path.is_file():
+            raise InputError(f'{path}: not a regular file; name a file for the history')
         with path.open('rb') as file:
             found = file.read(len(start))
     except FileNotFoundError:

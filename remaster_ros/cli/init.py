@@ -35,7 +35,13 @@ from remaster_ros.planning.tour_order import Tour
 from remaster_ros.planning.tour_planner import TourPlanner
 from remaster_ros.reports.plan_json import outlook_text, outlook_to_dict
 from remaster_ros.session.cell_template import SENSORS, CellProposal, cell_text, left_alone
-from remaster_ros.session.files import make_folder, undone_on_failure, write_atomically
+from remaster_ros.session.files import (
+    URDF_LIMIT,
+    make_folder,
+    read_limited,
+    undone_on_failure,
+    write_atomically,
+)
 from remaster_ros.session.meshes import find_mesh, mesh_reader
 from remaster_ros.session.packages import package_of
 from remaster_ros.session.robot_description import is_xacro, read_description
@@ -145,7 +151,9 @@ def _urdf_file(robot: Path, out: Path, text: str) -> Path:
         return robot
     name = robot.name.removesuffix('.xacro').removesuffix('.urdf')
     urdf = out.parent / f'{name}.urdf'
-    if urdf.exists() and urdf.read_text(errors='replace') != text:
+    if urdf.exists() and (
+        not urdf.is_file() or read_limited(urdf, URDF_LIMIT, 'it was there') != text.encode()
+    ):
         raise InputError(
             f'{urdf}: already there with other content; move it, or name '
             'another folder with --out, such as new/cell.yaml'

@@ -45,6 +45,9 @@ FILE_LIMIT = 256 * 1024**2
 # Digits of what the covariance is made of: the errors of a marker are a millionth of those of its
 # parameters, which make up for each other.
 DIGITS = 10
+# Of any number of the file, in its unit: far beyond the widest prior of anything (300 m of a
+# sensor), and its fourth power is finite.
+LARGEST = 1e9
 
 Triple = tuple[float, float, float]
 Source = Literal['fit', 'discover']
@@ -433,15 +436,32 @@ def read_compensation(path: str | os.PathLike[str]) -> Compensation:
     )
     try:
         content = msgspec.json.decode(data, type=CompensationPart)
-    except msgspec.DecodeError as error:
+    except (msgspec.DecodeError, RecursionError) as error:
         raise _not_one(path, _other_format(data) or str(error)) from None
     if content.format != FORMAT:
         raise _not_one(path, _other_format(data) or 'its format is empty')
     try:
+        _refuse_huge(content)
         model = _model(content)
     except InputError as error:
         raise InputError(f'{path}: {error}') from None
     return Compensation(path, Compensator(model), content, hashlib.sha256(data).hexdigest())
+
+
+def _refuse_huge(content: CompensationPart) -> None:
+    """Refuse numbers that no arm has, whose products overflow."""
+    parts = msgspec.to_builtins(content)
+    # What the controller reported is shown, never computed with.
+    del parts['state']
+    waiting: list[tuple[str, Any]] = [('', parts)]
+    while waiting:
+        where, value = waiting.pop()
+        if isinstance(value, dict):
+            waiting += [(f'{where}.{key}' if where else key, one) for key, one in value.items()]
+        elif isinstance(value, list | tuple):
+            waiting += [(f'{where}.{i}', one) for i, one in enumerate(value)]
+        elif isinstance(value, int | float) and abs(value) > LARGEST:
+            raise _broken(where, f'is {value:.3g}, beyond what any arm has')
 
 
 class _AnyFile(Struct):
@@ -454,7 +474,7 @@ def _other_format(data: bytes) -> str:
     """Return which other file of this program it is; '' where that is not known."""
     try:
         given = msgspec.json.decode(data, type=_AnyFile).format
-    except msgspec.DecodeError:
+    except (msgspec.DecodeError, RecursionError):
         return ''
     # Before its keys: another file's would only confuse.
     return f'its format is {given[:60]!r}, not {FORMAT!r}' if given not in ('', FORMAT) else ''
@@ -507,6 +527,9 @@ def _model(content: CompensationPart) -> ArmModel:
         BaseTerm(term.effect, *_function(term, f'base_terms.{i}', chain, 3))
         for i, term in enumerate(content.base_terms)
     )
+    for sensor, part in content.base_frame.items():
+        if abs(np.linalg.norm(part.rotation_xyzw) - 1.0) > 1e-3:
+            raise _broken(f'base_frame.{sensor}.rotation_xyzw', 'is no quaternion of length 1')
     warm = content.temperature
     model = ArmModel(
         chain=chain,

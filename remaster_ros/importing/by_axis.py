@@ -13,6 +13,9 @@ _NAMED = re.compile(r'(.+?)[ ._:/-]+([XYZxyz])')
 _SHARE = 0.5
 _FEWEST_POINTS = 3
 _SEEN = 100
+# Of characters: a name, a separator and a letter are no longer; of more separators in a row the
+# expression above would try every beginning.
+_LONGEST = 200
 
 Rows = list[tuple[str, ...]]
 
@@ -81,7 +84,7 @@ def _axes(rows: Rows) -> tuple[list[str], int, list[str] | None] | None:
         axes = [cell.upper() if cell.upper() in _AXES else '' for cell in cells]
         if {*_AXES} <= {*axes} and sum(map(bool, axes)) > _SHARE * len(rows):
             return axes, column, None
-        named = [_NAMED.fullmatch(cell) for cell in cells]
+        named = [_NAMED.fullmatch(cell) if len(cell) <= _LONGEST else None for cell in cells]
         if sum(map(bool, named)) > _SHARE * len(rows):
             axes = [match[2].upper() if match else '' for match in named]
             if {*_AXES} <= {*axes}:

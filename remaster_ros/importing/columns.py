@@ -532,7 +532,7 @@ def _by_place(table: TextTable, found: Columns, joints: int) -> Columns:
     """Take columns without a header by their place: a name, then joints, then X, Y, Z."""
     free = [i for i in range(len(table.names)) if i not in found.why]
     numeric = [i for i in free if _numeric(table, i)]
-    texts = [i for i in free if i not in numeric]
+    texts = sorted({*free}.difference(numeric))
     wanted = (0 if found.joints else joints, 0 if found.points else 3)
     first = numeric[:1] if _counts_up(table, numeric) else []
     for need_joints, need_point in ((*wanted,), (0, wanted[1]), (wanted[0], 0)):

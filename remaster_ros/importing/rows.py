@@ -20,6 +20,7 @@ from remaster_ros.importing.makers import kuka
 from remaster_ros.importing.makers.named import some
 from remaster_ros.importing.standstills import stopped
 from remaster_ros.importing.text_table import (
+    MOST_COLUMNS,
     TABLE_LIMIT,
     TextTable,
     decode,
@@ -313,8 +314,6 @@ def _refuse_equal_times(
 # A marker that moves by less than this share of what others move is not on the arm: one on the
 # first link would, by less than a fiftieth of the arm's reach about its axis.
 _STATIC = 0.02
-# Of a range of numbers of columns.
-_MOST_COLUMNS = 10_000
 # Of fewer configurations any two may well have one time.
 _FEWEST_ALIKE = 4
 _OTHERS = ('pose', 'configuration', 'split', 'sensor', 'marker')
@@ -604,15 +603,15 @@ def _values(
     for one, found in both:
         prefix = f'{one.path.name}: ' if len(both) > 1 else ''
         is_joints, is_points = found is joints[1], found is columns
-        for i, name in enumerate(one.names):
-            meaning = _meaning(
-                i,
-                found if is_joints else replace(found, joints=(), from_joints=()),
-                chain,
-                tuple(f'{unit} ({how})' for unit, how in units),
-                f'{length} ({how_length})' if is_points else '',
-            )
-            meanings[f'{prefix}{name}'] = meaning
+        meaning = _meanings(
+            found if is_joints else replace(found, joints=(), from_joints=()),
+            chain,
+            tuple(f'{unit} ({how})' for unit, how in units),
+            f'{length} ({how_length})' if is_points else '',
+        )
+        meanings |= {
+            f'{prefix}{name}': meaning.get(i, 'not used') for i, name in enumerate(one.names)
+        }
     return RawRows(
         where=tuple(f'{table.path}, line {table.lines[i]}' for i in row),
         joint_columns=tuple(joints[0].names[i] for i in joints[1].joints),
@@ -716,32 +715,35 @@ def _optional(points: Table, kind: str) -> FloatArray:
     return numbers(points[0], (column,), optional=True)[:, 0]
 
 
-def _meaning(
-    i: int, columns: Columns, chain: SerialChain, units: Sequence[str], length: str
-) -> str:
-    """Return what a column was taken for."""
-    how = columns.why.get(i, '')
-    by_place = ', by its place' if how == 'place' else ', as told' if how == 'told' else ''
+def _meanings(
+    columns: Columns, chain: SerialChain, units: Sequence[str], length: str
+) -> dict[int, str]:
+    """Return what each column was taken for, by its index; of points only with a `length`."""
+
+    def how(i: int) -> str:
+        place = {'place': ', by its place', 'told': ', as told'}
+        return place.get(columns.why.get(i, ''), '')
+
+    found: dict[int, str] = {}
     for kind, joints in (('', columns.joints), ('coming from, ', columns.from_joints)):
-        if i in joints:
-            joint = joints.index(i)
+        for joint, i in enumerate(joints):
             name, unit = chain.joint_names[joint], units[joint]
-            return f'{kind}joint {joint + 1} ({name}), {unit}{by_place}'
-    for marker, own in columns.points.items():
+            found.setdefault(i, f'{kind}joint {joint + 1} ({name}), {unit}{how(i)}')
+    for marker, own in columns.points.items() if length else ():
         of = f'marker {marker}' if marker else 'the marker'
         spread, turned = columns.stds.get(marker, ()), columns.orientations.get(marker, ())
-        if length and i in own:
-            return f'{AXES[own.index(i)]} of {of}, {length}{by_place}'
-        if length and i in spread:
-            return f'standard deviation of {AXES[spread.index(i)]} of {of}, {length}'
-        if length and i in turned:
-            return f'{"xyzw"[turned.index(i)]} of the quaternion of {of}{by_place}'
-    if length and i in columns.turned:
-        return f'orientation of the marker{by_place}'
+        for axis, i in zip(AXES, own):
+            found.setdefault(i, f'{axis} of {of}, {length}{how(i)}')
+        for axis, i in zip(AXES, spread):
+            found.setdefault(i, f'standard deviation of {axis} of {of}, {length}')
+        for letter, i in zip('xyzw', turned):
+            found.setdefault(i, f'{letter} of the quaternion of {of}{how(i)}')
+    for i in columns.turned if length else ():
+        found.setdefault(i, f'orientation of the marker{how(i)}')
     for kind, places in columns.others.items():
-        if i in places:
-            return f'{kind}{by_place}'
-    return 'not used'
+        for i in places:
+            found.setdefault(i, f'{kind}{how(i)}')
+    return found
 
 
 def _of_table(told: Told, table: TextTable, tables: Sequence[TextTable]) -> Told:
@@ -771,7 +773,7 @@ def _of_file(told: Told, path: Path, paths: Sequence[Path]) -> Told:
 
 def _range(name: str) -> list[str]:
     ends = re.fullmatch(r'(\d+)-(\d+)', name)
-    if ends is None or not int(ends[1]) <= int(ends[2]) < _MOST_COLUMNS:
+    if ends is None or not int(ends[1]) <= int(ends[2]) <= MOST_COLUMNS:
         return [name]
     return [str(i) for i in range(int(ends[1]), int(ends[2]) + 1)]
 

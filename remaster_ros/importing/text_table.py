@@ -19,16 +19,22 @@ from remaster_ros.importing import by_axis
 from remaster_ros.importing.makers import READERS
 from remaster_ros.importing.makers.named import Named, some
 from remaster_ros.importing.units import bare, is_unit, split_unit
-from remaster_ros.session.files import read_limited
+from remaster_ros.session.files import cpu_limited, read_limited
 from remaster_ros.types import IntArray
 
 TABLE_LIMIT = 256 * 1024**2
+# Processor time for reading a file, s, and for each MiB of it: five times what the slowest of
+# plain tables takes (test_reading_time).
+CPU_S, CPU_S_PER_MIB = 30.0, 5.0
+# An export of Motive with five skeletons and 300 markers has 4,000 columns; the longest name seen
+# (a path of SpatialAnalyzer) has 200 characters.
+MOST_COLUMNS, LONGEST_NAME = 5_000, 1_000
 # In this order where several explain a table equally well; blanks come last.
 SEPARATORS = {';': 'semicolons', '\t': 'tabs', ',': 'commas', '|': 'bars', ' ': 'blanks'}
 # From so many lines the separator is found.
 SEEN_LINES = 2000
 _COMMENT = re.compile(r'\s*(?:#|//|%|!|\*)\s*')
-_PLAIN = re.compile(r'[+-]?(?:\d+[.,]?\d*|[.,]\d+)(?:[eE][+-]?\d+)?', re.ASCII)
+_PLAIN = re.compile(r'[+-]?(?:\d+(?:[.,]\d*)?|[.,]\d+)(?:[eE][+-]?\d+)?', re.ASCII)
 # Groups of three digits, as spreadsheets like to write thousands, and then a decimal sign.
 _THOUSANDS = re.compile(r'[+-]?\d{1,3}(?:([.,])\d{3})(?:\1\d{3})*[.,]\d+', re.ASCII)
 # A number whose unit stands in its cell, as spreadsheets show one.
@@ -47,6 +53,9 @@ _ORNAMENT = re.compile(r'[\s|+:=-]+')
 _NUMBERS = re.compile(r'(?<![\w.,])[+-]?\d+(?:[.,]\d*)?(?!\w)')
 _LIST = re.compile(r'[\[(]([^\[\]()]*)[\])]')
 _JSON = re.compile(r'\s*(?:\{\s*"|\[\s*\{)')
+# Numbers in the cell of a row: joints, points and matrices have fewer. An empty cell of such a
+# column stands for as many columns. A number of double precision with blanks has fewer letters.
+_LONGEST_LIST, _LONGEST_NUMBER = 100, 40
 _MARKUP = re.compile(r'\s*<(?:!DOCTYPE|\?xml|html|table)\b', re.IGNORECASE)
 _NEVER = re.compile(r'(?!)')
 # Blanks, but not those before a unit in brackets: `X [mm]  Y [mm]`.
@@ -149,6 +158,17 @@ def read_table(
     data = read_limited(path, TABLE_LIMIT, 'name the table')
     if data.startswith(b'\x1f\x8b'):
         data = _unpacked(data, path)
+    limit_s = CPU_S + CPU_S_PER_MIB * len(data) / 1024**2
+    refusal = (
+        f'{path}: not read after {limit_s:.0f} s of processor time, many times what a file of its '
+        'size takes; take out what is no row of joints or points'
+    )
+    with cpu_limited(limit_s, refusal):
+        return _table(data, path, separator, decimal, encoding)
+
+
+def _table(data: bytes, path: Path, separator: str, decimal: str, encoding: str) -> TextTable:
+    """Return the table of the bytes of a file; as `read_table`."""
     text, encoding = decode(data, path, encoding)
     for read in READERS:
         try:
@@ -156,7 +176,7 @@ def read_table(
         except InputError as error:
             raise InputError(f'{path}, {error}') from None
         if found is not None:
-            return TextTable(path=path, encoding=encoding, **vars(found))
+            return _bounded(TextTable(path=path, encoding=encoding, **vars(found)))
     if _JSON.match(text):
         raise InputError(
             f'{path}: this is JSON, not a table; save it as CSV, a row for each configuration'
@@ -179,6 +199,8 @@ def read_table(
         [(number, line, _split(line, separator, path, number)) for number, line in lines]
     )
     width, first, usual = _first_row(split, path, comment)
+    if width > MOST_COLUMNS:
+        raise _too_wide(path, split[first][0], width)
     header, preamble, named = _header(split[:first], width, separator, path)
     written = [cells for _, _, cells in split[:named]]
     rows: list[tuple[str, ...]] = []
@@ -227,10 +249,10 @@ def read_table(
         )
     if report is not None:
         names, rows, at = tuple(report[0]), report[1], report[2]
-    for name in names:
-        if name and names.count(name) > 1:
+    for name, count in Counter(names).items():
+        if name and count > 1:
             raise InputError(f'{path}: two columns are named {name!r}; name them differently')
-    return TextTable(
+    found_table = TextTable(
         kind='',
         path=path,
         encoding=encoding,
@@ -243,6 +265,27 @@ def read_table(
         has_header=bool(header),
         notes=(f'{path}, line{"s" * (len(left) > 1)} {some(left)}: no row, left out',)
         * bool(left),
+    )
+    return _bounded(found_table)
+
+
+def _bounded(table: TextTable) -> TextTable:
+    """Return the table; InputError if it has more columns, or longer names, than any table has."""
+    if len(table.names) > MOST_COLUMNS:
+        raise _too_wide(table.path, min(table.lines, default=1), len(table.names))
+    for name in table.names:
+        if len(name) > LONGEST_NAME:
+            raise InputError(
+                f'{table.path}: a column is named {name[:_SHOWN]!r}… ({len(name)} characters); '
+                f'give it a name of {LONGEST_NAME} at the most'
+            )
+    return table
+
+
+def _too_wide(path: Path, line: int, width: int) -> InputError:
+    return InputError(
+        f'{path}, line {line}: {width} columns, where {MOST_COLUMNS} at the most are read; give a '
+        'line to each configuration, and leave out columns that are neither joints nor points'
     )
 
 
@@ -308,9 +351,9 @@ def _is_ornament(line: str) -> bool:
 
 def _listed(cell: str) -> list[str]:
     """Return the numbers of a list in a cell, as `[0.1, -1.5]`; [] where it is none."""
-    found = _LIST.fullmatch(cell)
+    found = _LIST.fullmatch(cell) if len(cell) <= _LONGEST_LIST * _LONGEST_NUMBER else None
     cells = re.split(r'\s*[,;]\s*|\s+', found[1].strip()) if found else []
-    return cells if len(cells) > 1 and all(map(_PLAIN.fullmatch, cells)) else []
+    return cells if 1 < len(cells) <= _LONGEST_LIST and all(map(_PLAIN.fullmatch, cells)) else []
 
 
 def _without_lists(
@@ -341,15 +384,16 @@ def _without_lists(
 
 def _without_groups(rows: list[tuple[str, ...]]) -> list[tuple[str, ...]]:
     """Return cells without what is between thousands, in columns that have it everywhere."""
-    for i, column in enumerate(zip(*rows)):
+    columns = [*zip(*rows)]
+    for i, column in enumerate(columns):
         # At once, as logs are large.
         if not _BETWEEN_GROUPS.search('\n'.join(column)):
             continue
         grouped = {cell for cell in column if _GROUPED.fullmatch(cell)}
         if grouped and not any(map(_UNGROUPED.fullmatch, column)):
             plain = {cell: _BETWEEN_GROUPS.sub('', cell) for cell in grouped}
-            rows = [(*row[:i], plain.get(row[i], row[i]), *row[i + 1 :]) for row in rows]
-    return rows
+            columns[i] = tuple(plain.get(cell, cell) for cell in column)
+    return [*zip(*columns)]
 
 
 def _without_units(
@@ -357,7 +401,8 @@ def _without_units(
 ) -> tuple[list[tuple[str, ...]], list[str]]:
     """Return cells without the unit that all cells of a column have; it goes into its name."""
     header = list(header)
-    for i, column in enumerate(zip(*rows)):
+    columns = [*zip(*rows)]
+    for i, column in enumerate(columns):
         if not _WITH_UNIT.fullmatch(next((cell for cell in column if not is_missing(cell)), '')):
             continue
         found = {cell: _WITH_UNIT.fullmatch(cell) for cell in column if not is_missing(cell)}
@@ -366,10 +411,10 @@ def _without_units(
             continue
         (unit,) = units
         plain = {cell: match[1] for cell, match in found.items() if match}
-        rows = [(*row[:i], plain.get(row[i], row[i]), *row[i + 1 :]) for row in rows]
+        columns[i] = tuple(plain.get(cell, cell) for cell in column)
         if not split_unit(header[i])[1]:
             header[i] = f'{header[i]} [{unit}]'
-    return rows, header
+    return [*zip(*columns)], header
 
 
 def _find_separator(lines: Sequence[str]) -> str:
@@ -395,7 +440,11 @@ def _find_separator(lines: Sequence[str]) -> str:
 
 
 def _is_number(cell: str) -> bool:
-    return bool(_PLAIN.fullmatch(cell) or _THOUSANDS.fullmatch(cell) or _WITH_UNIT.fullmatch(cell))
+    # Many cells of a wide table are empty.
+    return bool(
+        cell
+        and (_PLAIN.fullmatch(cell) or _THOUSANDS.fullmatch(cell) or _WITH_UNIT.fullmatch(cell))
+    )
 
 
 def _count(cell: str) -> int:
@@ -422,7 +471,7 @@ def _is_no_row(cells: Sequence[str], usual: IntArray, width: int) -> bool:
     page = bool(words) and words[0] in _PAGES
     if len(cells) == width and not page and _is_number(cells[usual[0]]):
         return False
-    found = [cells[i] for i in usual if i < len(cells)]
+    found = [cells[i] for i in usual[: np.searchsorted(usual, len(cells))]]
     if len(cells) == width and all(is_missing(cell) or _is_number(cell) for cell in found):
         return page and not any(map(_is_number, found))
     return page or not any(is_missing(cell) or _is_number(cell) for cell in found)
@@ -506,8 +555,9 @@ def _below(over: Sequence[str], names: list[str]) -> list[str]:
     for cell in (*over, *[''] * (len(names) - len(over))):
         group = cell or group
         groups.append(group)
+    count = Counter(names)
     return [
-        f'{group} {name}' if name and group and names.count(name) > 1 else name
+        f'{group} {name}' if name and group and count[name] > 1 else name
         for group, name in zip(groups, names)
     ]
 

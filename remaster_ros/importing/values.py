@@ -33,10 +33,12 @@ WITHOUT_DATE_S = 946_684_800.0
 _COMPACT = re.compile(r'(?:19|20)\d\d[01]\d[0-3]\d[0-2]\d[0-5]\d[0-5]\d')
 _CLOCK = re.compile(r'(\d\d?)\.(\d\d)\.\d\d')
 # Numbers that are no date.
-_SHORT = re.compile(r'[^:]?\d*[.,\s-]*\d*')
+_SHORT = re.compile(r'[^:]?\d*(?:[.,\s-]+\d*)?')
 # Two numbers of a date and the sign between them; dates that begin with the year are not meant.
 _DATE = re.compile(r'\D*(\d\d?)([./-])(\d\d?)\2\d\d(?:\d\d)?(?!\d)')
 _MOST_MONTHS = 12
+# Characters of a time: a day of the week, a date with the month as a word, a time and a zone.
+_LONGEST_TIME = 100
 _WORD = re.compile(r'([^\W\d_]+)\b\.?')
 # Hours, minutes and seconds between points or strokes: before AM and PM, or behind a date.
 _POINTS = re.compile(
@@ -231,6 +233,8 @@ def times(table: TextTable, columns: Columns) -> FloatArray | None:
 
 
 def _time(text: str, decimal: str, day_first: bool) -> float | None:
+    if len(text) > _LONGEST_TIME:
+        return None
     number = parse_number(text, decimal)
     if number is not None and not _COMPACT.fullmatch(text):
         return number

@@ -182,8 +182,7 @@ def _turning_behind(model: UrdfModel, link: str) -> int:
     return max(
         (
             _turns(joint) + _turning_behind(model, joint.child)
-            for joint in model.parent_joint.values()
-            if joint.parent == link
+            for joint in model.child_joints[link]
         ),
         default=0,
     )
@@ -222,9 +221,8 @@ def _arm(
 def _moved_from(model: UrdfModel, link: str) -> list[UrdfJoint]:
     """Return the next joints that move behind a link."""
     found = []
-    for joint in model.parent_joint.values():
-        if joint.parent == link:
-            found += [joint] if joint.kind != 'fixed' else _moved_from(model, joint.child)
+    for joint in model.child_joints[link]:
+        found += [joint] if joint.kind != 'fixed' else _moved_from(model, joint.child)
     return found
 
 

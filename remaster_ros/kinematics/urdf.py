@@ -10,6 +10,7 @@ import math
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Container, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from graphlib import CycleError, TopologicalSorter
 
 import numpy as np
@@ -24,6 +25,9 @@ _XACRO = (
     'URDF: this is xacro, from which a URDF is still to be made; let its name end in .xacro, and '
     'expand it: remaster init FILE (or ros2 run xacro xacro FILE > robot.urdf)'
 )
+MOST_LINKS, MOST_DEPTH = 2_000, 200
+"""Ten times the links of the largest description seen (a cell of two arms with hands, 190), and of
+those one behind the other (a humanoid's finger, 20)."""
 _NO_LIMIT = 1e300
 """Some programs write a huge limit, such as 1e16, where they mean none."""
 
@@ -62,6 +66,14 @@ class UrdfModel:
     root: str
     links: Mapping[str, UrdfLink]
     parent_joint: Mapping[str, UrdfJoint]
+
+    @cached_property
+    def child_joints(self) -> Mapping[str, list[UrdfJoint]]:
+        """Map each link to the joints that it carries, in file order."""
+        found: dict[str, list[UrdfJoint]] = {name: [] for name in self.links}
+        for joint in self.parent_joint.values():
+            found[joint.parent].append(joint)
+        return found
 
     def leaves(self) -> list[str]:
         """Return the links that carry nothing, in file order."""
@@ -106,6 +118,12 @@ def parse_urdf(text: str) -> UrdfModel:
     if robot.tag != 'robot':
         raise InputError(f'URDF: the outermost element is <{robot.tag}>, not <robot>')
 
+    count = len(robot.findall('link'))
+    if count > MOST_LINKS:
+        raise InputError(
+            f'URDF: {count} links, where {MOST_LINKS} at the most are read; leave out what is no '
+            'part of the arm and its base'
+        )
     links: dict[str, UrdfLink] = {}
     for element in robot.findall('link'):
         link = _link(element)
@@ -142,7 +160,21 @@ def parse_urdf(text: str) -> UrdfModel:
     except CycleError as error:
         link = min(error.args[1])
         raise InputError(f"URDF: link '{link}' is part of a loop; a robot is a tree") from None
-    return UrdfModel(robot.get('name', ''), roots[0], links, parent_joint)
+    model = UrdfModel(robot.get('name', ''), roots[0], links, parent_joint)
+    _refuse_deep(model)
+    return model
+
+
+def _refuse_deep(model: UrdfModel) -> None:
+    """Refuse a robot with more links behind one another than any arm has."""
+    level, depth = [model.root], 0
+    while level := [joint.child for link in level for joint in model.child_joints[link]]:
+        depth += 1
+        if depth > MOST_DEPTH:
+            raise InputError(
+                f"URDF: link '{level[0]}' has more than {MOST_DEPTH} links between it and "
+                f"'{model.root}', which no arm has; correct the description"
+            )
 
 
 def _is_xacro(element: ElementTree.Element) -> bool:

@@ -412,7 +412,7 @@ def require_own(path: Path, format_: str) -> None:
     """Refuse to replace a file that is no JSON of this format, or not of this program."""
     try:
         content = msgspec.json.decode(read_limited(path, FIT_LIMIT, 'it was there'))
-    except msgspec.DecodeError:
+    except (msgspec.DecodeError, RecursionError):
         content = None
     if not isinstance(content, dict) or content.get('format') != format_:
         raise InputError(f'{path}: is there and is no {format_}; it is not replaced, name another')

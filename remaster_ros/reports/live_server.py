@@ -532,7 +532,7 @@ class _Command(_WithToken):
         if name in SEEN_FIRST:
             try:
                 seen = msgspec.json.decode(self.request.body, type=Seen)
-            except msgspec.MsgspecError:
+            except (msgspec.MsgspecError, RecursionError):
                 raise HTTPError(400, reason=f'{name} needs view and seen') from None
             if refusal := self._server.refusal(seen):
                 raise HTTPError(409, reason=refusal)

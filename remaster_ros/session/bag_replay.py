@@ -194,7 +194,7 @@ def _cell(bag: BagReader, text: str) -> Workcell | None:
         return None
     try:
         return msgspec.json.decode(text, type=Workcell)
-    except msgspec.MsgspecError as error:
+    except (msgspec.MsgspecError, RecursionError) as error:
         raise InputError(
             f'{bag.path}: the cell in it is of another version ({error}); name its file with '
             '--cell'

@@ -51,7 +51,7 @@ class HaltFile:
                 return ''
             data = read_limited(self.path, LIMIT, 'it holds a halt')
             halt = msgspec.json.decode(data, type=_Halt)
-        except (OSError, InputError, msgspec.DecodeError) as error:
+        except (OSError, InputError, msgspec.DecodeError, RecursionError) as error:
             # What the disk does not answer may be a halt.
             return f'{self.path}: a halt that cannot be read ({error})'
         return f'{halt.halted} (halted {halt.since}, before this bridge was started)'
@@ -113,7 +113,7 @@ class LastCommandFile:
                 return None
             data = read_limited(self.path, LIMIT, 'it holds the last command')
             kept = msgspec.json.decode(data, type=_Kept)
-        except (OSError, InputError, msgspec.DecodeError):
+        except (OSError, InputError, msgspec.DecodeError, RecursionError):
             return LastCommand(None, np.inf)
         # A clock that was set back leaves open how long ago it was.
         age_s = (now_ns - kept.sent_ns) / 1e9 if now_ns >= kept.sent_ns else np.inf

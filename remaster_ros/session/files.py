@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import os
+import signal
+import threading
 from collections.abc import Iterator
 from contextvars import ContextVar
 from pathlib import Path
+from types import FrameType
 
 from remaster_ros.errors import DiskError, InputError
 
@@ -65,6 +68,35 @@ def read_limited(path: Path, limit: int, missing: str) -> bytes:
     if len(data) > limit:
         raise InputError(f'{path}: larger than {limit} bytes; this is not a file of this format')
     return data
+
+
+class _CpuTimeUsedUp(BaseException):
+    """Processor time is used up; no handler of ordinary errors on the way may take it."""
+
+
+@contextlib.contextmanager
+def cpu_limited(limit_s: float, refusal: str) -> Iterator[None]:
+    """Raise an `InputError` with the text `refusal` if the body takes longer, s of processor time.
+
+    A signal interrupts the body, also inside of a regular expression. Signals reach the main
+    thread alone: in any other thread there is no limit.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def expired(number: int, frame: FrameType | None) -> None:
+        raise _CpuTimeUsedUp
+
+    handler = signal.signal(signal.SIGPROF, expired)
+    outer_s, outer_interval_s = signal.setitimer(signal.ITIMER_PROF, limit_s)
+    try:
+        yield
+    except _CpuTimeUsedUp:
+        raise InputError(refusal) from None
+    finally:
+        signal.setitimer(signal.ITIMER_PROF, outer_s, outer_interval_s)
+        signal.signal(signal.SIGPROF, handler)
 
 
 def refuse_utf16(data: bytes, path: Path) -> None:
@@ -155,6 +187,9 @@ class AppendFile:
         self._descriptor: int | None = None
         made_if_new(path)
         try:
+            if path.exists() and not path.is_file():
+                # Opened for writing a pipe waits for a reader.
+                raise InputError(f'{path}: not a regular file; give another name')
             self._descriptor = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o666)
             self.size = os.fstat(self._descriptor).st_size
             # Also where it is there: who made it may have been killed before this.

@@ -75,6 +75,9 @@ def check_file(sums: Mapping[str, str], path: Path) -> None:
 def sha256_of(path: Path) -> str:
     """Return a file's checksum in hexadecimal."""
     try:
+        if path.exists() and not path.is_file():
+            # A pipe or a device has no end.
+            raise InputError(f'{path}: not a regular file; take another copy')
         with path.open('rb') as file:
             return hashlib.file_digest(file, 'sha256').hexdigest()
     except OSError as error:

@@ -95,7 +95,10 @@ def _inside(folder: Path) -> list[Path]:
 
 def _declared_name(path: Path) -> str:
     try:
-        found = _NAME.search(path.read_text(encoding='utf-8', errors='replace')[:10_000])
+        if not path.is_file():
+            return ''
+        with path.open('rb') as file:
+            found = _NAME.search(file.read(10_000).decode(errors='replace'))
     except OSError:
         return ''
     return found[1] if found else ''

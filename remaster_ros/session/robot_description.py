@@ -25,6 +25,8 @@ from remaster_ros.session.files import URDF_LIMIT, decode_text, read_limited
 
 CPU_S = 30
 """Processor time for an expansion, s: the largest descriptions take 2."""
+WALL_S = 30.0
+"""Wall time for an expansion, s, also where a busy computer gives it little processor time."""
 _KEPT = ('AMENT_PREFIX_PATH', 'LD_LIBRARY_PATH')
 """Of the environment: where packages are, and what Python itself may need to start."""
 # Headers of hundreds of columns are shorter, bytes.
@@ -92,13 +94,12 @@ def read_description(
             capture_output=True,
             env=kept,
             check=False,
-            # It computes and waits for nothing; a busy machine may give it a tenth of a core.
-            timeout=10.0 * CPU_S,
+            timeout=WALL_S,
         )
     except subprocess.TimeoutExpired:
-        raise _too_slow(path) from None
+        raise _too_slow(path, f'{WALL_S:g} s; if this computer is busy, try again') from None
     if done.returncode in (-signal.SIGXCPU, -signal.SIGKILL):
-        raise _too_slow(path)
+        raise _too_slow(path, f'{CPU_S} s of processor time')
     printed = _COLOURS.sub('', done.stderr.decode(errors='replace')).splitlines()
     try:
         answer = json.loads(done.stdout)
@@ -115,10 +116,10 @@ def read_description(
     return f'<?xml version="1.0"?>\n<!-- expanded from {path.name} by xacro -->\n{answer["text"]}'
 
 
-def _too_slow(path: Path) -> InputError:
+def _too_slow(path: Path, after: str) -> InputError:
     return InputError(
-        f'{path}: xacro: it is not expanded after {CPU_S} s of processor time; does a macro call '
-        'itself, or double what it is given?'
+        f'{path}: xacro: it is not expanded after {after}; does a macro call itself, or double '
+        'what it is given?'
     )
 
 

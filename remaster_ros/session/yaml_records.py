@@ -131,7 +131,7 @@ def key_lines(text: str) -> dict[Keys, int]:
 
     try:
         visit(yaml.compose(text, Loader=yaml.SafeLoader), ())
-    except yaml.YAMLError:
+    except (yaml.YAMLError, RecursionError):
         return {}
     return lines
 

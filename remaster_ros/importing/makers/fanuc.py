@@ -32,7 +32,7 @@ def read(text: str) -> Named | None:
     """Return the joint positions of a program of FANUC's; None for anything else."""
     if re.search(r'\$POSREG\b.*\bARRAY\b', text):
         return _registers(text)
-    if not re.search(r'^\s*/PROG\b|^\s*PR?\[\d+[^\n]*\]\s*\{', text, re.MULTILINE):
+    if not re.search(r'^[ \t]*/PROG\b|^[ \t]*PR?\[\d+[^\n]*\]\s*\{', text, re.MULTILINE):
         return None
     found: list[tuple[int, str, dict[str, str]]] = []
     name, opened, place, places, untaught = '', 0, False, 0, 0
@@ -61,9 +61,11 @@ def read(text: str) -> Named | None:
                 others.add(joint[1])
                 at = joint.end()
             elif joint := _JOINT.match(line, at):
-                if joint[1] in values or (joint[1][0] == 'J' and joint[3] != 'deg'):
+                if joint[1].replace('XT', '') in values or (
+                    joint[1][0] == 'J' and joint[3] != 'deg'
+                ):
                     raise unexpected(number, line, 'each axis once, in deg,')
-                values[joint[1]] = joint[2]
+                values[joint[1].replace('XT', '')] = joint[2]
                 at = joint.end()
             elif cartesian := _PLACE.match(line, at):
                 place, at = True, cartesian.end()

@@ -18,7 +18,9 @@ _EXPECTED = '#name and an angle for each joint'
 
 def read(text: str) -> Named | None:
     """Return the joint displacements of a text in AS; None for anything else."""
-    if not (re.search(r'^\s*\.JOINTS', text, re.MULTILINE | re.IGNORECASE) or _CALL.search(text)):
+    if not (
+        re.search(r'^[ \t]*\.JOINTS', text, re.MULTILINE | re.IGNORECASE) or _CALL.search(text)
+    ):
         return None
     found: list[tuple[int, str, dict[str, str]]] = []
     section, places = '', 0

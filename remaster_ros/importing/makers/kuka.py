@@ -20,6 +20,8 @@ _MOVE = re.compile(r'\s*S?(?:PTP|LIN)\s+([A-Za-z]\w*)', re.IGNORECASE)
 _NAME = re.compile(r'([A-Za-z]\w*(?:\[\d+\])?)\s*=\s*$')
 _LABEL = re.compile(r'\s*([A-Za-z]\w*)\s*[:;,]?\s*$')
 _PROGRAM = re.compile(r'\s*(?:&[A-Z]|;\s*FOLD|DEF(?:DAT)?\s+\w[^:\n]*(?:\n|$))', re.IGNORECASE)
+# A name in KRL has 24 characters, and stands directly before its position.
+_LONGEST_NAME = 200
 _EXPECTED = '{E6AXIS: A1 …, A2 …} with a number for each axis'
 
 
@@ -36,8 +38,10 @@ def read(text: str) -> Named | None:
         if axes and _RELATIVE.search(code):
             raise unexpected(number, line, 'a position, not a way from one to another,')
         if axes:
-            for aggregate in axes:
-                found.append((number, *_position(number, line, code, aggregate)))
+            ends = [0, *(aggregate.end() for aggregate in axes)]
+            for end, aggregate in zip(ends, axes):
+                before = code[max(end, aggregate.start() - _LONGEST_NAME) : aggregate.start()]
+                found.append((number, *_position(number, line, before, aggregate)))
         elif _PLACE.search(code):
             places.append(number)
         elif (
@@ -72,16 +76,18 @@ def _point(name: str) -> str:
 
 
 def _position(
-    number: int, line: str, code: str, aggregate: re.Match[str]
+    number: int, line: str, before: str, aggregate: re.Match[str]
 ) -> tuple[str, dict[str, str]]:
-    """Return the name of a position, '' where it has none, and its axes."""
+    """Return the name of a position, '' where it has none, and its axes.
+
+    ``before``: the text between the position before and this one.
+    """
     values: dict[str, str] = {}
     for part in aggregate[1].split(','):
         entry = _ENTRY.fullmatch(part)
         if entry is None or entry[1].upper() in values:
             raise unexpected(number, line, _EXPECTED)
         values[entry[1].upper()] = entry[2]
-    before = code[: aggregate.start()]
     named = _NAME.search(before) or _LABEL.fullmatch(before)
     name = '' if named is None or named[1].upper() in _NO_NAMES else named[1]
     return _point(name), values

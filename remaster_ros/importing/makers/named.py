@@ -12,8 +12,8 @@ from remaster_ros.errors import InputError
 SHOWN = 60
 NUMBER = re.compile(r'[+-]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][+-]?\d+)?', re.ASCII)
 _TIME = re.compile(r'\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d(?:[.,]\d+)?|\d{5,}\.\d+')
-# An arm that this program calibrates has more than one joint.
-_FEWEST_AXES = 2
+# An arm that this program calibrates has more than one joint, and no controller has more axes.
+_FEWEST_AXES, _MOST_AXES = 2, 100
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,6 +82,9 @@ def axes_in_order(
     are those of the arm's axes, then of external axes, which are left out where they stay at 0.
     """
     every = {axis for _, _, values in found for axis in values}
+    if len(every) > _MOST_AXES:
+        number = next(number for number, _, values in found if values)
+        raise unexpected(number, f'{len(every)} axes', f'{_MOST_AXES} at the most')
     axes = sorted(every, key=lambda axis: (letters.index(axis[0]), int(axis[1:])))
     arm = [axis for axis in axes if axis[0] == letters[0]]
     if arm != [f'{letters[0]}{i}' for i in range(1, len(arm) + 1)] or len(arm) < _FEWEST_AXES:
@@ -90,11 +93,8 @@ def axes_in_order(
         for axis in arm:
             if axis not in values:
                 raise unexpected(number, f'{name} {", ".join(values)}', f'{axis} as well')
-    axes = arm + [
-        axis
-        for axis in axes
-        if axis not in arm and any(float(values.get(axis, '0')) for _, _, values in found)
-    ]
+    moved = {axis for *_, values in found for axis, cell in values.items() if float(cell)}
+    axes = arm + [axis for axis in axes if axis[0] != letters[0] and axis in moved]
     named = any(name for _, name, _ in found)
     return Named(
         kind=kind,

@@ -21,7 +21,7 @@ _ARRAY = re.compile(r'\s*([A-Za-z]\w*)\s*\{\s*(\d+)\s*\}\s*:=\s*\[')
 _TARGET = re.compile(r'\bjointtarget\b', re.IGNORECASE)
 # Rokae's, which may end without a semicolon.
 _ROKAE = re.compile(r'\bjointtarget\s+\w+\s*=\s*J\s*:', re.IGNORECASE)
-_LISTED = re.compile(r'^\s*\[\s*\[', re.MULTILINE)
+_LISTED = re.compile(r'^[ \t]*\[\s*\[', re.MULTILINE)
 _MOVE = re.compile(r'\bMoveAbsJ\s*\[', re.IGNORECASE)
 _ASSIGNED = re.compile(r'\s*([A-Za-z]\w*)\s*:?=\s*')
 _VALUE = re.compile(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from bisect import bisect_right
 from collections import Counter
 
 from remaster_ros.importing.makers.named import NUMBER, Named, axes_in_order, unexpected
@@ -21,8 +22,9 @@ def read(text: str) -> Named | None:
     found: list[tuple[int, str, dict[str, str]]] = []
     name, several = '', False
     without_key: list[tuple[int, str]] = []
+    starts = [newline.end() for newline in re.finditer('\n', text)]
     for tag in _TAG.finditer(text):
-        number = text.count('\n', 0, tag.start()) + 1
+        number = bisect_right(starts, tag.start()) + 1
         attributes = dict(_ATTRIBUTE.findall(tag[0]))
         if 'name' in attributes:
             name = attributes['name']

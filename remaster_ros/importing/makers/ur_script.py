@@ -26,7 +26,9 @@ def read(text: str) -> Named | None:
     if re.search(r'<JointAngles\b', text):
         return _waypoints(text)
     if not re.search(
-        r'\b(?:move[jlp]|servoj)\s*\(|^\s*(?:global\s+)?\w+_q\s*=\s*\[', text, re.MULTILINE
+        r'\b(?:move[jlp]|servoj)\s*\(|^[ \t]*(?:global[ \t]+)?\w+_q[ \t]*=\s*\[',
+        text,
+        re.MULTILINE,
     ):
         return None
     named = {*re.findall(r'\bmovej\s*\(\s*([A-Za-z]\w*)\s*[,)]', text)}
@@ -84,16 +86,16 @@ def read(text: str) -> Named | None:
 
 def _whole_lists(text: str) -> list[tuple[int, str]]:
     """Return the lines without comments, those of one list together, and where each begins."""
-    lines: list[tuple[int, str]] = []
+    lines: list[tuple[int, list[str]]] = []
     opened = 0
     for number, line in enumerate(text.splitlines(), 1):
         code = line.partition('#')[0]
         if opened > 0:
-            lines[-1] = lines[-1][0], f'{lines[-1][1]} {code.strip()}'
+            lines[-1][1].append(code.strip())
         else:
-            lines.append((number, code))
+            lines.append((number, [code]))
         opened = max(opened, 0) + code.count('[') - code.count(']')
-    return lines
+    return [(number, ' '.join(parts)) for number, parts in lines]
 
 
 _WAYPOINT = re.compile(r'<Waypoint\b[^<>]*\bname="([^"<>]*)"|<JointAngles\b([^<>]*)(?:>|$)')

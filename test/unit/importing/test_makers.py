@@ -60,6 +60,25 @@ def test_the_coupling_of_fanuc_and_the_names_are_kept(tmp_path, imported):
     assert session.controller.joints['joint_3'].coupling == {'joint_2': 1}
 
 
+@pytest.mark.parametrize('axis', ['E1', 'EXT1'])
+def test_a_rail_of_fanuc_is_read_under_both_of_its_names(axis, tmp_path):
+    arm = measured(rows=12)
+    program = KINDS['fanuc'].write(names_of('fanuc', len(arm.q)), np.rad2deg(arm.q))
+    places = iter(range(10, 1000))
+    along = re.sub(
+        '(J6 *= *[-.0-9]+ *deg)', lambda j6: f'{j6[1]}, {axis}= {next(places)}.0 mm', program
+    )
+    assert f'{axis}= 10.0 mm' in along
+    table = read_table(write(tmp_path, 'calib.ls', along))
+    assert [row[table.names.index('E1')] for row in table.rows][:2] == ['10.0', '11.0']
+    # An axis that stands at 0 throughout is left out, as of other makers.
+    parked = re.sub(f'{axis}= [0-9.]+', f'{axis}= 0.0', along)
+    assert 'E1' not in read_table(write(tmp_path, 'calib.ls', parked)).names
+    twice = along.replace(f'{axis}= 10.0 mm', 'E1= 10.0 mm, EXT1= 10.0 mm')
+    with pytest.raises(InputError, match='each axis once'):
+        read_table(write(tmp_path, 'calib.ls', twice))
+
+
 def test_a_description_that_couples_itself_is_left_as_it_is(tmp_path, imported):
     arm = measured(rows=30)
     names = names_of('fanuc', len(arm.q))

@@ -11,7 +11,7 @@ import pytest
 from remaster_ros.errors import InputError
 from remaster_ros.session import robot_description
 from remaster_ros.session.meshes import find_mesh, read_mesh
-from remaster_ros.session.robot_description import read_description
+from remaster_ros.session.robot_description import read_arm, read_description
 from remaster_ros.session.xacro_expansion import ExpressionError, evaluate, global_names
 
 NAMESPACE = 'xmlns:xacro="http://www.ros.org/wiki/xacro"'
@@ -285,19 +285,50 @@ def test_a_hostile_description_is_refused_in_one_line_and_leaves_no_trace(name, 
     assert 'SECRET-TEXT' not in line + caplog.text
 
 
-def test_macros_that_double_end_in_bounded_time(cell, monkeypatch):
-    monkeypatch.setattr(robot_description, 'CPU_S', 1)
-    path = cell / 'arm.urdf.xacro'
-    macros = ''.join(
+# A pattern of xacro's own takes exponential time for this default of a parameter.
+BOMBS = {
+    'macros that double': '<xacro:macro name="m0"><a/></xacro:macro>'
+    + ''.join(
         f'<xacro:macro name="m{i + 1}"><xacro:m{i}/><xacro:m{i}/></xacro:macro>' for i in range(60)
     )
-    path.write_text(robot(f'<xacro:macro name="m0"><a/></xacro:macro>{macros}<xacro:m60/>'))
-    with pytest.raises(InputError, match='not expanded after 1 s of processor time'):
+    + '<xacro:m60/>',
+    'a default of many ways': f'<xacro:macro name="m" params="p:={"a" * 60}&quot;"/>',
+}
+
+
+@pytest.mark.parametrize('limit', ['CPU_S', 'WALL_S'])
+@pytest.mark.parametrize('name', BOMBS)
+def test_a_bomb_ends_by_either_limit(name, limit, cell, monkeypatch):
+    """By processor time; and by wall time where a busy computer gives it little of that."""
+    monkeypatch.setattr(robot_description, limit, 1)
+    path = cell / 'arm.urdf.xacro'
+    path.write_text(robot(BOMBS[name]))
+    words = {'CPU_S': '1 s of processor time;', 'WALL_S': '1 s; if this computer is busy'}[limit]
+    with pytest.raises(InputError, match=f'not expanded after {words}'):
         read_description(path)
-    # A pattern of xacro's own that takes exponential time for this default of a parameter.
-    path.write_text(robot(f'<xacro:macro name="m" params="p:={"a" * 60}&quot;"/>'))
-    with pytest.raises(InputError, match='not expanded after 1 s of processor time'):
-        read_description(path)
+
+
+def test_the_limits_are_half_a_minute():
+    assert robot_description.CPU_S == robot_description.WALL_S == 30
+
+
+def chain_of(joints, kind='revolute'):
+    """Return a URDF of so many joints one behind the other."""
+    parts = ''.join(
+        f'<link name="l{i + 1}"/><joint name="j{i}" type="{kind}"><parent link="l{i}"/>'
+        f'<child link="l{i + 1}"/><axis xyz="0 0 1"/>'
+        '<limit lower="-1" upper="1" velocity="1" effort="1"/></joint>'
+        for i in range(joints)
+    )
+    return f'<robot name="r"><link name="l0"/>{parts}</robot>'
+
+
+@pytest.mark.parametrize('kind', ['revolute', 'fixed', 'prismatic'])
+@pytest.mark.parametrize(('joints', 'words'), [(300, 'links between'), (60_000, '60001 links')])
+def test_a_description_of_more_links_than_any_robot_has_is_refused(joints, words, kind, tmp_path):
+    (tmp_path / 'arm.urdf').write_text(chain_of(joints, kind))
+    with pytest.raises(InputError, match=words):
+        read_arm(tmp_path / 'arm.urdf')
 
 
 @pytest.mark.parametrize('name', ['arm.urdf', 'arm.xml', 'arm'])
