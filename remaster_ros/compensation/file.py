@@ -527,8 +527,8 @@ def _model(content: CompensationPart) -> ArmModel:
         BaseTerm(term.effect, *_function(term, f'base_terms.{i}', chain, 3))
         for i, term in enumerate(content.base_terms)
     )
-    for sensor, part in content.base_frame.items():
-        if abs(np.linalg.norm(part.rotation_xyzw) - 1.0) > 1e-3:
+    for sensor, frame in content.base_frame.items():
+        if abs(np.linalg.norm(frame.rotation_xyzw) - 1.0) > 1e-3:
             raise _broken(f'base_frame.{sensor}.rotation_xyzw', 'is no quaternion of length 1')
     warm = content.temperature
     model = ArmModel(
