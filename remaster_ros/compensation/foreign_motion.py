@@ -16,6 +16,7 @@ import numpy as np
 from remaster_ros.compensation.compensator import Compensator
 from remaster_ros.compensation.in_use import CorrectionInUse
 from remaster_ros.compensation.trajectories import (
+    DrawnPath,
     Now,
     corrected_points,
     corrected_trajectory,
@@ -44,6 +45,11 @@ NEAR_RAD = 2e-4
 hundredths of the way. So near to the end of a trajectory the arm has arrived: it stands still."""
 KNOWN_RAD = 1e-7
 """It is known where a further step changes less, rad: an encoder of 23 bits reads 7e-7."""
+PLACES = 33
+"""A stretch of a path is looked at in so many places."""
+LONGEST_S = 3600.0
+"""No trajectory of a planner takes longer, s: an hour. Switching waits for its end, and a slip of
+the unit is a thousand times as long."""
 EVERY_S = 0.02
 """While the arm moves the correction of reported angles is found anew so often, s."""
 ADDED_RAD_S = 0.5
@@ -69,9 +75,26 @@ class Passed:
 
     admitted: Admitted  # What the gate has let pass
     end_s: float  # When it ends, from its start
+    # Where the arm was when this was worked out, rad and rad/s, (k,) each, and whether it stood
+    start: FloatArray
+    velocity: FloatArray
+    stood: bool
     notes: tuple[str, ...] = ()  # What a person is to know of it, a line each
     # What is commanded at its end, and what was wanted there, rad, (k,); None where it is held
     end: tuple[FloatArray, FloatArray] | None = None
+
+    def places(self, since_s: float, until_s: float) -> FloatArray:
+        """Return where the controller leads the arm between two times from its start, (n, k)."""
+        waypoints = self.admitted.waypoints
+        times = np.array([0.0, *(point.time_s for point in waypoints)])
+        q = np.array([self.start, *(point.q for point in waypoints)])
+        v = np.array([self.velocity, *(point.velocity for point in waypoints)])
+        first = 1 if times[1] <= 0.0 else 0
+        drawn = DrawnPath(
+            times[first:], q[first:], None if self.admitted.is_straight else v[first:]
+        )
+        between = np.linspace(since_s, until_s, PLACES)
+        return drawn.at(np.clip(between, times[first], times[-1]))
 
 
 class Present:
@@ -97,6 +120,12 @@ class Present:
         while len(reports) > 2 and reports[1][0] <= stamp_s - STANDING_S:
             reports.popleft()
         self._wall_s = wall_s
+
+    def snapshot(self) -> Present:
+        """Return it as it is now, for another thread."""
+        taken = Present()
+        taken._reports, taken._wall_s = self._reports.copy(), self._wall_s
+        return taken
 
     def is_fresh(self, wall_s: float) -> bool:
         """Whether the last report still shows where the arm is."""
@@ -209,7 +238,7 @@ def passed_on(
     Raises InputError: the trajectory is refused; one line.
     """
     if not len(wanted.times_s):
-        return Passed(gate.admit((), arm.q, arm.velocity), 0.0)
+        return _passed(gate.admit((), arm.q, arm.velocity), 0.0, arm, [])
     _refuse_bad_numbers(wanted)
     if told is None:
         told = correction.compensator.true(arm.q, temperature_c)
@@ -229,7 +258,18 @@ def passed_on(
                 'them, and begin where the arm stands'
             )
         raise InputError(f'{error}{hint}') from None
-    return Passed(admitted, float(t[-1]), tuple(notes), (q[-1], wanted.positions[-1]))
+    end = q[-1], wanted.positions[-1]
+    return _passed(admitted, float(t[-1]), arm, notes, end)
+
+
+def _passed(
+    admitted: Admitted,
+    end_s: float,
+    arm: Present,
+    notes: list[str],
+    end: tuple[FloatArray, FloatArray] | None = None,
+) -> Passed:
+    return Passed(admitted, end_s, arm.q, arm.velocity, arm.stands, tuple(notes), end)
 
 
 def _refuse_bad_numbers(wanted: Trajectory) -> None:
@@ -238,6 +278,8 @@ def _refuse_bad_numbers(wanted: Trajectory) -> None:
         raise InputError('a number of it is not finite')
     if t[0] < 0.0 or np.any(np.diff(t) <= 0.0):
         raise InputError('its times do not ascend from 0 on')
+    if t[-1] > LONGEST_S:
+        raise InputError(f'it takes {t[-1]:.0f} s; {LONGEST_S:.0f} are the most')
 
 
 def _refuse_too_fast(

@@ -97,7 +97,7 @@ def corrected_trajectory(
     path whose correction no point per millisecond follows.
     """
     t, q, v = _checked(compensator, times_s, positions, velocities)
-    wanted = _Path(t, q, v)
+    wanted = DrawnPath(t, q, v)
     if velocity_limits is None:
         velocity_limits = compensator.model.chain.velocity_limits
     speed_limits = np.broadcast_to(np.asarray(velocity_limits, dtype=float), q.shape[1:])
@@ -155,10 +155,10 @@ def largest_speeds(
     times_s: FloatArray, positions: FloatArray, velocities: FloatArray | None
 ) -> FloatArray:
     """Return the largest speed of each joint of what a controller draws, rad/s, (k,)."""
-    return _Path(times_s, positions, velocities).largest()[0]
+    return DrawnPath(times_s, positions, velocities).largest()[0]
 
 
-class _Path:
+class DrawnPath:
     """What a controller draws through points."""
 
     def __init__(self, t: FloatArray, q: FloatArray, v: FloatArray | None) -> None:
@@ -229,7 +229,7 @@ def _checked(
     return t, q, v
 
 
-def _spread(compensator: Compensator, wanted: _Path) -> FloatArray:
+def _spread(compensator: Compensator, wanted: DrawnPath) -> FloatArray:
     """Return times between which the correction cannot hide a wave."""
     orders = [term.function.order for term in compensator.model.joint_terms]
     step = min(LONGEST_STEP_RAD, 2.0 * np.pi / (POINTS_OF_WAVE * max([1, *orders])))
@@ -283,18 +283,18 @@ def _thinned(times: FloatArray, apart_s: float) -> IntArray:
 
 def _corrected(
     compensator: Compensator,
-    wanted: _Path,
+    wanted: DrawnPath,
     times: FloatArray,
     knots: IntArray,
     limits: tuple[FloatArray, FloatArray],
     ends: Ends,
     temperature_c: float | None,
     before: SmoothChanges | None,
-) -> tuple[_Path, Correction, SmoothChanges]:
+) -> tuple[DrawnPath, Correction, SmoothChanges]:
     """Return the corrected path through points at these times, and what was done to them."""
     q = wanted.at(times)
     v = None if wanted.v is None else wanted.speed(times)
-    path = _Path(times, q, v)
+    path = DrawnPath(times, q, v)
     unit = compensator.model.chain.per_radian
     problem = compensator.problem(q[knots], temperature_c)
     speeds = np.zeros_like(q) if v is None else v
@@ -311,7 +311,7 @@ def _corrected(
     command = q + unit * change
     every = problem if len(knots) == len(times) else compensator.problem(q, temperature_c)
     done = compensator.correction(command, every.left(change))
-    return _Path(times, command, None if v is None else v + unit * added), done, changes
+    return DrawnPath(times, command, None if v is None else v + unit * added), done, changes
 
 
 def _largest_between(accelerations: FloatArray, knots: IntArray) -> FloatArray:
@@ -332,8 +332,8 @@ def _largest_between(accelerations: FloatArray, knots: IntArray) -> FloatArray:
 
 def _between(
     compensator: Compensator,
-    wanted: _Path,
-    sent: _Path,
+    wanted: DrawnPath,
+    sent: DrawnPath,
     knots: IntArray,
     temperature_c: float | None,
 ) -> FloatArray:
@@ -379,7 +379,7 @@ def corrected_points(
         problem.errors,
         times,
         problem.own,
-        (_Path(times, q, speeds).accelerations() / unit, np.zeros_like(q)),
+        (DrawnPath(times, q, speeds).accelerations() / unit, np.zeros_like(q)),
         limits,
         # The controller goes on from the speed of the arm, whatever part the correction has in it.
         Ends((now.q - now.told) / unit, None, True, v is not None and not np.any(v[-1])),

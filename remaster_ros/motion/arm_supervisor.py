@@ -102,8 +102,6 @@ class ArmSupervisor:
         self._interlocks = Interlocks(rules.heartbeat_s, rules.resume_alone_s)
         self._queue = MoveQueue()
         self._motion = MotionUnderWay(gate, rules, end, Arm.HALTED if halted else Arm.STANDS)
-        # Where the arm is reported, which a person was asked to compare with the pad.
-        self._asked: FloatArray | None = None
         # Whether it may be elsewhere than reported, until a probe has led it there to its end.
         self._unsure = end is None
         self._wall = -np.inf
@@ -233,7 +231,7 @@ class ArmSupervisor:
         actions = self._step(Event.CHECKED)
         if seen is None or self.blocked(wall_s) or not seen.stands(wall_s):
             return actions
-        if self._differs(start, seen.q):
+        if self._motion.led.differs(start, seen.q):
             # It was moved since: it is asked again.
             return []
         if answer.path is None and answer.at_start:
@@ -257,12 +255,12 @@ class ArmSupervisor:
         if not self.halted:
             return 'the arm is not halted'
         seen = self._seen
-        if seen is not None and seen.is_fresh(self._wall) and self._elsewhere(seen.q):
-            asked, self._asked = self._asked, seen.q
-            if asked is None or self._differs(asked, seen.q):
-                return self._elsewhere(seen.q)
-            self._motion.end, self._unsure = seen.q, True
-        self._asked = None
+        led = self._motion.led
+        if seen is not None and seen.is_fresh(self._wall) and led.elsewhere(seen.q):
+            if refusal := led.confirm(seen.q):
+                return refusal
+            self._unsure = True
+        led.forget_question()
         self.halted = ''
         self._step(Event.CLEARED)
         self._interlocks.revoke('the halt was cleared')
@@ -355,7 +353,7 @@ class ArmSupervisor:
     @property
     def end(self) -> FloatArray | None:
         """Where the last command led, (k,); None before it is sure that the arm is there."""
-        return None if self._unsure else self._motion.end
+        return None if self._unsure else self._motion.led.end
 
     @property
     def busy(self) -> bool:
@@ -405,33 +403,6 @@ class ArmSupervisor:
             return ''
         return f'the robot was not observed for {gap_s / self._rate:.1f} s'
 
-    # Inside: where the arm is
-
-    def _differs(self, q: FloatArray, other: FloatArray) -> bool:
-        return self.rules.units.largest(q - other) > self.rules.settle.arrive_tolerance
-
-    def _elsewhere(self, q: FloatArray) -> str:
-        """Return that the arm is reported elsewhere than the last command led, and what to do; ''.
-
-        ``q``: where it is reported, rad or m, (k,).
-        """
-        end, units = self._motion.end, self.rules.units
-        if end is None or not self._differs(q, end):
-            return ''
-        off = np.abs(q - end) > self.rules.settle.arrive_tolerance * units.per_radian
-        joints = ', '.join(
-            f'{name} at {units.in_degrees(i, q[i])}, '
-            f'{units.in_degrees(i, q[i] - end[i], sign="+")} from there'
-            for i, name in enumerate(self.gate.limits.names)
-            if off[i]
-        )
-        shown = 'positions' if any(units.slides) else 'angles'
-        return (
-            f'the arm is not reported where the last command led: {joints}; compare with the '
-            f"robot's own display: where it shows the same {shown}, /remaster/clear_halt confirms "
-            'them; where it does not, joint_states are wrong: see to the driver first'
-        )
-
     # Inside: the next configuration
 
     def _go_on(self, wall_s: float) -> list[Action]:
@@ -439,9 +410,9 @@ class ArmSupervisor:
         seen, queue = self._seen, self._queue
         if seen is None or self.state is not Arm.STANDS or not seen.stands(wall_s):
             return []
-        elsewhere = self._elsewhere(seen.q)
+        elsewhere = self._motion.led.elsewhere(seen.q)
         if elsewhere:
-            self._asked = seen.q
+            self._motion.led.ask(seen.q)
             return self._halt(elsewhere)
         if queue.place in (Place.UNKNOWN, Place.PROBED):
             return self._step(Event.ASK, queue.ask(STANDING, seen.q, seen.q))

@@ -35,6 +35,10 @@ from remaster_ros.types import BoolArray, FloatArray
 START_RAD = 2e-3
 """A move begins so near to where the arm stands, rad: the way between is not checked. At the end
 of an arm of a metre that is 2 mm; a slide, 0.5 mm off, has nothing further off than that."""
+STEP_S = 0.1
+"""Where a controller draws lines the speed steps from one to the next: by no more than what the
+acceleration limit allows in so much time, s. A servo follows a step within its lag, for which
+`SupervisorRules.lag_s` allows 0.35 s, and which is a tenth of a second on the simulated arm."""
 SLOW_RAD_S = START_RAD / 0.1
 """An arm that is no faster has hardly moved when it begins, rad/s: a tenth of a second may be
 between a report of it and the command (as much as a busy machine may add to its lag)."""
@@ -316,6 +320,13 @@ class ForeignGate:
         _check_rate('speed', largest, limits.velocity, 's', limits)
         largest = pieces.largest_acceleration().max(axis=0)
         _check_rate('acceleration', largest, limits.acceleration, 's2', limits)
+        if is_straight:
+            # Where two lines meet, and at rest before the first and behind the last.
+            rest = np.zeros_like(q)
+            begins = velocity if waypoints[0].time_s > 0.0 else rest
+            rates = np.vstack((begins, first, rest))
+            steps = np.abs(np.diff(rates, axis=0)).max(axis=0)
+            _check_rate('step of its speed', steps, STEP_S * limits.acceleration, 's', limits)
         return Admitted(tuple(waypoints), None, is_straight)
 
     def brake(self, q: FloatArray, velocity: FloatArray) -> Admitted:

@@ -17,6 +17,7 @@ from remaster_ros.motion.following import (
     allowed_lag_s,
 )
 from remaster_ros.motion.joint_units import JointUnits
+from remaster_ros.motion.led_last import LedLast
 from remaster_ros.motion.motion_gate import MotionGate
 from remaster_ros.motion.path_check import FreePath
 from remaster_ros.motion.settling import SettleDetector
@@ -147,7 +148,7 @@ class MotionUnderWay:
 
     ``gate``: every command comes from it; ``end``: where the last command led that was sent before
     this process was started, rad or m, (k,); None where that is not known; ``state``: to begin in.
-    Attributes: ``state``: see `states.ARM`; ``end``: where the last command led, (k,); ``visit``:
+    Attributes: ``state``: see `states.ARM`; ``led``: where the last command led; ``visit``:
     the configuration under way, ``braking``: the stop under way; None in the states without one.
     """
 
@@ -155,7 +156,10 @@ class MotionUnderWay:
         self, gate: MotionGate, rules: SupervisorRules, end: FloatArray | None, state: Arm
     ) -> None:
         self.gate, self.rules, self.state = gate, rules, state
-        self.end = self._end_before = end
+        settle, limits = rules.settle, gate.limits
+        self.led = LedLast(
+            limits.names, rules.units, settle.arrive_tolerance, end, '/remaster/clear_halt'
+        )
         # The farthest that the arm was reported from an end while it stood there, rad.
         self._stood_off = -np.inf
         self.visit: Visit | None = None
@@ -207,7 +211,7 @@ class MotionUnderWay:
         detector = SettleDetector(trajectory.end, rules.settle)
         following = Following(trajectory, time, wall_s, rules)
         self.visit = Visit(solution, following, detector, rules, seen.stamp, deadline)
-        self._lead_to(trajectory.end)
+        self.led.lead_to(trajectory.end)
         return Drive(solution, admitted, wall_s)
 
     def judge(self, seen: Seen, rate: float, *, recorder_waits: bool) -> Outcome:
@@ -245,12 +249,9 @@ class MotionUnderWay:
         deadline = over + max(STOPPED_S, patience_s)
         units = self.rules.units
         self.braking = Braking(stop.q, begins, over, deadline, self.near, patience_s, units)
-        self._lead_to(stop.q)
+        self.led.lead_to(stop.q)
         return Stop(admitted, reason, wall_s)
 
     def take_back(self) -> None:
         """Process that the last command was not sent."""
-        self.end = self._end_before
-
-    def _lead_to(self, end: FloatArray) -> None:
-        self._end_before, self.end = self.end, end
+        self.led.take_back()

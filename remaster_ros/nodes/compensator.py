@@ -8,10 +8,12 @@ the way: that is the planner's.
 
 from __future__ import annotations
 
+import itertools
 import json
+import sys
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -28,8 +30,20 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 from remaster_ros.collection.message_fields import JointOrder, refuse_repeated, seconds
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.same_arm import axes_apart, difference
+from remaster_ros.motion.actions import SupervisorRules
+from remaster_ros.motion.following import ON_PATH_RAD, allowed_lag_s
+from remaster_ros.motion.joint_units import JointUnits
+from remaster_ros.motion.led_last import LedLast
 from remaster_ros.motion.limits import ACCELERATION, MotionLimits
-from remaster_ros.motion.motion_gate import Admitted, ForeignGate
+from remaster_ros.motion.motion_gate import (
+    START_RAD,
+    Admitted,
+    ForeignGate,
+    MotionRefusedError,
+)
+from remaster_ros.motion.motion_under_way import STOPPED_S
+from remaster_ros.motion.settling import SettleRules
+from remaster_ros.nodes.background import Background
 from remaster_ros.nodes.controller_link import control_messages
 from remaster_ros.nodes.messages import duration_of
 from remaster_ros.nodes.parameters import declare, parameter
@@ -37,6 +51,7 @@ from remaster_ros.nodes.rivals import JOINTS, ArmStates, OnlyPublisher
 from remaster_ros.nodes.robot_bridge import DESCRIPTION, DESCRIPTION_QOS, NEWEST_STATES
 from remaster_ros.nodes.running import RemasterNode, fault_of_this_program, run
 from remaster_ros.nodes.status import LEASED, RELIABLE
+from remaster_ros.session.bridge_files import LastCommandFile
 from remaster_ros.types import FloatArray
 
 NOW_S = 0.1
@@ -144,6 +159,25 @@ class CompensatorNode(RemasterNode):
         self._halted = ''
         self._said: dict[str, float] = {}
         self._told = ''
+        # What is worked out beside the callbacks, and numbers of what was wanted and is still.
+        self._work, self._disk = Background(self), Background(self)
+        self._numbers = itertools.count()
+        self._wanted = -1
+        # What was passed on last, and when (s of the node's clock).
+        self._passed: Any = None
+        self._begun_s = -np.inf
+        names = self.get_fully_qualified_name()
+        self._command_file = LastCommandFile(names, self._names)
+        # A simulated arm begins anew with each world: nothing holds from the one before.
+        self._keeps_end = not self.get_parameter('use_sim_time').value
+        last = self._command_file.read(time.time_ns()) if self._keeps_end else None
+        self._led = LedLast(
+            self._names,
+            JointUnits.of(self._chain),
+            SettleRules().arrive_tolerance,
+            None if last is None else last.end,
+            self.resolve_topic_name('~/enable'),
+        )
         self._goals: list[_Goal] = []
         controller = self.p.controller
         self._commands_topic = self.resolve_topic_name(f'{controller}/joint_trajectory')
@@ -193,6 +227,8 @@ class CompensatorNode(RemasterNode):
             goal.cancelled = True
             if goal.sent is not None:
                 goal.sent.cancel_goal_async()
+        self._wanted = -1
+        self._note_held()
         present = self._present
         moves = present.is_known and present.is_fresh(time.monotonic()) and not present.stands
         if moves and self._on is not None:
@@ -246,8 +282,23 @@ class CompensatorNode(RemasterNode):
             topic = self.resolve_topic_name(self.p.temperature_topic)
             return f'{topic} has not come for {WARM_S:.0f} s'
         return (
-            self.clock_trouble or self._described or self._states.rival() or self._only.trouble()
+            self.clock_trouble
+            or self._described
+            or self._states.rival()
+            or self._only.trouble()
+            or self._misled()
         )
+
+    def _misled(self) -> str:
+        """Return that the arm is not reported where what was passed on has led it; ''."""
+        q, since_s = self._present.q, self.now_s() - self._begun_s
+        passed = self._passed
+        if passed is not None and passed.admitted.waypoints and since_s < passed.end_s + STOPPED_S:
+            places = passed.places(since_s - allowed_lag_s(SupervisorRules(), 1.0), since_s)
+            if np.abs(places - q).max(axis=1).min() <= ON_PATH_RAD:
+                return ''
+            return 'the arm is not reported on the way of the trajectory that was passed on'
+        return self._led.elsewhere(q)
 
     def _moves(self) -> str:
         """Return that the arm moves, or is about to; ''."""
@@ -270,6 +321,8 @@ class CompensatorNode(RemasterNode):
 
     def _switch(self, on: bool, request: Trigger.Request, response: Trigger.Response) -> Any:
         why = self._moves()
+        if on and not why and self._led.elsewhere(self._present.q):
+            why = self._led.confirm(self._present.q)
         if on and not why:
             try:
                 correction = self._read()
@@ -294,7 +347,7 @@ class CompensatorNode(RemasterNode):
 
     def _turn(self, on: bool) -> str:
         """Begin or end to correct, and return what is said of it."""
-        self._on = on
+        self._on, self._wanted = on, -1
         self._true = self._motion.TrueAngles(self._correction.compensator)
         self._in_use = used = self._correction if on else self._correction.off()
         limits = MotionLimits.of(self._chain, 1.0, used.shifts, self.p.acceleration_limit_rad_s2)
@@ -366,33 +419,131 @@ class CompensatorNode(RemasterNode):
 
     # What is passed on
 
-    def _passed(self, message: JointTrajectory) -> Any:
-        """Return what is sent for a planner's trajectory; an `InputError` why nothing is."""
-        why = self._trouble()
-        if not why and self._on is None:
-            why = self._moves() or 'the compensator has just been started'
-        if why:
-            raise InputError(why)
-        stamp_s = seconds(message.header.stamp)
-        if stamp_s and abs(stamp_s - self.now_s()) > NOW_S:
-            raise InputError(
-                f'its stamp is {stamp_s - self.now_s():+.2f} s from now: give none, for at once'
-            )
+    def _submit(
+        self,
+        message: JointTrajectory,
+        pass_on: Callable[[JointTrajectory], None],
+        refuse: Callable[[str], None],
+    ) -> None:
+        """Work out what is sent for a planner's trajectory, and pass it on.
+
+        Beside the callbacks, as that takes a second where there are ten thousand points. A
+        trajectory that comes meanwhile takes its place; an empty one, which lets the controller
+        hold the arm, waits for nothing.
+        """
+        number = self._wanted = next(self._numbers)
+        try:
+            why = self._trouble()
+            if not why and self._on is None:
+                why = self._moves() or 'the compensator has just been started'
+            if why:
+                raise InputError(why)
+            stamp_s = seconds(message.header.stamp)
+            ahead_s = stamp_s - self.now_s()
+            if stamp_s and abs(ahead_s) > NOW_S:
+                raise InputError(f'its stamp is {ahead_s:+.2f} s from now: give none, for at once')
+        except InputError as error:
+            refuse(str(error))
+            return
+        arm = self._present.snapshot()
+        told = arm.q + self._true.added if self._on else None
+        work = partial(self._work_out, message, arm, self._gate, self._in_use, self._warm, told)
+
+        def take(found: Any) -> None:
+            why = self._outdated(number, arm, found)
+            if isinstance(found, InputError):
+                refuse(str(found))
+            elif isinstance(found, Exception):
+                refuse(str(fault_of_this_program(found)))
+                self.on_fault(found)
+            elif why:
+                refuse(why)
+            else:
+                passed, sent = found
+                if not arm.stands:
+                    # It has gone on meanwhile.
+                    q, velocity = self._present.q, self._present.velocity
+                    passed = replace(passed, start=q, velocity=velocity)
+                for note in passed.notes:
+                    self.get_logger().info(note)
+                pass_on(sent)
+                self._note_led(passed)
+
+        if message.points:
+            self._work.submit(work, take)
+            return
+        try:
+            found: Any = work()
+        except InputError as error:
+            found = error
+        take(found)
+
+    def _work_out(
+        self,
+        message: JointTrajectory,
+        arm: Any,
+        gate: ForeignGate,
+        in_use: Any,
+        warm: float | None,
+        told: FloatArray | None,
+    ) -> tuple[Any, JointTrajectory]:
+        """Return what is passed on, and its message; reads nothing that callbacks change."""
         wanted = self._motion.Trajectory(*_points(message, self._names))
         passed = self._motion.passed_on(
-            wanted,
-            self._present,
-            self._gate,
-            self._in_use,
-            1e-3 * self.p.tolerance_mm,
-            self._warm,
-            self._present.q + self._true.added if self._on else None,
+            wanted, arm, gate, in_use, 1e-3 * self.p.tolerance_mm, warm, told
         )
+        return passed, self._message(passed.admitted)
+
+    def _outdated(self, number: int, arm: Any, found: Any) -> str:
+        """Return why what was worked out for an arm as it was is not passed on any more; ''."""
+        if number != self._wanted:
+            return 'another trajectory has come since'
+        if why := self._trouble():
+            return why
+        if arm.stands:
+            moved = np.abs(self._present.q - arm.q).max() > START_RAD
+            return 'the arm has moved since it came' if moved else ''
+        if isinstance(found, Exception):
+            return ''
+        admitted = found[0].admitted
+        try:
+            self._gate.admit(
+                admitted.waypoints,
+                self._present.q,
+                self._present.velocity,
+                is_straight=admitted.is_straight,
+            )
+        except MotionRefusedError as error:
+            return str(error)
+        return ''
+
+    def _note_led(self, passed: Any) -> None:
+        """Keep where the arm is led from now on."""
         self._true.lead(passed)
-        for note in passed.notes:
-            self.get_logger().info(note)
-        self._end_s = self.now_s() + passed.end_s
-        return passed
+        if not passed.admitted.waypoints:
+            self._note_held()
+            return
+        self._passed, self._begun_s = passed, self.now_s()
+        self._end_s = self._begun_s + passed.end_s
+        self._keep(passed.admitted.waypoints[-1].q)
+
+    def _note_held(self) -> None:
+        """Process that the controller holds the arm on its way: where on it, is not known."""
+        passed, since_s = self._passed, self.now_s() - self._begun_s
+        if passed is not None and passed.admitted.waypoints and since_s < passed.end_s:
+            lag_s = allowed_lag_s(SupervisorRules(), 1.0)
+            self._keep(*passed.places(since_s - lag_s, since_s + lag_s))
+        self._passed, self._end_s = None, self.now_s()
+
+    def _keep(self, *places: FloatArray) -> None:
+        self._led.lead_to(*places)
+        if self._keeps_end:
+            write = partial(self._command_file.write, places[-1], time.time_ns())
+            self._disk.submit(write, self._on_written)
+
+    def _on_written(self, result: object) -> None:
+        if isinstance(result, Exception):
+            self._say(f'{self._command_file.path}: where the arm was led is not kept ({result})')
 
     def _message(self, admitted: Admitted) -> JointTrajectory:
         """Return what the gate has admitted as a message; nothing else is ever sent."""
@@ -408,14 +559,13 @@ class CompensatorNode(RemasterNode):
         return message
 
     def _on_trajectory(self, message: JointTrajectory) -> None:
-        try:
-            passed = self._passed(message)
-            if not self._commands.get_subscription_count():
-                raise InputError(f'no controller listens to {self._commands_topic}')
-        except InputError as error:
-            self._say(f'trajectory refused: {error}')
+        def refuse(why: str) -> None:
+            self._say(f'trajectory refused: {why}')
+
+        if not self._commands.get_subscription_count():
+            refuse(f'no controller listens to {self._commands_topic}')
             return
-        self._commands.publish(self._message(passed.admitted))
+        self._submit(message, self._commands.publish, refuse)
 
     # The same by the action
 
@@ -436,20 +586,26 @@ class CompensatorNode(RemasterNode):
     def _on_goal(self, handle: Any) -> None:
         goal = _Goal(handle)
         request = handle.request
-        try:
-            if request.multi_dof_trajectory.points:
-                raise InputError('it has a multi_dof_trajectory, which is not corrected')
+
+        def refuse(why: str) -> None:
+            self._say(f'goal refused: {why}')
+            status = GoalStatus.STATUS_CANCELED if goal.cancelled else GoalStatus.STATUS_ABORTED
+            self._end(goal, status, self._refused(why))
+
+        def pass_on(sent: JointTrajectory) -> None:
             assert self._client is not None
-            if not self._client.server_is_ready():
-                raise InputError(f'no controller has the action {self._controllers}')
-            request.trajectory = self._message(self._passed(request.trajectory).admitted)
-        except InputError as error:
-            self._say(f'goal refused: {error}')
-            self._end(goal, GoalStatus.STATUS_ABORTED, self._refused(str(error)))
-            return
+            request.trajectory = sent
+            answer = self._client.send_goal_async(request, partial(self._on_feedback, goal))
+            answer.add_done_callback(partial(self._on_answer, goal))
+
+        assert self._client is not None
         self._goals.append(goal)
-        sent = self._client.send_goal_async(request, partial(self._on_feedback, goal))
-        sent.add_done_callback(partial(self._on_answer, goal))
+        if request.multi_dof_trajectory.points:
+            refuse('it has a multi_dof_trajectory, which is not corrected')
+        elif not self._client.server_is_ready():
+            refuse(f'no controller has the action {self._controllers}')
+        else:
+            self._submit(request.trajectory, pass_on, refuse)
 
     def _refused(self, why: str) -> Any:
         return self._action.Result(error_code=self._action.Result.INVALID_GOAL, error_string=why)
@@ -460,6 +616,10 @@ class CompensatorNode(RemasterNode):
         if not future.result().accepted:
             why = f'{self._controllers}: the controller refuses it; its log has why'
             self._say(f'goal refused: {why}')
+            if goal is self._goals[-1]:
+                # Nothing has led the arm.
+                self._led.take_back()
+                self._passed, self._end_s = None, self.now_s()
             self._end(goal, GoalStatus.STATUS_ABORTED, self._refused(why))
             return
         goal.sent = future.result()
@@ -487,12 +647,18 @@ class CompensatorNode(RemasterNode):
                 goal.cancelled = True
                 if goal.sent is not None:
                     goal.sent.cancel_goal_async()
+                elif goal is self._goals[-1]:
+                    # What is still worked out for it is not passed on.
+                    self._wanted = -1
                 return CancelResponse.ACCEPT
         return CancelResponse.REJECT
 
     def _on_result(self, goal: _Goal, future: Future) -> None:
         if not future.cancelled() and future.result() is not None:
             if goal is self._goals[-1]:
+                succeeded = future.result().status == GoalStatus.STATUS_SUCCEEDED
+                if not succeeded:
+                    self._note_held()
                 self._end_s = self.now_s()
             self._end(goal, future.result().status, future.result().result)
 
@@ -518,6 +684,8 @@ class CompensatorNode(RemasterNode):
 
     def close(self) -> None:
         """Let the controller hold an arm whose goal nobody can cancel any more."""
+        self._work.close(0.5)
+        self._disk.close()
         awaited = [goal.sent.cancel_goal_async() for goal in self._goals if goal.sent is not None]
         executor, end = self.executor, time.monotonic() + LAST_ANSWER_WALL_S
         while executor is not None and not all(one.done() for one in awaited):
@@ -561,6 +729,8 @@ def _points(
 
 def main(args: list[str] | None = None) -> int:
     """Run the node."""
+    # What is worked out must not keep a cancelling waiting for the interpreter: 1 ms instead of 5.
+    sys.setswitchinterval(1e-3)
     make: Callable[[], RemasterNode] = CompensatorNode
     return run(make, args)
 

@@ -13,27 +13,32 @@ LIMITS = MotionLimits(
 )
 GATE = ForeignGate(LIMITS)
 NEAR = 0.02
+NAMES = ('go to', 'would have a speed of', 'acceleration of', 'step of its speed of')
 
 
 def shares(times, q, v, is_straight):
     """Return the largest share of each limit that a controller comes to: dense, by itself."""
-    worst = {'go to': 0.0, 'speed of': 0.0, 'acceleration of': 0.0}
+    worst = dict.fromkeys(NAMES, 0.0)
+    rates = [v[0]]
     for i in range(len(times) - 1):
         T = times[i + 1] - times[i]
         s = np.linspace(0.0, 1.0, 400)[:, None]
         if is_straight:
             place, speed = q[i] + s * (q[i + 1] - q[i]), (q[i + 1] - q[i]) / T * np.ones_like(s)
             bend = np.zeros_like(speed)
+            rates.append(speed[0])
         else:
             a, b = q[i], v[i] * T
             c = 3 * (q[i + 1] - q[i]) - (2 * v[i] + v[i + 1]) * T
             d = -2 * (q[i + 1] - q[i]) + (v[i] + v[i + 1]) * T
             place = a + b * s + c * s**2 + d * s**3
             speed, bend = (b + 2 * c * s + 3 * d * s**2) / T, (2 * c + 6 * d * s) / T**2
-        for name, values, limit in (
-            ('go to', place, 1.0), ('speed of', speed, 1.5), ('acceleration of', bend, 6.0)
-        ):  # fmt: skip
+        for name, values, limit in zip(NAMES, (place, speed, bend), (1.0, 1.5, 6.0)):
             worst[name] = max(worst[name], np.abs(values).max() / limit)
+    if is_straight:
+        # Of what the limit of acceleration allows in a tenth of a second, at each corner.
+        steps = np.diff([*rates, np.zeros(K)], axis=0)
+        worst['step of its speed of'] = np.abs(steps).max() / 0.6
     return worst
 
 
@@ -41,11 +46,11 @@ def shares(times, q, v, is_straight):
 @pytest.mark.parametrize('moves', [False, True])
 def test_it_passes_what_keeps_the_limits_and_nothing_else(is_straight, moves):
     rng = np.random.default_rng(3)
-    passed, refused = 0, dict.fromkeys(('go to', 'speed of', 'acceleration of'), 0)
+    passed, refused = 0, dict.fromkeys(NAMES, 0)
     for _ in range(700):
         n = int(rng.integers(2, 6))
         times = np.cumsum(rng.uniform(0.3, 1.0, n))
-        size = rng.uniform(0.1, 1.0)
+        size = rng.uniform(0.02, 1.0)
         q = np.cumsum(size * rng.normal(0.0, 0.4, (n, K)), axis=0)
         v = size * rng.normal(0.0, 0.4, (n, K))
         v[-1] = 0.0
@@ -72,8 +77,9 @@ def test_it_passes_what_keeps_the_limits_and_nothing_else(is_straight, moves):
         refused[name] += 1
     assert passed > 50
     assert refused['go to'] > 20
-    assert refused['speed of'] > 20
+    assert refused['would have a speed of'] > 20
     assert (refused['acceleration of'] > 20) != is_straight
+    assert (refused['step of its speed of'] > 20) == is_straight
 
 
 def test_an_arm_that_stands_outside_may_go_inwards_alone():

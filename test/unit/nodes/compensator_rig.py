@@ -74,6 +74,8 @@ class Rig:
         self.executor, self.own = SingleThreadedExecutor(context=self.context), None
         self.executor.add_node(self.peer)
         self.q, self.drive, self.due = HOME, None, 0.0
+        # Reported in place of where the arm is, if given.
+        self.frozen = None
         self.came, self.told, self.states = [], [], []
         self.joint_states = self.peer.create_publisher(JointState, 'joint_states', 10)
         self.description = self.peer.create_publisher(String, 'robot_description', LATCHED)
@@ -118,11 +120,15 @@ class Rig:
         if now >= self.due:
             self.due = now + 0.02
             # In another order, as drivers do.
-            message = JointState(name=NAMES[::-1], position=self.q[::-1].tolist())
+            message = JointState(name=NAMES[::-1], position=self.reported[::-1].tolist())
             message.header.stamp = self.peer.get_clock().now().to_msg()
             self.joint_states.publish(message)
         for executor in (self.executor, self.own):
             executor.spin_once(timeout_sec=0.002)
+
+    @property
+    def reported(self):
+        return self.q if self.frozen is None else self.frozen
 
     def run(self, seconds, until=lambda: False):
         end = time.monotonic() + seconds

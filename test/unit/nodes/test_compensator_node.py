@@ -1,5 +1,6 @@
 """The compensator: what it passes on, what it refuses, and how it is switched."""
 
+import threading
 import time
 
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 pytest.importorskip('rclpy', reason='needs ROS 2 Jazzy or its wheels')
 
 from compensator_rig import (
+    CHAIN,
     CONTROLLER,
     HOME,
     NAMES,
@@ -15,6 +17,7 @@ from compensator_rig import (
     TARGET,
     URDF,
     erring,
+    message_of,
 )
 from rclpy.action import ActionClient
 from rigs.action_controller import ActionController, follow_joint_trajectory
@@ -22,6 +25,7 @@ from sensor_msgs.msg import JointState, Temperature
 from std_msgs.msg import String
 from trajectory_msgs.msg import JointTrajectory
 from worlds.compensation_files import save
+from worlds.drawn_moves import line
 
 from remaster_ros.compensation.compensator import Compensator
 from remaster_ros.compensation.controller_forms import exported, held
@@ -177,6 +181,99 @@ def test_what_it_cannot_begin_with_is_one_line(rig, parameters, words):
 
 
 # The action
+
+
+def test_joint_states_that_freeze_in_a_move_are_not_led_on_from(rig):
+    """The planner begins where the arm is reported, and the arm is elsewhere by then."""
+    r = rig().ready()
+    slow = line(r.told[-1], TARGET, 0.3, CHAIN)
+    r.planned.publish(message_of(slow.times_s, slow.positions, slow.velocities))
+    assert r.run(PATIENCE_S, lambda: r.drive and time.monotonic() > r.drive[0] + 1.0)
+    frozen = r.frozen = r.q
+    end_s = r.drive[0] + r.drive[1][-1]
+    assert r.run(PATIENCE_S, lambda: time.monotonic() > end_s + 1.5)
+    assert np.abs(r.q - frozen).max() > 0.02
+    # It is on its way still, or has come to its end: both is said.
+    refused = r.refused(r.plan(r.told[-1], HOME))
+    assert 'the arm is not reported where the last command led: ' in refused
+    assert '/compensator/enable confirms' in refused
+    # A person who has compared both calls twice: once it is said what to compare.
+    first = r.call('enable')
+    assert not first.success
+    assert first.message in refused
+    r.frozen = None
+    assert r.run(PATIENCE_S, lambda: np.abs(r.told[-1] - TARGET).max() < 1e-6)
+    assert r.run(PATIENCE_S, lambda: not (r.node._trouble() or r.node._moves()))
+    r.planned.publish(r.plan(r.told[-1], HOME))
+    before = len(r.came)
+    assert r.run(PATIENCE_S, lambda: len(r.came) > before)
+
+
+def test_an_arm_that_was_moved_by_hand_is_confirmed_by_a_person(rig):
+    """Also by a compensator that was started again."""
+    r = rig().ready()
+    r.planned.publish(r.plan(r.told[-1], TARGET))
+    assert r.run(PATIENCE_S, lambda: r.drive and not r.node._moves())
+    assert r.run(PATIENCE_S, lambda: time.monotonic() > r.drive[0] + r.drive[1][-1] + 1.5)
+    kept = r.node._command_file.read(time.time_ns())
+    np.testing.assert_allclose(kept.end, r.compensator.command(TARGET), atol=1e-7)
+    r.drive, r.q = None, r.q + 0.05
+    assert r.run(PATIENCE_S, lambda: 'the last command led' in r.node._trouble())
+    assert r.run(PATIENCE_S, lambda: not r.node._moves())
+    assert r.run(5.0, lambda: 'the last command led' in r.states[-1]['why'])
+    assert not r.call('enable').success
+    r.run(0.5)
+    assert r.call('enable').success
+    assert not r.node._trouble()
+
+
+def test_what_is_worked_out_keeps_nothing_waiting(rig, monkeypatch):
+    """An empty trajectory holds the arm at once, and what is worked out is not passed on."""
+    r = rig().ready()
+    begun, go_on = threading.Event(), threading.Event()
+    own = r.node._motion.passed_on
+
+    def slow(wanted, *rest):
+        if len(wanted.times_s):
+            begun.set()
+            assert go_on.wait(PATIENCE_S)
+        return own(wanted, *rest)
+
+    monkeypatch.setattr(r.node._motion, 'passed_on', slow)
+    said = []
+    r.node._say = said.append
+    r.planned.publish(r.plan(r.told[-1], TARGET))
+    assert r.run(PATIENCE_S, begun.is_set)
+    r.planned.publish(JointTrajectory(joint_names=NAMES))
+    assert r.run(PATIENCE_S, lambda: r.came)
+    assert not r.came[0].points
+    go_on.set()
+    assert r.run(PATIENCE_S, lambda: said)
+    assert said == ['trajectory refused: another trajectory has come since']
+    assert len(r.came) == 1
+
+
+@pytest.mark.parametrize(
+    ('change', 'why'),
+    [
+        (lambda m: setattr(m.points[-1].time_from_start, 'sec', 2**31 - 1), 'are the most'),
+        (
+            lambda m: [setattr(one, 'velocities', []) for one in m.points],
+            'step of its speed',
+        ),
+    ],
+)
+def test_times_without_end_and_steps_of_the_speed_are_refused(rig, change, why):
+    r = rig().ready()
+    # Quick, and by few points: what a controller draws through them has corners.
+    wanted = line(r.told[-1], r.told[-1] + 0.5, 3.0, CHAIN)
+    every = slice(None, None, max(len(wanted.times_s) // 4, 1))
+    message = message_of(
+        *(part[every] for part in (wanted.times_s, wanted.positions, wanted.velocities))
+    )
+    message.points[-1].velocities = [0.0] * 7
+    change(message)
+    assert why in r.refused(message)
 
 
 class ByAction:

@@ -1,0 +1,114 @@
+"""Where an arm was led last, and whether it is reported there.
+
+A report that is fresh, finite and plausible may still be wrong: positions that are frozen, say.
+What was commanded is known without any report. An arm that is reported elsewhere is not led on
+before a person has compared the report with the robot's own display.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+
+import numpy as np
+
+from remaster_ros.motion.joint_units import JointUnits
+from remaster_ros.types import FloatArray
+
+
+class LedLast:
+    """The memory of it, of the bridge and of the compensator alike.
+
+    ``names, units``: of the joints; ``tolerance_rad``: an arm that is no further off is there;
+    ``end``: where it was led before this process was started, rad or m, (k,); None where that is
+    not known; ``confirms``: the service by which a person confirms the report.
+    Attributes: ``end``: where the last command led, (k,); None where that is not known.
+    """
+
+    def __init__(
+        self,
+        names: Sequence[str],
+        units: JointUnits,
+        tolerance_rad: float,
+        end: FloatArray | None,
+        confirms: str,
+    ) -> None:
+        self._names, self._units, self._tolerance_rad = names, units, tolerance_rad
+        self._confirms = confirms
+        # Where the arm is, rad or m, (k,); several where it was held somewhere between them.
+        self._places: tuple[FloatArray, ...] = () if end is None else (end,)
+        self._before: tuple[FloatArray, ...] = self._places
+        # Where it is reported, which a person was asked to compare with the robot's display.
+        self._asked: FloatArray | None = None
+
+    @property
+    def end(self) -> FloatArray | None:
+        """Where the last command led, rad or m, (k,); of several places the last one."""
+        return self._places[-1] if self._places else None
+
+    def lead_to(self, *places: FloatArray) -> None:
+        """Process a command that leads to a place, rad or m, (k,), or to one between several."""
+        self._before, self._places = self._places, places
+
+    def take_back(self) -> None:
+        """Process that the last command was not sent."""
+        self._places = self._before
+
+    def differs(self, q: FloatArray, other: FloatArray) -> bool:
+        """Whether two places, (k,), are not the same."""
+        return self._units.largest(q - other) > self._tolerance_rad
+
+    def elsewhere(self, q: FloatArray) -> str:
+        """Return that the arm is reported elsewhere than it was led, and what to do; ''.
+
+        ``q``: where it is reported, rad or m, (k,).
+        """
+        if not self._places:
+            return ''
+        end = self._nearest(q)
+        if not self.differs(q, end):
+            return ''
+        units = self._units
+        off = np.abs(q - end) > self._tolerance_rad * units.per_radian
+        joints = ', '.join(
+            f'{name} at {units.in_degrees(i, q[i])}, '
+            f'{units.in_degrees(i, q[i] - end[i], sign="+")} from there'
+            for i, name in enumerate(self._names)
+            if off[i]
+        )
+        shown = 'positions' if any(units.slides) else 'angles'
+        return (
+            f'the arm is not reported where the last command led: {joints}; compare with the '
+            f"robot's own display: where it shows the same {shown}, {self._confirms} confirms "
+            'them; where it does not, joint_states are wrong: see to the driver first'
+        )
+
+    def _nearest(self, q: FloatArray) -> FloatArray:
+        """Return the place nearest to `q`, (k,), on the lines between the places."""
+        scale = self._units.per_radian
+        found = list(self._places)
+        for start, end in pairwise(self._places):
+            way, gone = (end - start) / scale, (q - start) / scale
+            length = float(way @ way)
+            share = float(np.clip(way @ gone / length, 0.0, 1.0)) if length else 0.0
+            found.append(start + share * (end - start))
+        return min(found, key=lambda place: self._units.largest(q - place))
+
+    def ask(self, q: FloatArray) -> None:
+        """Process that a person was told where the arm is reported, (k,)."""
+        self._asked = q
+
+    def confirm(self, q: FloatArray) -> str:
+        """Take a report, (k,), for true, if a person who was told it confirms it.
+
+        Returns what that person is to compare first, '' where it is taken.
+        """
+        asked, self._asked = self._asked, q
+        if asked is None or self.differs(asked, q):
+            return self.elsewhere(q)
+        self._places, self._asked = (q,), None
+        return ''
+
+    def forget_question(self) -> None:
+        """Process that the question, if there was one, is settled."""
+        self._asked = None
