@@ -431,9 +431,15 @@ def read_compensation(path: str | os.PathLike[str]) -> Compensation:
         One line naming the file, the place in it and the remedy.
     """
     path = Path(path)
-    data = read_limited(
-        path, FILE_LIMIT, 'give apply/compensation.json that fit or discover has written'
-    )
+    hint = 'give apply/compensation.json that fit or discover has written'
+    return of_text(read_limited(path, FILE_LIMIT, hint), path)
+
+
+def of_text(data: bytes, path: Path) -> Compensation:
+    """Return what the text of a compensation.json holds; ``path`` is for messages.
+
+    Raises InputError as `read_compensation` does.
+    """
     try:
         content = msgspec.json.decode(data, type=CompensationPart)
     except (msgspec.DecodeError, RecursionError) as error:

@@ -28,7 +28,6 @@ from remaster_ros.compensation.arm_model import (
     Geometry,
     JointTerm,
 )
-from remaster_ros.compensation.compensator import Compensator
 from remaster_ros.compensation.export import check_first
 from remaster_ros.discovery.effects.base import Cell
 from remaster_ros.discovery.effects.registry import EFFECTS
@@ -37,7 +36,7 @@ from remaster_ros.discovery.geometry_model import GeometryModel
 from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.discovery.thinning import of_spread_poses
 from remaster_ros.kinematics.serial_chain import SerialChain
-from remaster_ros.kinematics.transforms import apply, inverse, matrix_to_rotation_vector
+from remaster_ros.kinematics.transforms import inverse, matrix_to_rotation_vector
 from remaster_ros.types import FloatArray, Measurements
 
 # Each takes away all of the difference but for what is of its second order.
@@ -177,47 +176,6 @@ def everything(fit: FitResult, cells: Sequence[Cell], data: Residuals) -> Descri
         What was searched.
     """
     return _described(fit, cells, fit.theta, data, 1.0)
-
-
-def corrected_residuals(
-    fit: FitResult, cells: Sequence[Cell], model: ArmModel, measurements: Measurements
-) -> FloatArray:
-    """Return the residuals of every row where `everything` is corrected that can be, m, (n, 3).
-
-    Those of the fit lack what no command corrects as well: backlash, say, and what remains near
-    singularities; that is put back. Errors of the measurement stay taken out. ``model`` is the arm
-    of `everything`, and ``measurements`` have its sensors and markers by their indices.
-    """
-    return _with_what_remains(fit, cells) + remaining(model, measurements)
-
-
-def remaining(model: ArmModel, measurements: Measurements) -> FloatArray:
-    """Return by how much a commanded arm of the model misses, in frames N, m, (n, 3)."""
-    m = measurements
-    known = np.isfinite(m.temperature_c)
-    warm = np.where(known, m.temperature_c, model.reference_c)
-    command = Compensator(model).command(m.q, warm)
-    reached, wanted = model.state(command, warm).tool, model.chain.forward(m.q)
-    markers = np.stack(list(model.markers.values()))[m.marker]
-    turns = np.stack([T[:3, :3] for T in model.T_R_N.values()])[m.sensor]
-    off = apply(reached, markers) - apply(wanted, markers)
-    return np.einsum('nji,nj->ni', turns, off)
-
-
-def _with_what_remains(fit: FitResult, cells: Sequence[Cell]) -> FloatArray:
-    core, start = fit.predictive.model.core, 0
-    z = fit.predictive.after.copy()
-    for cell in cells:
-        if not cell.of_measurement and not list(placed(cell, fit.chain)):
-            z[core + start : core + start + cell.size] = 0.0
-        start += cell.size
-    if fit.found is None or np.array_equal(z, fit.predictive.after):
-        return fit.residuals_after
-    whole, less = (
-        predicted_rows(fit.found.problem, fit.predictive.model, at)
-        for at in (fit.predictive.after, z)
-    )
-    return fit.residuals_after + whole - less
 
 
 def _described(

@@ -139,13 +139,16 @@ class Discovery:
     def loads_geometry(self) -> bool:
         """Whether a robot model with all lengths and tilts is worth loading.
 
-        Held-out poses decide; without them, that a length or tilt is among the causes.
+        Held-out poses decide; without them, or where these gain by chance alone, that a length or
+        tilt is among the causes.
         """
         if self.geometry is None:
             return False
-        if self.geometry.judged.any():
-            return self.geometry.is_better
-        return any(effect.in_robot_model for effect in self.effects)
+        is_cause = any(effect.in_robot_model for effect in self.effects)
+        if not self.geometry.judged.any():
+            return is_cause
+        gains = self.geometry.held_out_m < self.geometry.drawing_held_out_m
+        return self.geometry.is_better or (is_cause and gains)
 
 
 @one_thread
@@ -258,7 +261,8 @@ def discover_session(
         for cell in group
     ]
     alone = fit
-    if not all(effect.is_taken_out for effect in effects):
+    # Kinds that nobody named are in no file with zero-offsets either.
+    if not {*solution.cells} <= {*measured}:
         errors = search.fit(measured) if measured else None
         alone = fit_session(
             session,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, NamedTuple
@@ -11,8 +11,6 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 import msgspec
 import numpy as np
 
-from remaster_ros.calibration.comparison import predicted_rows
-from remaster_ros.calibration.estimate import Problem, estimate
 from remaster_ros.calibration.gauge_words import counted, listed
 from remaster_ros.calibration.noise_check import MEAN_LENGTH
 from remaster_ros.calibration.outliers import LARGEST_SHARE
@@ -23,6 +21,7 @@ from remaster_ros.compensation.export import (
     REMASTER_FILE,
     URDF_FILE,
 )
+from remaster_ros.compensation.loaded_errors import errors_with_urdf
 from remaster_ros.compensation.mastering import MasteringStep, mastering
 from remaster_ros.discovery.words import clock_time
 from remaster_ros.errors import InputError
@@ -205,13 +204,8 @@ def all_taken_out(found: Discovered | None) -> bool:
 
 
 def errors_with_model_mm(session: Session, urdf: str) -> FloatArray:
-    """Return the 3-D error of every row with another robot model, as it is, mm, (n,).
-
-    Registrations and markers are fitted to the optimization rows, as for the error of today.
-    """
-    found = estimate(Problem.of(replace(session, urdf=urdf)))
-    predicted = predicted_rows(found.problem, found.model, found.before.z)
-    return lengths_mm(session.measurements.position - predicted)
+    """Return the 3-D error of every row with another robot model, as it is, mm, (n,)."""
+    return lengths_mm(errors_with_urdf(session, urdf))
 
 
 def _require_same(session: Session, result: Fit | Discovered, path: Path, verb: str) -> None:

@@ -18,11 +18,15 @@ from remaster_ros.compensation.export import (
     URDF_FILE,
     exports,
 )
-from remaster_ros.compensation.file import COMPENSATION_FILE
+from remaster_ros.compensation.file import COMPENSATION_FILE, of_text
+from remaster_ros.compensation.loaded_errors import (
+    errors_with_correction,
+    errors_with_urdf,
+    without_errors_of_measuring,
+)
 from remaster_ros.compensation.of_result import (
     Described,
     NotCorrected,
-    corrected_residuals,
     everything,
     geometry_too,
     offsets_alone,
@@ -185,7 +189,11 @@ def applied(discovery: Discovery, widening: float, result_sha256: str) -> dict[s
     files = exports(discovery.alone, _remarks(discovery))
     if discovery.loads_geometry:
         assert discovery.geometry is not None
-        files[MODEL_FILE] = model_text(discovery.alone, discovery.geometry)
+        errors = errors_to_load(discovery)
+        geometry = replace(
+            discovery.geometry, errors=errors['geometry'], drawing_errors=errors['offsets']
+        )
+        files[MODEL_FILE] = model_text(discovery.alone, geometry)
     described = compensation_of(discovery, widening)
     files[COMPENSATION_FILE] = correction_text(
         described, discovery.fit.session, 'discover', result_sha256
@@ -203,7 +211,7 @@ def compensation_of(discovery: Discovery, widening: float) -> Described:
     those fitted without them.
     """
     if holds_everything(discovery):
-        described = _everything(discovery)[0]
+        described = _everything(discovery)
         return replace(described, model=replace(described.model, widening=widening))
     alone = discovery.alone
     rows = discovery.residuals.context.measurements
@@ -224,23 +232,51 @@ def compensation_of(discovery: Discovery, widening: float) -> Described:
 
 def holds_everything(discovery: Discovery) -> bool:
     """Whether compensation.json holds everything in the model, and not the offsets alone."""
-    alone = _held_out_mean(discovery, discovery.alone.residuals_after)
-    _, errors, can_be_commanded = _everything(discovery)
-    every = _held_out_mean(discovery, errors)
+    alone = _held_out_mean(discovery, errors_to_load(discovery)['offsets'])
+    every = _held_out_mean(discovery, errors_to_load(discovery)['everything'])
     better = bool(np.isnan(alone)) or round(every, 3) < round(alone, 3)
+    can_be_commanded = _everything(discovery).model.steepest() < 1.0
     return better and can_be_commanded and bool(discovery.solution.cells)
 
 
 @lru_cache(maxsize=1)
-def _everything(discovery: Discovery) -> tuple[Described, FloatArray, bool]:
-    """Return the arm with everything corrected, and the residuals with it, m, (n, 3).
+def _everything(discovery: Discovery) -> Described:
+    """Return the arm with everything corrected."""
+    return everything(discovery.fit, discovery.solution.cells, discovery.residuals)
 
-    And whether there is a command for each wanted angle: without it the file is not read.
+
+@lru_cache(maxsize=1)
+def errors_to_load(discovery: Discovery) -> dict[str, FloatArray]:
+    """Return the error of every row with each of the files, as `Loadable` names them, m, (n, 3).
+
+    Each is of the text that is written, or would be if it were worth it. Errors of the measurement
+    that the file has nothing of are taken out: the certain ones, of compensation.json all.
     """
-    fit, cells, data = discovery.fit, discovery.solution.cells, discovery.residuals
-    described = everything(fit, cells, data)
-    errors = corrected_residuals(fit, cells, described.model, data.context.measurements)
-    return described, errors, described.model.steepest() < 1.0
+    alone, fit, cells = discovery.alone, discovery.fit, discovery.solution.cells
+    session, rows = alone.session, discovery.residuals.context.measurements
+    # Beside the offsets that are loaded alone nothing was fitted but certain errors of measuring.
+    measured = without_errors_of_measuring(alone, slice(None))
+    plain = replace(session, measurements=replace(session.measurements, position=measured))
+    left_out = [observation for observation, _ in alone.left_out]
+    found = {'offsets': errors_with_urdf(plain, exports(alone)[URDF_FILE], left_out)}
+    if discovery.geometry is not None:
+        found['geometry'] = errors_with_urdf(
+            plain, model_text(alone, discovery.geometry), left_out
+        )
+    described = _everything(discovery)
+    if described.model.steepest() < 1.0:
+        text = correction_text(described, session, 'discover', '').encode()
+        of_measuring = np.repeat(
+            np.array([cell.of_measurement for cell in cells], dtype=bool),
+            [cell.size for cell in cells],
+        )
+        model = of_text(text, Path(COMPENSATION_FILE)).model
+        position = without_errors_of_measuring(fit, of_measuring)
+        found['everything'] = errors_with_correction(model, replace(rows, position=position))
+    else:
+        # Such a file is not read.
+        found['everything'] = np.full_like(measured, np.nan)
+    return found
 
 
 def _held_out_mean(discovery: Discovery, errors: FloatArray) -> float:
@@ -252,22 +288,25 @@ def _held_out_mean(discovery: Discovery, errors: FloatArray) -> float:
 
 def loadable(discovery: Discovery) -> list[Loadable]:
     """Return the results that a robot can load, the plainest first."""
-    results: list[tuple[Literal['offsets', 'geometry', 'everything'], FloatArray, str]] = [
-        ('offsets', discovery.alone.residuals_after, f'{APPLY_FOLDER}/{URDF_FILE}')
-    ]
-    if discovery.geometry is not None:
-        file = f'{APPLY_FOLDER}/{MODEL_FILE}' if discovery.loads_geometry else ''
-        results.append(('geometry', discovery.geometry.errors, file))
-    file = f'{APPLY_FOLDER}/{COMPENSATION_FILE}' if holds_everything(discovery) else ''
-    results.append(('everything', _everything(discovery)[1], file))
+    files = {
+        'offsets': f'{APPLY_FOLDER}/{URDF_FILE}',
+        'geometry': f'{APPLY_FOLDER}/{MODEL_FILE}' if discovery.loads_geometry else '',
+        'everything': f'{APPLY_FOLDER}/{COMPENSATION_FILE}' if holds_everything(discovery) else '',
+    }
     rows: list[Loadable] = []
     # To what is shown: a difference in the fourth figure is no reason to load anything else.
     least = np.inf
-    for name, errors, file in results:
-        mean_mm = round(_held_out_mean(discovery, errors), 3)
+    results: tuple[Literal['offsets', 'geometry', 'everything'], ...]
+    results = ('offsets', 'geometry', 'everything')
+    for name in results:
+        if name not in errors_to_load(discovery):
+            continue
+        mean_mm = round(_held_out_mean(discovery, errors_to_load(discovery)[name]), 3)
         shown = None if np.isnan(mean_mm) else mean_mm
-        rows.append(Loadable(name, shown, mean_mm < least, file))
-        least = min(least, mean_mm)
+        # A gain by chance is none.
+        better = mean_mm < least and (name != 'geometry' or discovery.loads_geometry)
+        rows.append(Loadable(name, shown, better, files[name]))
+        least = mean_mm if better else least
     return rows
 
 

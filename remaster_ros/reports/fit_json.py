@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,15 +20,12 @@ from remaster_ros.compensation.export import (
     MODEL_FILE,
     URDF_FILE,
     calibrated_urdf,
+    exports,
 )
-from remaster_ros.compensation.file import Source, written
-from remaster_ros.compensation.of_result import (
-    Described,
-    geometry_too,
-    offsets_alone,
-    remaining,
-)
-from remaster_ros.discovery.geometry_model import GeometryModel, geometry_model, mean_length
+from remaster_ros.compensation.file import COMPENSATION_FILE, Source, of_text, written
+from remaster_ros.compensation.loaded_errors import errors_with_correction, errors_with_urdf
+from remaster_ros.compensation.of_result import Described, geometry_too, offsets_alone
+from remaster_ros.discovery.geometry_model import GeometryModel, geometry_model
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.transforms import quaternion_xyzw
@@ -35,7 +33,7 @@ from remaster_ros.reports import schemas
 from remaster_ros.reports.rows_csv import RESIDUALS_FILE
 from remaster_ros.reports.sentences import verdict
 from remaster_ros.session.files import read_limited
-from remaster_ros.types import FloatArray, Measurements, Session
+from remaster_ros.types import FloatArray, Session
 from remaster_ros.version import __version__
 
 if TYPE_CHECKING:
@@ -121,8 +119,14 @@ def geometry_of(result: FitResult) -> GeometryModel | None:
     if result.found is None:
         return None
     geometry = geometry_model(result.found)
+    if geometry is None:
+        return None
     gross = [row for check in result.noise_checks for row in check.gross]
-    return None if geometry is None else geometry.beside(result, gross)
+    # Each figure is that of the file which is loaded.
+    left_out = [observation for observation, _ in result.left_out]
+    drawn = errors_with_urdf(result.session, exports(result)[URDF_FILE], left_out)
+    loaded = errors_with_urdf(result.session, model_text(result, geometry), left_out)
+    return replace(geometry.beside(result, gross), errors=loaded, drawing_errors=drawn)
 
 
 def model_text(result: FitResult, geometry: GeometryModel) -> str:
@@ -153,14 +157,13 @@ def compensation_text(result: FitResult, result_sha256: str) -> str:
     """
     geometry, rows = geometry_of(result), result.measurements
     described = None if geometry is None else geometry_too(result, geometry, rows)
-    if described is None or geometry is None or not _reaches(described, geometry, rows):
-        described = offsets_alone(result, predict(result, rows).widening, geometry=described)
-    return correction_text(described, result.session, 'fit', result_sha256)
-
-
-def _reaches(described: Described, geometry: GeometryModel, rows: Measurements) -> bool:
-    errors = geometry.errors + remaining(described.model, rows)
-    return mean_length(errors[geometry.judged]) < geometry.drawing_held_out_m
+    if described is not None and geometry is not None:
+        text = correction_text(described, result.session, 'fit', result_sha256)
+        model = of_text(text.encode(), Path(COMPENSATION_FILE)).model
+        if replace(geometry, errors=errors_with_correction(model, rows)).is_better:
+            return text
+    alone = offsets_alone(result, predict(result, rows).widening, geometry=described)
+    return correction_text(alone, result.session, 'fit', result_sha256)
 
 
 def correction_text(

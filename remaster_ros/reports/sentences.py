@@ -593,7 +593,7 @@ def load_words(row: Loadable) -> tuple[str, str]:
         # Better than the offsets alone, or the file would not hold it.
         what_to_do = f'only where no robot model can be loaded: {file}'
     elif worse:
-        what_to_do = 'leave it: no better than a plainer one'
+        what_to_do = 'leave it: not clearly better than a plainer one'
     elif row.file:
         what_to_do = file
     elif row.held_out_mean_mm is None:

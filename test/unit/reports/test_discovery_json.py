@@ -336,15 +336,14 @@ def test_what_is_no_better_in_the_figures_shown_is_not_to_be_loaded(monkeypatch)
     found = _Remembered(
         residuals=SimpleNamespace(context=SimpleNamespace(measurements=rows)),
         outliers=(),
-        alone=SimpleNamespace(residuals_after=2.0 * errors),
-        geometry=SimpleNamespace(errors=errors),
         fit=None,
         solution=SimpleNamespace(cells=(SimpleNamespace(of_measurement=True, size=1),)),
         loads_geometry=True,
     )
     model = SimpleNamespace(steepest=lambda: 0.1)
     monkeypatch.setattr(discovery_json, 'everything', lambda *_: SimpleNamespace(model=model))
-    monkeypatch.setattr(discovery_json, 'corrected_residuals', lambda *_: 0.9999 * errors)
+    left = {'offsets': 2.0 * errors, 'geometry': errors, 'everything': 0.9999 * errors}
+    monkeypatch.setattr(discovery_json, 'errors_to_load', lambda _: left)
     results = loadable(found)
     assert [row.better for row in results] == [True, True, False]
     assert load_words(results[-1])[1].startswith('only where no robot model can be loaded')

@@ -1,0 +1,70 @@
+"""What is left of a session with a file that a robot can load: by that very file.
+
+Whatever a result has in memory, its figure is that of what is written: with the offsets that are
+not applied left out, the base and the marker that belong to the file, and nothing that it has no
+place for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from remaster_ros.calibration.comparison import predicted_rows
+from remaster_ros.calibration.estimate import Problem, estimate
+from remaster_ros.calibration.result import FitResult
+from remaster_ros.compensation.arm_model import ArmModel
+from remaster_ros.compensation.compensator import Compensator
+from remaster_ros.kinematics.transforms import apply
+from remaster_ros.types import FloatArray, Measurements, Session
+
+
+def errors_with_urdf(session: Session, urdf: str, gross: Sequence[int] = ()) -> FloatArray:
+    """Return the error of every row with a robot model as it is, m, (n, 3).
+
+    Registrations and markers are fitted to the optimization rows, but for ``gross``: their
+    ``observation``.
+    """
+    session = replace(session, urdf=urdf)
+    m = session.measurements
+    kept = np.flatnonzero(~np.isin(m.observation, gross) | m.is_validation)
+    found = estimate(Problem.of(replace(session, measurements=m.select(kept))))
+    predicted = predicted_rows(Problem.of(session), found.model, found.before.z)
+    return np.asarray(m.position - predicted)
+
+
+def errors_with_correction(model: ArmModel, measurements: Measurements) -> FloatArray:
+    """Return the error of every row with the arm of a compensation.json, m, (n, 3).
+
+    What a command leaves, near singularities, is in it; nothing is fitted. ``measurements`` have
+    the model's sensors and markers by their indices.
+    """
+    m = measurements
+    known = np.isfinite(m.temperature_c)
+    warm = np.where(known, m.temperature_c, model.reference_c)
+    command = Compensator(model).command(m.q, warm)
+    reached, wanted = model.state(command, warm).tool, model.chain.forward(m.q)
+    markers = np.stack(list(model.markers.values()))[m.marker]
+    frames = np.stack(list(model.T_R_N.values()))[m.sensor]
+    there = apply(model.state(m.q, warm).tool, markers)
+    left = apply(reached, markers) - apply(wanted, markers)
+    # From R to each row's sensor.
+    seen = np.einsum('nji,nj->ni', frames[:, :3, :3], there - left - frames[:, :3, 3])
+    return np.asarray(m.position - seen)
+
+
+def without_errors_of_measuring(fit: FitResult, where: slice | FloatArray) -> FloatArray:
+    """Return the positions of every row less what further parameters of a fit do, m, (n, 3).
+
+    ``where``: which of its further parameters, slice or mask.
+    """
+    measured = fit.session.measurements.position
+    model, after = fit.predictive.model, fit.predictive.after
+    z = after.copy()
+    z[model.core :][where] = 0.0
+    if fit.found is None or np.array_equal(z, after):
+        return measured
+    whole, less = (predicted_rows(fit.found.problem, model, at) for at in (after, z))
+    return np.asarray(measured - (whole - less))
