@@ -58,6 +58,12 @@ FEWEST_FITTED = 10
 # How far the sensor stands behind what the arm reaches, m.
 SENSOR_BEHIND_M = 1.2
 REMEDY = 'give another name with --out'
+# What the nodes are to be told of this robot before its arm moves; no description has it.
+ASKED = (
+    'does the robot publish that its own safety stops it (std_msgs/Bool)? set '
+    'emergency_stop_topic of robot_bridge in your copy of real.yaml to that topic, or to none: '
+    'then a person goes on after every interruption; robot_bridge does not start without it'
+)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -126,7 +132,7 @@ def run(args: argparse.Namespace) -> int:
             reached, of = _reached(scene, tour, args.seed)
         else:
             planned, text, (reached, of) = _plan(cell, missing, args.seed)
-    written = f'written: {args.out}; look at its lines marked CHECK'
+    written = f'written: {args.out}; look at its lines marked CHECK\n{ASKED}'
     tell(args, _as_json(args.out, proposal) | planned, _as_text(proposal), text, written)
     if reached < FEWEST_FITTED:
         # The file stays: what it states may be what is wrong.
@@ -322,6 +328,7 @@ def _as_json(out: Path, p: CellProposal) -> dict[str, Any]:
         'solutions': held.solutions,
         'inverse_kinematics': _kinematics_as_json(held.kinematics),
         'missing_meshes': list(p.missing_meshes),
+        'asks': {'emergency_stop_topic': ASKED},
     }
 
 

@@ -139,7 +139,8 @@ class Interlocks:
         lasted_s = wall_s - self._held_since_wall
         if self.run and not self._released and lasted_s > self._resume_alone_s:
             self._must_collect = (
-                f'the collection was interrupted for more than {self._resume_alone_s:g} s'
+                'the collection was interrupted'
+                f'{f" for more than {self._resume_alone_s:g} s" if self._resume_alone_s else ""}'
                 f'{f" ({reason})" if reason else ""}'
             )
             self.say(Word.TOO_LONG)

@@ -93,6 +93,8 @@ NEWEST_STATES = QoSProfile(depth=50, reliability=ReliabilityPolicy.BEST_EFFORT)
 """A bridge that is kept busy drops what is old: it needs where the arm is now."""
 MATCHED_WALL_S = 0.5
 """So much later than ours the controller's side of a DDS match may come."""
+NO_TOPIC = 'none'
+"""What `emergency_stop_topic` is where the robot has no such topic."""
 LATE_WALL_S = {Stop: 0.1, Drive: 0.5}
 """A command that was decided longer ago is not published any more, s of wall time.
 
@@ -200,12 +202,14 @@ class Parameters(SimulationParameters):
         choices=('topic', 'action'),
     )
     emergency_stop_topic: str = parameter(
-        '', "std_msgs/Bool, true while the robot's own safety stops it; empty where there is none"
+        '',
+        "std_msgs/Bool, true while the robot's own safety stops it; none where there is none: "
+        'then a person goes on after every interruption; must be given',
     )
     resume_alone_s: float = parameter(
         5.0,
         'after a longer interruption of a collection /remaster/collect is needed, unless '
-        'emergency_stop_topic was false all the time, wall time',
+        'emergency_stop_topic was false all the time; 0 where that is none; wall time',
         unit='s',
         low=0.0,
         high=60.0,
@@ -223,8 +227,14 @@ class Parameters(SimulationParameters):
             stall_s=self.stall_s,
             reaction_s=self.reaction_s,
             lag_s=self.lag_s,
-            resume_alone_s=self.resume_alone_s,
+            # Nothing shows an emergency stop of an arm that rests or waits, or its release.
+            resume_alone_s=self.resume_alone_s if self.safety_topic else 0.0,
         )
+
+    @property
+    def safety_topic(self) -> str:
+        """The topic of the robot's safety circuit; '' if it has none."""
+        return '' if self.emergency_stop_topic == NO_TOPIC else self.emergency_stop_topic
 
     def raised_from(self, before: Parameters) -> str:
         """Return which limit is higher than it was before; ''. No limit is higher than any."""
@@ -332,6 +342,12 @@ class RobotBridge(RemasterNode):
                 'robot_bridge: parameter cell is empty; give the cell file of this arm (demo, the '
                 'shipped one, is for the fakes)'
             )
+        if not self.p.emergency_stop_topic:
+            raise InputError(
+                'robot_bridge: parameter emergency_stop_topic is empty; give the topic '
+                "(std_msgs/Bool) that is true while the robot's own safety stops it, or none if "
+                'there is no such topic: then /remaster/collect is needed after every interruption'
+            )
         cell = read_cell(self.p.cell)
         self.chain = cell.chain()
         self._correction = correction = self.p.correction(cell, self.chain)
@@ -393,7 +409,7 @@ class RobotBridge(RemasterNode):
         self.create_subscription(JointTrajectory, WAYPOINTS, self._on_waypoints, RELIABLE)
         self.create_subscription(JointTrajectory, SOLUTIONS, self._on_solutions, RELIABLE)
         self._emergency = EmergencyLink(
-            self, self.p.emergency_stop_topic, self._on_emergency_stop, self.p.heartbeat_s
+            self, self.p.safety_topic, self._on_emergency_stop, self.p.heartbeat_s
         )
         self._only = [
             OnlyPublisher(self, topic, kind, allowed)

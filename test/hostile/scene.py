@@ -57,6 +57,7 @@ def bench_of(
     """Return a bench of the demo cell; options are `Bench`'s and the bridge's parameters."""
     known = {'rate', 'clock_s', 'stamp_noise_s', 'exact', 'open_loop'}
     parameters = {'cell': 'demo', 'speed_share': rules.speed_share, **FAST}
+    parameters['emergency_stop_topic'] = 'none'
     parameters |= {key: value for key, value in options.items() if key not in known}
     if np.isfinite(rules.cartesian_m_s):
         parameters['cartesian_speed_limit_m_s'] = rules.cartesian_m_s

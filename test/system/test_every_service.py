@@ -77,7 +77,10 @@ def test_without_a_robot_planner_recorder_and_bridge_say_so(start, client, tmp_p
     nodes = [
         start('remaster_ros.nodes.pose_planner', *node_arguments(session=session)),
         start('remaster_ros.nodes.recorder', *node_arguments(session=session)),
-        start('remaster_ros.nodes.robot_bridge', *node_arguments(cell='demo')),
+        start(
+            'remaster_ros.nodes.robot_bridge',
+            *node_arguments(cell='demo', emergency_stop_topic='none'),
+        ),
     ]
     refused(client, '/remaster/collect', 'no joint_states yet: is the robot running?')
     refused(client, '/remaster/pause', 'not running, but ')

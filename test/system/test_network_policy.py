@@ -25,7 +25,7 @@ NODES = (
 PLANS = '/remaster/confirm/plan_*'
 OWN = {
     # As beside an arm without such a topic.
-    'robot_bridge': {'simulated_clock_rate': 0.0, 'emergency_stop_topic': "''"},
+    'robot_bridge': {'simulated_clock_rate': 0.0, 'emergency_stop_topic': 'none'},
     'recorder': {'simulated_clock_rate': 0.0},
     'optitrack_markers': {'start_timeout_s': 600.0},
     'laser_tracker_markers': {'start_timeout_s': 600.0},

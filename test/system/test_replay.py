@@ -137,7 +137,10 @@ def test_a_robot_that_comes_later_ends_it(start, client, old_bag):
 
 
 def test_a_bridge_is_refused(start, client, old_bag):
-    start('remaster_ros.nodes.robot_bridge', *node_arguments(cell='demo'))
+    start(
+        'remaster_ros.nodes.robot_bridge',
+        *node_arguments(cell='demo', emergency_stop_topic='none'),
+    )
     until(client, lambda: client.get_publishers_info_by_topic('/remaster/settled'), 60, 'it')
     line = refusal(spun(client, start('remaster_ros.cli.main', 'replay', old_bag)))
     assert '/robot_bridge' in line

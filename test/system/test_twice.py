@@ -36,7 +36,9 @@ def until(client, condition, timeout_s, what):
 
 def begin(start, node, tmp_path, number, *more):
     session = tmp_path / f'session_{number}'
-    values = {'session': session} if node != 'robot_bridge' else {'cell': 'demo'}
+    values = {'session': session}
+    if node == 'robot_bridge':
+        values = {'cell': 'demo', 'emergency_stop_topic': 'none'}
     return start(f'remaster_ros.nodes.{node}', *node_arguments(**values), *more)
 
 
@@ -93,7 +95,14 @@ def start_elsewhere(ros_environment, tmp_path):
     def begin(node, *args):
         host = tmp_path / f'host_{len(running)}'
         host.mkdir()
-        args = [*args, *(node_arguments(cell='demo') if node == 'robot_bridge' else [])]
+        args = [
+            *args,
+            *(
+                node_arguments(cell='demo', emergency_stop_topic='none')
+                if node == 'robot_bridge'
+                else []
+            ),
+        ]
         process = subprocess.Popen(
             [sys.executable, '-c', UNLOCKED, str(host), node, *map(str, args)],
             env=ros_environment,

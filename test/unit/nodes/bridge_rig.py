@@ -14,10 +14,10 @@ from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray
 from hostile.arm import HostileArm
 from rclpy.executors import SingleThreadedExecutor
-from rclpy.qos import QoSProfile
+from rclpy.qos import DurabilityPolicy, QoSProfile
 from rigs.ros_rig import OWN_DOMAIN
 from sensor_msgs.msg import JointState
-from std_msgs.msg import String
+from std_msgs.msg import Bool, String
 from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
@@ -45,6 +45,7 @@ FAST = {
     'reaction_s': 1.0,
     'speed_share': 1.0,
     'cartesian_speed_limit_m_s': 0.5,
+    'emergency_stop_topic': 'robot/released',
 }
 """Parameters of a bridge whose decisions come soon."""
 PATIENCE_S = 30.0
@@ -200,6 +201,10 @@ class Rig:
         node.create_subscription(DiagnosticArray, 'remaster/status', self._on_status, 200)
         node.create_subscription(String, 'remaster/events', self._on_record, 200)
         self.clear = node.create_client(Trigger, 'remaster/clear_halt')
+        # The robot's own safety circuit, which stops nothing; a test may have another, or none.
+        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        self.released = node.create_publisher(Bool, FAST['emergency_stop_topic'], latched)
+        self.released.publish(Bool(data=False))
 
     def open_controller(self, **qos):
         self.controller = self.peer.create_subscription(
@@ -342,10 +347,17 @@ class Rig:
     def ready(self):
         """Let the bridge find itself alone, its controller there and its arm standing."""
         self.alone()
+        if self.bridge.p.emergency_stop_topic == FAST['emergency_stop_topic']:
+            self.wait(lambda: not self.bridge._emergency.trouble(), 'the safety circuit')
         if self.controller is not None:
             self.wait(self.bridge._controller.matched, 'the controller')
         self.bridge._watch()
         self.wall += robot_bridge.MATCHED_WALL_S
+        if self.bridge.p.emergency_stop_topic == 'none':
+            # A bridge that was away was an interruption: a person goes on.
+            self.run(1.5)
+            self.say_planner('stopped')
+            self.say_planner('running')
         self.run(2.5, lambda: not self.bridge.supervisor.blocked(self.wall))
         return self
 

@@ -34,6 +34,7 @@ def test_parameters_reach_the_limits_and_the_rules(rig, tmp_path):
         limit_margin_deg=2.0,
         settle_s=0.7,
         heartbeat_s=4.0,
+        emergency_stop_topic='none',
     )
     bridge = r.bridge
     limits = bridge.supervisor.gate.limits
@@ -45,6 +46,8 @@ def test_parameters_reach_the_limits_and_the_rules(rig, tmp_path):
     assert limits.names == CHAIN.joint_names
     assert bridge.supervisor.rules == bridge.p.rules(TURNING)
     assert bridge.supervisor.rules.settle.settle_s == 0.7
+    # Nothing shows that an arm was stopped while it stood: every interruption is too long.
+    assert bridge.supervisor.rules.resume_alone_s == 0.0
     assert bridge._emergency._silence_s == 4.0
     assert bridge._emergency.topic == ''
     assert not r.logged()
@@ -68,6 +71,16 @@ def test_without_a_cell_file_it_does_not_start(rig):
     assert str(error.value) == (
         'robot_bridge: parameter cell is empty; give the cell file of this arm (demo, the '
         'shipped one, is for the fakes)'
+    )
+
+
+def test_without_a_word_on_the_safety_circuit_it_does_not_start(rig):
+    with pytest.raises(InputError) as error:
+        rig(ready=False, emergency_stop_topic='')
+    assert str(error.value) == (
+        'robot_bridge: parameter emergency_stop_topic is empty; give the topic (std_msgs/Bool) '
+        "that is true while the robot's own safety stops it, or none if there is no such topic: "
+        'then /remaster/collect is needed after every interruption'
     )
 
 
