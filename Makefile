@@ -63,9 +63,10 @@ check: $(VENV)/installed
 # Small sizes, some ten minutes on two idle cores; FULL=1 takes those of benchmarks/RESULTS.md,
 # hours for the hidden world of bench_discovery. BENCH='bench_speed …' chooses.
 BENCH ?= bench_real_data bench_discovery bench_halves bench_exactness bench_calibration \
-	bench_speed bench_scaling bench_peers paper_tables
+	bench_speed bench_scaling bench_peers bench_compensation paper_tables
 SMALL_bench_discovery := --only null pair --count 4 --results build/discovery_small.jsonl
 SMALL_bench_halves := --only panda_left --splits 2 --results build/halves_small.jsonl
+SMALL_bench_compensation := --robots iiwa7 --kinds length tilt --results build/commanded_small.jsonl
 SMALL_paper_tables := --steps 10000
 FULL_bench_discovery := --results build/discovery.jsonl
 FULL_bench_halves := --results build/halves.jsonl
@@ -74,6 +75,7 @@ FULL_bench_exactness := --gold 1300000 --draws 60000
 FULL_bench_speed := --full
 FULL_bench_scaling := --sizes 50 173 1000 10000 100000
 FULL_bench_peers := --seeds 10
+FULL_bench_compensation := --results build/commanded.jsonl
 FULL_paper_tables := --out docs/paper.md
 bench: $(VENV)/bench-installed
 	@mkdir -p build

@@ -205,8 +205,13 @@ class TrueAngles:
                 step = np.clip(aim - self.added, -reach * unit, reach * unit)
             else:
                 here = (self.added / unit)[None]
+                # No further than any correction goes.
+                most = np.maximum(self._compensator.most_rad, np.abs(here))
                 found = self._compensator.nominal_within(
-                    q[None], model.warming(1, temperature_c), (here - reach, here + reach), here
+                    q[None],
+                    model.warming(1, temperature_c),
+                    (np.maximum(here - reach, -most), np.minimum(here + reach, most)),
+                    here,
                 )
                 step = found[0] - self.added
             self.added = self.added + step

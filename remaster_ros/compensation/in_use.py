@@ -191,6 +191,15 @@ class CorrectionInUse:
             )
         return refused
 
+    def on_the_way(self, waypoints: FloatArray) -> tuple[FloatArray, dict[int, str]]:
+        """Return what to command for waypoints, rad, (n, k), and why some must not be.
+
+        The true joint angles are those of the planned way, so that the arm keeps to it: no tool
+        has to be anywhere there, and near a singularity no joint goes further than it errs.
+        """
+        change = self.compensator.angle_errors(waypoints)
+        return waypoints + change, self.too_large(change)
+
     def commands(self, wanted: FloatArray) -> Commands:
         """Return what to command for wanted configurations, rad, (n, k)."""
         finite = np.all(np.isfinite(wanted), axis=-1)

@@ -96,7 +96,11 @@ class Parameters:
         high=10.0,
     )
     max_change_deg: float = parameter(
-        2.0, 'what changes a joint by more is refused', unit='deg', low=0.0, high=10.0
+        2.0,
+        'largest change of a joint; what has a joint off by more is refused',
+        unit='deg',
+        low=0.0,
+        high=10.0,
     )
     acceleration_limit_rad_s2: float = parameter(
         ACCELERATION,

@@ -527,9 +527,8 @@ class RobotBridge(RemasterNode):
             done = self._correction.commands(targets)
             targets, self._changes = done.command, done.change
             for number, points in waypoints.items():
-                way = self._correction.commands(points)
-                waypoints[number] = way.command
-                for why in way.refused.values():
+                waypoints[number], too_far = self._correction.on_the_way(points)
+                for why in too_far.values():
                     refused[number] = f'on its way {why}'
             refused |= done.refused
             self.counts['corrected_near_singularity'] += int(done.incomplete.sum())

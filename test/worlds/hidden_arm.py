@@ -127,5 +127,69 @@ def six_joint_arm() -> str:
     return '<robot name="six_joint_arm">' + ''.join(parts) + '</robot>'
 
 
+H = np.pi / 2
+# Joint: origin, roll-pitch-yaw, limits (rad); its link: mass (kg), centre of mass (m). Of Franka's
+# and Universal Robots' published descriptions, with masses of that size; all axes are z.
+PANDA = (
+    ((0, 0, 0.333), (0, 0, 0), (-2.8973, 2.8973), 3.0, (0, -0.03, -0.07)),
+    ((0, 0, 0), (-H, 0, 0), (-1.7628, 1.7628), 3.0, (0, -0.07, 0.03)),
+    ((0, -0.316, 0), (H, 0, 0), (-2.8973, 2.8973), 2.5, (0.04, 0.02, -0.04)),
+    ((0.0825, 0, 0), (H, 0, 0), (-3.0718, -0.0698), 2.5, (-0.04, 0.04, 0.02)),
+    ((-0.0825, 0.384, 0), (-H, 0, 0), (-2.8973, 2.8973), 2.5, (0, 0.04, -0.11)),
+    ((0, 0, 0), (H, 0, 0), (-0.0175, 3.7525), 1.5, (0.05, 0.01, 0)),
+    ((0.088, 0, 0), (H, 0, 0), (-2.8973, 2.8973), 0.7, (0.01, 0, 0.08)),
+)
+UR10 = (
+    ((0, 0, 0.1273), (0, 0, 0), (-np.pi, np.pi), 7.8, (0, 0, 0)),
+    ((0, 0.220941, 0), (0, H, 0), (-np.pi, np.pi), 12.9, (0, 0, 0.306)),
+    ((0, -0.1719, 0.612), (0, 0, 0), (-np.pi, np.pi), 3.9, (0, 0, 0.286)),
+    ((0, 0, 0.5723), (0, H, 0), (-np.pi, np.pi), 2.0, (0, 0, 0)),
+    ((0, 0.1149, 0), (0, 0, 0), (-np.pi, np.pi), 2.0, (0, 0, 0)),
+    ((0, 0, 0.1157), (0, 0, 0), (-np.pi, np.pi), 0.2, (0, 0, 0)),
+)
+# Of UR10 all but the first and the fifth axis are y.
+UR10_AXES = ('z', 'y', 'y', 'y', 'z', 'y')
+
+
+def panda_arm() -> str:
+    """Return the URDF of an arm with a Panda's lengths."""
+    return _of_rows('panda', PANDA, ('z',) * 7, ((0, 0, 0.107), (0, 0, 0)))
+
+
+def ur10_arm() -> str:
+    """Return the URDF of an arm with a UR10's lengths; its tool looks along the last axis."""
+    return _of_rows('ur10', UR10, UR10_AXES, ((0, 0.0922, 0), (-H, 0, 0)))
+
+
+def _of_rows(name: str, rows: tuple, axes: tuple[str, ...], flange: tuple) -> str:
+    unit = {'y': '0 1 0', 'z': '0 0 1'}
+    inertia = '<inertia ixx="0.02" ixy="0" ixz="0" iyy="0.02" iyz="0" izz="0.02"/>'
+    parts, parent = ['<link name="base_link"/>'], 'base_link'
+    for number, (xyz, rpy, (low, high), mass, center) in enumerate(rows, 1):
+        parts.append(
+            f'<joint name="joint_{number}" type="revolute"><parent link="{parent}"/>'
+            f'<child link="link_{number}"/>'
+            f'{_origin(xyz, rpy)}<axis xyz="{unit[axes[number - 1]]}"/>'
+            f'<limit lower="{float(low)!r}" upper="{float(high)!r}" velocity="2.5" '
+            'effort="100"/></joint>'
+            f'<link name="link_{number}"><inertial><origin xyz="{_text(center)}"/>'
+            f'<mass value="{mass}"/>{inertia}</inertial></link>'
+        )
+        parent = f'link_{number}'
+    xyz, rpy = flange
+    parts.append(
+        f'<joint name="tool_joint" type="fixed"><parent link="{parent}"/><child link="tool"/>'
+        f'{_origin(xyz, rpy)}</joint>'
+        '<link name="tool"><inertial><origin xyz="0 0 0.01"/><mass value="0.4"/>'
+        f'{inertia}</inertial></link>'
+    )
+    return f'<robot name="{name}">' + ''.join(parts) + '</robot>'
+
+
+def _origin(xyz: tuple[float, ...], rpy: tuple[float, ...]) -> str:
+    turn = ' '.join(repr(float(angle)) for angle in rpy)
+    return f'<origin xyz="{_text(xyz)}" rpy="{turn}"/>'
+
+
 def _text(numbers: tuple[float, ...]) -> str:
     return ' '.join(f'{number:g}' for number in numbers)

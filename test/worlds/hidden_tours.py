@@ -10,7 +10,7 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
-from worlds.hidden_arm import six_joint_arm
+from worlds.hidden_arm import panda_arm, six_joint_arm, ur10_arm
 from worlds.hidden_world import MARKER_STD_M, HiddenWorld, Visits
 
 from remaster_ros.kinematics.collision import CollisionModel, arm_bodies
@@ -29,7 +29,8 @@ PLACES = {
     'mocap': ('sir', np.array([1.9, 0.0, 1.3]), 60.0),
     'tracker': ('smr', np.array([1.9, 0.3, 1.0]), 45.0),
 }
-CANDIDATES = {'lwr4plus': 60, 'iiwa14': 60, 'iiwa7': 75, 'six': 95}
+CANDIDATES = {'lwr4plus': 60, 'iiwa14': 60, 'iiwa7': 75, 'six': 95, 'panda': 75, 'ur10': 75}
+MADE = {'six': six_joint_arm, 'panda': panda_arm, 'ur10': ur10_arm}
 # A small region; the tool hardly turns in it, nor on the plane.
 LITTLE_ROLL = (-0.3, 0.3)
 REGION = PoseRanges((-0.25, 0.25), (0.42, 0.55), (0.5, 0.62), LITTLE_ROLL)
@@ -42,9 +43,9 @@ REPEATABILITY_RAD = 2e-5
 
 @cache
 def robot(name: str) -> str:
-    """Return the URDF of a shipped robot, or of the one with ``six`` joints."""
-    if name == 'six':
-        return six_joint_arm()
+    """Return the URDF of a shipped robot, or of one of `MADE`."""
+    if name in MADE:
+        return MADE[name]()
     return (ROBOTS / f'{name}.urdf').read_text(encoding='utf-8')
 
 
@@ -129,7 +130,7 @@ def world(
     Parameters
     ----------
     name
-        ``iiwa7``, ``lwr4plus``, ``iiwa14`` or ``six``.
+        ``iiwa7``, ``lwr4plus``, ``iiwa14``, ``six``, ``panda`` or ``ur10``.
     rng
         Source of all randomness but the tour's.
     sensors
