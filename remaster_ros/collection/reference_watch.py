@@ -485,6 +485,10 @@ class SetupChanges:
     def __init__(
         self, chain: SerialChain, markers: Mapping[str, FloatArray], stop_m: float
     ) -> None:
+        # Loaded now, and not with the first test, at the third round: that would take seconds on a
+        # busy computer, while an arm and all that watches it wait for this process.
+        import scipy.stats  # noqa: F401
+
         self._stop_m = stop_m
         self._watch = ReferenceWatch(chain, markers, **({'stop_m': stop_m} if stop_m else {}))
         self._reported: SetupChange | None = None

@@ -10,6 +10,7 @@ import ctypes
 import json
 import os
 import random
+import select
 import shutil
 import signal
 import socket
@@ -148,8 +149,11 @@ class NodeProcesses:
         """Return the process that runs a node now."""
         return self._running[name].pid
 
-    def stop(self, names: Sequence[str] = (), grace_s: float = 3.5) -> list[str]:
-        """End processes within about `grace_s`, all by default; return those that were killed."""
+    def stop(self, names: Sequence[str] = (), grace_s: float = 20.0) -> list[str]:
+        """End processes within about `grace_s`, all by default; return those that were killed.
+
+        On an idle computer they take a second.
+        """
         ended = {name: self._running[name] for name in names or self._running}
         for process in ended.values():
             if process.poll() is None:
@@ -294,8 +298,14 @@ def print_hidden(console: Console, discovery: Discovered, truth: SessionTruth) -
         console.print(line)
 
 
-ANSWER_WALL_S = 30.0
-"""So long a node may take to answer, and one that was killed to be ready again, s."""
+ANSWER_WALL_S, WORK_WALL_S = 120.0, 3600.0
+"""So long a node may take to answer or to be ready, also anew, and to fit, s: on an idle computer
+they take a second and half a minute, and 40 processes for each processor are no fault of theirs.
+"""
+STANDS_WALL_S = 1800.0
+"""A collection of which nothing becomes for so long will not end, s."""
+CLEARING_CALLS = 2
+"""A halt of an arm that is reported elsewhere than it was led is cleared by a second call."""
 AFTERWARDS = 5
 """Candidate poses, each, that are visited with the correction on: with all their solutions a dozen
 or two of configurations, and `remaster verify` asks for ten."""
@@ -410,12 +420,29 @@ class Conductor(Node):
         return client.call_async(Trigger.Request()) if client.service_is_ready() else None
 
 
+class Keyboard:
+    """What a person types at the terminal, line by line."""
+
+    @property
+    def is_there(self) -> bool:
+        """Whether a person may be at the terminal."""
+        return sys.stdin is not None and sys.stdin.isatty()
+
+    def line(self) -> str | None:
+        """Return what was typed since the last call, without waiting; None for nothing."""
+        ready, _, _ = select.select([sys.stdin], [], [], 0.0)
+        # A terminal that was closed has an end, and nobody to ask.
+        return (sys.stdin.readline() or 'f').strip().lower() if ready else None
+
+
 class Demo:
     """One run of the demo; `stopping`, filled by a signal, is looked at between all steps."""
 
     def __init__(self, node: Conductor, stopping: list[int]) -> None:
         self.node, self.p, self._stopping = node, node.p, stopping
-        self.console = Console(quiet=self.p.quiet)
+        self.console, self._keyboard = Console(quiet=self.p.quiet), Keyboard()
+        # Why a person is to go on, where that was said already.
+        self._told = ''
         # Refused before anything is written.
         self.requests = [EffectSpec.parse(text) for text in self.p.hide.split(',') if text]
         cell = read_cell(self.p.cell)
@@ -462,25 +489,19 @@ class Demo:
 
     # Running
 
-    def run(self) -> None:
-        """Collect, fit, print."""
+    def run(self) -> bool:
+        """Collect, fit, print; return whether the collection came to its end."""
         self.console.print(f'hidden world drawn with seed {self.p.seed}; starting the nodes')
         self.console.print(
             'the fake arm moves without a Cartesian speed limit (real.yaml: 0.25 m/s)'
         )
         self._start()
-        self._wait(self._ready, 60.0, 'the nodes to come up')
+        self._wait(self._ready, ANSWER_WALL_S, 'the nodes to come up')
         self._trigger('remaster/collect', 'pose_planner')
-        self._collect()
-        self.console.print('fitting')
-        self._trigger('remaster/fit', 'optimizer', timeout_s=300.0)
-        results = [('report', self.fit, 'fit.json')]
-        if self.requests:
-            self.console.print('looking for causes')
-            self._trigger('remaster/discover', 'optimizer', timeout_s=300.0)
-            results.append(('causes', self.discovery, 'discovery.json'))
+        complete = self._collect()
+        results = self._estimate()
         times, file = self.node.times, None
-        if self.p.apply:
+        if self.p.apply and complete:
             file = self._apply()
         if self.p.watch:
             self._stay()
@@ -497,6 +518,20 @@ class Demo:
         self.console.print(f'session: {self.session}')
         for label, folder, data in results:
             self.console.print(f'{label}: {folder / ("report.html" if self.p.figures else data)}')
+        if not complete:
+            self._say(f'the arm was halted on its way: remaster demo --out {self.out} goes on')
+        return complete
+
+    def _estimate(self) -> list[tuple[str, Path, str]]:
+        """Fit what was measured, and look for causes; return label, folder and file of each."""
+        self.console.print('fitting')
+        self._trigger('remaster/fit', 'optimizer', timeout_s=WORK_WALL_S)
+        results = [('report', self.fit, 'fit.json')]
+        if self.requests:
+            self.console.print('looking for causes')
+            self._trigger('remaster/discover', 'optimizer', timeout_s=WORK_WALL_S)
+            results.append(('causes', self.discovery, 'discovery.json'))
+        return results
 
     def _apply(self) -> Path:
         """Give the bridge the correction, and collect once more; return its file."""
@@ -512,7 +547,7 @@ class Demo:
             self.node.summaries.pop(name, None)
         self.node.times = ConfigurationTimes(self.p.rate)
         self._start_core(self.corrected, self.p.seed + 1, AFTERWARDS, AFTERWARDS, str(file))
-        self._wait(self._ready, 60.0, 'the nodes to come up')
+        self._wait(self._ready, ANSWER_WALL_S, 'the nodes to come up')
         self._trigger('remaster/collect', 'pose_planner')
         self._collect()
         return file
@@ -658,7 +693,8 @@ class Demo:
         if not response.success:
             raise DeviceError(f'{service}: {response.message}')
 
-    def _collect(self) -> None:
+    def _collect(self) -> bool:
+        """Visit all poses; return whether all were visited, and not the arm halted for good."""
         columns = (
             TextColumn('{task.description}'),
             BarColumn(),
@@ -667,8 +703,8 @@ class Demo:
         )
         with Progress(*columns, console=self.console, transient=False) as progress:
             task = progress.add_task('registering the sensors', total=None)
-
-            def complete() -> bool:
+            done, since_wall = '', time.monotonic()
+            while not self._is_complete():
                 planner = self.node.summaries.get('pose_planner', {})
                 if planner.get('phase') == 'collection' and planner.get('configurations') != '0':
                     progress.update(
@@ -677,28 +713,19 @@ class Demo:
                         total=int(planner.get('configurations', 0)),
                         completed=int(planner.get('configurations_done', 0)),
                     )
-                if planner.get('state') == 'idle' and planner.get('resuming') == 'no':
-                    # It was killed and waits for a person to resume its run.
-                    self._go_on()
-                recorder = self.node.summaries.get('recorder', {})
-                if planner.get('state') == 'paused' and recorder.get('changed'):
-                    # A person would look at the cell first; in the demo there is nothing to mend.
-                    self.console.print(f'changed since the reference: {recorder["changed"]}')
-                    self.console.print('going on, as /remaster/collect does')
-                    self._go_on()
-                if planner.get('state') == 'failed':
-                    raise DeviceError(f'the planner gave up: {planner["message"]}')
-                halted = self.node.summaries.get('robot_bridge', {}).get('halted')
-                if halted and not self.p.watch:
-                    # Only a person ends a halt, and here is none; with the live page there may be.
-                    raise DeviceError(
-                        f'the arm was halted, which only a person ends: {halted}. What was '
-                        'measured is kept; start the demo again'
-                    )
-                closed = self.node.summaries.get('recorder', {}).get('exit_status')
-                return planner.get('state') == 'complete' and closed == 'complete'
-
-            self._wait(complete, 3600.0, 'the collection to complete')
+                self._go_on_alone()
+                if halted := self.node.summaries.get('robot_bridge', {}).get('halted'):
+                    progress.stop()
+                    if not self._goes_on(halted):
+                        return False
+                    progress.start()
+                    since_wall = time.monotonic()
+                if planner.get('configurations_done', '') != done:
+                    done, since_wall = planner.get('configurations_done', ''), time.monotonic()
+                elif time.monotonic() - since_wall > STANDS_WALL_S:
+                    states = {name: s['message'] for name, s in self.node.summaries.items()}
+                    raise DeviceError(f'nothing was measured for {STANDS_WALL_S:g} s; {states}')
+                self._spin()
         self.console.print(self.node.planned)
         measuring = [
             f'{key.removeprefix("waited_s_")} {value} s'
@@ -709,6 +736,92 @@ class Demo:
             f'the arm stood still for measuring: {", ".join(measuring)} (world time, sum of all '
             'configurations; a sensor that measures beside a faster one counts only beyond it)'
         )
+        return True
+
+    def _is_complete(self) -> bool:
+        """Whether all was visited, and the session is closed; DeviceError if that cannot be."""
+        planner = self.node.summaries.get('pose_planner', {})
+        if planner.get('state') == 'failed':
+            raise DeviceError(f'the planner gave up: {planner["message"]}')
+        closed = self.node.summaries.get('recorder', {}).get('exit_status')
+        return planner.get('state') == 'complete' and closed == 'complete'
+
+    def _go_on_alone(self) -> None:
+        """Begin again where a person would: in the demo there is nothing to look at or to mend.
+
+        With the live page there may be one, who is told.
+        """
+        summaries = self.node.summaries
+        planner, bridge = (summaries.get(name, {}) for name in ('pose_planner', 'robot_bridge'))
+        if planner.get('state') == 'idle' and planner.get('resuming') == 'no':
+            # It was killed and waits for a person to resume its run.
+            self._go_on()
+        if planner.get('state') != 'paused' or bridge.get('halted'):
+            self._told = ''
+            return
+        changed, asks = (
+            summaries.get('recorder', {}).get('changed'),
+            bridge.get('asks_for_collect'),
+        )
+        if changed or (asks and not self.p.watch):
+            self._say(f'changed since the reference: {changed}' if changed else f'paused: {asks}')
+            self._say('going on, as /remaster/collect does')
+            self._go_on()
+        elif (why := asks or planner['message']) != self._told:
+            self._say(f'paused: {why}; the live page, or /remaster/collect, goes on')
+            self._told = why
+
+    def _goes_on(self, halted: str) -> bool:
+        """Say that the arm is halted, and let a person go on; return whether that was done.
+
+        A halt is ended by a person alone: at the terminal, or on the live page.
+        """
+        done = self.node.summaries.get('pose_planner', {}).get('configurations_done', '0')
+        self._say(f'the arm is halted: {halted}. {done} configurations were measured')
+        asks = self._keyboard.is_there
+        if asks:
+            self._say(
+                'Enter goes on, as /remaster/clear_halt and /remaster/collect do; f and Enter '
+                'fits what was measured; Ctrl-C ends the demo'
+            )
+        elif not self.p.watch:
+            self._say('nobody is at the terminal: what was measured is fitted')
+            return False
+        else:
+            self._say('the live page goes on; what was measured is fitted meanwhile')
+            try:
+                self._estimate()
+            except DeviceError as error:
+                self._say(str(error))
+        while self.node.summaries.get('robot_bridge', {}).get('halted'):
+            self._spin()
+            line = self._keyboard.line() if asks else None
+            if line is None:
+                continue
+            if line.startswith('f'):
+                return False
+            self._clear_halt()
+        return True
+
+    def _clear_halt(self) -> None:
+        """Do as a person does who has looked at the arm."""
+        for _ in range(CLEARING_CALLS):
+            try:
+                self._trigger('remaster/clear_halt', 'robot_bridge')
+            except DeviceError as error:
+                self._say(str(error))
+                continue
+            # The next one says that it is not halted any more.
+            self.node.summaries.pop('robot_bridge', None)
+            self._go_on()
+            return
+
+    def _say(self, text: str) -> None:
+        """Print what a person has to know, also where nothing but errors is printed."""
+        if self.p.quiet:
+            print(text, file=sys.stderr)
+        else:
+            self.console.print(text, soft_wrap=True)
 
     def close(self) -> None:
         """End every process and remove the hidden World."""
@@ -771,8 +884,7 @@ def main(args: list[str] | None = None) -> int:
     demo = None
     try:
         demo = Demo(Conductor(), stopping)
-        demo.run()
-        return 0
+        return 0 if demo.run() else 1
     except KeyboardInterrupt:
         print('stopped; what was recorded so far can be read', file=sys.stderr)
         return 130

@@ -37,13 +37,14 @@ from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.client import Client
 from rclpy.clock import Clock
 from rclpy.node import Node
+from rclpy.publisher import Publisher
 from rclpy.subscription import Subscription
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from remaster_ros.collection import events
-from remaster_ros.collection.announcements import PEERS, Announcements
+from remaster_ros.collection.announcements import PEERS, Announcements, Lack
 from remaster_ros.collection.collection_run import CollectionRun
 from remaster_ros.collection.events import OptimizerState, PoseAnnounced
 from remaster_ros.collection.message_fields import CORRECTED, JointOrder, stamp_key, wanted_of
@@ -306,6 +307,9 @@ class PosePublisher:
         self._solutions = node.create_publisher(
             JointTrajectory, 'remaster/joint_solutions', LEASED
         )
+        # The last announcement: its event, and its messages with their publishers.
+        self._event: PoseAnnounced | None = None
+        self._messages: list[tuple[Publisher, PoseStamped | JointTrajectory]] = []
 
     @property
     def subscribers(self) -> int:
@@ -328,25 +332,16 @@ class PosePublisher:
         pose.header.stamp = self._node.get_clock().now().to_msg()
         pose.header.frame_id = self._chain.base_link
         key = stamp_key(pose.header.stamp)
-        # The event goes first: the recorder must have the pose before the arm gets there.
-        status.event(
-            PoseAnnounced(
-                stamp=key,
-                pose=stop.pose,
-                split=stop.split,
-                ids=stop.ids,
-                unreached=stop.unreached,
-                plan=plan,
-                last=last,
-            )
+        self._event = PoseAnnounced(
+            stamp=key,
+            pose=stop.pose,
+            split=stop.split,
+            ids=stop.ids,
+            unreached=stop.unreached,
+            plan=plan,
+            last=last,
         )
-        if not stop.ids:
-            # Without a solution the bridge would take the pose back, which nothing asks for.
-            return key
         write_place(stop.T_R_T, pose.pose.position, pose.pose.orientation)
-        self._poses.publish(pose)
-        # Before the solutions: with those the bridge begins to move.
-        self._waypoints.publish(waypoints_message(stop, self._chain.joint_names, pose.header))
         prefix = CORRECTED.get(stop.correction, '')
         names = [f'{prefix}{name}' for name in self._chain.joint_names]
         message = JointTrajectory(joint_names=names)
@@ -355,8 +350,24 @@ class PosePublisher:
             JointTrajectoryPoint(positions=q.tolist(), time_from_start=duration_of(i + 1.0))
             for i, q in enumerate(stop.solutions)
         ]
-        self._solutions.publish(message)
+        # The solutions last: with those the bridge begins to move. Without a solution it would
+        # take the pose back, which nothing asks for.
+        waypoints = waypoints_message(stop, self._chain.joint_names, pose.header)
+        self._messages = [
+            (self._poses, pose),
+            (self._waypoints, waypoints),
+            (self._solutions, message),
+        ] * bool(stop.ids)
+        self.repeat(status)
         return key
+
+    def repeat(self, status: NodeStatus) -> None:
+        """Publish the last announcement (again), as it was."""
+        assert self._event is not None
+        # The event goes first: the recorder must have the pose before the arm gets there.
+        status.event(self._event)
+        for publisher, message in self._messages:
+            publisher.publish(message)
 
 
 # The token of a collection under way, and the sign of life of the planner that runs it.
@@ -899,9 +910,11 @@ class PosePlanner(RemasterNode):
                 stop = self.progress.next(q, required, recorder.registration)
                 if stop is not None:
                     self._announcements.retract()
-            elif self._announcements.is_lost():
+            elif (lack := self._announcements.lack()) is Lack.ANEW:
                 stop = self.progress.rest(q)
             else:
+                if lack is Lack.LATE:
+                    self._repeat()
                 return
         except RemasterError as error:
             self._end('failed', str(error))
@@ -956,6 +969,13 @@ class PosePlanner(RemasterNode):
                 last = self.progress.is_last_reference(stop)
                 stamp = self._poses.announce(stop, self.journal.id, self.status, last=last)
                 self._announcements.announced(stamp, time.monotonic())
+
+    def _repeat(self) -> None:
+        """Send the open pose's announcement again, for a node that lags."""
+        with self._lock:
+            if self.run.state == 'running':
+                self._poses.repeat(self.status)
+                self._announcements.announced(self._announcements.stamp, time.monotonic())
 
     def _write_state(self) -> None:
         """Write the state down; a stop or pause came in a thread that must not wait for it."""

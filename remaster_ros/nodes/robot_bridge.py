@@ -380,6 +380,8 @@ class RobotBridge(RemasterNode):
         self._search = PathSearch(model, speeds)
         self._paths, self._disk = Background(self), Background(self)
         self._pose_stamp = self._run = ''
+        # The last announcement as it came: its stamp, and what is wanted, rad or m, (m, k).
+        self._announced: tuple[str, FloatArray] = ('', np.empty((0, len(self.chain))))
         self.steady_s = SteadyTime(self, self.p.simulated_clock_rate)
         self._taken = ReportsTaken(self, self.p.simulated_clock_rate)
         if last is not None:
@@ -515,6 +517,15 @@ class RobotBridge(RemasterNode):
         except InputError as error:
             self.get_logger().error(f'joint_solutions dropped: {error}')
             return
+        announced = stamp_key(message.header.stamp), targets
+        if (
+            len(targets)
+            and announced[0] == self._announced[0]
+            and (np.array_equal(targets, self._announced[1]))
+        ):
+            # Repeated for a node that lags. The arm goes on with it.
+            return
+        self._announced = announced
         refused: dict[int, str] = {}
         asked, self._changes = correction_asked(message), None
         if asked == 'on' and self._correction is None:

@@ -12,6 +12,8 @@ import threading
 import time
 
 from builtin_interfaces.msg import Time
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Header
 
 from remaster_ros.collection.message_fields import seconds
@@ -22,8 +24,16 @@ TAKEN = 'remaster/joint_states_taken'
 TAKEN_EVERY_S = 0.1
 """Reports are confirmed no more often than this, s of their stamps, or where these stand of wall
 time."""
-STANDS_WALL_S = 5.0
-"""A clock that stands longer than this has ended, and watchdogs follow the wall's, s."""
+SILENT_WALL_S = 5.0
+"""A clock that is not published for so long has ended, and watchdogs follow the wall's, s.
+
+One that is published and stands waits for somebody, however long.
+"""
+OWN_PAUSE_WALL_S = 0.5
+"""A process that has not looked at its time for longer than this was paused or kept busy, s, and
+has heard nothing meanwhile. Watchdogs look twenty times a second."""
+CLOCK_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+"""As rclpy subscribes to the clock."""
 
 
 class SteadyTime:
@@ -44,11 +54,17 @@ class SteadyTime:
                 'set; beside a real arm leave it out'
             )
         self._lock = threading.Lock()
-        # Of the last look, but `_advanced_wall`: when the simulated clock was seen to advance.
-        self._wall = self._value = self._advanced_wall = time.monotonic()
+        # Of the last look, but `_heard_wall`: when the simulated clock came.
+        self._wall = self._value = self._heard_wall = time.monotonic()
         self._simulated = 0.0
         # Between value and simulated clock.
         self._offset = 0.0
+        if rate:
+            # Beside rclpy's own subscription, which tells nothing of a time that comes again.
+            node.create_subscription(Clock, '/clock', self._on_clock, CLOCK_QOS, raw=True)
+
+    def _on_clock(self, message: bytes) -> None:
+        self._heard_wall = time.monotonic()
 
     def __call__(self) -> float:
         """Return the time now, s."""
@@ -56,14 +72,16 @@ class SteadyTime:
         if not self._rate:
             return wall
         with self._lock:
+            if wall - self._wall > OWN_PAUSE_WALL_S:
+                self._heard_wall += wall - self._wall
             simulated = self._node.now_s() / self._rate
-            ended = wall - self._advanced_wall > STANDS_WALL_S
+            ended = wall - self._heard_wall > SILENT_WALL_S
             most = self._value + wall - self._wall
             if simulated != self._simulated:
                 if ended or not self._simulated or simulated < self._simulated:
                     # It begins, again or anew: it goes on from here.
                     self._offset = self._value - simulated
-                self._simulated, self._advanced_wall = simulated, wall
+                self._simulated = simulated
                 self._value = max(self._value, min(simulated + self._offset, most))
             elif ended:
                 self._value = most

@@ -37,7 +37,7 @@ AHEAD_S, AHEAD_WALL_S = 0.15, 0.05
 """World time may be ahead of a participant by so much, s, and by so much wall time at its rate:
 half of what the bridge allows an arm to lag (0.35 s and 0.1 s of wall time), since a command takes
 a while to get to the arm."""
-PATIENCE_WALL_S = 30.0
+PATIENCE_WALL_S = 120.0
 """A process that runs and does nothing for so long is not waited for any more, s of wall time."""
 LOOK_WALL_S = 0.1
 """How often it is looked whether a process that is waited for still runs, s of wall time."""

@@ -1,5 +1,8 @@
 """What the recorder says of the references: once, again where it grows, and after a restart."""
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 
@@ -149,3 +152,25 @@ def test_a_recorder_that_is_started_again_takes_the_run_that_it_finds_as_stopped
     assert not again.follow(state, run)
     assert not again.follow(state, run)
     assert again.follow('running', 'b')
+
+
+LOADED = f"""
+import runpy, sys
+scene = runpy.run_path({__file__!r})
+arm = scene['Arm']()
+changes = scene['SetupChanges'](scene['CHAIN'], scene['MARKERS'], 5e-4)
+before = set(sys.modules)
+for shift_m in (0.0, 0.0, 0.0, 3e-3):
+    arm.shift[0] = shift_m
+    arm.round(changes)
+    arm.other(changes)
+print(changes.rounds, changes.stops, sorted(set(sys.modules) - before))
+"""
+
+
+def test_judging_a_round_loads_nothing():
+    """A library takes seconds of a busy computer, and the arm waits for the recorder."""
+    done = subprocess.run(
+        [sys.executable, '-c', LOADED], capture_output=True, text=True, check=False
+    )
+    assert done.stdout.strip().splitlines()[-1:] == ['4 True []'], done.stdout + done.stderr

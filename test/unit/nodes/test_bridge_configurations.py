@@ -259,6 +259,30 @@ def test_another_pose_stops_the_arm_and_is_gone_to(rig):
     np.testing.assert_allclose(r.settled[0].position, HOME, atol=1e-4)
 
 
+def test_the_same_pose_never_stops_the_arm(rig):
+    """A planner repeats an announcement for a node that lags; the bridge has it already."""
+    r = rig()
+    r.go(AWAY, speed=0.2)
+    for _ in range(5):
+        r.pose -= 1
+        r.plan(AWAY)
+        r.run(0.2)
+    assert r.named(ArmStopped) == []
+    assert len(r.moves()) == 1
+    r.run(20.0, lambda: r.settled)
+    r.pose -= 1
+    # Also where it stands and is measured.
+    named = r.plan(AWAY)
+    r.run(5.0)
+    assert len(r.settled) == 1
+    r.answer(named, 0)
+    # The same stamp with other joints is no repetition.
+    r.pose -= 1
+    r.plan(HOME)
+    r.run(20.0, lambda: len(r.settled) == 2)
+    np.testing.assert_allclose(r.settled[1].position, HOME, atol=1e-4)
+
+
 @pytest.mark.parametrize('names', [None, []])
 def test_no_solutions_are_a_stop_whatever_joints_they_name(rig, names):
     r = rig()

@@ -12,7 +12,7 @@ import rclpy
 from std_srvs.srv import Trigger
 from worlds.simple_cells import write_cell
 
-from remaster_ros.collection.events import Decided, EventRecord, RecorderState
+from remaster_ros.collection.events import BridgeState, Decided, EventRecord, RecorderState
 from remaster_ros.nodes.pose_planner import PosePlanner
 
 pytestmark = [pytest.mark.ros, pytest.mark.timeout(60)]
@@ -41,12 +41,20 @@ class Planner:
         state = RecorderState(waiting_for='', run='')
         node._peers.take(EventRecord(node='/recorder', body=state), time.monotonic())
         node._hindrance = lambda now: ''
-        self.announced = []
-        node._poses.announce = self._announce
+        self.announced, self.repeated = [], 0
+        node._poses.announce, node._poses.repeat = self._announce, self._repeat
 
     def _announce(self, stop, plan, status, *, last):
         self.announced.append(stop)
         return f'stamp {len(self.announced)}'
+
+    def _repeat(self, status):
+        self.repeated += 1
+
+    def peer(self, body, after_s=0.0, started='first'):
+        """Have a record of bridge or recorder, which comes in so much time."""
+        record = EventRecord(node=f'/{body.sender}', body=body, started=started)
+        self.node._peers.take(record, time.monotonic() + after_s)
 
     def call(self, what):
         response = getattr(self.node, f'_on_{what}')(Trigger.Request(), Trigger.Response())
@@ -98,6 +106,28 @@ def begin(tmp_path, monkeypatch):
     yield make
     if rclpy.ok():
         running[-1].kill()
+
+
+def test_a_pose_that_a_busy_recorder_has_not_taken_is_repeated_and_not_announced_anew(begin):
+    planner = begin(confirm=False)
+    node = planner.node
+    planner.peer(RecorderState(waiting_for='', run=''))
+    planner.peer(BridgeState(halted=''))
+    assert planner.call('collect')[0]
+    planner.step_until(lambda: planner.announced, 'the first pose')
+    stamp = node._announcements.stamp
+    planner.peer(BridgeState(halted='', pose=stamp))
+    for minute in range(1, 20):
+        # What the recorder says is from before the pose, for ever longer.
+        planner.peer(RecorderState(waiting_for='', run=''), 60.0 * minute)
+        node._step()
+    assert len(planner.announced) == 1
+    assert node._announcements.stamp == stamp
+    assert 1 <= planner.repeated <= 19
+    # One that was started anew has nothing of it: what is left is announced anew.
+    planner.peer(RecorderState(waiting_for='', run=''), started='second')
+    planner.step_until(lambda: len(planner.announced) == 2, 'the pose again')
+    assert planner.announced[1].pose == planner.announced[0].pose
 
 
 def test_a_pose_is_announced_only_where_its_own_plan_was_confirmed(begin, tmp_path):
