@@ -404,8 +404,9 @@ class Pairing:
             return None
         if used := within(end):
             return end, used
+        # A damaged stamp is in no order.
         enough = [
-            part[rules.min_samples - 1].stamp_s
+            sorted(reading.stamp_s for reading in part)[rules.min_samples - 1]
             for part in seen.values()
             if len(part) >= rules.min_samples
         ]
