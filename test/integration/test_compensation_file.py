@@ -66,6 +66,27 @@ def test_the_hidden_arm_is_where_the_nominal_one_would_be(hidden, found):
     assert 0.4 < good.rms_m / good.predicted_m < 2.0
 
 
+def test_lengths_and_tilts_are_corrected_where_the_arm_is_and_all_over_its_limits(tmp_path):
+    """A fade of singular directions left 0.4 mm of a length, of which the file said 0.06."""
+    recipe = Recipe(
+        2, ('link_length', 'joint_axis_tilt'), size_m=0.5e-3, robot='lwr4plus', noise='plain',
+        candidates=30,
+    )  # fmt: skip
+    hidden = hidden_session(recipe)
+    save_discovery(remaster_ros.discover(hidden.session), tmp_path, figures=False)
+    file = remaster_ros.read_compensation(tmp_path / 'apply' / 'compensation.json')
+    assert file.model.geometry.is_any
+    visits = hidden.world.visits
+    low, high = (0.7 * limit for limit in file.model.chain.usual_range)
+    q = np.random.default_rng(1).uniform(low, high, (300, 7))
+    everywhere = replace(visits, q=q, pose=np.arange(300), is_validation=np.zeros(300, dtype=bool))
+    for tour, most_m in ((visits, 0.06e-3), (everywhere, 0.15e-3)):
+        found = judged(hidden, file.compensator, tour)
+        assert found.rms_m < most_m
+        assert found.rms_m < 1.5 * found.predicted_m
+        assert found.inside > 0.8
+
+
 def test_file_and_memory_are_one(found):
     discovery, folder = found
     assert holds_everything(discovery)
