@@ -105,19 +105,18 @@ def test_what_can_be_loaded_of_a_panda(tmp_path: Path) -> None:
     offsets, geometry, everything = (row['held_out_mean_mm'] for row in loadable)
     assert offsets > 1.0
     assert geometry < 0.33
-    # As commanded: at most of these poses a direction fades near a singularity, and what stays
-    # uncorrected there counts, though the model itself predicts the arm to 0.27 mm.
-    assert geometry < everything < 0.5 * offsets
+    # As commanded: two degrees a joint suffice at nearly all of these poses.
+    assert everything < 0.9 * geometry
     m = found.residuals.context.measurements
     commanded = file.model.state(file.command(m.q)).tool
     wanted = file.model.chain.forward(m.q)
     (place,) = file.model.markers.values()
     missed = (commanded - wanted) @ [*place, 1.0]
     missed_mm = 1e3 * np.linalg.norm(missed[m.is_validation, :3], axis=1).mean()
-    assert missed_mm > 0.25
-    assert abs(everything - np.hypot(0.27, missed_mm)) < 0.1
+    # By a fade of singular directions it was 0.3 mm.
+    assert missed_mm < 0.05
     row = read_discovery(tmp_path / 'discovery.json').loadable[2]
-    assert load_words(row)[1].startswith('only where no robot model')
+    assert load_words(row)[1].startswith('apply/compensation.json')
 
 
 @pytest.mark.parametrize('name', ['meca500_repeats', 'irb120_three_points'])
