@@ -49,12 +49,15 @@ class Confinement:
     """Which files a robot description may name.
 
     Those below its own folder, below the package that it is in, below the packages that it names,
-    and below the folders that the user gives. Links are followed before that is judged, but for
-    what a sourced workspace has: who builds a workspace runs its code, and links of its files lead
-    to their sources.
+    below the folders that the user gives, and the files that the user has named. Links are
+    followed before that is judged, but for what a sourced workspace has: who builds a workspace
+    runs its code, and links of its files lead to their sources.
     """
 
-    def __init__(self, path: Path, package_path: Sequence[Path] = ()) -> None:
+    def __init__(
+        self, path: Path, package_path: Sequence[Path] = (), named: Sequence[Path] = ()
+    ) -> None:
+        self._named = [file.resolve() for file in named]
         self._sourced = [Path(os.path.abspath(folder)) for folder in sourced()]
         self._folders: list[Path] = []
         for folder in package_path:
@@ -71,8 +74,10 @@ class Confinement:
     def holds(self, path: Path) -> bool:
         """Return whether a file may be read."""
         real, written = path.resolve(), Path(os.path.abspath(path))
-        return any(map(real.is_relative_to, self._folders)) or any(
-            map(written.is_relative_to, self._sourced)
+        return (
+            real in self._named
+            or any(map(real.is_relative_to, self._folders))
+            or any(map(written.is_relative_to, self._sourced))
         )
 
 

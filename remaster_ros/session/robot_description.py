@@ -29,6 +29,7 @@ WALL_S = 30.0
 """Wall time for an expansion, s, also where a busy computer gives it little processor time."""
 _KEPT = ('AMENT_PREFIX_PATH', 'LD_LIBRARY_PATH')
 """Of the environment: where packages are, and what Python itself may need to start."""
+_NAMED = ('.yaml', '.yml', '.xacro', '.urdf', '.xml')
 # Headers of hundreds of columns are shorter, bytes.
 _HEAD = 16_384
 _COLOURS = re.compile(r'\x1b\[[0-9;]*m')
@@ -58,7 +59,8 @@ def read_description(
     Parameters
     ----------
     arguments
-        What ``xacro`` takes as NAME:=VALUE.
+        What ``xacro`` takes as NAME:=VALUE. A file that one of them names, from the working
+        folder, is read wherever it lies: it was named by the user, and not by the description.
     package_path
         Folders to look for ROS packages in, beside those around the file.
     trusted
@@ -78,9 +80,11 @@ def read_description(
                 f'{" ".join(f"{name}:={value}" for name, value in arguments.items())}'
             )
         return text
+    values = {name: _from_here(value) for name, value in (arguments or {}).items()}
     request = {
         'file': str(path.absolute()),
-        'arguments': dict(arguments or {}),
+        'arguments': values,
+        'named': [value for value in values.values() if _names_a_file(value)],
         'package_path': [str(folder.absolute()) for folder in package_path],
         'trusted': trusted,
         'cpu_s': CPU_S,
@@ -114,6 +118,23 @@ def read_description(
         if line.strip():
             log.warning('%s: %s', path, line.strip())
     return f'<?xml version="1.0"?>\n<!-- expanded from {path.name} by xacro -->\n{answer["text"]}'
+
+
+def _names_a_file(value: str) -> bool:
+    """Whether the value of an argument is a file of a description; a word may be one by chance."""
+    path = Path(value)
+    try:
+        return path.suffix in _NAMED and path.is_file()
+    except (OSError, ValueError):
+        return False
+
+
+def _from_here(value: str) -> str:
+    """Return the value of an argument; of a file in the working folder, its whole path.
+
+    xacro would look for it beside the description.
+    """
+    return str(Path(value).absolute()) if _names_a_file(value) else value
 
 
 def _too_slow(path: Path, after: str) -> InputError:

@@ -386,12 +386,15 @@ _TOKENS = re.compile(
 class Expansion:
     """The expansion of one file, which may do what a program may if it is trusted.
 
-    ROS packages are looked for in the folders of `package_path`, and around the file.
+    ROS packages are looked for in the folders of `package_path`, and around the file. The files
+    `named` by the user may be read as well.
     """
 
-    def __init__(self, path: Path, package_path: list[Path], *, trusted: bool) -> None:
+    def __init__(
+        self, path: Path, package_path: list[Path], named: list[Path], *, trusted: bool
+    ) -> None:
         self._path, self._package_path = path, package_path
-        self._files = Confinement(path, package_path)
+        self._files = Confinement(path, package_path, named)
         if trusted:
             substitution_args._eval_find = self._find
             substitution_args._eval_dict['find'] = self._find
@@ -610,7 +613,9 @@ def serve(request: dict[str, Any]) -> None:
         folders = [Path(folder) for folder in request['package_path']]
         # What xacro prints is for people.
         with contextlib.redirect_stdout(sys.stderr):
-            text = Expansion(path, folders, trusted=trusted).text(request['arguments'])
+            named = [Path(file) for file in request['named']]
+            expansion = Expansion(path, folders, named, trusted=trusted)
+            text = expansion.text(request['arguments'])
         answer = {'text': text}
     # A xacro file is a program: it raises whatever it leads to.
     except Exception as error:

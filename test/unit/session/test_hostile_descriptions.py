@@ -399,6 +399,32 @@ def test_files_of_the_description_its_package_and_named_packages_are_read(tmp_pa
     assert '<linked/>' in read_description(path)
 
 
+@pytest.mark.parametrize('whole', [False, True])
+def test_a_file_that_the_user_names_is_read_wherever_it_lies(whole, cell, monkeypatch):
+    """As of a UR, whose calibration lies with the robot and not with its description."""
+    elsewhere = cell.parent / 'robots'
+    elsewhere.mkdir()
+    (elsewhere / 'arm7.yaml').write_text('length: 0.425')
+    (elsewhere / 'other.yaml').write_text('length: 1.0')
+    path = cell / 'arm.xacro'
+    default = '<xacro:arg name="file" default="../robots/arm7.yaml"/>'
+    path.write_text(
+        robot(
+            f'{default}<a b="${{xacro.load_yaml(\'$(arg file)\').length}}"/>'
+            '<xacro:arg name="more" default=""/><xacro:if value="${\'$(arg more)\' != \'\'}">'
+            '<a c="${xacro.load_yaml(\'../robots/other.yaml\').length}"/></xacro:if>'
+        )
+    )
+    # What the description names by itself stays outside.
+    with pytest.raises(InputError, match='lies outside'):
+        read_description(path)
+    monkeypatch.chdir(elsewhere)
+    named = {'file': str(elsewhere / 'arm7.yaml') if whole else 'arm7.yaml'}
+    assert '<a b="0.425"/>' in read_description(path, named)
+    with pytest.raises(InputError, match=r'other.yaml, which lies outside'):
+        read_description(path, {**named, 'more': 'arm7.yaml'})
+
+
 MESHES = {
     'a whole path': 'file://{outside}/part.stl',
     'steps up': '../outside/part.stl',
