@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import compress
@@ -116,6 +117,24 @@ def _first(parts: Sequence[str]) -> str:
         rest = len(parts) - MOST_NAMED
         return listed([*parts[:MOST_NAMED], f'{rest} more'])
     return listed(parts)
+
+
+# The share of a parameter in a direction, and what it moves by.
+_AMOUNT = re.compile(r' \([+-][\d.e+-]+\)|(?: tangentially)?, [\d.]+ mm per degree')
+_MOST_SHOWN = 2
+
+
+def in_a_line(why: str) -> str:
+    """Return a reason of `in_words` for a terminal: without amounts, of many names the first."""
+    cause, *rest = why.split('; ')
+    before, sign, after = _AMOUNT.sub('', cause).partition(' = ')
+    text = after if sign else before
+    names = re.split(r', | and ', text)
+    if len(names) > _MOST_SHOWN + 1:
+        text = f'{", ".join(names[:_MOST_SHOWN])} and {len(names) - _MOST_SHOWN} more'
+    remedy = next((part for part in rest if 'separate' in part or 'show' in part), '')
+    looks = f'looks like {text}' if sign else text
+    return f'{looks}; {remedy}' if remedy else looks
 
 
 def hardly_seen(names: Sequence[str], loadings: FloatArray) -> str:

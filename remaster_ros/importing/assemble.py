@@ -143,6 +143,12 @@ def assemble(
     sensor, sensors = _numbered(rows.labels.get('sensor', [options.sensor] * n))
     marker, markers = _numbered(rows.labels.get('marker', [options.marker] * n))
     from_q = pad.to_urdf(rows.from_q)
+    effort = rows.effort
+    if effort is not None:
+        # Power is the same however joints are counted: q = A q_pad + b, and so A^T tau = tau_pad.
+        shown = np.vstack((np.zeros(len(chain)), np.eye(len(chain))))
+        turned = pad.to_urdf(shown)
+        effort = np.linalg.solve(turned[1:] - turned[0], effort.T).T
     if options.visited_in_order:
         from_q = _visited(configuration, q)
     measurements = Measurements(
@@ -163,6 +169,7 @@ def assemble(
             rows.stamp_s if rows.reading is None else rows.reading, sensor, marker, configuration
         ),
         orientation=rows.orientation,
+        effort=effort,
     )
     place = np.zeros(3) if options.marker_m is None else np.array(options.marker_m)
     std = UNKNOWN_MARKER_STD_M if options.marker_m is None else 0.5e-3

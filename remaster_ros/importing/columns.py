@@ -39,6 +39,9 @@ _OTHER_JOINTS = {
     *('velocity', 'vel', 'qd', 'speed', 'current', 'torque', 'effort', 'moment', 'tau', 'temp'),
     *('temperature', 'acceleration', 'error', 'err', 'offset', 'std', 'sigma', 'min', 'max'),
 }
+# Words of torques that were measured at all joints, in N m, and what else stands beside them.
+_TORQUES = {'torque', 'torques', 'tau', 'effort', 'efforts', 'moment'}
+_OF_TORQUES = {'nm', 'motor', 'j'}
 # What pendants call the joints, base to tip, as words of a header: UR in five languages, Yaskawa.
 _PENDANTS = tuple(
     tuple(tuple(_TOKEN.findall(name)) for name in names.split())
@@ -102,6 +105,8 @@ class Columns:
     # Base to tip.
     joints: tuple[int, ...] = ()
     from_joints: tuple[int, ...] = ()
+    # Measured torques of the joints, N m; () where there are none.
+    efforts: tuple[int, ...] = ()
     # Marker ('' where there is one without a name) -> X, Y and Z, their standard deviations, and
     # the quaternion x, y, z, w where it was measured.
     points: dict[str, tuple[int, ...]] = field(default_factory=dict)
@@ -293,6 +298,16 @@ def _joints(
     if came_from:
         found.from_joints = complete[came_from[0]]
         _take(found, found.from_joints, taken)
+    torques = [
+        columns
+        for stem, columns in complete.items()
+        if _TORQUES & set(stem)
+        and set(stem) <= _TORQUES | _OF_TORQUES | _JOINT_WORDS | _REPORTED | {*'*=#'}
+        and len(columns) == len(joint_names)
+    ]
+    if len(torques) == 1:
+        found.efforts = torques[0]
+        _take(found, found.efforts, taken)
     usable = [stem for stem in complete if not _OTHER_JOINTS & set(stem) and stem not in came_from]
     known = [stem for stem in usable if set(stem) <= _JOINT_WORDS | _REPORTED | {*'*=#'}]
     best = [stem for stem in known if '=' in stem or _REPORTED & set(stem)] or known or usable

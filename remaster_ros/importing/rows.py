@@ -18,6 +18,7 @@ from remaster_ros.errors import InputError
 from remaster_ros.importing.columns import AXES, Columns, Table, Told, find_columns
 from remaster_ros.importing.makers import kuka
 from remaster_ros.importing.makers.named import some
+from remaster_ros.importing.pose_matrices import with_poses
 from remaster_ros.importing.standstills import stopped
 from remaster_ros.importing.text_table import (
     MOST_COLUMNS,
@@ -372,6 +373,7 @@ class RawRows:
     # Joint column -> (another one, 1 or -1), as the controller of this file counts
     coupling: Mapping[str, tuple[str, Literal[1, -1]]] = field(default_factory=dict)
     maker: str = ''  # Of the controller; '' where it is not known
+    effort: FloatArray | None = None  # Measured torques, N m, (n, k); None where there are none
 
     def in_order(self) -> RawRows:
         """Return the rows in the order of their times."""
@@ -420,15 +422,22 @@ def read_rows(paths: Sequence[Path], chain: SerialChain, options: TableOptions) 
         for table in tables
     ]
     sliding = np.flatnonzero(chain.slides).tolist()
-    found = [
-        (
-            table,
-            find_columns(
-                table, chain.joint_names, _of_table(options.told, table, tables), sliding
-            ),
-        )
-        for table in tables
-    ]
+
+    def with_columns(tables: list[TextTable]) -> list[Table]:
+        return [
+            (
+                table,
+                find_columns(
+                    table, chain.joint_names, _of_table(options.told, table, tables), sliding
+                ),
+            )
+            for table in tables
+        ]
+
+    found = with_columns(tables)
+    if not any(columns.points for _, columns in found) and not options.told.points:
+        tables = [with_poses(table) for table in tables]
+        found = with_columns(tables)
     _refuse_untold(found, options.told)
     with_points = _told_first([pair for pair in found if pair[1].points], 'points')
     with_joints = _told_first([pair for pair in found if pair[1].joints], 'joints')
@@ -583,6 +592,10 @@ def _values(
         if name in columns.orientations:
             turns[i] = numbers(table, columns.orientations[name], optional=True)
             _refuse_no_turn(table, columns.orientations[name], turns[i])
+    effort = None
+    # Of a stream the torques are those of one moment, and no mean over a standstill.
+    if joints[1].efforts and stamp is None:
+        effort = numbers(joints[0], joints[1].efforts, optional=True)
     if stamp is None and options.told.time != 'none':
         stamp = times(*points)
         if stamp is None and joints[0] is not table:
@@ -604,7 +617,7 @@ def _values(
         prefix = f'{one.path.name}: ' if len(both) > 1 else ''
         is_joints, is_points = found is joints[1], found is columns
         meaning = _meanings(
-            found if is_joints else replace(found, joints=(), from_joints=()),
+            found if is_joints else replace(found, joints=(), from_joints=(), efforts=()),
             chain,
             tuple(f'{unit} ({how})' for unit, how in units),
             f'{length} ({how_length})' if is_points else '',
@@ -642,6 +655,7 @@ def _values(
         ),
         coupling=joints[0].coupling,
         maker=joints[0].maker,
+        effort=None if effort is None else effort[row],
     )
 
 
@@ -729,6 +743,8 @@ def _meanings(
         for joint, i in enumerate(joints):
             name, unit = chain.joint_names[joint], units[joint]
             found.setdefault(i, f'{kind}joint {joint + 1} ({name}), {unit}{how(i)}')
+    for name, i in zip(chain.joint_names, columns.efforts):
+        found.setdefault(i, f'torque of {name}, N m')
     for marker, own in columns.points.items() if length else ():
         of = f'marker {marker}' if marker else 'the marker'
         spread, turned = columns.stds.get(marker, ()), columns.orientations.get(marker, ())

@@ -38,6 +38,9 @@ from remaster_ros.types import FloatArray, Session
 SAME_JOINTS_RAD = 1e-3
 # Points that agree so well with the nominal arm are computed from its joints, m.
 COMPUTED_M = 2e-5
+# Twice what the softest arms bend by (an LBR iiwa with its payload, 5 mm). What is further off was
+# measured wrong, or belongs to other joints.
+BENT_M = 0.01
 # Rows that a sentence names.
 SHOWN_ROWS = 5
 
@@ -86,8 +89,9 @@ def check_sense(session: Session, rows: RawRows, progress: Callable[[str, float]
             error_m=as_given.error_m,
         )
     beside = _beside(session, off, rows)
+    too_many = off.too_many and bool(beside)
     allowed = max(DISPLACED * session.marker_std_m, MARKER_SHIFT_M)
-    if not as_given.gross and not off.too_many and as_given.marker_shift_m < allowed:
+    if not as_given.gross and not too_many and as_given.marker_shift_m < allowed:
         return Sense(
             True,
             f'the robot fits to {without} (median), with zero-offsets of up to '
@@ -113,7 +117,7 @@ def check_sense(session: Session, rows: RawRows, progress: Callable[[str, float]
     if mistakes.fitting:
         sentence, options = in_a_sentence(mistakes, session, columns_of(rows, chain))
         return Sense(False, sentence, options, as_given.error_m)
-    if off.too_many and as_given.error_m <= UNCALIBRATED_ERROR_M:
+    if too_many and as_given.error_m <= UNCALIBRATED_ERROR_M:
         return _many_off(as_given, beside, rows)
     if not as_given.gross:
         return Sense(
@@ -210,7 +214,7 @@ def _by_marker(session: Session, rows: RawRows, without: str) -> Sense | None:
 
 def _beside(session: Session, off: RowsOff, rows: RawRows) -> tuple[tuple[str, float], ...]:
     """Return the rows that do not fit, the farthest first, with their distances, m."""
-    found = np.flatnonzero(off.off)
+    found = np.flatnonzero(off.off & (off.error_m > BENT_M))
     order = found[np.argsort(-off.error_m[found], kind='stable')]
     # Rows were left out where points were moved to other joints.
     line = session.measurements.observation

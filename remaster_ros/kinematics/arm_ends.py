@@ -36,7 +36,7 @@ def likely_base(model: UrdfModel, names: Container[str] = ()) -> str:
     arms = {
         link: arm
         for link in model.links
-        if (arm := _arm(model, link, sliders=sliders)) is not None
+        if (arm := _arm(model, link, sliders=sliders, names=names)) is not None
     }
     # From the root where both are as good.
     best = max(
@@ -86,12 +86,19 @@ def likely_tips(model: UrdfModel, base_link: str, names: Container[str] = ()) ->
     arms = {
         link: arm[1]
         for link in model.links
-        if (arm := _arm(model, link, base_link, sliders)) is not None and arm[0] == base_link
+        if (arm := _arm(model, link, base_link, sliders, names)) is not None
+        and arm[0] == base_link
     }
-    most = max(((_named(arm, names), len(arm)) for arm in arms.values()), default=(0, 0))
-    if not most[1]:
+
+    def worth(arm: list[UrdfJoint]) -> tuple[int, bool, int]:
+        # An arm all of whose joints are named ends there, whatever else moves behind it.
+        count = _named(arm, names)
+        return count, 0 < count == len(arm), len(arm)
+
+    most = max(map(worth, arms.values()), default=(0, False, 0))
+    if not most[2]:
         raise InputError(f"URDF: no joint moves behind link '{base_link}'; name another base link")
-    ends = [link for link, arm in arms.items() if (_named(arm, names), len(arm)) == most]
+    ends = [link for link, arm in arms.items() if worth(arm) == most]
     parents = {joint.parent for joint in model.parent_joint.values()}
 
     def rank(link: str) -> tuple[int, bool, int]:
@@ -107,7 +114,7 @@ def likely_tips(model: UrdfModel, base_link: str, names: Container[str] = ()) ->
     if len(first) > 1:
         tips = ' or '.join(sorted(first.values()))
         raise InputError(
-            f'URDF: there are several arms of {most[1]} joints ({", ".join(sorted(first))} are '
+            f'URDF: there are several arms of {most[2]} joints ({", ".join(sorted(first))} are '
             f'their last ones); name the tip link, --tip-link {tips}'
         )
     return ordered
@@ -122,7 +129,7 @@ def likely_tip(model: UrdfModel, base_link: str, names: Container[str] = ()) -> 
         As `likely_tips`, or the arm goes on behind a joint that slides and is not named.
     """
     tip = likely_tips(model, base_link, names)[0]
-    last = _arm(model, tip, base_link, _sliders(model, names, carrying=True))
+    last = _arm(model, tip, base_link, _sliders(model, names, carrying=True), names)
     for joint in _moved_from(model, last[1][-1].child if last else tip):
         beyond = [j for j in _moved_from(model, joint.child) if not _is_jaw(j)]
         if joint.kind == 'prismatic' and not joint.mimic and not _is_jaw(joint) and beyond:
@@ -197,8 +204,11 @@ def _arm(
     link: str,
     base_link: str | None = None,
     sliders: Container[str] = (),
+    names: Container[str] = (),
 ) -> tuple[str, list[UrdfJoint]] | None:
     """Return where the arm that carries a link starts, and its joints; None behind its tool.
+
+    A joint of `names` is the arm's, also where something else that moves branches off beside it.
 
     It starts at `base_link`, or at the root, or at what a joint carries that neither turns nor is
     one of the sliders.
@@ -214,7 +224,10 @@ def _arm(
             joints.append(joint)
         link = joint.parent
     joints.reverse()
-    hand = any(len(_moved_from(model, joint.parent)) > 1 for joint in joints[_HAND_BEHIND:])
+    hand = any(
+        joint.name not in names and len(_moved_from(model, joint.parent)) > 1
+        for joint in joints[_HAND_BEHIND:]
+    )
     return None if hand or any(map(_is_jaw, joints)) else (link, joints)
 
 

@@ -37,6 +37,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 from std_srvs.srv import Trigger
 
+from remaster_ros.calibration.gauge_words import in_a_line
 from remaster_ros.collection.events import (
     ConfigurationEnded,
     Event,
@@ -262,7 +263,7 @@ def print_offsets(console: Console, fit: Fit, truth: SessionTruth) -> None:
     console.print(table)
     for row in fit.joint_offsets:
         if not row.identifiable:
-            console.print(f'{row.joint}: {row.why}')
+            console.print(f'{row.joint}: {in_a_line(row.why)}', soft_wrap=True)
     title = 'error on validation poses, which were never fitted, mm (mean)'
     accuracy = _table(title, 'metric', 'before', 'after')
     for metric in ('relative', 'post_registration'):

@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 from msgspec import Struct
 
-from remaster_ros.calibration.gauge_words import counted, listed
+from remaster_ros.calibration.gauge_words import counted, in_a_line, listed
 from remaster_ros.calibration.measured_again import MeasuredAgain
 from remaster_ros.calibration.noise_check import SPOILT, NoiseCheck
 from remaster_ros.calibration.predictions import Coverage
@@ -651,7 +651,7 @@ def fit_lines(fit: Fit) -> list[str]:
 
 def _offset(row: JointOffset) -> str:
     if not row.identifiable:
-        return f'   not identifiable: {row.why}'
+        return f'   not identifiable: {in_a_line(row.why)}'
     if row.unit == 'mm':
         return f'{row.mean_mm:+9.4f} ± {row.std_mm:.4f} mm'
     return f'{row.mean_deg:+9.4f} ± {row.std_deg:.4f} deg'

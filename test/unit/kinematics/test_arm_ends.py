@@ -139,3 +139,37 @@ def test_a_rail_is_of_the_arm_where_what_it_carries_is_none_or_a_base_says_so():
     # What slides behind a whole arm is its tool's.
     pusher = tree(*FIVE, ('push', 'l5', 'plunger', 'prismatic'))
     assert likely_tips(pusher, 'l0') == ['l5']
+
+
+def seven_joints(extra):
+    """Return an arm of seven joints, and what else moves on it: (parent, child) of each."""
+    links = ['base_link', *(f'link_{i}' for i in range(1, 8))]
+    names = [f'joint_{i}' for i in range(1, 8)]
+    joints = [Joint(name, (0, 0, 1), (0, 0, 0), (0, 0, 0.2), -2, 2) for name in names]
+    branches = [
+        part
+        for parent, child in extra
+        for part in (
+            link(child),
+            arm(
+                [Joint(f'{child}_joint', (0, 0, 1), (0, 0, 0), (0.1, 0, 0), -1, 1)],
+                [parent, child],
+            ),
+        )
+    ]
+    return parse_urdf(document('seven', *map(link, links), arm(joints, links), *branches))
+
+
+@pytest.mark.parametrize(
+    'extra',
+    [
+        [('link_6', 'camera')],
+        [('link_6', 'pan'), ('pan', 'tilt')],
+        [('link_7', 'changer')],
+        [('link_5', 'pan'), ('pan', 'tilt'), ('tilt', 'zoom')],
+    ],
+)
+def test_seven_joints_that_are_named_decide_the_tip_against_a_branch(extra):
+    model = seven_joints(extra)
+    names = {'time', *(f'joint_{i}' for i in range(1, 8))}
+    assert likely_tip(model, likely_base(model, names), names) == 'link_7'

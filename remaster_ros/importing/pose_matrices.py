@@ -1,0 +1,102 @@
+"""Poses that a table writes as 4×4 matrices, sixteen columns each: a point and a quaternion."""
+
+from __future__ import annotations
+
+import re
+from collections import defaultdict
+from collections.abc import Mapping
+from dataclasses import replace
+from itertools import product
+
+import numpy as np
+
+from remaster_ros.errors import InputError
+from remaster_ros.importing.text_table import TextTable
+from remaster_ros.kinematics.transforms import quaternion_xyzw
+from remaster_ros.types import FloatArray
+
+# A column by row and column of its number, `T[0][3]`, or by one count, `O_T_EE_12`.
+_ROW_AND_COLUMN = re.compile(r'(.*?)[\[(_ ]*([0-4])[\])_, \[(]*([0-4])[\])]?')
+_COUNTED = re.compile(r'(.*?)[\[(_ ]*(\d{1,2})[\])]?')
+_SIZE = 4
+# Of a rotation written with three digits.
+_ROUNDING = 2e-3
+
+
+def with_poses(table: TextTable) -> TextTable:
+    """Return a table with X, Y, Z and quaternion of each 4×4 matrix in place of its columns.
+
+    The numbers stand row by row, or column by column as libfranka writes them: the row 0 0 0 1
+    tells which. Sixteen columns that are no rigid motion stay as they are.
+    """
+    names, rows = list(table.names), [list(row) for row in table.rows]
+    dropped: set[int] = set()
+    poses: dict[str, list[int]] = {}
+    for stem, places in _groups(table).items():
+        numbers = _numbers(table, places)
+        T = None if numbers is None else _rigid(numbers)
+        if T is None:
+            continue
+        of = stem or 'pose'
+        # Where they stood: seven columns in place of sixteen.
+        labels = [f'{of} {axis}' for axis in 'xyz'] + [f'{of} q{axis}' for axis in 'xyzw']
+        values = np.column_stack((T[:, :3, 3], [quaternion_xyzw(one[:3, :3]) for one in T]))
+        for column, label, cells in zip(places, labels, values.T):
+            names[column] = label
+            for row, value in zip(rows, cells):
+                text = repr(float(value))
+                row[column] = text.replace('.', ',') if table.decimal == ',' else text
+        poses[of] = places[: len(labels)]
+        dropped.update(places[len(labels) :])
+    if not dropped:
+        return table
+    kept = [i for i in range(len(names)) if i not in dropped]
+    at = {column: i for i, column in enumerate(kept)}
+    return replace(
+        table,
+        names=tuple(names[i] for i in kept),
+        rows=tuple(tuple(row[i] for i in kept) for row in rows),
+        groups={of: tuple(at[i] for i in columns[:3]) for of, columns in poses.items()},
+        turns={of: tuple(at[i] for i in columns[3:]) for of, columns in poses.items()},
+    )
+
+
+def _groups(table: TextTable) -> Mapping[str, list[int]]:
+    """Return the sixteen columns of each matrix, in the order of their numbers, by their name."""
+    found: dict[str, list[int]] = {}
+    for pattern, counts in ((_ROW_AND_COLUMN, _SIZE), (_COUNTED, _SIZE * _SIZE)):
+        by_stem: dict[str, dict[tuple[int, ...], int]] = defaultdict(dict)
+        for i, name in enumerate(table.names):
+            if match := pattern.fullmatch(name):
+                by_stem[match[1]].setdefault(tuple(map(int, match.groups()[1:])), i)
+        for stem, columns in by_stem.items():
+            if stem in found or len(columns) != _SIZE * _SIZE:
+                continue
+            for first in (0, 1):
+                each = range(first, first + counts)
+                order = [*product(each, repeat=2 if counts == _SIZE else 1)]
+                if {*columns} == {*order}:
+                    found[stem] = [columns[key] for key in order]
+    return found
+
+
+def _numbers(table: TextTable, columns: list[int]) -> FloatArray | None:
+    """Return the numbers of columns, (n, 16); None where one is missing or is none."""
+    try:
+        cells = [[table.number(row, i) for i in columns] for row in range(len(table.rows))]
+    except InputError:
+        return None
+    if any(None in row for row in cells):
+        return None
+    return np.array(cells, float)
+
+
+def _rigid(numbers: FloatArray) -> FloatArray | None:
+    """Return rigid motions (n, 4, 4) of their numbers (n, 16); None where they are none."""
+    T = numbers.reshape(-1, _SIZE, _SIZE)
+    for each in (T, T.swapaxes(1, 2)):
+        R = each[:, :3, :3]
+        turns = np.abs(R @ R.swapaxes(1, 2) - np.eye(3)).max() < _ROUNDING
+        if turns and np.all(each[:, 3] == [0, 0, 0, 1]) and np.all(np.linalg.det(R) > 0.0):
+            return each
+    return None
