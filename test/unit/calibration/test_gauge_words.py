@@ -15,8 +15,8 @@ from remaster_ros.calibration.gauge_words import in_a_line
             'known base frame (base_prior) would separate them',
         ),
         (
-            'joint_7 offset = the marker ma moved tangentially, 1.740 mm per degree, the marker mb '
-            'moved tangentially, 1.586 mm per degree, the marker mc moved tangentially, 1.3 mm per '
+            'joint_7 offset = the marker ma moved tangentially, 1.74 mm per degree, the marker mb '
+            'moved tangentially, 1.6 mm per degree, the marker mc moved tangentially, 1.3 mm per '
             'degree and the marker md moved tangentially, 1.275 mm per degree; a measured marker '
             'would separate them; fixed by the prior on marker ma, 0.5 mm per axis',
             'looks like the marker ma moved, the marker mb moved and 2 more; a measured marker '
