@@ -277,6 +277,11 @@ def in_words(found: Checked, joint_names: tuple[str, ...], names: list[str]) -> 
             'again at once. If it stays so: is it this arm, this marker, and is the correction '
             'in use as it was when it was measured?'
         )
+    if found.verdict == 'unclear' and not found.again:
+        return (
+            'Something may have changed, and checks at once do not decide it: go on with the '
+            'usual checks. A change that matters is named as soon as it is certain.'
+        )
     if found.verdict == 'unclear':
         return 'Something may have changed: check again at once.'
     beyond = [

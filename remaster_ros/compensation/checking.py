@@ -40,6 +40,10 @@ ALARM = 100.0
 DOUBT = 10.0
 """Evidence, and `BEYOND` standard deviations of a single result, that ask for another check."""
 BEYOND = 5.0
+AT_ONCE = 2
+"""So many checks in a row are asked for at once. What these do not decide, a small change or a
+drift, the usual checks do: what is the same all day becomes no better by more checks of it.
+"""
 SMALLEST_M = 1e-4
 """What matters at the tool."""
 POWER_STD = 3.09 + 1.645
@@ -363,8 +367,10 @@ def judge(model: ArmModel, checks: Sequence[Measured], smallest_m: float = SMALL
     before = looks[-2].T_R_N if T > 1 else model.T_R_N
     moved, moved_is = _moved(before, last, checks[-1], noise, max(T - 1, 1), smallest_m)
     clear = abs(found[best].size) - found[best].half > smallest_m
-    small = abs(found[best].size) + found[best].half < smallest_m
-    single = _single(looks, x_m, counts, is_seen)
+    asked = AT_ONCE < T and all(
+        _is_doubtful(looks[:until], x_m[:until], counts, is_seen, smallest_m)
+        for until in range(T - AT_ONCE, T)
+    )
     verdict: Verdict = 'setup_moved' if moved_is else 'unchanged'
     named: tuple[int, ...] = ()
     tool = False
@@ -373,8 +379,8 @@ def judge(model: ArmModel, checks: Sequence[Measured], smallest_m: float = SMALL
         named, tool = _named(looks, at, noise, is_seen)
         # A joint and the marker that look alike: nobody is told to correct the arm for that.
         verdict = 'unclear' if tool and named else 'setup_moved' if tool else 'changed'
-    elif (total > DOUBT and not small) or single:
-        verdict, again = 'unclear', True
+    elif _is_doubtful(looks, x_m, counts, is_seen, smallest_m):
+        verdict, again = 'unclear', not asked
     if named or tool:
         # What has changed is taken out of the others, which would show a part of it.
         taken = last.joints[:, list(named[:1])] if named else last.tool
@@ -468,6 +474,21 @@ def _moved(
         fdtri(count, float(looks * last.freedom), 1.0 - erfc(BEYOND / np.sqrt(2.0)))
     )
     return size, size > smallest_m and squares > 2.0 * noise**2 * limit
+
+
+def _is_doubtful(
+    looks: Sequence[Seen],
+    x_m: FloatArray,
+    counts: BoolArray,
+    is_seen: BoolArray,
+    smallest_m: float,
+) -> bool:
+    """Whether these checks ask for another one, where they are no alarm."""
+    found = [change(x_m[:, i]) for i in np.flatnonzero(counts)]
+    best = max(found, key=lambda one: one.evidence)
+    small = abs(best.size) + best.half < smallest_m
+    doubted = float(np.mean([one.evidence for one in found])) > DOUBT and not small
+    return doubted or _single(looks, x_m, counts, is_seen)
 
 
 def _single(looks: Sequence[Seen], x_m: FloatArray, counts: BoolArray, is_seen: BoolArray) -> bool:

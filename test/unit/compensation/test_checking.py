@@ -117,6 +117,22 @@ def test_a_large_change_asks_for_another_check_at_once(days):
     assert found.again or found.changed == (2,)
 
 
+def test_checks_at_once_come_to_an_end():
+    """A change of 3 std of a check, about what matters: no number of checks at once decides it."""
+    arm = CheckedArm(11)
+    days = arm.days(BEFORE)
+    asked, verdicts = [], set()
+    for _ in range(24):
+        days += arm.days(1, arm.joint(2, 1.1e-4))
+        found = judge(arm.found, days)
+        asked.append(found.again)
+        verdicts.add(found.verdict)
+    assert 'unclear' in verdicts
+    assert any(asked)
+    for i in range(len(asked) - 2):
+        assert not all(asked[i : i + 3]), 'at once for the third time in a row'
+
+
 @pytest.mark.parametrize('arms', [10, pytest.param(40, marks=pytest.mark.qualify)])
 def test_nothing_is_found_where_nothing_is(arms):
     """12 checks each, every one of which is judged: the bound is 0.4 alarms of 40."""
