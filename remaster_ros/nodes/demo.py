@@ -786,6 +786,8 @@ class Demo:
                 'fits what was measured; Ctrl-C ends the demo'
             )
         elif not self.p.watch:
+            if done == '0':
+                raise DeviceError('nobody is at the terminal, and there is nothing to fit')
             self._say('nobody is at the terminal: what was measured is fitted')
             return False
         else:

@@ -71,6 +71,14 @@ def test_where_nobody_is_at_the_terminal_what_was_measured_is_fitted(quiet, caps
     assert demo.calls == []
 
 
+def test_where_nothing_was_measured_nothing_is_fitted(capsys):
+    demo = HaltedDemo(None)
+    demo.summaries['pose_planner']['configurations_done'] = '0'
+    with pytest.raises(DeviceError, match='nothing to fit'):
+        demo._goes_on(WHY)
+    assert f'the arm is halted: {WHY}' in capsys.readouterr().out
+
+
 def test_a_person_at_the_terminal_goes_on_or_has_it_fitted(capsys):
     demo = HaltedDemo([None, ''])
     assert demo._goes_on(WHY)
