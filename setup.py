@@ -5,6 +5,7 @@ from pathlib import Path
 from setuptools import find_packages, setup
 
 NAME = 'remaster_ros'
+URL = 'https://remaster-ros.example'
 
 # The ROS 2 Jazzy wheels that a machine without ROS needs. A bare `ros-rclpy` would be another
 # distribution.
@@ -27,7 +28,6 @@ JAZZY = [
 
 # What judges in the tests: clients and readers of others, their distances between bodies, and V8.
 JUDGES = [
-    'NatNetClient==0.8.3',
     'natnet==0.3.0',
     'CESAPI==1.1.3',
     'mcap-ros2-support>=0.5',
@@ -55,6 +55,22 @@ setup(
     author='remaster_ros maintainers',
     maintainer='remaster_ros maintainers',
     maintainer_email='maintainers@remaster-ros.example',
+    url=URL,
+    project_urls={'Source': f'{URL}/source', 'Issues': f'{URL}/issues'},
+    keywords='robot calibration, mastering, zero-offset, ROS 2, OptiTrack, laser tracker',
+    classifiers=[
+        'Development Status :: 4 - Beta',
+        'Environment :: Console',
+        'Intended Audience :: Manufacturing',
+        'Intended Audience :: Science/Research',
+        'License :: OSI Approved :: Apache Software License',
+        'Operating System :: POSIX :: Linux',
+        'Programming Language :: Python :: 3',
+        'Programming Language :: Python :: 3.11',
+        'Programming Language :: Python :: 3.12',
+        'Programming Language :: Python :: 3.13',
+        'Topic :: Scientific/Engineering',
+    ],
     python_requires='>=3.11',
     # config/ stays at the top level, where ROS users look for it, and is package data as well:
     # without ROS there is no share/ folder to read defaults from.
@@ -90,6 +106,8 @@ setup(
         'matplotlib>=3.6',
         'plotly>=5.20',
         'mcap>=1.2',
+        # The backend `client: natnetclient`, which checks what it reads against this version.
+        'NatNetClient==0.8.3',
         'python-dateutil>=2.8',
         'rosbags>=0.10',
         'threadpoolctl>=3.1',
@@ -103,7 +121,6 @@ setup(
         'docs': ['sphinx>=8.1', 'myst-parser>=4', 'furo>=2024.8'],
         # `remaster batch --scheduler`; on the scheduler's workers as well.
         'cluster': ['distributed>=2024.1'],
-        'natnetclient': ['NatNetClient==0.8.3'],
         # colcon, with which a test builds the package, runs pytest only where it is in this list.
         'test': [
             'pytest>=7.4',

@@ -3,30 +3,15 @@
 from __future__ import annotations
 
 import gc
-import importlib.util
 import signal
 
 import pytest
 from hypothesis import HealthCheck, settings
 
-# Distribution -> module, of what package.xml cannot name: rosdep has no Debian package for these.
-PIP_ONLY = {
-    'EAIK': 'eaik',
-    'mcap': 'mcap',
-    'msgspec': 'msgspec',
-    'plotly': 'plotly',
-    'rosbags': 'rosbags',
-    'threadpoolctl': 'threadpoolctl',
-    'trimesh': 'trimesh',
-}
+from remaster_ros.requirements import missing_packages
 
-_missing = [name for name, module in PIP_ONLY.items() if importlib.util.find_spec(module) is None]
-if _missing:
-    pytest.exit(
-        f'error: the tests need {", ".join(_missing)}, which rosdep does not install: '
-        f'pip install -c constraints-ros.txt {" ".join(_missing)}',
-        returncode=2,
-    )
+if _missing := missing_packages():
+    pytest.exit(_missing, returncode=2)
 
 # How long an example takes says how busy the machine is, not whether the example is right.
 settings.register_profile('busy', deadline=None, suppress_health_check=[HealthCheck.too_slow])

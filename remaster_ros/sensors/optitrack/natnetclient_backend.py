@@ -1,4 +1,4 @@
-"""The optional backend ``client: natnetclient``: PyPI ``natnetclient``, guarded.
+"""The backend ``client: natnetclient``: PyPI ``natnetclient``, guarded.
 
 That package (LGPL, 2018) reads NatNet 2.6 to 2.10 from a server on the same computer that sends
 its frames unicast to a fixed port. It checks no datagram, keeps markers that are no longer sent

@@ -1,0 +1,41 @@
+"""Packages that pip alone installs, and the line for a program that misses some of them.
+
+rosdep has no key for most of them, and its two keys of rosbags and trimesh call pip, which a
+Debian or Ubuntu without ``PIP_BREAK_SYSTEM_PACKAGES=1`` refuses.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping
+from importlib.util import find_spec
+
+# Distribution -> module. Keys of rosdep: rosdistro, rosdep/python.yaml, 2026-08-22.
+FROM_PIP: Mapping[str, str] = {
+    'EAIK': 'eaik',
+    'mcap': 'mcap',
+    'msgspec': 'msgspec',
+    'plotly': 'plotly',
+    'rosbags': 'rosbags',
+    'threadpoolctl': 'threadpoolctl',
+    'trimesh': 'trimesh',
+}
+WRONG_ENVIRONMENT = 2
+
+
+def missing_packages() -> str:
+    """Names and remedy of the packages of `FROM_PIP` that are not installed; '' if none is."""
+    missing = [name for name, module in FROM_PIP.items() if find_spec(module) is None]
+    if not missing:
+        return ''
+    return (
+        f'error: remaster_ros needs {", ".join(missing)}, not installed for {sys.executable}: '
+        f'{sys.executable} -m pip install {" ".join(missing)}'
+    )
+
+
+def end_without_packages() -> None:
+    """End the program with one line if a package is missing."""
+    if message := missing_packages():
+        print(message, file=sys.stderr)
+        raise SystemExit(WRONG_ENVIRONMENT)
