@@ -514,7 +514,7 @@ class Session:
     def positions_alone(self) -> Session:
         """Return the same without the measured orientations."""
         without = replace(self.measurements, orientation=None)
-        return replace(self, measurements=without, oriented=frozenset(), on_tool=frozenset())
+        return replace(self, measurements=without, oriented=frozenset())
 
     def through_correction(self) -> Session:
         """Return the rows with the correction on as the nominal robot: at the angles wanted.

@@ -1,8 +1,9 @@
-"""Write a correction in the form that a controller or driver takes."""
+"""Write a correction in the form of a controller or driver, or its registrations for tf."""
 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 
@@ -10,8 +11,14 @@ import numpy as np
 
 from remaster_ros.cli.console import tell
 from remaster_ros.compensation.controller_forms import FORMS, exported, held
-from remaster_ros.compensation.file import read_compensation
+from remaster_ros.compensation.file import Compensation, read_compensation
 from remaster_ros.compensation.pad_pages import MotorNumber
+from remaster_ros.compensation.static_transforms import (
+    LAUNCH_FILE,
+    TF,
+    static_transforms,
+    transform_files,
+)
 from remaster_ros.errors import InputError
 from remaster_ros.session.files import (
     URDF_LIMIT,
@@ -33,11 +40,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         '--to',
-        choices=FORMS,
+        choices=(*FORMS, TF),
         required=True,
         help='urdf; ur: kinematics file of a Universal Robots arm; ros2_control: offsets of '
         'transmissions; rising: calibration of the URDF; pad: what to set by hand; json, csv: DH, '
-        'Hayati and POE',
+        'Hayati and POE; tf: static transforms of the sensors, a launch file and a YAML',
     )
     parser.add_argument('--out', metavar='DIR', type=Path, required=True, help='a new folder')
     parser.add_argument(
@@ -61,6 +68,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='pad: a number that the controller has stored of a motor, counts per degree, and 1 '
         'or -1 as the reported angle grows or falls with it; may be repeated',
     )
+    parser.add_argument(
+        '--frame',
+        metavar='SENSOR=FRAME',
+        type=_frame,
+        action='append',
+        default=[],
+        help="tf: the sensor's frame where it has not the sensor's name; may be repeated",
+    )
     parser.add_argument('--json', action='store_true', help='print what was done as JSON')
 
 
@@ -80,16 +95,26 @@ def _motor(text: str) -> tuple[str, MotorNumber]:
     return name, MotorNumber(old, counts, direction)
 
 
+def _frame(text: str) -> tuple[str, str]:
+    sensor, _, frame = text.partition('=')
+    if not (sensor and frame):
+        raise argparse.ArgumentTypeError(f'{text!r} is not SENSOR=FRAME, such as mocap=bar_link')
+    return sensor, frame
+
+
 def run(args: argparse.Namespace) -> int:
     """Read, compare with the whole correction, write, and state what is left out."""
     for given, forms, option in (
         (args.base, ('ur', 'ros2_control', 'rising'), '--base'),
         (args.driver_param, ('ros2_control',), '--driver-param'),
         (args.motor, ('pad',), '--motor'),
+        (args.frame, (TF,), '--frame'),
     ):
         if given and args.to not in forms:
             raise InputError(f'{option} goes with --to {" or ".join(forms)}; leave it out')
     compensation = read_compensation(args.compensation)
+    if args.to == TF:
+        return _transforms(args, compensation)
     names = compensation.compensator.joint_names
     motors = dict(args.motor)
     for name in motors:
@@ -106,10 +131,7 @@ def run(args: argparse.Namespace) -> int:
         compensation, args.to, one, base, driver_param=args.driver_param, motors=motors
     )
     files[LEFT_OUT_FILE] = '\n'.join([*one.words, ''])
-    with undone_on_failure():
-        make_new_folder(args.out)
-        for name, text in files.items():
-            write_atomically(args.out / name, text)
+    _write(args.out, files)
     content = {
         'format': FORMAT,
         'form': args.to,
@@ -123,3 +145,32 @@ def run(args: argparse.Namespace) -> int:
     }
     tell(args, content, *one.words, f'written: {args.out} ({", ".join(files)})')
     return 0
+
+
+def _transforms(args: argparse.Namespace, compensation: Compensation) -> int:
+    """Write the registrations for tf, and the lines that publish them."""
+    transforms = static_transforms(compensation, dict(args.frame))
+    files = transform_files(transforms)
+    _write(args.out, files)
+    content = {
+        'format': FORMAT,
+        'form': TF,
+        'files': list(files),
+        'transforms': [asdict(one) for one in transforms],
+    }
+    tell(
+        args,
+        content,
+        *(one.words for one in transforms),
+        'Right with the whole correction in use, and where no other node publishes these frames.',
+        f'to publish: ros2 launch {args.out / LAUNCH_FILE}',
+        f'written: {args.out} ({", ".join(files)})',
+    )
+    return 0
+
+
+def _write(folder: Path, files: Mapping[str, str]) -> None:
+    with undone_on_failure():
+        make_new_folder(folder)
+        for name, text in files.items():
+            write_atomically(folder / name, text)

@@ -169,6 +169,14 @@ class MarkerPart(Struct):
     std_m: Triple
 
 
+class MountPart(Struct):
+    """How a sensor stands on the tool: its origin at a marker, and its turn in T where known."""
+
+    marker: str
+    rotation_xyzw: tuple[float, float, float, float] | UnsetType = UNSET
+    std_rad: Triple | UnsetType = UNSET
+
+
 class LeftPart(Struct):
     """What is not corrected."""
 
@@ -198,6 +206,9 @@ class CompensationPart(Struct):
     base_terms: list[TermPart] = []
     temperature: TemperaturePart | None = None
     controller: Controller | None = None
+    # Sensors on the tool, whose `base_frame` is that of what they see; files of earlier versions
+    # do not tell.
+    on_tool: dict[str, MountPart] | UnsetType = UNSET
 
     def per_joint(self, what: str, chain: SerialChain) -> FloatArray:
         """Return offset or range of every joint, rad, m of those that slide, (k, ...)."""
@@ -252,6 +263,7 @@ def written(
     hashes: tuple[str, str],
     state: Mapping[str, Any],
     controller: Controller | None = None,
+    on_tool: Mapping[str, MountPart] | None = None,
 ) -> str:
     """Return the text of compensation.json.
 
@@ -269,6 +281,8 @@ def written(
         Of the controller while it was measured.
     controller
         How the robot's own pad writes the joints.
+    on_tool
+        Sensors that are on the tool.
     """
     model, chain = described.model, described.model.chain
     joints = [term.joint for term in model.joint_terms]
@@ -352,6 +366,7 @@ def written(
         ],
         notes=list(described.notes),
         controller=controller,
+        on_tool=dict(on_tool or {}),
     )
     encoder = msgspec.json.Encoder()
     lines = [
@@ -536,6 +551,12 @@ def _model(content: CompensationPart) -> ArmModel:
     for sensor, frame in content.base_frame.items():
         if abs(np.linalg.norm(frame.rotation_xyzw) - 1.0) > 1e-3:
             raise _broken(f'base_frame.{sensor}.rotation_xyzw', 'is no quaternion of length 1')
+    for sensor, mount in ({} if content.on_tool is UNSET else content.on_tool).items():
+        if sensor not in content.base_frame or mount.marker not in content.tool:
+            raise _broken(f'on_tool.{sensor}', 'names no sensor of base_frame or marker of tool')
+        turn = mount.rotation_xyzw
+        if turn is not UNSET and abs(np.linalg.norm(turn) - 1.0) > 1e-3:
+            raise _broken(f'on_tool.{sensor}.rotation_xyzw', 'is no quaternion of length 1')
     warm = content.temperature
     model = ArmModel(
         chain=chain,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
@@ -12,9 +12,10 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 import numpy as np
 from msgspec import UNSET
+from scipy.spatial.transform import Rotation
 
 from remaster_ros.calibration.predictions import predict
-from remaster_ros.compensation.arm_model import Geometry
+from remaster_ros.compensation.arm_model import ArmModel, Geometry
 from remaster_ros.compensation.export import (
     APPLY_FOLDER,
     MODEL_FILE,
@@ -22,7 +23,13 @@ from remaster_ros.compensation.export import (
     calibrated_urdf,
     exports,
 )
-from remaster_ros.compensation.file import COMPENSATION_FILE, Source, of_text, written
+from remaster_ros.compensation.file import (
+    COMPENSATION_FILE,
+    MountPart,
+    Source,
+    of_text,
+    written,
+)
 from remaster_ros.compensation.loaded_errors import errors_with_correction, errors_with_urdf
 from remaster_ros.compensation.of_result import Described, geometry_too, offsets_alone
 from remaster_ros.discovery.geometry_model import GeometryModel, geometry_model
@@ -158,21 +165,64 @@ def compensation_text(result: FitResult, result_sha256: str) -> str:
     geometry, rows = geometry_of(result), result.measurements
     described = None if geometry is None else geometry_too(result, geometry, rows)
     if described is not None and geometry is not None:
-        text = correction_text(described, result.session, 'fit', result_sha256)
+        text = _of_fit(described, result, result_sha256)
         model = of_text(text.encode(), Path(COMPENSATION_FILE)).model
         if replace(geometry, errors=errors_with_correction(model, rows)).is_better:
             return text
     alone = offsets_alone(result, predict(result, rows).widening, geometry=described)
-    return correction_text(alone, result.session, 'fit', result_sha256)
+    return _of_fit(alone, result, result_sha256)
+
+
+def _of_fit(described: Described, result: FitResult, result_sha256: str) -> str:
+    mounts = _mounts(result, described.model)
+    return correction_text(described, result.session, 'fit', result_sha256, mounts)
+
+
+def _mounts(result: FitResult, model: ArmModel) -> dict[str, MountPart]:
+    """How each sensor on the tool stands there, by its name, with the arm of a correction.
+
+    The turns of the fit belong to its own zero-offsets. A correction leaves out those that are not
+    identifiable: with it the turn is the mean of what the fitted rows show.
+    """
+    session, found, m = result.session, result.orientations, result.measurements
+    left_out = [observation for observation, _ in result.left_out]
+    mounts = {}
+    for sensor in sorted(session.on_tool):
+        mount = MountPart(session.sensors[sensor])
+        # Bodies have the sensor's name behind the marker's where several sensors measure one.
+        names = mount.marker, f'{mount.marker}.{sensor}'
+        body = next((name for name in names if found is not None and name in found.R_T_B), '')
+        if body and found is not None and m.orientation is not None:
+            rows = (m.sensor == session.sensor_names.index(sensor)) & ~m.is_validation
+            rows &= ~np.isin(m.observation, left_out) & np.isfinite(m.orientation).all(axis=1)
+            R_R_T = model.state(m.q[rows]).tool[:, :3, :3]
+            R_R_C = (
+                model.T_R_N[sensor][:3, :3] @ Rotation.from_quat(m.orientation[rows]).as_matrix()
+            )
+            R_T_C = Rotation.from_matrix(np.swapaxes(R_R_T, 1, 2) @ R_R_C).mean()
+            x, y, z, w = R_T_C.as_quat().tolist()
+            about_x, about_y, about_z = np.asarray(found.std_rad[body]).tolist()
+            mount = MountPart(mount.marker, (x, y, z, w), (about_x, about_y, about_z))
+        mounts[sensor] = mount
+    return mounts
 
 
 def correction_text(
-    described: Described, session: Session, made_by: Source, result_sha256: str
+    described: Described,
+    session: Session,
+    made_by: Source,
+    result_sha256: str,
+    mounts: Mapping[str, MountPart] | None = None,
 ) -> str:
-    """Return compensation.json of the arm that a result describes."""
+    """Return compensation.json of the arm that a result describes.
+
+    Without ``mounts`` how the sensors on the tool are turned is not known.
+    """
+    if mounts is None:
+        mounts = {sensor: MountPart(session.sensors[sensor]) for sensor in session.on_tool}
     state = {'correction': session.correction, 'accuracy_option': session.accuracy_option}
     hashes = (result_sha256, session.observations_sha256)
-    return written(described, session.urdf, made_by, hashes, state, session.controller)
+    return written(described, session.urdf, made_by, hashes, state, session.controller, mounts)
 
 
 def _geometry(result: FitResult, geometry: GeometryModel) -> dict[str, Any]:
