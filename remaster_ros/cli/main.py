@@ -32,7 +32,7 @@ VERBS = {
     'accuracy': 'Judge the zero-offsets of a fit on any session: the three metrics.',
     'compensate': 'Correct a table of joint targets by compensation.json, for a program.',
     'export': 'Write compensation.json in the form that a controller, a driver or tf takes.',
-    'verify': 'Is a correction in use, once, and what remains? From ten new poses.',
+    'verify': 'Does a correction act, and not twice? What error remains? From ten new poses.',
     'check': 'Has an arm changed since its correction was measured? From eight poses, day by day.',
     'batch': 'Fit, discover and check many sessions: a row each, resumable, a page over all.',
     'recover': 'Finish the files of a session whose recorder was killed; print what was lost.',

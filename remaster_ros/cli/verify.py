@@ -1,4 +1,4 @@
-"""Is a correction in use, once, and what remains?"""
+"""Whether a correction acts exactly once, and what error remains."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from remaster_ros.types import BoolArray, Correction, FloatArray, IntArray, Sess
 
 FORMAT = 'remaster-verify/1'
 WORDS: dict[Verdict, str] = {
-    'in_use': 'The correction is in use, once.',
+    'in_use': 'The correction acts, and not twice.',
     'not_in_use': 'The correction does not act: load it, or see why it is not taken.',
     'twice': 'The correction acts twice: take it out of one of the two places (the zeros on the '
     'pad and a layer or model, say).',

@@ -47,6 +47,8 @@ class LiveResiduals:
         self._pairs: dict[str, list[tuple[FloatArray, str, FloatArray]]] = {
             name: [] for name in markers
         }
+        # How many of them, the first ones, are of the registration.
+        self._registering = dict.fromkeys(markers, 0)
         self._found: dict[str, tuple[FloatArray, FloatArray]] = {}
 
     def settled(self, q: FloatArray) -> None:
@@ -60,12 +62,15 @@ class LiveResiduals:
         if self._q is not None and np.all(np.isfinite(position_N)):
             self._sums[sensor, marker] += [*position_N, 1.0]
 
-    def ended(self, *, recorded: bool) -> None:
-        """End a configuration; its readings count where it was recorded."""
+    def ended(self, *, recorded: bool, registering: bool = False) -> None:
+        """End a configuration, of the registration or not; it counts where it was recorded."""
         if self._q is not None and recorded:
             for (name, marker), total in self._sums.items():
                 if total[3]:
                     self._pairs[name].append((self._q, marker, total[:3] / total[3]))
+                    self._registering[name] += registering
+                    gone = len(self._pairs[name][:-MOST])
+                    self._registering[name] = max(0, self._registering[name] - gone)
                     del self._pairs[name][:-MOST]
                     self._found.pop(name, None)
         self._q = None
@@ -89,6 +94,10 @@ class LiveResiduals:
     def norms_m(self, sensor: str) -> FloatArray:
         """Return the length of each residual, m, (n,); n = 0 for too few."""
         return self._fitted(sensor)[0]
+
+    def of_registration(self, sensor: str) -> int:
+        """Return how many of the residuals, the first ones, are of registration poses."""
+        return self._registering[sensor]
 
     def points_R(self, sensor: str) -> FloatArray:
         """Return the measured points in the robot base, m, (n, 3); n = 0 for too few."""

@@ -193,7 +193,7 @@ def remaster_text(
               if words else ()),
             '',
             'Afterwards measure ten new poses and run "remaster verify": it shows whether the',
-            'offsets are in use, once.',
+            'offsets act, and that they do not act twice.',
             '',
         ]
     )  # fmt: skip

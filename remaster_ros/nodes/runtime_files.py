@@ -51,7 +51,7 @@ class NameLock:
     """
 
     def __init__(self, domain: int, name: str, patience_s: float = PATIENCE_S) -> None:
-        self.path = runtime_folder() / f'domain_{domain}{name.replace("/", "%")}.lock'
+        self.path = runtime_folder() / f'domain_{domain}{name.replace("/", ".")}.lock'
         try:
             self._file = os.open(
                 self.path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600
@@ -100,7 +100,7 @@ class NameLock:
 
 def page_name(domain: int, node: str) -> str:
     """Return what the files of the page are called that ``/left/watch``, say, serves."""
-    return f'domain_{domain}{node.replace("/", "%")}'
+    return f'domain_{domain}{node.replace("/", ".")}'
 
 
 def opening_path(name: str) -> Path:

@@ -537,6 +537,10 @@ NO_FILE = (
 MOST_NAMED, MOST_SIZES = 4, 2
 
 
+# Where nothing shows how large the noise is, or too little was held out to say.
+NOISE_UNKNOWN = 'May be sensor noise alone'
+
+
 class Remaining(NamedTuple):
     """Something that the deed leaves: its name, its size in words, and what to do."""
 
@@ -563,7 +567,7 @@ def what_remains(inputs: Inputs, loads_model: bool, held_out: bool) -> list[Rema
         )
         rows.append(
             Remaining(
-                'More than noise' if judgement.findings else 'Not shown to be noise',
+                'More than noise' if judgement.findings else NOISE_UNKNOWN,
                 lines[0],
                 ('Measure more poses first, and fit again.' if few else search)
                 if judgement.findings
@@ -578,7 +582,7 @@ def what_remains(inputs: Inputs, loads_model: bool, held_out: bool) -> list[Rema
         if left:
             rows.append(
                 Remaining(
-                    'Not shown to be noise' if FEW_HELD_OUT in left else 'More than noise',
+                    NOISE_UNKNOWN if FEW_HELD_OUT in left else 'More than noise',
                     f'{left.rstrip(".")}. No cause that was tried explains it',
                     'Look at the largest errors below; measure again, with references in between.',
                 )

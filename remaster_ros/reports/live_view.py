@@ -52,6 +52,8 @@ class FitFacts:
 SILENT_S = 3.0
 """A node that was not heard for longer counts as gone."""
 LONGEST_TEXT = 400
+LONGEST_DESCRIPTION = 4000
+"""Of a plan, characters: those of this planner have some 500, and stand behind a fold."""
 MOST_NODES = 30
 MOST_MESSAGES = 40
 MOST_POINTS = 400
@@ -134,7 +136,7 @@ class LiveView:
             case events.SensorReport(sensor=sensor) if sensor in self._sensors:
                 self._reports[sensor] = body
             case events.TourPlanned(description):
-                self._plan = _clip(description)
+                self._plan = _clip(description, LONGEST_DESCRIPTION)
             case events.SolutionSettled(stamp=stamp, solution=solution) if self._q is not None:
                 self._open = {(stamp, solution): self._q}
                 self.residuals.settled(self._q)
@@ -146,7 +148,8 @@ class LiveView:
     def _end(self, end: events.ConfigurationEnded, now_s: float) -> None:
         recorded = end.result in ('recorded', 'partial')
         q = self._open.pop((end.stamp, end.solution), None)
-        self.residuals.ended(recorded=recorded and q is not None)
+        registering = self._values.get('phase') == 'registration'
+        self.residuals.ended(recorded=recorded and q is not None, registering=registering)
         if end.result != 'recorded':
             self._messages.append((now_s, _clip(f'configuration {end.result}: {end.reason}')))
 
@@ -264,6 +267,7 @@ class LiveView:
         state = _clip(self._planner.state) if self._planner else ''
         message = self._nodes[PLANNER].message
         waiting = _clip(self._recorder.waiting_for) if self._recorder else ''
+        plan, _, details = self._plan.partition(';')
         left_s = self._pace.left_s(of - done) if collecting and state != 'complete' else None
         return {
             'state': 'silent' if silent else state,
@@ -275,7 +279,8 @@ class LiveView:
             'done': done if collecting else 0,
             'of': of if collecting else 0,
             'left': minutes_text(left_s),
-            'plan': self._plan,
+            'plan': _as_sentence(_clip(plan)),
+            'plan_details': _as_sentence(details.strip()),
         }
 
     def _node_rows(self, now_s: float) -> list[dict[str, Any]]:
@@ -294,6 +299,7 @@ class LiveView:
         report = self._reports.get(name)
         ages = self._recorder.read_age_s if self._recorder else {}
         norms = 1e3 * self.residuals.norms_m(name)
+        registering = self.residuals.of_registration(name) if len(norms) else 0
         return {
             'name': name,
             'ready': bool(report and report.ready),
@@ -302,6 +308,7 @@ class LiveView:
             'read_age_s': ages.get(name),
             'registered': name in self.registration,
             'residuals_mm': _rounded(norms[-MOST_POINTS:], 3),
+            'of_registration': max(0, registering - len(norms[:-MOST_POINTS])),
             'median_mm': float(np.median(norms)) if len(norms) else None,
             'corrected': self.residuals.corrected,
         }
@@ -414,8 +421,12 @@ def tool_path(chain: SerialChain, way: FloatArray, steps: int = 12) -> FloatArra
     return chain.positions(np.concatenate(lines), np.zeros(3))
 
 
-def _clip(text: str) -> str:
-    return text if len(text) <= LONGEST_TEXT else f'{text[: LONGEST_TEXT - 1]}…'
+def _clip(text: str, longest: int = LONGEST_TEXT) -> str:
+    return text if len(text) <= longest else f'{text[: longest - 1]}…'
+
+
+def _as_sentence(text: str) -> str:
+    return f'{text[:1].upper()}{text[1:]}.' if text else ''
 
 
 def _degrees(radians: float) -> float:

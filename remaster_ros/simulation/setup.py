@@ -35,7 +35,7 @@ def default_folder(namespace: str = '/') -> Path:
         Such as ``/left``: every cell of a domain has its own World.
     """
     domain = os.environ.get('ROS_DOMAIN_ID', '0')
-    cell = namespace.rstrip('/').replace('/', '%')
+    cell = namespace.rstrip('/').replace('/', '.')
     return Path(tempfile.gettempdir()) / f'remaster_world_{os.getuid()}_{domain}{cell}'
 
 

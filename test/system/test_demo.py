@@ -152,7 +152,7 @@ def test_the_corrected_arm_comes_to_where_it_is_wanted(ros_environment, tmp_path
     assert np.max(np.abs(m.q - m.wanted)) > np.deg2rad(0.2)
     assert 'halted' not in (out / 'log' / 'robot_bridge.log').read_text()
 
-    assert 'in_use: The correction is in use, once.' in printed
+    assert 'in_use: The correction acts, and not twice.' in printed
     (line,) = [line for line in printed.splitlines() if line.startswith('opened truth:')]
     after, before = (float(word) for word in re.findall(r'([0-9.]+) mm', line))
     assert before > 1.0

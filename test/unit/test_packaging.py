@@ -138,6 +138,18 @@ def test_every_import_is_declared(setup_arguments: dict[str, Any]) -> None:
             assert module in depends, f'{module} is missing in package.xml'
 
 
+def test_a_user_installs_nothing_that_only_tests_need(setup_arguments: dict[str, Any]) -> None:
+    used = {normal(DISTRIBUTION.get(m, m)) for m in imported(ROOT / 'remaster_ros')}
+    required = {normal(line) for line in setup_arguments['install_requires']}
+    # Of plotly the script is served, by importlib.resources.
+    server = (ROOT / 'remaster_ros/reports/live_server.py').read_text(encoding='utf-8')
+    assert "files('plotly')" in server
+    assert required - {'plotly'} <= used
+    extras = setup_arguments['extras_require']
+    for name in ('test', 'qualify', 'bench', 'check', 'docs'):
+        assert required.isdisjoint(map(normal, extras[name])), name
+
+
 def test_package_xml_names_every_requirement_or_a_program_does_when_it_starts(
     setup_arguments: dict[str, Any],
 ) -> None:

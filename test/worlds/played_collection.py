@@ -52,13 +52,13 @@ class PlayedCollection:
             self.view.take_fit(FitFacts(shown, frozenset({'joint_1'})))
         done(True, f'{name} done')
 
-    def beat(self, now=None):
+    def beat(self, now=None, phase='collection'):
         """Let every node report its state."""
         now = time.monotonic() if now is None else now
         for name in ('robot_bridge', 'recorder', 'optimizer'):
             self.view.take_summary(name, 'ok', 'waiting', {}, now)
         values = {
-            'phase': 'collection',
+            'phase': phase,
             'configurations_done': str(self.done),
             'configurations': str(self.of),
             'poses_done': str(self.done // PER_POSE),
@@ -83,9 +83,10 @@ class PlayedCollection:
         report = events.SensorReport(sensor='tracker', ready=False, trouble='the beam is broken')
         self.view.take(report, now)
 
-    def step(self, now=None, result='recorded'):
+    def step(self, now=None, result='recorded', phase='collection'):
         """Visit one configuration, where the collection runs; then the nodes report."""
         now = time.monotonic() if now is None else now
+        self.beat(now, phase)
         if self.state == 'running' and self.done < self.of:
             index = self.done % PER_POSE
             self.stamp = f'{self.done - index}.0'
@@ -102,4 +103,4 @@ class PlayedCollection:
             self.done += 1
             if self.done == self.of:
                 self.state = 'complete'
-        self.beat(now)
+        self.beat(now, phase)

@@ -97,6 +97,8 @@ function show(view) {
   setText('count', run.of ? `${run.done} of ${run.of} configurations, ${run.poses_done} of ${run.poses} poses` : '');
   setText('left', run.left && `– ${run.left}`);
   setText('plan', run.plan);
+  setText('plan-details', run.plan_details);
+  get('plan-fold').hidden = !run.plan_details;
   for (const [name, command] of Object.entries(view.commands)) {
     const button = get(name);
     button.disabled = !command.on;

@@ -106,11 +106,12 @@ function flat(id, made, layout) {
 function drawResiduals(sensors) {
   const made = sensors.filter((s) => s.residuals_mm.length).map((s, index) => ({
     name: plain(s.name), y: s.residuals_mm, x: s.residuals_mm.map((_, i) => i + 1), mode: 'markers',
-    marker: { size: 5, color: COLORS[index % COLORS.length] },
+    marker: { size: 5, color: COLORS[index % COLORS.length], symbol: s.residuals_mm.map((_, i) => (i < s.of_registration ? 'circle-open' : 'circle')) },
   }));
+  const registering = sensors.some((s) => s.of_registration);
   const model = sensors.some((s) => s.corrected) ? 'the arm with the fitted zero-offsets' : 'the nominal arm';
   setText('residuals-note', made.length
-    ? `Distance from each measured marker to where ${model} has it, registered by all configurations so far. The fit itself weighs them by their noise.`
+    ? `Distance from each measured marker to where ${model} has it, registered by all configurations so far. The fit itself weighs them by their noise.${registering ? ' Open circles: at the registration poses, which are not among the configurations counted above.' : ''}`
     : 'After five measured points.');
   flat('residuals', made, { xaxis: axis('measured point since this page was started'), yaxis: axis('mm', { rangemode: 'tozero' }), showlegend: true });
 }

@@ -1,6 +1,7 @@
 """A lock per node name and domain, which goes with its process."""
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -10,7 +11,8 @@ import pytest
 
 from remaster_ros.errors import InputError
 from remaster_ros.nodes import runtime_files
-from remaster_ros.nodes.runtime_files import NameLock
+from remaster_ros.nodes.runtime_files import NameLock, page_name
+from remaster_ros.simulation.setup import default_folder
 
 HOLD = """
 import sys, time
@@ -78,3 +80,17 @@ def test_a_folder_of_somebody_else_is_refused(tmp_path, monkeypatch):
     folder.symlink_to('/')
     with pytest.raises(InputError, match='belongs to another user'):
         runtime_files.runtime_folder()
+
+
+def test_no_file_has_a_character_that_a_shell_or_a_page_takes_for_another():
+    """Every node name has a file of its own: a dot is in none of them."""
+    names = ['/watch', '/left/watch', '/left_watch', '/le/ft/watch']
+    pages = [page_name(7, name) for name in names]
+    assert len(set(pages)) == len(names)
+    assert all(re.fullmatch(r'[A-Za-z0-9_.]+', page) for page in pages)
+    held = NameLock(233, '/left/test_naming')
+    assert re.fullmatch(r'[A-Za-z0-9_.]+', held.path.name)
+    held.release()
+    folder = default_folder('/left/cell')
+    assert re.fullmatch(r'[A-Za-z0-9_.]+', folder.name)
+    assert folder != default_folder('/left_cell')

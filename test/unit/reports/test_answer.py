@@ -244,7 +244,10 @@ def test_a_doubt_is_no_finding(inputs, fit):
     """Where nothing shows how large the noise is, nobody is told that it is exceeded."""
     fit.judgement.doubts = ['tracker: nothing shows how much of the 0.500 mm is noise.']
     alone = answer_of(inputs()).remains[0]
-    assert (alone.what, alone.size) == ('Not shown to be noise', fit.judgement.doubts[0])
+    assert (alone.what, alone.size) == (
+        'May be sensor noise alone',
+        fit.judgement.doubts[0],
+    )
     (searched,) = answer_of(inputs([])).remains
     assert searched.what == 'Noise'
     assert 'nothing shows' in searched.size

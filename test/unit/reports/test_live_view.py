@@ -64,6 +64,30 @@ def test_residuals_and_points(played):
     assert len(view['scene']['points']['mocap']) == 12
 
 
+def test_residuals_of_registration_poses_are_labelled(played):
+    """They are measured before the first configuration that the line under the bar counts."""
+    played.state = 'running'
+    for i in range(6):
+        played.step(now=float(i), phase='registration')
+    view = played.view.view(5.0)
+    assert (view['run']['done'], view['run']['of']) == (0, 0)
+    assert view['sensors'][0]['of_registration'] == len(view['sensors'][0]['residuals_mm']) == 6
+    for i in range(6, 9):
+        played.step(now=float(i))
+    mocap, tracker = played.view.view(8.0)['sensors']
+    assert (mocap['of_registration'], len(mocap['residuals_mm'])) == (6, 9)
+    assert tracker['of_registration'] == 0
+
+
+def test_the_line_under_the_bar_is_one_sentence_and_the_rest_is_complete(played):
+    tour = 'planned 13 optimization poses with 40 configurations'
+    rest = ['6 reference configurations', 'dropped poses: ' + ', '.join(['12 beyond reach'] * 60)]
+    played.view.take(events.TourPlanned('; '.join([tour, *rest])), 1.0)
+    run = played.view.view(1.0)['run']
+    assert run['plan'] == 'Planned 13 optimization poses with 40 configurations.'
+    assert run['plan_details'] == f'6 reference configurations; {rest[1]}.'
+
+
 def test_a_rejected_configuration_is_told_and_leaves_no_residual(played):
     view = after(played, 8, result='rejected')
     assert view['sensors'][0]['residuals_mm'] == []
