@@ -1,4 +1,4 @@
-"""Whether a correction acts, and not twice, and what remains: from poses with what was wanted there.
+"""Whether a correction acts exactly once, and what remains: from poses with what was wanted there.
 
 A marker is measured where the arm went for wanted joint angles w, those of the nominal robot.
 Four states predict where that is, exactly: the correction acts (its command of w), does not (w),
