@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 import argparse
-from typing import NoReturn
+from pathlib import Path
 
+from remaster_ros.cli.console import show
 from remaster_ros.cli.demo import run_node
 from remaster_ros.cli.options import integer
+from remaster_ros.errors import InputError
+from remaster_ros.session.files import write_atomically
+from remaster_ros.session.rviz_config import rviz_config
+from remaster_ros.session.workcell import read_cell
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -33,10 +38,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument('--certificate', default='', metavar='PEM', help='for https')
     parser.add_argument('--key', default='', metavar='PEM', help='of the certificate')
+    parser.add_argument(
+        '--rviz',
+        metavar='FILE',
+        type=Path,
+        help="write a configuration of RViz with the cell's own sensors, and end (needs no ROS)",
+    )
 
 
-def run(args: argparse.Namespace) -> NoReturn:
-    """Become the process of the node that serves the page."""
+def run(args: argparse.Namespace) -> int:
+    """Become the process of the node that serves the page, or write what RViz shows."""
+    if args.rviz is not None:
+        if args.rviz.exists():
+            raise InputError(f'{args.rviz}: already there, and not overwritten; give another name')
+        write_atomically(args.rviz, rviz_config(read_cell(args.cell)))
+        show(args.quiet, f'written: {args.rviz}; show it: rviz2 -d {args.rviz}')
+        return 0
     run_node(
         'watch',
         {

@@ -4,6 +4,7 @@ That each topic in them has the type that is expected there is tested with runni
 test/system/test_network_policy.py.
 """
 
+import yaml
 from judges.viewer_configs import (
     DISPLAYS,
     PANELS,
@@ -15,12 +16,13 @@ from judges.viewer_configs import (
     rviz,
     topics,
 )
+from rigs.command_line import refusal, remaster
 
-from remaster_ros.session.workcell import read_cell
+from remaster_ros.session.workcell import config_path, read_cell
 
 
-def test_rviz_has_every_display_and_property():
-    manager = rviz()['Visualization Manager']
+def assert_displays(manager):
+    """Every display has a class, properties and a topic that RViz knows."""
     for display in manager['Displays']:
         package, _, kind = display['Class'].partition('/')
         assert package == 'rviz_default_plugins'
@@ -28,6 +30,11 @@ def test_rviz_has_every_display_and_property():
         topic = display.get('Topic', {})
         assert topic.keys() <= TOPIC
         assert all(topic[name] in known for name, known in POLICIES.items() if topic)
+
+
+def test_rviz_has_every_display_and_property():
+    manager = rviz()['Visualization Manager']
+    assert_displays(manager)
     assert {tool['Class'] for tool in manager['Tools']} <= {
         f'rviz_default_plugins/{name}' for name in TOOLS
     }
@@ -38,6 +45,43 @@ def test_rviz_has_every_display_and_property():
         'rviz_common/Displays',
         'rviz_common/Time',
     }
+
+
+CAMERA = """
+  camera: {marker: sir, topic: /detector/board, message_type: geometry_msgs/msg/PoseStamped,
+           mounted_on: tool, rough_position_m: [0.6, 0.0, 0.05]}
+"""
+
+
+def test_rviz_of_a_cell_shows_its_own_sensors(tmp_path):
+    shipped = config_path('cells/demo.yaml')
+    text = shipped.read_text(encoding='utf-8').replace('../robots', str(config_path('robots')))
+    # One sensor of another name, a camera on the tool, and no tracker.
+    head, rest = text.split('  mocap:', 1)
+    _, tail = rest.split('# The tool', 1)
+    tail = tail.replace('aim_at: tracker', 'aim_at: bar')
+    bar = '  bar: {marker: smr, topic: hall/bar, rough_position_m: [1.9, 0.0, 1.3]}'
+    cell = tmp_path / 'cell.yaml'
+    cell.write_text(head + bar + CAMERA + '\n# The tool' + tail, encoding='utf-8')
+    out = tmp_path / 'cell.rviz'
+    remaster('watch', cell, '--rviz', out)
+    content = yaml.safe_load(out.read_text(encoding='utf-8'))
+    manager = content['Visualization Manager']
+    assert_displays(manager)
+    shown = {
+        display['Topic']['Value']: display['Class'].partition('/')[2]
+        for display in manager['Displays']
+        if 'Topic' in display
+    }
+    assert shown == {
+        '/remaster/markers': 'MarkerArray',
+        '/remaster/target_pose': 'Pose',
+        '/hall/bar': 'PointStamped',
+        '/camera/marker': 'PointStamped',
+        '/camera/marker/pose': 'Pose',
+    }
+    assert manager['Global Options']['Fixed Frame'] == read_cell(cell).robot.base_link
+    assert 'already there' in refusal('watch', cell, '--rviz', out)
 
 
 def leaves(layout):
