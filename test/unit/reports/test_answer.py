@@ -1,6 +1,7 @@
 """What the page of `remaster report` decides: the deed, the gain, the colour, what remains."""
 
 import builtins
+import re
 from dataclasses import replace
 
 import msgspec
@@ -238,6 +239,16 @@ def test_the_first_screen_says_how_to_see_whether_it_is_in_use(inputs, fit_resul
     html = answer_html(Subject(inputs(), answer_of(inputs()), fit_result.chain), {})
     assert 'run <code>remaster verify</code>' in html
     assert 'href="apply/compensation.json"' in html
+
+
+def test_the_column_beside_what_to_do_is_filled_below_the_plot(inputs, fit_result):
+    """What to do is the longer column: what remains stands in the other, under the plot."""
+    drawings = {'stages': 'the plot of the stages'}
+    html = answer_html(Subject(inputs(), answer_of(inputs()), fit_result.chain), drawings)
+    do, other = re.findall(r'<section>(.*?)</section>', html, re.DOTALL)[:2]
+    assert re.findall(r'<h2 id="(\w+)"', do) == ['do']
+    places = [other.index(text) for text in ('id="brings"', drawings['stages'], 'id="remains"')]
+    assert places == sorted(places)
 
 
 def test_a_doubt_is_no_finding(inputs, fit):
