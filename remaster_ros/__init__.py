@@ -67,21 +67,37 @@ def session_from(
     *,
     base_link: str | None = None,
     tip_link: str | None = None,
+    angles: Literal['', 'rad', 'deg', 'gon'] = '',
+    length: Literal['', 'm', 'cm', 'mm', 'um', 'in'] = '',
+    couple: Mapping[str, str] | None = None,
+    reverse: Sequence[str] = (),
+    offset_deg: Mapping[str, float] | None = None,
+    never_mastered: bool = False,
     seed: int = 0,
 ) -> Session:
-    """Make a session of arrays.
+    """Make a session of arrays, or of two data frames.
+
+    A row with NaN is left out, with a warning.
 
     Parameters
     ----------
     joints
-        Reported joint angles, rad, (n, k), base to tip; or a data frame (or a dict of arrays) with
-        a column for each joint of the URDF.
+        Reported joint angles, (n, k), base to tip; or a dict of arrays with one for each joint of
+        the URDF; or a data frame, whose columns are found as those of a table are.
     points
-        Measured marker positions in the sensor's own frame, m, (n, 3); or columns x, y and z.
+        Measured marker positions in the sensor's own frame, (n, 3); or a dict of x, y and z; or a
+        data frame. Rows of two frames are joined by their index; by their names, times or order
+        where both count the rows.
     urdf
         File of the nominal arm.
     base_link, tip_link
         Ends of the arm; None for the likely ones.
+    angles, length
+        Units; '' for rad and m of arrays, and for those found in data frames.
+    couple, reverse, offset_deg
+        As of `import_table`.
+    never_mastered
+        Zero-offsets may be of any size (hobby servos, a motor that was replaced).
     seed
         Of the poses that are held out.
 
@@ -100,24 +116,51 @@ def session_from(
     ...
     remaster_ros.errors.InputError: no_such.urdf: ...
     """
+    from remaster_ros.errors import InputError
     from remaster_ros.importing import in_python
+    from remaster_ros.importing.assemble import SessionOptions
+    from remaster_ros.importing.rows import TableOptions
+    from remaster_ros.importing.units import ANGLES, LENGTHS
     from remaster_ros.session.robot_description import read_arm
 
+    if angles not in ('', *ANGLES) or length not in ('', *LENGTHS):
+        raise InputError(
+            f'angles={angles!r}, length={length!r}: one of {", ".join(ANGLES)}, and of '
+            f'{", ".join(LENGTHS)}'
+        )
+    choices = in_python.Choices(
+        TableOptions(angles=angles, length=length),
+        SessionOptions.of(couple, reverse, offset_deg),
+        (
+            *('joints', 'points', 'base_link', 'tip_link', 'angles', 'length', 'couple'),
+            *('reverse', 'offset_deg', 'never_mastered'),
+        ),
+        never_mastered,
+        seed,
+    )
     robot = read_arm(Path(urdf), base_link, tip_link)
-    return in_python.of_arrays(joints, points, robot, seed)
+    return in_python.of_arrays(joints, points, robot, choices)
 
 
 def import_table(
-    *files: str | os.PathLike[str],
+    *files: Any,
     urdf: str | os.PathLike[str],
     base_link: str | None = None,
     tip_link: str | None = None,
     joints: Sequence[str] = (),
     points: Sequence[str] = (),
     join: Literal['', 'name', 'time', 'order'] = '',
+    angles: Literal['', 'rad', 'deg', 'gon'] = '',
+    length: Literal['', 'm', 'cm', 'mm', 'um', 'in'] = '',
+    time: str = '',
+    names: str = '',
+    sheets: Sequence[str] = (),
+    pulses_per_degree: Sequence[float] = (),
+    clock_offset_s: float | None = None,
     couple: Mapping[str, str] | None = None,
     reverse: Sequence[str] = (),
     offset_deg: Mapping[str, float] | None = None,
+    never_mastered: bool = False,
     seed: int = 0,
 ) -> Session:
     """Make a session of one table with joints and points, or of two, as ``remaster import`` does.
@@ -125,11 +168,19 @@ def import_table(
     Parameters
     ----------
     files
-        Tables, or makers' own texts.
-    urdf, base_link, tip_link, seed
+        Tables, or makers' own texts; or data frames, which are read as the same tables.
+    urdf, base_link, tip_link, never_mastered, seed
         As of `session_from`.
-    joints, points, join
+    joints, points, time, names, join
         Names of columns, and how two tables are joined, where that is not found.
+    angles, length
+        Units, where they are neither in the header nor guessed right.
+    sheets
+        Of a workbook: the one with joints and points, or two.
+    pulses_per_degree
+        Of joints in pulses of the motors, base to tip.
+    clock_offset_s
+        Of two streams: the joints' clock less the points'; None to find it.
     couple, reverse, offset_deg
         Corrections of the joints: joint -> another one that is added (``'-J2'``: subtracted),
         those that count the other way round, and joint -> angle that is added, degrees.
@@ -155,21 +206,28 @@ def import_table(
     from remaster_ros.importing.rows import TableOptions
     from remaster_ros.session.robot_description import read_arm
 
-    paths = [Path(file) for file in files]
-    added = (
-        (name, (other.lstrip('+-'), other[:1] == '-')) for name, other in (couple or {}).items()
-    )
-    return in_python.of_files(
-        paths,
-        read_arm(Path(urdf), base_link, tip_link, tables=paths),
-        TableOptions(told=Told(tuple(joints), tuple(points)), join=join),
-        SessionOptions(
-            couple=tuple((name, (other, -1 if minus else 1)) for name, (other, minus) in added),
-            reverse=tuple(reverse),
-            add_deg=tuple((offset_deg or {}).items()),
+    choices = in_python.Choices(
+        TableOptions(
+            angles=angles,
+            length=length,
+            told=Told(tuple(joints), tuple(points), time, names),
+            join=join,
+            clock_offset_s=clock_offset_s,
+            pulses_per_degree=tuple(pulses_per_degree),
+            sheets=tuple(sheets),
         ),
+        SessionOptions.of(couple, reverse, offset_deg),
+        (
+            *('joints', 'points', 'join', 'angles', 'length', 'time', 'names', 'sheets'),
+            *('pulses_per_degree', 'clock_offset_s', 'base_link', 'tip_link', 'couple'),
+            *('reverse', 'offset_deg', 'never_mastered'),
+        ),
+        never_mastered,
         seed,
     )
+    paths = [Path(file) for file in files if isinstance(file, (str, os.PathLike))]
+    robot = read_arm(Path(urdf), base_link, tip_link, tables=paths)
+    return in_python.of_files(files, robot, choices)
 
 
 def fit(session: Session, *, seed: int = 0, priors: Priors | None = None) -> Fit:

@@ -32,6 +32,7 @@ from remaster_ros.importing.turns import oriented
 from remaster_ros.importing.units import ANGLES, LENGTHS
 from remaster_ros.kinematics.pad_angles import pad_in_words
 from remaster_ros.kinematics.serial_chain import SerialChain
+from remaster_ros.kinematics.urdf import parse_urdf
 from remaster_ros.session.reader import HEADER, read_session, write_session
 from remaster_ros.session.robot_description import read_arm
 from remaster_ros.session.workcell import Workcell, read_cell
@@ -91,6 +92,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     table.add_argument('--time', metavar='COLUMN', default='', help="or 'none' to leave it out")
     table.add_argument('--names', metavar='COLUMN', default='', help='by which to join two tables')
     table.add_argument('--angles', choices=tuple(ANGLES), default='', help='unit of the joints')
+    table.add_argument(
+        '--pulses-per-degree',
+        metavar='N,…',
+        type=_pulses,
+        default=(),
+        help='of joints in pulses of the motors, base to tip; negative where one counts the '
+        'other way round',
+    )
+    table.add_argument(
+        '--sheet',
+        metavar='NAME,…',
+        type=names,
+        default=(),
+        help='of a workbook: the one with joints and points, or two (default: those with numbers)',
+    )
     table.add_argument('--length', choices=tuple(LENGTHS), default='', help='unit of the points')
     table.add_argument('--separator', choices=tuple(SEPARATORS), help='between the columns')
     table.add_argument('--decimal', choices=tuple(DECIMALS), help='decimal sign')
@@ -211,6 +227,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="the maker's own (KUKA $ABS_ACCUR, ABB Absolute Accuracy), while it was measured",
     )
     session.add_argument(
+        '--never-mastered',
+        action='store_true',
+        help='zero-offsets may be of any size (hobby servos, a motor that was replaced); all else '
+        'is checked',
+    )
+    session.add_argument(
         '--unchecked', action='store_true', help='write it also where it does not fit the robot'
     )
 
@@ -240,6 +262,14 @@ def _turn(text: str) -> tuple[str, float]:
     if axis not in ('x', 'y', 'z') or not sign:
         raise argparse.ArgumentTypeError(f'{text!r} is not AXIS=DEGREES, such as z=90')
     return axis, number(-360.0, 360.0, 'degrees')(angle)
+
+
+def _pulses(text: str) -> tuple[float, ...]:
+    """Argument type: how many pulses are a degree, of each joint."""
+    counts = tuple(number(-1e9, 1e9)(part) for part in text.split(','))
+    if not all(counts):
+        raise argparse.ArgumentTypeError(f'{text!r}: no joint has 0 pulses a degree')
+    return counts
 
 
 def _offset(text: str) -> tuple[str, float]:
@@ -275,7 +305,7 @@ def run(args: argparse.Namespace) -> int:
     with progress_bar(args.quiet or args.json) as progress:
         progress('reading', 0.0)
         told = _session_options(args, cell)
-        rows = oriented(_read(args, chain).in_order(), chain, told)
+        rows = oriented(_read(args, urdf, chain).in_order(), chain, told)
         if args.on_tool:
             rows = from_tool(rows)
         options, counted = as_counted(rows, chain, told)
@@ -292,7 +322,7 @@ def run(args: argparse.Namespace) -> int:
         )
         session = mended(session, arrangement)
         session = replace(session, accuracy_option=args.accuracy_option)
-        sense = check_sense(session, rows, progress)
+        sense = check_sense(session, rows, progress, args.never_mastered)
     session, turned = without_whole_turns(session, chain)
     how += [*counted, *filter(None, [turned]), *_names_not_used(args, rows)]
     # RAPID is written by others than ABB too: such targets do not tell the maker.
@@ -368,12 +398,20 @@ def _written(out: Path) -> str:
     return f'written: {out}; go on with: remaster fit {quote(str(out))} --out …'
 
 
-def _read(args: argparse.Namespace, chain: SerialChain) -> RawRows:
+def _read(args: argparse.Namespace, urdf: str, chain: SerialChain) -> RawRows:
     bags = [path for path in args.files if is_bag(path)]
     if bags:
         if len(args.files) > 1:
             raise InputError(f'{bags[0]}: a bag is imported alone; give one file')
-        return read_bag(bags[0], chain, args.joints, args.points, args.length, args.clock_offset)
+        return read_bag(
+            bags[0],
+            chain,
+            args.joints,
+            args.points,
+            args.length,
+            args.clock_offset,
+            parse_urdf(urdf).links,
+        )
     return read_rows(
         args.files,
         chain,
@@ -387,6 +425,8 @@ def _read(args: argparse.Namespace, chain: SerialChain) -> RawRows:
             join=args.join,
             within_s=args.within,
             clock_offset_s=args.clock_offset,
+            pulses_per_degree=args.pulses_per_degree,
+            sheets=tuple(args.sheet),
         ),
     )
 

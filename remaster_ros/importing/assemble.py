@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
 from typing import Literal
@@ -63,6 +63,24 @@ class SessionOptions:
     hold_out: float = 1.0 / HOLD_OUT_ONE_OF
     visited_in_order: bool = False  # Each row's configuration was reached from that before
     on_tool: bool = False  # The sensor is, and measures the pose of what stands
+
+    @classmethod
+    def of(
+        cls,
+        couple: Mapping[str, str] | None,
+        reverse: Sequence[str],
+        offset_deg: Mapping[str, float] | None,
+    ) -> SessionOptions:
+        """Return corrections of the joints as Python's functions take them."""
+        added: dict[str, tuple[str, Literal[1, -1]]] = {
+            name: (other.lstrip('+-'), -1 if other[:1] == '-' else 1)
+            for name, other in (couple or {}).items()
+        }
+        return cls(
+            couple=tuple(added.items()),
+            reverse=tuple(reverse),
+            add_deg=tuple((offset_deg or {}).items()),
+        )
 
 
 def controller_of(rows: RawRows, chain: SerialChain, options: SessionOptions) -> Controller | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Container, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 
 from remaster_ros.errors import InputError
-from remaster_ros.importing.rows import RawRows
+from remaster_ros.importing.calibration_data import CALIBRATION_DATA, rows_of
+from remaster_ros.importing.rows import STATIC, RawRows
 from remaster_ros.importing.standstills import (
     SWING_S,
     Stream,
@@ -38,6 +39,13 @@ PLACES = {
     'geometry_msgs/msg/PoseWithCovarianceStamped': 'pose.pose',
     'nav_msgs/msg/Odometry': 'pose.pose',
 }
+# Of messages with several places, the likeliest first: the field with them.
+SEVERAL = {
+    'mocap4r2_msgs/msg/RigidBodies': 'rigidbodies',
+    'mocap4r2_msgs/msg/Markers': 'markers',
+    'tf2_msgs/msg/TFMessage': 'transforms',
+}
+_KINDS = (*PLACES, *SEVERAL)
 SUFFIXES = ('.mcap', '.db3', '.bag')
 
 
@@ -79,6 +87,21 @@ def _place(message: Any, where: str) -> tuple[float, ...]:
     return place.x, place.y, place.z, *quaternion
 
 
+def _places(topic: str, kind: str, message: Any) -> Iterator[tuple[str, Any, tuple[float, ...]]]:
+    """Give the name, the header and the place, as `_place`, of each place in a message."""
+    if kind in PLACES:
+        yield topic, message.header, _place(message, PLACES[kind])
+        return
+    for one in getattr(message, SEVERAL[kind]):
+        if hasattr(one, 'child_frame_id'):
+            yield one.child_frame_id, one.header, _place(one, 'transform')
+        elif hasattr(one, 'rigid_body_name'):
+            yield f'{topic}/{one.rigid_body_name}', message.header, _place(one, 'pose')
+        else:
+            name = one.marker_name or one.marker_index
+            yield f'{topic}/{name}', message.header, _place(one, 'translation')
+
+
 def read_bag(
     path: Path,
     chain: SerialChain,
@@ -86,8 +109,9 @@ def read_bag(
     point_topics: Sequence[str] = (),
     length: str = '',
     clock_offset_s: float | None = None,
+    links: Container[str] = (),
 ) -> RawRows:
-    """Read a bag; each topic of points is a sensor.
+    """Read a bag; each topic of points is a sensor, or what a message of several names.
 
     Parameters
     ----------
@@ -97,6 +121,8 @@ def read_bag(
         Unit of the points where it is not the metre of ROS.
     clock_offset_s
         What is added to the stamps of the points to have the joints'; None to find it.
+    links
+        Of the robot: where these are the robot believes, and no sensor has measured.
 
     Raises
     ------
@@ -105,25 +131,48 @@ def read_bag(
     """
     refuse_sliding(chain, path)
     joints: dict[str, _Topic] = defaultdict(_Topic)
-    found: dict[str, dict[str, _Topic]] = {kind: defaultdict(_Topic) for kind in PLACES}
+    found: dict[str, dict[str, _Topic]] = {kind: defaultdict(_Topic) for kind in _KINDS}
+    calibration: list[tuple[float, Any]] = []
     seen: dict[str, str] = {}
+    of: dict[str, str] = {}
     for topic, kind, message, log_s in _messages(path, seen):
-        stamp = message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec or log_s
-        if kind in PLACES and (not point_topics or topic in point_topics):
-            found[kind][topic].stamps.append(stamp)
-            found[kind][topic].values.append(_place(message, PLACES[kind]))
-        elif kind == JOINT_STATE and (not joint_topics or topic in joint_topics):
+        if kind == CALIBRATION_DATA:
+            calibration.append((log_s, message))
+        elif kind == JOINT_STATE:
+            if joint_topics and topic not in joint_topics:
+                continue
             position = dict(zip(message.name, message.position))
             if all(name in position for name in chain.joint_names):
-                joints[topic].stamps.append(stamp)
+                joints[topic].stamps.append(_stamp(message.header, log_s))
                 joints[topic].values.append([position[name] for name in chain.joint_names])
+        else:
+            for name, header, place in _places(topic, kind, message):
+                if point_topics and not {topic, name} & {*point_topics}:
+                    continue
+                if name not in links:
+                    found[kind][name].stamps.append(_stamp(header, log_s))
+                    found[kind][name].values.append(place)
+                    of[name] = topic
+    if calibration:
+        return rows_of(path, calibration, chain, point_topics, length)
     joint_topic = _joint_topic(path, joints, seen, chain)
-    kind = next((kind for kind in PLACES if found[kind]), '')
+    kind = next((kind for kind in _KINDS if found[kind]), '')
     if not kind:
         raise InputError(
-            f'{path}: no geometry_msgs/PointStamped or PoseStamped; it has {_topics(seen)}'
+            f'{path}: no geometry_msgs/PointStamped or PoseStamped, and no transform of a frame '
+            f'that is no link of the robot; it has {_topics(seen)}'
         )
     points = found[kind]
+    if kind in SEVERAL and not point_topics:
+        # Frames of a camera and of the room stand still.
+        extent = {
+            name: np.ptp(np.array(one.values)[:, :3], axis=0).max() for name, one in points.items()
+        }
+        points = {
+            name: one
+            for name, one in points.items()
+            if extent[name] > STATIC * max(extent.values())
+        } or points
     if len(points) > 1 and not point_topics and kind != next(iter(PLACES)):
         # One of them may well be where the robot believes its tool to be.
         raise InputError(
@@ -132,7 +181,13 @@ def read_bag(
     rows = _Rows(path, chain, joints[joint_topic].stream(), joint_topic, clock_offset_s)
     for topic, own in sorted(points.items()):
         rows.add(topic, own.stream(LENGTHS[length or 'm']))
+    used = {of[name] for name in points}
+    seen = {topic: what for topic, what in seen.items() if topic not in used}
     return rows.raw(sorted(points), length or 'm', seen)
+
+
+def _stamp(header: Any, log_s: float) -> float:
+    return float(header.stamp.sec + 1e-9 * header.stamp.nanosec or log_s)
 
 
 def _messages(path: Path, seen: dict[str, str]) -> Iterator[tuple[str, str, Any, float]]:
@@ -140,7 +195,7 @@ def _messages(path: Path, seen: dict[str, str]) -> Iterator[tuple[str, str, Any,
     # Imported here: it takes a quarter of a second, which tables need not wait for.
     from rosbags.highlevel import AnyReader
 
-    wanted = (JOINT_STATE, *PLACES)
+    wanted = (JOINT_STATE, CALIBRATION_DATA, *_KINDS)
     if path.suffix == '.mcap' or (path.is_dir() and any(path.glob('*.mcap'))):
         bag = BagReader(path)
         seen.update(bag.topics)
@@ -154,6 +209,9 @@ def _messages(path: Path, seen: dict[str, str]) -> Iterator[tuple[str, str, Any,
         with AnyReader([folder], default_typestore=jazzy_types()) as reader:
             seen.update({c.topic: c.msgtype for c in reader.connections})
             kept = [c for c in reader.connections if c.msgtype in wanted]
+            if not kept:
+                # Of no connections rosbags gives the messages of all.
+                return
             for connection, stamp_ns, data in reader.messages(connections=kept):
                 message = reader.deserialize(data, connection.msgtype)
                 yield connection.topic, connection.msgtype, message, 1e-9 * stamp_ns

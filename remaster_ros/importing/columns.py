@@ -11,7 +11,7 @@ from itertools import chain as flat
 
 from remaster_ros.errors import InputError
 from remaster_ros.importing.text_table import TextTable
-from remaster_ros.importing.units import ANGLES, LENGTHS, other_unit, split_unit
+from remaster_ros.importing.units import ANGLES, LENGTHS, PULSES, other_unit, split_unit
 
 AXES = ('x', 'y', 'z')
 _TOKEN = re.compile(r'[^\W\d_]+|\d+|#')
@@ -60,7 +60,19 @@ _SPREAD = {'std', 'stdev', 'stddev', 'sigma', 'sd', 'uncertainty', 'rms'}
 # Of an expanded uncertainty, U(95), which is no standard deviation.
 _EXPANDED = {'u', '95'}
 _TOOL = {
-    *('target', 'goal', 'tcp', 'tool', 'flange', 'robot', 'ref', 'reference', 'plan', *'rwvaf'),
+    *(
+        'target',
+        'goal',
+        'tcp',
+        'tool',
+        'flange',
+        'robot',
+        'effector',
+        'ref',
+        'reference',
+        'plan',
+        *'rwvaf',
+    ),
 }
 # Of columns that are no place that was measured.
 _NOT_MEASURED = {
@@ -181,7 +193,8 @@ def find_columns(
     if not found.points:
         found.points = _points(table, headers, taken, found)
     for i in (*found.joints, *found.point):
-        if unit := other_unit(table.names[i]):
+        unit = other_unit(table.names[i])
+        if unit and not (i in found.joints and unit.lower() in PULSES):
             raise InputError(
                 f'{table.path}, column {table.names[i]}: {unit}, where one of '
                 f'{", ".join(ANGLES if i in found.joints else LENGTHS)} is expected; convert the '
@@ -489,6 +502,9 @@ def _orientations(headers: Sequence[_Header], taken: set[int], found: Columns) -
         for names in ('xyzw', *_ANGLES, '0123', '1234')
         if {*columns} == {*names}
     ]
+    if len(complete) > 1:
+        # A log has the robot's own beside that of the point.
+        complete = [columns for columns in complete if _is_beside(headers, found, columns)]
     if len(complete) == 1:
         _take(found, complete[0], taken)
         if {*'xyzw'} in map(set, groups.values()):
@@ -497,6 +513,17 @@ def _orientations(headers: Sequence[_Header], taken: set[int], found: Columns) -
             found.turned = complete[0]
 
 
+def _is_beside(headers: Sequence[_Header], found: Columns, columns: Sequence[int]) -> bool:
+    """Return whether an orientation has the words of the point's columns beside the axis."""
+    stems = [
+        tuple(word for word in _with_axis(headers[i].words) if word not in (*AXES, *_PLACES))
+        for i in found.point[:1]
+    ]
+    return stems == [_turn_of(headers[columns[0]].words)[0]]
+
+
+# Words for the place in a pose.
+_PLACES = {'position', 'translation', 'pos', 'point', 't'}
 _TURNED = {
     *('quaternion', 'quat', 'orientation', 'rotation', 'rot', 'q', 'rotvec', 'rvec', 'euler'),
 }
@@ -545,6 +572,10 @@ def _take(found: Columns, columns: Sequence[int], taken: set[int]) -> None:
 
 def _by_place(table: TextTable, found: Columns, joints: int) -> Columns:
     """Take columns without a header by their place: a name, then joints, then X, Y, Z."""
+    if table.groups and not found.points:
+        found.points, found.orientations = {**table.groups}, {**table.turns}
+        for columns in (*found.points.values(), *found.orientations.values()):
+            found.why.update(dict.fromkeys(columns, 'place'))
     free = [i for i in range(len(table.names)) if i not in found.why]
     numeric = [i for i in free if _numeric(table, i)]
     texts = sorted({*free}.difference(numeric))

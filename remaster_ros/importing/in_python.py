@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import contextlib
+import logging
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from remaster_ros.errors import InputError, InsufficientDataError
+from remaster_ros.importing.arguments import in_python, remedy
 from remaster_ros.importing.assemble import (
     SessionOptions,
     as_counted,
@@ -16,27 +20,54 @@ from remaster_ros.importing.assemble import (
     refuse_outside_limits,
     without_whole_turns,
 )
+from remaster_ros.importing.frames import is_frame, tables_of
+from remaster_ros.importing.makers.named import some
 from remaster_ros.importing.rows import RawRows, TableOptions, read_rows
 from remaster_ros.importing.sense import check_sense
+from remaster_ros.importing.text_table import TextTable
 from remaster_ros.importing.turns import oriented
+from remaster_ros.importing.units import ANGLES, LENGTHS
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.types import FloatArray, Session
 
+log = logging.getLogger('remaster_ros')
 
-def of_arrays(joints: Any, points: Any, robot: tuple[str, SerialChain], seed: int) -> Session:
-    """Return the session of joints, rad, and points, m, row by row; see `session_from`."""
+
+@dataclass(frozen=True)
+class Choices:
+    """What was said to a function, and the names of its arguments, for messages."""
+
+    table: TableOptions
+    corrections: SessionOptions
+    arguments: tuple[str, ...]
+    never_mastered: bool = False
+    seed: int = 0
+
+
+def of_arrays(
+    joints: Any, points: Any, robot: tuple[str, SerialChain], choices: Choices
+) -> Session:
+    """Return the session of joints and points, row by row; see `session_from`."""
     urdf, chain = robot
-    q = _numbers(joints, 'joints', chain.joint_names)
-    position = _numbers(points, 'points', ('x', 'y', 'z'))
+    if is_frame(joints) and is_frame(points):
+        with _naming(choices.arguments):
+            tables = tables_of((joints, points), ('joints', 'points'))
+        return of_tables(tables, robot, choices)
+    options = choices.table
+    q = _numbers(joints, 'joints', chain.joint_names) * ANGLES[options.angles or 'rad']
+    position = _numbers(points, 'points', ('x', 'y', 'z')) * LENGTHS[options.length or 'm']
     if len(q) != len(position):
         raise InputError(f'joints have {len(q)} rows, points {len(position)}; give a point each')
-    n = len(q)
+    known = np.isfinite(q).all(axis=1) & np.isfinite(position).all(axis=1)
+    at = np.flatnonzero(known)
+    lost = [str(row) for row in np.flatnonzero(~known)]
+    n = len(at)
     rows = RawRows(
-        where=tuple(f'row {i}' for i in range(n)),
+        where=tuple(f'row {i}' for i in at),
         joint_columns=chain.joint_names,
-        q=q,
-        from_q=np.full(q.shape, np.nan),
-        position=position,
+        q=q[at],
+        from_q=np.full((n, len(chain)), np.nan),
+        position=position[at],
         std=np.full((n, 3), np.nan),
         stamp_s=None,
         labels={},
@@ -44,40 +75,63 @@ def of_arrays(joints: Any, points: Any, robot: tuple[str, SerialChain], seed: in
         samples=np.full(n, -1.0),
         columns={},
         description=(),
-        warnings=(),
+        warnings=(f'row{"s" * (len(lost) > 1)} {some(lost)}: not a number, left out',)
+        * bool(lost),
     )
-    return _made(rows, urdf, chain, SessionOptions(), seed, 'from arrays')
+    return _made(rows, urdf, chain, choices, 'from arrays')
 
 
-def of_files(
-    paths: Sequence[Path],
-    robot: tuple[str, SerialChain],
-    options: TableOptions,
-    corrections: SessionOptions,
-    seed: int,
+def of_files(files: Sequence[Any], robot: tuple[str, SerialChain], choices: Choices) -> Session:
+    """Return the session of files, or of data frames; see `import_table`."""
+    frames = [file for file in files if is_frame(file)]
+    names = ['frame'] if len(frames) == 1 else [f'frame {i + 1}' for i in range(len(frames))]
+    with _naming(choices.arguments):
+        read = iter(tables_of(frames, names))
+    return of_tables(
+        [next(read) if is_frame(file) else Path(file) for file in files], robot, choices
+    )
+
+
+def of_tables(
+    files: Sequence[Path | TextTable], robot: tuple[str, SerialChain], choices: Choices
 ) -> Session:
-    """Return the session of one table or of two that are joined; see `import_table`."""
+    """Return the session of one table or of two that are joined, some of which were read."""
     urdf, chain = robot
-    rows = oriented(read_rows(paths, chain, options).in_order(), chain, corrections)
-    notes = f'imported from {", ".join(path.name for path in paths)}'
-    return _made(rows, urdf, chain, corrections, seed, notes)
+    with _naming(choices.arguments):
+        rows = read_rows(files, chain, choices.table).in_order()
+        rows = oriented(rows, chain, choices.corrections)
+    named = [file.path if isinstance(file, TextTable) else file for file in files]
+    notes = f'imported from {", ".join(path.name for path in named)}'
+    return _made(rows, urdf, chain, choices, notes)
 
 
-def _made(
-    rows: RawRows,
-    urdf: str,
-    chain: SerialChain,
-    corrections: SessionOptions,
-    seed: int,
-    notes: str,
-) -> Session:
-    options, _ = as_counted(rows, chain, corrections)
-    session, _ = assemble(rows, urdf, chain, options, np.random.default_rng(seed), notes)
-    sense = check_sense(session, rows, lambda *_: None)
-    if not sense.fits:
-        raise InsufficientDataError('; '.join(filter(None, (sense.sentence, sense.options))))
-    session, _ = without_whole_turns(session, chain)
-    refuse_outside_limits(rows, chain, session.measurements.q)
+@contextlib.contextmanager
+def _naming(arguments: Collection[str]) -> Iterator[None]:
+    """Let errors name these arguments of a function in place of options of the command."""
+    try:
+        yield
+    except (InputError, InsufficientDataError) as error:
+        words = in_python(str(error), arguments)
+        if words == str(error):
+            raise
+        kind = InputError if isinstance(error, InputError) else InsufficientDataError
+        raise kind(words) from None
+
+
+def _made(rows: RawRows, urdf: str, chain: SerialChain, choices: Choices, notes: str) -> Session:
+    with _naming(choices.arguments):
+        options, _ = as_counted(rows, chain, choices.corrections)
+        rng = np.random.default_rng(choices.seed)
+        session, _ = assemble(rows, urdf, chain, options, rng, notes)
+        sense = check_sense(session, rows, lambda *_: None, choices.never_mastered)
+        if not sense.fits:
+            sentence = in_python(sense.sentence, choices.arguments)
+            help_with = remedy(sense.options, choices.arguments)
+            raise InsufficientDataError('; '.join(filter(None, (sentence, help_with))))
+        for warning in (*rows.warnings, *filter(None, [sense.warning])):
+            log.warning('%s', warning)
+        session, _ = without_whole_turns(session, chain)
+        refuse_outside_limits(rows, chain, session.measurements.q)
     return session
 
 
@@ -99,7 +153,7 @@ def _numbers(given: Any, what: str, names: Sequence[str]) -> FloatArray:
         raise InputError(f'{what}: not an array of numbers') from None
     if values.ndim != 2 or values.shape[1] != len(names):
         raise InputError(f'{what}: {values.shape} is not (rows, {len(names)}): {", ".join(names)}')
-    if not np.isfinite(values).all():
-        row = int(np.flatnonzero(~np.isfinite(values).all(axis=1))[0])
-        raise InputError(f'{what}: row {row} is not finite; leave it out of joints and points')
+    if np.isinf(values).any():
+        row = int(np.flatnonzero(np.isinf(values).any(axis=1))[0])
+        raise InputError(f'{what}: row {row} is infinite; leave it out of joints and points')
     return values

@@ -11,6 +11,7 @@ from itertools import product
 import numpy as np
 
 from remaster_ros.errors import InputError
+from remaster_ros.importing.rigid_numbers import COUNT, SIZE, rigid
 from remaster_ros.importing.text_table import TextTable
 from remaster_ros.kinematics.transforms import quaternion_xyzw
 from remaster_ros.types import FloatArray
@@ -18,23 +19,20 @@ from remaster_ros.types import FloatArray
 # A column by row and column of its number, `T[0][3]`, or by one count, `O_T_EE_12`.
 _ROW_AND_COLUMN = re.compile(r'(.*?)[\[(_ ]*([0-4])[\])_, \[(]*([0-4])[\])]?')
 _COUNTED = re.compile(r'(.*?)[\[(_ ]*(\d{1,2})[\])]?')
-_SIZE = 4
-# Of a rotation written with three digits.
-_ROUNDING = 2e-3
 
 
 def with_poses(table: TextTable) -> TextTable:
     """Return a table with X, Y, Z and quaternion of each 4×4 matrix in place of its columns.
 
-    The numbers stand row by row, or column by column as libfranka writes them: the row 0 0 0 1
-    tells which. Sixteen columns that are no rigid motion stay as they are.
+    Sixteen columns that are no rigid motion stay as they are.
     """
     names, rows = list(table.names), [list(row) for row in table.rows]
     dropped: set[int] = set()
     poses: dict[str, list[int]] = {}
-    for stem, places in _groups(table).items():
+    found = _groups(table) if table.has_header else _in_a_row(table)
+    for stem, places in found.items():
         numbers = _numbers(table, places)
-        T = None if numbers is None else _rigid(numbers)
+        T = None if numbers is None else rigid(numbers)
         if T is None:
             continue
         of = stem or 'pose'
@@ -64,20 +62,37 @@ def with_poses(table: TextTable) -> TextTable:
 def _groups(table: TextTable) -> Mapping[str, list[int]]:
     """Return the sixteen columns of each matrix, in the order of their numbers, by their name."""
     found: dict[str, list[int]] = {}
-    for pattern, counts in ((_ROW_AND_COLUMN, _SIZE), (_COUNTED, _SIZE * _SIZE)):
+    for pattern, counts in ((_ROW_AND_COLUMN, SIZE), (_COUNTED, COUNT)):
         by_stem: dict[str, dict[tuple[int, ...], int]] = defaultdict(dict)
         for i, name in enumerate(table.names):
             if match := pattern.fullmatch(name):
                 by_stem[match[1]].setdefault(tuple(map(int, match.groups()[1:])), i)
         for stem, columns in by_stem.items():
-            if stem in found or len(columns) != _SIZE * _SIZE:
+            if stem in found or len(columns) != COUNT:
                 continue
             for first in (0, 1):
                 each = range(first, first + counts)
-                order = [*product(each, repeat=2 if counts == _SIZE else 1)]
+                order = [*product(each, repeat=2 if counts == SIZE else 1)]
                 if {*columns} == {*order}:
                     found[stem] = [columns[key] for key in order]
     return found
+
+
+def _in_a_row(table: TextTable) -> Mapping[str, list[int]]:
+    """Return the sixteen columns of each matrix of a table without names."""
+    found: dict[str, list[int]] = {}
+    first = 0
+    while first + COUNT <= len(table.names):
+        columns = [*range(first, first + COUNT)]
+        # The first row tells where there can be none.
+        one = _numbers(table.select([0]), columns)
+        numbers = None if one is None or rigid(one) is None else _numbers(table, columns)
+        if numbers is not None and rigid(numbers) is not None:
+            found[f'pose {len(found) + 1}'] = columns
+            first += COUNT
+        else:
+            first += 1
+    return {'pose': found['pose 1']} if len(found) == 1 else found
 
 
 def _numbers(table: TextTable, columns: list[int]) -> FloatArray | None:
@@ -89,14 +104,3 @@ def _numbers(table: TextTable, columns: list[int]) -> FloatArray | None:
     if any(None in row for row in cells):
         return None
     return np.array(cells, float)
-
-
-def _rigid(numbers: FloatArray) -> FloatArray | None:
-    """Return rigid motions (n, 4, 4) of their numbers (n, 16); None where they are none."""
-    T = numbers.reshape(-1, _SIZE, _SIZE)
-    for each in (T, T.swapaxes(1, 2)):
-        R = each[:, :3, :3]
-        turns = np.abs(R @ R.swapaxes(1, 2) - np.eye(3)).max() < _ROUNDING
-        if turns and np.all(each[:, 3] == [0, 0, 0, 1]) and np.all(np.linalg.det(R) > 0.0):
-            return each
-    return None

@@ -19,6 +19,7 @@ from remaster_ros.importing.columns import AXES, Columns, Table, Told, find_colu
 from remaster_ros.importing.makers import kuka
 from remaster_ros.importing.makers.named import some
 from remaster_ros.importing.pose_matrices import with_poses
+from remaster_ros.importing.pulses import in_degrees
 from remaster_ros.importing.standstills import stopped
 from remaster_ros.importing.text_table import (
     MOST_COLUMNS,
@@ -26,7 +27,7 @@ from remaster_ros.importing.text_table import (
     TextTable,
     decode,
     is_missing,
-    read_table,
+    read_tables,
 )
 from remaster_ros.importing.units import ANGLES, LENGTHS
 from remaster_ros.importing.values import (
@@ -93,6 +94,10 @@ def join(
         if pairs is not None:
             return pairs
     a, b = points[0], joints[0]
+    if how in ('', 'order') and a.rows_in_order and a.rows_in_order == b.rows_in_order:
+        # Also where rows of either were left out.
+        _, rows, of = np.intersect1d(a.lines, b.lines, return_indices=True)
+        return Pairs(rows, of, 'by the order of their rows')
     if how == 'order':
         if len(a.rows) != len(b.rows):
             raise InputError(
@@ -187,7 +192,8 @@ def _by_name(points: Table, joints: Table, *, by_header: bool) -> Pairs | None:
             raise table.fault(
                 twice[1],
                 column,
-                f'is also on line {table.lines[twice[0]]}; keep one, or say --join order',
+                f'is also on {table.counted} {table.lines[twice[0]]}; keep one, or say --join '
+                'order',
             )
     at = {key: row for row, key in enumerate(b)}
     rows = np.array([row for row, key in enumerate(a) if key in at], dtype=np.int64)
@@ -272,8 +278,7 @@ def _by_time(points: Table, joints: Table, within_s: float) -> Pairs | None:
         ('measured while the arm moved', np.flatnonzero(moved)),
     ):
         if len(rows):
-            lines = some([str(table.lines[row]) for row in rows])
-            left_out.append(f'{table.path}, line{"s" * (len(rows) > 1)} {lines}: {why}, left out')
+            left_out.append(f'{table.at_rows(rows.tolist())}: {why}, left out')
     if not kept.any():
         raise InputError(f'{table.path}: every point was measured while the arm moved')
     return Pairs(np.flatnonzero(kept), order[nearer[kept]], 'by time', tuple(left_out))
@@ -307,14 +312,14 @@ def _refuse_equal_times(
                 raise table.fault(
                     int(two),
                     column,
-                    f'is the time of line {table.lines[one]} as well, and the joints are others; '
-                    'give times with seconds, or say --join order',
+                    f'is the time of {table.counted} {table.lines[one]} as well, and the joints '
+                    'are others; give times with seconds, or say --join order',
                 )
 
 
 # A marker that moves by less than this share of what others move is not on the arm: one on the
 # first link would, by less than a fiftieth of the arm's reach about its axis.
-_STATIC = 0.02
+STATIC = 0.02
 # Of fewer configurations any two may well have one time.
 _FEWEST_ALIKE = 4
 _OTHERS = ('pose', 'configuration', 'split', 'sensor', 'marker')
@@ -333,6 +338,8 @@ class TableOptions:
     join: How = ''
     within_s: float = 1.0
     clock_offset_s: float | None = None
+    pulses_per_degree: tuple[float, ...] = ()  # Base to tip; () for joints in angles
+    sheets: tuple[str, ...] = ()  # Of a workbook; () for all with numbers
 
 
 @dataclass(frozen=True, eq=False)
@@ -396,14 +403,18 @@ class RawRows:
         )
 
 
-def read_rows(paths: Sequence[Path], chain: SerialChain, options: TableOptions) -> RawRows:
-    """Read one table with joints and points, or one with each.
+def read_rows(
+    files: Sequence[Path | TextTable], chain: SerialChain, options: TableOptions
+) -> RawRows:
+    """Read one table with joints and points, or one with each; some may have been read before.
 
     Raises
     ------
     InputError
         One line naming file, line, column and remedy.
     """
+    read_before = [file for file in files if isinstance(file, TextTable)]
+    paths = [file for file in files if isinstance(file, Path)]
     programs = {
         data: path
         for path in paths
@@ -412,10 +423,16 @@ def read_rows(paths: Sequence[Path], chain: SerialChain, options: TableOptions) 
         and path.stem.lower() == data.stem.lower()
     }
     paths = [path for path in paths if path not in programs.values()]
-    if len(paths) > 2:
-        raise InputError(f'{len(paths)} files; give one table, or two that are to be joined')
-    tables = [
-        read_table(path, options.separator, options.decimal, options.encoding) for path in paths
+    if len(paths) + len(read_before) > 2:
+        count = len(paths) + len(read_before)
+        raise InputError(f'{count} files; give one table, or two that are to be joined')
+    tables = [*read_before]
+    tables += [
+        table
+        for path in paths
+        for table in read_tables(
+            path, options.separator, options.decimal, options.encoding, options.sheets
+        )
     ]
     tables = [
         _visited(table, programs[table.path]) if table.path in programs else table
@@ -424,21 +441,32 @@ def read_rows(paths: Sequence[Path], chain: SerialChain, options: TableOptions) 
     sliding = np.flatnonzero(chain.slides).tolist()
 
     def with_columns(tables: list[TextTable]) -> list[Table]:
-        return [
-            (
-                table,
-                find_columns(
-                    table, chain.joint_names, _of_table(options.told, table, tables), sliding
-                ),
-            )
-            for table in tables
-        ]
+        found, problems = [], []
+        for table in tables:
+            told = _of_table(options.told, table, tables)
+            try:
+                found.append((table, find_columns(table, chain.joint_names, told, sliding)))
+            except InputError as error:
+                # A workbook has sheets for other things.
+                if not table.part:
+                    raise
+                problems.append(error)
+        if problems and not any(c.points or c.joints for _, c in found):
+            raise problems[0]
+        return found
 
+    if not (options.told.joints or options.told.points):
+        # Numbers that were told are those of the file.
+        tables = [table if table.has_header else with_poses(table) for table in tables]
     found = with_columns(tables)
     if not any(columns.points for _, columns in found) and not options.told.points:
         tables = [with_poses(table) for table in tables]
         found = with_columns(tables)
     _refuse_untold(found, options.told)
+    whole = [pair for pair in found if pair[1].points and pair[1].joints]
+    if len(whole) == 1 and all(table.part for table, _ in found):
+        # Beside it a workbook has sums, and an archive other arrays.
+        found = whole
     with_points = _told_first([pair for pair in found if pair[1].points], 'points')
     with_joints = _told_first([pair for pair in found if pair[1].joints], 'joints')
     # A log of joints may have where the robot believes its tool to be.
@@ -454,6 +482,11 @@ def read_rows(paths: Sequence[Path], chain: SerialChain, options: TableOptions) 
         '--joints',
     )
     warnings = [note for table in tables for note in table.notes]
+    warnings += [
+        f'{table.path} left out: it is neither with the joints nor with the points used'
+        for table in tables
+        if table.part and table not in (points[0], joints[0])
+    ]
     joints, idle = _without_idle(joints, len(chain))
     if idle:
         warnings.append(f'{joints[0].path}: {", ".join(idle)} left out: 0 in every row')
@@ -467,8 +500,13 @@ def read_rows(paths: Sequence[Path], chain: SerialChain, options: TableOptions) 
             'with --base-link and --tip-link'
         )
     description = [table.describe() for table in tables]
+    same = joints is points
+    joints, how_pulses = in_degrees(joints, options.pulses_per_degree, options.angles)
+    description += filter(None, [how_pulses])
+    if same:
+        points = joints
     for table, columns in with_points:
-        if table is not points[0]:
+        if table.path != points[0].path:
             unused = ', '.join(table.names[i] for i in columns.point)
             warnings.append(f'{table.path}: {unused} left out, the points are in {points[0].path}')
     stamp = None
@@ -519,12 +557,12 @@ def _complete(points: Table, joints: Table) -> tuple[Table, Table, tuple[str, ..
         ('no joints', joints, joints[1].joints),
         ('no point', points, points[1].point),
     ):
-        known = np.array([not all(is_missing(row[i]) for i in places) for row in table.rows])
+        # A file has a damaged point, a frame what its program could not tell: NaN.
+        lost = any if table.counted == 'row' and len(places) <= len(joints[1].joints) else all
+        known = np.array([not lost(is_missing(row[i]) for i in places) for row in table.rows])
         kept[what] = known
-        lines = [str(table.lines[row]) for row in np.flatnonzero(~known)]
-        if lines and known.any():
-            plural = 's' * (len(lines) > 1)
-            left.append(f'{table.path}, line{plural} {some(lines)}: {what}, left out')
+        if not known.all() and known.any():
+            left.append(f'{table.at_rows(np.flatnonzero(~known).tolist())}: {what}, left out')
         if not known.any():
             kept[what] = np.ones(len(table.rows), bool)
     if same:
@@ -626,7 +664,7 @@ def _values(
             f'{prefix}{name}': meaning.get(i, 'not used') for i, name in enumerate(one.names)
         }
     return RawRows(
-        where=tuple(f'{table.path}, line {table.lines[i]}' for i in row),
+        where=tuple(table.at(int(i)) for i in row),
         joint_columns=tuple(joints[0].names[i] for i in joints[1].joints),
         q=q[row],
         from_q=from_q[row],
@@ -685,25 +723,25 @@ def _refuse_no_turn(table: TextTable, columns: Sequence[int], turns: FloatArray)
         )
 
 
+def moving(raw: FloatArray) -> BoolArray:
+    """Return which markers (markers, n, 3) move as the arm does; NaN where one was not seen."""
+    seen = np.isfinite(raw[:, :, 0])
+    extent = np.array(
+        [np.ptp(own[at], axis=0).max() if at.any() else 0.0 for own, at in zip(raw, seen)]
+    )
+    return np.asarray(extent > STATIC * extent.max(initial=0.0))
+
+
 def _moved(
     raw: FloatArray, names: Sequence[str], table: TextTable
 ) -> tuple[BoolArray, tuple[str, ...]]:
     """Return which markers move with the arm, (markers,), and the sentences on the others."""
-    seen = np.array([bool(np.isfinite(own[:, 0]).any()) for own in raw])
-    extent = np.array(
-        [
-            np.nanmax(np.ptp(own[np.isfinite(own[:, 0])], axis=0), initial=0.0)
-            if any_seen
-            else 0.0
-            for own, any_seen in zip(raw, seen)
-        ]
-    )
-    moved = extent > _STATIC * extent.max()
+    moved = moving(raw)
     return moved, tuple(
         f'{table.path}: {name} stays in its place, so it is not on the arm; left out'
-        if any_seen
+        if np.isfinite(own[:, 0]).any()
         else f'{table.path}: {name} was never seen; left out'
-        for name, is_moved, any_seen in zip(names, moved, seen)
+        for name, is_moved, own in zip(names, moved, raw)
         if not is_moved
     )
 

@@ -41,6 +41,10 @@ COMPUTED_M = 2e-5
 # Twice what the softest arms bend by (an LBR iiwa with its payload, 5 mm). What is further off was
 # measured wrong, or belongs to other joints.
 BENT_M = 0.01
+# Zeros further off, rad, are of another zero position, by quarters of a turn: a mistake.
+_LARGEST_UNMASTERED = np.pi / 4.0
+# Option with which zeros that are off by less are written, and all else is still checked.
+NEVER_MASTERED = '--never-mastered'
 # Rows that a sentence names.
 SHOWN_ROWS = 5
 
@@ -59,7 +63,12 @@ class Sense:
     warning: str = ''
 
 
-def check_sense(session: Session, rows: RawRows, progress: Callable[[str, float], None]) -> Sense:
+def check_sense(
+    session: Session,
+    rows: RawRows,
+    progress: Callable[[str, float], None],
+    never_mastered: bool = False,
+) -> Sense:
     """Fit the table as it is and, where that is gross, as it might be meant.
 
     Parameters
@@ -68,6 +77,8 @@ def check_sense(session: Session, rows: RawRows, progress: Callable[[str, float]
         As it would be written.
     rows
         For the names of the columns.
+    never_mastered
+        Zero-offsets may be larger than a mastered robot has.
     """
     # The marker is left free: one that is firm at a wrong place would bend the fit.
     part = replace(session, marker_std_m=UNKNOWN_MARKER_STD_M)
@@ -98,9 +109,7 @@ def check_sense(session: Session, rows: RawRows, progress: Callable[[str, float]
             f'{_largest(as_given.joint_offsets, chain)}',
             error_m=as_given.error_m,
             rows_off=beside,
-            warning=f'{_few_words(beside, rows)}; correct these rows or remove them'
-            if beside
-            else '',
+            warning=_to_correct(beside, rows),
         )
     if as_given.gross and len(part.measurements) < FEWEST_ROWS:
         return Sense(
@@ -117,6 +126,12 @@ def check_sense(session: Session, rows: RawRows, progress: Callable[[str, float]
     if mistakes.fitting:
         sentence, options = in_a_sentence(mistakes, session, columns_of(rows, chain))
         return Sense(False, sentence, options, as_given.error_m)
+    # Of an arm that fits, its zeros apart.
+    largest = np.abs(as_given.joint_offsets / as_given.per_radian).max()
+    unmastered = as_given.left_m <= UNCALIBRATED_ERROR_M and largest < _LARGEST_UNMASTERED
+    if as_given.gross and unmastered and not too_many and as_given.marker_shift_m < allowed:
+        found = _not_mastered(as_given, without, chain, never_mastered)
+        return replace(found, rows_off=beside, warning=_to_correct(beside, rows))
     if too_many and as_given.error_m <= UNCALIBRATED_ERROR_M:
         return _many_off(as_given, beside, rows)
     if not as_given.gross:
@@ -221,6 +236,11 @@ def _beside(session: Session, off: RowsOff, rows: RawRows) -> tuple[tuple[str, f
     return tuple((rows.where[line[row]], float(off.error_m[row])) for row in order)
 
 
+def _to_correct(beside: Sequence[tuple[str, float]], rows: RawRows) -> str:
+    """Return the warning on rows that do not fit; '' where all do."""
+    return f'{_few_words(beside, rows)}; correct these rows or remove them' if beside else ''
+
+
 def _few_words(beside: Sequence[tuple[str, float]], rows: RawRows) -> str:
     """Return how many rows do not fit, how far they are off, and the first of them."""
     shown = [
@@ -253,6 +273,32 @@ def _many_off(given: Fitted, beside: tuple[tuple[str, float], ...], rows: RawRow
 ON_TOOL = '; poses that a camera on the tool has of a board that stands need --on-tool'
 
 
+def _not_mastered(given: Fitted, without: str, chain: SerialChain, never_mastered: bool) -> Sense:
+    """Return that zeros are further off than those of a mastered robot, and what to do."""
+    far = np.flatnonzero(np.abs(given.joint_offsets) > LARGEST_OFFSET * given.per_radian)
+    listed = ' and '.join(
+        f'{chain.joint_names[i]} off by {chain.shown_offset(i, given.joint_offsets[i], 1)}'
+        for i in far.tolist()
+    )
+    several = len(far) > 1
+    found = (
+        f'the data fit to {without} with the zero{"s" * several} of {listed}, more than a '
+        'mastered robot has'
+    )
+    if never_mastered:
+        return Sense(True, f'{found}, as was said', error_m=given.error_m)
+    these = 'these joints' if several else 'this joint'
+    return Sense(
+        False,
+        f'{found}: master {these} and measure again; if the arm was never mastered (hobby servos, '
+        f'a motor that was replaced), the data are right as they are and {these} '
+        f'{"are" if several else "is"} corrected by so much; if it was, is the URDF that of this '
+        'arm?',
+        NEVER_MASTERED,
+        given.error_m,
+    )
+
+
 def _nothing_found(given: Fitted, without: str, chain: SerialChain, oriented: bool) -> Sense:
     equal = np.abs(given.joint_offsets) / given.per_radian
     worst = int(np.argmax(equal))
@@ -263,15 +309,6 @@ def _nothing_found(given: Fitted, without: str, chain: SerialChain, oriented: bo
             f'the data fit to {without} only, with zero-offsets{off}; check units, signs and '
             'order of the joints (where a joint slides other mistakes are not looked for), that '
             'the URDF is that of this arm, and that each point stands beside its own joints',
-            error_m=given.error_m,
-        )
-    angle = given.joint_offsets[worst]
-    if given.error_m < UNCALIBRATED_ERROR_M and abs(angle) > LARGEST_OFFSET:
-        return Sense(
-            False,
-            f'the data fit to {without} with the zero of joint {worst + 1} off by '
-            f'{np.degrees(angle):.1f} degrees, more than a mastered robot has; is the URDF that '
-            'of this arm?',
             error_m=given.error_m,
         )
     return Sense(

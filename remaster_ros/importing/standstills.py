@@ -19,7 +19,6 @@ from remaster_ros.calibration.arrangement import linear_fit
 from remaster_ros.collection.pairing import SensorRules, are_too_many, of_the_marker
 from remaster_ros.errors import InputError
 from remaster_ros.importing.columns import Table
-from remaster_ros.importing.makers.named import some
 from remaster_ros.importing.units import ANGLES, LENGTHS
 from remaster_ros.importing.values import angle_unit, length_unit, numbers, times
 from remaster_ros.kinematics.serial_chain import SerialChain
@@ -579,9 +578,7 @@ def _unpaired(
         (lost[~inside], 'measured before or after the record of the joints'),
     ):
         if len(rows):
-            lines = some([str(points[0].lines[row]) for row in rows])
-            some_lines = f'line{"s" * (len(rows) > 1)} {lines}'
-            notes.append(f'{points[0].path}, {some_lines}: {why}, left out')
+            notes.append(f'{points[0].at_rows(rows.tolist())}: {why}, left out')
     return tuple(notes)
 
 

@@ -8,7 +8,7 @@ import io
 import re
 import zlib
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -16,7 +16,7 @@ import numpy as np
 
 from remaster_ros.errors import InputError
 from remaster_ros.importing import by_axis
-from remaster_ros.importing.makers import READERS
+from remaster_ros.importing.makers import READERS, UNPACKERS
 from remaster_ros.importing.makers.named import Named, some
 from remaster_ros.importing.units import bare, is_unit, split_unit
 from remaster_ros.session.files import cpu_limited, read_limited
@@ -33,6 +33,8 @@ MOST_COLUMNS, LONGEST_NAME = 5_000, 1_000
 SEPARATORS = {';': 'semicolons', '\t': 'tabs', ',': 'commas', '|': 'bars', ' ': 'blanks'}
 # From so many lines the separator is found.
 SEEN_LINES = 2000
+# In place of the encoding of a table that was no text: of a workbook, of arrays.
+CELLS = 'cells'
 _COMMENT = re.compile(r'\s*(?:#|//|%|!|\*)\s*')
 _PLAIN = re.compile(r'[+-]?(?:\d+(?:[.,]\d*)?|[.,]\d+)(?:[eE][+-]?\d+)?', re.ASCII)
 # Groups of three digits, as spreadsheets like to write thousands, and then a decimal sign.
@@ -52,7 +54,6 @@ _UNGROUPED = re.compile(r'[+-]?\d{4,}(?:[.,]\d*)?', re.ASCII)
 _ORNAMENT = re.compile(r'[\s|+:=-]+')
 _NUMBERS = re.compile(r'(?<![\w.,])[+-]?\d+(?:[.,]\d*)?(?!\w)')
 _LIST = re.compile(r'[\[(]([^\[\]()]*)[\])]')
-_JSON = re.compile(r'\s*(?:\{\s*"|\[\s*\{)')
 # Numbers in the cell of a row: joints, points and matrices have fewer. An empty cell of such a
 # column stands for as many columns. A number of double precision with blanks has fewer letters.
 _LONGEST_LIST, _LONGEST_NUMBER = 100, 40
@@ -88,14 +89,19 @@ class TextTable(Named):
     path: Path  # The file, for messages
     # What it was found, or told, to be written with
     encoding: str
+    part: str = ''  # Sheet of a workbook that has several tables
+    counted: str = 'line'  # What `lines` counts, for messages
+    # Of a data frame whose index counts them, with those left out; 0 of others
+    rows_in_order: int = 0
     separator: str = ''
     preamble: str = ''  # Title and comment lines
-    has_header: bool = True  # The names stand in the file
 
     def describe(self) -> str:
         """Return how it is written, in a few words."""
         if self.kind:
             return f'{self.path}: {len(self.rows)} rows of {self.kind}'
+        if self.encoding == CELLS:
+            return f'{self.path}: {len(self.rows)} rows of cells'
         sign = 'comma' if self.decimal == ',' else 'point'
         header = '' if self.has_header else ', no header'
         return (
@@ -103,13 +109,20 @@ class TextTable(Named):
             f'between the columns, decimal {sign}, {self.encoding}{header}'
         )
 
+    def at(self, row: int) -> str:
+        """Return the file and the line of a row."""
+        return f'{self.path}, {self.counted} {self.lines[row]}'
+
+    def at_rows(self, rows: Iterable[int]) -> str:
+        """Return the file and the lines of rows, the first five of them."""
+        lines = [str(self.lines[row]) for row in rows]
+        return f'{self.path}, {self.counted}{"s" * (len(lines) > 1)} {some(lines)}'
+
     def fault(self, row: int, column: int, problem: str) -> InputError:
         """Return the error of one cell, both counted from 0."""
         cell = self.rows[row][column]
         shown = repr(cell if len(cell) <= 40 else cell[:40] + '…')
-        return InputError(
-            f'{self.path}, line {self.lines[row]}, column {self.names[column]}: {shown} {problem}'
-        )
+        return InputError(f'{self.at(row)}, column {self.names[column]}: {shown} {problem}')
 
     def number(self, row: int, column: int) -> float | None:
         """Return a cell as a number; None where it is empty."""
@@ -148,12 +161,35 @@ def parse_number(cell: str, decimal: str) -> float | None:
 def read_table(
     path: Path, separator: str = '', decimal: str = '', encoding: str = ''
 ) -> TextTable:
-    """Read a text table; what is not told is found.
+    """Read a file with one table; what is not told is found.
 
     Raises
     ------
     InputError
         One line naming file, line and remedy: no text, no numbers, or rows of unequal length.
+    """
+    tables = read_tables(path, separator, decimal, encoding)
+    if len(tables) > 1:
+        listed = ', '.join(table.part for table in tables)
+        raise InputError(f'{path}: {len(tables)} tables ({listed}); name one with --sheet')
+    return tables[0]
+
+
+def table_of_text(text: str, path: Path) -> TextTable:
+    """Return the table of a text with tabs, which was no file; `path` is its name in messages."""
+    return _table(text, path, '\t', '.', CELLS)
+
+
+def read_tables(
+    path: Path,
+    separator: str = '',
+    decimal: str = '',
+    encoding: str = '',
+    sheets: Sequence[str] = (),
+) -> list[TextTable]:
+    """Read the tables of a file: those of a workbook's sheets, else one; as `read_table`.
+
+    `sheets` are the names of those that are read; () for all that hold numbers.
     """
     data = read_limited(path, TABLE_LIMIT, 'name the table')
     if data.startswith(b'\x1f\x8b'):
@@ -164,23 +200,59 @@ def read_table(
         'size takes; take out what is no row of joints or points'
     )
     with cpu_limited(limit_s, refusal):
-        return _table(data, path, separator, decimal, encoding)
+        for unpack in UNPACKERS:
+            try:
+                parts = unpack(data)
+            except InputError as error:
+                raise InputError(f'{path}: {error}') from None
+            if parts is not None:
+                return _of_parts(parts, path, decimal, sheets)
+        text, encoding = decode(data, path, encoding)
+        return [_table(text, path, separator, decimal, encoding)]
 
 
-def _table(data: bytes, path: Path, separator: str, decimal: str, encoding: str) -> TextTable:
-    """Return the table of the bytes of a file; as `read_table`."""
-    text, encoding = decode(data, path, encoding)
+def _of_parts(
+    parts: Mapping[str, str], path: Path, decimal: str, sheets: Sequence[str]
+) -> list[TextTable]:
+    """Return the tables of a workbook's sheets, or of arrays, that hold rows of numbers."""
+    folded = {name.casefold(): name for name in parts}
+    for name in sheets:
+        if name.casefold() not in folded:
+            raise InputError(f'--sheet {name}: {path} has {", ".join(parts) or "none"}')
+    chosen = [folded[name.casefold()] for name in sheets] or [*parts]
+    tables, empty, problem = [], [], ''
+    for name in chosen:
+        try:
+            tables.append(_table(parts[name], path, '\t', decimal, CELLS, name))
+        except InputError as error:
+            # Notes, charts and lists of parameters stand on sheets of their own.
+            if name in map(folded.get, map(str.casefold, sheets)) or len(chosen) == 1:
+                raise
+            empty.append(name)
+            problem = problem or str(error)
+    if not tables:
+        raise InputError(problem or f'{path}: no sheet that is shown has anything in it')
+    if len(tables) == 1:
+        tables = [replace(tables[0], part='')]
+    else:
+        tables = [replace(table, path=Path(f'{path}:{table.part}')) for table in tables]
+    if empty:
+        note = f'{path}: {", ".join(empty)} left out: no rows of numbers'
+        tables[0] = replace(tables[0], notes=(*tables[0].notes, note))
+    return tables
+
+
+def _table(
+    text: str, path: Path, separator: str, decimal: str, encoding: str, part: str = ''
+) -> TextTable:
+    """Return the table of a text; as `read_table`. `part` is the sheet of a workbook."""
     for read in READERS:
         try:
             found = read(text)
         except InputError as error:
             raise InputError(f'{path}, {error}') from None
         if found is not None:
-            return _bounded(TextTable(path=path, encoding=encoding, **vars(found)))
-    if _JSON.match(text):
-        raise InputError(
-            f'{path}: this is JSON, not a table; save it as CSV, a row for each configuration'
-        )
+            return _bounded(TextTable(path=path, encoding=encoding, part=part, **vars(found)))
     if _MARKUP.match(text):
         raise InputError(f'{path}: this is HTML or XML, not a table; save it as CSV')
     text = text.replace('\r\n', '\n').replace('\r', '\n').replace('\u2212', '-')
@@ -256,6 +328,7 @@ def _table(data: bytes, path: Path, separator: str, decimal: str, encoding: str)
         kind='',
         path=path,
         encoding=encoding,
+        part=part,
         separator=separator,
         decimal=decimal or _find_decimal(rows),
         names=tuple(name or str(i) for i, name in enumerate(names, start=1)),
@@ -307,8 +380,6 @@ def decode(data: bytes, path: Path, encoding: str = '') -> tuple[str, str]:
     A byte order mark decides, then zeros between Latin letters (UTF-16), then whether it is valid
     UTF-8; else it is Windows' Latin alphabet, which gives each byte a letter.
     """
-    if data.startswith((b'PK\x03\x04', b'\xd0\xcf\x11\xe0')):
-        raise InputError(f'{path}: this is a workbook, not a text table; save the sheet as CSV')
     even, odd = data[:64:2], data[1:64:2]
     if encoding:
         guesses: Sequence[str] = (encoding,)

@@ -6,7 +6,7 @@ import re
 
 from remaster_ros.calibration.mistakes import ANGLES, LENGTHS
 
-__all__ = ['ANGLES', 'LENGTHS', 'SI', 'TEMPERATURES', 'TIMES', 'split_unit']
+__all__ = ['ANGLES', 'LENGTHS', 'PULSES', 'SI', 'TEMPERATURES', 'TIMES', 'split_unit']
 
 TIMES = {'s': 1.0, 'ms': 1e-3, 'us': 1e-6, 'ns': 1e-9, 'min': 60.0, 'h': 3600.0}
 TEMPERATURES = {'degc': 1.0, 'k': 1.0}
@@ -40,9 +40,11 @@ _COORDINATE_IN_M = re.compile(r'(?:^|.*[ _.-])[xyz]_m$', re.IGNORECASE)
 _MM_AT_ONCE = re.compile(r'[xyz]mm', re.IGNORECASE)
 
 
+# Of the motors; `pulses` makes angles of them.
+PULSES = ('pulses', 'pulse', 'puls', 'counts', 'count', 'ticks', 'inc')
 # What tables are written in as well, and nothing here converts.
 _OTHERS = {
-    *('mrad', 'arcmin', 'arcsec', 'rev', 'turns', 'counts', 'pulses', 'pulse', 'inc', 'ticks'),
+    *('mrad', 'arcmin', 'arcsec', 'rev', 'turns', *PULSES),
     *('ft', 'feet', 'foot', 'yd', 'mil', 'mils', 'thou', 'dm', 'km', 'nm', 'px', 'pixel'),
 }
 

@@ -293,6 +293,8 @@ class BagReader:
         # Message type, and number of messages, of every topic
         self.topics: dict[str, str] = {}
         self.counts: Counter[str] = Counter()
+        self._definitions: dict[str, str] = {}  # Message type -> its text, and what it uses
+        self._own_types: Typestore | None = None
         for file in self.files:
             for message in self.messages_of(file, first_look=True):
                 known = self.topics.setdefault(message.topic, message.msgtype)
@@ -313,7 +315,7 @@ class BagReader:
     def decoded(self, msgtype: str, cdr: bytes) -> Any:
         """Return a message; an `InputError` names the bag where its bytes are none."""
         try:
-            return jazzy_types().deserialize_cdr(cdr, msgtype)
+            return self._types(msgtype).deserialize_cdr(cdr, msgtype)
         # rosbags raises whatever bad bytes lead to.
         except Exception as error:
             what = ' '.join(str(error).split())[:120]
@@ -321,6 +323,20 @@ class BagReader:
                 f'{self.path}: a damaged message ({type(error).__name__}: {what}); take another '
                 'copy of the bag'
             ) from None
+
+    def _types(self, msgtype: str) -> Typestore:
+        """Return types with this one: of other packages, as the bag itself defines them."""
+        if msgtype in jazzy_types().types or msgtype not in self._definitions:
+            return jazzy_types()
+        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+        if self._own_types is None:
+            self._own_types = get_typestore(Stores.ROS2_JAZZY)
+        store = self._own_types
+        if msgtype not in store.types:
+            found = get_types_from_msg(self._definitions[msgtype], msgtype)
+            store.register({name: own for name, own in found.items() if name not in store.types})
+        return store
 
     def messages_of(self, file: FileMetadata, first_look: bool = False) -> Iterator[BagMessage]:
         """Yield the messages of one of `files`; the first look also notes where it breaks off."""
@@ -374,6 +390,8 @@ class BagReader:
                 if opcode == Opcode.SCHEMA:
                     schema = Schema.read(stream)
                     schemas[schema.id] = schema
+                    if schema.encoding == 'ros2msg':
+                        self._definitions[schema.name] = schema.data.decode()
                 elif opcode == Opcode.CHANNEL:
                     channel = Channel.read(stream)
                     if channel.message_encoding != 'cdr':

@@ -10,23 +10,32 @@ from remaster_ros.importing.makers import (
     fanuc,
     gsi,
     inform,
+    json_text,
     kawasaki,
     keyed,
     kuka,
     listed,
     motive,
+    numpy_file,
+    pacscript,
+    qualisys,
     rapid,
+    replies,
     ros_echo,
     staubli,
     ur_script,
     vicon,
+    workbook,
+    yaml_text,
 )
 from remaster_ros.importing.makers.named import Named
 
 # Each returns None where a text is not of its kind.
 READERS: tuple[Callable[[str], Named | None], ...] = (
+    json_text.read,
     motive.read,
     vicon.read,
+    qualisys.read,
     fanuc.read,
     kuka.read,
     inform.read,
@@ -34,6 +43,9 @@ READERS: tuple[Callable[[str], Named | None], ...] = (
     # Before URScript, whose moves are called so too.
     doosan.read,
     ur_script.read,
+    pacscript.read,
+    # Before lists without the state of a reply.
+    replies.read,
     # Before RAPID, whose logs have two lists in brackets.
     listed.read,
     rapid.read,
@@ -42,4 +54,9 @@ READERS: tuple[Callable[[str], Named | None], ...] = (
     ros_echo.read,
     keyed.read,
     axis_lines.read,
+    yaml_text.read,
 )
+
+# Of bytes that are no text: the tables in it as text, by their names; None where a file is not of
+# this kind.
+UNPACKERS: tuple[Callable[[bytes], dict[str, str] | None], ...] = (workbook.read, numpy_file.read)

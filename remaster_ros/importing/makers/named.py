@@ -41,6 +41,7 @@ class Named:
     maker: str = ''
     # What was left out of the file, a sentence each.
     notes: tuple[str, ...] = ()
+    has_header: bool = True  # The names stand in the file
 
 
 def unexpected(number: int, line: str, expected: str) -> InputError:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import re
 
-from remaster_ros.errors import InputError
 from remaster_ros.importing.makers.named import NUMBER, Named, unexpected
 
 _FIELD = re.compile(r'field\.(name|position)\[?(\d+)\]?')
@@ -22,10 +21,6 @@ def read(text: str) -> Named | None:
     head = [cell.strip() for cell in lines[0][1].split(',')]
     if any(_FIELD.fullmatch(cell) for cell in head):
         return _with_header(head, lines[1:])
-    if re.search(r'^position:', text, re.MULTILINE) and re.search(r'^---\s*$', text, re.MULTILINE):
-        raise InputError(
-            'line 1: messages as YAML; record them with ros2 topic echo --csv or rostopic echo -p'
-        )
     if _names(head):
         return _without(lines)
     return _places(lines) if _is_place(head) else None

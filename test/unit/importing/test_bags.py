@@ -94,9 +94,7 @@ def test_one_topic_can_be_told(bag, chain):
 
 
 def test_what_is_missing_is_named(bag, session, chain, tmp_path):
-    with pytest.raises(
-        InputError, match=r'no geometry_msgs/PointStamped or PoseStamped; it has /joint_states'
-    ):
+    with pytest.raises(InputError, match=r'no link of the robot; it has /joint_states'):
         read_bag(bag, chain, point_topics=('/elsewhere',))
     urdf = session.urdf.replace('"joint_2"', '"elbow"')
     other = SerialChain.from_urdf(urdf, session.base_link, session.tip_link)

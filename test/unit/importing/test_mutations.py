@@ -1,11 +1,13 @@
 """Plain tables and takes with one thing wrong: read right but for it, or refused."""
 
+import json
 import random
 import re
 from collections import Counter
 
 import numpy as np
 import pytest
+import yaml
 from foreign.streams import arm_of, run_of, seen, take_of
 from foreign.tables import text
 from test_makers import JOINTS, changed_cell, joints_of, mutated
@@ -100,7 +102,51 @@ def pieces():
     return '\n'.join([*head, 'Frame,Time (Seconds),X,Y,Z,X,Y,Z', *lines, ''])
 
 
+def json_lines():
+    """An object a line."""
+    rows = zip(NAMES, joints_of(8).tolist(), points_of().tolist(), strict=True)
+    return '\n'.join(json.dumps({'name': n, 'angles': q, 'marker': p}) for n, q, p in rows)
+
+
+def yaml_records():
+    """Records as a block of YAML."""
+    rows = zip(NAMES, joints_of(8).tolist(), points_of().tolist(), strict=True)
+    records = [{'name': n, 'angles': q, 'marker': dict(zip('xyz', p))} for n, q, p in rows]
+    return yaml.safe_dump(records, sort_keys=False)
+
+
+def qualisys():
+    """A capture of one marker."""
+    head = ['NO_OF_FRAMES\t8', 'FREQUENCY\t20', 'DATA_INCLUDED\t3D', 'MARKER_NAMES\ttool']
+    head += ['Frame\tTime\ttool X\ttool Y\ttool Z']
+    rows = enumerate(points_of().tolist(), 1)
+    lines = [f'{i}\t{i / 20:.3f}\t' + '\t'.join(f'{v:.4f}' for v in p) for i, p in rows]
+    return '\n'.join([*head, *lines, ''])
+
+
+def pacscript():
+    """Joints of Denso, eight axes."""
+    rows = enumerate(joints_of(8).tolist(), 10)
+    lines = [f'  J[{i}] = J({", ".join(f"{v:.4f}" for v in q)}, 0, 0)' for i, q in rows]
+    return '\n'.join(['Sub Main', '  TakeArm Keep = 0', *lines, 'End Sub', ''])
+
+
+def replies():
+    """A log of replies with times."""
+    rows = enumerate(joints_of(8).tolist())
+    lines = [
+        f'[2026-03-02 10:00:{i:02d}] Recv: 0,{{{",".join(f"{v:.4f}" for v in q)}}},GetAngle();'
+        for i, q in rows
+    ]
+    return '\n'.join(['[2026-03-02 09:59:59] Send: GetAngle()', *lines, ''])
+
+
 KINDS = {
+    'json_lines': (json_lines, True),
+    'yaml_records': (yaml_records, False),
+    'qualisys': (qualisys, True),
+    'pacscript': (pacscript, True),
+    'replies': (replies, True),
     'report': (report, True),
     'inspection': (inspection, False),
     'axis_lines': (axis_lines, False),
@@ -139,7 +185,8 @@ def test_a_mutated_table_is_read_right_or_refused(kind, count, seed, tmp_path):
     columns, true = cells_of(read_table(path))
     read, refusals = 0, []
     for _ in range(count):
-        broken, may_lose = mutated(rng, content, one_line, [*'#/!*'])
+        marks = '#/!*' + "'" * (kind == 'pacscript')
+        broken, may_lose = mutated(rng, content, one_line, [*marks])
         path.write_bytes(broken.encode())
         try:
             found, rows = cells_of(read_table(path))

@@ -127,6 +127,12 @@ TEXTS = {
         f'field.{what}{i}' for what in ('name', 'position') for i in (0, 1)
     ) + '\n'),
     'messages as YAML': same('position:\n- 1\n---\n'),
+    'JSON lines': lines('{{"t": {i}, "q": [1, 2, 3], "p": [3, 4, 5]}}\n'),
+    'JSON': same('[1,2],', '{"q": [', '[1,2]]}'),
+    'PacScript': lines('J[{i}] = J(1, 2, 3, 4, 5, 6, 0, 0)\n'),
+    'replies': same('[2026-01-01 10:00:00] 0,{1,2,3,4,5,6},GetAngle();\n'),
+    'Qualisys': lines('{i}\t{i}.5\t1\t2\t3\n', 'NO_OF_FRAMES\t9\nMARKER_NAMES\ta\n'
+        'Frame\tTime\ta X\ta Y\ta Z\n'),
 }  # fmt: skip
 SHORT, LONG = 10_000, 40_000
 # Of four times the length twice three times the time, as of a reader that takes less than three

@@ -513,14 +513,17 @@ def test_what_tells_no_joints_says_what_to_give(arm, tmp_path):
     job = PROGRAMS['degrees of a Yaskawa job'](arm.q)
     module = f'MODULE M\n  CONST robtarget p1:=[[1,2,3],[1,0,0,0],[0,0,0,0],{UNUSED}];\nENDMODULE'
     for content, words in (
-        (job.replace('ANGLE', 'PULSE'), 'line 7: positions in pulses of the motors'),
+        (job.replace('ANGLE', 'PULSE'), 'pulses of the motors'),
         (job.replace('POSTYPE ANGLE', 'POSTYPE BASE'), 'no position of joints in this job'),
         (module, 'there is no joint target in it'),
-        ('[{"q": [1, 2], "p": [3, 4, 5]}]', 'this is JSON, not a table'),
+        ('[{"q": [1, 2], "p": [3, 4, 5]}]', 'line 1: JSON without a list of records'),
         ('<table>\n<tr><td>1.5</td><td>2.5</td></tr>\n</table>', 'this is HTML or XML'),
         ('[*POSREG*]$POSREG  Storage: CMOS  : ARRAY[1,1] OF Position Reg\n', 'record them so'),
         ('.JOINTS\n.END\n', 'line 1: there are no joint displacements in it'),
-        ('header:\n  stamp:\nname:\n- a\nposition:\n- 1.0\n---\n', 'ros2 topic echo --csv'),
+        (
+            'header:\n  stamp:\nname:\n- a\nposition:\n- 1.0\n---\n',
+            'line 1: YAML without a list of records',
+        ),
         ('*110001+00000000000000P1 21.102+0000000012345678\r\n', 'export coordinates'),
     ):
         with pytest.raises(InputError, match=re.escape(words)):
@@ -684,11 +687,17 @@ def test_a_report_that_lost_an_axis_is_refused(change, words, arm, tmp_path):
         rows_of(arm, tmp_path, '\n'.join([*change(inspected(arm)), '']), joints_table(arm))
 
 
-@pytest.mark.parametrize('unit', ['mrad', 'counts'])
-def test_a_unit_that_is_not_converted_is_refused(unit, arm, tmp_path):
+@pytest.mark.parametrize(
+    ('unit', 'words'),
+    [
+        ('mrad', r'column A1 \[mrad\]: mrad, where one of rad, deg'),
+        ('counts', r'A1 \[counts\] … A6 \[counts\] are pulses of the motors \(by their header\)'),
+    ],
+)
+def test_a_unit_that_is_not_converted_is_refused(unit, words, arm, tmp_path):
     header = ['Point', *(f'{axis} [{unit}]' for axis in AXES)]
     table = text(header, [POINTS, *degrees(arm)])
-    with pytest.raises(InputError, match=rf'column A1 \[{unit}\]: {unit}, where one of rad, deg'):
+    with pytest.raises(InputError, match=words):
         rows_of(arm, tmp_path, points_table(arm), table)
 
 

@@ -223,7 +223,7 @@ GOOD = text(
         ('X [mm];', 'U;', 'no columns that could be a measured point'),
         (GOOD, 'a;b\n1;x\n', 'no row with two numbers'),
         (GOOD, '', 'no row with two numbers'),
-        (GOOD, 'PK\x03\x04rest', 'this is a workbook, not a text table'),
+        (GOOD, 'PK\x03\x04rest', 'a zip archive that is damaged or locked'),
         (GOOD, 'a\0b\0\0c', 'this is no text in'),
     ],
 )

@@ -1,0 +1,77 @@
+"""Data frames (pandas, or anything with its columns, index and itertuples) as text tables."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from remaster_ros.errors import InputError
+from remaster_ros.importing.makers.named import some
+from remaster_ros.importing.text_table import TextTable, table_of_text
+
+# A column with this name is that of rows (`columns` has the word).
+_INDEX = 'index'
+
+
+def is_frame(given: Any) -> bool:
+    """Return whether an object is a data frame, as pandas has them."""
+    return all(hasattr(given, name) for name in ('columns', 'index', 'itertuples'))
+
+
+def tables_of(frames: Sequence[Any], names: Sequence[str]) -> list[TextTable]:
+    """Return frames as the tables that files with the same content are; `names` for messages.
+
+    The index is a column, unless it counts the rows of all frames from 0 on.
+    """
+    plain = all(_counts(frame) for frame in frames)
+    for frame, name in zip(frames, names):
+        labels = [*frame.index]
+        if len({*labels}) < len(labels) and len(frames) > 1:
+            twice = next(label for label in labels if labels.count(label) > 1)
+            raise InputError(f'{name}: two rows have the index {twice!r}; give each row its own')
+    return [_table_of(frame, name, not plain) for frame, name in zip(frames, names)]
+
+
+def _counts(frame: Any) -> bool:
+    """Return whether the index counts the rows from 0 on."""
+    return [*frame.index] == [*range(len(frame.index))]
+
+
+def _table_of(frame: Any, name: str, with_index: bool) -> TextTable:
+    header = [' '.join(map(str, c)) if isinstance(c, tuple) else str(c) for c in frame.columns]
+    # A frame of an array has counted columns: no names.
+    named = header != [*map(str, range(len(header)))]
+    rows = [[_cell(value) for value in row] for row in frame.itertuples(index=False, name=None)]
+    if with_index:
+        labels = [_cell(label) for label in frame.index]
+        timed = all(hasattr(label, 'isoformat') for label in frame.index)
+        header = ['time' if timed and 'time' not in header else _INDEX, *header]
+        if not named:
+            header = [header[0], *(str(i) for i in range(1, len(header)))]
+            named = True
+        rows = [[label, *row] for label, row in zip(labels, rows)]
+    text = io.StringIO()
+    writer = csv.writer(text, delimiter='\t', lineterminator='\n')
+    writer.writerows([header] * named + rows)
+    table = table_of_text(text.getvalue(), Path(name))
+    empty = [str(i) for i, row in enumerate(rows) if not any(row)]
+    note = f'{name}, row{"s" * (len(empty) > 1)} {some(empty)}: no value, left out'
+    return replace(
+        table,
+        counted='row',
+        lines=tuple(line - 1 - named for line in table.lines),
+        rows_in_order=0 if with_index else len(rows),
+        notes=(*table.notes, *(note,) * bool(empty)),
+    )
+
+
+def _cell(value: Any) -> str:
+    """Return a value as a file has it: as many digits as it needs, ISO 8601, nothing for NaN."""
+    if value is None or value != value:
+        return ''
+    text = value.isoformat() if hasattr(value, 'isoformat') else str(value)
+    return ' '.join(text.split())

@@ -1,0 +1,106 @@
+"""Arrays that NumPy has saved (.npy, .npz): those with a row for each configuration, as text."""
+
+from __future__ import annotations
+
+import io
+import zipfile
+import zlib
+from collections import defaultdict
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from remaster_ros.errors import InputError
+
+_FEWEST_ROWS = 2
+# Of numbers in an array, unpacked.
+_LIMIT = 64 * 1024**2
+
+
+def read(data: bytes) -> dict[str, str] | None:
+    """Return the arrays of a file as text with tabs; None for anything else.
+
+    Arrays with equally many rows are columns of one text, by the name of the first.
+    """
+    if data.startswith(b'\x93NUMPY'):
+        array = _loaded(data, '')
+        # Columns of numbers alone have no names.
+        labels, cells = _columns(array, '', '')
+        return {'': _as_text(labels if array.dtype.names else [], cells)}
+    if not data.startswith(b'PK\x03\x04'):
+        return None
+    arrays: dict[str, NDArray[Any]] = {}
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as parts:
+            for info in parts.infolist():
+                if info.filename.endswith('.npy'):
+                    if info.file_size > 8 * _LIMIT:
+                        raise InputError(f'{info.filename} in it has more than {_LIMIT} numbers')
+                    name = info.filename.removesuffix('.npy')
+                    arrays[name] = _loaded(parts.read(info), f'{name}: ')
+    except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError):
+        raise InputError('a zip archive that is damaged or locked; take another copy') from None
+    by_rows: dict[int, list[str]] = defaultdict(list)
+    for name, array in arrays.items():
+        if array.ndim and len(array) >= _FEWEST_ROWS:
+            by_rows[len(array)].append(name)
+    found = {}
+    for names in by_rows.values():
+        header: list[str] = []
+        columns: list[list[str]] = []
+        for name in names:
+            names_of, own = _columns(arrays[name], name, f'{name}: ')
+            header += names_of
+            columns += own
+        found[names[0]] = _as_text(header, columns)
+    return found
+
+
+def _loaded(data: bytes, where: str) -> NDArray[Any]:
+    try:
+        array = np.load(io.BytesIO(data), allow_pickle=False)
+    except (ValueError, EOFError, OSError, SyntaxError, TypeError, MemoryError) as error:
+        what = ' '.join(str(error).split())[:80]
+        raise InputError(
+            f'{where}no array of numbers that can be read ({what}); save it with numpy.save as '
+            'plain numbers'
+        ) from None
+    return np.asarray(array)
+
+
+def _columns(array: NDArray[Any], name: str, where: str) -> tuple[list[str], list[list[str]]]:
+    """Return names and columns of an array as text: a matrix has its numbers row by row."""
+    if array.dtype.names:
+        fields = [_columns(array[own], own, where) for own in array.dtype.names]
+        return [one for header, _ in fields for one in header], [
+            column for _, own in fields for column in own
+        ]
+    if not 0 < array.ndim <= 3 or array.dtype.kind not in 'fiuUSM':
+        raise InputError(
+            f'{where}an array of shape {array.shape} and type {array.dtype}, where numbers with a '
+            'row for each configuration are expected'
+        )
+    if array.dtype.kind == 'S':
+        array = np.char.decode(array, 'latin-1')
+    flat = array.reshape(len(array), -1)
+    columns = [[str(value) for value in column] for column in flat.T]
+    return _labels(name, len(columns)), columns
+
+
+def _labels(name: str, width: int) -> list[str]:
+    """Return names of the columns of an array: an axis each of three, else a number."""
+    if width == 1:
+        return [name]
+    return [f'{name} {one}' for one in ('xyz' if width == 3 else range(1, width + 1))]
+
+
+def _as_text(header: list[str], columns: list[list[str]]) -> str:
+    rows = [header] if header else []
+    rows += [list(row) for row in zip(*columns)]
+    clean = (' '.join(cell.split()) for row in rows for cell in row)
+    width = len(columns)
+    cells = [*clean]
+    return ''.join(
+        '\t'.join(cells[i : i + width]) + '\n' for i in range(0, len(cells), width or 1)
+    )

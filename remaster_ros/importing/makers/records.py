@@ -1,0 +1,253 @@
+"""Nested data (JSON, YAML) as named columns: a row for each of the records in it."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+
+from remaster_ros.errors import InputError
+from remaster_ros.importing.makers.named import NUMBER, Named, unexpected
+from remaster_ros.importing.rigid_numbers import COUNT, rigid
+from remaster_ros.kinematics.transforms import quaternion_xyzw
+
+_FEWEST_RECORDS = 2
+# A log of an arm has fewer numbers in a record; what is longer is a cloud of points or an image.
+_MOST_CELLS = 500
+_DEEPEST = 20
+# Of joints, in a message or a file that has them once.
+_JOINT_NAMES = ('name', 'names', 'joint_names', 'jointNames', 'joints')
+_OF_A_POSE = ('x', 'y', 'z', 'qx', 'qy', 'qz', 'qw')
+_EMPTY = ('null', '~', 'none', 'nan', '.nan')
+_SECONDS = (('sec', 'nanosec'), ('secs', 'nsecs'), ('sec', 'nsec'), ('s', 'ns'))
+
+
+class Mapping(dict[str, Any]):
+    """Keys and values, with the line on which they begin."""
+
+    line = 0
+
+
+class Items(list[Any]):
+    """Values in order, with the line on which they begin."""
+
+    line = 0
+
+
+Record = tuple[int, dict[str, str]]
+
+
+def read(kind: str, data: Any) -> Named | None:
+    """Return the rows of nested data, whose scalars are text; None where it has no records."""
+    found, names, left = _records(data, ())
+    if len(found) < _FEWEST_RECORDS:
+        return None
+    rows = [(line, dict(_cells('', record, names, 0, line))) for line, record in found]
+    usual = Counter(tuple(cells) for _, cells in rows).most_common(1)[0][0]
+    if len(usual) < _FEWEST_RECORDS or len(usual) > _MOST_CELLS:
+        return None
+    known = {*usual}
+    expected = f'{", ".join(usual[:6])}{", …" * (len(usual) > 6)}'
+    for line, cells in rows:
+        # A place that is null has no x, y and z.
+        for key in [key for key, text in cells.items() if not text and key not in known]:
+            del cells[key]
+            cells.update((own, '') for own in usual if own.startswith(f'{key} '))
+        if other := next((key for key in cells if key not in known), ''):
+            raise unexpected(line, other, expected)
+        if absent := next((key for key in usual if key not in cells), ''):
+            given = ', '.join([*cells][:6])
+            raise unexpected(line, given, f'{absent} as well, null where it was not measured,')
+    single = all(key.isdigit() for key in usual)
+    return Named(
+        kind=kind,
+        names=tuple(key or '1' for key in usual),
+        rows=tuple(tuple(cells.get(key, '') for key in usual) for _, cells in rows),
+        lines=tuple(line for line, _ in rows),
+        has_header=not single,
+        notes=(f'{", ".join(left[:5])} left out: not of each record',) * bool(left),
+    )
+
+
+def _records(
+    data: Any, names: Sequence[str]
+) -> tuple[list[tuple[int, Any]], Sequence[str], list[str]]:
+    """Return the records in the data with their lines, names of joints, and keys left out."""
+    if isinstance(data, Items):
+        if _are_records(data):
+            return [(one.line or data.line, one) for one in data], names, []
+        deeper = [one for one in data if isinstance(one, (Items, Mapping))]
+        return _records(deeper[0], names) if len(deeper) == 1 else ([], names, [])
+    if not isinstance(data, Mapping):
+        return [], names, []
+    if isinstance(data.get('columns'), Items) and isinstance(data.get('data'), Items):
+        # As pandas writes a frame that is split.
+        header = [str(one) for one in data['columns']]
+        named = Items(_named(header, row) for row in data['data'] if isinstance(row, Items))
+        return [(one.line, one) for one in named], names, []
+    for key in _JOINT_NAMES:
+        own = data.get(key)
+        if isinstance(own, Items) and own and all(_is_name(one) for one in own):
+            names = [str(one) for one in own]
+            break
+    else:
+        key = ''
+    mappings = data and all(isinstance(one, Mapping) for one in data.values())
+    if mappings and (found := _of_keys(data)):
+        return found, names, []
+    columns = {
+        name: value
+        for name, value in data.items()
+        if name != key and isinstance(value, Items) and len(value) >= _FEWEST_RECORDS
+    }
+    if columns:
+        # Of the most alike, those with most in them.
+        count = Counter(len(value) for value in columns.values())
+        size = max(count, key=lambda n: (count[n] > 1, _weight(columns, n), n))
+        chosen = {name: value for name, value in columns.items() if len(value) == size}
+        left = [name for name in data if name not in chosen and name != key]
+        if (
+            len(chosen) == 1
+            and _are_records(only := next(iter(chosen.values())))
+            and all(isinstance(one, Mapping) for one in only)
+        ):
+            return [(one.line, one) for one in only], names, left
+        rows = [Mapping(zip(chosen, values)) for values in zip(*chosen.values())]
+        for i, row in enumerate(rows):
+            lines = [getattr(value[i], 'line', 0) for value in chosen.values()]
+            row.line = max(lines) or next(iter(chosen.values())).line
+        return [(row.line, row) for row in rows], names, left
+    deeper = [value for value in data.values() if isinstance(value, Mapping)]
+    return _records(deeper[0], names) if len(deeper) == 1 else ([], names, [])
+
+
+def _weight(columns: dict[str, Items], size: int) -> int:
+    return sum(
+        len(value[0]) if isinstance(value[0], (Items, Mapping)) else 1
+        for value in columns.values()
+        if len(value) == size
+    )
+
+
+def _are_records(data: Items) -> bool:
+    kinds = {type(one) for one in data}
+    return len(data) >= _FEWEST_RECORDS and kinds in ({Mapping}, {Items})
+
+
+def _named(header: Sequence[str], row: Items) -> Mapping:
+    if len(row) != len(header):
+        raise unexpected(row.line, str([*row]), f'{len(header)} values')
+    found = Mapping(zip(header, row))
+    found.line = row.line
+    return found
+
+
+def _of_keys(data: Mapping) -> list[tuple[int, Any]]:
+    """Return records of a frame that is written by column, key, row or by row, key, column."""
+    inner = [tuple(one) for one in data.values()]
+    if len({*inner}) != 1 or any(
+        isinstance(cell, (Items, Mapping)) for one in data.values() for cell in one.values()
+    ):
+        # Of records that have names.
+        shapes = {frozenset(one) for one in data.values()}
+        if len(data) < _FEWEST_RECORDS or len(shapes) != 1 or {*shapes.pop()} <= {*'xyzw'}:
+            return []
+        return [(one.line, _with_name(key, one)) for key, one in data.items()]
+    if {*inner[0]} <= {*'xyzw'}:
+        return []
+    if all(key.isdigit() for key in inner[0]):
+        return [
+            (data.line, Mapping({key: one[row] for key, one in data.items()})) for row in inner[0]
+        ]
+    return [(one.line, _with_name(key, one)) for key, one in data.items()]
+
+
+def _with_name(key: str, record: Mapping) -> Mapping:
+    found = Mapping({'name': key, **record})
+    found.line = record.line
+    return found
+
+
+def _cells(
+    name: str, value: Any, names: Sequence[str], depth: int, line: int
+) -> Iterator[tuple[str, str]]:
+    """Give the column and the text of each scalar of a record."""
+    if depth > _DEEPEST:
+        raise InputError(f'line {line}: more than {_DEEPEST} levels of brackets')
+    if isinstance(value, Mapping):
+        yield from _of_mapping(name, value, names, depth, line)
+    elif isinstance(value, Items):
+        flat = [*_flat(value)]
+        if len(flat) == COUNT and (pose := _pose(flat)):
+            for label, number in zip(_OF_A_POSE, pose):
+                yield f'{name} {label}'.strip(), repr(number)
+            return
+        if not all(_is_scalar_number(one) for one in flat):
+            # Names and the like that a record has itself.
+            for i, one in enumerate(value, 1):
+                yield from _cells(f'{name} {i}'.strip(), one, names, depth + 1, line)
+            return
+        if len(names) == len(flat) and len(flat) != len('xyz'):
+            labels: Sequence[Any] = names
+        else:
+            labels = 'xyz' if len(flat) == len('xyz') else range(1, len(flat) + 1)
+        for label, one in zip(labels, flat):
+            yield f'{name} {label}'.strip(), _text(one)
+    else:
+        yield name, _text(value)
+
+
+def _of_mapping(
+    name: str, value: Mapping, names: Sequence[str], depth: int, line: int
+) -> Iterator[tuple[str, str]]:
+    for whole, part in _SECONDS:
+        if {*value} == {whole, part} and all(str(one).isdigit() for one in value.values()):
+            yield f'{name} [s]', f'{value[whole]}.{value[part]:0>9}'
+            return
+    keyed = next(
+        (
+            key
+            for key in _JOINT_NAMES
+            if isinstance(value.get(key), Items)
+            and value[key]
+            and all(_is_name(one) for one in value[key])
+        ),
+        '',
+    )
+    own = [str(one) for one in value[keyed]] if keyed else names
+    for key, one in value.items():
+        if key != keyed:
+            yield from _cells(f'{name} {key}'.strip(), one, own, depth + 1, line)
+
+
+def _pose(cells: Sequence[Any]) -> list[float]:
+    """Return place and quaternion of sixteen numbers that are a pose; [] where they are none."""
+    if not all(NUMBER.fullmatch(str(one)) for one in cells):
+        return []
+    T = rigid(np.array(cells, float))
+    return [] if T is None else [*map(float, (*T[0, :3, 3], *quaternion_xyzw(T[0, :3, :3])))]
+
+
+def _flat(value: Items) -> Iterator[Any]:
+    for one in value:
+        if isinstance(one, Items):
+            yield from _flat(one)
+        else:
+            yield one
+
+
+def _is_scalar_number(value: Any) -> bool:
+    return not isinstance(value, (Items, Mapping)) and (
+        str(value).lower() in _EMPTY or bool(NUMBER.fullmatch(str(value)))
+    )
+
+
+def _is_name(value: Any) -> bool:
+    return not isinstance(value, (Items, Mapping)) and not NUMBER.fullmatch(str(value))
+
+
+def _text(value: Any) -> str:
+    text = ' '.join(str(value).split())
+    return '' if text.lower() in _EMPTY else text

@@ -1,0 +1,92 @@
+"""Logs of replies of a controller, with times: `[10:00:05] 0,{1.0,…},GetAngle();`.
+
+The replies of one call have the joints. Those of others are text, or places of the tool.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import defaultdict
+
+from remaster_ros.importing.makers.named import NUMBER, Named, some, unexpected
+
+_TIME = re.compile(
+    r'\s*[\[(<]?\s*((?:\d{4}[-/]\d\d[-/]\d\d[T ,]\s*)?\d\d:\d\d:\d\d(?:[.,]\d+)?Z?|\d{9,10}\.\d+)'
+    r'\s*[\])>]?[\s:,;|-]*'
+)
+# Behind the time: words, the state of the call, a list, and the call.
+_REPLY = re.compile(
+    r'(?P<before>[^\[\]{}()\d]*)(?:(?P<state>-?\d+)\s*,\s*|\[(?P<code>\d+)\]\s*)?'
+    r'[\[{(](?P<list>[^\[\]{}()]*)[\]})](?P<after>[^\[\]{}\d]*(?:\(\s*\))?[^\[\]{}\d]*)'
+)
+_PLACES = re.compile(r'pose|cart|tcp|coord|tool|user|flange', re.IGNORECASE)
+_WORD = re.compile(r'[^\W\d_]\w*')
+_SPLIT = re.compile(r'\s*[,;]\s*|\s+')
+_FEWEST, _MOST = 3, 12
+_SEEN = 50
+_DIGITS = re.compile(r'\d+(?:\.\d+)?')
+
+
+def read(text: str) -> Named | None:
+    """Return the joints of the replies, with their times; None for anything else."""
+    lines = [(i, line) for i, line in enumerate(text.splitlines(), 1) if line.strip()]
+    seen = [line for _, line in lines[:_SEEN]]
+    timed = [line[match.end() :] for line in seen if (match := _TIME.match(line))]
+    if 2 * len(timed) <= len(seen) or not any(
+        (reply := _REPLY.fullmatch(rest.strip()))
+        and (reply['state'] or reply['code'] or '(' in reply['after'])
+        for rest in timed
+    ):
+        # A log of lists.
+        return None
+    found: dict[str, list[tuple[int, str, list[str]]]] = defaultdict(list)
+    beside: list[str] = []
+    failed: list[str] = []
+    for number, line in lines:
+        time = _TIME.match(line)
+        rest = line[time.end() :].strip() if time else line.strip()
+        reply = _REPLY.fullmatch(rest)
+        cells = _SPLIT.split(reply['list'].strip()) if reply and reply['list'].strip() else []
+        if reply is None or not time or len(cells) < _FEWEST:
+            if len(_DIGITS.findall(rest)) >= _FEWEST:
+                raise unexpected(number, line, 'a time and a list of numbers in brackets')
+            (failed if reply and reply['state'] not in (None, '0') else beside).append(str(number))
+            continue
+        if not all(map(NUMBER.fullmatch, cells)) or len(cells) > _MOST:
+            raise unexpected(number, line, 'numbers alone in the brackets')
+        if reply['state'] not in (None, '0'):
+            raise unexpected(number, line, '0, the state of a reply that is right,')
+        found[_call(reply)].append((number, time[1], cells))
+    joints = {call: rows for call, rows in found.items() if not _PLACES.search(call)}
+    if not joints:
+        raise unexpected(*lines[0], 'replies with joints, not with poses of the tool alone,')
+    if len(joints) > 1:
+        call, other = [*joints][:2]
+        raise unexpected(
+            joints[other][0][0], other, f'{call or "one call"} in every reply with a list'
+        )
+    ((call, rows),) = joints.items()
+    for number, _, cells in rows:
+        if len(cells) != len(rows[0][2]):
+            raise unexpected(number, ','.join(cells), f'{len(rows[0][2])} joints')
+    notes = [f'replies of {", ".join(sorted(set(found) - {call}))} left out'] * (len(found) > 1)
+    if failed:
+        notes.append(
+            f'line{"s" * (len(failed) > 1)} {some(failed)}: replies of an error, left out'
+        )
+    if beside:
+        notes.append(f'{len(beside)} lines without a list were left out')
+    return Named(
+        kind=f'replies{" of " * bool(call)}{call}',
+        names=('time', *(f'J{i}' for i in range(1, len(rows[0][2]) + 1))),
+        rows=tuple((time.replace(',', '.'), *cells) for _, time, cells in rows),
+        lines=tuple(number for number, *_ in rows),
+        notes=tuple(notes),
+    )
+
+
+def _call(reply: re.Match[str]) -> str:
+    """Return what was called: the word behind the list, else the last one before it."""
+    behind = _WORD.findall(reply['after'])
+    before = _WORD.findall(reply['before'])
+    return behind[0] if behind else before[-1] if before else ''
