@@ -220,25 +220,25 @@ def _of_parts(
         if name.casefold() not in folded:
             raise InputError(f'--sheet {name}: {path} has {", ".join(parts) or "none"}')
     chosen = [folded[name.casefold()] for name in sheets] or [*parts]
-    tables, empty, problem = [], [], ''
+    tables: list[TextTable] = []
+    problems = []
     for name in chosen:
         try:
             tables.append(_table(parts[name], path, '\t', decimal, CELLS, name))
         except InputError as error:
             # Notes, charts and lists of parameters stand on sheets of their own.
-            if name in map(folded.get, map(str.casefold, sheets)) or len(chosen) == 1:
+            if sheets or len(chosen) == 1:
                 raise
-            empty.append(name)
-            problem = problem or str(error)
+            problems.append(f'{name} left out: {error}')
     if not tables:
-        raise InputError(problem or f'{path}: no sheet that is shown has anything in it')
+        raise InputError(
+            problems[0] if problems else f'{path}: no sheet that is shown has anything in it'
+        )
     if len(tables) == 1:
         tables = [replace(tables[0], part='')]
     else:
         tables = [replace(table, path=Path(f'{path}:{table.part}')) for table in tables]
-    if empty:
-        note = f'{path}: {", ".join(empty)} left out: no rows of numbers'
-        tables[0] = replace(tables[0], notes=(*tables[0].notes, note))
+    tables[0] = replace(tables[0], notes=(*tables[0].notes, *problems))
     return tables
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as RosbagsWriter
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from remaster_ros.errors import InputError
 from remaster_ros.importing.bags import is_bag, read_bag
@@ -196,3 +196,66 @@ def test_a_camera_with_a_clock_of_its_own_is_matched_by_standstills(chain, tmp_p
     np.testing.assert_allclose(rows.q, stops, atol=1e-5)
     np.testing.assert_allclose(rows.position, place, atol=1e-4)
     assert '/camera/marker +1600000000.' in ' '.join(rows.description)
+
+
+BODIES = 'mocap4r2_msgs/msg/RigidBodies'
+DEFINITIONS = {
+    BODIES: 'std_msgs/Header header\nuint32 frame_number\nmocap4r2_msgs/RigidBody[] rigidbodies',
+    'mocap4r2_msgs/msg/RigidBody': (
+        'string rigid_body_name\nmocap4r2_msgs/Marker[] markers\ngeometry_msgs/Pose pose'
+    ),
+    'mocap4r2_msgs/msg/Marker': (
+        'int8 id_type\nint32 marker_index\nstring marker_name\ngeometry_msgs/Point translation'
+    ),
+}
+
+
+def bodies(store, time_s, places):
+    kinds = store.types
+    turn = kinds['geometry_msgs/msg/Quaternion'](0.0, 0.0, 0.0, 1.0)
+    found = []
+    for name, xyz in places.items():
+        pose = kinds['geometry_msgs/msg/Pose'](kinds['geometry_msgs/msg/Point'](*xyz), turn)
+        found.append(kinds['mocap4r2_msgs/msg/RigidBody'](name, [], pose))
+    return '/rigid_bodies', BODIES, kinds[BODIES](header(time_s), 0, found), time_s
+
+
+def transforms(store, time_s, places):
+    kinds = store.types
+    turn = kinds['geometry_msgs/msg/Quaternion'](0.0, 0.0, 0.0, 1.0)
+    found = []
+    for name, xyz in places.items():
+        moved = kinds['geometry_msgs/msg/Transform'](
+            kinds['geometry_msgs/msg/Vector3'](*xyz), turn
+        )
+        found.append(kinds[TRANSFORM](header(time_s), name, moved))
+    kind = 'tf2_msgs/msg/TFMessage'
+    return '/tf', kind, kinds[kind](found), time_s
+
+
+@pytest.mark.parametrize('plugin', [StoragePlugin.MCAP, StoragePlugin.SQLITE3])
+@pytest.mark.parametrize('made', [bodies, transforms])
+def test_what_a_message_names_is_a_sensor(made, plugin, chain, tmp_path):
+    """Links are where the robot believes them to be; what stands still is not on the arm."""
+    store = get_typestore(Stores.ROS2_JAZZY)
+    for name, definition in DEFINITIONS.items():
+        store.register(get_types_from_msg(definition, name))
+    folder = tmp_path / 'bag'
+    with RosbagsWriter(folder, version=9, storage_plugin=plugin) as writer:
+        connections = {}
+        for topic, kind, message, time_s in messages():
+            if topic == '/joint_states':
+                at = int((time_s - START_S) / 4.0)
+                places = {'wall': (5.0, 5.0, 5.0), 'tag:7': (at, 1.0, 2.0), 'tool': (at, 0.0, 0.0)}
+                both = (topic, kind, message, time_s), made(store, time_s, places)
+                for own, of, content, when in both:
+                    if own not in connections:
+                        connections[own] = writer.add_connection(own, of, typestore=store)
+                    data = store.serialize_cdr(content, of)
+                    writer.write(connections[own], int(1e9 * when), data)
+    rows = read_bag(folder, chain, clock_offset_s=0.0, links=('tool', '/rigid_bodies/tool'))
+    assert len({*rows.labels['sensor']}) == 1
+    np.testing.assert_allclose(rows.position, [[i, 1.0, 2.0] for i in range(3)])
+    assert rows.orientation is not None
+    with pytest.raises(InputError, match='name those of the sensor with --points'):
+        read_bag(folder, chain, clock_offset_s=0.0)
