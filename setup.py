@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Package of remaster_ros: ament_python at the root, and a plain pip package too."""
 
 from pathlib import Path

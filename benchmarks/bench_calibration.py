@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Are the intervals right? Sessions with random truths: coverage, rank statistics, efficiency.
 
 Every session has the paper's size (36 poses, 173 configurations), one of three choices of sensors

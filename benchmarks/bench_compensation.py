@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Hidden arms commanded by their compensation.json: what is left at poses measured and at random.
 
 Four arms, each with zero-offsets of 0.3 degrees and one kind of error of 0.5 mm beside; measured

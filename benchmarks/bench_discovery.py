@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Does `remaster discover` name what is hidden, and nothing where nothing is?
 
 Sessions come from a world of its own (test/worlds/hidden_world.py: pinocchio, no code shared with

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Does the fast sampler sample the posterior itself? Against a long run of another program.
 
 The model of eq. 8 and 15 (joint 1 held, see `paper_model`) at 173 configurations. The gold run

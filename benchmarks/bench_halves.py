@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Do two halves of one session agree as well as their stated standard deviations say?
 
 Each set beside this repository is split at random into halves that share no pose; both go through

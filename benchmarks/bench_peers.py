@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Against peers that install with pip: figaroh and pybotics on the same synthetic session.
 
 A LWR 4+ of seven joints, one sensor, 36 poses with 173 configurations to fit, 32 with 156 held

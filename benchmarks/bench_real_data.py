@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Real robots, zero-offsets only: `remaster fit` on the public sets beside this repository.
 
 Prints the mean error on the held-out poses, nothing refitted, and what an independent fit of

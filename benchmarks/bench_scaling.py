@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Cost against the number of configurations, and the whole command `remaster fit`.
 
 Each size is fitted in a process of its own (one sensor, about five solutions a pose, a common part

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Effective samples per second of CPU: ours, the paper's algorithm, emcee, NumPyro's NUTS.
 
 All sample one density: the paper's model (eq. 8 and 15; joint 1 held) at 173 configurations, 13

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What the benchmarks share: the folder of the tests' helpers, and printing."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The tables of bench_discovery.py, from the lines of its results file."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The paper's posterior, eq. 8 and 15 of Van Wyk et al., written a second time.
 
 Shares no code with the product's posterior: kinematics by Rodrigues' formula on points, residuals

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The paper's Tables I to VIII beside ours: writes docs/paper.md.
 
 Its two experiments are simulated from its own Tables I and II: 36 poses with 173 configurations to

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """How Sphinx builds the site: `make docs` writes it to build/docs."""
 
 from remaster_ros.version import __version__

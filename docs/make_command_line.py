@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Write docs/command-line.md: every verb and option, from the parsers themselves."""
 
 from __future__ import annotations

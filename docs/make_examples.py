@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Write docs/examples: two arms and tables as others write them (made up: a simulated IRB 120).
 
 Run it with test/ on the path: `PYTHONPATH=test python docs/make_examples.py`.

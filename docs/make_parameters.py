@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Write docs/parameters.md from the nodes' parameter dataclasses: ``make docs``."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Write the states of the bridge into docs/safety.md, from the tables that it keeps to."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Where obvious methods name the wrong cause: three kinds of session of the hidden world.
 
     python docs/make_wrong_causes.py [--seeds 10] [--figure docs/figures/wrong_causes.svg]

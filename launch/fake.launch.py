@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The same nodes in front of the three fakes; the fake robot draws the hidden World.
 
 ``ros2 service call /remaster/collect std_srvs/srv/Trigger`` begins, ``…/fit`` fits. `remaster

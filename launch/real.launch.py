@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The nodes on real hardware: an arm behind ros2_control and the sensors of the cell file.
 
 ``ros2 launch remaster_ros real.launch.py cell:=/abs/cell.yaml params:=/abs/my.yaml``; then

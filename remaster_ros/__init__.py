@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Remaster a robot arm in place: joint zero-offsets with honest uncertainty.
 
 The functions here are all that a program needs; the rest may change between versions.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The exceptions a caller may expect; each carries what is wrong and the remedy."""
 
 from __future__ import annotations

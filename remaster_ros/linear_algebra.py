@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Linear algebra in one thread, whatever the machine has.
 
 Products of matrices of some hundred parameters in several threads take many times as long as in

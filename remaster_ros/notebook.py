@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What results show of themselves in Python: a short table, a report's first screen, figures."""
 
 from __future__ import annotations

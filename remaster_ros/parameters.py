@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Parameters: a frozen dataclass, each field with unit, range and description; no ROS.
 
 Nodes declare such a class to ROS (`remaster_ros.nodes.parameters`); a sensor's driver has one of

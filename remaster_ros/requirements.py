@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Packages that pip alone installs, and the line for a program that misses some of them.
 
 rosdep has no key for most of them, and its two keys of rosbags and trimesh call pip, which a

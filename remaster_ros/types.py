@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Frozen records that pass between collection, storage and estimation. SI units throughout."""
 
 from __future__ import annotations

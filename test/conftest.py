@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """For every test: missing packages are named in one line, and a signal ends what was started."""
 
 from __future__ import annotations

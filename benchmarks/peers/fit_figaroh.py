@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Fit a session with figaroh: its joint-offset calibration; see bench_peers.py.
 
 Sensor frame and marker are unknown frames of its model, the rest are its defaults; the cost

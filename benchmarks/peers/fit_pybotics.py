@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Fit a session with pybotics, as its own calibration example does; see bench_peers.py.
 
 Offsets of all joints, the sensor's frame and the marker, by `scipy.optimize.least_squares` on

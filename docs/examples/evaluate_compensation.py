@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Where an arm has its tool by its compensation.json: NumPy, the file and the URDF in it.
 
     python evaluate_compensation.py compensation.json 0.1 -0.5 0.6 0.2 0.9 0.3 0.0

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The paper's three measures of accuracy, section V of Van Wyk et al.
 
 The first two are free of the gauge: the relative error compares distances; the absolute one

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Are a session's tables as the robot has it? Signs, order, zeros, units and rows, tried on data.
 
 Tables of others have a joint that counts the other way round, columns in another order, a zero

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A fit beside the same one with all offsets held at zero."""
 
 from __future__ import annotations

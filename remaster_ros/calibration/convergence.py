@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Have the chains mixed, and how many independent draws are they worth?
 
 Rank-normalised split R-hat and effective sample sizes of Vehtari, Gelman, Simpson, Carpenter and

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """From a session to the posterior's mode: gauge fixed, gross errors left out, nothing sampled."""
 
 from __future__ import annotations

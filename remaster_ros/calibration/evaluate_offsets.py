@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Judge given zero-offsets on any session of the robot: `remaster accuracy`."""
 
 from __future__ import annotations

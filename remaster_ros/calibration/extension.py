@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Further parameters of the model: what physical effects add, linear in each observation.
 
 An effect is what it does to each row of the measurements: it turns joints, or it displaces the

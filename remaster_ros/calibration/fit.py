@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """`fit_session`: zero-offsets, registrations, markers and noise of a session, with uncertainty."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Sentences about directions that the data do not determine."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Limits of p-values for a test that is looked at again and again while data come in.
 
 A test at 1 % that is looked at a dozen times fires in far more than 1 % of the sessions where

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Observations sorted for the estimators: by sensor, then by pose, then by frame.
 
 Where a sensor measures how a body stands, too, its orientations are rows of their own behind those

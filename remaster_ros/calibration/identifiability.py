@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Which combinations of parameters the data do not determine, and what fixes each of them.
 
 The null space of the data's Jacobian (priors left out) over every parameter group, found

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A first solution, robust against a few gross outliers and badly known markers.
 
 Closed-form starts (registration by points; registration and markers together as one linear

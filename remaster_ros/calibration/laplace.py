@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The mode of a posterior, and its width there.
 
 Gauss-Newton steps to where the linearised posterior (`linearisation`) peaks, the noise at the peak

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Are held-out poses predicted as well as poses that are left out of the fit in turn?
 
 Parameters and noise of a fit take up a part of the model's errors on the poses fitted, and

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The posterior of a model that is linear about a point: Gaussian given the noise.
 
 Mean and precision follow from a handful of Gram matrices whatever the noise: a rotation of well

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Held-out configurations that were fitted as well: they prove nothing of others."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Metropolis–Hastings on any log density: independent proposals in one batch, or a random walk.
 
 Both work in logarithms, run several chains at once and repeat the state on rejection.

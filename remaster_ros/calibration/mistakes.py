@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Which mistake of a person makes a session fit its robot? Tried on data, where it does not fit.
 
 Joints that count the other way round, columns in another order, zero positions 90 degrees off,

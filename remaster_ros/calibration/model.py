@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Chain, registrations and markers together: where each sensor should measure each marker.
 
 The model of one observation (eq. 8 of Van Wyk et al., with the marker's position as a parameter)::

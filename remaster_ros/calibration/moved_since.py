@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """From when on a sensor's readings are off: it, or its marker, was moved in mid-session."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Noise of the sensors: what is independent, what rows share, and the sums by which data enter.
 
 The error of a row is independent per point and axis with standard deviation sigma, plus a part

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Whether noise explains the error that a fit leaves, judged without the fitted noise.
 
 The fitted noise is what the model leaves: it contains the errors of a tracker that was moved, of a

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The noise of each sensor as a fit reports it: means and standard deviations over the draws.
 
 That of orientations is reported alike, under the names of `Posterior.noise_names`, in rad.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What measured orientations are good for: their errors, what they tell, and whether they agree.
 
 Where a sensor measures full poses. Eq. 17 of Van Wyk et al. compares the distances between

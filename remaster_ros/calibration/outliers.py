@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Gross errors: rows that are far more likely to be mistakes than noise, named one by one.
 
 A mixture: most rows have the noise of the others, a small share has an error many times as wide;

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The source paper's estimator, exactly: equations 8 and 12 to 16 of Van Wyk et al.
 
 It does not converge within its 2e5 steps, which one chain alone does not show. Therefore several

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The exact log density of parameters and noise given the data.
 
 The noise is that of `noise`. Priors: flat in log sigma, which is the paper's p(sigma^2) ∝ sigma^-2

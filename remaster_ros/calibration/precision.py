@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """How well a fit knows its offsets and its tool, the noise integrated out; and what more would do.
 
 Given the noise the parameters are Gaussian (`laplace`). Their covariance is that over the draws of

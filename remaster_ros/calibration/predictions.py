@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Where a fit predicts each measurement, how sure it is of that, and how often it is right.
 
 To first order the prediction is Gaussian, with the covariance Σ of the parameters' posterior

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """How far off the arm is by what the posterior allows: section V-C of Van Wyk et al.
 
 For draws of the posterior and configurations of the arm, the distance from the place of the marker

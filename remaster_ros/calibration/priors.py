@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What is known before the data: markers, base frames and offsets, Gaussian.
 
 Numpy in, numpy out; how they are read from a session or a file is in `session`.

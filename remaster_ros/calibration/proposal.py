@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What the independence sampler proposes from: a Student t, moved to where the posterior is.
 
 Independent draws of a proposal, weighted by density over proposal, have the moments of the density

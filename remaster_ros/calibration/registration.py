@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Frame registration from points known in two frames: three of them, or more by least squares."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Is any structure left in the residuals of a fit? A light omnibus test.
 
 The residuals at the mode, in units of the noise, fall into two independent parts: the means of

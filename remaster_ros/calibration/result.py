@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What a fit gives: the posterior's summary, and everything that follows from it."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Which rows of a table do not fit the robot that the others fit, before it is fitted for good.
 
 A robust fit follows the majority; a row whose error would be gross in a fit (`outliers`) is named.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Draws from the exact posterior of a fit, by Metropolis-Hastings with one adapted proposal.
 
 Independent proposals of a Student t (`proposal`) that begins at the linearised posterior. Where

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What errors that no model has may look like: smooth functions, as columns beside the model's.
 
 Of the position in front of a sensor, of time, of each joint's own angle, of the time of its

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The three metrics of a fit's zero-offsets on any session of the same robot."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Fit, discover and check many sessions: a row each, resumable, and a page over all.
 
 Sessions are handed out to workers that stay: processes of this computer, started anew and not

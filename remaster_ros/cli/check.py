@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Has an arm changed since its correction was measured?"""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Correct a table of joint targets, for controllers that take nothing but programs."""
 
 from __future__ import annotations

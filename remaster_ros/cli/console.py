@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What the command prints: progress on a terminal, a few lines on stdout."""
 
 from __future__ import annotations

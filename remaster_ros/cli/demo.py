@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The whole pipeline on fake hardware: real nodes, real DDS, real sockets."""
 
 from __future__ import annotations

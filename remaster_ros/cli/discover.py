@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Find what the offsets leave: discovery.json, figures and report.html."""
 
 from __future__ import annotations

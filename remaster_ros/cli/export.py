@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Write a correction in the form of a controller or driver, or its registrations for tf."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Fit the zero-offsets of a session: fit.json, figures and report.html."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Make a session of anybody's table of joint angles and points, or of a ROS bag."""
 
 from __future__ import annotations

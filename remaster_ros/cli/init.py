@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Write a workcell file for a robot, with what is proposed and why."""
 
 from __future__ import annotations

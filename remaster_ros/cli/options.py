@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Argument types of the command line: what cannot be is refused before any work is done."""
 
 from __future__ import annotations

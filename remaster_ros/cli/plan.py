@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What a collection would do, and what its fit is expected to state, before anything moves."""
 
 from __future__ import annotations

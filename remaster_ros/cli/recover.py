@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Finish the files of a session that a crash has left; print what was lost."""
 
 from __future__ import annotations

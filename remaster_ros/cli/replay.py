@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Publish a recorded session again (as ``ros2 bag play`` does), or write its rows again."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """One page of session, fit and causes: what to do, what it brings, what remains."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A session that is to be fitted, read for the verbs of the command line."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A session from a known truth, planned and ordered as the planner node does it."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Whether a correction acts exactly once, and what error remains."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Show a collection under way on a local web page."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Which nodes have the pose under way: an announcement that one of them missed is repeated.
 
 A node that lags is sent the same announcement, with the same stamp: nodes that have it already

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What the planner does: idle, running, paused, stopped, complete or failed; and in which run.
 
 Each /remaster/collect begins a run, named by a token. Recorder and bridge hold the token in

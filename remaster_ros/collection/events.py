@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What the nodes act on: one record, typed and versioned, as JSON on ``remaster/events``.
 
 A record carries either the *state* of a node (twice a second and at each change, so that a node

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """First registration of the sensors: by three points each, refined by those that follow."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Residuals while a session is measured: how far the markers are from where the model has them.
 
 A look beside the session, not a part of it: every reading since the arm has settled counts as it

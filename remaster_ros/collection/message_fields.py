@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """From ROS messages to arrays, by their fields alone: of rclpy's messages and of rosbags'."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """How long a collection still takes, from the configurations that are done."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A settled configuration + joint states + marker readings -> observations, or the reason why not.
 
 Everything is decided on the messages' own time stamps and never on their time of arrival, so a

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The other nodes of a cell, by their records: their last states, and whether they mean one arm.
 
 Times are wall time and arguments.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Whether a person has looked at the plan that the arm is about to follow.
 
 What counts is the plan itself, by its fingerprint, not that something was confirmed: the tour for

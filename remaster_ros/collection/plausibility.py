@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Is a reading this marker, measured now? Against the robot's own motion, before it is recorded.
 
 A stray that is taken for the marker (swapped) stands still or moves in a way of its own: seen from

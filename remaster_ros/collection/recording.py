@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Which settled configuration is read next, by which messages, and what becomes of it.
 
 Stamps come with the messages. Nothing here uses clocks, files or ROS: the recorder's node

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Has anything changed since the references were first measured? What, when and by how much.
 
 The references are measured twice at the beginning: how far the two rounds lie apart is what arm

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """When enough is known to end a collection, and what more it would cost.
 
 After every few configurations the session so far is fitted, to the posterior's mode and no draws,

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Which pose is next, and with which of its solutions: registration first, then the collection."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The arm as it was found to be: where its tool is at reported joint angles, and how surely.
 
 With q the reported angles, δ the zero-offsets and τ gravity's torques at q + δ::

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Joint changes whose tool is nearest to a wanted pose, within bounds of each joint.
 
 Gauss–Newton steps on the pose error, each the exact minimum of its linear least squares within the

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The configurations of a check: chosen once, kept as a table, and what is expected of them."""
 
 from __future__ import annotations

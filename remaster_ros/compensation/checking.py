@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Has an arm changed since its correction was measured? From the same few poses, day after day.
 
 A check measures some eight poses. Where base and sensor stand is fitted again each time, and what

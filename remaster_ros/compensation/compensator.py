@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What to command so that the tool comes to where the nominal robot would have it, and back.
 
 The tool pose that is wanted is that of the *nominal* robot at the wanted joints. Newton steps lead

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A correction in the forms that controllers and drivers take, with what each leaves out.
 
 Where a form cannot hold all of a correction what it holds is fitted again to the whole one, base

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Ready ways to use the offsets: re-master, an offset layer, or a corrected URDF.
 
 The true joint angle is the reported one plus the offset. Each way corrects all of it, so only one

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """compensation.json: the whole correction of an arm in one file (``remaster-compensation/1``)."""
 
 from __future__ import annotations

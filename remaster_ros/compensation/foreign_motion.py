@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Trajectories of other planners, corrected on their way to the controller, and the way back.
 
 A planner that knows nothing of a correction plans for the nominal arm. It must be told where that

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A correction of what an arm is commanded, and where the arm then is.
 
 It is held against the arm first: one of another robot, or one that changes a joint by more than

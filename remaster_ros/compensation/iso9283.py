@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Position accuracy and repeatability of a session whose visits are those that ISO 9283 asks for.
 
 References

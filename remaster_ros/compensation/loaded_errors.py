@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What is left of a session with a file that a robot can load: by that very file.
 
 Whatever a result has in memory, its figure is that of what is written: with the offsets that are

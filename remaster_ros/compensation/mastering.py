@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What a person does on the robot's own pad so that a joint's zero is right, in the pad's numbers.
 
 In a place in which the pad shows x it has to show y = x + d afterwards, with d the offset on the

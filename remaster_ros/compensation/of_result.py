@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """From a fit and the cells of a discovery to the arm that they describe.
 
 Where a cell of `discovery.effects` goes follows from its place, its driver and its form, not from

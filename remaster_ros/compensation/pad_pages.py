@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Pages for re-mastering on makers' pads, and numbers that controllers store of motors."""
 
 from __future__ import annotations

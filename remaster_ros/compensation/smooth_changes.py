@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The correction along a path: as near to the wanted tool as accelerations allow.
 
 At each of n times the change c of the joints and its speed are sought; between them it is the

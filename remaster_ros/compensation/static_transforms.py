@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Registrations as static transforms of tf2: a launch file and a message in YAML.
 
 A sensor that stands is a child of the arm's base; a sensor on the tool is a child of the tool, and

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A trajectory whose tool path is that of the nominal robot, on points of its own.
 
 Between points a trajectory controller draws a straight line where they have positions alone, a

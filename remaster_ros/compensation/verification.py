@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Whether a correction acts exactly once, and what remains: from poses with what was wanted there.
 
 A marker is measured where the arm went for wanted joint angles w, those of the nominal robot.

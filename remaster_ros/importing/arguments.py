@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What the options of ``remaster import`` are called in Python, in sentences and as remedies."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """From rows to a session: poses by equal goals, a fair choice of what is held out, one order."""
 
 from __future__ import annotations

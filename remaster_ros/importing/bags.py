@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Rows from a ROS bag: joint states, and the points measured while the arm stood still."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Reports that have a row for each of X, Y and Z, as inspection programs write them: made wide."""
 
 from __future__ import annotations

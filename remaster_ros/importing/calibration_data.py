@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Bags of robot_calibration: a message a pose, with its joint states and the points of sensors."""
 
 from __future__ import annotations

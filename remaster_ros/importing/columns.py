@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What the columns of a table are (joints, a point, time, …), by their headers or as told."""
 
 from __future__ import annotations

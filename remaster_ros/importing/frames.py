@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Data frames (pandas, or anything with its columns, index and itertuples) as text tables."""
 
 from __future__ import annotations

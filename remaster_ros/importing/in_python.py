@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Sessions from Python: of arrays or a data frame, or of files as the command reads them."""
 
 from __future__ import annotations

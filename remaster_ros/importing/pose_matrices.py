@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Poses that a table writes as 4×4 matrices, sixteen columns each: a point and a quaternion."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Joints in pulses of the motors, as controllers of Yaskawa save them: to degrees."""
 
 from __future__ import annotations

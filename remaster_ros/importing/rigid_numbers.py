@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Sixteen numbers that are a pose: a 4×4 matrix, row by row or column by column."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """From tables to rows of joints and points in SI, each with the line it came from."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Whether a table makes sense for the robot, and if not, which change makes it: one sentence."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A session that was written with a mistake in it, without the mistake: as import is told."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Streams: where one stood still, which clock is that of another, a table of standstills.
 
 A log of joints and a camera's take have each their own clock. Both stand still where the arm does:

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A text table of any program: its encoding, separator and decimal sign, and its cells by line."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Orientations whose columns do not say how they turn: the one that turns as the arm did.
 
 Euler angles have 24 orders, a quaternion two; a rotation vector looks like angles. From one row to

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Units as tables write them, and what they are in SI."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The numbers, names and times of a table's columns, in SI."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The ends of the arm in a robot description: which links are likely its base and its tool."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Convex bodies for collision checks: boxes, cylinders, spheres, capsules and hulls of points.
 
 Each shape lies about the origin of a frame of its own. A body is a shape fastened to one link of

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Pairs of bodies that may not touch: which there are, what each keeps, how far apart they are.
 
 A pair is two bodies, or a body and the floor (its inner body is -1). The rules stand in

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Whether a configuration, or the whole way between two, is free of collisions, with clearance.
 
 The arm is a set of convex `bodies`; so are the obstacles, and the floor is a plane. Bounding

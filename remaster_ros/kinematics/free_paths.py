@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Free paths between configurations: straight where that is free, else around what is in the way.
 
 Paths are polylines of configurations, straight in joint space from each to the next. Effort is

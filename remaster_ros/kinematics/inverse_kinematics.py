@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """All inverse-kinematics solutions of a pose, certified by forward kinematics.
 
 EAIK [1]_ decomposes arms of six free joints into closed-form subproblems. It needs exact geometry

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Whether the arm hides a marker from a sensor, with a capsule around each link.
 
 A link is the set of points within ``radius`` of the straight line from its joint to the next one,

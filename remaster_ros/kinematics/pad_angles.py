@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The angles on a robot's own pad and those of its URDF: sign, zero and coupling of joints.
 
 Of k joints, with the pad's angles p and the URDF's q,

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Whether a robot description is that of the arm of a chain, as far as motion goes.
 
 A description on ``/robot_description`` may be written otherwise than the URDF of the cell: made

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A serial chain of joints from a URDF: kinematics with zero-offsets, gravity torques.
 
 The true joint angle is the reported one plus the zero-offset, everywhere. All methods take any

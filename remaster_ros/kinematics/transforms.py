@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Rigid transforms SE(3) on arrays: any number of leading dimensions, which broadcast.
 
 ``T_a_b`` maps coordinates of frame b to frame a: ``p_a = apply(T_a_b, p_b)``.

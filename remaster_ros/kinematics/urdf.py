@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A strict reader of URDF text: the links, joints, limits and masses, nothing else.
 
 Meshes, materials and the like are ignored. Text that is wrong is refused with one line that names

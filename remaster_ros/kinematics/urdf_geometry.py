@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The geometry of a URDF: which shapes hang on which joint of the arm, and where.
 
 Collision geometry is read strictly, as it decides what the arm may do; visual geometry is for

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What an arm is commanded, and when: limits, paths, the motion gate, the arm's supervisor.
 
 Nothing else decides that, and nothing here has ROS, sockets, files or clocks. To judge the safety

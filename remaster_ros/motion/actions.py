@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The actions that the arm supervisor returns, and the rules that it keeps."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Which joint configuration an arm is sent to, when it may move at all, and when it is halted.
 
 This is the state machine of the robot bridge: reports and their times are its input, actions are

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Where the arm is, and whether it follows the trajectory that it was sent along."""
 
 from __future__ import annotations

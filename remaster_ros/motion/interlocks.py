@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What must be right before an arm may move: live nodes, observations, a person's consent."""
 
 from __future__ import annotations

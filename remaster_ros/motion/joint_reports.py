@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Which reports of the joints are believed.
 
 They are finite, within limits and no faster than the arm can be; their stamps advance and are not

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The units of joints: rad of those that turn, m of those that slide.
 
 Tolerances and steps of motion are stated as angles. An angle moves what is at a distance from its

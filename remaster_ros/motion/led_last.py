@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Where an arm was led last, and whether it is reported there.
 
 A report that is fresh, finite and plausible may still be wrong: positions that are frozen, say.

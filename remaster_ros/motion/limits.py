@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What limits motion: joint limits, speeds of joints and of the fastest point, accelerations."""
 
 from __future__ import annotations

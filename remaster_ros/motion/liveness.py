@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Which sensors are present: their nodes report, and report ready. Times are arguments."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The gate: the last check before a command is published to the controller.
 
 A move passes if everything that the controller will make of it is allowed: the controller joins

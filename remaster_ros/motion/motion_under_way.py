@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The one move or stop under way: how it begins, what becomes of it, how it is stopped."""
 
 from __future__ import annotations

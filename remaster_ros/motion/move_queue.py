@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Which move comes next: the configurations of a pose, and what must come before any of them."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Paths that were found free, and how fast the fastest point of arm and tool moves on them.
 
 This takes milliseconds to seconds: it never runs in the callbacks that serve a stop.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Find a free path for the arm supervisor; slow, and so not called by the node's callbacks."""
 
 from __future__ import annotations

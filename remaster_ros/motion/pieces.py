@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What the controller has of a move: a piece of a short time, which ends at rest on the way.
 
 A bridge that is killed, or whose host or cable fails, sends no stop. So the controller never has

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What must be right before the first motion: topics, sensors and nodes. Times are arguments."""
 
 from __future__ import annotations

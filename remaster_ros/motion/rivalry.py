@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Which of two nodes of one name ends: the one that has been running for less long.
 
 Each node publishes when it was started (an identity: text that no other start has) and for how

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Whether the arm has arrived and has stood still long enough. Time stamps are arguments."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The states of the bridge's supervisor and all ways from one to another: three tables.
 
 `ARM`: what the arm does by this program, and what leaves the bridge with each step. `PLACE`: how

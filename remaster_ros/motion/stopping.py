@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """How an arm that is on a line comes to rest on it.
 
 Where on the line the arm is, is known to a stretch of time only: it lags behind the reference that

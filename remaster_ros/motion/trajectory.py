@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Trajectories: straight lines in joint space, each from rest to rest.
 
 A controller joins positions and velocities by cubics, as joint_trajectory_controller does; it then

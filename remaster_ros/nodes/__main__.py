@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Run a node: ``python -m remaster_ros.nodes NAME --ros-args …``; without a name, list them."""
 
 import importlib

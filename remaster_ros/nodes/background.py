@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Slow work beside the callbacks of a node: path checks, planning, writing to a disk."""
 
 from __future__ import annotations

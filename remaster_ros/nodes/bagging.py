@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Subscribe raw, write the bytes into the bag as they came, then hand the message on."""
 
 from __future__ import annotations

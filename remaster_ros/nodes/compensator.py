@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Correct what other planners send to an arm's controller, and tell them where the arm is.
 
 A planner (MoveIt, say) that plans for the nominal arm sends its trajectories to this node in place

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """How the admitted commands reach the arm's controller: by its topic, or as goals of its action.
 
 Both are of one controller, ``…/joint_trajectory`` and ``…/follow_joint_trajectory``, and carry the

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The main job on fake hardware: start every node, collect, fit, and print what was found.
 
 Real nodes in processes of their own, real DDS, real sockets; the fakes share a hidden World, whose

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """ROS shell of the fake laser tracker, whose only connection to the product is emScon."""
 
 from __future__ import annotations

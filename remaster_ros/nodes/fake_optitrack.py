@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """ROS shell of the fake OptiTrack server, whose only connection to the product is NatNet."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """ROS shell of the fake arm: joint_trajectory_controller, joint_states, safety circuit, a clock.
 
 The clock is relative like every name here: in a namespace, nodes that use it are started with the

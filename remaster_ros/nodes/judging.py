@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Visits by which an arm is judged, in place of a collection and in a session of their own.
 
 /remaster/verify: is the correction of the bridge in use? /remaster/check: has the arm changed?

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The description that both launch files return, of the nodes that `launching` lists."""
 
 from __future__ import annotations

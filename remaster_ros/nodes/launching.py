@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Which nodes the launch files and the demo start, with which parameters and names.
 
 This module does not import launch, so that it is tested where launch is not installed;

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Stamps, transforms and waypoints as ROS messages; others: `collection.message_fields`."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Fit the session on request, or look for what else is wrong; publish the offsets, latched.
 
 Offsets are published with their standard deviations, and only those of a fit: the ones that a

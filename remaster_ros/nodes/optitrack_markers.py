@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The node of `remaster_ros.sensors.optitrack.driver`."""
 
 from __future__ import annotations

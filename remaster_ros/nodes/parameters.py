@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A node's parameters: one frozen dataclass, each field with unit, range and description.
 
 A value of the wrong type, outside its range, or the name of no parameter is refused at

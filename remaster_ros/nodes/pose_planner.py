@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Plan poses in front of the sensors; publish them one by one, each with all its joint solutions.
 
 ``/remaster/collect`` starts or resumes; ``/remaster/pause`` and ``/remaster/stop`` hold the arm.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Pair settled joints with marker readings; write the session and the bag; register the sensors.
 
 What becomes of a message is decided in `session.session_recorder`, which a bag gives the same

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Publish a recorded bag again, byte for byte and in its own time, as ``ros2 bag play`` does.
 
 It never publishes onto a live graph: where other nodes publish what robot, bridge and planner

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Who else publishes on a topic that moves the arm, or that reports where it is.
 
 The graph lists the publishers of a killed process for some 20 s more. Those with a liveliness

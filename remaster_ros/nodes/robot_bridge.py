@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Command the joint solutions of a pose one by one; publish when the arm has settled.
 
 Every command comes from the motion gate (`remaster_ros.motion`); this is the ROS shell of its

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Run a node as a process: signals, one-line errors, exit status."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Files of this user outside of every session: locks of nodes, and the way to the live page.
 
 There is one process per node name and ROS domain on this computer, by a lock that the kernel

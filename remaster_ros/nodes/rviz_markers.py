@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """For RViz and Foxglove: the arm, its way and the measured points in base_link, and static tf.
 
 ``remaster/markers`` (visualization_msgs/MarkerArray) has the same as the live page. Where the

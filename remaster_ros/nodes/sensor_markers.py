@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The node of any sensor: its markers' readings out, and whether the sensor is ready.
 
 Its name begins with that of its driver: ``ros2 run remaster_ros sensor_markers --ros-args -r

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Nodes in a simulation that waits for them.
 
 The watchdogs of a node measure silence in wall time, since a clock that is published may stand

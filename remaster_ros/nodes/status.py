@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """How a node reports: records to the other nodes, and its state to people.
 
 `remaster/events` carries the records of `remaster_ros.collection.events`, on which the nodes act.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Serve the live page: what the nodes publish, and the services that a person may call there.
 
 The page is `reports.live_view` and `reports.live_server`; this is their ROS shell. It commands

@@ -1,1 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
 """Which configurations are measured, and in which order."""

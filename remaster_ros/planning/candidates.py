@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Which poses to measure: spread over the workspace, facing the sensor, reachable and visible.
 
 Candidates follow Van Wyk et al., section III-A, equations (2) to (5): a Latin hypercube over

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What a cell file may hold for an arm that is not known yet: which joint is held, which poses.
 
 Everything is tried on the arm itself: the inverse kinematics with each joint held, and which tool

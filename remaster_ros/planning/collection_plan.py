@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A whole collection before anything moves: every visit with its way, times, what is expected."""
 
 from __future__ import annotations

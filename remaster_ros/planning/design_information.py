@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What configurations will tell of the joint offsets: Fisher information before any measurement.
 
 Model, derivatives, priors and gauge are those of the fit (`calibration`), at the nominal arm: the

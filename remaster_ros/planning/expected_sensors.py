@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What sensors are expected to measure at configurations of the nominal arm, as a fit takes it."""
 
 from __future__ import annotations

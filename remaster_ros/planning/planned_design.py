@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """From the poses that can be measured to a designed plan, with free ways, and to its order."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Choose poses that tell the most in the least time: greedy, then exchange.
 
 A-optimal for the joint offsets (least sum of their variances), I-optimal for the tool (least mean

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Reference configurations: what can change beside an arm in mid-run, and where it shows best.
 
 Each cause moves the measured markers linearly in few parameters; all displacements are in the

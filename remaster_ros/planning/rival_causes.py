@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Two causes that explain what was measured nearly as well: by how much they would differ.
 
 Of a cause A of a stated size and a look-alike B, what counts is how well the size of A is

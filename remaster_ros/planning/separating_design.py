@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Configurations that tell two causes apart, which explain what was measured nearly as well.
 
 Configurations are added to those that were measured or are planned, each the one that adds the

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The order of a collection: which pose is next, and its joint solutions nearest first."""
 
 from __future__ import annotations

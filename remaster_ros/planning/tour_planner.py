@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The tours of a session: for the registration, and for the collection with its references."""
 
 from __future__ import annotations

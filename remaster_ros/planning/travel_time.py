@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """How long an arm takes from one configuration to another, and for a whole tour.
 
 The lines are those of `motion.trajectory`, at the speeds of the motion gate; here the same is

@@ -1,1 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
 """fit.json and discovery.json, figures and pages."""

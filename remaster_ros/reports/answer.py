@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What to do after a fit and a search for causes, what it brings, and what remains."""
 
 from __future__ import annotations

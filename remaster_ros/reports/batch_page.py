@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Many sessions on one page: which differ from the others, and which joints change along them."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The checks of an arm on a page: what they say, and the trend of each joint."""
 
 from __future__ import annotations

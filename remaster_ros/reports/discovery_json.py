@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """discovery.json, and what of it a robot can load (format ``remaster-discovery/1``)."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The figures of a fit, of its causes and of the answer, as SVG text.
 
 Drawn on Matplotlib figures of their own (no pyplot, no window, no shared state). Lines and text

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """fit.json: the result of a fit as other programs read it (format ``remaster-fit/1``)."""
 
 from __future__ import annotations

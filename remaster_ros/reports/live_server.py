@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Web server of the live page: fixed files, the view as JSON, and five commands.
 
 Whoever may command here lets an arm move, so every request is judged as if it came from somebody

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """State of the live page: what the nodes publish in, a view for people out. No ROS, no clock.
 
 Every text that a view holds came over the network: it is clipped here and shown as text there.

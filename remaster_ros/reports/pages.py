@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What the reports share: templates of this package, figures made part of a page, numbers."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A planned collection as JSON and as text."""
 
 from __future__ import annotations

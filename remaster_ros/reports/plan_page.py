@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A planned collection as one page: the arm in 3-D with every way and configuration, and figures.
 
 The page is complete in itself: nothing is fetched when it is opened.

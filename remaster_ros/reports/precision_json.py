@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What is known while a collection is under way, as JSON on ``remaster/precision``."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """report.html of a fit, of a discovery and of both: self-contained pages; the last also as PDF."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A folder of results: made ready before the long work, written after it."""
 
 from __future__ import annotations

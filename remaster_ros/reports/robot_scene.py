@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """An arm and what stands around it as surfaces, for pictures in 3-D.
 
 Only plain arrays, in base_link or in the frames that move: whatever draws them, a page or a

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Files with a line for every row: residuals.csv of `fit`, predictions.csv of `discover`."""
 
 from __future__ import annotations

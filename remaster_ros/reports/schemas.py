@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What fit.json and discovery.json hold: each key once, to write and to read.
 
 A key without a default is what other programs rely on, and a file without it is refused. One that

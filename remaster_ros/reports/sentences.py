@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What a fit and its causes are worth, in words: green, amber or red, and why."""
 
 from __future__ import annotations

@@ -1,1 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
 """Measuring devices, one folder each: wire format, client, diagnosis."""

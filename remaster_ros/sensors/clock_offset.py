@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A device's clock against ours: when was a reading captured, by our clock?"""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What the driver of a sensor gives; no ROS. `remaster_ros.nodes.sensor_markers` runs any of them.
 
 A device is one folder beside this file with one class that derives from `StreamDriver` or from

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The registered sensors: one line a device."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Read rosbag2 bags (MCAP) without a ROS installation: raw messages, and one kind of error."""
 
 from __future__ import annotations

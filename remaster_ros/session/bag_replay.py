@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A session from its bag, without ROS: its messages, in order, through the recorder's code.
 
 A recorder writes each message into the bag when it takes it, so the order is the one in which it

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Write rosbag2 bags (MCAP) without a ROS installation, and finish those of killed writers.
 
 Written unchunked and flushed message by message, so that a killed writer leaves every message it

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What a robot bridge keeps on the disk from one process to the next: a halt, the last command."""
 
 from __future__ import annotations

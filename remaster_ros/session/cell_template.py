@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The text of a new cell file: every key with what it means, and why it is proposed so."""
 
 from __future__ import annotations

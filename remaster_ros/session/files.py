@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Reading files of unknown origin and writing files that survive a crash."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Append-only journals: JSON lines with a checksum each, durable before `append` returns.
 
 A crash can leave only the last line incomplete: cut anywhere, also inside a character, or with

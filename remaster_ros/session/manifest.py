@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """SHA256SUMS: the checksums of a folder's closed files, as ``sha256sum --check`` reads them."""
 
 from __future__ import annotations

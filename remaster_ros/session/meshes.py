@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Meshes: found as a URDF names them, read into arrays.
 
 Those of collision geometry as vertices alone, those of pictures with triangles and colours.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """An observation as a line, and as one of columns: observations.csv, its rules, its faults.
 
 The journal keeps the same lines (see `session_writer`). Every fault is named by line and column.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """ROS packages as folders: where `package://NAME` and `$(find NAME)` are, also without ROS."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What a planner keeps on the disk: its plan, and which of its poses was next.
 
 ``plan.jsonl`` in the session folder is a journal (see `journal`). The plan is in it before the

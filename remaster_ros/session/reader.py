@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Session folders: the strict reader, and the writer of a whole session."""
 
 from __future__ import annotations

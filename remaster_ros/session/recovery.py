@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Finish a session folder that a crash has left incomplete, and report what was lost."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Robot descriptions as their makers ship them: URDF text, or xacro that is expanded to it.
 
 A xacro file is expanded in a process of its own, with little time and memory, without this

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Configuration of RViz for a workcell: the arm, its way, the topics of the cell's sensors."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What a recorder keeps on the disk: the session, and its decisions so far.
 
 A recorder that is started again finds here what it decided before, so that nothing is recorded

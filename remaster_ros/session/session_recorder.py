@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """From messages to a session: what the recorder's node does, and what a bag gives again.
 
 Messages and records come in through `SessionRecorder.take_joints` and the like, in the order in

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Write a session observation by observation, and go on with one after whatever has happened.
 
 Each record goes into the journal first (a line with a checksum, synced), then its rows go into

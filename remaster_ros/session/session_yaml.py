@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """session.yaml: what was measured, with what, on which robot (format ``remaster-session/1``).
 
 And the file of priors, which has the same base frames.

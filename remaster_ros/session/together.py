@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Several sessions of one arm as one: the arm is shared, all else is each session's own.
 
 Sensors and markers of a later session are further ones with names of their own: they stand

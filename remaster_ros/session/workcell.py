@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Workcell files (config/cells/*.yaml): the arm, the markers on its tool, the sensors."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Expand one xacro file, in a process of its own, which `robot_description` starts and bounds.
 
 xacro's places where a file does something are replaced: expressions, substitutions ``$(…)``, which

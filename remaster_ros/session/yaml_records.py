@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Records of YAML files, each declared once: a msgspec struct with the bounds of its numbers.
 
 Bounds stand in the annotation of a field and hold for every number in it::

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """How the fake arm moves: a second-order servo behind a trajectory, solved in closed form.
 
 The reported joint positions x follow a reference r by x'' + 2 ζ ω x' + ω² x = ω² r. Each piece

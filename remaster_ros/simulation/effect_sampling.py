@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Draws effects to hide, of a given size: which joint, which direction, which sign."""
 
 from __future__ import annotations

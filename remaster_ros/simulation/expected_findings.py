@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What discovery has to report of a hidden effect: its cause by name.
 
 This is the one module that uses both the names of hidden effects and those of discovery.json; only

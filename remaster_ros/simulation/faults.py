@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Faults that are injected into the fakes: a file in the hidden World that a test writes.
 
 ``faults.json`` maps a device (``robot`` or a sensor's name) to its faults, and each fault to its

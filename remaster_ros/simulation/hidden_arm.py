@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The true arm of the fakes: the package's chain as `simulation.world_model` needs it."""
 
 from __future__ import annotations

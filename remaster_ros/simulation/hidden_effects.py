@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What a hidden world can hide: every effect written from its equation, on its own.
 
 Nothing here is shared with the code that estimates (`discovery.effects`). An effect is linear in

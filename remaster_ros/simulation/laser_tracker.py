@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A fake laser tracker: the emScon protocol on a TCP port, with the world behind it."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A fake OptiTrack server: NatNet over real UDP sockets, with the world behind it.
 
 The command channel answers at once in wall time, and clients are dropped by wall time, as both

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A fake arm behind ros2_control: joint_trajectory_controller and joint_state_broadcaster.
 
 It does what the real controller of Jazzy does with a trajectory: permutes by joint name, drops

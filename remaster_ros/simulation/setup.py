@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Draw a hidden World around a cell, and find the one of this DDS domain."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A simulated session of a workcell, planned and measured as with the fake devices."""
 
 from __future__ import annotations

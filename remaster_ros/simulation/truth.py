@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What a simulated session is made from: one description for the fakes and the offline simulation.
 
 No module that estimates or moves an arm may import it.

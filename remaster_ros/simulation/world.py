@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The hidden World behind all fakes: the true arm, the true sensors, world time.
 
 The fakes run as separate processes. They share one World through a folder that no estimating

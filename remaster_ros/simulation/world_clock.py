@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """World time, shared by the processes of all fakes, which waits for who cannot keep up.
 
 World time runs `rate` times as fast as the wall clock up to a limit, and stands there. The fake

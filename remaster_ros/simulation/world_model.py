@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What sensors measure of an arm with hidden effects, on one round of visits.
 
 Every hidden world uses this model: the fakes with the package's chain, the tests with pinocchio's.

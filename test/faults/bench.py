@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Real nodes on fake devices in a ROS domain of their own, to spoil one part of it at a time.
 
 Every node is a process of its own. The bench's own node observes (`faults.observer`),

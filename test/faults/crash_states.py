@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What a power cut may leave of files, from what their writer really asked the system for.
 
 A `Recorder` notes every operation on the files of one folder. `crash_state` then plays a crash:

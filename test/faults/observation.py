@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What becomes of a fault that is injected into a running collection of real nodes.
 
 `observe` injects a row's fault, ends it, lets an operator do what is needed, and returns the row

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What a bench of real nodes observes: every command to the controller, and the messages about it.
 
 Commands are judged as a controller takes them: cubics from where the arm is to the first point,

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The tables of docs/faults.md, which the tests write (FAULTS_PAGE=write or add) or compare.
 
 ``write`` replaces the rows that were tried; ``add`` keeps what they were before as well: where a

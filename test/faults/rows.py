@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The faults of docs/faults.md that are tried on real nodes.
 
 A row is one fault in the middle of a running collection (`faults.observation`).

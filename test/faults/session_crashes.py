@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The life of a session as its recorder writes it, and what must hold after a crash anywhere."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Messages of ROS 2 that the tests write into bags."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A data frame with no more of pandas than the import uses, for machines without it."""
 
 from __future__ import annotations

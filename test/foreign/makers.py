@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Programs and logs in the text of makers of controllers, for the tests: joints by name."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Takes and logs as programs write them: an arm that stops and goes, two clocks, for the tests."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Tables as programs of others write them: an arm measured by a tracker, for the tests."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Workbooks as spreadsheets write them, by hand: shared strings, dates, several sheets."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """An arm and its controller that execute every command; no ROS, times are arguments.
 
 It stands for joint_trajectory_controller and a position-controlled arm: each trajectory is

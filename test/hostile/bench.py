@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A bridge process between stand-ins and a hostile arm, over real DDS.
 
 `Lines` are the man in the middle: what becomes of joint states on their way out, and of commands

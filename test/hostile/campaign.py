@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Many injections at random moments, several in the life of one bridge.
 
 Expected of an injection is `halt`, `go on` (a control, or something that must not disturb) or

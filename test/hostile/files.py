@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Files from strangers: valid ones, spoilt, and the readers that must refuse or read them.
 
 Every reader has one exception, `InputError`, whose text is one line; whatever else comes out is a

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Hostile bytes: valid messages of every version of the two wire formats, and damaged ones.
 
 The same seed gives the same bytes.

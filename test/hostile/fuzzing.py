@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Targets of hostile bytes: the decoders, and the clients as they stand behind a socket.
 
 A target takes bytes and raises an error if something happens that must not. `run` feeds it, and

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What can go wrong between a bridge and its arm, at random moments of a move under way.
 
 Each injection is a function of the scene; it returns from when on the arm must receive nothing

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What a command to an arm means physically: speeds, accelerations, limits, the way of a stop.
 
 Written from the physics of the arm alone: pinocchio's kinematics of the URDF, the controller's

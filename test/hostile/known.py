@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The situations in which the first bridge was found to command what must not be commanded.
 
 Each begins in the middle of a long move of a bridge process of its own, with the same figures

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What may happen to messages on their way, and what the bridge showed of itself."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What became of the injections into a bridge: what was wrong, and tables of it."""
 
 from __future__ import annotations

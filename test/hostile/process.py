@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The bridge as a process of its own: start it, pause it, kill it."""
 
 from __future__ import annotations

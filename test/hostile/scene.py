@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The demo cell as the hostile tests take it: its arm, and moves without obstacles."""
 
 from __future__ import annotations

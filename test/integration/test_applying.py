@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Each applied form, used, leaves nothing to correct, on descriptions as makers ship them."""
 
 from __future__ import annotations

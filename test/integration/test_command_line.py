@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The command line at its work: simulate, fit, judge, as real processes.
 
 The seeds are fixed. Were they drawn afresh, a correct program would fail this file less than once

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Bad input: each one clear line on stderr and its exit status, from real processes."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """compensation.json: what fit and discover write corrects the hidden arm, and nothing is lost."""
 
 from __future__ import annotations

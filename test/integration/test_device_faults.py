@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The devices at their wires x every kind of fault: what their drivers make of it.
 
 Real drivers and real sockets, fake devices that do the wrong things. Whatever happens: no reading

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What `remaster discover` holds in memory against the number of rows of a session."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Every command of README and docs: those without ROS are run, the others are parsed.
 
 The pages are run one by one in a scratch folder, in the order of their commands. A file or folder

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """compensation.json by itself: an evaluator with nothing but NumPy, the file and its URDF.
 
 It ships as docs/examples/evaluate_compensation.py, is written from docs/files.md and shares no

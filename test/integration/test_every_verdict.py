@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Every verdict of every verb that judges, by the real command, with its figures and its report.
 
 A verdict that is rare is where a page is seldom tried.

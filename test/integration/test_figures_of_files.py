@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Each figure beside a file to load, by loading that file with programs of others.
 
 Robot models: pinocchio, base and marker fitted here. compensation.json: the evaluator that ships

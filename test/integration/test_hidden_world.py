@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The hidden world itself: its physics against the package's, its effects against known sizes.
 
 Only here do the two meet: the package's chain judges pinocchio's, and the other way round.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Moves as the planner plans them, judged by what shares nothing with its checks.
 
 The kinematics are pinocchio's, the distances FCL's on triangles; sampled at 1 mm, bodies grown by

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The live page in a real browser, before a collection of events alone: no ROS, no devices."""
 
 from __future__ import annotations

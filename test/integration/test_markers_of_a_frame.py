@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Several markers of a tool in one frame: files, fit and search."""
 
 from dataclasses import replace

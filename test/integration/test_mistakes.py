@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A session with a mistake of a person in it is refused with the mistake, and how to mend it."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Is what a world of its own hides found: its name, its joint, its size; and nothing else?
 
 Effect, joint, size and sign are drawn; sizes are eight times what the best possible test needs to

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What is hidden at a joint that slides is named there, in metres; and where nothing is, nothing.
 
 The arm's kinematics and gravity are pinocchio's, the effects written from their equations.

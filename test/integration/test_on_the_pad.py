@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Re-mastered as the file says, in the pad's own numbers, an arm has no zero-offsets left.
 
 Measured on a controller whose pad counts otherwise than the URDF, imported, fitted, re-mastered

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Tables V to VII of the paper follow from its own Tables I and II, joints 1 and 7 counted."""
 
 import re

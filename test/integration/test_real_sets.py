@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Two real robots measured by others; the figures to reach are those of an independent fit."""
 
 from __future__ import annotations

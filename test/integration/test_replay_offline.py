@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A bag gives its session again, without ROS: every row, to the last bit, whatever was decided."""
 
 import csv

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """`remaster report` as a user runs it: simulate, fit, discover, and one page with its figures."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Inputs of other programs, second round: the offsets that made them, or what to do."""
 
 from pathlib import Path

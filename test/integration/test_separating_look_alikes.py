@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Sag or a base that yields: decided by what separates them, in a world of its own."""
 
 import numpy as np

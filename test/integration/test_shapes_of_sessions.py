@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Sessions of every shape go through every verb of the command line."""
 
 from __future__ import annotations

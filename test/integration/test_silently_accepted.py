@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What was taken without a word, or refused with the wrong one: one line that names the remedy."""
 
 from __future__ import annotations

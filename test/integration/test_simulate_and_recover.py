@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Simulated truths, fitted: what comes back, with what claim, and how often it is right.
 
 The seeds are fixed and printed. Error rates of the checks, were the seeds drawn afresh, stand with

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Offsets of an arm with a joint that slides, through all that applies and judges them.
 
 The arm is pinocchio's, and what is reported of it lacks the offsets.

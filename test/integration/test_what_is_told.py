@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What a person is told of pure noise, of readings paired wrongly and of backlash.
 
 By the real commands. Terminal, JSON and pages have one verdict.

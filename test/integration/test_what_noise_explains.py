@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """`remaster fit` where something else than the offsets is wrong: not green, and why."""
 
 from __future__ import annotations

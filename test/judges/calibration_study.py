@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Sessions with random truths: intervals, ranks and errors of what is fitted to them.
 
 Compared are parameters in coordinates that the data can see (joint 1 turned into the

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """How far the hidden arm is from where it is wanted, once it is commanded by a compensation.
 
 The truth is the hidden world's: pinocchio, and effects by their own equations. What errs in the

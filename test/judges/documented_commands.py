@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The commands that stand in README and docs, and whether each can be run as it stands there."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Was the hidden effect found: its name, its joint, its size?
 
 The judge is strict. A result is right if it names exactly what was hidden, no less and no more.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The best possible test: it is given the noise, and the effect to look for.
 
 It uses the rows to fit without the gross errors, the noise's true covariance, and the effect's

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A page as a browser would take it apart."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """All inverse-kinematics solutions by a second method: Newton's from random starts, by pinocchio.
 
 Nothing of the package is used: kinematics and derivatives are pinocchio's, of the URDF's text.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Was anything lost, twice or wrong where nodes were killed?"""
 
 from __future__ import annotations

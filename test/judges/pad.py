@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A robot's controller as its pad shows it, and a person who does there what a file says.
 
 It has code of its own: true angles, how the pad counts, and what mastering sets. Two kinds of

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Judges of paths that share nothing with the collision checks under test.
 
 Kinematics by pinocchio (by PyBullet for the iiwa), bodies as triangles (`trimesh`), distances by

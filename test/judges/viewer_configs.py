@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What config/remaster.rviz and config/foxglove.json may hold, by the viewers' published formats.
 
 Neither viewer is needed to run these tests. The names are those of rviz_default_plugins'

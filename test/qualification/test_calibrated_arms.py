@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Ten makers' arms as calibrations describe them, each joint elsewhere, can be planned."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Hidden arms commanded by their compensation.json: each effect that can be corrected, and pairs.
 
 COMPENSATED_ARMS=220 are the 200 of benchmarks/RESULTS.md and more; 0.1 mm of noise on each axis.

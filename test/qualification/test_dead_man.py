@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A bridge that is killed in a move leaves two seconds of motion, and costs little for that.
 
 The bridge is a process, the arm one that obeys everything (test/hostile); the figures that are

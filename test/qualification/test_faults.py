@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A pause, then faults in the middle of a whole run of real nodes: the reason, and its end.
 
 The faults are injected into the fakes' hidden World one after the other; what each kind does to

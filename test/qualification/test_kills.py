@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """SIGKILL of nodes in a running demo: nothing lost, nothing twice, the collection completes.
 
 KILLS=100 makes at least as many, in complete demos of other seeds; about a minute for four.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The calibration study of benchmarks/bench_calibration.py, small: 27 sessions of 12 poses.
 
 Sessions of all kinds: one and two sensors, both models of the noise and its prior, truths anew

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A sensor is bumped in mid-run: the references tell it, by name and size, and the arm stands."""
 
 import csv

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A pause or stop leaves the planner while it plans, and while the disk keeps it waiting."""
 
 import sys

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Collections through topics of other packages' nodes: every fault, kills of every node."""
 
 import pytest

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Sensors on one host, the rest on another, the cable cut: two_hosts.py, small."""
 
 import subprocess

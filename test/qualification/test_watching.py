@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """`remaster watch` before real nodes on fake devices, in a real browser: plan to result.
 
 Everything that moves the arm is asked for on the page, in the words and with the buttons that a

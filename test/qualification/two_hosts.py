@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Two hosts, one cable: the sensors on one, the rest on the other; the cable cut in the middle.
 
 Two network namespaces joined by a veth pair stand for the hosts: NatNet stays on the first, DDS

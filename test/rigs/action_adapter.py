@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The action of a controller in front of an arm that takes trajectories on a topic: a process."""
 
 import contextlib

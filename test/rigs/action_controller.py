@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A server of FollowJointTrajectory that does with goals what joint_trajectory_controller does.
 
 A goal takes the place of the one before it, of which nothing is heard any more: the real one may

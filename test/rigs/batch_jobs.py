@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Stand-ins for the work of a batch, in a module that a worker imports in no time."""
 
 import os

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A headless Chromium, driven over its DevTools protocol: what a person does with a page."""
 
 import asyncio

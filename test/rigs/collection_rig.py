@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A small collection of real nodes on fake devices, without the demo around them."""
 
 import socket

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Run `remaster` as a user does: in a process of its own, or as one would, within this process."""
 
 from __future__ import annotations

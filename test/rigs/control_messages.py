@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """`control_msgs` for the tests, where the distribution's own is not installed.
 
 The wheels of ROS 2 bring the generators of messages and rclpy's actions, but not control_msgs. The

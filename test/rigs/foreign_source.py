@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A mocap driver or tracker driver of another package: a process that publishes positions alone.
 
     python -m rigs.foreign_source WORLD SENSOR MESSAGE_TYPE TOPIC [tool]

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Processes of nodes, forked from one that has imported most of what nodes import.
 
 A node takes two seconds of a processor to import its libraries, and a collection has eight. Here

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Hostile values for every message, request and parameter, made from its fields alone.
 
 Of a valid message one field at a time is spoilt: each message comes as deep as a valid one does.

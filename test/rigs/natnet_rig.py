@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A fake OptiTrack server and a client of it, on real sockets."""
 
 from __future__ import annotations

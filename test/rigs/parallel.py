@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The same work for many items, in several processes."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Tests of real processes: each has a DDS domain, a ROS_HOME and processes of its own."""
 
 import atexit

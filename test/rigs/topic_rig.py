@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A collection whose sensors are topics of nodes of other packages: no heartbeat, real DDS."""
 
 import numpy as np

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A collection whose arm is commanded by FollowJointTrajectory.
 
 The action is control_msgs' own where that is installed, else made from its definition; the server

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A camera on the tool: its poses of a board, collected by the nodes, and fitted as such."""
 
 import csv

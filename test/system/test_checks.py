@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """/remaster/check: eight configurations, visited by real nodes, and judged against a baseline."""
 
 import json

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """With `confirm: true` the arm of real nodes follows no plan that was not shown and confirmed."""
 
 import pytest

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A collection through a bridge that corrects what it commands, with real nodes."""
 
 import hashlib

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The main job, once, with everything real but the devices; then many looks at what it left."""
 
 import csv

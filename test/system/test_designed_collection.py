@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Poses chosen for what they tell, in the order of least travel, through the nodes."""
 
 import numpy as np

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """In the loop: the optimizer looks for causes on request; a demo hides one and opens the truth."""
 
 import json

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A collection ends once enough is known: the optimizer's looks and the planner's end, by DDS."""
 
 import json

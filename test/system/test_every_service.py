@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Every service answers in every state: done, refused with the reason, nothing to do."""
 
 import json

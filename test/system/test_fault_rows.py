@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Faults in running collections of real nodes, and the page of them.
 
 `make faults` tries every row and writes docs/faults.md, `make qualify` compares with it. What is

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Nodes without the demo around them: which sensor the arm waits for, and a disk that fills up."""
 
 import resource

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A demo whose arm is halted, at a terminal: a person goes on, and it comes to its end."""
 
 import os

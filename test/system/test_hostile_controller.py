@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A real bridge and an arm that obeys everything: nothing it commands may be what it must not be.
 
 The arm, the man in the middle and the judge are the tests' own, in test/hostile.

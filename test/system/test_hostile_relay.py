@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """All real nodes, and a man in the middle between the bridge and the fake robot.
 
 The fake robot's topics are remapped away; what the bridge hears and what the robot obeys passes

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Installed by pip and by colcon: what `ros2 run` would find is there, starts, and finds config/.
 
 There is no `ros2` among the wheels, so its part is played by hand: look the package up in the

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """CESAPI, an independent client of Leica trackers, as judge of the packets and of the fake."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Behind a complete collection: collect measures what separates a cause from its look-alike."""
 
 import json

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Independent clients must understand the fake server: `natnetclient` 2.10, `natnet` 3.1 and 4.1.
 
 Both run in processes of their own (one never ends its thread) and print what they read; the

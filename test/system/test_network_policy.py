@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """config/sros2/policy.xml allows what the nodes do, and nothing else: compared with real nodes."""
 
 import importlib.util

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A node that cannot work ends with one error line and status 2."""
 
 import socket

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What can be changed while a node runs changes, checked; all else is refused with the reason.
 
 By the parameter services, and by `ros2 param set` where there is one.

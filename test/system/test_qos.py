@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Best-effort joint states are received; a mismatch of the quality of service is reported."""
 
 import pytest

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The recorder by itself: a test publishes in place of the robot, the planner and the sensors.
 
 What it writes down of them is then known to the last digit.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A replay moves no arm: on a live graph it ends with status 2, and it leaves commands out."""
 
 import os

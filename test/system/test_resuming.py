@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A planner never moves the arm before /remaster/collect, unless its run still lives."""
 
 import os

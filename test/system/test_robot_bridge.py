@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The bridge as a process between a plan and an arm that obeys everything: what it commands."""
 
 import time

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What a user does with the real `ros2` command line; beside each, the same through rclpy.
 
 Parameters are in test_parameters_live.py, launch files in unit/nodes/test_launching.py.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The optimizer on request: fit, and the latched offsets. Pausing is in test_faults.py."""
 
 import json

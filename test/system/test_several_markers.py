@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Three markers of the bar through the nodes: one is hidden, the recorder is killed."""
 
 import numpy as np

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A laser tracker with two reflectors: one after another at each standstill, also after a kill."""
 
 import numpy as np

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A sensor's node reports a simulated clock that is not published yet, and stamps nothing.
 
 A node that is started again in a running simulation receives the clock late; what it measured

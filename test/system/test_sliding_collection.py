@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """An arm with a joint that slides: planned, moved, measured, recorded and fitted by the nodes."""
 
 import signal

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Ctrl-C at any moment: every process gone soon, the session readable."""
 
 import os

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Collections whose sensors are topics of nodes of other packages: faults and kills."""
 
 import pytest

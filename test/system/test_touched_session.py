@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The session is edited, renamed or removed while real nodes write it: noticed within seconds."""
 
 import shutil

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The same node twice on one cell: the second ends with an error line and status 2."""
 
 import signal

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Two complete cells in two namespaces of one DDS domain: neither affects the other."""
 
 import socket

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The node behind the live page, on real DDS: what comes in, what a button does, what stays in."""
 
 import http.client

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A small two-joint session, and a fit, for the storage tests."""
 
 from __future__ import annotations

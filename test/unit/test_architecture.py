@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """docs/architecture.md is true: its modules exist, and no subject is left out."""
 
 import importlib.util

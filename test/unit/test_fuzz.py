@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A short run of the fuzzer; FUZZ=1000000 takes as many inputs of each kind."""
 
 from __future__ import annotations

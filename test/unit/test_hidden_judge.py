@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The judge of hidden causes: by hand-made discoveries, without any search."""
 
 from __future__ import annotations

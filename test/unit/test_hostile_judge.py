@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The judge of commanded motion finds each thing that it is there to find."""
 
 import numpy as np

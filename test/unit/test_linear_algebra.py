@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What estimates works in one thread of linear algebra, also where nothing else has said so."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What is declared (setup.py, package.xml, constraints, launch files, docs) is what is there."""
 
 from __future__ import annotations
@@ -79,6 +80,26 @@ def pins(name: str) -> dict[str, str]:
     lines = (ROOT / name).read_text(encoding='utf-8').splitlines()
     lines = [line for line in lines if line and not line.startswith('#')]
     return {normal(line): line for line in lines}
+
+
+def test_every_python_file_names_its_licence_at_the_top() -> None:
+    """As SPDX, in the first line or behind that of the interpreter; the licence is LICENSE's."""
+    licence = ElementTree.parse(ROOT / 'package.xml').getroot().findtext('license')
+    text = (ROOT / 'LICENSE').read_text(encoding='utf-8')
+    assert re.search(r'Apache License\s+Version 2\.0', text)
+    assert licence == 'Apache-2.0'
+    folders = ('remaster_ros', 'test', 'docs', 'benchmarks', 'launch')
+    paths = [ROOT / 'setup.py', *(ROOT / 'scripts').glob('[a-z]*')]
+    paths += [path for folder in folders for path in (ROOT / folder).rglob('*.py')]
+    paths = [path for path in paths if ROOT / 'remaster_ros/discovery' not in path.parents]
+    assert len(paths) > 500
+    without = [
+        str(path.relative_to(ROOT))
+        for path in paths
+        if f'# SPDX-License-Identifier: {licence}'
+        not in path.read_text(encoding='utf-8').splitlines()[:2]
+    ]
+    assert without == []
 
 
 def test_the_version_is_the_same_everywhere(setup_arguments: dict[str, Any]) -> None:

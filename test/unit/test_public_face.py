@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The functions of the package: their examples run, and users need nothing deeper."""
 
 import ast

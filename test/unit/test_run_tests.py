@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """tools/run-tests: every test is in one group, and a failure in any of them is a failure."""
 
 import subprocess

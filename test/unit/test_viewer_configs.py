@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The configurations of RViz and Foxglove name only what these programs have.
 
 That each topic in them has the type that is expected there is tested with running nodes, in

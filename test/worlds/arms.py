@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Small arms: planar ones of links that are easy to reckon with, and any that joints make."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Sessions simulated for the tests of the fit: an LWR 4+ seen by one or two sensors."""
 
 from __future__ import annotations

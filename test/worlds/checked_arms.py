@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Checks of an arm, day by day, with what has changed at one of them."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Arms with known errors, and their compensation.json."""
 
 from __future__ import annotations

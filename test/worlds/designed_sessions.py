@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Sessions of chosen configurations: every sensor measures all of its markers in one frame."""
 
 from __future__ import annotations

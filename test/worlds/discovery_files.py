@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What discovery.json holds, for tests of what reads it."""
 
 from __future__ import annotations

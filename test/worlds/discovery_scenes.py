@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Sessions with something wrong in them, made row by row, for the tests of the discovery."""
 
 from __future__ import annotations

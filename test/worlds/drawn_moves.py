@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Trajectories as a planner sends them, and what a controller draws of them."""
 
 from __future__ import annotations

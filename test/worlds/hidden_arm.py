@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The arm of the hidden world: kinematics and gravity by pinocchio.
 
 Joints are counted from 1 in everything that leaves this module as a joint's number; arrays are

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What the true zero-offset is where another effect is in part the same.
 
 Of an error that follows the joint's own angle and is not named, the mean over the configurations

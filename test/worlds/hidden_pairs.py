@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Pairs of look-alikes in the hidden world: an arm is measured, and measured further.
 
 The cell is the demo's with the bar alone, and configurations come from the package's planning, as

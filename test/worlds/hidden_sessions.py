@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Sessions with something hidden in them, or nothing: for tests and benchmarks."""
 
 from __future__ import annotations

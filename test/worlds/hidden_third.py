@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A third set of poses, seen by neither fit nor guard: does the model that was returned do harm?
 
 The same arm goes on another tour during the same time. Its errors are against what the sensors

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Where the hidden world's arm goes: planned by the robot's own software, as in a real cell.
 
 Only the choice of configurations comes from `remaster_ros` (poses that face a sensor, all their

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A world that the estimating code cannot see and that shares no physics with it.
 
 Its kinematics and gravity are pinocchio's (`hidden_arm`); the effects and the least squares that

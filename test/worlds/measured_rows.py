@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Rows of a session for tests that need a few columns of them, and where markers are in them."""
 
 from __future__ import annotations

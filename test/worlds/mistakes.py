@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Mistakes of people in the tables of a session, made on purpose, for the tests.
 
 Each is returned with the option of ``remaster import`` that undoes it; None where the session has

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A world with one marker for the tests of OptiTrack: no arm; and ports that are free."""
 
 from __future__ import annotations

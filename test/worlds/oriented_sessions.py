@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Sessions of full poses of a hidden world: by a tracker, a standing camera, one on the tool.
 
 The arm is pinocchio's. A camera sees the corners of a board through a lens with distortion, to

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Tables V to VII as the paper computes them, from its own Tables I and II.
 
 The offsets of all seven joints are drawn from Table I, those of joints 1 and 7 as well, which no

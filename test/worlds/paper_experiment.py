@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Simulated experiments of the source paper's size, in the demo cell."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The numbers of Tables I to VIII of Van Wyk, Falco and Cheok, as published."""
 
 # Zero-offsets of joints 1 to 7, degrees: means, then standard deviations.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Cells for the judgement of paths: three robots, low poses, held values, long tools, boxes.
 
 Meshes are made of cylinders and boxes. Each cell is written as a user would write it: a URDF, mesh

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A collection of events alone, for the live page: no ROS, no devices."""
 
 import time

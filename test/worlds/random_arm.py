@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Random arms as URDF text for the tests: any axes, fixed joints and masses in between."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Bags as a recorder writes them, made without ROS: an arm that visits poses, and its sensors."""
 
 from __future__ import annotations

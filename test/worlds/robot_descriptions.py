@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Robot descriptions as their makers ship them once xacro has expanded them, for the tests.
 
 The kinematics are the published ones. Around them stands what such files hold besides the arm and

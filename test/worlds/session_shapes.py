@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Sessions of every shape: repeated readings, one sensor or three, no times, few poses, many."""
 
 from __future__ import annotations

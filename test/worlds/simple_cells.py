@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Cell files for tests: the shipped demo cell with changes."""
 
 from pathlib import Path

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Arms with a joint that slides, and cells for them: a rail, a SCARA, a lift, a telescope."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The scene of tests and benchmark of the stopping rule: an arm before one bar."""
 
 from __future__ import annotations

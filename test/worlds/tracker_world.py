@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A world with one reflector for the tests of the laser tracker: no arm, times as arguments."""
 
 from __future__ import annotations

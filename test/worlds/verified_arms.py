@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Arms whose correction is in a known state, measured at poses with what was wanted there."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Files of one maker's own form, read into named columns: one file a maker, one function each."""
 
 from __future__ import annotations

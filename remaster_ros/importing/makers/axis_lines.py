@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Reports with one number a line: `P1.X;1,5`, or a name and below it `X 1.5`, `Y 2.5`, `Z 3.5`."""
 
 from __future__ import annotations

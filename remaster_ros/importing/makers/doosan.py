@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Doosan's DRL, also in Python: positions of joints, posj(…), in degrees."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """FANUC's texts: positions at the end of a program (.ls), and position registers (posreg.va).
 
 FANUC counts J3 from the horizontal: what the axis itself turns is J3 + J2.

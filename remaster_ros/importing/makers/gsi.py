@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Leica's GSI, as total stations export it: words of a fixed width, point by point.
 
 A word has two digits of what it is (11: the point's name, 81 to 83: east, north, height), four of

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Jobs of Yaskawa's (.JBI): positions in degrees, or in pulses of the motors."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """JSON: a list of objects or of lists, an object of lists, or an object a line (JSON lines)."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Kawasaki's AS: joint displacements of a saved file (.JOINTS) and of a program (#PPOINT)."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Logs in which each number has its name before it: `P1 X=1.5 Y=2.5 Z=3.5`, `A1 10.0 A2 …`."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """KUKA's own texts: axis positions of a .dat or .src file, and of $AXIS_ACT as it is shown."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Logs in which each line has the joints in brackets, as programs print a list: `P1: [0, 1]`."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """OptiTrack Motive's export of a take: rigid bodies and markers, a line a frame.
 
 Above the frames stand a line about the take and one line each for type, name, ID, in newer

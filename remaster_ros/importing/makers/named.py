@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What a maker's own file has: named columns, and what is known of how its controller counts."""
 
 from __future__ import annotations

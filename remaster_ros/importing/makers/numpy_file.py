@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Arrays that NumPy has saved (.npy, .npz): those with a row for each configuration, as text."""
 
 from __future__ import annotations

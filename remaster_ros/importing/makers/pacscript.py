@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Joint positions of Denso's PacScript (.pcs) and PAC: `J[10] = J(…)`, eight axes each."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Qualisys' exports of a capture (QTM, .tsv): markers (3D) or rigid bodies (6D), a line a frame.
 
 Above the frames stand lines with a key each. Lengths are in mm; what was not seen is 0 0 0.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Joint targets of RAPID (ABB), as Rokae writes them, and of a log of CJointT()."""
 
 from __future__ import annotations

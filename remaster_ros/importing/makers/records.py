@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Nested data (JSON, YAML) as named columns: a row for each of the records in it."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Logs of replies of a controller, with times: `[10:00:05] 0,{1.0,…},GetAngle();`.
 
 The replies of one call have the joints. Those of others are text, or places of the tool.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What ``rostopic echo -p`` and ``ros2 topic echo --csv`` print of joint states.
 
 ROS 1 has the names of the joints in cells of their own (``field.name0``); ROS 2 has no header: a

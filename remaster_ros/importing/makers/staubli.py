@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Joint variables of Staubli's VAL 3 (.dtx and older data files in XML)."""
 
 from __future__ import annotations

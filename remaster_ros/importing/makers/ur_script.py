@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Joint positions of a program of UR's: those of movej, waypoints called …_q, and of a .urp."""
 
 from __future__ import annotations

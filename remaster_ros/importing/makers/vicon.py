@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Vicon's export of a capture (Nexus, Tracker): markers, or objects, a line a frame.
 
 Each section has its name, the frames per second, the names of what it follows, the axes, the units

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Workbooks of spreadsheets (.xlsx, .xlsm): each sheet with numbers as a text table."""
 
 from __future__ import annotations

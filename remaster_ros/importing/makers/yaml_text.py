@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """YAML: samples of hand-eye calibrations (MoveIt, easy_handeye2), messages that ROS prints."""
 
 from __future__ import annotations

@@ -1,1 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
 """Leica laser trackers by the emScon protocol."""

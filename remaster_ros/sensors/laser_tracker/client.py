@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Client of a laser tracker by emScon: lock the reflector, measure it standing still.
 
 A tracker follows the reflector with its beam. When the beam breaks it has to find the reflector

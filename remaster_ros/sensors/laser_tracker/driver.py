@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A laser tracker as the sensor of a node: one ADM measurement on request, the reflector kept.
 
 The reflector is found again when the beam has broken. Once the tracker is registered, the search

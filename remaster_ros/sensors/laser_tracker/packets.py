@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The Leica emScon subset that is used here: bytes to events and back, both directions, no I/O.
 
 Every packet is ``int32 size`` (of the whole packet), ``uint32 type`` and a body, little-endian and

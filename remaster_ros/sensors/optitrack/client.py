@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """An OptiTrack client: sockets and one thread around the NatNet decoder; no ROS.
 
 Nothing that arrives can end the thread: what is foreign, damaged, late or not measured is counted

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """An OptiTrack bar as the sensor of a node: the measured positions of the markers of a body.
 
 Occluded, model-filled and otherwise unmeasured frames never become a reading; they are counted

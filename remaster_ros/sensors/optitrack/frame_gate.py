@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """From a frame of data to one marker reading, or the reason why not; no sockets, no clocks."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What both OptiTrack clients have in common: the thread, the markers, counts and diagnosis."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """NatNet, OptiTrack's streaming protocol: datagrams to events and back; no sockets.
 
 A client decodes with `decode_message` and encodes with the ``encode_…_request`` functions; a

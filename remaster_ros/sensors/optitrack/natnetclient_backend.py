@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The backend ``client: natnetclient``: PyPI ``natnetclient``, guarded.
 
 That package (LGPL, 2018) reads NatNet 2.6 to 2.10 from a server on the same computer that sends

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """How to reach an OptiTrack server, and which marker to follow."""
 
 from __future__ import annotations

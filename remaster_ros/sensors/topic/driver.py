@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A topic as a sensor: the positions that a node which is not of this package publishes.
 
 That node sends no heartbeat. Whether it works, and how well, is judged from its messages: how many

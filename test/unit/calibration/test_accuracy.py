@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The paper's metrics on cases that can be done by hand."""
 
 import numpy as np

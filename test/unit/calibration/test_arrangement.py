@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Tables whose joints are otherwise than the robot's are recognised, and right ones left alone."""
 
 from dataclasses import replace

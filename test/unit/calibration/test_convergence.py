@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """R-hat, effective sample size and Pareto smoothing: those of arviz, and where they have none."""
 
 import numpy as np

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Noise along and across the line of sight: found where it is, not where it is not."""
 
 from dataclasses import replace

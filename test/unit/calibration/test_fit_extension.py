@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A fit with further physical effects: the truth comes back, next to the core parameters."""
 
 from dataclasses import replace

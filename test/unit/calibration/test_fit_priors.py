@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Priors that a user gives take part in the fit, and are reported where they decide."""
 
 import numpy as np

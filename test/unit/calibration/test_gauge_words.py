@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What a terminal says of a joint that the data do not determine: one line, with the remedy."""
 
 import pytest

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Looks at a test while data come in: the error rate of all of them together is held."""
 
 import numpy as np

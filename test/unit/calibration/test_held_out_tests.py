@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Held-out poses are held against poses left out of the fit, sensor by sensor."""
 
 from dataclasses import replace

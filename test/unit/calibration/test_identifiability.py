@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The null directions of an LWR 4+ that sensors watch: found, named, fixed."""
 
 from dataclasses import replace

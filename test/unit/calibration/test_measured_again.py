@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Held-out configurations that were fitted as well are counted, and prove nothing."""
 
 from dataclasses import replace

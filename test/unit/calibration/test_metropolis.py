@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The samplers on targets that are known exactly; SciPy is the judge.
 
 KS tests run on draws thinned to independence, with fixed seeds: a correct sampler fails one with

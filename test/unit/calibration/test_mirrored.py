@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A sensor whose points are mirrored is refused by name, and no other."""
 
 from dataclasses import replace

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The prediction of a marker, its derivative, and the coordinates with the gauge taken out."""
 
 from dataclasses import replace

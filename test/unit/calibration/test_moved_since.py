@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A sensor that was moved in mid-session: when, and by how much."""
 
 from dataclasses import replace

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """One noise engine for fit and discovery: sums, Gram matrices and whitening say the same."""
 
 from dataclasses import replace

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Whether noise explains what a fit leaves: by what is stated and by the scatter within poses."""
 
 from dataclasses import replace

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Errors of a camera on the tool are those of what it measures, in its own frame.
 
 Its place in front of the board, by its readings, has the noise of the orientation at the distance.

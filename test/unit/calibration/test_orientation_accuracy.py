@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Orientation errors beside eq. 17 and 18, where a sensor measures full poses."""
 
 from dataclasses import replace

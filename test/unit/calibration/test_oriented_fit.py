@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Orientations in the fit: derivative, gauge, coverage, gross errors, what is refused."""
 
 from dataclasses import replace

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Gross errors: named with their numbers, neighbours and heavy tails left alone."""
 
 import numpy as np

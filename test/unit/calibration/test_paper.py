@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The source paper's estimator: its equations, and that it reports its failure to converge."""
 
 from dataclasses import replace

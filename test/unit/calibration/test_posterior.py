@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The log density against SciPy's, and the linear approximation against the exact density."""
 
 from dataclasses import replace

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What a fit knows with the noise integrated out, and how much more data a goal takes."""
 
 from functools import lru_cache

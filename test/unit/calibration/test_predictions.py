@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Predicted positions with their covariance: as wide as errors on other poses are."""
 
 from dataclasses import replace

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Section V-C on posteriors whose distances are known."""
 
 from dataclasses import replace

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Structure in the residuals is found, noise is left alone, and the intervals become honest."""
 
 from collections.abc import Callable

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Arms with a joint that slides: kinematics against pinocchio, offsets in m, refusals."""
 
 import json

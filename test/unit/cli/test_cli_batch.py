@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """``remaster batch``: rows that stay, workers that die, and what is said over all sessions."""
 
 import json

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """``remaster check``: the history, what it refuses, and what is printed."""
 
 import json

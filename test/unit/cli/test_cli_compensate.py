@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """``remaster compensate``: a table of joint targets, corrected and back, and what is refused."""
 
 import csv

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Progress shows on a terminal and nowhere else."""
 
 import os

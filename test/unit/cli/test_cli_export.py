@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """``remaster export``: each form, read by an independent program, is the arm as it was found.
 
 Pinocchio reads URDFs, xacro makes them, urchin reads ``<calibration>``. Of ros2_control's

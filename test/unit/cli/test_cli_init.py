@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Robot descriptions become cell files in which poses can be planned, without an edit."""
 
 import json

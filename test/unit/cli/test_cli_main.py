@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Whatever a verb raises becomes one line on stderr and an exit status."""
 
 import os

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Option values that cannot be are refused with one line that names option and value."""
 
 import argparse

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """`remaster plan`: what is printed, as text and as JSON, and what is refused."""
 
 import json

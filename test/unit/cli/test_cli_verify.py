@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """``remaster verify``: what a session must tell, and what is printed."""
 
 import json

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """``remaster export --to tf``: registrations as static transforms, of a camera on the tool too."""
 
 import json

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A verb that fails leaves nothing behind, takes nothing away, and can be tried again."""
 
 import errno

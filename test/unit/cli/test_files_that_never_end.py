@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Every file that a command reads may be a pipe that nobody writes, or a link to a device."""
 
 import json

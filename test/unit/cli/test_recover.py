@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """`remaster recover`: 0 where nothing was lost, 3 where something was (and what), else 2."""
 
 import json

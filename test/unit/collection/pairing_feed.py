@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Sensors and joint states for tests of the pairing."""
 
 import numpy as np

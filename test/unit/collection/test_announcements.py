@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A pose that bridge or recorder missed is announced again; times are arguments."""
 
 import pytest

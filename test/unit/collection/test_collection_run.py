@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What the planner does, and in which run: a token is gone on with only where it surely lives."""
 
 import pytest

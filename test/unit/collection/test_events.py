@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The records that the nodes act on: what comes back is what was sent, or one clear error."""
 
 import json

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Three points register a sensor; further ones refine it; those that do not agree tell so."""
 
 import itertools

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A reading of frames, some of which are not of the marker: right, with the others' scatter."""
 
 import numpy as np

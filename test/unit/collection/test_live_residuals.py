@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Residuals beside a session: paired by settling, registered by least squares."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Joint positions by name: in any order, among others, and never of a joint that stands twice."""
 
 from types import SimpleNamespace

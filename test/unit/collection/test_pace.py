@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Time that a collection still takes, from what it took so far while it ran."""
 
 from __future__ import annotations

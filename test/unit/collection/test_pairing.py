@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Pairing: only what was captured after settling, while the arm stood, is ever an observation."""
 
 import numpy as np

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Several markers of a sensor: of one frame, and measured one after another."""
 
 from dataclasses import replace

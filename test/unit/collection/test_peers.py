@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The other nodes of a cell: what the preflight knows of them, and whether they mean one arm."""
 
 import pytest

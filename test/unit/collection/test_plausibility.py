@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Swapped and frozen markers: found by the robot's own motion, and good ones let through."""
 
 from dataclasses import replace

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Which configuration is read, by which messages, and what becomes of it: stamps are arguments."""
 
 import numpy as np

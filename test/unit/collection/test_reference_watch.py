@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """References: few are enough, every change is named and measured, nothing is found in nothing."""
 
 from dataclasses import replace

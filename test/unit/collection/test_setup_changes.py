@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What the recorder says of the references: once, again where it grows, and after a restart."""
 
 import subprocess

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Readings of an arm with a joint that slides: what counts as still, frozen, slipped and known."""
 
 import json

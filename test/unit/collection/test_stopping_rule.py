@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """When a collection ends because enough is known, on simulated sessions."""
 
 import json

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Which pose is next, with the journal of a real session and tours of a few poses."""
 
 from dataclasses import replace

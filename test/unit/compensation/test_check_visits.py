@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The configurations of a check: chosen, written, read again, and refused where they are none."""
 
 import numpy as np

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Checks day by day: what has changed is found and named, and nothing where nothing has."""
 
 import numpy as np

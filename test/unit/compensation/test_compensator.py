@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The correction against what each effect is defined to do, and its behaviour at its limits."""
 
 from dataclasses import replace

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What becomes of other planners' trajectories, against what a controller draws of them."""
 
 import time

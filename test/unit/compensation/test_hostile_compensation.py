@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """compensation.json of somebody who means harm: refused in one line, naming the place in it."""
 
 import json

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A correction that is made of every command: held against the arm, and where the arm then is."""
 
 import json

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Where a joint is driven to and what is set there: within its limits, in the pad's digits."""
 
 import numpy as np

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What a controller draws through the corrected points, against the wanted path of the tool."""
 
 from dataclasses import replace

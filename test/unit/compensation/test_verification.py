@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Each state of a correction is called by its name, and what is too small to tell is unclear.
 
 Cheap: a few arms of each kind; `make qualify` has the shares over hundreds.

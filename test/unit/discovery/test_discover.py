@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The discovery on small sessions: the cause by name, or nothing; in another session; in doubt.
 
 Tests that need the same search are in this file, so that it is made once.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Every effect's columns against numerical derivatives of its own equation."""
 
 import ast

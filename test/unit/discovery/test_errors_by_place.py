@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Errors that follow the place before a sensor, too weak for the search, are reported."""
 
 from dataclasses import replace

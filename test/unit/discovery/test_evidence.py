@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Fits of sets of cells: Gram matrices that are kept, cells taken out, noise that is settled."""
 
 from typing import Any

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Lengths and tilts off the drawing: what they do to the offsets, and the robot model of them."""
 
 import json

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Held-out poses are compared with poses left out of the fit, both by what was to be expected."""
 
 import numpy as np

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The decision between look-alikes: of two cells, of one of them, and of a free form."""
 
 from dataclasses import replace

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Errors that no measuring instrument has are no noise, whatever the search finds in them."""
 
 from dataclasses import replace

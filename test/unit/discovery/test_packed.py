@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Symmetric matrices of which one half is kept."""
 
 import numpy as np

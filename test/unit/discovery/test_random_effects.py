@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Kinds of errors in one model: those with a name stay, of the others those that show."""
 
 import numpy as np

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """How much of the gain is lost without each cause."""
 
 from dataclasses import replace

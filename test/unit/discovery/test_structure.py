@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Structure without a cause, steps at a moment, and what is implausible: found, and bounded."""
 
 import re

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What of the measurement is taken out of what a robot can load."""
 
 import numpy as np

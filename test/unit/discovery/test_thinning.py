@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A large session is searched in part, evenly; a small one as it is."""
 
 from dataclasses import replace

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """From a search to the model that is sampled: where the zero-offsets may go beside its effects."""
 
 from dataclasses import replace

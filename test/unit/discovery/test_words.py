@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What people are told of a cause: its heading, its sentence, and what to do, for every effect."""
 
 import re

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A table becomes a session, by the command."""
 
 import pytest

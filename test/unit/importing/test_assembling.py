@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Joining two tables, poses by equal goals, fair splits, and what is refused with its row."""
 
 from pathlib import Path

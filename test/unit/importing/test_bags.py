@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A bag of joint states and points becomes rows: one for each standstill and sensor."""
 
 import numpy as np

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Small inputs on which users got stuck: the offsets that made them, or what to do."""
 
 from pathlib import Path

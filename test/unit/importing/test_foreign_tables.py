@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Tables of five other programs become sessions, and each session can be fitted."""
 
 import json

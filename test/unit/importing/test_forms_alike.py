@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The same rows as text, workbook, JSON, YAML and arrays are the same to the last digit."""
 
 import json

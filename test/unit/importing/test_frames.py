@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Data frames are read as the same table in a file is; their index joins two of them."""
 
 import numpy as np

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Sessions of arrays, of columns by name, and of files, from Python."""
 
 import numpy as np

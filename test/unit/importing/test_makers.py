@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Joints from the text of each maker's controller; what is damaged is read right or refused."""
 
 import random

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Plain tables and takes with one thing wrong: read right but for it, or refused."""
 
 import json

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Columns of 4×4 matrices are a point and a quaternion; those of torques go into the session."""
 
 import numpy as np

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Reading takes time in proportion to a file's length, whatever is in it, and ends.
 
 Each text is read as `remaster import` reads it, at two lengths: a reader that is quadratic takes

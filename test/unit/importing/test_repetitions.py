@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """No reader of a maker's text takes longer than its length says, whatever is repeated in it.
 
 An expression with two ways to match the same text tries them all where the text ends otherwise.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What import says of rows that do not fit, of too few, and what it proposes."""
 
 import json

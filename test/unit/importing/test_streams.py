@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A take and a log of joints with two clocks become rows: one for each stop that both have."""
 
 import itertools

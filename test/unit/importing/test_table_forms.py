@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Tables, logs and programs as people really have them: each is read, or refused in one line."""
 
 import gzip

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Separators, decimal signs and encodings are found; damaged tables give one clear error."""
 
 import random

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Orientations in any form are read as the arm turned, or left out with a sentence."""
 
 import numpy as np

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Arms and bodies for tests of collisions."""
 
 from pathlib import Path

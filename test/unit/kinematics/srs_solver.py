@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Closed-form inverse kinematics of a spherical-roll-spherical arm, the judge of the tests.
 
 Written from the geometry, with nothing of the package: shoulder at (0, 0, d_base), elbow and

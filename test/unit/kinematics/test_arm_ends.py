@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The ends of an arm are found in descriptions as their makers ship them."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Configurations: distances by closed forms, clearance, what is left out."""
 
 import numpy as np

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Paths without a collision, and what the motion gate takes of the bodies."""
 
 import numpy as np

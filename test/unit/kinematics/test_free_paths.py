@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Free paths around what is in the way, and ways out of margins and contacts."""
 
 import numpy as np

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Inverse kinematics against a closed-form S-R-S solver, and on two 6R arms."""
 
 from pathlib import Path

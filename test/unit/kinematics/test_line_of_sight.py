@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Capsules around the links: distances of segments and the line of sight."""
 
 import numpy as np

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The robots in config/robots, against their makers' dimensions and pinocchio."""
 
 from pathlib import Path

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A robot description against the arm of a cell: only what matters to motion is compared."""
 
 import re

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The serial chain, judged by pinocchio (kinematics, gravity) and finite differences."""
 
 import numpy as np

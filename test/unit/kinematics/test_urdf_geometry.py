@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Collision geometry of a URDF: on which joint it hangs, where, and what is refused."""
 
 import numpy as np

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A gate that judges whatever waypoints a test wants to see judged."""
 
 import copy

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The supervisor with an arm in stepped time: a servo that lags and overshoots behind cubics."""
 
 import copy

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """One configuration after the other: who must be heard, what is asked, what is announced."""
 
 import numpy as np

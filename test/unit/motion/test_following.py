@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Where the arm is by its reports: whether it stands, and on its path, lag, and what is lost."""
 
 import numpy as np

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The gate for trajectories of other planners, against what a controller draws of them."""
 
 import numpy as np

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Reports that are believed and that are not: values, speeds, stamps, lateness, three clocks."""
 
 import numpy as np

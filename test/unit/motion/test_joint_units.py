@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Joints that slide: the gate in metres against SciPy's cubics, and what else is told in mm."""
 
 import dataclasses

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Joint limits, speeds, accelerations: of a chain, shifted by offsets, and in words."""
 
 from types import SimpleNamespace

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Liveness of sensors: silent, not ready, back again."""
 
 import math

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The gate: every single violation is refused alone, judged by SciPy's cubics sampled densely."""
 
 import dataclasses

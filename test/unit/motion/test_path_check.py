@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Speeds of points against numerical differences and pinocchio; free paths and their distance."""
 
 from pathlib import Path

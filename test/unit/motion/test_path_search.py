@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The way that the bridge finds beside its callbacks: straight, the planner's, around, or none."""
 
 import functools

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Moves in pieces: what a controller has ends soon, and no renewal is seen in the motion."""
 
 import copy

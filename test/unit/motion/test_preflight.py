@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Preflight: every single thing that is missing is named, and nothing else is in the way."""
 
 from dataclasses import replace

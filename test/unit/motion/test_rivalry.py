@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Of two nodes of one name exactly one goes on, whatever the order of their messages."""
 
 import pytest

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Settling: still means still, at the target, for the whole time, and seen all the while."""
 
 import numpy as np

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The tables of the supervisor's states: what they allow, that all of it happens, and the page."""
 
 import copy

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Stops: never back, never faster, never off the line or beyond its end, not too hard."""
 
 import dataclasses

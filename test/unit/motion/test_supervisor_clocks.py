@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Stops, late and lost messages, pauses of this process, clocks that differ or run fast."""
 
 import re

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Ends of motions that are neither arrivals nor plain stops; limits that change on the way."""
 
 import dataclasses

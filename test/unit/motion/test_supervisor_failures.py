@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The supervisor and failures in a row, and conditions that end or hold a collection."""
 
 import numpy as np

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What halts an arm, in which words, that nothing is commanded then, and what lets it go on."""
 
 import pytest

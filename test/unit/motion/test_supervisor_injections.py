@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Whatever happens: nothing is commanded outside limits, speeds, accelerations; none after a halt.
 
 320 runs of six seconds with one to four injections each, at random moments. Each command is judged

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Ways to the solutions: asked for, answered late, to another pose, or not at all."""
 
 import numpy as np

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The probe: is an arm commanded as measured, or does its driver repeat commands?"""
 
 import numpy as np

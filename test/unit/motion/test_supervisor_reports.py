@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The supervisor and reports that are wrong, unreadable, frozen, late or of a clock that jumps."""
 
 import numpy as np

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Arms that do what they are told and arms that do not: what is decided, and in which words.
 
 An arm with joints that slide is judged as one whose joints turn, a quarter of a metre a radian:

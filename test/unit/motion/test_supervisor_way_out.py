@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The way out of a margin: offered, confirmed by a person, gone slowly."""
 
 import numpy as np

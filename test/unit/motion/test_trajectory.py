@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Lines and trajectories: within speeds and accelerations, exactly on the line, to rest."""
 
 import dataclasses

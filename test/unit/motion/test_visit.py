@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What becomes of a configuration at the very limits of its times and distances."""
 
 import dataclasses

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What is done where it is not sure that the arm is where it is reported; who goes on when."""
 
 import copy

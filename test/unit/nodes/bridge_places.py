@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Where the arm of the bridge's tests goes, and what its true arm is where it is corrected."""
 
 import numpy as np

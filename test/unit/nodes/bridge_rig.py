@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The robot bridge in the test's process, on a clock that the test moves on, and a peer.
 
 The peer is what the bridge works between: planner, recorder, robot and controller, as a node in a

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The compensator between a planner and a controller, all on real DDS: both are fakes."""
 
 import json

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The robot bridge of most tests here, and plain nodes; other nodes have a rig of their own."""
 
 import pytest

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Nodes in the test's process, each in a context of its own as a process has one."""
 
 import time

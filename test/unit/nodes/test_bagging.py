@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What comes fast does not wait behind what comes seldom."""
 
 import time

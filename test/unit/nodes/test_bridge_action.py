@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The bridge that commands by FollowJointTrajectory: goals on the real DDS, and their ends."""
 
 import sys

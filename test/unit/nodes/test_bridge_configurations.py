@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Configurations and ways that the robot bridge commands, and what it makes of bad ones."""
 
 import hashlib

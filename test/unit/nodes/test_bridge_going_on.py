@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The bridge's shell: the first move after a start, and who goes on after an interruption."""
 
 import numpy as np

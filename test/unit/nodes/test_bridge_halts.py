@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The robot bridge's shell: who else commands, the emergency stop, and halts that are kept."""
 
 import json

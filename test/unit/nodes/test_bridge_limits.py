@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What parameters, cell and offsets make of the limits that the robot bridge keeps."""
 
 import numpy as np

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A bridge does not move an arm that planner, recorder or the robot itself know otherwise."""
 
 import pytest

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The robot bridge's shell: what it makes of each message, and each message that it sends."""
 
 import runpy

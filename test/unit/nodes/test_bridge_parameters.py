@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Parameters of the bridge: their ranges, and what the supervisor keeps of them."""
 
 import dataclasses

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Moves in pieces between the real bridge and a controller, by its topic and by its action."""
 
 import time

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The bridge of arms with a joint that slides: moved, stopped, halted, by DDS."""
 
 import re

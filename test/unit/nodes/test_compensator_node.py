@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The compensator: what it passes on, what it refuses, and how it is switched."""
 
 import threading

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A demo of few candidates has enough poses to fit, whatever its seed."""
 
 import numpy as np

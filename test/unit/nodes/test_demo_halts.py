@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A demo whose arm is halted says so, offers to go on, and fits what was measured."""
 
 from types import SimpleNamespace

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The link to the robot's safety circuit: when its state is known, and when it is missed."""
 
 from types import SimpleNamespace

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Hostile values to every subscription, service and parameter of every node, in every state.
 
 No message, request or parameter may end a node that leads an arm, nor lead to what nobody has

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The launch files with stand-ins for launch, and what they start, which needs none."""
 
 from __future__ import annotations

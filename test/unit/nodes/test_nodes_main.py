@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """`python -m remaster_ros.nodes` lists the nodes, and names the one that was meant."""
 
 from __future__ import annotations

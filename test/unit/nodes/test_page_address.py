@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The file that leads to the live page is for this user alone."""
 
 from __future__ import annotations

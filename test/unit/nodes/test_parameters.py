@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Node parameters: every config file fits; wrong values are refused with one line."""
 
 import importlib

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The arm follows no plan that a person has not looked at, where the cell asks for that."""
 
 import dataclasses

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The planner's node announces no pose of a plan that was not confirmed, whatever led there."""
 
 import time

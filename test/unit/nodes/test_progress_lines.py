@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Lines in the terminal of a launch."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Who else publishes: told at once, or by their leases where a killed one may still be listed."""
 
 from types import SimpleNamespace

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Whose collection is still under way: this boot, a clock that nobody sets."""
 
 import os

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A lock per node name and domain, which goes with its process."""
 
 import os

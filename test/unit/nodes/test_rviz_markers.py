@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Markers for RViz: what the live page shows, in base_link."""
 
 from __future__ import annotations

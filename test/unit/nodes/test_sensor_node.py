@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The node of any sensor, around drivers without a device: what is published, retried, refused."""
 
 import os

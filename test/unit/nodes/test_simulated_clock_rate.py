@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Time of a node's watchdogs: the wall clock's beside an arm, and never faster than that.
 
 And what a simulation that waits for its nodes hears of them.

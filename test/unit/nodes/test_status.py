@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What a node publishes of itself: a record for the nodes, the same as text for people."""
 
 import time

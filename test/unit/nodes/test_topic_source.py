@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A topic of another package's node as a sensor, through real DDS: its publishers are fakes."""
 
 import time

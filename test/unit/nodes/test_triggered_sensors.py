@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Measurements asked for: again where question or answer was lost; clients are stand-ins."""
 
 from types import SimpleNamespace

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What the live page tells of a fit, and whom a pose waits for while somebody looks on."""
 
 from __future__ import annotations

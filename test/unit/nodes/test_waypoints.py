@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Waypoints on their own topic: grouped again by the solution that they lead to."""
 
 import numpy as np

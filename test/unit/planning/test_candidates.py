@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Planning: the paper's equations, what is dropped and why, and the order of the visit."""
 
 from pathlib import Path

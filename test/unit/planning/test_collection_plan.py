@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A whole collection before it begins: designs and orders of a cell, every way of them free."""
 
 from collections import Counter

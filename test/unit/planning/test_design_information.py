@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What configurations tell: exact under shared noise, and the standard deviations of the fit."""
 
 from dataclasses import replace

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The choice of configurations: what is wanted is reached, in less time, with the floors kept."""
 
 from functools import cache

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Configurations that tell two causes apart, and what they are said to bring."""
 
 from dataclasses import replace

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The order of a collection: proximity, splits mixed, registration by the widest triangle."""
 
 import numpy as np

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Times of motion are those of the bridge's trajectories; orders by them are nearly the best."""
 
 from itertools import pairwise, permutations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What the page of `remaster report` decides: the deed, the gain, the colour, what remains."""
 
 import builtins

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What the page of `remaster report` tells of the plan of its session."""
 
 from dataclasses import replace

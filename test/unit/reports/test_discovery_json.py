@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """discovery.json as the contract has it, and a report that stands alone, for every verdict."""
 
 import csv

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """fit.json keeps its contract, and the three ways to apply offsets do the same."""
 
 import json

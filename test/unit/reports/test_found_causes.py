@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Causes and look-alikes of an earlier search, as plans and decisions take them."""
 
 import json

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The live page among connections that want nothing of it: floods, trickles, garbage, no reader.
 
 The server is a process of its own, with a pipe as stderr that nobody reads meanwhile.

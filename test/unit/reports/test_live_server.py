@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The web server of the live page, read as somebody who is not meant to use it would."""
 
 import gzip

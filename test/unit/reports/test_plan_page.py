@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The page of a plan: complete in itself, true to the plan, and played in a browser."""
 
 import base64

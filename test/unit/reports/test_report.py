@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The report is one page that needs nothing else, with the verdict, and of bounded size."""
 
 import re

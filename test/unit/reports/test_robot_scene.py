@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The scene that pages draw: the arm's own meshes where they can be read, else its bodies."""
 
 import numpy as np

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What a fit is worth: never green where anything contradicts it, with the reason in words."""
 
 import html

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Capture times: jitter of the arrival drops out, a restarted device is followed."""
 
 import numpy as np

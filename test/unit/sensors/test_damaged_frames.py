@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """NatNet frames with damaged bytes, from the wire to the mean that is recorded.
 
 NatNet has no checksum. Some damaged frames pass all that is asked of a single one; no mean of a

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What a driver must have is asked for where its class is defined."""
 
 import pytest

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Which frames give a reading of the marker, and why the others do not."""
 
 import math

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Who gets the lock, who keeps it, and who is never given it; times in seconds of one clock."""
 
 import pytest

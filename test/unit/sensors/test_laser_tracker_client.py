@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The driver against the fake tracker over real sockets."""
 
 import contextlib

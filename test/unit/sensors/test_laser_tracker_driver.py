@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A laser tracker's driver on the fake's wire: one of several reflectors, never another one."""
 
 import numpy as np

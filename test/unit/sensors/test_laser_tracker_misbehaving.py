@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The driver against scripted peers over real sockets: what no instrument should do."""
 
 import contextlib

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The emScon packets: whole, byte by byte, with trailing junk, damaged; no network."""
 
 import itertools

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The OptiTrack client on real sockets, against the fake server."""
 
 import socket

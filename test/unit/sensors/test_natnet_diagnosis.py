@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Which of address, interface, multicast, port, version or rigid body is wrong."""
 
 import dataclasses

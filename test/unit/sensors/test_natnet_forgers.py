@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Frames are believed from one address and port: forgers on the server's computer.
 
 A forger copies each genuine frame, moves its marker by 3 mm (less than what counts as a jump) and

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Frames of data: sizes, round trips and damage, for every bitstream version."""
 
 import contextlib

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Everything but frames: server info, requests, model definitions; whole, cut and damaged."""
 
 import contextlib

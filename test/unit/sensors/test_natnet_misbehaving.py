@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The OptiTrack client against a server that sends exactly what a test wants sent."""
 
 import socket

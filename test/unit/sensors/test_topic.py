@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Topics of other packages' nodes: what is read of a message, and what the stream shows."""
 
 import time

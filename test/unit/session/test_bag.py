@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Other people's readers open our bags; a killed writer leaves all it wrote; damage is refused."""
 
 import logging

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A bag that goes on after a kill, or is damaged: one bag of several files, or refused."""
 
 import os

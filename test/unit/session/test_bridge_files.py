@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What a bridge keeps on the disk: a halt, and where the arm was led last."""
 
 import json

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Keys of a cell file: what they come to, and one clear line for each that is wrong."""
 
 import pytest

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Chunks that unpack to more than they state are refused before they are in memory."""
 
 import struct

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """How a pad writes the joints is kept in session.yaml, and refused where it cannot be so."""
 
 from dataclasses import replace

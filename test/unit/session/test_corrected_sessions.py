@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Sessions measured with a correction on: what is told of them, and how they are fitted."""
 
 from dataclasses import replace

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Simulated power cuts in the life of a session; CRASH_STATES=12000 tries more.
 
 What a crash may leave is in test/faults/crash_states.py, what must hold then in session_crashes.py

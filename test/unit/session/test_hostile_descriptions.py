@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Robot descriptions of somebody who means harm: refused in one line, and nothing is done."""
 
 import logging

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Every reader of files, on spoilt files: it reads them or raises `InputError`, nothing else."""
 
 import logging

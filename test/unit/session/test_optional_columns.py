@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Columns and keys that a session may leave out: kept, not there without, refused by place."""
 
 from dataclasses import replace

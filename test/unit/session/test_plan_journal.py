@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A planner that is started again takes up its tour where it was, and refuses another plan."""
 
 from dataclasses import replace

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The file of priors: read strictly, refused in one line, and felt by the fit."""
 
 from pathlib import Path

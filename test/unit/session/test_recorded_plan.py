@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The plan of a session that is over: what was planned, expected, and became of it."""
 
 import json

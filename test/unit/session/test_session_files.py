@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The session reader refuses with one clear line; writer and reader agree to the last bit."""
 
 import logging

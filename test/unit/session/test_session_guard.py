@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What others do to the files of a session while it is written: restored, said, never sealed."""
 
 import json

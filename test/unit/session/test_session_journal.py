@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The recorder's memory: numbering, results, registration and time across restarts."""
 
 from dataclasses import replace

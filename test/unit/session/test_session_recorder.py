@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What became of configurations that the arm did not get to is in the session's journal too."""
 
 import numpy as np

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What `append` returned from is on the disk, whatever happens next."""
 
 import os

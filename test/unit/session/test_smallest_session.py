@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The smallest session of docs/session-format.md is one, and can be fitted."""
 
 import re

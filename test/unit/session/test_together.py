@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Several sessions of one arm: one set of offsets, registrations and markers of each session."""
 
 import json

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Cell files and meshes: what the arm must not hit, as a user writes it."""
 
 import numpy as np

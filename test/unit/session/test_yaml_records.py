@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Numbers of YAML files are held to the bounds that their records declare."""
 
 from pathlib import Path

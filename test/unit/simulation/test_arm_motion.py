@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The fake arm's closed-form servo, judged by SciPy's integrator and splines."""
 
 import numpy as np

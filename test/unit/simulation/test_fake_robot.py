@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The fake arm takes and drops trajectories as joint_trajectory_controller does."""
 
 import numpy as np

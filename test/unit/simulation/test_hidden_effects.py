@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Effects hidden in the fakes: over time in a World, on a stage, and as they are asked for."""
 
 import json

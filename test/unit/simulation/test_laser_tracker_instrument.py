@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The fake tracker's behaviour, step by step, without sockets, threads or clocks."""
 
 from __future__ import annotations

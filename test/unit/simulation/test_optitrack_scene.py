@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What the fake cameras see, statistically, and how the fake server answers."""
 
 import contextlib

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The fakes meet in a folder of the temporary directory, where anybody may have been before."""
 
 import os

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A simulated session is what its truth says, and looks like a recorded one."""
 
 from dataclasses import replace

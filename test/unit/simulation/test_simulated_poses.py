@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Sensors that measure poses, simulated: noise as asked for, and a fit that finds the truth."""
 
 import json

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The parts of a simulated workcell: robot, sensors, placement, order of the visits."""
 
 from pathlib import Path

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Arms with a joint that slides, simulated by the command and fitted: what comes back."""
 
 import json

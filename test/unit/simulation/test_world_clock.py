@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """World time on a clock that the test moves on: it runs at its rate, and waits for who is late."""
 
 import os

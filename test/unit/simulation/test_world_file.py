@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The file of a hidden World: it appears complete, and holds each marker once."""
 
 import numpy as np
