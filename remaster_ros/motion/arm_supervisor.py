@@ -25,7 +25,6 @@ from remaster_ros.motion.actions import (
     Failed,
     Halted,
     PathAnswer,
-    Renew,
     Stop,
     SupervisorRules,
 )
@@ -107,7 +106,6 @@ class ArmSupervisor:
         # Whether it may be elsewhere than reported, until a probe has led it there to its end.
         self._unsure = end is None
         self._wall = -np.inf
-        self._keeps_stamps = rules.keeps_stamps
         self._failures = self._refusals = 0
         self._seen: Seen | None = None
         self._doubted_wall: float | None = None
@@ -301,16 +299,13 @@ class ArmSupervisor:
         """Process since when a bridge before this one has been gone, s of wall time."""
         self._interlocks.interrupted(since_wall_s)
 
-    def not_sent(self, command: Drive | Renew | Stop, wall_s: float) -> list[Action]:
+    def not_sent(self, command: Drive | Stop, wall_s: float) -> list[Action]:
         """Process that a command was not published, as this process was paused since its decision.
 
         A move is decided again after all that arrived meanwhile is processed. An arm that was to
         be stopped goes on, and where it is now is not known.
         """
         self._motion.take_back()
-        if isinstance(command, Renew):
-            # The piece before it ends in a stop, if none comes in time.
-            return []
         if isinstance(command, Drive):
             return self._step(Event.MOVE_NOT_SENT)
         late_s = wall_s - command.wall_s
@@ -336,9 +331,7 @@ class ArmSupervisor:
         if silent and self._engaged:
             return self._halt('; '.join(filter(None, (silent, self.trouble))))
         blocked = self.blocked(wall_s)
-        if blocked:
-            return self._stop(blocked, wall_s)
-        return self._go_on_moving(wall_s) or self._go_on(wall_s)
+        return self._stop(blocked, wall_s) if blocked else self._go_on(wall_s)
 
     # What is reported
 
@@ -362,15 +355,6 @@ class ArmSupervisor:
     def end(self) -> FloatArray | None:
         """Where the last command led, (k,); None before it is sure that the arm is there."""
         return None if self._unsure else self._motion.led.end
-
-    @property
-    def next_end(self) -> FloatArray | None:
-        """Where the next piece of the move under way ends, (k,); None where there is none."""
-        return self._motion.next_end
-
-    def use_stamps(self, *, kept: bool) -> None:
-        """Send moves from now on as of `SupervisorRules.keeps_stamps`."""
-        self._keeps_stamps = kept
 
     @property
     def busy(self) -> bool:
@@ -420,26 +404,6 @@ class ArmSupervisor:
             return ''
         return f'the robot was not observed for {gap_s / self._rate:.1f} s'
 
-    # Inside: the rest of a move
-
-    def _go_on_moving(self, wall_s: float) -> list[Action]:
-        """Give the controller the next piece of a move that is followed."""
-        seen = self._seen
-        if seen is None or self.state not in (Arm.LEAVES, Arm.MOVES):
-            return []
-        due = self._motion.due(seen, wall_s, self._rate)
-        if due == 'missed':
-            # The arm is about to stop by itself; it is sent on from where it stands.
-            self._motion.end_piece(seen, wall_s, self._rate)
-            return self._step(Event.MISSED)
-        if due == 'renew' and not self._motion.lost(seen, wall_s):
-            try:
-                return self._step(Event.RENEW, self._motion.renew(seen, wall_s, self._rate))
-            except MotionRefusedError:
-                # What it has ends in a stop.
-                return []
-        return []
-
     # Inside: the next configuration
 
     def _go_on(self, wall_s: float) -> list[Action]:
@@ -469,8 +433,6 @@ class ArmSupervisor:
         return actions
 
     def _drive(self, solution: int, path: FreePath, seen: Seen, wall_s: float) -> list[Action]:
-        # A stamp that is not of the controller's clock would lead the arm to another time.
-        self._motion.keeps_stamps = self._keeps_stamps and self.reports.is_on_time
         doubtful = None
         if solution == PROBE:
             doubtful = np.logical_or(seen.frozen(), self._unsure)
@@ -568,7 +530,7 @@ class ArmSupervisor:
         if then is not None and tuple(map(type, actions)) == then.actions:
             self._motion.enter(then.state)
             return list(actions)
-        if any(isinstance(action, Drive | Renew | Stop) for action in actions):
+        if any(isinstance(action, Drive | Stop) for action in actions):
             self._motion.take_back()
         self.halted = self.halted or f'a fault of this program: "{event}" while the arm {state}'
         self._motion.enter(Arm.HALTED)

@@ -36,9 +36,6 @@ SLOWED_RAD = 5e-3
 """Only where its path leads on by so much in this time, rad."""
 SLOWED_SHARE = 0.5
 """An arm that has gone less than this share of it is being stopped."""
-JOINED_WITHIN_S = 1.0
-"""So long after the rest of a trajectory was sent anew the arm has joined it, s: `pieces.JOINS_S`,
-and a command's way."""
 LAG_CHANGES_S = 0.1
 """By so much the lag of an arm that follows may have changed in this time, s."""
 VARIES_S = 1.0
@@ -104,38 +101,26 @@ class Following:
 
     ``trajectory``: where it was sent; ``sent, sent_wall``: when, robot time and wall time, s;
     ``rules``: how far it may lag and how long a command may take to be seen.
-    Attributes: ``sent``: when it was, robot time, s; ``reacted``: whether the arm has left its
-    start, or goes too short a way for that to be seen.
+    Attributes: ``reacted``: whether the arm has left its start, or goes too short a way for that
+    to be seen.
     """
 
     def __init__(
         self, trajectory: Trajectory, sent: float, sent_wall: float, rules: SupervisorRules
     ) -> None:
         self.trajectory, self._rules = trajectory, rules
-        self.sent, self._sent_wall = sent, sent_wall
+        self._sent, self._sent_wall = sent, sent_wall
         self.reacted = False
         self._lag_s = 0.0
         # The last moments: time since it was sent (s), where the arm was, its lag (s).
         self._trail: deque[tuple[float, FloatArray, float]] = deque()
-        # By how much it was set back last, s, and when, s since it was sent.
-        self._set_back_s = 0.0
-        self._set_back_at: float | None = None
         self._allowed_s, self._early_s = rules.lag_s, EARLY_S + LATENCY_S
         self._astray = ''
         self._astray_wall: float | None = None
 
     def elapsed_s(self, time: float) -> float:
         """Return the time since it was sent at a robot time, s."""
-        return time - self.sent
-
-    def set_back(self, by_s: float) -> None:
-        """Process that the rest of the trajectory is sent anew, later by `by_s`.
-
-        A controller may begin it where the arm is, so that its servo has to gain its lag again.
-        """
-        self.sent += by_s
-        self._set_back_s, self._set_back_at = by_s, None
-        self._trail = deque((t - by_s, q, lag - by_s) for t, q, lag in self._trail)
+        return time - self._sent
 
     def update(self, seen: Seen, rate: float) -> str:
         """Process a report; return how the arm has been off its path for too long, ''."""
@@ -146,8 +131,6 @@ class Following:
         elapsed = self.elapsed_s(seen.time)
         self._astray = self._look(seen, elapsed)
         self._trail.append((elapsed, seen.q, self._lag_s))
-        if self._set_back_at is None:
-            self._set_back_at = elapsed
         while len(self._trail) > 1 and elapsed - self._trail[1][0] >= SLOWED_S:
             self._trail.popleft()
         if not self._astray:
@@ -178,11 +161,7 @@ class Following:
         # In a rest the lag is what the arm still has to the end of the line.
         index, since_s = self.trajectory.line_at(reported)
         rested_s = max(since_s - self.trajectory.lines[index].duration_s, 0.0)
-        at = reported if self._set_back_at is None else self._set_back_at
-        # A controller that joins from where it has led the arm is ahead until it has.
-        ahead_s = max(self._set_back_s, 0.0) if reported - at < JOINED_WITHIN_S else 0.0
-        low_s = reported - rested_s - self._lag_s - jitter
-        return low_s, elapsed + seen.late_s + jitter + ahead_s
+        return reported - rested_s - self._lag_s - jitter, elapsed + seen.late_s + jitter
 
     def has_ended(self, seen: Seen, wall_s: float, rate: float) -> bool:
         """Whether the arm is at the end of the trajectory, or will be without any command."""
@@ -241,8 +220,6 @@ class Following:
             line.share(since_s + passed_s + change)[0] - line.share(since_s + change)[0]
             for change in (-LAG_CHANGES_S, 0.0, LAG_CHANGES_S)
         )
-        if self._set_back_at is None or now - self._set_back_at < SLOWED_LONGEST_S:
-            expected -= units.largest(line.way) * line.rate * self._set_back_s
         moved = units.largest(q - q_before)
         return expected > SLOWED_RAD and moved < SLOWED_SHARE * expected
 

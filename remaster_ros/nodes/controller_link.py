@@ -52,9 +52,6 @@ CODES = {
 UNDER_WAY = (GoalStatus.STATUS_ACCEPTED, GoalStatus.STATUS_EXECUTING, GoalStatus.STATUS_CANCELING)
 OVER = (CancelGoal.Response.ERROR_UNKNOWN_GOAL_ID, CancelGoal.Response.ERROR_GOAL_TERMINATED)
 """Answers to the cancelling of a goal that is over."""
-LATEST = 3
-"""So many goals of a move may be under way: the newest, one that it replaces, one that is late."""
-STATE_TYPE = 'control_msgs/msg/JointTrajectoryControllerState'
 LAST_ANSWER_WALL_S = 0.5
 """A bridge that ends waits so long for the answer to its last stop, s: much longer than a request
 and its answer take on one computer, and no one who ends it notices."""
@@ -103,24 +100,6 @@ class ForeignGoals:
         return f'another client has sent a goal to {self._action}: end that client'
 
 
-class ControllerStates:
-    """Whether the controller publishes its state as joint_trajectory_controller does.
-
-    Of that one, and of what is derived from it, it is known what becomes of a trajectory's stamp.
-    """
-
-    def __init__(self, node: Node) -> None:
-        place = node.resolve_topic_name(COMMANDS).rpartition('/')[0]
-        self._node, self._topic = node, f'{place}/controller_state'
-
-    def is_there(self) -> bool:
-        """Return whether it does now; its type is known without the package of its message."""
-        if not self._node.count_publishers(self._topic):
-            return False
-        found = self._node.get_publishers_info_by_topic(self._topic)
-        return any(info.topic_type == STATE_TYPE for info in found)
-
-
 class TopicLink:
     """Publish the commands on the controller's topic."""
 
@@ -146,8 +125,8 @@ class TopicLink:
         """Return who else commands the controller, ''; publishers are counted elsewhere."""
         return ''
 
-    def send(self, message: JointTrajectory, kind: str) -> None:
-        """Send a trajectory that the motion gate has admitted: a move, a renewal or a stop."""
+    def send(self, message: JointTrajectory, *, stop: bool = False) -> None:
+        """Send a trajectory that the motion gate has admitted."""
         self._publisher.publish(message)
 
     def cancel(self) -> None:
@@ -225,23 +204,18 @@ class ActionLink:
             'some 20 s)'
         )
 
-    def send(self, message: JointTrajectory, kind: str) -> None:
+    def send(self, message: JointTrajectory, *, stop: bool = False) -> None:
         """Send a trajectory that the motion gate has admitted, in place of the one under way."""
         names, rules = message.joint_names, self._rules
         # rad or m, as the positions.
         end = np.full(len(names), rules.settle.arrive_tolerance) * rules.units.per_radian
-        if kind == 'stop':
+        if stop:
             # No target: where on its line the arm comes to rest is enough.
             end = path_tolerance(np.zeros(len(names)), rules)
         else:
-            speeds = np.max(np.abs([point.velocities for point in message.points]), axis=0)
-            if kind == 'move':
-                self._goals.clear()
-                self._speeds = np.zeros(len(names))
+            self._goals.clear()
             # A stop begins with the speeds of its move.
-            self._speeds = np.maximum(self._speeds, speeds)
-            # Those that were replaced are over, and only the last ones may not have been yet.
-            del self._goals[:-LATEST]
+            self._speeds = np.max(np.abs([point.velocities for point in message.points]), axis=0)
         goal = self._action_type.Goal(
             trajectory=message,
             path_tolerance=self._tolerances(names, path_tolerance(self._speeds, rules)),

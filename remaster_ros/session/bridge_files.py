@@ -82,7 +82,6 @@ class _Kept(msgspec.Struct):
     joints: list[str]
     end: list[float]
     sent_ns: int
-    next: list[float] | None = None  # Where the piece of the move behind it would end
 
 
 @dataclass(frozen=True)
@@ -93,14 +92,6 @@ class LastCommand:
     end: FloatArray | None
     # How long ago it was sent, s; infinite where that is not known.
     age_s: float
-    # Where the next piece of its move would have ended, rad, (k,): that may have been sent, too
-    next_end: FloatArray | None = None
-
-    @property
-    def places(self) -> FloatArray | None:
-        """Between which places the arm was led, rad, (n, k)."""
-        ends = [end for end in (self.end, self.next_end) if end is not None]
-        return None if self.end is None else np.array(ends)
 
 
 class LastCommandFile:
@@ -127,14 +118,11 @@ class LastCommandFile:
             return LastCommand(None, np.inf)
         # A clock that was set back leaves open how long ago it was.
         age_s = (now_ns - kept.sent_ns) / 1e9 if now_ns >= kept.sent_ns else np.inf
-        names = kept.joints == self._joints
-        end, following = (
-            np.array(one) if names and one and _is_place(one, len(self._joints)) else None
-            for one in (kept.end, kept.next)
-        )
-        return LastCommand(end, age_s, following)
+        end = np.array(kept.end)
+        known = kept.joints == self._joints and end.shape == (len(self._joints),)
+        return LastCommand(end if known and np.isfinite(end).all() else None, age_s)
 
-    def write(self, end: FloatArray, sent_ns: int, next_end: FloatArray | None = None) -> None:
+    def write(self, end: FloatArray, sent_ns: int) -> None:
         """Keep where a command leads.
 
         Raises
@@ -144,17 +132,5 @@ class LastCommandFile:
         """
         make_folder(self.path.parent)
         write_atomically(
-            self.path,
-            msgspec.json.encode(
-                _Kept(
-                    self._joints,
-                    end.tolist(),
-                    sent_ns,
-                    None if next_end is None else next_end.tolist(),
-                )
-            ),
+            self.path, msgspec.json.encode(_Kept(self._joints, end.tolist(), sent_ns))
         )
-
-
-def _is_place(values: Sequence[float], joints: int) -> bool:
-    return len(values) == joints and bool(np.isfinite(values).all())
