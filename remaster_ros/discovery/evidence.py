@@ -17,7 +17,7 @@ a Gaussian about 0 as wide as the largest plausible value.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 
@@ -63,31 +63,8 @@ def solve(
 
     It may be empty. The search for noise and smoothness begins at those of another fit, if given.
     """
-    # Penalised ones last: one Cholesky factor holds all determinants.
-    cells = tuple(sorted(cells, key=lambda cell: cell.penalty is not None))
-    norms, grams = data.gram_matrices(cells)
-    p = data.base.shape[2]
-    free = np.array([cell.penalty is None for cell in cells for _ in cell.parameters], dtype=bool)
-    if np.any(norms[p:-1][free] == 0.0):
-        return None
-    scale = units(cells, norms[p:-1])
-    largest = np.array([cell.largest or np.nan for cell in cells for _ in cell.parameters])
-    typical = LARGEST_M * np.sqrt(len(data)) / scale
-    std = np.where(np.isnan(largest), typical, largest)
-    # Of free forms the heights of a curve and a kind's weights have a plausible size, weights of
-    # kernels have none.
-    sized = np.array(
-        [
-            cell.penalty is None or cell.curve is not None or cell.form == RANDOM
-            for cell in cells
-            for _ in cell.parameters
-        ],
-        dtype=bool,
-    )
-    ridge = np.concatenate((np.zeros(p), np.where(sized, (std * scale) ** -2.0, 0.0)))
-    unit = np.concatenate((np.ones(p), scale))
-    system = _System(data.noise_model, grams, data.noise, cells, data.base_precision, unit, ridge)
-    if not system.visible():
+    system = System.of(data, cells)
+    if system is None or not system.visible():
         return None
     try:
         return system.solution(start, log_prior_one_by_one(cells))
@@ -97,7 +74,7 @@ def solve(
 
 
 @dataclass(eq=False)
-class _System:
+class System:
     """The mixed-model equations of one set of cells, in scaled columns.
 
     The Gram matrices are `packed`, (groups, length of size + 1).
@@ -110,6 +87,33 @@ class _System:
     base_precision: FloatArray
     unit: FloatArray
     ridge: FloatArray
+
+    @classmethod
+    def of(cls, data: Residuals, cells: Sequence[Cell]) -> System | None:
+        """Assemble the equations of some cells; None if one of them displaces no marker."""
+        # Penalised ones last: one Cholesky factor holds all determinants.
+        cells = tuple(sorted(cells, key=lambda cell: cell.penalty is not None))
+        norms, grams = data.gram_matrices(cells)
+        p = data.base.shape[2]
+        free = np.array([c.penalty is None for c in cells for _ in c.parameters], dtype=bool)
+        if np.any(norms[p:-1][free] == 0.0):
+            return None
+        scale = units(cells, norms[p:-1])
+        largest = np.array([cell.largest or np.nan for cell in cells for _ in cell.parameters])
+        typical = LARGEST_M * np.sqrt(len(data)) / scale
+        std = np.where(np.isnan(largest), typical, largest)
+        # Heights of a curve and weights of a kind have a plausible size, weights of kernels none.
+        sized = np.array(
+            [
+                cell.penalty is None or cell.curve is not None or cell.form == RANDOM
+                for cell in cells
+                for _ in cell.parameters
+            ],
+            dtype=bool,
+        )
+        ridge = np.concatenate((np.zeros(p), np.where(sized, (std * scale) ** -2.0, 0.0)))
+        unit = np.concatenate((np.ones(p), scale))
+        return cls(data.noise_model, grams, data.noise, cells, data.base_precision, unit, ridge)
 
     def __post_init__(self) -> None:
         self.p = len(self.base_precision)
@@ -150,6 +154,7 @@ class _System:
         return not wrong and bool(np.all(np.diag(root)[self.p :] > ABSORBED))
 
     def noise(self, eta: FloatArray) -> Noise:
+        """Return the noise of the coordinates eta."""
         count = len(self.model.channels)
         return self.model.noise(np.exp(eta[:count]), np.exp(eta[count : len(self.entering)]))
 
@@ -159,6 +164,28 @@ class _System:
         total, factor, beta = self._solved(eta)
         value = self._likelihood(total, weights, beta) - np.sum(np.log(np.diag(factor.root)))
         return float(value + self._smooth(factors, beta))
+
+    def marginal(self, eta: FloatArray) -> float:
+        """Return L with the normalised prior of the unpenalised parameters, too."""
+        prior = self.ridge[self.p : self.unpenalised]
+        return self.value(eta) + 0.5 * float(np.sum(np.log(prior)))
+
+    def most_likely(self, start: Mapping[object, float], noise: Noise | None) -> FloatArray:
+        """Return the noise and smoothness, as logarithms, that maximise L.
+
+        ``start``: smoothness of cells by key, and noise, to begin at.
+        """
+        return self._most_likely(*self._start(start, self.guess if noise is None else noise))
+
+    def factors(self, eta: FloatArray) -> dict[object, float]:
+        """Return the smoothness of each penalised cell, by key."""
+        values = np.exp(eta[len(self.entering) :])
+        return {self.cells[i].key: float(v) for i, v in zip(self.penalised, values, strict=True)}
+
+    def estimate(self, eta: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return mean (size,) and covariance (size, size) of base and parameters."""
+        _, cholesky, beta = self._solved(eta)
+        return beta / self.unit, _covariances(cholesky, self.unit, 0)[0]
 
     def derivatives(self, eta: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the gradient of L and its average information."""
@@ -235,7 +262,10 @@ class _System:
         return self._last[1]
 
     def solution(self, start: Solution | None, prior: float) -> Solution:
-        eta = self._most_likely(*self._start(start))
+        """Return the fit at the maximum of L, with the log prior of its cells."""
+        known = {} if start is None else start.factors()
+        noise = self.guess if start is None else start.noise
+        eta = self._most_likely(*self._start(known, noise))
         weights, factors = self._precisions(eta)
         total, cholesky, beta = self._solved(eta)
         evidence = self._evidence(total, cholesky.root, weights, factors, beta)
@@ -314,9 +344,10 @@ class _System:
         base = beta[: self.p]
         return float(self.ridge @ beta**2 + base @ self.base_precision @ base)
 
-    def _start(self, start: Solution | None) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def _start(
+        self, known: Mapping[object, float], noise: Noise
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return where the search for noise and smoothness begins, and its bounds."""
-        noise = self.guess if start is None else start.noise
         sigma = np.log(np.maximum(noise.sigma, RESOLUTION_M))
         least = 0.1 * noise.sigma
         shared = self.model.shared(
@@ -326,13 +357,6 @@ class _System:
                 np.maximum(noise.frame_sigma, least),
             )
         )
-        known: dict[object, float] = {}
-        if start is not None:
-            known = {
-                cell.key: factor
-                for cell, factor in zip(start.cells, start.smoothness, strict=True)
-                if np.isfinite(factor)
-            }
         factors = [
             known[key] if (key := self.cells[i].key) in known else self._typical(which, noise)
             for which, i in enumerate(self.penalised)

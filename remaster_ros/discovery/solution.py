@@ -57,6 +57,14 @@ class Solution:
         edges = np.cumsum([0, *(cell.size for cell in self.cells)])
         return [slice(int(a), int(b)) for a, b in itertools.pairwise(edges)]
 
+    def factors(self) -> dict[object, float]:
+        """Return the precision factor of each penalised cell, by the cell's key."""
+        return {
+            cell.key: float(factor)
+            for cell, factor in zip(self.cells, self.smoothness, strict=True)
+            if np.isfinite(factor)
+        }
+
     def weight_precisions(self) -> dict[Cell, float]:
         """Return the prior precision that all weights of a cell have; of those of a kind alone."""
         first = [where.start for where in self.slices()]

@@ -36,7 +36,7 @@ from remaster_ros.discovery.decision import Decision, Named, decisions, sigma_of
 from remaster_ros.discovery.discover import Discovery, discover_session
 from remaster_ros.discovery.effects.base import Design
 from remaster_ros.discovery.effects.registry import EFFECTS
-from remaster_ros.discovery.evidence import _System, solve
+from remaster_ros.discovery.evidence import System, solve
 from remaster_ros.discovery.screening import Catalogue, screen
 from remaster_ros.discovery.words import p_value_text, percent
 from remaster_ros.errors import InputError, InsufficientDataError
@@ -222,8 +222,8 @@ def test_restricted_likelihood_has_the_gradient_it_says(name, split):
     noise = model.of_sensors(*robust_noise(data.rows, data.errors, np.ones(len(data), bool)))
     ridge = np.where(np.arange(len(unit)) < p, 0.0, 0.5)
     grams = packed.of_rows(grams, 0)
-    system = _System(model, grams, noise, cells, data.base_precision, unit, ridge)
-    eta, _, _ = system._start(None)
+    system = System(model, grams, noise, cells, data.base_precision, unit, ridge)
+    eta, _, _ = system._start({}, system.guess)
     gradient, information = system.derivatives(eta)
     for i in range(len(eta)):
         step = np.zeros(len(eta))

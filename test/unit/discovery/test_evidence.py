@@ -124,7 +124,7 @@ def test_a_fit_less_a_cell_is_the_fit_of_the_others_with_the_same_noise(
 def test_noise_and_smoothness_are_where_no_small_step_raises_the_likelihood(scene):
     data: Residuals = residuals_of(scene[0])
     systems: list[Any] = []
-    solve_with = evidence._System.solution
+    solve_with = evidence.System.solution
 
     def kept(system: Any, start: Solution | None, prior: float) -> Solution:
         found = solve_with(system, start, prior)
@@ -132,7 +132,7 @@ def test_noise_and_smoothness_are_where_no_small_step_raises_the_likelihood(scen
         return found
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(evidence._System, 'solution', kept)
+        patch.setattr(evidence.System, 'solution', kept)
         assert solve(data, scene[1]) is not None
     ((system, eta),) = systems
     most = system.value(eta)

@@ -1,0 +1,603 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The models visited by the walk, each at its own noise and background, and averages over them.
+
+The background is in every model: all kinds of errors as random effects (`random_effects`), each
+with a variance that the restricted likelihood gives, lengths and tilts of no less than the
+tolerance of the drawing. What offsets imitate exactly has no evidence, but for its prior. A kind
+that the data do not show has no variance and costs nothing.
+
+A cause is in a model as a block, or as a member of the background that stands out of it: by the
+ratio of the densities at nothing before and after the data (Savage & Dickey; Dickey 1971, Ann.
+Math. Stat. 42). The share of a model is its posterior weight among all models visited
+(renormalised; George & McCulloch 1997, Statistica Sinica 7); what is reported is an average by
+these shares.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from scipy.special import log_expit, logsumexp
+
+from remaster_ros.calibration.noise import Noise
+from remaster_ros.discovery.effects.base import Cell
+from remaster_ros.discovery.effects.registry import EFFECTS
+from remaster_ros.discovery.evidence import System
+from remaster_ros.discovery.random_effects import Family, kinds
+from remaster_ros.discovery.residuals import Residuals
+from remaster_ros.discovery.solution import Covariances, Solution
+from remaster_ros.types import FloatArray, IntArray
+from walk.surface import (
+    KIND_ODDS,
+    LEVELS_M,
+    NOTHING,
+    Model,
+    Pool,
+    State,
+    Surface,
+    Walker,
+    candidates,
+)
+
+# Variant of a kind that is one free form, with a variance of its own.
+ALONE = 'alone'
+# Share of the displacement by a wave that a curve of the same joint has, from which on the wave is
+# a part of the curve.
+PART_OF_A_CURVE = 0.9
+# What the likelihood must lose without a kind of the background for it to stay: the price of one
+# variance (Akaike 1974).
+PRICE = 1.0
+# Rounds of a chain at most, each with noise and background of the one before; steps of a round at
+# most; steps without a better model after which a round ends, and so many more for each block.
+ROUNDS, STEPS, PATIENCE, PATIENCE_EACH = 8, 300, 40, 5
+# A log posterior that rises by less is settled.
+SETTLED = 0.1
+# Models that are evaluated in the end at most, the log posterior below the best at which none is,
+# and the share below which none is kept.
+MOST_MODELS, NEGLIGIBLE, LEAST_SHARE = 24, 7.0, 1e-3
+
+
+def is_special_case(cell: Cell, form: Cell) -> bool:
+    """Return whether a cell is one of the shapes that a free form can have."""
+    return (
+        form.penalty is not None
+        and cell.penalty is None
+        and (cell.place, cell.driver, cell.joints, cell.subject)
+        == (form.place, form.driver, form.joints, form.subject)
+    )
+
+
+Identity = tuple[str, tuple[int, ...], str, str, str]
+"""What makes a cause: name, joints, place, driver and subject."""
+
+
+def identity(cell: Cell) -> Identity:
+    """Return which cause a candidate is, at whatever moment, order or axis."""
+    return cell.name, cell.joints, cell.place, cell.driver, cell.subject
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluated:
+    """A model at the maximum of its likelihood over noise and background."""
+
+    data: Residuals
+    model: Model
+    value: float  # Log posterior
+    cells: tuple[Cell, ...]  # Weights of its blocks and of the kinds of the background
+    eta: FloatArray  # Noise and variances, as `System` has them
+    noise: Noise
+    factors: Mapping[object, float]  # Precision of the weights of each kind, by key
+    families: tuple[Family, ...]  # Kinds of the background
+    blocks: tuple[tuple[Cell, int], ...]  # Candidates that are its blocks, with their levels
+
+    @cached_property
+    def estimate(self) -> tuple[FloatArray, FloatArray]:
+        """Mean and covariance of base coefficients and all weights."""
+        system = System.of(self.data, self.cells)
+        assert system is not None
+        return system.estimate(self.eta)
+
+    @cached_property
+    def std(self) -> dict[Cell, float]:
+        """Prior standard deviation of the weights of each kind of the background, m."""
+        return {
+            one.cell: (self.factors[one.cell.key] + (one.cell.largest or np.inf) ** -2.0) ** -0.5
+            for one in self.families
+        }
+
+    @cached_property
+    def where(self) -> dict[Cell, slice]:
+        """Where the weights of each cell are."""
+        p = self.data.base.shape[2]
+        edges = p + np.cumsum([0, *(cell.size for cell in self.cells)])
+        return {
+            cell: slice(int(a), int(b))
+            for cell, a, b in zip(self.cells, edges[:-1], edges[1:], strict=True)
+        }
+
+    def log_factor(self, where: IntArray, std: FloatArray) -> float:
+        """Return the log Bayes factor for some weights, by their densities at nothing.
+
+        Savage & Dickey: before the data, with their prior standard deviations, over after them.
+        """
+        mean, covariance = self.estimate
+        own, spread = mean[where], covariance[np.ix_(where, where)]
+        worth = own @ np.linalg.solve(spread, own) + np.linalg.slogdet(spread)[1]
+        return float(0.5 * worth - np.sum(np.log(std)))
+
+    def log_factor_of_kind(self, family: Family) -> float:
+        """Return the log Bayes factor for a kind of the background."""
+        part = self.where[family.cell]
+        std = np.full(family.cell.size, self.std[family.cell])
+        return self.log_factor(np.arange(part.start, part.stop), std)
+
+    @cached_property
+    def members(self) -> list[tuple[Family, Cell, IntArray, FloatArray]]:
+        """Members of the background: kind, cell, places of the weights, and its map from these."""
+        found = []
+        for family in self.families:
+            start = self.where[family.cell].start
+            for member, mapping in zip(family.members, family.maps, strict=True):
+                stop = start + mapping.shape[1]
+                found.append((family, member, np.arange(start, stop), mapping))
+                start = stop
+        return found
+
+    @cached_property
+    def by_itself(self) -> dict[Cell, float]:
+        """Log Bayes factor of each member of the background by itself."""
+        return {
+            member: self.log_factor(where, np.full(len(where), self.std[family.cell]))
+            for family, member, where, _ in self.members
+        }
+
+    @cached_property
+    def standing_out(self) -> dict[Cell, float]:
+        """Probability of each member of the background that it is there, given the model.
+
+        The kind has to be there, which it is for lengths and tilts, and among its m causes this
+        one, at odds of 1 to m - 1.
+        """
+        found = {}
+        for family in self.families:
+            mine = [one for one in self.members if one[0] is family]
+            causes: dict[Identity, list[tuple[Cell, IntArray]]] = {}
+            for _, member, where, _ in mine:
+                causes.setdefault(identity(member), []).append((member, where))
+            kind = 0.0
+            if family.cell.least == 0.0:
+                price = np.log(KIND_ODDS / len(LEVELS_M))
+                kind = float(log_expit(self.log_factor_of_kind(family) + price))
+            count = max(len(causes), max(member.drawn_from for member in family.members))
+            for parts in causes.values():
+                where = np.concatenate([part for _, part in parts])
+                factor = self.log_factor(where, np.full(len(where), self.std[family.cell]))
+                chance = np.exp(kind + log_expit(factor - np.log(count)))
+                for member, _ in parts:
+                    found[member] = float(chance)
+        return found
+
+
+def evaluated(
+    pool: Pool, families: Sequence[Family], model: Model, start: Evaluated | None = None
+) -> Evaluated | None:
+    """Return a model with noise and background at the maximum of its likelihood.
+
+    None if its columns cannot be distinguished.
+    """
+    cells = [pool.blocks[block].weights(level) for block, level in model]
+    system = System.of(pool.data, [*cells, *(family.cell for family in families)])
+    if system is None:
+        return None
+    try:
+        eta = system.most_likely(
+            {} if start is None else start.factors, None if start is None else start.noise
+        )
+        value = system.marginal(eta) + pool.prior(model) + log_price(families)
+    except np.linalg.LinAlgError:
+        return None
+    return Evaluated(
+        pool.data, model, float(value), system.cells, eta, system.noise(eta),
+        system.factors(eta), tuple(families),
+        tuple((pool.blocks[block].cell, level) for block, level in model),
+    )  # fmt: skip
+
+
+def background(data: Residuals, cells: Sequence[Cell], tolerance_m: float) -> list[Family]:
+    """Return the kinds of errors that are in every model."""
+    families = []
+    for family in kinds(data, cells):
+        # No session proves that an arm is its drawing.
+        if family.members[0].model_change is not None:
+            drawn = Family.of(data, family.cell.name, family.members, tolerance_m)
+            families += [drawn] if drawn is not None else []
+        else:
+            families.append(family)
+    return families
+
+
+def by_form(data: Residuals, families: Sequence[Family]) -> list[Family]:
+    """Return kinds of errors in which each free form is one by itself."""
+    found = []
+    for family in families:
+        if family.members[0].penalty is None:
+            found.append(family)
+            continue
+        for member in family.members:
+            one = Family.of(data, ' '.join(map(str, member.key)), [member])
+            assert one is not None
+            found.append(replace(one, cell=replace(one.cell, variant=ALONE)))
+    return found
+
+
+def log_price(families: Sequence[Family]) -> float:
+    """Return the log prior odds of the free forms that have a variance of their own.
+
+    Each is a candidate by itself; kinds of errors that strike all members cost nothing.
+    """
+    forms = [one.members[0] for one in families if one.cell.variant == ALONE]
+    each = -sum(np.log(form.drawn_from * len(LEVELS_M)) for form in forms)
+    return float(each + len({form.name for form in forms}) * np.log(KIND_ODDS))
+
+
+@dataclass(frozen=True, eq=False)
+class Chain:
+    """What one chain ended with."""
+
+    best: Evaluated  # Its best model
+    visited: Mapping[Model, float]  # Log posterior of the models of its last round
+    trace: FloatArray  # Log posterior by step of that round
+
+
+class Walk:
+    """Chains on one set of residuals, and the models they visited with their shares.
+
+    Attributes
+    ----------
+    models
+        Models of a share worth mentioning, the largest first.
+    share
+        Posterior weight of each, (models,).
+    """
+
+    def __init__(
+        self,
+        data: Residuals,
+        cells: Sequence[Cell],
+        rng: np.random.Generator,
+        tolerance_m: float,
+        progress: Callable[[float], None] = lambda share: None,
+        start: Evaluated | None = None,
+    ) -> None:
+        self.data, self.rng = data, rng
+        self.families = background(data, cells, tolerance_m)
+        # The same with a variance for each free form: one smoothness for all may fit none of them.
+        self.by_form = by_form(data, self.families)
+        of_background = {member.key for one in self.families for member in one.members}
+        singles = [cell for cell in cells if cell.penalty is None or cell.key not in of_background]
+        self.pool = Pool(data, candidates(data, singles))
+        self._known: dict[Model, Evaluated | None] = {}
+        # Models whose kinds of the background have been chosen anew.
+        self._wholes: dict[Model, Evaluated | None] = {}
+        empty = self._whole((), None)
+        assert empty is not None
+        self.empty = empty
+        bare = evaluated(self.pool, [one for one in self.families if one.cell.least > 0.0], ())
+        self.bare = self.empty if bare is None else bare
+        self.chains = []
+        if start is None:
+            starts = [self.bare, self.empty]
+        else:
+            starts = [self._again(start)]
+        for index, first in enumerate(starts):
+            self.chains.append(self._chain(first, hot=index > 0))
+            progress((index + 1) / len(starts))
+        if self._dated():
+            best = max((chain.best for chain in self.chains), key=lambda one: one.value)
+            self.chains.append(self._chain(best, hot=False))
+        self._weigh()
+
+    def _dated(self) -> bool:
+        """Add candidates at moments near those of the best model; return whether there are any."""
+        best = max((chain.best for chain in self.chains), key=lambda one: one.value)
+        context, tried = self.data.part, [block.cell for block in self.pool.blocks]
+        added = False
+        for position, (block, _) in enumerate(best.model):
+            cell = self.pool.blocks[block].cell
+            between = EFFECTS[cell.name].between
+            if not cell.happened or between is None:
+                continue
+            moments = np.unique([one.moment for one in tried if one.name == cell.name])
+            low = np.max(moments[moments < cell.moment], initial=-np.inf)
+            high = np.min(moments[moments > cell.moment], initial=np.inf)
+            nearby = [
+                replace(other, drawn_from=cell.drawn_from)
+                for other in between(context, float(low), float(high))
+                if (other.place, other.joints, other.subject)
+                == (cell.place, cell.joints, cell.subject)
+                and other.key not in self.pool.place
+            ]
+            first = len(self.pool.blocks)
+            self.pool.extend(candidates(self.data, nearby))
+            surface = Surface(self.pool, best.noise, best.std)
+            rest = State.of(surface, best.model[:position] + best.model[position + 1 :])
+            near = [block, *range(first, len(self.pool.blocks))]
+            gain = rest.gains[near].max(axis=1)
+            at = np.array([self.pool.blocks[i].cell.moment for i in near])
+            weight = np.exp(gain - gain.max())
+            middle = at[np.argmax(gain)]
+            spread = float(np.sqrt(np.average((at - middle) ** 2, weights=weight)))
+            for i in near:
+                one = self.pool.blocks[i]
+                self.pool.blocks[i] = replace(one, cell=replace(one.cell, moment_std=spread))
+            added = added or len(near) > 1
+        if added:
+            self._known.clear()
+            self._wholes.clear()
+        return added
+
+    def _again(self, start: Evaluated) -> Evaluated:
+        """Return the model of an earlier walk on these rows."""
+        place, levels = self.pool.place, {}
+        for cell, level in start.blocks:
+            if cell.key in place:
+                levels[place[cell.key]] = level
+        again = self._whole(tuple(sorted(levels.items())), start)
+        return self.empty if again is None else again
+
+    def _shown(self, found: Evaluated) -> Evaluated:
+        """Return a model without the kinds of the background that the likelihood does not show."""
+        shown = [
+            family
+            for family in found.families
+            if family.cell.least > 0.0
+            or found.log_factor_of_kind(family) > max(PRICE, -log_price([family]))
+        ]
+        if len(shown) == len(found.families):
+            return found
+        fewer = evaluated(self.pool, shown, found.model, found)
+        return found if fewer is None else fewer
+
+    def evaluate(self, model: Model, start: Evaluated) -> Evaluated | None:
+        """Return a model at its own noise and background; None if it cannot be fitted."""
+        if model not in self._known:
+            self._known[model] = evaluated(self.pool, start.families, model, start)
+        return self._known[model]
+
+    def _chain(self, current: Evaluated, hot: bool) -> Chain:
+        anew = current is self.bare
+        for _ in range(ROUNDS):
+            surface = Surface(self.pool, current.noise, current.std)
+            walker = Walker(State.of(surface, current.model), self.rng)
+            trace = self._run(walker, hot)
+            best = max(walker.seen, key=lambda model: walker.seen[model])
+            found = self._settled(best, current, anew)
+            if current is not self.bare and found.value < current.value + SETTLED:
+                if anew:
+                    break
+                # Kinds that were not shown beside other blocks may be now.
+                anew = True
+                found = self._settled(current.model, current, anew)
+                if found.value < current.value + SETTLED:
+                    break
+            current, hot = found, False
+        offset = current.value - walker.seen.get(current.model, walker.seen[best])
+        visited = {model: value + offset for model, value in walker.seen.items()}
+        return Chain(current, visited, trace + offset)
+
+    def _run(self, walker: Walker, hot: bool) -> FloatArray:
+        """Walk until no better model was found for a while; return the trace."""
+        best, since, trace = -np.inf, 0, []
+        for step in range(STEPS):
+            walker.step(min(1.0, 0.3 + step / (0.5 * STEPS)) if hot else 1.0)
+            trace.append(walker.state.value)
+            since += 1
+            if walker.state.value > best + SETTLED:
+                best, since = walker.state.value, 0
+            if since > PATIENCE + len(walker.state.model) * PATIENCE_EACH:
+                break
+        return np.array(trace)
+
+    def _whole(self, model: Model, start: Evaluated | None) -> Evaluated | None:
+        """Return a model with the kinds of the background chosen anew among all."""
+        if model not in self._wholes:
+            tried = [
+                self._shown(found)
+                for families in (self.families, self.by_form)
+                if (found := evaluated(self.pool, families, model, start)) is not None
+            ]
+            self._wholes[model] = max(tried, key=lambda one: one.value, default=None)
+        return self._wholes[model]
+
+    def _settled(self, model: Model, before: Evaluated, anew: bool) -> Evaluated:
+        """Return a model at its own noise, with members that stand out as blocks."""
+        if anew:
+            best = self._whole(model, before)
+        else:
+            best = self.evaluate(model, before)
+        if best is None:
+            return before
+        self._known[model] = best
+        while True:
+            more = self._swapped(best)
+            if more is None or more.value <= best.value:
+                return best
+            best = more
+
+    def _swapped(self, found: Evaluated) -> Evaluated | None:
+        """Return a model with the members that stand out of the background as its blocks."""
+        have = {
+            name for block, _ in found.model for name in self.pool.blocks[block].cell.parameters
+        }
+        more = []
+        for _, member, where, mapping in found.members:
+            block = self.pool.place.get(member.key)
+            if block is None or found.standing_out[member] < 0.5 or have & {*member.parameters}:
+                continue
+            moved = self.data.columns([member]) @ (mapping @ found.estimate[0][where])
+            size = np.sqrt(np.sum(moved**2) / len(self.data))
+            away = np.abs(np.log(LEVELS_M / max(size, NOTHING)))
+            away = np.where(self.pool.allowed[block], away, np.inf)
+            more.append((block, int(np.argmin(away))))
+        return self.evaluate(tuple(sorted({*found.model, *more})), found) if more else None
+
+    def _weigh(self) -> None:
+        """Weigh the models visited, those that matter at their own noise and background."""
+        pooled: dict[Model, float] = {}
+        for chain in self.chains:
+            for model, value in chain.visited.items():
+                pooled[model] = max(value, pooled.get(model, -np.inf))
+        pooled |= {model: one.value for model, one in self._known.items() if one is not None}
+        start = max((chain.best for chain in self.chains), key=lambda one: one.value)
+        order = sorted(pooled, key=lambda model: -pooled[model])[:MOST_MODELS]
+        models = [
+            one
+            for model in order
+            if pooled[model] > start.value - NEGLIGIBLE
+            and (one := self.evaluate(model, start)) is not None
+        ]
+        models.sort(key=lambda one: -one.value)
+        values = np.array([one.value for one in models])
+        share = np.exp(values - logsumexp(values))
+        count = int(np.sum(share > LEAST_SHARE))
+        self.models = models[:count]
+        self.share = share[:count] / share[:count].sum()
+
+    def probability_of(self, cell: Cell) -> float:
+        """Return the probability that a cause is there, at any moment or order."""
+        return self.probability.get(identity(cell), 0.0)
+
+    @cached_property
+    def claimed(self) -> list[Cell]:
+        """Causes of the best model that are there, or of which one of several look-alikes is."""
+        found = []
+        best = self.models[0]
+        named = self.named(best)
+        blocks = {identity(self.pool.blocks[block].cell) for block, _ in best.model}
+        for cell in named:
+            if any(self._is_part(cell, form) for form in named):
+                continue
+            if identity(cell) in blocks and cell in best.standing_out:
+                # The same cause by another axis or direction, which the background has.
+                continue
+            if cell in best.standing_out and best.by_itself[cell] < 0.0:
+                mine = [one for one in named if identity(one) == identity(cell)]
+                if cell is not max(mine, key=lambda one: best.by_itself.get(one, np.inf)):
+                    continue
+            chance = self.probability_of(cell)
+            if chance >= 0.5 or chance + sum(self.instead_of([cell]).values()) >= 0.5:
+                found.append(cell)
+        return found
+
+    def _is_part(self, cell: Cell, form: Cell) -> bool:
+        """Return whether one of thousands of shapes is a part of a free form that is there."""
+        if not (EFFECTS[cell.name].many and is_special_case(cell, form)):
+            return False
+        both = [self.data.columns([one]).reshape(3 * len(self.data), -1) for one in (cell, form)]
+        rest = both[0] - both[1] @ np.linalg.lstsq(both[1], both[0], rcond=None)[0]
+        return bool(np.sum(rest**2) < (1.0 - PART_OF_A_CURVE) * np.sum(both[0] ** 2))
+
+    def instead_of(self, group: Sequence[Cell]) -> dict[Cell, float]:
+        """Return what models have in the place of some causes of the best one, by probability.
+
+        Of models that have none of them: what is not in the best model.
+        """
+        mine = {identity(cell) for cell in group}
+        best = {identity(cell) for cell in self.named(self.models[0])}
+        found: dict[Identity, float] = {}
+        cells: dict[Identity, Cell] = {}
+        for model, share in zip(self.models, self.share, strict=True):
+            named = {identity(cell): cell for cell in self.named(model)}
+            if mine & named.keys():
+                continue
+            for key in named.keys() - best:
+                cells.setdefault(key, named[key])
+                found[key] = found.get(key, 0.0) + float(share)
+        return {cells[key]: chance for key, chance in found.items()}
+
+    @cached_property
+    def probability(self) -> dict[Identity, float]:
+        """Probability of each cause that some model has, as a block or as a member."""
+        found: dict[Identity, float] = {}
+        for model, share in zip(self.models, self.share, strict=True):
+            present: dict[Identity, float] = {}
+            for cell, chance in self.present(model).items():
+                present[identity(cell)] = max(chance, present.get(identity(cell), 0.0))
+            for key, chance in present.items():
+                found[key] = found.get(key, 0.0) + float(share) * chance
+        return found
+
+    def present(self, model: Evaluated) -> dict[Cell, float]:
+        """Return the candidates of a model with the probability that each is there, given it."""
+        blocks = {self.pool.blocks[block].cell: 1.0 for block, _ in model.model}
+        have = {name for cell in blocks for name in cell.parameters}
+        out = {
+            member: chance
+            for member, chance in model.standing_out.items()
+            if not have.issuperset(member.parameters)
+        }
+        return blocks | out
+
+    def named(self, model: Evaluated) -> list[Cell]:
+        """Return the candidates that are rather there than not, given a model."""
+        return [cell for cell, chance in self.present(model).items() if chance >= 0.5]
+
+    def solution(self, model: Evaluated) -> Solution:
+        """Return a model by the parameters of its cells, blocks and background together.
+
+        A cause that is a member of the background, too, has the sum of both: its size is not
+        shrunk by the variance of its kind.
+        """
+        p = self.data.base.shape[2]
+        mean, covariance = model.estimate
+        parts: list[tuple[Cell, slice, FloatArray, FloatArray, float]] = []
+        for block, level in model.model:
+            one = self.pool.blocks[block]
+            where = model.where[one.weights(level)]
+            parts.append((one.cell, where, one.map, one.scale, LEVELS_M[level] ** -2.0))
+        scales = {
+            member: scale
+            for family in model.families
+            for member, scale in zip(family.members, family.scales, strict=True)
+        }
+        for family, member, places, mapping in model.members:
+            where = slice(int(places[0]), int(places[-1]) + 1)
+            parts.append((member, where, mapping, scales[member], model.std[family.cell] ** -2.0))
+        # A member may be a part of a block: both are parameters of the larger.
+        cells: list[Cell] = []
+        for cell, *_ in sorted(parts, key=lambda part: -part[0].size):
+            if not any(set(one.parameters).issuperset(cell.parameters) for one in cells):
+                cells.append(cell)
+        cells.sort(key=lambda cell: cell.penalty is not None)
+        names = [name for cell in cells for name in cell.parameters]
+        row = {name: p + i for i, name in enumerate(names)}
+        to = np.zeros((p + len(names), len(mean)))
+        to[:p, :p] = np.eye(p)
+        variance = np.zeros(len(names))
+        for cell, where, mapping, scale, precision in parts:
+            rows = np.array([row[name] for name in cell.parameters])
+            to[rows, where] += mapping
+            variance[rows - p] += 1.0 / (precision * scale)
+        every = to @ mean
+        edges = np.cumsum([0, *(cell.size for cell in cells)])
+        smooth = np.array([cell.penalty is not None for cell in cells], dtype=bool)
+        ridge = np.where(np.repeat(smooth, np.diff(edges)), 0.0, 1.0 / variance)
+        smoothness = np.where(smooth, 1.0 / variance[edges[:-1]], np.nan)
+
+        def covariances() -> tuple[FloatArray, FloatArray]:
+            full = to @ covariance @ to.T
+            return full, full
+
+        return Solution(
+            tuple(cells),
+            every[p:],
+            every[:p],
+            model.noise,
+            smoothness,
+            ridge,
+            Covariances(covariances),
+            model.value,
+        )

@@ -1,0 +1,479 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Posterior over models: a Metropolis walk over sets of candidate causes.
+
+A model is a set of blocks beside what every model contains: the columns of the offsets model,
+with flat priors, and the background (`models`). A block is one candidate cause; its weights are
+N(0, s²) with s, the RMS displacement of the marker by a weight, one of `LEVELS_M`. With all
+weights integrated out, the log posterior of a model S is::
+
+    L(S) = ½ Σ n_g log w_g − ½ log|H| + ½ log|Λ| − ½ (y'Wy − b'H⁻¹b) + Σ log prior(block)
+
+with w_g the weights of the error groups, H = Z'WZ + Λ and b = Z'Wy (Patterson & Thompson 1971).
+On a `Surface`, noise and background are as they are: errors and candidate columns are whitened and
+the background is taken out once. A `State` holds the regression of all candidates on its blocks,
+which a block that joins or leaves changes by a sweep (Goodnight 1979, The American Statistician
+33), so that a step costs O(columns of the state × all columns).
+
+Proposals are drawn by the posterior itself, tempered (locally informed proposals: Zanella 2020,
+J. Am. Stat. Assoc. 115): one block joins, leaves, is exchanged, or a pair is changed, whose first
+is drawn widely: what needs a partner is found by no step of one.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from remaster_ros.calibration.noise import Noise
+from remaster_ros.discovery.effects.base import LARGEST_M, Cell, Design
+from remaster_ros.discovery.effects.context import Context
+from remaster_ros.discovery.effects.registry import EFFECTS
+from remaster_ros.discovery.residuals import Residuals
+from remaster_ros.types import BoolArray, FloatArray, IntArray
+
+Single = NDArray[np.float32]
+
+# Prior standard deviations of a weight, RMS displacement of the marker, m: half-decades from a
+# fifth of the noise of the best trackers to what no calibrated arm exceeds.
+LEVELS_M = np.array([3e-5, 1e-4, 3e-4, 1e-3, 3e-3, 1e-2])
+# Prior odds that a kind of error is present, shared out among its candidates.
+KIND_ODDS = 1.0 / 20.0
+# Log posterior below which a proposal is refused by the diagonal of its Gram matrix alone: the
+# exact value is hardly ever that much higher.
+FAR = 12.0
+# Share of the largest eigenvalue below which a direction is rounding.
+ROUNDING = 1e-9
+# A column with a smaller RMS displacement per unit displaces nothing, m.
+NOTHING = 1e-12
+# Share of the largest displacement, in square, of the directions of a penalised candidate.
+# Coarser, and a fit of curves ends on a plateau, four times as far from held-out poses.
+LEAST_SHARE = 1e-7
+
+Model = tuple[tuple[int, int], ...]
+"""Blocks of a model, each with its level, ascending."""
+
+
+@dataclass(frozen=True, eq=False)
+class Block:
+    """A candidate with weights that displace the marker by a metre RMS over the rows worked on."""
+
+    cell: Cell
+    map: FloatArray  # Parameters of the cell from the weights, (parameters, weights)
+    # Prior precision of each parameter, or factor of the penalty, for weights of precision 1
+    scale: FloatArray
+    allowed: BoolArray  # Which levels are plausible, (levels,)
+
+    @property
+    def size(self) -> int:
+        """Number of weights."""
+        return self.map.shape[1]
+
+    @property
+    def log_prior(self) -> float:
+        """Log prior odds that it is in a model, at one of its levels, if its kind is there."""
+        return -float(np.log(self.cell.drawn_from * self.allowed.sum()))
+
+    @property
+    def sign(self) -> int:
+        """Sign of its weight that physics allows; 0 for both."""
+        return self.cell.sign if self.size == 1 else 0
+
+    def displacement(self, context: Context) -> FloatArray:
+        """Return the displacement of the marker by a unit of each weight, m, (n, 3, weights)."""
+        moved: FloatArray = self.cell.columns(context).displacement(context) @ self.map
+        return moved
+
+    @cached_property
+    def _weights(self) -> dict[int, Cell]:
+        return {}
+
+    def weights(self, level: int) -> Cell:
+        """Return a cell of its weights, with the prior of a level."""
+        if level not in self._weights:
+            self._weights[level] = Cell(
+                name=self.cell.name,
+                place=self.cell.place,
+                driver=self.cell.driver,
+                form=self.cell.form,
+                parameters=tuple(f'{self.cell.key}#{i}' for i in range(self.size)),
+                unit='m',
+                columns=lambda context: Design(None, self.displacement(context)),
+                largest=float(LEVELS_M[level]),
+            )
+        return self._weights[level]
+
+
+def candidates(data: Residuals, cells: Sequence[Cell]) -> list[Block]:
+    """Return the blocks of all cells that displace a marker."""
+    blocks, n = [], len(data)
+    for cell in cells:
+        if not cell.size:
+            continue
+        moved = cell.columns(data.part).displacement(data.part)
+        if cell.penalty is None:
+            unit = np.sqrt(np.sum(moved**2, axis=(0, 1)) / n)
+            if np.any(unit < NOTHING):
+                continue
+            mapping, scale = np.diag(1.0 / unit), unit**2
+            largest = float((cell.largest or np.inf) * unit.max())
+        else:
+            values, vectors = np.linalg.eigh(cell.penalty)
+            root = vectors / np.sqrt(np.maximum(values, np.finfo(float).eps * values[-1]))
+            share = np.sum((moved @ root) ** 2, axis=(0, 1)) / n
+            if share.sum() < NOTHING**2:
+                continue
+            seen = share > LEAST_SHARE * share.max()
+            total = share[seen].sum()
+            mapping, scale, largest = root[:, seen] / np.sqrt(total), np.array([total]), np.inf
+        allowed = max(min(largest, LARGEST_M), LEVELS_M[0]) >= LEVELS_M
+        blocks.append(Block(cell, mapping, scale, allowed))
+    return blocks
+
+
+class Pool:
+    """All blocks with their columns on the rows worked on."""
+
+    def __init__(self, data: Residuals, blocks: Sequence[Block]) -> None:
+        self.data = data
+        self.blocks: list[Block] = []
+        # Displacements by a unit of each weight, m, (n, 3, m)
+        self.columns: Single = np.zeros((len(data), 3, 0), np.float32)
+        self.extend(blocks)
+
+    def extend(self, blocks: Sequence[Block]) -> None:
+        """Add blocks behind the others."""
+        self.blocks += blocks
+        self.sizes = np.array([block.size for block in self.blocks], dtype=np.int64)
+        ends = np.cumsum([0, *self.sizes])
+        self.first = ends[:-1]  # First column of each block, (blocks,)
+        self.of = [np.arange(a, b) for a, b in itertools.pairwise(ends)]  # Its columns
+        before = self.columns
+        self.columns = np.empty((len(self.data), 3, int(ends[-1])), np.float32)
+        self.columns[:, :, : before.shape[2]] = before
+        start = before.shape[2]
+        for block in blocks:
+            where = slice(start, start + block.size)
+            self.columns[:, :, where] = block.displacement(self.data.part)
+            start = where.stop
+        self.log_prior = np.array([block.log_prior for block in self.blocks])
+        self.allowed = np.array([block.allowed for block in self.blocks])
+        self.sign = np.array([block.sign for block in self.blocks])
+        # Errors of one kind come together; what has no name is no kind, and happens once.
+        names = [
+            str(block.cell.key)
+            if EFFECTS[block.cell.name].cause_per == 'variant'
+            else block.cell.name
+            for block in self.blocks
+        ]
+        self.kind: IntArray = np.unique(names, return_inverse=True)[1]
+        users: dict[str, set[int]] = {}
+        for index, block in enumerate(self.blocks):
+            for name in block.cell.parameters:
+                users.setdefault(name, set()).add(index)
+        # Blocks with a parameter in common are one cause twice: never in one model.
+        self.excluded = [
+            np.array(sorted(set().union(*(users[name] for name in block.cell.parameters))))
+            for block in self.blocks
+        ]
+        self.place = {block.cell.key: index for index, block in enumerate(self.blocks)}
+
+    def prior(self, model: Model) -> float:
+        """Return the log prior odds of a model."""
+        which = [block for block, _ in model]
+        present = len(np.unique(self.kind[which]))
+        return float(np.sum(self.log_prior[which]) + present * np.log(KIND_ODDS))
+
+
+class Surface:
+    """The log posterior over models with noise and background as they are.
+
+    Columns and errors are whitened, and what the offsets model and the background absorb is taken
+    out: by M with M'M = (I + Z D Z')⁻¹ for the background Z with variances D, and by projection
+    for the flat columns of the offsets model. The weights of a block are turned so that its Gram
+    matrix is diagonal: their prior is the same in all directions.
+    """
+
+    def __init__(self, pool: Pool, noise: Noise, background: Mapping[Cell, float]) -> None:
+        self.pool, data = pool, pool.data
+        n = 3 * len(data)
+        std = np.concatenate([np.zeros(0), *(np.full(c.size, s) for c, s in background.items())])
+        columns = data.columns(list(background)) * std
+        head = np.concatenate((data.base, data.errors[:, :, None], columns), axis=2)
+        white = data.noise_model.whitened(head, noise).reshape(n, -1)
+        p = data.base.shape[2]
+        # Priors on the base columns as further rows.
+        values, vectors = np.linalg.eigh(data.base_precision)
+        known = values > ROUNDING * max(1.0, values[-1])
+        rows = (vectors[:, known] * np.sqrt(values[known])).T
+        Q = np.linalg.qr(np.concatenate((white[:, :p], rows)))[0]
+        rest = np.concatenate((white[:, p:], np.zeros((len(rows), white.shape[1] - p))))
+        rest -= Q @ (Q.T @ rest)
+        errors, absorbed = rest[:, 0], rest[:, 1:]
+        square, turn = np.linalg.eigh(absorbed.T @ absorbed)
+        seen = square > ROUNDING * max(1.0, square.max(initial=0.0))
+        U = absorbed @ (turn[:, seen] / np.sqrt(square[seen]))
+        shrink = 1.0 - 1.0 / np.sqrt(1.0 + square[seen])
+        self.errors = errors - U @ (shrink * (U.T @ errors))
+        both = np.concatenate((Q, U), axis=1)
+        white_columns = data.noise_model.whitened(pool.columns, noise).reshape(n, -1)
+        product = both[:n].T.astype(np.float32) @ white_columns
+        product[Q.shape[1] :] *= shrink.astype(np.float32)[:, None]
+        white_columns -= both[:n].astype(np.float32) @ product
+        if len(rows):
+            tail = -(both[n:].astype(np.float32) @ product)
+            white_columns = np.concatenate((white_columns, tail))
+        self.columns: Single = white_columns
+        self._turn()
+        self.pull = (self.errors.astype(np.float32) @ self.columns).astype(float)
+        self.square = np.einsum('ij,ij->j', self.columns, self.columns).astype(float)
+
+    def _turn(self) -> None:
+        """Turn the weights of each block to the principal axes of its Gram matrix."""
+        first, sizes = self.pool.first, self.pool.sizes
+        pairs = first[sizes == 2]
+        one, other = self.columns[:, pairs], self.columns[:, pairs + 1]
+        a, b, c = (
+            np.einsum('ij,ij->j', x, y) for x, y in ((one, one), (one, other), (other, other))
+        )
+        angle = 0.5 * np.arctan2(2.0 * b, a - c)
+        cosine, sine = np.cos(angle), np.sin(angle)
+        self.columns[:, pairs] = cosine * one + sine * other
+        self.columns[:, pairs + 1] = cosine * other - sine * one
+        for start, size in zip(first[sizes > 2], sizes[sizes > 2], strict=True):
+            mine = self.columns[:, start : start + size]
+            self.columns[:, start : start + size] = mine @ np.linalg.eigh(mine.T @ mine)[1]
+
+
+class State:
+    """A model on a surface, with what every candidate would add to it.
+
+    Products of the columns are those of their residuals beside the model: with the errors
+    (``pull``, (m,)), and with themselves (``square``, (m,)). ``value``: log posterior relative to
+    that of the model of no block.
+    """
+
+    def __init__(
+        self,
+        surface: Surface,
+        model: tuple[tuple[int, int], ...],
+        value: float,
+        pull: FloatArray,
+        square: FloatArray,
+        inverse: FloatArray,
+        weights: FloatArray,
+        regression: Callable[[], Single],
+    ) -> None:
+        self.surface, self.model, self.value = surface, model, value
+        self.pull, self.square = pull, square
+        self.inverse = inverse  # H⁻¹ of the weights of the blocks, (q, q)
+        self.weights = weights  # Their means, (q,)
+        self._regression: Callable[[], Single] | None = regression
+
+    @classmethod
+    def empty(cls, surface: Surface) -> State:
+        """Return the model of no block."""
+        none: Single = np.zeros((0, surface.columns.shape[1]), np.float32)
+        return cls(
+            surface,
+            (),
+            0.0,
+            surface.pull,
+            surface.square,
+            np.zeros((0, 0)),
+            np.zeros(0),
+            lambda: none,
+        )
+
+    @classmethod
+    def of(cls, surface: Surface, model: Model) -> State:
+        """Return a model."""
+        state = cls.empty(surface)
+        for block, level in model:
+            state = state.joined(block, level)
+        return state
+
+    @cached_property
+    def regression(self) -> Single:
+        """Regression of all columns on those of the model, (q, m)."""
+        assert self._regression is not None
+        found = self._regression()
+        # The state before is kept no longer.
+        self._regression = None
+        return found
+
+    @cached_property
+    def places(self) -> list[slice]:
+        """Where the weights of each block of the model are."""
+        ends = np.cumsum([0, *(self.surface.pool.sizes[block] for block, _ in self.model)])
+        return [slice(int(a), int(b)) for a, b in itertools.pairwise(ends)]
+
+    @cached_property
+    def gains(self) -> FloatArray:
+        """What each block at each level adds to the log posterior, (blocks, levels).
+
+        Of blocks of several weights by the diagonal of their Gram matrix, until `joined` tells.
+        """
+        pool = self.surface.pool
+        precision = LEVELS_M[:, None] ** -2.0
+        d = np.maximum(self.square, 0.0)
+        each = self.pull**2 / (precision + d) - np.log1p(d / precision)
+        gain: FloatArray = 0.5 * np.add.reduceat(each, pool.first, axis=1).T
+        gain[(pool.sign != 0) & (pool.sign * self.pull[pool.first] < 0.0)] = -np.inf
+        gain[~pool.allowed] = -np.inf
+        there = np.isin(pool.kind, self.kinds)
+        gain += (pool.log_prior + np.where(there, 0.0, np.log(KIND_ODDS)))[:, None]
+        for block, _ in self.model:
+            gain[pool.excluded[block]] = -np.inf
+        return gain
+
+    @cached_property
+    def losses(self) -> FloatArray:
+        """What the log posterior loses without each block of the model."""
+        lost, pool = [], self.surface.pool
+        for (block, level), where in zip(self.model, self.places, strict=True):
+            covariance, mean = self.inverse[where, where], self.weights[where]
+            determinant = np.linalg.slogdet(covariance)[1] - 2.0 * len(mean) * np.log(
+                LEVELS_M[level]
+            )
+            worth = 0.5 * (mean @ np.linalg.solve(covariance, mean) + determinant)
+            lost.append(worth + self._prior(block, self.kinds.count(pool.kind[block]) > 1))
+        return np.array(lost)
+
+    def joined(self, block: int, level: int) -> State:
+        """Return the model with a block more."""
+        pool, columns = self.surface.pool, self.surface.columns
+        own = pool.of[block]
+        residual: Single = columns[:, own].T @ columns
+        if self.model:
+            residual -= residual[:, self.columns] @ self.regression
+        gram = residual[:, own].astype(float)
+        gram = 0.5 * (gram + gram.T) + np.eye(len(own)) * LEVELS_M[level] ** -2.0
+        middle = np.linalg.inv(gram)
+        mean = middle @ self.pull[own]
+        gain = 0.5 * (mean @ self.pull[own] + np.linalg.slogdet(middle)[1])
+        gain += self._prior(block, pool.kind[block] in self.kinds)
+        gain -= len(own) * np.log(LEVELS_M[level])
+        step = middle.astype(np.float32) @ residual
+        between = self.regression[:, own].astype(float)
+        corner = -between @ middle
+
+        def regression() -> Single:
+            return np.concatenate((self.regression - between.astype(np.float32) @ step, step))
+
+        if np.isfinite(self.gains[block, level]):
+            self.gains[block, level] = gain
+        return State(
+            self.surface,
+            (*self.model, (block, level)),
+            self.value + float(gain),
+            self.pull - mean @ residual,
+            self.square - np.einsum('km,km->m', residual, step),
+            np.block([[self.inverse - corner @ between.T, corner], [corner.T, middle]]),
+            np.concatenate((self.weights - between @ mean, mean)),
+            regression,
+        )
+
+    def left(self, position: int) -> State:
+        """Return the model without a block."""
+        out = np.zeros(len(self.weights), bool)
+        out[self.places[position]] = True
+        middle = np.linalg.inv(self.inverse[out][:, out])
+        pulled = self.inverse[~out][:, out] @ middle
+        across = self.regression[out]
+
+        def regression() -> Single:
+            return self.regression[~out] - pulled.astype(np.float32) @ across
+
+        turned = middle.astype(np.float32) @ across
+        return State(
+            self.surface,
+            (*self.model[:position], *self.model[position + 1 :]),
+            self.value - float(self.losses[position]),
+            self.pull + (middle @ self.weights[out]) @ across,
+            self.square + np.einsum('km,km->m', across, turned),
+            self.inverse[~out][:, ~out] - pulled @ self.inverse[out][:, ~out],
+            self.weights[~out] - pulled @ self.weights[out],
+            regression,
+        )
+
+    @cached_property
+    def kinds(self) -> list[int]:
+        """Kind of each block of the model."""
+        return [int(self.surface.pool.kind[block]) for block, _ in self.model]
+
+    def _prior(self, block: int, there: bool) -> float:
+        """Return the log prior odds of a block whose kind is there, or not."""
+        odds = float(self.surface.pool.log_prior[block])
+        return odds if there else odds + float(np.log(KIND_ODDS))
+
+    @property
+    def columns(self) -> IntArray:
+        """Columns of the blocks of the model, in the order of the weights."""
+        of = self.surface.pool.of
+        return np.concatenate([np.zeros(0, np.int64), *(of[block] for block, _ in self.model)])
+
+    @property
+    def key(self) -> Model:
+        """The model, sorted."""
+        return tuple(sorted(self.model))
+
+
+class Walker:
+    """Random moves of one chain on a surface; notes the log posterior of every model visited."""
+
+    def __init__(self, state: State, rng: np.random.Generator) -> None:
+        self.state, self.rng = state, rng
+        self.seen = {state.key: state.value}
+
+    def step(self, heat: float) -> None:
+        """Make one move: a block joins, leaves, is exchanged, or a pair is changed."""
+        u, state = self.rng.random(), self.state
+        if not state.model or u < 0.25:
+            self._join(state, heat)
+        elif u < 0.4:
+            self._to(state.left(self._which(state, heat)), heat)
+        elif u < 0.7:
+            self._join(state.left(self._which(state, heat)), heat)
+        else:
+            # What needs a partner: one block drawn widely, then what goes best with it.
+            drawn = self._draw(state, 0.3 * heat)
+            if drawn is None:
+                return
+            more = state.joined(*drawn)
+            if state.model and self.rng.random() < 0.5:
+                self._to(more.left(int(np.argmin(more.losses[:-1]))), heat)
+            else:
+                self._join(more, heat)
+
+    def _join(self, state: State, heat: float) -> None:
+        drawn = self._draw(state, heat)
+        # By the diagonal far worse: the exact gain is hardly ever that much more.
+        if drawn is not None and state.value + state.gains[drawn] > self.state.value - FAR:
+            self._to(state.joined(*drawn), heat)
+
+    def _to(self, state: State, heat: float) -> None:
+        """Go to a model, by Metropolis."""
+        self.seen[state.key] = state.value
+        if np.log(self.rng.random()) < heat * (state.value - self.state.value):
+            self.state = state
+
+    def _draw(self, state: State, heat: float) -> tuple[int, int] | None:
+        """Draw a block and its level by the posterior of what it adds."""
+        gain = state.gains.ravel()
+        top = gain.max()
+        if not np.isfinite(top):
+            return None
+        cumulative = np.cumsum(np.exp(heat * (gain - top)))
+        index = int(np.searchsorted(cumulative, self.rng.random() * cumulative[-1]))
+        return divmod(min(index, gain.size - 1), len(LEVELS_M))
+
+    def _which(self, state: State, heat: float) -> int:
+        """Draw a block of the model: half by how little is lost without it, half evenly."""
+        chance = np.exp(-heat * (state.losses - state.losses.min()))
+        chance = 0.5 * chance / chance.sum() + 0.5 / len(chance)
+        return int(self.rng.choice(len(chance), p=chance))
