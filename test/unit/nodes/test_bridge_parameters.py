@@ -64,6 +64,8 @@ def test_every_rule_comes_from_its_own_parameter():
         stall_s=14.0,
         reaction_s=15.0,
         lag_s=1.25,
+        # Without it nothing goes on by itself.
+        emergency_stop_topic='robot/stops',
     )
     units = JointUnits((False, True))
     assert parameters.rules(units) == SupervisorRules(
