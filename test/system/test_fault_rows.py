@@ -173,7 +173,8 @@ def test_a_correction_that_is_none(fault, tmp_path):
     path = tmp_path / 'compensation.json'
     path.write_text(BAD_CORRECTIONS[fault])
     done = subprocess.run(
-        [*command, '-p', 'cell:=demo', '-p', f'compensation:={path}'],
+        [*command, '-p', 'cell:=demo', '-p', 'emergency_stop_topic:=none',
+         '-p', f'compensation:={path}'],
         env=environment, capture_output=True, text=True, timeout=900, check=False,
     )  # fmt: skip
     assert done.returncode == 2, done.stderr
