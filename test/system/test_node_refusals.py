@@ -44,7 +44,11 @@ def test_a_missing_cell_file(start, tmp_path):
     ('node', 'parameters', 'why'),
     [
         ('demo', {'apply': True}, 'no node corrects what such an arm is commanded'),
-        ('robot_bridge', {'compensation': 'c.json'}, 'leave the parameter compensation empty'),
+        (
+            'robot_bridge',
+            {'compensation': 'c.json', 'emergency_stop_topic': 'none'},
+            'leave the parameter compensation empty',
+        ),
     ],
 )
 def test_what_an_arm_with_a_joint_that_slides_is_not_for(node, parameters, why, start, tmp_path):
