@@ -85,7 +85,7 @@ def content_of(session, confirmation=None, to_load=()):
 def test_causes_look_alikes_and_gain_are_said():
     text = summary(found((EFFECT,), Gain(1e-3, 0.3e-3, 0.28e-3, {}), {}), to_load=TO_LOAD)
     assert 'alone, mean error on held-out poses 1.400 mm: apply/robot_calibrated.urdf, ' in text
-    assert 'together, mean error on held-out poses 1.500 mm: leave it: no better than' in text
+    assert 'together, mean error on held-out poses 1.500 mm: leave it: not clearly better' in text
     assert 'can correct, mean error on held-out poses 0.300 mm: apply/compensation.json' in text
     assert 'verdict: effects' in text
     assert (
