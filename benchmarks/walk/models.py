@@ -23,6 +23,7 @@ import numpy as np
 from scipy.special import log_expit, logsumexp
 
 from remaster_ros.calibration.noise import Noise
+from remaster_ros.discovery.causes import is_special_case
 from remaster_ros.discovery.effects.base import Cell
 from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.discovery.evidence import System
@@ -58,16 +59,6 @@ SETTLED = 0.1
 # Models that are evaluated in the end at most, the log posterior below the best at which none is,
 # and the share below which none is kept.
 MOST_MODELS, NEGLIGIBLE, LEAST_SHARE = 24, 7.0, 1e-3
-
-
-def is_special_case(cell: Cell, form: Cell) -> bool:
-    """Return whether a cell is one of the shapes that a free form can have."""
-    return (
-        form.penalty is not None
-        and cell.penalty is None
-        and (cell.place, cell.driver, cell.joints, cell.subject)
-        == (form.place, form.driver, form.joints, form.subject)
-    )
 
 
 Identity = tuple[str, tuple[int, ...], str, str, str]

@@ -97,7 +97,7 @@ class LiveResiduals:
         return self._fitted(sensor)[0]
 
     def of_registration(self, sensor: str) -> int:
-        """Return how many of the residuals, the first ones, are of registration poses."""
+        """Return the number of residuals of registration poses, which come first."""
         return self._registering[sensor]
 
     def points_R(self, sensor: str) -> FloatArray:

@@ -129,7 +129,7 @@ class Compensator:
         return self.correction(command, error)
 
     def correction(self, command: FloatArray, error: FloatArray) -> Correction:
-        """Return what commands (n, k) do that leave pose errors of m and rad, (n, 6)."""
+        """Return the correction by commands (n, k), given the pose errors they leave, (n, 6)."""
         shift, turn = (np.linalg.norm(part, axis=1) for part in np.split(error, 2, axis=1))
         incomplete = np.maximum(shift, turn) > CORRECTED
         return Correction(command, shift, turn, incomplete, self.model.outside(command))
@@ -234,11 +234,11 @@ class Compensator:
         return wanted + self.model.chain.per_radian * change, problem.left(change)
 
     def problem(self, q: FloatArray, temperature_c: float | None = None) -> PoseProblem:
-        """Return what changes of the joints leave of the poses at wanted angles (n, k)."""
+        """Return the pose errors at wanted angles (n, k) as a function of changes of the joints."""
         return PoseProblem(self, q, self.model.warming(len(q), temperature_c))
 
     def _way_back(self, reported: FloatArray, warming: FloatArray) -> FloatArray:
-        """Return what to add to reported angles for those of the nominal robot, rad, (n, k)."""
+        """Return the difference of the nominal robot's angles from reported ones, rad, (n, k)."""
         added = self.model.added_angles(self.model.drivers(reported, warming))
         added /= self.model.chain.per_radian
         budget = np.maximum(self.most_rad, np.abs(added))
@@ -251,7 +251,7 @@ class Compensator:
         bounds: tuple[FloatArray, FloatArray],
         start: FloatArray,
     ) -> FloatArray:
-        """Return what to add to reported angles for the nominal robot's, rad, (n, k).
+        """Return the bounded difference of the nominal robot's angles from reported ones, (n, k).
 
         ``reported``: joint angles, rad, (n, k); ``warming``: K, (n,); ``bounds``: least and
         largest of what is added, rad or `SerialChain.per_radian`, (n, k) each; ``start``: within
@@ -306,11 +306,11 @@ class PoseProblem:
         return weights * _pose_error(self._target[rows], state.tool), weights[:, None] * jacobian
 
     def errors(self, change: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the same of all rows."""
+        """Return weighted errors (n, 6) and Jacobians (n, 6, k) at changes (n, k) of all rows."""
         return self.of_rows(change, np.arange(len(self.wanted)))
 
     def left(self, change: FloatArray) -> FloatArray:
-        """Return what is left of each pose, m and rad, (n, 6)."""
+        """Return the error of each pose after a change, m and rad, (n, 6)."""
         return self.errors(change)[0] / self._compensator.weights
 
 
