@@ -68,7 +68,7 @@ class Announcements:
         return now - self._matched_wall > MATCH_WALL_S
 
     def announced(self, stamp: str, now: float) -> None:
-        """Note that the pose is announced; with an unchanged stamp the next wait is twice as long."""
+        """Note that the pose is announced; with an unchanged stamp the next wait doubles."""
         again = stamp == self.stamp
         self._wait_wall = min(2.0 * self._wait_wall, LONGEST_WALL_S) if again else ANNOUNCE_WALL_S
         self.stamp, self._announced_wall = stamp, now

@@ -234,7 +234,7 @@ class Compensator:
         return wanted + self.model.chain.per_radian * change, problem.left(change)
 
     def problem(self, q: FloatArray, temperature_c: float | None = None) -> PoseProblem:
-        """Return the pose errors at wanted angles (n, k) as a function of changes of the joints."""
+        """Return the pose errors at wanted angles (n, k) by changes of the joints."""
         return PoseProblem(self, q, self.model.warming(len(q), temperature_c))
 
     def _way_back(self, reported: FloatArray, warming: FloatArray) -> FloatArray:

@@ -39,8 +39,8 @@ from remaster_ros.types import FloatArray, Session
 SAME_JOINTS_RAD = 1e-3
 # Points that agree so well with the nominal arm are computed from its joints, m.
 COMPUTED_M = 2e-5
-# Good rows of an LBR iiwa, which bends under its weight, were up to 3 mm off. Three times that is a
-# choice: no arm was measured that bends so far, and errors below it are left to `fit`.
+# Good rows of an LBR iiwa, which bends under its weight, were up to 3 mm off. Three times that is
+# a choice: no arm was measured that bends so far, and errors below it are left to `fit`.
 BENT_M = 0.01
 # Zeros further off, rad, are of another zero position, by quarters of a turn: a mistake.
 _LARGEST_UNMASTERED = np.pi / 4.0
