@@ -13,7 +13,7 @@ from remaster_ros.importing.makers import records
 from remaster_ros.importing.makers.named import Named, unexpected
 
 _START = re.compile(
-    r'(?:\s*#[^\n]*\n|\s*\n|%YAML[^\n]*\n|---[^\n]*\n)*(?:- ?|[A-Za-z_]\w*:(?:\s|$))'
+    r'(?:[^\S\n]*(?:#[^\n]*)?\n|%YAML[^\n]*\n|---[^\n]*\n)*(?:- ?|[A-Za-z_]\w*:(?:\s|$))'
 )
 # A line of nested data: an item, a document, or a key with blanks before it.
 _NESTED = re.compile(r'[ ]*-(?:\s.*)?|---.*|[ ]+[A-Za-z_]\w*:(?:\s.*)?|[A-Za-z_]\w*:\s*')

@@ -5,21 +5,14 @@ An expression with two ways to match the same text tries them all where the text
 Judged by the time for twice the length, in the same process: no absolute time.
 """
 
-import importlib
-import pkgutil
 import time
 from contextlib import suppress
 
 import pytest
 
 from remaster_ros.errors import InputError
-from remaster_ros.importing import makers
+from remaster_ros.importing.makers import READERS
 
-READERS = [
-    module
-    for found in pkgutil.iter_modules(makers.__path__)
-    if hasattr(module := importlib.import_module(f'{makers.__name__}.{found.name}'), 'read')
-]
 HEADS = (
     '',
     'x = [',
@@ -48,15 +41,11 @@ def seconds(read, text):
     return time.process_time() - begun
 
 
-# Readers of text alone: what takes bytes or decoded records has no repetition of letters.
-OF_TEXT = [one for one in READERS if one.__name__.split('.')[-1] not in ('numpy_file', 'records')]
-
-
 @pytest.mark.timeout(300)
-@pytest.mark.parametrize('reader', OF_TEXT, ids=lambda reader: reader.__name__.split('.')[-1])
-def test_what_is_repeated_is_read_or_refused_in_time(reader):
+@pytest.mark.parametrize('read', READERS, ids=lambda read: read.__module__.split('.')[-1])
+def test_what_is_repeated_is_read_or_refused_in_time(read):
     for head in HEADS:
         for part in REPEATED:
             once, twice = (head + part * (n // len(part)) + '!\n' for n in (LENGTH, 2 * LENGTH))
-            first, second = seconds(reader.read, once), seconds(reader.read, twice)
+            first, second = seconds(read, once), seconds(read, twice)
             assert second < max(SOON_S, MOST_TIMES * first), (head, part)
