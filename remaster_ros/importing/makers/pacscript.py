@@ -22,7 +22,9 @@ _FEWEST, _MOST = 3, 8
 
 def read(text: str) -> Named | None:
     """Return the joint positions of a program of Denso's; None for anything else."""
-    if not re.search(r'^[^\S\n]*(?:let\s+)?J\[\s*\w+\s*\]\s*=\s*J?\s*\(', text, re.MULTILINE | re.I):
+    if not re.search(
+        r'^[^\S\n]*(?:let\s+)?J\[\s*\w+\s*\]\s*=\s*J?\s*\(', text, re.MULTILINE | re.I
+    ):
         return None
     found: list[tuple[int, str, dict[str, str]]] = []
     places = 0

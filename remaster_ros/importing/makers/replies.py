@@ -12,7 +12,8 @@ from collections import defaultdict
 from remaster_ros.importing.makers.named import NUMBER, Named, some, unexpected
 
 _TIME = re.compile(
-    r'\s*+[\[(<]?\s*+((?:\d{4}[-/]\d\d[-/]\d\d[T ,]\s*)?\d\d:\d\d:\d\d(?:[.,]\d+)?Z?|\d{9,10}\.\d+)'
+    r'\s*+[\[(<]?\s*+'
+    r'((?:\d{4}[-/]\d\d[-/]\d\d[T ,]\s*)?\d\d:\d\d:\d\d(?:[.,]\d+)?Z?|\d{9,10}\.\d+)'
     r'\s*[\])>]?[\s:,;|-]*'
 )
 # Behind the time: words, the state of the call, a list, and the call.
