@@ -454,6 +454,8 @@ def joint_offsets_of(fit: schemas.Fit, chain: SerialChain) -> tuple[FloatArray, 
             )
         for key, low in ((f'mean_{unit}', -high), (f'std_{unit}', 0.0)):
             value = getattr(row, key)
+            if value in (None, UNSET):
+                raise InputError(f'{row.joint}: {key} is missing; fit again')
             if not low <= value <= high:
                 raise InputError(
                     f'{row.joint}: {key} is {value:g}, not {low:g} to {high:g}; fit again'

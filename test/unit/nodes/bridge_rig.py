@@ -253,6 +253,8 @@ class Rig:
             ),
             'the nodes to find each other',
         )
+        if self.bridge.p.emergency_stop_topic == FAST['emergency_stop_topic']:
+            self.wait(lambda: not self.bridge._emergency.trouble(), 'the safety circuit')
 
     def quiet(self):
         """End the bridge's timers: it looks and reports only when it is told to, or has to."""
@@ -348,8 +350,6 @@ class Rig:
     def ready(self):
         """Let the bridge find itself alone, its controller there and its arm standing."""
         self.alone()
-        if self.bridge.p.emergency_stop_topic == FAST['emergency_stop_topic']:
-            self.wait(lambda: not self.bridge._emergency.trouble(), 'the safety circuit')
         if self.controller is not None:
             self.wait(self.bridge._controller.matched, 'the controller')
         self.bridge._watch()

@@ -64,6 +64,13 @@ def test_offsets_of_another_robot_are_refused(fit_result):
         joint_offsets_of(fit, rail)
 
 
+def test_an_offset_without_its_std_is_refused(fit_result):
+    fit = fit_content(fit_result)
+    fit.joint_offsets[1].std_deg = None
+    with pytest.raises(InputError, match='joint_2: std_deg is missing; fit again'):
+        joint_offsets_of(fit, fit_result.chain)
+
+
 @pytest.mark.parametrize(
     ('key', 'value'), [('std_deg', -0.01), ('std_deg', 1e30), ('mean_deg', -1e300)]
 )
