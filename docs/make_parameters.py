@@ -49,7 +49,8 @@ def page() -> str:
 
 def section(node: str) -> str:
     """Return the heading and the table of one node."""
-    kind = importlib.import_module(f'remaster_ros.nodes.{node}').Parameters
+    module = 'demo.conductor' if node == 'demo' else f'nodes.{node}'
+    kind = importlib.import_module(f'remaster_ros.{module}').Parameters
     rows = [row(field) for field in parameter_fields(kind).values()]
     return '\n'.join(
         [

@@ -73,8 +73,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> NoReturn:
     """Become the demo's process."""
     out = Path(args.out) if args.out else free_folder()
-    run_node(
+    become(
         'demo',
+        ['remaster_ros.demo'],
         {
             'out': str(out),
             'seed': args.seed,
@@ -115,9 +116,17 @@ def free_folder() -> Path:
 
 def run_node(name: str, parameters: dict[str, object]) -> NoReturn:
     """Replace this process by the node `name` with these parameters; does not return."""
+    become(name, ['remaster_ros.nodes', name], parameters)
+
+
+def become(verb: str, module: list[str], parameters: dict[str, object]) -> NoReturn:
+    """Replace this process by ``python -m MODULE`` with ROS parameters; does not return.
+
+    Raises InputError, which names the verb, if rclpy is not installed.
+    """
     if importlib.util.find_spec('rclpy') is None:
-        raise InputError(f'remaster {name} {WITHOUT_ROS}')
-    command = [sys.executable, '-m', 'remaster_ros.nodes', name, '--ros-args']
+        raise InputError(f'remaster {verb} {WITHOUT_ROS}')
+    command = [sys.executable, '-m', *module, '--ros-args']
     for key, value in parameters.items():
         # JSON is YAML; text in double quotes stays text whatever it looks like.
         command += ['-p', f'{key}:={json.dumps(value)}']

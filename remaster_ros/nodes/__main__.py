@@ -21,7 +21,6 @@ NODES = {
     'fake_robot': 'a simulated arm',
     'fake_optitrack': 'a simulated OptiTrack system',
     'fake_laser_tracker': 'a simulated laser tracker',
-    'demo': 'the whole job on the simulated devices',
 }
 
 

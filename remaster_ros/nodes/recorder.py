@@ -11,39 +11,32 @@ from __future__ import annotations
 
 import json
 import logging
-import time
 from collections import Counter
-from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import msgspec
-import numpy as np
-from geometry_msgs.msg import PointStamped, PoseStamped, TransformStamped
+from geometry_msgs.msg import TransformStamped
 from rclpy.callback_groups import ReentrantCallbackGroup
-from rclpy.client import Client
 from rclpy.task import Future
-from sensor_msgs.msg import JointState, Temperature
+from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory
 
 from remaster_ros.collection import events
-from remaster_ros.collection.events import EventRecord, RecorderBegan, SensorReport
-from remaster_ros.collection.message_fields import temperature_topic
-from remaster_ros.collection.pairing import Pairing
-from remaster_ros.collection.peers import RequiredSensors
-from remaster_ros.collection.recording import EndedReading, Recording
-from remaster_ros.errors import DiskError, InputError, MovedError
-from remaster_ros.motion.liveness import Liveness
-from remaster_ros.nodes.bagging import BagRecorder
+from remaster_ros.collection.recording import EndedReading
+from remaster_ros.errors import DiskError
+from remaster_ros.nodes.cell_sensors import CellSensors
 from remaster_ros.nodes.controller_link import COMMANDS, COPIES
 from remaster_ros.nodes.messages import transform_message
 from remaster_ros.nodes.parameters import declare
 from remaster_ros.nodes.rivals import JOINTS, ArmStates
 from remaster_ros.nodes.running import RemasterNode, run
-from remaster_ros.nodes.simulated_clock import ReportsTaken, SteadyTime
+from remaster_ros.nodes.session_keeper import SessionKeeper
+from remaster_ros.nodes.simulated_clock import ReportsTaken
 from remaster_ros.nodes.status import (
     EVENTS,
     JOINT_STATES,
@@ -54,236 +47,14 @@ from remaster_ros.nodes.status import (
     receiver,
     taken_key,
 )
-from remaster_ros.session.session_journal import SessionJournal
 from remaster_ros.session.session_recorder import (
     Outlet,
     Parameters,
     SessionRecorder,
     session_header,
 )
-from remaster_ros.session.session_yaml import ExitStatus
-from remaster_ros.session.workcell import Workcell, read_cell
-from remaster_ros.types import FloatArray, Session
-
-# The sensors of a cell as the recorder follows them: readings, heartbeats, measure services.
-
-
-PATIENCE_WALL_S = 1.0
-"""An answer counts after so long: in this time the status of the node may show that the instrument
-is gone, and the reading of a measurement arrives."""
-MISSING_WALL_S = 5.0
-"""A service that is not there counts after so long: by then a node that died is absent."""
-
-
-@dataclass
-class _Shot:
-    """A measurement: since when it is needed, the request, and when it was answered."""
-
-    since_wall: float
-    future: Future | None = None
-    answered_wall: float | None = None
-
-
-class TriggeredSensors:
-    """The measurements that one configuration after the other needs, by service clients."""
-
-    def __init__(self, clients: Mapping[str, Client]) -> None:
-        self._clients = clients
-        self._pairing: Pairing | None = None
-        self._shots: dict[str, _Shot] = {}
-
-    def look(self, pairing: Pairing, absent: Mapping[str, str], now: float) -> None:
-        """Send the requests that this pairing still needs, and note the refusals.
-
-        ``now`` is of the recorder's watchdogs, s.
-
-        The request is sent again to a sensor that was absent meanwhile, and to one whose reading
-        was lost.
-        """
-        if pairing is not self._pairing:
-            self._pairing, self._shots = pairing, {}
-        for name, client in self._clients.items():
-            if name in absent or name in pairing.decided:
-                self._shots.pop(name, None)
-                continue
-            shot = self._shots.setdefault(name, _Shot(now))
-            if shot.future is not None:
-                self._take_answer(name, shot, pairing, now)
-            elif client.service_is_ready():
-                shot.future = client.call_async(Trigger.Request())
-            elif now - shot.since_wall > MISSING_WALL_S:
-                pairing.fail(name, f'the service {client.srv_name} is not there')
-
-    def _take_answer(self, name: str, shot: _Shot, pairing: Pairing, now: float) -> None:
-        assert shot.future is not None
-        response = shot.future.result() if shot.future.done() else None
-        if response is None:
-            return
-        if shot.answered_wall is None:
-            shot.answered_wall = now
-        if now - shot.answered_wall <= PATIENCE_WALL_S:
-            return
-        if not response.success:
-            pairing.fail(name, response.message)
-        elif not pairing.has_reading(name):
-            del self._shots[name]
-
-
-class CellSensors:
-    """Subscribe to all sensors and find which are missing; `InputError` for a wrong require."""
-
-    def __init__(self, node: RemasterNode, p: Parameters, cell: Workcell) -> None:
-        try:
-            self.required = RequiredSensors(cell.sensors, p.require)
-        except InputError as error:
-            raise InputError(f'{node.get_name()}: {error}') from None
-        streams = [name for name, sensor in cell.sensors.items() if not sensor.single_shot]
-        self._steady_s = SteadyTime(node, p.simulated_clock_rate)
-        self._liveness = Liveness(cell.sensors, p.heartbeat_s, streams, since_s=self._steady_s())
-        self._sensors = cell.sensors
-        self._shots = TriggeredSensors(
-            {
-                name: node.create_client(Trigger, sensor.measure_service)
-                for name, sensor in cell.sensors.items()
-                if sensor.single_shot and sensor.measure_service and p.call_measure
-            }
-        )
-
-    def subscribe(self, bag: BagRecorder, recorder: SessionRecorder) -> None:
-        """Subscribe to the readings, through the bag."""
-        for name, sensor in self._sensors.items():
-            for marker, topic in sensor.topics.items():
-                take = self._taker(recorder, name, marker)
-                bag.subscribe(PointStamped, topic, None if sensor.pose_topic else take)
-            if sensor.pose_topic:
-                take = self._taker(recorder, name, sensor.marker)
-                bag.subscribe(PoseStamped, sensor.pose_topic, take)
-            topic = temperature_topic(sensor.topic)
-            bag.subscribe(Temperature, topic, recorder.take_temperature)
-
-    def _taker(self, recorder: SessionRecorder, sensor: str, marker: str) -> Callable[[Any], None]:
-        def take(message: PointStamped | PoseStamped) -> None:
-            if recorder.take_marker(sensor, marker, message):
-                self._liveness.reads(sensor, self._steady_s())
-
-        return take
-
-    def take(self, record: EventRecord, report: SensorReport) -> None:
-        """Take the state of a sensor's node."""
-        self._liveness.node_reports(
-            report.sensor,
-            report.ready,
-            report.message,
-            self._steady_s(),
-            record.started,
-            hidden=report.hidden,
-        )
-
-    def missing(self) -> str:
-        """Return which sensors the arm has to wait for, and why; ''."""
-        return self.required.missing(self._absent())
-
-    def read_age_s(self) -> dict[str, float | None]:
-        """Return the time since the last reading of each sensor, s; None for never."""
-        now = self._steady_s()
-        ages_s = {name: self._liveness.read_age_s(name, now) for name in self._sensors}
-        return {name: age_s if np.isfinite(age_s) else None for name, age_s in ages_s.items()}
-
-    def trigger(self, pairing: Pairing) -> None:
-        """Have single-shot sensors measure for the reading under way."""
-        self._shots.look(pairing, self._absent(), self._steady_s())
-
-    def give_up(self, recording: Recording) -> None:
-        """Reject what does not come in time."""
-        recording.give_up(self._absent(), self._liveness.reports)
-
-    def _absent(self) -> dict[str, str]:
-        return self._liveness.absent(self._steady_s(), self.required.names)
-
-
-# The session and the bag on a disk that may be full: what it does not take is tried again.
-
-
-RETRY_S = 1.0
-"""How often a full disk is tried again, s of wall time."""
-CHECK_S = 1.0
-"""How often it is looked whether the session's files are still the ones that are written, s."""
-
-
-class SessionKeeper:
-    """Write a session, one thing at a time.
-
-    ``began``: what a bag begins with; None to record none.
-    Attributes: ``journal, bag``: what is written; ``full``: why the disk does not take what waits;
-    '' where nothing waits; ``restored``: what was last found changed by others and restored; ''.
-    """
-
-    def __init__(
-        self, node: RemasterNode, folder: Path, header: Session, began: RecorderBegan | None
-    ) -> None:
-        self._node = node
-        self.journal = SessionJournal(folder, header)
-        self.bag = BagRecorder(node, folder / 'bag', began, begin=not self.journal.closed)
-        self._waiting: Callable[[], object] | None = None
-        self._tried_wall = self._checked_wall = time.monotonic()
-        self._moved = False
-        self.full = self.restored = ''
-
-    @property
-    def waits_for(self) -> str:
-        """What has to happen before anything can be written; ''."""
-        return self.full if self._moved or not self.full else f'room on the disk: {self.full}'
-
-    def write(self, write: Callable[[], object]) -> None:
-        """Call `write`; where the disk does not take it, `look` tries it again."""
-        self._waiting, self._tried_wall = None, time.monotonic()
-        try:
-            write()
-        except DiskError as error:
-            if not self.full:
-                self._node.get_logger().error(f'the arm is held: {error}')
-            self._waiting, self.full = write, str(error)
-            self._moved = isinstance(error, MovedError)
-        else:
-            self.full = ''
-
-    def look(self) -> bool:
-        """Try again what waits, and restore what others did to the files, once a second.
-
-        Returns whether something was restored.
-        """
-        now = time.monotonic()
-        if self._waiting is not None and now - self._tried_wall > RETRY_S:
-            self.write(self._waiting)
-        if now - self._checked_wall < CHECK_S:
-            return False
-        self._checked_wall = now
-        if not self.full:
-            self.write(self.journal.check)
-        return self._report_restored()
-
-    def _report_restored(self) -> bool:
-        lines = self.journal.take_restored()
-        for line in lines:
-            self._node.get_logger().error(line)
-            self.restored = line
-        return bool(lines)
-
-    def reopen(self, *, go_further: bool = False) -> None:
-        """Go on with a session that was stopped; with `go_further`, with one that is complete."""
-        self.journal.reopen(go_further=go_further)
-        self.bag.reopen()
-
-    def close(self, exit_status: ExitStatus) -> None:
-        """Close session and bag; `DiskError` where the session remains open."""
-        self.journal.close(exit_status)
-        self._report_restored()
-        if self.journal.closed != exit_status:
-            self._node.get_logger().error(
-                f'the session is closed as {self.journal.closed}, not as {exit_status}: '
-                f'{self.journal.beyond_repair}; its observations are all there'
-            )
-        self.bag.close()
+from remaster_ros.session.workcell import read_cell
+from remaster_ros.types import FloatArray
 
 
 class Recorder(RemasterNode):

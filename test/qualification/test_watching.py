@@ -18,7 +18,7 @@ from rigs.collection_rig import Cell
 from rigs.ros_rig import ROOT, clear_halt, node_arguments
 from worlds.simple_cells import write_cell
 
-from remaster_ros.nodes.demo import free_ports
+from remaster_ros.demo.processes import free_ports
 
 pytestmark = [
     pytest.mark.ros,

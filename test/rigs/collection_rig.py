@@ -8,8 +8,8 @@ import numpy as np
 from rigs.ros_rig import ROOT, call, node_arguments, wait_until
 
 from remaster_ros.collection.events import ConfigurationEnded
+from remaster_ros.demo.processes import free_ports
 from remaster_ros.kinematics.serial_chain import SerialChain
-from remaster_ros.nodes.demo import free_ports
 from remaster_ros.session.journal import read_journal
 from remaster_ros.session.plan_journal import read_plan
 from remaster_ros.session.reader import read_session

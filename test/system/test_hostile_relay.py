@@ -20,7 +20,7 @@ from hostile.judge import GRACE_S, Judge, Rules, after
 from hostile.lines import RELIABLE
 from hostile.scene import demo_body
 
-from remaster_ros.nodes.demo import free_ports
+from remaster_ros.demo.processes import free_ports
 from remaster_ros.session.bridge_files import LastCommandFile
 from remaster_ros.session.workcell import read_cell
 from remaster_ros.simulation.setup import make_world

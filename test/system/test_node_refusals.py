@@ -16,7 +16,8 @@ pytestmark = [pytest.mark.ros, pytest.mark.timeout(900)]
 
 def refuse(start, node, *, timeout=900, **parameters):
     """Start a node that must refuse; return its one line."""
-    process = start(f'remaster_ros.nodes.{node}', *node_arguments(**parameters))
+    module = 'remaster_ros.demo' if node == 'demo' else f'remaster_ros.nodes.{node}'
+    process = start(module, *node_arguments(**parameters))
     out, err = process.communicate(timeout=timeout)
     assert process.returncode == 2, out + err
     lines = [line for line in err.splitlines() if line.startswith('error:')]
@@ -103,7 +104,7 @@ def test_a_laser_tracker_that_is_not_there(start):
 def test_a_demo_that_is_refused_or_stopped_before_its_session_does_not_block_the_next(
     start, tmp_path
 ):
-    from remaster_ros.nodes.demo import output_folder
+    from remaster_ros.demo.demo import output_folder
 
     line = refuse(start, 'demo', out=tmp_path / 'demo', hide='backlash@9:0.3')
     assert 'backlash@9: the arm has 7 joints; give 1 to 7' in line

@@ -12,7 +12,7 @@ import pytest
 import yaml
 from rigs.ros_rig import call, node_arguments, wait_until
 
-from remaster_ros.nodes.demo import free_ports
+from remaster_ros.demo.processes import free_ports
 from remaster_ros.session.bag import BagReader
 from remaster_ros.session.workcell import read_cell
 from remaster_ros.simulation.setup import make_world

@@ -17,7 +17,7 @@ ROOT = Path(__file__).parents[3]
 def test_every_executable_and_no_other_is_listed(capsys):
     assert main([]) == 0
     out = capsys.readouterr().out
-    assert set(NODES) == {path.name for path in (ROOT / 'scripts').iterdir()}
+    assert {*NODES, 'demo'} == {path.name for path in (ROOT / 'scripts').iterdir()}
     assert all(f'  {name} ' in out for name in NODES)
 
 
@@ -32,10 +32,10 @@ def test_an_unknown_node_is_refused_with_the_one_that_was_meant(capsys):
     ('others', 'late'),
     [
         # A third of the time until nine nodes are there went into libraries for fits and figures.
-        (('watch', 'demo'), ('scipy.stats', 'scipy.optimize', 'scipy.interpolate', 'matplotlib')),
+        (('watch',), ('scipy.stats', 'scipy.optimize', 'scipy.interpolate', 'matplotlib')),
         # Nodes that measure and move need neither fit nor search.
         (
-            ('pose_planner', 'optimizer', 'watch', 'demo'),
+            ('pose_planner', 'optimizer', 'watch'),
             [
                 f'remaster_ros.{name}'
                 for name in ('calibration.estimate', 'discovery.screening', 'planning.pose_design')

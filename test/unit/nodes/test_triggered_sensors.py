@@ -9,7 +9,7 @@ import pytest
 pytest.importorskip('rclpy', reason='needs ROS 2 Jazzy or its wheels')
 
 from remaster_ros.collection.pairing import Pairing, SensorRules
-from remaster_ros.nodes import recorder
+from remaster_ros.nodes import measure_services
 from remaster_ros.types import MarkerReading
 
 pytestmark = pytest.mark.ros
@@ -46,7 +46,7 @@ def scene():
     client = Client()
     rules = SensorRules('tracker', 'smr', single_shot=True, timeout_s=60.0)
     pairing = Pairing(10.0, Q, (rules,))
-    asking = recorder.TriggeredSensors({'tracker': client})
+    asking = measure_services.TriggeredSensors({'tracker': client})
 
     def look(at, absent=()):
         clock.now = at

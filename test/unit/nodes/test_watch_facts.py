@@ -14,7 +14,7 @@ from worlds.played_collection import CHAIN
 
 from remaster_ros.errors import InputError
 from remaster_ros.nodes import watch
-from remaster_ros.nodes.pose_planner import PosePublisher
+from remaster_ros.nodes.planner.pose_publisher import PosePublisher
 from remaster_ros.nodes.watch import fit_facts
 from remaster_ros.reports.live_view import FitFacts
 from remaster_ros.reports.schemas import Accuracy, JointOffset, Marker

@@ -7,10 +7,7 @@ truth is compared with the estimate only at the very end.
 
 from __future__ import annotations
 
-import ctypes
-import json
 import os
-import random
 import select
 import shutil
 import signal
@@ -19,286 +16,39 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 import rclpy
 import yaml
 from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-from rich.table import Table
-from std_srvs.srv import Trigger
 
-from remaster_ros.calibration.gauge_words import in_a_line
-from remaster_ros.collection.events import (
-    ConfigurationEnded,
-    Event,
-    EventRecord,
-    PoseAnnounced,
-    ShotMeasured,
-    SolutionCommanded,
-    SolutionSettled,
-    State,
-    TourPlanned,
-)
-from remaster_ros.compensation.compensator import Compensator
 from remaster_ros.compensation.export import APPLY_FOLDER
 from remaster_ros.compensation.file import COMPENSATION_FILE, read_compensation
-from remaster_ros.compensation.verification import Visits, verify
+from remaster_ros.demo.conductor import Conductor
+from remaster_ros.demo.configuration_times import ConfigurationTimes
+from remaster_ros.demo.processes import NodeProcesses, free_ports
+from remaster_ros.demo.tables import print_hidden, print_offsets, print_times, true_errors
 from remaster_ros.errors import DeviceError, InputError, RemasterError
 from remaster_ros.nodes.launching import CORE, SENSORS
-from remaster_ros.nodes.parameters import declare, parameter
 from remaster_ros.nodes.running import report
 from remaster_ros.nodes.runtime_files import opening_path, page_name
-from remaster_ros.nodes.status import listen
 from remaster_ros.planning.tour_planner import TourPlanner
 from remaster_ros.reports.discovery_json import read_discovery
 from remaster_ros.reports.fit_json import read_fit
-from remaster_ros.reports.schemas import Discovered, Effect, Fit
-from remaster_ros.reports.sentences import discovery_lines
 from remaster_ros.session.files import cannot_write, make_folder, undone_on_failure
 from remaster_ros.session.reader import HEADER, read_session
 from remaster_ros.session.session_journal import is_complete
 from remaster_ros.session.workcell import Workcell, config_path, read_cell
 from remaster_ros.session.yaml_records import to_plain
 from remaster_ros.simulation.effect_sampling import EffectSpec
-from remaster_ros.simulation.expected_findings import causes, describe, named_cause
-from remaster_ros.simulation.hidden_arm import tool_points
-from remaster_ros.simulation.hidden_effects import true_parameters
 from remaster_ros.simulation.setup import make_world
-from remaster_ros.simulation.truth import SessionTruth
-from remaster_ros.types import Session
-
-_PR_SET_PDEATHSIG = 1
-
-SHORT_LIFE_S = 2.0
-"""A process that ends this soon has hardly begun, s."""
-SHORT_LIVES = 5
-"""How many of these in a row are borne."""
-
-
-def _die_with_parent() -> None:
-    """Ask Linux for SIGTERM when the parent dies, so that even a killed demo leaves nothing."""
-    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
-
-
-class NodeProcesses:
-    """The node processes of a run, each with its output in a file ``<name>.log``."""
-
-    def __init__(self, log_folder: Path, environment: Mapping[str, str]) -> None:
-        self._log_folder = log_folder
-        self._environment = {**os.environ, **environment}
-        self._running: dict[str, subprocess.Popen[bytes]] = {}
-        self._commands: dict[str, list[str]] = {}
-        self._begun: dict[str, float] = {}
-        self._short_lives: Counter[str] = Counter()
-
-    def start(self, name: str, parameters_file: Path, parameters: Mapping[str, Any]) -> None:
-        """Start node `name` with a parameter file and values that override it."""
-        command = [sys.executable, '-m', 'remaster_ros.nodes', name, '--ros-args']
-        command += ['--params-file', str(parameters_file)]
-        for key, value in parameters.items():
-            # JSON is YAML; text in double quotes stays text whatever it looks like.
-            command += ['-p', f'{key}:={json.dumps(value)}']
-        self._commands[name] = command
-        self._spawn(name)
-
-    def _spawn(self, name: str) -> None:
-        self._begun[name] = time.monotonic()
-        with (self._log_folder / f'{name}.log').open('ab') as log:
-            self._running[name] = subprocess.Popen(
-                self._commands[name],
-                stdout=log,
-                stderr=subprocess.STDOUT,
-                stdin=subprocess.DEVNULL,
-                env=self._environment,
-                start_new_session=True,  # Ctrl-C on the terminal reaches us alone; we end them.
-                preexec_fn=_die_with_parent,
-            )
-
-    def check(self) -> list[str]:
-        """Start again whoever was killed, as a supervisor does; return their names.
-
-        Raises DeviceError: with the last line of its log, if a process has ended by itself, or is
-        killed again and again as soon as it is there.
-        """
-        killed = []
-        for name, process in list(self._running.items()):
-            status = process.poll()
-            if status is None:
-                continue
-            lived_s = time.monotonic() - self._begun[name]
-            self._short_lives[name] = self._short_lives[name] + 1 if lived_s < SHORT_LIFE_S else 0
-            if status < 0 and self._short_lives[name] <= SHORT_LIVES:
-                self._spawn(name)
-                killed.append(name)
-            else:
-                lines = (self._log_folder / f'{name}.log').read_text(errors='replace').split('\n')
-                last = next((line for line in reversed(lines) if line.strip()), 'its log is empty')
-                raise DeviceError(f'{name} ended with status {status}: {last.strip()}')
-        return killed
-
-    def pid(self, name: str) -> int:
-        """Return the process that runs a node now."""
-        return self._running[name].pid
-
-    def stop(self, names: Sequence[str] = (), grace_s: float = 20.0) -> list[str]:
-        """End processes within about `grace_s`, all by default; return those that were killed.
-
-        On an idle computer they take a second.
-        """
-        ended = {name: self._running[name] for name in names or self._running}
-        for process in ended.values():
-            if process.poll() is None:
-                process.send_signal(signal.SIGINT)
-        deadline = time.monotonic() + grace_s
-        killed = []
-        for name, process in ended.items():
-            try:
-                process.wait(max(0.0, deadline - time.monotonic()))
-            except subprocess.TimeoutExpired:
-                process.kill()
-                process.wait()
-                killed.append(name)
-            del self._running[name]
-        return killed
-
-
-class ConfigurationTimes:
-    """Where the time of each configuration went, from the nodes' events.
-
-    Motion, settle and measuring are world time. Measuring is what the slowest instrument took:
-    the dwell of a stream, or search and integration of a laser tracker. Software is wall time:
-    from the bridge's report that the arm has settled to its next command, less the measuring.
-
-    ``rate``: world time over wall time.
-    """
-
-    def __init__(self, rate: float) -> None:
-        self._rate = rate
-        self._instrument_s = 0.0
-        self._open: dict[tuple[str, int], dict[str, float]] = {}
-        self._last: dict[str, float] | None = None
-        self._registration: set[str] = set()
-        self.rows: list[dict[str, float]] = []
-
-    def add(self, event: Event | State) -> None:
-        """Take what a node published; only events of a configuration count."""
-        match event:
-            case PoseAnnounced(split='registration', stamp=stamp):
-                self._registration.add(stamp)
-            case SolutionCommanded(stamp=stamp, solution=solution, since_settled_wall_s=since_s):
-                if self._last is not None:
-                    self._last['until_command'] = since_s
-                self._last = None
-                if stamp not in self._registration:
-                    # A registration pose is followed by planning, which is not of its time.
-                    self._last = self._open.setdefault((stamp, solution), {})
-            case SolutionSettled(stamp=stamp, solution=solution):
-                if (row := self._open.get((stamp, solution))) is not None:
-                    row.update(motion=event.motion_s, settle=event.settle_s)
-            case ShotMeasured(instrument_wall_s=wall_s):
-                self._instrument_s = wall_s * self._rate
-            case ConfigurationEnded(stamp=stamp, solution=solution, measuring_s=float(reading_s)):
-                if (row := self._open.get((stamp, solution))) is not None:
-                    row['measuring'] = max(reading_s, self._instrument_s)
-                    self._instrument_s = 0.0
-                    self.rows.append(row)
-
-    def columns(self) -> dict[str, np.ndarray]:
-        """Return motion, settle, measuring (world s) and software (wall s) of complete rows."""
-        needed = ('motion', 'settle', 'measuring', 'until_command')
-        rows = [row for row in self.rows if all(name in row for name in needed)]
-        table = {name: np.array([row[name] for row in rows]) for name in needed}
-        # A reading begins when the arm stands, a moment before the bridge's report of it.
-        software = table.pop('until_command') - table['measuring'] / self._rate
-        return {**table, 'software': np.maximum(software, 0.0)}
-
-
-def _table(title: str, *headings: str, left: int = 1) -> Table:
-    """Return an empty table, its first `left` columns aligned to the left."""
-    table = Table(title=title)
-    for column, heading in enumerate(headings):
-        table.add_column(heading, justify='left' if column < left else 'right')
-    return table
-
-
-def print_times(console: Console, times: ConfigurationTimes) -> None:
-    """Print the table of times per configuration."""
-    columns = times.columns()
-    title = f'time per configuration, s ({len(columns["motion"])} configurations)'
-    table = _table(title, '', 'median', '95 %', 'largest')
-    for name, values in columns.items():
-        if len(values):
-            unit = 'wall' if name == 'software' else 'world time'
-            figures = (np.median(values), np.quantile(values, 0.95), values.max())
-            table.add_row(f'{name} ({unit})', *(f'{figure:.3f}' for figure in figures))
-    console.print(table)
-
-
-def print_offsets(console: Console, fit: Fit, truth: SessionTruth) -> None:
-    """Print the offsets beside the true ones, and the error on validation poses."""
-    title = 'joint zero-offsets, degrees'
-    table = _table(title, 'joint', 'estimate', 'std', 'hidden truth', 'off by, std')
-    for row, hidden in zip(fit.joint_offsets, truth.joint_offsets):
-        slides = row.unit == 'mm'
-        mean, std, true = (1e3 if slides else np.degrees(1.0)) * np.array(
-            [*row.mean_and_std, hidden]
-        )
-        if row.identifiable:
-            estimate, spread, off = f'{mean:.4f}', f'{std:.4f}', f'{(mean - true) / std:+.1f}'
-        else:
-            # An offset that the data leave free has the spread of a whole turn: no useful figure.
-            estimate, spread, off = 'not identifiable', f'{std:.2f}' if std < 90 else 'n/a', ''
-        name = f'{row.joint}, mm' if slides else row.joint
-        table.add_row(name, estimate, spread, f'{true:.4f}', off)
-    console.print(table)
-    for row in fit.joint_offsets:
-        if not row.identifiable:
-            console.print(f'{row.joint}: {in_a_line(row.why)}', soft_wrap=True)
-    title = 'error on validation poses, which were never fitted, mm (mean)'
-    accuracy = _table(title, 'metric', 'before', 'after')
-    for metric in ('relative', 'post_registration'):
-        sides = (fit.accuracy.validation or {}).get(metric) or {}
-        cells = [
-            f'{sides[s]["mean_mm"]:.3f}' if sides.get(s) else '-' for s in ('before', 'after')
-        ]
-        accuracy.add_row(metric.replace('_', '-'), *cells)
-    console.print(accuracy)
-
-
-def print_hidden(console: Console, discovery: Discovered, truth: SessionTruth) -> None:
-    """Print what was found beside what was hidden, and the gain."""
-    found: dict[Any, list[Effect]] = {}
-    for claim in discovery.effects:
-        for cause in named_cause(msgspec.to_builtins(claim)):
-            found.setdefault(cause, []).append(claim)
-    hidden = [(cause, effect) for effect in truth.effects for cause in causes(effect)]
-    headings = ('hidden truth', 'found', 'parameter', 'estimate', 'std', 'truth', 'unit')
-    table = _table('beyond the zero-offsets', *headings, left=2)
-    for cause, effect in hidden:
-        claims = found.pop(cause, [])
-        table.add_row(describe(cause), 'yes' if claims else 'no')
-        true = true_parameters(effect)
-        for row in (row for claim in claims for row in claim.parameters):
-            if row.name in true:
-                figures = (f'{figure:.4g}' for figure in (row.value, row.std, true[row.name]))
-                table.add_row('', '', row.name, *figures, row.unit)
-    for cause in found:
-        table.add_row('nothing of the kind', describe(cause))
-    console.print(table)
-    for line in discovery_lines(discovery):
-        console.print(line)
-
 
 ANSWER_WALL_S, WORK_WALL_S = 120.0, 3600.0
 """So long a node may take to answer or to be ready, also anew, and to fit, s: on an idle computer
@@ -320,68 +70,6 @@ BEFORE_SESSION = {'log', 'ros_home', 'session'}
 """What a demo that was interrupted leaves in its folder; while there is no session yet, all."""
 
 
-@dataclass(frozen=True)
-class Parameters:
-    """Parameters of the demo."""
-
-    out: str = parameter(
-        '', 'folder of everything the demo writes: new, empty, or of a demo to go on with'
-    )
-    seed: int = parameter(0, 'seed of the hidden World and of all randomness', low=0)
-    cell: str = parameter('demo', 'cell file: a path, or the name of a shipped one')
-    candidates: int = parameter(
-        14, 'candidate poses for optimization and for validation, each', low=1, high=1000
-    )
-    held_out_candidates: int = parameter(
-        0, 'candidate poses for validation, where not as many; 0 for as many', low=0, high=1000
-    )
-    reference_every: int = parameter(
-        25, 'configurations between two visits to the references; 0 for none', low=0, high=10_000
-    )
-    rate: float = parameter(
-        10.0, 'how many times as fast as the wall clock world time runs', low=1.0, high=20.0
-    )
-    hide: str = parameter(
-        '', 'what else is wrong with the hidden arm: NAME[@JOINT][:SIZE_MM],…, or random'
-    )
-    figures: bool = parameter(True, 'write figures and the report')
-    apply: bool = parameter(
-        False, 'correct the arm by what was found, and measure poses that no fit has seen'
-    )
-    watch: bool = parameter(False, 'serve the live page, and end with a signal')
-    quiet: bool = parameter(False, 'print nothing but errors')
-
-
-def true_errors(
-    session: Session, compensator: Compensator, truth: SessionTruth
-) -> tuple[float, float]:
-    """Return the mean true error of the tool without and with a correction, mm.
-
-    At the configurations of a session that was measured with it on; against the nominal arm, base
-    and marker fitted to each.
-    """
-    m = session.measurements
-    assert m.wanted is not None
-    first = np.unique(m.configuration, return_index=True)[1]
-    tours = m.wanted[np.sort(first)], m.q[np.sort(first)]
-    n, marker = len(first), next(iter(compensator.model.markers))
-    found = verify(
-        compensator,
-        Visits(
-            np.tile(tours[0], (2, 1)),
-            np.repeat([False, True], n),
-            np.tile(np.arange(n), 2),
-            2 * n * ('truth',),
-            2 * n * (marker,),
-            np.concatenate(
-                [tool_points(compensator.model.chain, truth, q, marker) for q in tours]
-            ),
-        ),
-    )
-    assert found.error_off is not None
-    return found.error_off.mean_mm, found.error_on.mean_mm
-
-
 def enough_candidates(cell: Workcell, seed: int, asked: int) -> int:
     """Return how many candidates of each split leave `TO_FIT` poses to fit, `asked` at the least.
 
@@ -392,34 +80,6 @@ def enough_candidates(cell: Workcell, seed: int, asked: int) -> int:
         if TourPlanner(scene, {'optimization': count}, seed).left_to_fit >= TO_FIT:
             return count
     return asked
-
-
-class Conductor(Node):
-    """Calls the services and follows the status of the nodes."""
-
-    def __init__(self) -> None:
-        super().__init__('demo')
-        self.p = declare(self, Parameters)
-        self.summaries: dict[str, dict[str, str]] = {}
-        self.times = ConfigurationTimes(self.p.rate)
-        self.planned = ''
-        listen(self, self._on_record, self._on_summary)
-        self._clients_by_name: dict[str, Any] = {}
-
-    def _on_summary(self, node: str, message: str, values: dict[str, str]) -> None:
-        self.summaries[node] = {'message': message, **values}
-
-    def _on_record(self, record: EventRecord) -> None:
-        if isinstance(record.body, TourPlanned):
-            self.planned = record.body.description
-        self.times.add(record.body)
-
-    def call(self, service: str) -> Any:
-        """Begin a call of a std_srvs/Trigger service; returns the future."""
-        if service not in self._clients_by_name:
-            self._clients_by_name[service] = self.create_client(Trigger, service)
-        client = self._clients_by_name[service]
-        return client.call_async(Trigger.Request()) if client.service_is_ready() else None
 
 
 class Keyboard:
@@ -857,25 +517,6 @@ def output_folder(path: Path) -> Path:
     return path
 
 
-def free_ports(*kinds: int) -> list[int]:
-    """Return a port on loopback for each kind of socket, all different and unused now.
-
-    They lie above the ports that Linux gives to sockets without one (32768 to 60999): nine
-    processes open dozens of these before the ports found here are bound.
-    """
-    candidates = iter(random.SystemRandom().sample(range(61001, 65001), 1000))
-    return [next(port for port in candidates if _is_free(kind, port)) for kind in kinds]
-
-
-def _is_free(kind: int, port: int) -> bool:
-    with socket.socket(socket.AF_INET, kind) as probe:
-        try:
-            probe.bind(('127.0.0.1', port))
-        except OSError:
-            return False
-        return True
-
-
 def main(args: list[str] | None = None) -> int:
     """Run the demo; returns its exit status."""
     # The traffic of the demo and its nodes stays on this machine, and apart from other demos.
@@ -898,7 +539,3 @@ def main(args: list[str] | None = None) -> int:
         if demo is not None:
             demo.close()
         rclpy.try_shutdown()
-
-
-if __name__ == '__main__':
-    raise SystemExit(main())

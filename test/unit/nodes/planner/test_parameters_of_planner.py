@@ -6,7 +6,7 @@ import pytest
 pytest.importorskip('rclpy', reason='needs ROS 2 Jazzy or its wheels')
 
 from remaster_ros.errors import InputError
-from remaster_ros.nodes.pose_planner import Parameters
+from remaster_ros.nodes.planner.parameters import Parameters
 from remaster_ros.planning import tour_planner
 from remaster_ros.planning.rival_causes import FoundCause
 from remaster_ros.session.workcell import read_cell

@@ -9,8 +9,8 @@ pytest.importorskip('rclpy', reason='needs ROS 2 Jazzy or its wheels')
 
 import types
 
-from remaster_ros.nodes import pose_planner
-from remaster_ros.nodes.pose_planner import ProgressLines
+from remaster_ros.nodes.planner import progress_lines
+from remaster_ros.nodes.planner.progress_lines import ProgressLines
 
 
 def test_a_line_comes_at_each_change_of_state_and_now_and_then_between(monkeypatch):
@@ -20,7 +20,7 @@ def test_a_line_comes_at_each_change_of_state_and_now_and_then_between(monkeypat
         create_timer=lambda period, callback, clock: ticks.append(callback),
     )
     clock = types.SimpleNamespace(monotonic=lambda: now[0])
-    monkeypatch.setattr(pose_planner, 'time', clock)
+    monkeypatch.setattr(progress_lines, 'time', clock)
     counts = {'phase': 'registration', 'configurations_done': 0, 'configurations': 0}
     counts |= {'poses': 5, 'poses_done': 0}
     state = ['idle']

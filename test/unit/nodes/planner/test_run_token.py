@@ -6,8 +6,9 @@ import time
 
 import pytest
 
-from remaster_ros.nodes import pose_planner, runtime_files
-from remaster_ros.nodes.pose_planner import LivingRun, new_token, silence_s
+from remaster_ros.nodes import runtime_files
+from remaster_ros.nodes.planner import living_run
+from remaster_ros.nodes.planner.living_run import LivingRun, new_token, silence_s
 
 
 @pytest.fixture(autouse=True)
@@ -19,20 +20,20 @@ def folder(tmp_path, monkeypatch):
 def test_the_silence_is_counted_from_the_last_sign(monkeypatch):
     run = LivingRun(new_token())
     assert 0.0 <= silence_s(run.token) < 0.5
-    now = pose_planner.since_boot_s()
-    monkeypatch.setattr(pose_planner, 'since_boot_s', lambda: now + 20.0)
+    now = living_run.since_boot_s()
+    monkeypatch.setattr(living_run, 'since_boot_s', lambda: now + 20.0)
     assert silence_s(run.token) == pytest.approx(20.0, abs=0.5)
     again = LivingRun(run.token)
     assert again.token == run.token
     assert silence_s(run.token) < 0.5
     # From a later time than now: nothing that this boot can have written.
-    monkeypatch.setattr(pose_planner, 'since_boot_s', lambda: now)
+    monkeypatch.setattr(living_run, 'since_boot_s', lambda: now)
     assert silence_s(run.token) is None
 
 
 def test_another_boot_and_an_ended_run_are_not_gone_on_with(monkeypatch):
     run = LivingRun(new_token())
-    monkeypatch.setattr(pose_planner, 'boot_id', lambda: 'another')
+    monkeypatch.setattr(living_run, 'boot_id', lambda: 'another')
     assert silence_s(run.token) is None
     monkeypatch.undo()
 
@@ -56,6 +57,6 @@ def test_the_date_of_the_file_says_nothing(folder):
 
 def test_a_sign_that_is_damaged_is_none(folder):
     run = LivingRun(new_token())
-    for text in ('', 'x', f'{pose_planner.boot_id()} soon'):
+    for text in ('', 'x', f'{living_run.boot_id()} soon'):
         (folder / f'run_{run.token}').write_text(text)
         assert silence_s(run.token) is None

@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from remaster_ros.nodes.demo import TO_FIT, enough_candidates
+from remaster_ros.demo.demo import TO_FIT, enough_candidates
 from remaster_ros.planning.tour_planner import TourPlanner
 from remaster_ros.session.workcell import read_cell
 
@@ -27,7 +27,7 @@ def test_a_demo_that_has_enough_takes_what_was_asked():
 
 
 def test_a_cell_that_never_has_enough_is_left_to_its_planner(monkeypatch):
-    monkeypatch.setattr('remaster_ros.nodes.demo.MOST_CANDIDATES', 6)
+    monkeypatch.setattr('remaster_ros.demo.demo.MOST_CANDIDATES', 6)
     cell = read_cell('demo')
     for sensor in cell.sensors.values():
         sensor.rough_position_m = (0.0, 0.0, -3.0)

@@ -9,8 +9,8 @@ pytest.importorskip('rclpy', reason='needs ROS 2 Jazzy or its wheels')
 
 from rich.console import Console
 
+from remaster_ros.demo.demo import Demo
 from remaster_ros.errors import DeviceError
-from remaster_ros.nodes.demo import Demo
 
 pytestmark = pytest.mark.ros
 

@@ -14,7 +14,7 @@ from remaster_ros.collection.peers import Peers
 from remaster_ros.collection.plan_confirmation import PlanConfirmation, fingerprint
 from remaster_ros.collection.tour_progress import TourProgress
 from remaster_ros.nodes.background import PlanningThread
-from remaster_ros.nodes.pose_planner import PlanPreview
+from remaster_ros.nodes.planner.plan_preview import PlanPreview
 from remaster_ros.planning.tour_planner import TourPlanner
 from remaster_ros.session.plan_journal import PlanJournal
 from remaster_ros.session.workcell import read_cell

@@ -1,0 +1,133 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Processes of nodes, started and supervised, and the ports of the fake devices."""
+
+from __future__ import annotations
+
+import ctypes
+import json
+import os
+import random
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from remaster_ros.errors import DeviceError
+
+_PR_SET_PDEATHSIG = 1
+
+SHORT_LIFE_S = 2.0
+"""A process that ends this soon has hardly begun, s."""
+SHORT_LIVES = 5
+"""How many of these in a row are borne."""
+
+
+def _die_with_parent() -> None:
+    """Ask Linux for SIGTERM when the parent dies, so that even a killed demo leaves nothing."""
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+
+
+class NodeProcesses:
+    """The node processes of a run, each with its output in a file ``<name>.log``."""
+
+    def __init__(self, log_folder: Path, environment: Mapping[str, str]) -> None:
+        self._log_folder = log_folder
+        self._environment = {**os.environ, **environment}
+        self._running: dict[str, subprocess.Popen[bytes]] = {}
+        self._commands: dict[str, list[str]] = {}
+        self._begun: dict[str, float] = {}
+        self._short_lives: Counter[str] = Counter()
+
+    def start(self, name: str, parameters_file: Path, parameters: Mapping[str, Any]) -> None:
+        """Start node `name` with a parameter file and values that override it."""
+        command = [sys.executable, '-m', 'remaster_ros.nodes', name, '--ros-args']
+        command += ['--params-file', str(parameters_file)]
+        for key, value in parameters.items():
+            # JSON is YAML; text in double quotes stays text whatever it looks like.
+            command += ['-p', f'{key}:={json.dumps(value)}']
+        self._commands[name] = command
+        self._spawn(name)
+
+    def _spawn(self, name: str) -> None:
+        self._begun[name] = time.monotonic()
+        with (self._log_folder / f'{name}.log').open('ab') as log:
+            self._running[name] = subprocess.Popen(
+                self._commands[name],
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                stdin=subprocess.DEVNULL,
+                env=self._environment,
+                start_new_session=True,  # Ctrl-C on the terminal reaches us alone; we end them.
+                preexec_fn=_die_with_parent,
+            )
+
+    def check(self) -> list[str]:
+        """Start again whoever was killed, as a supervisor does; return their names.
+
+        Raises DeviceError: with the last line of its log, if a process has ended by itself, or is
+        killed again and again as soon as it is there.
+        """
+        killed = []
+        for name, process in list(self._running.items()):
+            status = process.poll()
+            if status is None:
+                continue
+            lived_s = time.monotonic() - self._begun[name]
+            self._short_lives[name] = self._short_lives[name] + 1 if lived_s < SHORT_LIFE_S else 0
+            if status < 0 and self._short_lives[name] <= SHORT_LIVES:
+                self._spawn(name)
+                killed.append(name)
+            else:
+                lines = (self._log_folder / f'{name}.log').read_text(errors='replace').split('\n')
+                last = next((line for line in reversed(lines) if line.strip()), 'its log is empty')
+                raise DeviceError(f'{name} ended with status {status}: {last.strip()}')
+        return killed
+
+    def pid(self, name: str) -> int:
+        """Return the process that runs a node now."""
+        return self._running[name].pid
+
+    def stop(self, names: Sequence[str] = (), grace_s: float = 20.0) -> list[str]:
+        """End processes within about `grace_s`, all by default; return those that were killed.
+
+        On an idle computer they take a second.
+        """
+        ended = {name: self._running[name] for name in names or self._running}
+        for process in ended.values():
+            if process.poll() is None:
+                process.send_signal(signal.SIGINT)
+        deadline = time.monotonic() + grace_s
+        killed = []
+        for name, process in ended.items():
+            try:
+                process.wait(max(0.0, deadline - time.monotonic()))
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+                killed.append(name)
+            del self._running[name]
+        return killed
+
+
+def free_ports(*kinds: int) -> list[int]:
+    """Return a port on loopback for each kind of socket, all different and unused now.
+
+    They lie above the ports that Linux gives to sockets without one (32768 to 60999): nine
+    processes open dozens of these before the ports found here are bound.
+    """
+    candidates = iter(random.SystemRandom().sample(range(61001, 65001), 1000))
+    return [next(port for port in candidates if _is_free(kind, port)) for kind in kinds]
+
+
+def _is_free(kind: int, port: int) -> bool:
+    with socket.socket(socket.AF_INET, kind) as probe:
+        try:
+            probe.bind(('127.0.0.1', port))
+        except OSError:
+            return False
+        return True

@@ -1,0 +1,99 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Measure services of single-shot sensors: measurements of a configuration, and of a preflight."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+
+from rclpy.client import Client
+from rclpy.node import Node
+from rclpy.task import Future
+from std_srvs.srv import Trigger
+
+from remaster_ros.collection.pairing import Pairing
+from remaster_ros.session.workcell import Workcell
+
+PATIENCE_WALL_S = 1.0
+"""An answer counts after so long: in this time the status of the node may show that the instrument
+is gone, and the reading of a measurement arrives."""
+MISSING_WALL_S = 5.0
+"""A service that is not there counts after so long: by then a node that died is absent."""
+
+
+@dataclass
+class _Shot:
+    """A measurement: since when it is needed, the request, and when it was answered."""
+
+    since_wall: float
+    future: Future | None = None
+    answered_wall: float | None = None
+
+
+class TriggeredSensors:
+    """The measurements that one configuration after the other needs, by service clients."""
+
+    def __init__(self, clients: Mapping[str, Client]) -> None:
+        self._clients = clients
+        self._pairing: Pairing | None = None
+        self._shots: dict[str, _Shot] = {}
+
+    def look(self, pairing: Pairing, absent: Mapping[str, str], now: float) -> None:
+        """Send the requests that this pairing still needs, and note the refusals.
+
+        ``now`` is of the recorder's watchdogs, s.
+
+        The request is sent again to a sensor that was absent meanwhile, and to one whose reading
+        was lost.
+        """
+        if pairing is not self._pairing:
+            self._pairing, self._shots = pairing, {}
+        for name, client in self._clients.items():
+            if name in absent or name in pairing.decided:
+                self._shots.pop(name, None)
+                continue
+            shot = self._shots.setdefault(name, _Shot(now))
+            if shot.future is not None:
+                self._take_answer(name, shot, pairing, now)
+            elif client.service_is_ready():
+                shot.future = client.call_async(Trigger.Request())
+            elif now - shot.since_wall > MISSING_WALL_S:
+                pairing.fail(name, f'the service {client.srv_name} is not there')
+
+    def _take_answer(self, name: str, shot: _Shot, pairing: Pairing, now: float) -> None:
+        assert shot.future is not None
+        response = shot.future.result() if shot.future.done() else None
+        if response is None:
+            return
+        if shot.answered_wall is None:
+            shot.answered_wall = now
+        if now - shot.answered_wall <= PATIENCE_WALL_S:
+            return
+        if not response.success:
+            pairing.fail(name, response.message)
+        elif not pairing.has_reading(name):
+            del self._shots[name]
+
+
+MEASURE_EVERY_WALL_S = 5.0
+"""How often a single-shot sensor measures until its marker was seen, wall time."""
+
+
+class MeasureCalls:
+    """Have single-shot sensors show that they see their markers."""
+
+    def __init__(self, node: Node, cell: Workcell) -> None:
+        self._clients: dict[str, Client] = {
+            name: node.create_client(Trigger, sensor.measure_service)
+            for name, sensor in cell.sensors.items()
+            if sensor.single_shot and sensor.measure_service
+        }
+        self._called_wall = dict.fromkeys(self._clients, float('-inf'))
+
+    def call(self, names: Collection[str], now: float) -> None:
+        """Call the measure services of these sensors, each now and then; wall time, s."""
+        for name, client in self._clients.items():
+            due = now - self._called_wall[name] >= MEASURE_EVERY_WALL_S
+            if name in names and due and client.service_is_ready():
+                self._called_wall[name] = now
+                client.call_async(Trigger.Request())

@@ -1,0 +1,98 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Measurements after a complete collection, which separate causes from their look-alikes.
+
+/remaster/discover looks for causes; if it leaves look-alikes, the next /remaster/collect measures
+the configurations that tell them apart, at most `MOST_FURTHER` of them in a session.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from functools import partial
+from pathlib import Path
+
+from remaster_ros.errors import InputError
+from remaster_ros.planning.rival_causes import FoundCause
+from remaster_ros.planning.separating_design import MOST_FURTHER
+from remaster_ros.planning.tour_order import Tour
+from remaster_ros.planning.tour_planner import TourPlanner
+from remaster_ros.session.files import read_limited
+from remaster_ros.session.plan_journal import PlanJournal
+from remaster_ros.session.reader import OBSERVATIONS_LIMIT, ROWS, read_session
+from remaster_ros.types import FloatArray
+
+DISCOVER = '/remaster/discover'
+
+
+class FurtherMeasuring:
+    """Decides what is measured further, by the optimizer's discovery; nothing for folder ''."""
+
+    def __init__(
+        self, discovery: str, session: Path, journal: PlanJournal, tours: TourPlanner
+    ) -> None:
+        self._discovery, self._session = discovery, session
+        self._journal, self._tours = journal, tours
+
+    def ask(self, state: str, *, under_way: bool) -> tuple[str | None, partial[Tour] | None]:
+        """Return why nothing is measured further, '' where it is, and what plans it if it is new.
+
+        With the planner's ``state``: behind a collection that is not complete nothing is measured,
+        None. ``under_way``: whether something is being measured further already.
+        """
+        if state != 'complete':
+            return '' if under_way else None, None
+        if self._journal.tour is not None and self._journal.tour.judges:
+            return 'it was no calibration; name a new session folder', None
+        # Imported when it is needed, as it takes a while.
+        from remaster_ros.reports.discovery_json import read_causes
+        from remaster_ros.reports.fit_json import DISCOVERY_FILE
+
+        path = Path(self._discovery) / DISCOVERY_FILE
+        if not self._discovery or not path.exists():
+            return f'{DISCOVER} looks for causes, and collect measures what they leave open', None
+        try:
+            causes = read_causes(path, observations_sha256=self._digest())
+        except InputError as error:
+            return str(error), None
+        left = MOST_FURTHER - self._measured()
+        if left <= 0:
+            return f'{MOST_FURTHER} configurations were measured to separate causes already', None
+        return '', partial(self._plan, causes, left)
+
+    def _digest(self) -> str:
+        rows = read_limited(self._session / ROWS, OBSERVATIONS_LIMIT, 'it is part of a session')
+        return hashlib.sha256(rows).hexdigest()
+
+    def _measured(self) -> int:
+        """Return how many configurations were planned for this so far."""
+        return sum(tour.to_fit for tour in self._journal.tours if tour.begin_at)
+
+    def _plan(
+        self, causes: tuple[FoundCause, ...], most: int, T_R_N: Mapping[str, FloatArray]
+    ) -> Tour:
+        before = self._journal.tour
+        assert before is not None
+        rows = read_session(self._session).measurements
+        return self._tours.further(T_R_N, causes, rows, before, most)
+
+    def planned(self, tour: Tour) -> str:
+        """Return a tour of the collection with what is expected of it, in a line."""
+        designed = self._tours.designed
+        expected = '' if designed is None else designed.describe()
+        if tour.begin_at:
+            expected = self.describe()
+        return '; '.join(filter(None, (tour.describe(), expected)))
+
+    def describe(self) -> str:
+        """Return what is measured further and what is not, in a line; '' before it is planned."""
+        design = self._tours.separated
+        if design is None:
+            return ''
+        words = [
+            f'{pair.cause} and {pair.look_alike}: {pair.before:.1f} standard deviations apart, '
+            f'{pair.after:.1f} expected'
+            for pair in design.pairs
+        ]
+        words += [f'no poses of this cell separate {sentence}' for sentence in design.otherwise]
+        return ('' if design.order else 'nothing to measure: ') + '; '.join(words)

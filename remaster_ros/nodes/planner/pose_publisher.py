@@ -1,0 +1,99 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Publish a pose with all its joint solutions to bridge and recorder."""
+
+from __future__ import annotations
+
+from geometry_msgs.msg import PoseStamped
+from rclpy.publisher import Publisher
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
+
+from remaster_ros.collection.announcements import PEERS
+from remaster_ros.collection.events import PoseAnnounced
+from remaster_ros.collection.message_fields import CORRECTED, stamp_key
+from remaster_ros.kinematics.serial_chain import SerialChain
+from remaster_ros.nodes.messages import (
+    duration_of,
+    waypoints_message,
+    write_place,
+)
+from remaster_ros.nodes.running import RemasterNode
+from remaster_ros.nodes.status import (
+    LEASED,
+    NodeStatus,
+)
+from remaster_ros.planning.tour_order import PoseVisit
+
+
+class PosePublisher:
+    """Publishes poses, and the stop that takes them back."""
+
+    def __init__(self, node: RemasterNode, chain: SerialChain) -> None:
+        self._node, self._chain = node, chain
+        self._poses = node.create_publisher(PoseStamped, 'remaster/target_pose', LEASED)
+        self._waypoints = node.create_publisher(
+            JointTrajectory, 'remaster/joint_waypoints', LEASED
+        )
+        self._solutions = node.create_publisher(
+            JointTrajectory, 'remaster/joint_solutions', LEASED
+        )
+        # The last announcement: its event, and its messages with their publishers.
+        self._event: PoseAnnounced | None = None
+        self._messages: list[tuple[Publisher, PoseStamped | JointTrajectory]] = []
+
+    @property
+    def subscribers(self) -> int:
+        """How many nodes subscribe to the solutions, without those that only look on."""
+        found = self._node.get_subscriptions_info_by_topic(self._solutions.topic_name)
+        others = sum(info.node_name not in PEERS for info in found)
+        return int(self._solutions.get_subscription_count()) - others
+
+    def stop(self) -> None:
+        """Take the pose back, on which the bridge stops the arm."""
+        self._solutions.publish(JointTrajectory(joint_names=list(self._chain.joint_names)))
+
+    def announce(self, stop: PoseVisit, plan: str, status: NodeStatus, *, last: bool) -> str:
+        """Publish a pose with what is left of its solutions; return the announcement's stamp.
+
+        ``plan``: the plan that poses and solutions are numbered by; ``last``: whether it is the
+        last reference of a round.
+        """
+        pose = PoseStamped()
+        pose.header.stamp = self._node.get_clock().now().to_msg()
+        pose.header.frame_id = self._chain.base_link
+        key = stamp_key(pose.header.stamp)
+        self._event = PoseAnnounced(
+            stamp=key,
+            pose=stop.pose,
+            split=stop.split,
+            ids=stop.ids,
+            unreached=stop.unreached,
+            plan=plan,
+            last=last,
+        )
+        write_place(stop.T_R_T, pose.pose.position, pose.pose.orientation)
+        prefix = CORRECTED.get(stop.correction, '')
+        names = [f'{prefix}{name}' for name in self._chain.joint_names]
+        message = JointTrajectory(joint_names=names)
+        message.header = pose.header
+        message.points = [
+            JointTrajectoryPoint(positions=q.tolist(), time_from_start=duration_of(i + 1.0))
+            for i, q in enumerate(stop.solutions)
+        ]
+        # The solutions last: with those the bridge begins to move. Without a solution it would
+        # take the pose back, which nothing asks for.
+        waypoints = waypoints_message(stop, self._chain.joint_names, pose.header)
+        self._messages = [
+            (self._poses, pose),
+            (self._waypoints, waypoints),
+            (self._solutions, message),
+        ] * bool(stop.ids)
+        self.repeat(status)
+        return key
+
+    def repeat(self, status: NodeStatus) -> None:
+        """Publish the last announcement (again), as it was."""
+        assert self._event is not None
+        # The event goes first: the recorder must have the pose before the arm gets there.
+        status.event(self._event)
+        for publisher, message in self._messages:
+            publisher.publish(message)
