@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 from remaster_ros.calibration.result import FitResult
 from remaster_ros.discovery.discover import Discovery
+from remaster_ros.types import FloatArray
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -29,6 +30,16 @@ class Fit(FitResult):
     def of(cls, result: FitResult) -> Fit:
         """Return a result as one that shows itself."""
         return cls(**{one.name: getattr(result, one.name) for one in fields(result)})
+
+    @cached_property
+    def joint_offsets_std_shown(self) -> FloatArray:
+        """Std of each offset with what links off their drawing do to it, rad or m, (k,).
+
+        ``joint_offsets_std`` is that of an arm that is exactly its drawing.
+        """
+        from remaster_ros.reports.fit_json import uncertainty
+
+        return uncertainty(self).std
 
     def __repr__(self) -> str:
         from remaster_ros.reports.fit_json import fit_content

@@ -171,7 +171,8 @@ class Orientations:
         scale, unit = chain.shown_scale[joint], chain.shown_units[joint]
         return (
             f'{text}; {chain.joint_names[joint]} is known to {scale * std[joint]:.4f} {unit} with '
-            f'them, to {scale * self.tell.std_without[joint]:.4f} by the positions alone'
+            f'them, to {scale * self.tell.std_without[joint]:.4f} by the positions alone, if the '
+            'arm is exactly its drawing'
         )
 
 

@@ -280,9 +280,9 @@ def _offset(one: Mapping[str, Any]) -> dict[str, Any]:
     known, unit = one['identifiable'], one.get('unit', 'deg')
     row = {'joint': one['joint'], 'mean_deg': None, 'std_deg': None}
     row |= {} if unit == 'deg' else {'unit': unit}
-    return row | {
-        f'{key}_{unit}': one[f'{key}_{unit}'] if known else None for key in ('mean', 'std')
-    }
+    row |= {f'{key}_{unit}': one[f'{key}_{unit}'] if known else None for key in ('mean', 'std')}
+    narrower = f'std_if_exactly_drawn_{unit}'
+    return row | ({narrower: one[narrower]} if known and narrower in one else {})
 
 
 def _of_discovery(path: Path) -> dict[str, Any]:

@@ -62,13 +62,13 @@ class ZeroOffsets:
     check_first: Sequence[str] = ()  # What must be checked before anything is loaded, a line each
 
     @classmethod
-    def of(cls, result: FitResult) -> ZeroOffsets:
-        """Return those of a fit."""
+    def of(cls, result: FitResult, std: FloatArray | None = None) -> ZeroOffsets:
+        """Return those of a fit, with other standard deviations (k,) where they are given."""
         return cls(
             result.session.urdf,
             result.chain,
             result.joint_offsets,
-            result.joint_offsets_std,
+            result.joint_offsets_std if std is None else std,
             result.identifiable,
             result.why,
             result.session.controller,
@@ -87,7 +87,9 @@ class ZeroOffsets:
         return {self.chain.joint_names[i]: self.why[i] for i in unknown}
 
 
-def exports(result: FitResult, remarks: Sequence[str] = ()) -> dict[str, str]:
+def exports(
+    result: FitResult, remarks: Sequence[str] = (), std: FloatArray | None = None
+) -> dict[str, str]:
     """Return the files with the zero-offsets of the folder ``apply``: name -> text.
 
     Parameters
@@ -96,8 +98,10 @@ def exports(result: FitResult, remarks: Sequence[str] = ()) -> dict[str, str]:
         Whose offsets they hold.
     remarks
         For the user: what is not corrected, a line each.
+    std
+        Of the offsets, rad or m, (k,), where not those of an arm that is exactly its drawing.
     """
-    offsets = ZeroOffsets.of(result)
+    offsets = ZeroOffsets.of(result, std)
     notes = written_notes(offsets, remarks)
     return {
         REMASTER_FILE: remaster_text(offsets, remarks),

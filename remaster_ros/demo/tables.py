@@ -47,19 +47,23 @@ def print_times(console: Console, times: ConfigurationTimes) -> None:
 def print_offsets(console: Console, fit: Fit, truth: SessionTruth) -> None:
     """Print the offsets beside the true ones, and the error on validation poses."""
     title = 'joint zero-offsets, degrees'
-    table = _table(title, 'joint', 'estimate', 'std', 'hidden truth', 'off by, std')
+    # The simulated arm is exactly its drawing: by that std the estimate is judged.
+    drawn = 'std if exactly drawn'
+    table = _table(title, 'joint', 'estimate', 'std', drawn, 'hidden truth', 'off by')
     for row, hidden in zip(fit.joint_offsets, truth.joint_offsets):
         slides = row.unit == 'mm'
-        mean, std, true = (1e3 if slides else np.degrees(1.0)) * np.array(
-            [*row.mean_and_std, hidden]
+        mean, std, drawn_std, true = (1e3 if slides else np.degrees(1.0)) * np.array(
+            [*row.mean_and_std, row.std_if_exactly_drawn, hidden]
         )
         if row.identifiable:
-            estimate, spread, off = f'{mean:.4f}', f'{std:.4f}', f'{(mean - true) / std:+.1f}'
+            estimate, spread, narrower = f'{mean:.4f}', f'{std:.4f}', f'{drawn_std:.4f}'
+            off = f'{(mean - true) / drawn_std:+.1f} std'
         else:
             # An offset that the data leave free has the spread of a whole turn: no useful figure.
-            estimate, spread, off = 'not identifiable', f'{std:.2f}' if std < 90 else 'n/a', ''
+            estimate, spread = 'not identifiable', f'{std:.2f}' if std < 90 else 'n/a'
+            narrower = off = ''
         name = f'{row.joint}, mm' if slides else row.joint
-        table.add_row(name, estimate, spread, f'{true:.4f}', off)
+        table.add_row(name, estimate, spread, narrower, f'{true:.4f}', off)
     console.print(table)
     for row in fit.joint_offsets:
         if not row.identifiable:

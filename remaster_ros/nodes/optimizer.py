@@ -48,7 +48,7 @@ from remaster_ros.nodes.status import (
     Summary,
     listen,
 )
-from remaster_ros.reports.fit_json import DISCOVERY_FILE, FIT_FILE, read_fit
+from remaster_ros.reports.fit_json import DISCOVERY_FILE, FIT_FILE, read_fit, uncertainty
 from remaster_ros.reports.precision_json import precision_json
 from remaster_ros.reports.result_folder import prepare_folder, save_fit
 from remaster_ros.session.reader import read_session
@@ -233,7 +233,7 @@ class Optimizer(RemasterNode):
             priors=self._priors(),
         )
         report = save_fit(result, out, figures=self.p.figures)
-        self._publish(result.joint_names, result.joint_offsets, result.joint_offsets_std)
+        self._publish(result.joint_names, result.joint_offsets, uncertainty(result).std)
         for line in result.implausible:
             self.get_logger().warning(line)
         return report, '; '.join(('fitted', *result.implausible))

@@ -25,6 +25,7 @@ from remaster_ros.calibration.predictive_accuracy import predicted_accuracy, too
 from remaster_ros.discovery.effects.drivers import driver_named
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.transforms import apply
+from remaster_ros.reports.fit_json import uncertainty
 from remaster_ros.reports.rows_csv import lengths_mm
 from remaster_ros.types import BoolArray, FloatArray, IntArray
 
@@ -146,7 +147,7 @@ def posteriors(result: FitResult) -> Figure:
     """Draw the marginal posterior of each joint's offset with mean and 95 % interval (Fig. 4)."""
     figure, axes = _joint_panels(result, 1.55, left=0.1, top=0.3)
     scale = result.chain.shown_scale
-    draws = scale * result.joint_offset_draws
+    draws, shown = scale * result.joint_offset_draws, uncertainty(result)
     for i, ax in enumerate(axes):
         sample = draws[..., i].ravel()
         if np.ptp(sample) == 0.0:
@@ -154,8 +155,8 @@ def posteriors(result: FitResult) -> Figure:
             continue
         color = AFTER if result.identifiable[i] else BEFORE
         ax.hist(sample, bins=60, density=True, histtype='stepfilled', color=color, alpha=0.55)
-        mean, std = scale[i] * result.joint_offsets[i], scale[i] * result.joint_offsets_std[i]
-        low, high = scale[i] * result.joint_offsets_interval95[i]
+        mean, std = scale[i] * result.joint_offsets[i], scale[i] * shown.std[i]
+        low, high = scale[i] * shown.interval95[i]
         unit = ' mm' if result.chain.slides[i] else '°'
         text = 'not identifiable: where the chains wandered to'
         if high - low < WHOLE_TURN_DEG / (180.0 / np.pi) * scale[i] * result.chain.per_radian[i]:

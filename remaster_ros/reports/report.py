@@ -400,9 +400,11 @@ def _stds(inputs: Inputs, plan: RecordedPlan) -> tuple[StdRow, ...]:
     expected = plan.expected.joint_std_rad
     rows = []
     for row in inputs.fit.joint_offsets:
-        # Of the model alone, as what is expected: where other errors are left it is wider.
-        std = getattr(row, f'model_std_{row.unit}')
-        std = getattr(row, f'std_{row.unit}') if std is UNSET else std
+        # Of the model and the drawing, as what is expected: of errors left, and of an arm that is
+        # off its drawing, it is wider.
+        keys = ('model_std', 'std_if_exactly_drawn', 'std')
+        stds = [getattr(row, f'{key}_{row.unit}') for key in keys]
+        std = next(one for one in stds if one is not UNSET)
         before = expected.get(row.joint)
         scale = 1e3 if row.unit == 'mm' else float(np.degrees(1.0))
         shown = None if before is None else scale * before

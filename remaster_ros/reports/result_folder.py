@@ -25,6 +25,7 @@ from remaster_ros.reports.fit_json import (
     geometry_of,
     model_text,
     require_own,
+    uncertainty,
 )
 from remaster_ros.reports.rows_csv import (
     PREDICTIONS_FILE,
@@ -32,6 +33,7 @@ from remaster_ros.reports.rows_csv import (
     predictions_text,
     residuals_text,
 )
+from remaster_ros.reports.sentences import std_remark
 from remaster_ros.session.files import make_folder, write_atomically, writing
 
 if TYPE_CHECKING:
@@ -104,8 +106,10 @@ def save_fit(result: FitResult, folder: str | os.PathLike[str], figures: bool = 
     write_atomically(folder / FIT_FILE, text)
     result_sha256 = hashlib.sha256(text).hexdigest()
     write_atomically(folder / RESIDUALS_FILE, residuals_text(result))
-    files = exports(result)
-    if (geometry := geometry_of(result)) is not None and geometry.is_better:
+    geometry = geometry_of(result)
+    remarks = [] if geometry is None else [std_remark(geometry.tolerance_m)]
+    files = exports(result, remarks, uncertainty(result).std)
+    if geometry is not None and geometry.is_better:
         files[MODEL_FILE] = model_text(result, geometry)
     files[COMPENSATION_FILE] = compensation_text(result, result_sha256)
     _write_applied(folder, files)

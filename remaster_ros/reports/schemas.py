@@ -62,9 +62,9 @@ class MeasuredSession(Struct):
 class JointOffset(Struct):
     """One joint's zero-offset; where ``identifiable`` is false, ``why`` is the reason.
 
-    ``model_std_deg`` stands where ``std_deg`` is wider than the model has it (``intervals``).
-    ``std_deg`` is for an arm that is its drawing; ``std_with_geometry_deg`` holds what lengths and
-    tilts off their drawing would do to the offset (``geometry``).
+    ``std_deg`` and ``interval95_deg`` contain what lengths and tilts off their drawing would do to
+    the offset (``geometry``); ``std_if_exactly_drawn_deg`` is without them, and ``model_std_deg``,
+    where errors are left (``intervals``), also without those.
 
     Of a joint that slides ``unit`` is mm, the values end in ``_mm``, and those in ``_deg`` are
     null: there is no such angle.
@@ -80,10 +80,10 @@ class JointOffset(Struct):
     mean_mm: float | UnsetType = UNSET
     std_mm: float | UnsetType = UNSET
     interval95_mm: tuple[float, float] | UnsetType = UNSET
+    std_if_exactly_drawn_deg: float | UnsetType = UNSET
+    std_if_exactly_drawn_mm: float | UnsetType = UNSET
     model_std_mm: float | UnsetType = UNSET
     model_std_deg: float | UnsetType = UNSET
-    std_with_geometry_deg: float | UnsetType = UNSET
-    std_with_geometry_mm: float | UnsetType = UNSET
 
     @property
     def mean_and_std(self) -> tuple[float, float]:
@@ -93,6 +93,14 @@ class JointOffset(Struct):
             assert self.std_mm is not UNSET
             return 1e-3 * self.mean_mm, 1e-3 * self.std_mm
         return math.radians(self.mean_deg), math.radians(self.std_deg)
+
+    @property
+    def std_if_exactly_drawn(self) -> float:
+        """Standard deviation on an arm that is its drawing, rad or m; ``std`` in older files."""
+        std = getattr(self, f'std_if_exactly_drawn_{self.unit}')
+        if std is UNSET:
+            return self.mean_and_std[1]
+        return 1e-3 * float(std) if self.unit == 'mm' else math.radians(std)
 
 
 class Registration(Struct):

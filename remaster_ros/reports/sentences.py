@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Literal
 
 import msgspec
 import numpy as np
-from msgspec import Struct
+from msgspec import UNSET, Struct
 
 from remaster_ros.calibration.gauge_words import counted, in_a_line, listed
 from remaster_ros.calibration.measured_again import MeasuredAgain
@@ -563,6 +563,17 @@ def coverage_words(held_out: Coverage, gross: int) -> str:
     )
 
 
+EXACTLY_DRAWN = 'if the arm is exactly its drawing'
+
+
+def std_remark(tolerance_m: float) -> str:
+    """Return what the standard deviations of offsets contain, a sentence for files."""
+    return (
+        'The standard deviations contain what links and axes that are off their drawing by '
+        f'{1e3 * tolerance_m:.2g} mm would do to the offsets.'
+    )
+
+
 def as_drawn(geometry: FittedGeometry, imitations: Sequence[Imitation]) -> str:
     """Return what lengths and tilts off their drawing do to the offsets."""
     moved = '; '.join(
@@ -571,8 +582,8 @@ def as_drawn(geometry: FittedGeometry, imitations: Sequence[Imitation]) -> str:
         for one in imitations
     )
     return (
-        'the standard deviations are for an arm as drawn: '
-        f'{geometry.tolerance_mm:.1f} mm at {moved}'
+        'the standard deviations contain links and axes off their drawing: '
+        f'{geometry.tolerance_mm:.2g} mm at {moved}'
     )
 
 
@@ -653,9 +664,11 @@ def fit_lines(fit: Fit) -> list[str]:
 def _offset(row: JointOffset) -> str:
     if not row.identifiable:
         return f'   not identifiable: {in_a_line(row.why)}'
-    if row.unit == 'mm':
-        return f'{row.mean_mm:+9.4f} ± {row.std_mm:.4f} mm'
-    return f'{row.mean_deg:+9.4f} ± {row.std_deg:.4f} deg'
+    mean, std, drawn = (
+        getattr(row, f'{key}_{row.unit}') for key in ('mean', 'std', 'std_if_exactly_drawn')
+    )
+    narrower = '' if drawn is UNSET else f' ({drawn:.4f} {EXACTLY_DRAWN})'
+    return f'{mean:+9.4f} ± {std:.4f} {row.unit}{narrower}'
 
 
 def _to_load(rows: Sequence[Loadable], effects: Sequence[Effect] = ()) -> list[str]:

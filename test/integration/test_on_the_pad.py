@@ -111,7 +111,7 @@ class Cell:
         told = (out / 'apply' / 'remaster.txt').read_text(encoding='utf-8')
         return (
             np.array([row['mean_deg'] for row in rows]),
-            np.array([row['std_deg'] for row in rows]),
+            np.array([row.get('std_if_exactly_drawn_deg', row['std_deg']) for row in rows]),
             np.array([row['identifiable'] for row in rows]),
             told,
         )

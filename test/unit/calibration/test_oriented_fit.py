@@ -183,7 +183,7 @@ def test_report_and_file_tell_that_they_were_used_and_how_sure():
     assert np.degrees(away) < 4.0 * np.linalg.norm(body.std_deg)
     assert 'orientations are fitted' in '\n'.join(fit_lines(fit_content(fit)))
     assert all(
-        found.std_positions_deg[row.joint] > 0.9 * row.std_deg
+        found.std_positions_deg[row.joint] > 0.9 * row.std_if_exactly_drawn_deg
         for row in content.joint_offsets
         if row.identifiable
     )

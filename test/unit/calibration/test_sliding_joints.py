@@ -128,11 +128,13 @@ def test_an_offset_in_mm_is_recovered_from_a_table(measured, tmp_path):
     assert slide['identifiable']
     assert slide['unit'] == 'mm'
     assert slide['mean_deg'] is None
-    assert slide['std_mm'] < 0.1
-    assert abs(slide['mean_mm'] - 1e3 * offsets[SLIDE]) < 4.5 * slide['std_mm']
+    drawn = slide['std_if_exactly_drawn_mm']
+    assert drawn < 0.1
+    assert drawn < slide['std_mm']
+    assert abs(slide['mean_mm'] - 1e3 * offsets[SLIDE]) < 4.5 * drawn
     for joint in (1, 3, 4):
         error = rows[joint]['mean_deg'] - np.degrees(offsets[joint])
-        assert abs(error) < 4.5 * rows[joint]['std_deg']
+        assert abs(error) < 4.5 * rows[joint]['std_if_exactly_drawn_deg']
     page = (out / 'apply' / 'remaster.txt').read_text()
     assert f'{slide["mean_mm"]:+.4f} mm' in page
 

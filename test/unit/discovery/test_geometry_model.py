@@ -67,6 +67,22 @@ def test_an_elbow_off_its_drawing_by_the_tolerance_is_held_by_the_wider_std() ->
     assert np.sum(np.array(with_geometry) > 1.96) <= 4
 
 
+def test_an_elbow_that_offsets_imitate_is_within_what_a_person_is_shown() -> None:
+    """At the tolerance: 0.1 mm along x of the third joint leave nothing in the residuals."""
+    made = remaster_ros.simulate(poses=25, validation_poses=8, seed=3)
+    chain = SerialChain.from_urdf(made.session.urdf, made.session.base_link)
+    session = off_its_drawing(made.session, chain.joint_names[2], 0, 1e-4)
+    rows = fit_content(remaster_ros.fit(session)).joint_offsets
+    true = np.degrees(made.truth.joint_offsets)
+    known = [i for i, row in enumerate(rows) if row.identifiable]
+    off = [abs(rows[i].mean_deg - true[i]) for i in known]
+    narrow = [rows[i].std_if_exactly_drawn_deg for i in known]
+    assert max(np.divide(off, narrow)) > 5.0
+    for i in known:
+        low, high = rows[i].interval95_deg
+        assert low < true[i] < high, rows[i].joint
+
+
 @pytest.mark.qualify
 def test_the_tolerance_of_the_drawing_is_a_prior() -> None:
     """Where lengths and tilts show nothing, it alone decides what they could do to offsets."""
@@ -144,7 +160,7 @@ def test_an_arm_as_drawn_is_not_told_to_load_lengths_and_tilts(tmp_path: Path) -
     assert geometry.length_std_mm >= geometry.tolerance_mm
     for row in fit_content(fit).joint_offsets:
         if row.identifiable:
-            assert row.std_with_geometry_deg > row.std_deg
+            assert row.std_deg > row.std_if_exactly_drawn_deg
 
 
 def bent(session: Session) -> FloatArray:

@@ -56,7 +56,7 @@ def inputs(fit_result, tmp_path) -> Inputs:
 
 def expected(inputs, factor):
     """Return inputs whose fit states the offsets `factor` times less well than was expected."""
-    stds = {r.joint: np.radians(r.std_deg) / factor for r in inputs.fit.joint_offsets}
+    stds = {r.joint: r.std_if_exactly_drawn / factor for r in inputs.fit.joint_offsets}
     return replace(inputs, plan=replace(inputs.plan, expected=ExpectationNoted(stds, 2e-4)))
 
 
@@ -87,8 +87,9 @@ def test_what_was_expected_stands_beside_what_came_out(inputs, factor, words):
     rows = {row.joint: row for row in facts.stds}
     for row in inputs.fit.joint_offsets:
         found = rows[row.joint]
-        assert found.expected == pytest.approx(row.std_deg / factor)
-        assert found.fit == (pytest.approx(row.std_deg) if row.identifiable else None)
+        drawn = np.degrees(row.std_if_exactly_drawn)
+        assert found.expected == pytest.approx(drawn / factor)
+        assert found.fit == (pytest.approx(drawn) if row.identifiable else None)
     assert words in facts.verdict
 
 
@@ -96,7 +97,8 @@ def test_a_wider_interval_for_other_errors_is_not_compared(inputs):
     """What is expected is of the model alone."""
     inputs = expected(inputs, 1.0)
     for row in inputs.fit.joint_offsets:
-        row.model_std_deg, row.std_deg = row.std_deg, 10.0 * row.std_deg
+        row.model_std_deg = float(np.degrees(row.std_if_exactly_drawn))
+        row.std_if_exactly_drawn_deg, row.std_deg = 3.0 * row.std_deg, 10.0 * row.std_deg
     assert plan_facts(inputs).ratio == pytest.approx(1.0)
 
 

@@ -22,9 +22,10 @@ from remaster_ros.compensation.export import (
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.transforms import matrix_from_quaternion_xyzw, matrix_from_rpy
-from remaster_ros.reports.fit_json import fit_content, joint_offsets_of, read_fit
+from remaster_ros.reports.fit_json import fit_content, geometry_of, joint_offsets_of, read_fit
 from remaster_ros.reports.report import fit_html
 from remaster_ros.reports.result_folder import prepare_folder, save_fit
+from remaster_ros.reports.sentences import fit_lines
 
 
 def test_fit_json_is_the_fit(fit_result, tmp_path):
@@ -55,6 +56,35 @@ def test_fit_json_is_the_fit(fit_result, tmp_path):
     assert len(fit.robot.urdf_sha256) == 64
 
 
+def test_what_a_person_is_shown_contains_an_arm_off_its_drawing(fit_result, tmp_path):
+    """Page, terminal, files and Python's table have the wider std, and name the narrower one."""
+    save_fit(fit_result, tmp_path, figures=False)
+    fit = read_fit(tmp_path / 'fit.json')
+    geometry = geometry_of(fit_result)
+    moved = np.sqrt(2.0) * np.linalg.norm(geometry.offset_moves, axis=1)
+    wider = np.degrees(np.hypot(moved, fit_result.joint_offsets_std))
+    drawn = np.degrees(fit_result.joint_offsets_std)
+    lines, html = fit_lines(fit), fit_html(fit_result, {})
+    layer = (tmp_path / 'apply' / 'offset_layer.yaml').read_text()
+    in_layer = iter(yaml.safe_load(layer)['/**']['ros__parameters']['joint_offsets_std'])
+    known = np.flatnonzero(fit_result.identifiable)
+    assert len(known)
+    for i in known:
+        row = fit.joint_offsets[i]
+        assert row.std_deg == pytest.approx(wider[i])
+        assert row.std_if_exactly_drawn_deg == pytest.approx(drawn[i])
+        assert 2.0 * drawn[i] < wider[i]
+        half = np.degrees(np.diff(fit_result.joint_offsets_interval95[i])[0]) / 2.0
+        low, high = row.interval95_deg
+        assert (high - low) / 2.0 == pytest.approx(half * wider[i] / drawn[i])
+        assert f'± {wider[i]:.4f} deg ({drawn[i]:.4f} if the arm is exactly' in lines[i]
+        assert f'<td class="n">{wider[i]:.4f}</td>' in html
+        assert np.degrees(next(in_layer)) == pytest.approx(wider[i])
+        assert f'{wider[i]:.4f}' in (tmp_path / 'apply' / 'remaster.txt').read_text()
+    assert 'std if the arm is exactly its drawing' in html
+    assert 'off their drawing by 0.1 mm' in layer
+
+
 def test_offsets_of_another_robot_are_refused(fit_result):
     fit = fit_content(fit_result)
     with pytest.raises(InputError, match='use the fit of this robot'):
@@ -72,7 +102,13 @@ def test_an_offset_without_its_std_is_refused(fit_result):
 
 
 @pytest.mark.parametrize(
-    ('key', 'value'), [('std_deg', -0.01), ('std_deg', 1e30), ('mean_deg', -1e300)]
+    ('key', 'value'),
+    [
+        ('std_deg', -0.01),
+        ('std_deg', 1e30),
+        ('mean_deg', -1e300),
+        ('std_if_exactly_drawn_deg', -1.0),
+    ],
 )
 def test_offsets_that_are_no_angles_are_refused(fit_result, key, value):
     fit = fit_content(fit_result)
@@ -227,7 +263,7 @@ def test_wider_intervals_and_their_reason_are_in_the_file(fit_result):
     assert [test['found'] for test in content['residual_structure']] == [True, False]
     assert content['residual_structure'][0]['driver'] == 'position'
     rows = content['joint_offsets']
-    assert rows[2]['model_std_deg'] == pytest.approx(rows[2]['std_deg'] / 3.0)
+    assert rows[2]['model_std_deg'] == pytest.approx(rows[2]['std_if_exactly_drawn_deg'] / 3.0)
     assert 'model_std_deg' not in rows[3]
     places = (*content['registration'].values(), *content['markers'].values())
     assert len(places) > 1
