@@ -373,6 +373,8 @@ class Session:
         Keys of session.yaml this version does not know, kept as they are.
     observations_sha256
         Of the file that the rows were read from; '' where they were not read, or are a part of it.
+    disagreements
+        What the sessions that it was made of disagree in, a sentence each.
     """
 
     urdf: str
@@ -399,6 +401,7 @@ class Session:
     controller: Controller | None = None
     correction: Correction | None = None
     accuracy_option: AccuracyOption = ''
+    disagreements: tuple[str, ...] = ()
 
     @property
     def urdf_sha256(self) -> str:

@@ -3,22 +3,36 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from remaster_ros.calibration.mistakes import sound_estimate
 from remaster_ros.errors import InputError, InsufficientDataError, MistakeFoundError
 from remaster_ros.session.reader import ROWS, read_session
-from remaster_ros.session.together import together
+from remaster_ros.session.together import disagreements, together
 from remaster_ros.types import Session
+
+log = logging.getLogger('remaster_ros')
 
 
 def read_together(folders: Sequence[Path]) -> tuple[Session, list[str]]:
-    """Read one session or several of one arm, and lines on how their rows are named."""
+    """Read one session or several of one arm, and lines on how their rows are named.
+
+    Raises
+    ------
+    InputError
+        What cannot be read, or sessions that are not of one arm, by their zero-offsets.
+    """
     sessions = [(str(folder), read_to_fit(folder)) for folder in folders]
     if len(sessions) == 1:
         return sessions[0][1], []
-    return together(sessions)
+    whole, lines = together(sessions)
+    differing, silent = disagreements(sessions)
+    for line in differing:
+        log.warning('%s', line)
+    return replace(whole, disagreements=tuple(differing)), [*lines, *silent]
 
 
 def _one_arm(session: Session, folder: Path) -> Session:

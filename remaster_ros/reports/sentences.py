@@ -126,7 +126,7 @@ def verdict(result: FitResult) -> Judgement:
             f'{FEW_POSES} whether other errors than noise are left, which the offsets would '
             f'take up: measure at least {FEWEST_POSES} and fit again.'
         )
-    disagreements = changes + spoilt + displaced
+    disagreements = [*result.session.disagreements, *changes, *spoilt, *displaced]
     points = findings + doubts + _widening(result) + disagreements
     doubtful = bool(unexplained or untold) or result.other_errors
     hardly = hardly_proven(_held_out_poses(result.session))
@@ -328,7 +328,8 @@ def judgement(
     """
     more = more_than_noise(content)
     again = MeasuredAgain.of(discovery.fit.session.measurements)
-    proven = _is_proven(discovery, confirmation) and not more and not again.most
+    disagreements = discovery.fit.session.disagreements
+    proven = _is_proven(discovery, confirmation) and not (more or again.most or disagreements)
     # What discovers takes half a second to import, and a fit needs none of it.
     from remaster_ros.discovery.confirmation import in_words
 
@@ -341,6 +342,7 @@ def judgement(
         doubts=[
             words
             for words in (
+                *disagreements,
                 again.words if again.again else '',
                 hardly_proven(_held_out_poses(discovery.fit.session)),
                 note,

@@ -13,7 +13,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from remaster_ros.errors import InputError
+from remaster_ros.calibration.estimate import Estimate
+from remaster_ros.calibration.mistakes import sound_estimate
+from remaster_ros.calibration.one_arm import OffsetsApart, offsets_apart
+from remaster_ros.errors import InputError, InsufficientDataError, MistakeFoundError
 from remaster_ros.session.observations import stacked
 from remaster_ros.types import Measurements, Session
 
@@ -106,6 +109,62 @@ def together(sessions: Sequence[tuple[str, Session]]) -> tuple[Session, list[str
         observations_sha256='',
     )
     return whole, lines
+
+
+def disagreements(sessions: Sequence[tuple[str, Session]]) -> tuple[list[str], list[str]]:
+    """Ask whether sessions were measured with one arm, by the zero-offsets of each alone.
+
+    Parameters
+    ----------
+    sessions
+        Name of each, for messages, and the session; each later one is compared with the first.
+
+    Returns
+    -------
+    list of str, list of str
+        What a few offsets differ in, and which sessions cannot answer alone, a sentence each.
+
+    Raises
+    ------
+    InputError
+        Most offsets differ: two arms, or one that was mastered anew in between.
+    MistakeFoundError
+        A mistake in the tables of one session, which explains its misfit.
+    """
+    found: list[tuple[str, Estimate]] = []
+    differing, silent = [], []
+    for name, session in sessions:
+        try:
+            found.append((name, sound_estimate(session)))
+        except MistakeFoundError as error:
+            raise MistakeFoundError(f'{name}: {error}', error.options) from None
+        except InsufficientDataError as error:
+            silent.append(f'{name} alone does not tell whether it is of the same arm: {error}')
+    for name, other in found[1:]:
+        first_name, first = found[0]
+        apart = offsets_apart(first, other)
+        if apart is None:
+            silent.append(
+                f'{first_name} and {name} determine no offset in common, which would tell '
+                'whether they are of one arm'
+            )
+        elif apart.mostly:
+            raise InputError(
+                f'{first_name} and {name} are not of one arm as it was: {_words(apart)}. Fit them '
+                'one by one, or together those sessions that were measured with one arm since it '
+                'was mastered last'
+            )
+        elif apart.differ:
+            differing.append(
+                f'{first_name} and {name} do not have the same zero-offsets: {_words(apart)}. '
+                'Together they give neither: fit them one by one, and find out what was changed '
+                'between them (a motor, a mastering, another arm).'
+            )
+    return differing, silent
+
+
+def _words(apart: OffsetsApart) -> str:
+    return f'fitted one by one their zero-offsets differ, {apart.words}'
 
 
 def _require_same_arm(first_name: str, first: Session, name: str, session: Session) -> None:

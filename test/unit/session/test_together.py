@@ -2,6 +2,7 @@
 """Several sessions of one arm: one set of offsets, registrations and markers of each session."""
 
 import json
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -14,7 +15,7 @@ from remaster_ros.discovery.to_extension import offsets_of
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.transforms import rotation_vector_to_matrix
 from remaster_ros.session.reader import write_session
-from remaster_ros.session.together import together
+from remaster_ros.session.together import disagreements, together
 
 SEED = 5
 
@@ -54,6 +55,60 @@ def test_the_arm_is_shared_and_registrations_are_not(made, halves) -> None:
         assert np.all(error < 4.0 * std[known])
         stds.append(std[known])
     assert np.all(stds[2] < np.minimum(stds[0], stds[1]))
+
+
+@pytest.fixture(scope='module')
+def of_another_arm(made):
+    """A session of an arm of the same kind, with zero-offsets of its own."""
+    return remaster_ros.simulate(poses=20, validation_poses=6, seed=SEED + 1).session
+
+
+def one_joint_mastered(session, joint: int, by_deg: float):
+    """Return a session whose arm counts one joint's angle from elsewhere."""
+    q = session.measurements.q.copy()
+    q[:, joint] += np.radians(by_deg)
+    return replace(session, measurements=replace(session.measurements, q=q))
+
+
+@pytest.mark.parametrize('verb', ['fit', 'discover'])
+def test_two_arms_are_refused_before_a_joint_fit(verb, halves, of_another_arm, tmp_path) -> None:
+    """The error falls by such a fit, too, and its offsets are those of neither arm."""
+    folders = [tmp_path / name for name in ('monday', 'tuesday')]
+    for folder, session in zip(folders, (halves[0], of_another_arm), strict=True):
+        write_session(folder, session)
+    said = refusal(verb, *folders, '--out', tmp_path / 'out')
+    assert 'monday' in said
+    assert 'tuesday are not of one arm as it was' in said
+    assert re.search(r'joint_[2-6] by \d+', said)
+    assert 'standard deviations. Fit them one by one' in said
+    assert not (tmp_path / 'out' / 'fit.json').exists()
+
+
+def test_one_joint_that_was_mastered_in_between_is_named(halves, tmp_path) -> None:
+    """The joint fit is made, and no page of it is green."""
+    folders = [tmp_path / name for name in ('monday', 'tuesday')]
+    sessions = halves[0], one_joint_mastered(halves[1], 3, 0.3)
+    for folder, session in zip(folders, sessions, strict=True):
+        write_session(folder, session)
+    done = remaster('fit', *folders, '--out', tmp_path / 'out', '--no-figures')
+    assert 'do not have the same zero-offsets' in done.stderr
+    assert re.search(r'differ, joint_4 by \d+ standard deviations\.', done.stderr), done.stderr
+    judgement = json.loads((tmp_path / 'out' / 'fit.json').read_text())['judgement']
+    assert judgement['mood'] != 'good'
+    assert any('joint_4 by' in line for line in judgement['disagreements'])
+
+
+def test_sessions_of_one_arm_disagree_in_nothing(halves) -> None:
+    assert disagreements([('monday', halves[0]), ('tuesday', halves[1])]) == ([], [])
+
+
+def test_a_session_that_cannot_answer_alone_says_so(halves) -> None:
+    few = halves[1].select(halves[1].measurements.pose == halves[1].measurements.pose[0])
+    assert not few.measurements.is_validation.all()
+    differing, silent = disagreements([('monday', halves[0]), ('tuesday', few)])
+    assert not differing
+    assert len(silent) == 1
+    assert silent[0].startswith('tuesday alone does not tell')
 
 
 def test_what_is_not_of_one_arm_is_refused_by_name(halves) -> None:
