@@ -336,7 +336,7 @@ def _as_json(out: Path, p: CellProposal) -> dict[str, Any]:
 def _kinematics_as_json(kinematics: InverseKinematics) -> dict[str, Any]:
     off = kinematics.difference
     return {
-        'way': kinematics.way,
+        'way': kinematics.method,
         'closed_form_off_mm': None if off is None else 1e3 * off[0],
         'closed_form_off_deg': None if off is None else float(np.degrees(off[1])),
         'in_words': kinematics.in_words(),

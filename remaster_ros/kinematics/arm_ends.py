@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The ends of the arm in a robot description: which links are likely its base and its tool."""
+"""The likely base and tool links of the arm in a robot description."""
 
 from __future__ import annotations
 
@@ -14,24 +14,22 @@ TOOL_NAMES = (
     *('link_ee', 'ee_link', 'link_eef', 'eef', 'ee', 'end_effector', 'flange', 'hand'),
 )
 _WORLD = ('world', 'map', 'odom')
-# Parts of a gripper that move against each other, in the names of joints and of what they carry.
+# Words for parts of a gripper in the names of joints and of their child links.
 _JAWS = ('finger', 'jaw', 'knuckle', 'thumb', 'claw')
-# What else is in the name of a joint that turns the gripper as a whole.
+# Words in the name of a joint that turns a whole gripper.
 _WHOLE = ('roll', 'rot', 'pitch', 'yaw', 'wrist', 'turn', 'spin', 'flex')
-# What branches behind so many joints that turn is a hand: two arms have no more of them in common.
+# Revolute joints behind which a branch is a hand: two arms share no more joints than this.
 _HAND_BEHIND = 5
 
 
 def likely_base(model: UrdfModel, names: Container[str] = ()) -> str:
-    """Return the root, or what is fixed to it where the root is the world.
+    """Return the likely base link of the arm.
 
-    Where a joint that slides (a rail, a lift) carries an arm of five or more joints that turn, it
-    is the base of what it carries, unless that joint is known to be the arm's.
+    The root, or, if the root is a world frame, the link fixed to it. If a prismatic joint (a rail,
+    a lift) carries an arm of five or more revolute joints, the link that this joint moves, unless
+    `names` has the prismatic joint.
 
-    Parameters
-    ----------
-    names
-        As of `likely_tips`.
+    ``names``: joints that are known to be the arm's, as in `likely_tips`.
     """
     sliders = _sliders(model, names, carrying=False)
     arms = {
@@ -39,7 +37,7 @@ def likely_base(model: UrdfModel, names: Container[str] = ()) -> str:
         for link in model.links
         if (arm := _arm(model, link, sliders=sliders, names=names)) is not None
     }
-    # From the root where both are as good.
+    # The root wins a tie.
     best = max(
         arms.values(),
         key=lambda arm: (_named(arm[1], names), len(arm[1]), arm[0] == model.root),
@@ -47,11 +45,11 @@ def likely_base(model: UrdfModel, names: Container[str] = ()) -> str:
     )
     if best is not None and best[0] != model.root and best[1]:
         start, joints = best
-        between, link = [start], joints[0].parent
+        links, link = [start], joints[0].parent
         while link != start:
-            between.append(link)
+            links.append(link)
             link = model.parent_joint[link].parent
-        based = [link for link in between if 'base' in link.lower()]
+        based = [link for link in links if 'base' in link.lower()]
         return min(based, key=len) if based else start
     if model.root not in _WORLD:
         return model.root
@@ -66,20 +64,16 @@ def likely_base(model: UrdfModel, names: Container[str] = ()) -> str:
 def likely_tips(model: UrdfModel, base_link: str, names: Container[str] = ()) -> list[str]:
     """Return the links behind the last joint of the arm, the likeliest tool frame first.
 
-    The arm is the way from the base with the most joints; a gripper's jaws and fingers are no
-    joints of it, nor what slides behind five joints that turn and carries none. Where `names` has
-    joints of the robot, only those that slide are the arm's that it has.
+    The arm is the chain from the base with the most joints. Joints of a gripper's jaws and fingers
+    are not counted, nor prismatic joints behind five revolute ones that carry none.
 
-    Parameters
-    ----------
-    names
-        Joints that are known to be the arm's, such as those of a table: the arm is the way with
-        the most of them.
+    ``names``: joints that are known to be the arm's, such as those of a table: the arm is then the
+    chain with the most of them, and only prismatic joints among them count.
 
     Raises
     ------
     InputError
-        No joint turns behind the base, or there are several arms.
+        If no joint moves behind the base, or there are several arms.
     """
     if base_link not in model.links:
         raise InputError(f"URDF: there is no link '{base_link}'; it has {', '.join(model.links)}")
@@ -92,7 +86,7 @@ def likely_tips(model: UrdfModel, base_link: str, names: Container[str] = ()) ->
     }
 
     def worth(arm: list[UrdfJoint]) -> tuple[int, bool, int]:
-        # An arm all of whose joints are named ends there, whatever else moves behind it.
+        # An arm all of whose joints are named ends with them, whatever moves behind.
         count = _named(arm, names)
         return count, 0 < count == len(arm), len(arm)
 
@@ -107,7 +101,7 @@ def likely_tips(model: UrdfModel, base_link: str, names: Container[str] = ()) ->
         for i, name in enumerate(TOOL_NAMES):
             if words == name or words.endswith(f'_{name}'):
                 return i, False, 0
-        # Else a frame that carries nothing, the last one in the file.
+        # Else a leaf, the last one in the file.
         return len(TOOL_NAMES), link in parents, -ends.index(link)
 
     ordered = sorted(ends, key=rank)
@@ -122,12 +116,10 @@ def likely_tips(model: UrdfModel, base_link: str, names: Container[str] = ()) ->
 
 
 def likely_tip(model: UrdfModel, base_link: str, names: Container[str] = ()) -> str:
-    """Return the first of `likely_tips`.
+    """Return the likeliest tool frame, the first of `likely_tips`.
 
-    Raises
-    ------
-    InputError
-        As `likely_tips`, or the arm goes on behind a joint that slides and is not named.
+    Raises InputError as `likely_tips` does, and if the arm goes on behind a prismatic joint that
+    `names` does not have.
     """
     tip = likely_tips(model, base_link, names)[0]
     last = _arm(model, tip, base_link, _sliders(model, names, carrying=True), names)
@@ -142,7 +134,7 @@ def likely_tip(model: UrdfModel, base_link: str, names: Container[str] = ()) -> 
 
 
 def moving_before(model: UrdfModel, base_link: str) -> list[str]:
-    """Return the joints between the root and a link that move, from the root on."""
+    """Return the names of the moving joints between the root and a link, from the root on."""
     joints = []
     while (joint := model.parent_joint.get(base_link)) is not None:
         if joint.kind != 'fixed':
@@ -152,14 +144,10 @@ def moving_before(model: UrdfModel, base_link: str) -> list[str]:
 
 
 def _sliders(model: UrdfModel, names: Container[str], *, carrying: bool) -> set[str]:
-    """Return the joints that slide and are likely the arm's.
+    """Return the names of the prismatic joints that likely belong to the arm.
 
-    Parameters
-    ----------
-    names
-        Where it has joints of the robot, those of them that slide.
-    carrying
-        Whether one that carries an arm of five joints that turn is taken.
+    ``names``: if it has joints of the robot, the prismatic ones among them are returned.
+    ``carrying``: whether a joint that carries an arm of five revolute joints counts.
     """
     joints = model.parent_joint.values()
     named = [joint for joint in joints if joint.kind != 'fixed' and joint.name in names]
@@ -177,7 +165,7 @@ def _sliders(model: UrdfModel, names: Container[str], *, carrying: bool) -> set[
 
 
 def _turning_before(model: UrdfModel, link: str) -> int:
-    """Return how many joints turn between the root and a link."""
+    """Return the number of revolute joints between the root and a link."""
     count = 0
     while (joint := model.parent_joint.get(link)) is not None:
         count += _turns(joint)
@@ -186,7 +174,7 @@ def _turning_before(model: UrdfModel, link: str) -> int:
 
 
 def _turning_behind(model: UrdfModel, link: str) -> int:
-    """Return how many joints turn one after the other behind a link, at most."""
+    """Return the largest number of revolute joints in one chain behind a link."""
     return max(
         (
             _turns(joint) + _turning_behind(model, joint.child)
@@ -197,6 +185,7 @@ def _turning_behind(model: UrdfModel, link: str) -> int:
 
 
 def _turns(joint: UrdfJoint) -> bool:
+    """Return whether a joint is a revolute joint of an arm, not a mimic or gripper joint."""
     return joint.kind in ('revolute', 'continuous') and not joint.mimic and not _is_jaw(joint)
 
 
@@ -207,12 +196,11 @@ def _arm(
     sliders: Container[str] = (),
     names: Container[str] = (),
 ) -> tuple[str, list[UrdfJoint]] | None:
-    """Return where the arm that carries a link starts, and its joints; None behind its tool.
+    """Return the first link and the joints of the arm that carries a link; None within a hand.
 
-    A joint of `names` is the arm's, also where something else that moves branches off beside it.
-
-    It starts at `base_link`, or at the root, or at what a joint carries that neither turns nor is
-    one of the sliders.
+    The arm starts at `base_link`, at the root, or behind a joint that is neither revolute nor one
+    of the `sliders`. A link behind five joints of which another moving joint branches off is in a
+    hand, unless `names` has the joint.
     """
     joints: list[UrdfJoint] = []
     while link != base_link and (joint := model.parent_joint.get(link)) is not None:
@@ -233,14 +221,15 @@ def _arm(
 
 
 def _moved_from(model: UrdfModel, link: str) -> list[UrdfJoint]:
-    """Return the next joints that move behind a link."""
-    found = []
+    """Return the next moving joints behind a link."""
+    joints = []
     for joint in model.child_joints[link]:
-        found += [joint] if joint.kind != 'fixed' else _moved_from(model, joint.child)
-    return found
+        joints += [joint] if joint.kind != 'fixed' else _moved_from(model, joint.child)
+    return joints
 
 
 def _is_jaw(joint: UrdfJoint) -> bool:
+    """Return whether a joint moves a part of a gripper, by its name."""
     name = joint.name.lower()
     if any(word in part for word in _JAWS for part in (name, joint.child.lower())):
         return True
@@ -248,4 +237,5 @@ def _is_jaw(joint: UrdfJoint) -> bool:
 
 
 def _named(joints: list[UrdfJoint], names: Container[str]) -> int:
+    """Return how many of the joints `names` has."""
     return sum(joint.name in names for joint in joints)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Convex bodies for collision checks: boxes, cylinders, spheres, capsules and hulls of points.
 
-Each shape lies about the origin of a frame of its own. A body is a shape fastened to one link of
-the arm, or to the base. Meshes are read elsewhere and handed in as arrays of points.
+Each shape is centred near the origin of its frame. A body is a shape fixed to one link of the arm,
+or to the base. Meshes are read in `session.meshes` and come here as arrays of points.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ from remaster_ros.errors import InputError
 from remaster_ros.kinematics.transforms import apply, transform
 from remaster_ros.types import FloatArray, IntArray
 
-# A cylinder is inside a prism with so many sides drawn around it; 0.5 % of its radius wider.
+# Sides of the prism that encloses a cylinder; with 32 it is 0.5 % of the radius wider.
 _SIDES = 32
-# More points than this are replaced by the corners of the box around them.
+# Most points of an outline; more are replaced by the corners of their bounding box.
 _MOST_POINTS = 60
 # Corners of a cube of edge length 2 about the origin, (8, 3).
 _CUBE = np.array(list(product((-1.0, 1.0), repeat=3)))
 _GOLDEN = (1 + 5**0.5) / 2
 _RECTANGLE = _CUBE[:4] * (0.0, 1 / _GOLDEN, _GOLDEN)
-# Corners of a regular dodecahedron with the unit sphere inside it, (20, 3): those of a cube and of
+# Corners of a regular dodecahedron that encloses the unit sphere, (20, 3): those of a cube and of
 # three rectangles.
 _AROUND_A_BALL = np.concatenate(
     [_CUBE, *(np.roll(_RECTANGLE, turn, axis=1) for turn in range(3))]
@@ -59,7 +59,7 @@ class Shape:
 
     @cached_property
     def capsule(self) -> tuple[FloatArray, FloatArray, float]:
-        """Both ends (m, (3,)) and the radius (m) of a capsule that contains the shape."""
+        """Ends (m, (3,) each) and radius (m) of a small capsule around the shape."""
         if self.kind in ('sphere', 'capsule', 'cylinder'):
             return self.points[0], self.points[-1], self.ball + self.disc
         best = (np.zeros(3), np.zeros(3), np.inf, np.inf)
@@ -68,13 +68,13 @@ class Shape:
         for axis in (*np.eye(3), *principal):
             along = (self.points - middle) @ axis
             across = self.points - middle - along[:, None] * axis
-            # The line goes through the middle of what lies across it.
+            # The axis of the capsule goes through the middle of the extent across it.
             centre = middle + (across.min(axis=0) + across.max(axis=0)) / 2
             centre = centre - ((centre - middle) @ axis) * axis
             off = self.points - centre
             wide = np.linalg.norm(off - (off @ axis)[:, None] * axis, axis=1)
             radius = float(wide.max())
-            # The round ends may cover what lies near the line: the segment can be shorter.
+            # The round ends cover points near the axis: the segment can be shorter.
             reach = np.sqrt(np.maximum(radius**2 - wide**2, 0.0))
             low, high = float(np.min(along + reach)), float(np.max(along - reach))
             if high < low:
@@ -82,12 +82,12 @@ class Shape:
             volume = np.pi * radius**2 * (high - low) + 4 / 3 * np.pi * radius**3
             if volume < best[3]:
                 best = (centre + low * axis, centre + high * axis, radius, volume)
-        # Somewhat wider, for rounding: the points lie on the surface.
+        # Wider by the rounding error: the points lie on the surface.
         return best[0], best[1], best[2] + 1e-9
 
     @property
     def is_its_capsule(self) -> bool:
-        """Whether the capsule around the shape is the shape itself."""
+        """Whether `capsule` is the shape itself, not an enclosure of it."""
         return self.kind in ('sphere', 'capsule')
 
 
@@ -98,28 +98,27 @@ def box(size_m: ArrayLike) -> Shape:
 
 
 def cylinder(radius_m: float, length_m: float) -> Shape:
-    """Return a cylinder along z, its middle at the origin."""
+    """Return a cylinder along z, centred at the origin."""
     radius, length = _positive('cylinder', (radius_m, length_m), 2)
     return Shape('cylinder', np.array([[0, 0, -length / 2], [0, 0, length / 2]]), disc=radius)
 
 
 def sphere(radius_m: float) -> Shape:
-    """Return a sphere about the origin."""
+    """Return a sphere centred at the origin."""
     (radius,) = _positive('sphere', (radius_m,), 1)
     return Shape('sphere', np.zeros((1, 3)), ball=radius)
 
 
 def capsule(start: ArrayLike, end: ArrayLike, radius_m: float) -> Shape:
-    """Return the points within a radius of the straight line between two points, m, (3,)."""
+    """Return a capsule: all points within a radius of the segment from start to end, m, (3,)."""
     (radius,) = _positive('capsule', (radius_m,), 1)
     return Shape('capsule', np.array([start, end], dtype=float), ball=radius)
 
 
 def hull(points: ArrayLike) -> Shape:
-    """Return the convex hull of points (a mesh's vertices), m, (n, 3).
+    """Return the convex hull of points (the vertices of a mesh), m, (n, 3).
 
-    Raises InputError: points that are not finite, or that all lie in one plane and so enclose
-    nothing.
+    Raises InputError if points are not finite, or all lie in one plane.
     """
     points = np.asarray(points, dtype=float)
     if points.ndim != 2 or points.shape[1:] != (3,) or not np.all(np.isfinite(points)):
@@ -135,6 +134,7 @@ def hull(points: ArrayLike) -> Shape:
 
 
 def _positive(kind: str, values: ArrayLike, count: int) -> FloatArray:
+    """Return sizes as an array (count,); raise InputError if one is not positive and finite."""
     array = np.asarray(values, dtype=float)
     if array.shape != (count,) or not np.all((array > 0.0) & (array < np.inf)):
         raise InputError(
@@ -145,23 +145,23 @@ def _positive(kind: str, values: ArrayLike, count: int) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class Body:
-    """A shape fastened to a link."""
+    """A shape fixed to a link of the arm, or to the base."""
 
     name: str
-    link: int  # 0 for the base, i for what moves with joint i (1-based)
+    link: int  # 0 for the base, i for the link after joint i (1-based)
     shape: Shape
-    # Where it is in the frame after that joint (in the base for 0), (4, 4)
+    # Pose of the shape in its link's frame, (4, 4)
     T_link_body: FloatArray = field(default_factory=lambda: np.eye(4))
     role: str = 'link'  # ``link``, ``tool`` (tool and markers) or ``obstacle``
 
     @cached_property
     def outline(self) -> FloatArray:
-        """Points whose hull contains the body, in the link's frame, m, (n, 3)."""
+        """Points whose hull contains the body, in the frame of its link, m, (n, 3)."""
         return apply(self.T_link_body, self.shape.outline)
 
     @cached_property
     def capsule(self) -> tuple[FloatArray, FloatArray, float]:
-        """Both ends and the radius of a capsule around it, in the link's frame, m."""
+        """Ends (m, (3,) each) and radius (m) of a capsule around the body, in its link's frame."""
         a, b, radius = self.shape.capsule
         return apply(self.T_link_body, a), apply(self.T_link_body, b), radius
 
@@ -169,23 +169,23 @@ class Body:
 def obstacle(
     name: str, center_m: ArrayLike, size_m: ArrayLike, rotation: ArrayLike | None = None
 ) -> Body:
-    """Return a box that stands in the base frame; `rotation` is (3, 3), none for upright."""
+    """Return a box that stands in the base frame; `rotation` is (3, 3), None for no rotation."""
     turn = np.eye(3) if rotation is None else np.asarray(rotation, dtype=float)
     return Body(name, 0, box(size_m), transform(turn, np.asarray(center_m, float)), 'obstacle')
 
 
 def triangles(points: FloatArray) -> IntArray:
-    """Return the triangles of the hull of points (n, 3), facing outwards, (m, 3)."""
-    found = ConvexHull(points)
-    faces = found.simplices.astype(np.int64)
+    """Return the outward triangles of the convex hull of points (n, 3), as indices (m, 3)."""
+    convex = ConvexHull(points)
+    faces = convex.simplices.astype(np.int64)
     a, b, c = (points[faces[:, i]] for i in range(3))
-    inwards = np.sum(np.cross(b - a, c - a) * found.equations[:, :3], axis=1) < 0.0
+    inwards = np.sum(np.cross(b - a, c - a) * convex.equations[:, :3], axis=1) < 0.0
     faces[inwards] = faces[inwards][:, ::-1]
     return faces
 
 
 def enclosing_points(points: FloatArray) -> FloatArray:
-    """Return few points whose hull contains all of these (n, 3): (m, 3), m at most 60."""
+    """Return at most 60 points whose hull contains the points (n, 3): hull corners, or a box."""
     if len(points) > 8:
         with suppress(QhullError):  # all in one plane: kept as they are
             points = points[np.sort(ConvexHull(points).vertices)]

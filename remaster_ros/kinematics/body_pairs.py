@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pairs of bodies that may not touch: which there are, what each keeps, how far apart they are.
+"""Pairs of bodies that must not touch: which pairs exist, their clearances and distances.
 
-A pair is two bodies, or a body and the floor (its inner body is -1). The rules stand in
-`collision`.
+A pair is two bodies, or a body and the floor (its inner body is -1). The rules are in `collision`.
 """
 
 from __future__ import annotations
@@ -22,9 +21,9 @@ from remaster_ros.types import BoolArray, FloatArray, IntArray
 
 
 class ConvexDistances:
-    """Distances between shapes that are fastened to moving frames.
+    """Distances between shapes fixed to moving frames.
 
-    ``shapes``: each with its place in the frame that carries it, (4, 4).
+    ``shapes``: each with its pose in its frame, (4, 4).
     """
 
     def __init__(self, shapes: Sequence[tuple[Shape, FloatArray]]) -> None:
@@ -32,7 +31,7 @@ class ConvexDistances:
 
     @cached_property
     def _coal(self) -> Any:
-        # Not at import: commands that move nothing need not load it.
+        # Imported here: commands that move nothing need not load it.
         try:
             import coal
         except ImportError:
@@ -54,15 +53,18 @@ class ConvexDistances:
         return request
 
     def distance(self, i: int, T_i: FloatArray, j: int, T_j: FloatArray) -> float:
-        """Return the distance of shapes i and j in frames at T_i, T_j (4, 4); m, < 0 inside."""
+        """Return the distance of shapes i and j, m, negative if they overlap.
+
+        ``T_i``, ``T_j``: poses of their frames, (4, 4).
+        """
         coal = self._coal
-        (one, own_1), (other, own_2) = self._objects[i], self._objects[j]
-        T_1, T_2 = T_i @ own_1, T_j @ own_2
+        (first, T_1_shape), (second, T_2_shape) = self._objects[i], self._objects[j]
+        T_1, T_2 = T_i @ T_1_shape, T_j @ T_2_shape
         return float(
             coal.distance(
-                one,
+                first,
                 coal.Transform3s(T_1[:3, :3], T_1[:3, 3]),
-                other,
+                second,
                 coal.Transform3s(T_2[:3, :3], T_2[:3, 3]),
                 self._request,
                 coal.DistanceResult(),
@@ -70,6 +72,7 @@ class ConvexDistances:
         )
 
     def _object(self, shape: Shape, T: FloatArray) -> tuple[Any, FloatArray]:
+        """Return coal's object of a shape and its pose in the shape's frame."""
         coal = self._coal
         if shape.kind == 'box':
             return coal.Box(*(shape.points.max(axis=0) * 2).tolist()), T
@@ -88,10 +91,10 @@ class ConvexDistances:
         length = float(np.linalg.norm(along))
         if length < 1e-9:
             return coal.Sphere(shape.ball), T @ transform(np.eye(3), start)
-        own = T @ transform(with_z_along(along), (start + end) / 2)
+        T_shape = T @ transform(with_z_along(along), (start + end) / 2)
         if shape.kind == 'capsule':
-            return coal.Capsule(shape.ball, length), own
-        return coal.Cylinder(shape.disc, length), own
+            return coal.Capsule(shape.ball, length), T_shape
+        return coal.Cylinder(shape.disc, length), T_shape
 
 
 SELF_COLLISION = 'self-collision'
@@ -99,7 +102,7 @@ FLOOR = 'hits the floor'
 OBSTACLE = 'hits an obstacle'
 
 RESERVE_M = 0.002
-"""What a planner keeps on top: an arm that stands a little off its path is still free, m."""
+"""Clearance that a planner adds, m, so that an arm slightly off its path is still free."""
 
 _SAMPLES = 300
 _MOST = 0.95
@@ -107,34 +110,35 @@ _MOST = 0.95
 
 @dataclass(frozen=True)
 class Shortfall:
-    """Two bodies nearer to each other than is kept: which configuration, which pair, m."""
+    """A pair of bodies nearer to each other than its clearance."""
 
-    index: int
+    index: int  # Of the configuration
     pair: int
-    distance: float
-    kept: float
+    distance: float  # m, negative if the bodies overlap
+    kept: float  # The clearance, m
 
 
 @dataclass(frozen=True)
 class Placed:
-    """The bodies at configurations: frames (n, k + 1, 4, 4), ends of capsules (n, B, 3), m."""
+    """The bodies at n configurations."""
 
-    frames: FloatArray
+    frames: FloatArray  # Of base and links, (n, k + 1, 4, 4)
+    # Ends of the bodies' capsules in R, m, (n, B, 3)
     a: FloatArray
     b: FloatArray
 
 
 class BodyPairs:
-    """The pairs of an arm, its tool and markers, the obstacles and the floor.
+    """All pairs among the arm, its tool and markers, the obstacles and the floor.
 
-    ``bodies``: everything, by link; ``floor_z``: height of the floor in R, m; None where there is
-    none to hit; ``margin``: fixed part of the clearance, m; ``unknown_offset``: what a joint's
-    zero-offset may be off by, rad; of one that slides by `LEVER_M` times as much, in m.
+    ``bodies``: all, by link; ``floor_z``: height of the floor in R, m; None for no floor;
+    ``margin``: fixed part of the clearance, m; ``unknown_offset``: bound of a joint's unknown
+    zero-offset, rad; of a prismatic joint `LEVER_M` times as much, in m.
     Attributes: ``inner, outer``: indices of the two bodies of each pair, (P,); inner is -1 for the
-    floor; ``is_floor, contact_only``: pairs with the floor, and those that are kept from touching
-    only, (P,); ``levers``: bounds of how far the outer body moves relative to the inner one for a
-    radian or metre of each joint, (P, k); ``most_kept``: the largest clearance of each pair, m,
-    (P,); ``left_out``: the pairs that are not checked, or only for contact, and why.
+    floor; ``is_floor``: pairs with the floor, (P,); ``contact_only``: pairs without clearance,
+    (P,); ``levers``: upper bounds on the motion of the outer body relative to the inner one per
+    radian or metre of each joint, (P, k); ``most_kept``: largest clearance of each pair, m, (P,);
+    ``left_out``: a line for each pair that is not checked, or for contact only.
     """
 
     def __init__(
@@ -160,17 +164,16 @@ class BodyPairs:
         self._set_pairs(*self._possible_pairs())
         self._apply_rule()
 
-    # Which pairs there are
-
     def _possible_pairs(self) -> tuple[IntArray, IntArray]:
+        """Return inner and outer bodies of all pairs that a joint can move, (P,) each."""
         inner, outer = [], []
         for j, second in enumerate(self.bodies):
             if second.link == 0:
                 continue
-            for i, one in enumerate(self.bodies[:j]):
-                apart = range(one.link, second.link)
-                near = {one.role, second.role} == {'link'} and self._on_one_line(apart)
-                if one.link < second.link and not near:
+            for i, first in enumerate(self.bodies[:j]):
+                joints = range(first.link, second.link)
+                adjacent = {first.role, second.role} == {'link'} and self._on_one_line(joints)
+                if first.link < second.link and not adjacent:
                     inner.append(i)
                     outer.append(j)
             if self.floor_z is not None:
@@ -179,7 +182,7 @@ class BodyPairs:
         return np.array(inner, dtype=np.int64), np.array(outer, dtype=np.int64)
 
     def _on_one_line(self, joints: Sequence[int]) -> bool:
-        """Return whether a single joint is between two links, or slides and turns on one line."""
+        """Return whether the joints between two links all move along and about one line."""
         if len(joints) < 2:
             return True
         if not any(self.chain.slides[joint] for joint in joints):
@@ -193,18 +196,19 @@ class BodyPairs:
     def _set_pairs(
         self, inner: IntArray, outer: IntArray, contact_only: BoolArray | None = None
     ) -> None:
+        """Set the pairs and the constants of each of them."""
         self.inner, self.outer = inner, outer
         self.is_floor = inner < 0
         shapes = [body.shape for body in self.bodies]
         links = np.where(self.is_floor, 0, self._link[inner] if len(self._link) else 0)
-        # A box that stands still bounds flat and long bodies better than a capsule around it.
+        # A box that stands still is used itself: its capsule would be far larger.
         is_box = np.array([b.link == 0 and b.shape.kind == 'box' for b in self.bodies], dtype=bool)
         self._is_box = ~self.is_floor & is_box[inner]
         is_capsule = np.array([shape.is_its_capsule for shape in shapes], dtype=bool)
         self._is_exact = ~self.is_floor & is_capsule[inner] & is_capsule[outer]
         joints = np.arange(1, len(self.chain) + 1)
         between = joints > links[:, None]
-        # A first joint that turns about the vertical moves nothing up or down.
+        # A first joint with a vertical axis moves nothing up or down.
         upright = abs((self.chain.T_fixed[0][:3, :3] @ self.chain.axes[0])[2]) > 1 - 1e-12
         if upright and not self.chain.slides[0]:
             between[self.is_floor, 0] = False
@@ -225,12 +229,12 @@ class BodyPairs:
         )
 
     def _apply_rule(self) -> None:
-        """Leave out what overlaps by construction; see the module's text."""
+        """Remove pairs that overlap by construction; see the module `collision`."""
         low = np.where(np.isfinite(self.chain.lower), self.chain.lower, -np.pi)
         high = np.where(np.isfinite(self.chain.upper), self.chain.upper, np.pi)
         q = low + np.random.default_rng(0).random((_SAMPLES, len(self.chain))) * (high - low)
         touching, near = np.zeros(len(self.inner)), np.zeros(len(self.inner))
-        # With the planner's reserve: it must not drop all that the construction brings so near.
+        # With the planner's reserve, so that it does not reject all configurations of such a pair.
         for short in self.examine(self.place(q), RESERVE_M)[0]:
             near[short.pair] += 1
             touching[short.pair] += short.distance < 0.0
@@ -244,21 +248,21 @@ class BodyPairs:
         self._set_pairs(self.inner[~out], self.outer[~out], contact_only[~out])
 
     def category(self, pair: int) -> str:
-        """Return what a collision of the pair is."""
+        """Return the category of a collision of a pair: with itself, the floor or an obstacle."""
         if self.is_floor[pair]:
             return FLOOR
         inner = self.bodies[self.inner[pair]]
         return OBSTACLE if inner.role == 'obstacle' else SELF_COLLISION
 
     def names(self, pair: int) -> tuple[str, str]:
-        """Return the names of inner and outer body."""
+        """Return the names of the inner and the outer body of a pair."""
         inner = 'the floor' if self.is_floor[pair] else self.bodies[self.inner[pair]].name
         return inner, self.bodies[self.outer[pair]].name
 
     def _reaches(self) -> FloatArray:
-        """Bound each body's distance from each joint's axis in any configuration, m, (B, k).
+        """Upper bound on each body's motion per radian or metre of each joint, m, (B, k).
 
-        That is how far it moves for a radian; for a metre of a joint that slides a metre.
+        For a revolute joint the distance from its axis over all configurations, for a prismatic 1.
         """
         chain = self.chain
         travel = np.where(chain.slides, np.maximum(np.abs(chain.lower), np.abs(chain.upper)), 0.0)
@@ -267,7 +271,7 @@ class BodyPairs:
             far = 0.0
             points = body.outline
             for joint in range(body.link - 1, -1, -1):
-                # What a further joint turns stays as far from that joint's origin.
+                # A body that another joint rotates keeps its distance to that joint's origin.
                 axis = chain.axes[joint]
                 across = np.linalg.norm(points - (points @ axis)[:, None] * axis, axis=1)
                 reach[b, joint] = 1.0 if chain.slides[joint] else far + across.max()
@@ -275,49 +279,50 @@ class BodyPairs:
                 points = chain.T_fixed[joint][None, :3, 3]
         return reach
 
-    # Distances
-
     def place(self, q: FloatArray) -> Placed:
-        """Return where the bodies are at configurations (n, k)."""
+        """Return the bodies at configurations (n, k)."""
         frames = np.empty((len(q), len(self.chain) + 1, 4, 4))
         frames[:, 0] = np.eye(4)
         frames[:, 1:] = self.chain.frames(q)
-        own = frames[:, self._link]
-        return Placed(frames, apply(own, self._a), apply(own, self._b))
+        links = frames[:, self._link]
+        return Placed(frames, apply(links, self._a), apply(links, self._b))
 
     def lower_bounds(self, placed: Placed) -> FloatArray:
-        """Return what each pair is apart at least, m, (n, P)."""
+        """Return lower bounds on the distance of each pair, m, (n, P)."""
         a, b, radius = placed.a, placed.b, self._radius
         bounds = np.empty((len(a), len(self.inner)))
-        floor, boxes, others = self._kinds
+        floor, boxes, capsules = self._kinds
         if len(floor):
-            own = self.outer[floor]
-            lowest = np.minimum(a[:, own, 2], b[:, own, 2]) - radius[own]
+            bodies = self.outer[floor]
+            lowest = np.minimum(a[:, bodies, 2], b[:, bodies, 2]) - radius[bodies]
             bounds[:, floor] = lowest - (self.floor_z or 0.0)
         for i in np.unique(self.inner[boxes]):
             pairs = boxes[self.inner[boxes] == i]
-            own = self.outer[pairs]
+            bodies = self.outer[pairs]
             T = inverse(self.bodies[i].T_link_body)
-            ends = np.stack((apply(T, a[:, own]), apply(T, b[:, own])))
+            ends = np.stack((apply(T, a[:, bodies]), apply(T, b[:, bodies])))
             half = self.bodies[i].shape.points.max(axis=0)
             gaps = np.maximum(ends.min(axis=0) - half, -half - ends.max(axis=0))
-            bounds[:, pairs] = np.linalg.norm(np.maximum(gaps, 0.0), axis=-1) - radius[own]
-        if len(others):
-            i, j = self.inner[others], self.outer[others]
-            apart = segment_distance(a[:, i], b[:, i], a[:, j], b[:, j])
-            bounds[:, others] = apart - radius[i] - radius[j]
+            bounds[:, pairs] = np.linalg.norm(np.maximum(gaps, 0.0), axis=-1) - radius[bodies]
+        if len(capsules):
+            i, j = self.inner[capsules], self.outer[capsules]
+            distances = segment_distance(a[:, i], b[:, i], a[:, j], b[:, j])
+            bounds[:, capsules] = distances - radius[i] - radius[j]
         return bounds
 
     def kept(self, placed: Placed, rows: IntArray, pairs: IntArray) -> FloatArray:
-        """Return the clearance of pairs (c,) at configurations (c,), m, (c,)."""
+        """Return the clearances of pairs, m, (c,).
+
+        ``rows``, ``pairs``: indices of configuration and pair of each, (c,).
+        """
         frames = placed.frames[rows, 1:]
         axes = self.chain.axes_in_base(frames)
-        own = self.outer[pairs]
-        ends = np.stack((placed.a[rows, own], placed.b[rows, own]), axis=1)
+        bodies = self.outer[pairs]
+        ends = np.stack((placed.a[rows, bodies], placed.b[rows, bodies]), axis=1)
         arms = np.cross(axes[:, None], ends[:, :, None] - frames[:, None, :, :3, 3])
         on_floor = self.is_floor[pairs]
         level = np.sqrt(np.maximum(0.0, 1.0 - axes[..., 2] ** 2))
-        radius = self._radius[own][:, None]
+        radius = self._radius[bodies][:, None]
         levers = np.where(
             on_floor[:, None],
             np.abs(arms[..., 2]).max(axis=1) + radius * level,
@@ -327,15 +332,15 @@ class BodyPairs:
         levers = np.where(self.chain.slides, sliding, levers)
         levers = np.where(self._between[pairs], levers, 0.0)
         kept = self.margin + np.linalg.norm(levers * self._unknown, axis=1)
-        # Not above the bound: the capsule around a body is wider than the body.
+        # Limited to the bound: the capsule around a body is wider than the body.
         return np.minimum(kept, self.most_kept[pairs])
 
     def on_top(self, extra: float) -> FloatArray:
-        """Return what is kept on top, m, (P,): nothing where only contact counts."""
+        """Return the addition to the clearance of each pair, m, (P,): 0 for contact only."""
         return np.where(self.contact_only, 0.0, extra)
 
     def measure(self, placed: Placed, row: int, pair: int) -> float:
-        """Return the distance of a pair of bodies, m, negative where they overlap."""
+        """Return the distance of a pair at configuration `row`, m, negative if they overlap."""
         inner, outer = int(self.inner[pair]), int(self.outer[pair])
         frames = placed.frames[row]
         return self._convex.distance(
@@ -345,24 +350,28 @@ class BodyPairs:
     def measure_cheap(
         self, placed: Placed, rows: IntArray, pairs: IntArray, bounds: FloatArray
     ) -> BoolArray:
-        """Put distances that need no coal into `bounds` (n, P); return which were, (c,)."""
+        """Write distances that need no coal into `bounds` (n, P); return for which pairs, (c,).
+
+        Those are pairs with the floor, and pairs whose bounds are exact already.
+        """
         on_floor = self.is_floor[pairs]
         for pair in np.unique(pairs[on_floor]):
-            own = rows[pairs == pair]
+            at = rows[pairs == pair]
             outer = int(self.outer[pair])
             shape = self.bodies[outer].shape
-            T = placed.frames[own, self._link[outer]] @ self.bodies[outer].T_link_body
+            T = placed.frames[at, self._link[outer]] @ self.bodies[outer].T_link_body
             lowest = np.min(T[:, 2, :3] @ shape.points.T, axis=1) + T[:, 2, 3]
             lowest = lowest - shape.ball - shape.disc * np.hypot(T[:, 2, 0], T[:, 2, 1])
-            bounds[own, pair] = lowest - (self.floor_z or 0.0)
+            bounds[at, pair] = lowest - (self.floor_z or 0.0)
         return on_floor | self._is_exact[pairs]
 
     def candidates(
         self, placed: Placed, bounds: FloatArray, is_open: BoolArray | None, extra: float
     ) -> tuple[IntArray, IntArray, FloatArray, BoolArray]:
-        """Return what may be too near: rows, pairs, what is kept, and whether it is decided.
+        """Return possible violations: rows, pairs, their clearances, and whether each is certain.
 
-        Pairs that need no coal are measured at once, and returned only if they are too near.
+        Distances that need no coal are computed at once, and only violations of these are
+        returned, as certain. ``is_open``: pairs to consider, (n, P), None for all.
         """
         on_top = self.on_top(extra)
         may = bounds < self.most_kept + on_top
@@ -379,15 +388,15 @@ class BodyPairs:
     def examine(
         self, placed: Placed, extra: float, *, first: bool = False, one: bool = False
     ) -> tuple[list[Shortfall], FloatArray]:
-        """Return shortfalls, and distances or lower bounds of them (n, P).
+        """Return the violations, and the distances or lower bounds of all pairs, m, (n, P).
 
-        With `first` one of each configuration is enough, with `one` a single one.
+        With `first`, one violation of each configuration at most; with `one`, one in all.
         """
         bounds = self.lower_bounds(placed)
         rows, pairs, kept, decided = self.candidates(placed, bounds, None, extra)
         found: list[Shortfall] = []
         done: set[int] = set()
-        # What is decided comes first, then what is probably too near: the rest costs more.
+        # Certain violations first, then likely ones: the others cost more.
         for n in np.lexsort((bounds[rows, pairs] - kept, self.is_floor[pairs], ~decided)):
             row, pair = int(rows[n]), int(pairs[n])
             if first and row in done:

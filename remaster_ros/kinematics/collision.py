@@ -1,31 +1,30 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether a configuration, or the whole way between two, is free of collisions, with clearance.
+"""Collision checks, with clearance, of configurations and of straight paths in joint space.
 
 The arm is a set of convex `bodies`; so are the obstacles, and the floor is a plane. Bounding
-capsules, all at once in NumPy, exclude most pairs; what they cannot exclude is measured by coal
-(distances between convex shapes; negative where they overlap).
+capsules, all at once in NumPy, exclude most pairs; the distances of the others are computed by
+coal (distances between convex shapes; negative if they overlap).
 
-Clearance covers what is not known yet. Each joint's zero-offset is unknown by ``unknown_offset``
+Clearance covers unknown zero-offsets. Each joint's zero-offset is unknown by ``unknown_offset``
 (1 degree unless stated), independently of the others: two bodies may be nearer to each other than
-the model has it by unknown_offset · √(Σ lever²), summed over the joints between the two. A lever
-is the largest distance of the outer body from the joint's axis at that configuration; for the
-floor only its horizontal part counts, and a vertical axis has none. A joint that slides has the
-lever 0.25 m (`serial_chain.LEVER_M`): so far it may be off for each radian of unknown_offset. A
-fixed margin comes on top:
+in the model by unknown_offset · √(Σ lever²), summed over the joints between the two. A lever is
+the largest distance of the outer body from the joint's axis at that configuration; for the floor
+only its horizontal part counts, and a vertical axis has none. A prismatic joint has the lever
+0.25 m (`serial_chain.LEVER_M`). A fixed margin is added:
 
-    kept = margin + unknown_offset · √(Σ lever²)
+    clearance = margin + unknown_offset · √(Σ lever²)
 
 The margin includes half a step of a swept path: a path is checked so finely that no body moves by
-more than 10 mm relative to another from one check to the next, so that it is nowhere nearer than
-5 mm less than at the checks.
+more than 10 mm relative to another between two checks, so that the distance is nowhere less than
+at the checks minus 5 mm.
 
-Not checked are, by this rule: bodies of one link; links next to each other, which their joint
-keeps apart, or several that slide and turn on one line, as a SCARA's do (tools and markers are
-checked against the link before theirs); two bodies of the arm
-that overlap as modelled in 95 % of sampled configurations; and a body that overlaps an obstacle
-or the floor in every one. Bodies that come nearer than what is kept in 95 % of the configurations
-(all of them for obstacles and floor), but do not overlap, are kept from touching only. `left_out`
-names them all. The base itself touches the floor.
+By this rule some pairs are not checked: bodies of one link; links next to each other, which their
+joint separates, or several that move along and about one line, as a SCARA's do (tools and markers
+are checked against the link before theirs); two bodies of the arm whose models overlap in 95 % of
+sampled configurations; and a body that overlaps an obstacle or the floor in all of them. Pairs
+that are nearer than the clearance in 95 % of the configurations (all of them for obstacles and
+floor), but do not overlap, are checked for contact only. `left_out` names all these pairs. The
+base itself touches the floor.
 """
 
 from __future__ import annotations
@@ -47,31 +46,25 @@ from remaster_ros.kinematics.transforms import apply
 from remaster_ros.types import BoolArray, FloatArray, IntArray
 
 STEP_M = 0.01
-"""No two bodies move by more relative to each other between two checks of a path, m."""
+"""Largest motion of two bodies relative to each other between two checks of a path, m."""
 HALF_STEP_M = STEP_M / 2
 ESCAPE_STEP_M = 0.002
-"""The same on a way out, m."""
+"""Largest such motion on an escape path, m."""
 ESCAPE_TOLERANCE_M = 1e-4
-"""How much nearer what is too near may come from one check of a way out to the next, m."""
+"""Largest decrease of a violated distance between two checks of an escape path, m."""
 
 _STRIDE = 8
 _LIMIT_TOLERANCE = 1e-6  # rad or m
 
 
 def arm_bodies(chain: SerialChain, given: Sequence[Body], link_radius: float) -> list[Body]:
-    """Add a capsule along each link that has no body: from its joint to the next one, or the tip.
+    """Return the given bodies, with a capsule along each link that has no body.
 
-    What leads a joint that slides is added, too: where the base has no body, a rail along all of
-    the way of a first joint; else a rod that slides with the joint's link, as long as its way.
+    A capsule goes from the link's joint to the next one, or to the tip. The guide of a prismatic
+    joint is added as well: if the base has no body, a rail along the whole travel of a first
+    joint; else a rod that moves with the joint's link, as long as its travel.
 
-    Parameters
-    ----------
-    chain
-        The arm.
-    given
-        What is known of the arm, its tool and its markers.
-    link_radius
-        Radius of the capsules, m.
+    ``given``: known bodies of the arm, its tool and markers; ``link_radius``: of the capsules, m.
     """
     covered = {body.link for body in given if body.role == 'link'}
     bodies = list(given)
@@ -95,22 +88,22 @@ def arm_bodies(chain: SerialChain, given: Sequence[Body], link_radius: float) ->
 
 
 class CollisionModel:
-    """The arm with its tool and markers, the obstacles and the floor around it.
+    """The arm with its tool and markers, the obstacles and the floor.
 
     Parameters
     ----------
     chain
         The arm.
     bodies
-        Everything; see `arm_bodies`. Bodies on link 0 stand still.
+        All bodies; see `arm_bodies`. Bodies on link 0 stand still.
     floor_z
-        Height of the floor in R, m; None where there is none to hit.
+        Height of the floor in R, m; None for no floor.
     margin
         Fixed part of the clearance, m; at least half a step of a swept path, 5 mm.
     unknown_offset
-        What a joint's zero-offset may be off by, rad; of one that slides see above.
+        Bound of a joint's unknown zero-offset, rad; see the module for prismatic joints.
     link_radius
-        Of the capsules that stand for the links in the line of sight, m.
+        Radius of the capsules that stand for the links in the line of sight, m.
 
     Attributes
     ----------
@@ -119,7 +112,7 @@ class CollisionModel:
     bodies
         All bodies, by link.
     left_out
-        The pairs that are not checked, or only for contact, and why.
+        A line for each pair that is not checked, or for contact only.
     """
 
     def __init__(
@@ -152,12 +145,10 @@ class CollisionModel:
         self._pairs = BodyPairs(chain, self.bodies, floor_z, margin, unknown_offset)
         self.left_out = self._pairs.left_out
 
-    # Single configurations and paths
-
     def trouble(self, q: ArrayLike, extra: float = 0.0) -> str:
-        """Return what is too near at a configuration, rad, (k,); '' where it is free.
+        """Return the worst violation of the clearance at q (k,) as text; '' if it is free.
 
-        `extra` is kept on top of the clearance, m.
+        ``extra``: added to the clearance, m.
         """
         found = self.shortfalls(np.asarray(q, dtype=float)[None], extra)
         if not found:
@@ -165,19 +156,10 @@ class CollisionModel:
         return self.describe(min(found, key=lambda short: short.distance - short.kept))
 
     def path_trouble(self, waypoints: ArrayLike, extra: float = 0.0) -> str:
-        """Return what is wrong on the way along configurations (n, k), straight in joint space.
+        """Return what blocks a path, as text; '' if it is free and within the joint limits.
 
-        Parameters
-        ----------
-        waypoints
-            rad, (n, k), n >= 1.
-        extra
-            Kept on top of the clearance, m.
-
-        Returns
-        -------
-        str
-            '' where every point of the way is within the joint limits and free.
+        ``waypoints``: configurations, straight in joint space between each two, rad, (n, k),
+        n >= 1; ``extra``: added to the clearance, m.
         """
         q = np.asarray(waypoints, dtype=float)
         if q.ndim != 2 or q.shape[1] != len(self.chain) or not len(q):
@@ -196,20 +178,18 @@ class CollisionModel:
         return ''
 
     def escape_trouble(self, waypoints: ArrayLike, *, ends_free: bool = True) -> str:
-        """Return what is wrong with a way out (n, k) of a margin or a contact; '' for nothing.
+        """Return why a path is no escape from a violated clearance, as text; '' if it is one.
 
-        What is too near at its start never comes nearer on the way (by more than 0.1 mm from one
-        check to the next), everything else stays as far as is kept, the end is free (with
-        `ends_free`), and no joint leaves its limits.
-
-        ``waypoints``: rad, (n, k), n >= 1.
+        Pairs whose clearance is violated at the start never come nearer on the way (by more than
+        0.1 mm between two checks), all others keep their clearance, the end is free (if
+        `ends_free`), and no joint leaves its limits. ``waypoints``: rad, (n, k), n >= 1.
         """
         q = np.asarray(waypoints, dtype=float)
         if not np.all(np.isfinite(q)):
             return 'a joint angle of the path is not finite'
         outside = np.maximum(self.chain.lower - q, q - self.chain.upper)
-        further = outside - np.maximum(outside[0], 0.0)
-        if np.max(further) > _LIMIT_TOLERANCE:
+        excess = outside - np.maximum(outside[0], 0.0)
+        if np.max(excess) > _LIMIT_TOLERANCE:
             return self._limit_trouble(q)
         parts = [q[:1]]
         for a, b in pairwise(q):
@@ -218,24 +198,24 @@ class CollisionModel:
         q = np.concatenate(parts)
         found = self.shortfalls(q)
         at = [{short.pair: short for short in found if short.index == i} for i in range(len(q))]
-        first = at[0]
+        at_start = at[0]
         for i, now in enumerate(at):
             for pair, short in now.items():
-                if pair not in first:
+                if pair not in at_start:
                     return f'on the way out, {self.describe(short)}'
-                before = at[i - 1].get(pair) if i else short
-                if before is None or short.distance < before.distance - ESCAPE_TOLERANCE_M:
+                previous = at[i - 1].get(pair) if i else short
+                if previous is None or short.distance < previous.distance - ESCAPE_TOLERANCE_M:
                     return f'on the way out it comes nearer: {self.describe(short)}'
         if ends_free and at[-1]:
             return f'at the end of the way out, {self.describe(next(iter(at[-1].values())))}'
         return ''
 
     def travel(self, start: FloatArray, end: FloatArray) -> float:
-        """Bound how far any point of the arm moves between configurations, m, or relatively."""
+        """Upper bound on the motion of any body relative to another between configurations, m."""
         return float((self._pairs.levers @ np.abs(end - start)).max(initial=0.0))
 
     def pair_distances(self, q: FloatArray, pairs: IntArray) -> FloatArray:
-        """Return the distances of pairs (p,) (see `Shortfall`) at configurations (n, k), m."""
+        """Return the distances of pairs (p,) at configurations (n, k), m, (n, p)."""
         placed = self._pairs.place(q)
         bounds = self._pairs.lower_bounds(placed)
         for column in pairs:
@@ -248,7 +228,10 @@ class CollisionModel:
     def reasons(
         self, q: ArrayLike, extra: float = 0.0
     ) -> np.ndarray[tuple[int], np.dtype[np.str_]]:
-        """Return why configurations (m, k) are not free, or '', (m,)."""
+        """Return a category of collision for each configuration (m, k), '' if it is free, (m,).
+
+        The categories are those of `body_pairs`; ``extra``: added to the clearance, m.
+        """
         q = np.asarray(q, dtype=float).reshape(-1, len(self.chain))
         reasons = np.full(len(q), '', dtype=f'U{len(OBSTACLE)}')
         for short in self.shortfalls(q, extra, first=True):
@@ -256,7 +239,7 @@ class CollisionModel:
         return reasons
 
     def free_mask(self, q: ArrayLike, extra: float = 0.0) -> BoolArray:
-        """Return which configurations (m, k) are free, (m,)."""
+        """Return whether each configuration (m, k) is free, (m,); ``extra``: as above."""
         return self.reasons(q, extra) == ''
 
     def hides(self, q: ArrayLike, marker_T: ArrayLike, sensor_R: ArrayLike) -> BoolArray:
@@ -265,23 +248,23 @@ class CollisionModel:
 
     @cached_property
     def extent_points(self) -> tuple[FloatArray, ...]:
-        """For each joint, points in the frame after it that enclose what it carries, (n_i, 3).
+        """Points that enclose all bodies of each link, in its frame, m, k arrays (n_i, 3).
 
-        Their hull contains the link, and on the last one tool and markers: of everything that
-        moves with the link one of them is the fastest.
+        Their hull contains the link, for the last joint also tool and markers: when the link
+        moves, one of these points is the fastest of it.
         """
         extents = []
         for link in range(1, len(self.chain) + 1):
-            own = [body.outline for body in self.bodies if body.link == link]
-            extents.append(enclosing_points(np.concatenate(own or [np.zeros((1, 3))])))
+            outlines = [body.outline for body in self.bodies if body.link == link]
+            extents.append(enclosing_points(np.concatenate(outlines or [np.zeros((1, 3))])))
         return tuple(extents)
 
     def shortfalls(
         self, q: FloatArray, extra: float = 0.0, *, first: bool = False
     ) -> list[Shortfall]:
-        """Return every pair that is nearer than is kept at configurations (n, k).
+        """Return the pairs that violate their clearance at configurations (n, k).
 
-        With `first` one of each configuration is enough.
+        With `first`, one pair of each configuration at most; ``extra``: added to the clearance, m.
         """
         return self._pairs.examine(self._pairs.place(q), extra, first=first)[0]
 
@@ -294,7 +277,7 @@ class CollisionModel:
         return f'{outer} {1e3 * short.distance:.0f} mm from {inner}, {kept}'
 
     def _limit_trouble(self, q: FloatArray) -> str:
-        """Return which waypoint (n, k) is outside the joint limits; '' for none."""
+        """Return in words which waypoint of (n, k) is outside the joint limits; '' if none."""
         chain = self.chain
         over = np.maximum(chain.lower - q, q - chain.upper)
         if np.max(over) <= _LIMIT_TOLERANCE:
@@ -307,16 +290,14 @@ class CollisionModel:
         )
         return f'{chain.joint_names[joint]} at {at}, its limits are {low.split()[0]} to {high}'
 
-    # Swept paths
-
     def _sweep(self, start: FloatArray, end: FloatArray, extra: float) -> Shortfall | None:
-        """Return something that is too near on the straight way in joint space."""
+        """Return a violation of the clearance on a straight path; None if it is free."""
         travel = self._pairs.levers @ np.abs(end - start)
         steps = max(1, ceil(float(travel.max(initial=0.0)) / STEP_M))
         grid = np.unique(np.append(np.arange(0, steps, _STRIDE), steps))
         share = np.arange(steps + 1) / steps
         q = start + share[:, None] * (end - start)
-        # Most ways that are not free show it at one of these.
+        # Most paths that are not free collide at one of these.
         found, _ = self._pairs.examine(
             self._pairs.place(q[[steps // 2, steps // 4, -1]]), extra, one=True
         )
@@ -325,7 +306,7 @@ class CollisionModel:
         found, distances = self._pairs.examine(self._pairs.place(q[grid]), extra, one=True)
         if found:
             return found[0]
-        # Where neither end of an interval excludes a pair, all of the interval is looked at.
+        # If the ends of an interval do not exclude a pair, every step of the interval is checked.
         least = distances[:-1] + distances[1:] - np.diff(grid)[:, None] / steps * travel
         is_open = least / 2 < self._pairs.most_kept + self._pairs.on_top(extra - HALF_STEP_M)
         open_ones = np.flatnonzero(is_open.any(axis=1))
@@ -343,7 +324,11 @@ class CollisionModel:
         per_step: FloatArray,
         extra: float,
     ) -> Shortfall | None:
-        """Check some steps (m,) of a way (n, k): the pairs (m, P) that are open there."""
+        """Return a violation at some steps of a path q (n, k); None if there is none.
+
+        ``inside``: indices of the steps, (m,); ``is_open``: pairs to check at each, (m, P);
+        ``per_step``: upper bound on the change of each pair's distance in one step, m, (P,).
+        """
         placed = self._pairs.place(q[inside])
         bounds = self._pairs.lower_bounds(placed)
         rows, pairs, kept, decided = self._pairs.candidates(placed, bounds, is_open, extra)
@@ -351,15 +336,17 @@ class CollisionModel:
             n = int(np.argmax(decided))
             row, pair = int(rows[n]), int(pairs[n])
             return Shortfall(row, pair, float(bounds[row, pair]), float(kept[n]))
-        most = self._pairs.most_kept + self._pairs.on_top(extra)
-        beyond = np.full(len(per_step), -1.0)
+        most_kept = self._pairs.most_kept + self._pairs.on_top(extra)
+        clear_until = np.full(len(per_step), -1.0)
         for n in range(len(rows)):
             row, pair = int(rows[n]), int(pairs[n])
-            if inside[row] < beyond[pair]:
+            if inside[row] < clear_until[pair]:
                 continue
             distance = self._pairs.measure(placed, row, pair)
             if distance < kept[n]:
                 return Shortfall(row, pair, distance, float(kept[n]))
-            # So many steps further it cannot have come nearer than what is kept at most.
-            beyond[pair] = inside[row] + (distance - most[pair]) / max(per_step[pair], 1e-12)
+            # Up to this step the pair cannot come nearer than its largest clearance.
+            clear_until[pair] = inside[row] + (distance - most_kept[pair]) / max(
+                per_step[pair], 1e-12
+            )
         return None

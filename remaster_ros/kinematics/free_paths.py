@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Free paths between configurations: straight where that is free, else around what is in the way.
+"""Collision-free paths between configurations: straight if that is free, else around obstacles.
 
 Paths are polylines of configurations, straight in joint space from each to the next. Effort is
 bounded by a number of checked segments, and the same Generator gives the same path.
@@ -19,16 +19,16 @@ from remaster_ros.kinematics.collision import CollisionModel
 from remaster_ros.types import FloatArray
 
 MOST_CHECKS = 400
-"""Segments checked for one path at most."""
+"""Most segments checked for one path."""
 REACH_RAD = 0.6
-"""How far a tree grows at a time, in its largest joint angle (`SerialChain.per_radian`)."""
+"""Step of a growing tree: largest joint motion, rad (in m of `SerialChain.per_radian`)."""
 _SHORTCUTS = 10
-_POINT_COST = 0.2  # of looking at one configuration, in segments
+_POINT_COST = 0.2  # Effort of checking one configuration, in segments
 
 WAY_OUT_STEP_M = 0.004
-"""No point of the arm moves more in a step of a way out."""
+"""Largest motion of a point of the arm in a step of an escape path."""
 WAY_OUT_STEPS = 120
-"""Steps of a way out at most: half a metre. An arm that is deeper inside is freed by hand."""
+"""Most steps of an escape path: half a metre. An arm deeper in a body is freed by hand."""
 
 
 def free_path(
@@ -39,26 +39,22 @@ def free_path(
     hints: Sequence[FloatArray] = (),
     most_checks: int = MOST_CHECKS,
 ) -> FloatArray | None:
-    """Return a free way between two configurations.
+    """Return a collision-free path between two configurations, rad, (n, k), ends included.
+
+    n is 2 if the straight path is free. None if an end is not free or no path was found.
 
     Parameters
     ----------
     model
-        The arm and all it can hit.
+        The arm and everything it can hit.
     start, end
         rad, (k,).
     rng
         Source of randomness.
     hints
-        Configurations that may be worth going through, rad, (k,) each.
+        Configurations that may be useful waypoints, rad, (k,) each.
     most_checks
-        Segments that are checked at most.
-
-    Returns
-    -------
-    ndarray or None
-        rad, (n, k), start and end included; n is 2 where the straight way is free. None where an
-        end is not free or no way was found.
+        Largest number of checked segments.
     """
     start, end = np.asarray(start, dtype=float), np.asarray(end, dtype=float)
     search = _Search(model, start, end, most_checks)
@@ -77,7 +73,7 @@ def free_path(
 
 
 def is_straight_free(model: CollisionModel, start: FloatArray, end: FloatArray) -> bool:
-    """Whether the straight way is free, with the reserve where the start has it too."""
+    """Whether the straight path is free; with the planner's reserve if the start has it too."""
     extra = RESERVE_M if model.free_mask(start[None], RESERVE_M)[0] else 0.0
     return not model.path_trouble(np.array([start, end]), extra)
 
@@ -85,7 +81,7 @@ def is_straight_free(model: CollisionModel, start: FloatArray, end: FloatArray) 
 def _intermediates(
     model: CollisionModel, start: FloatArray, end: FloatArray, hints: Sequence[FloatArray]
 ) -> Iterator[list[FloatArray]]:
-    """Yield what may lie between, the likeliest first."""
+    """Yield likely intermediate waypoints, the likeliest first."""
     for hint in hints:
         yield [np.asarray(hint, dtype=float)]
     chain = model.chain
@@ -96,20 +92,20 @@ def _intermediates(
         lifted_start[0], lifted_end[0] = start[0], end[0]
         yield [lifted_start, lifted_end]
     for first in (start, end):
-        # One arm's posture first, the turn of the base after it, or the other way round.
+        # First the posture, then the rotation of the base; or the base first.
         between = np.array(end if first is start else start)
         between[0] = first[0]
         yield [between]
 
 
 class _Node(NamedTuple):
-    """A configuration of a tree, rad, (k,), and the node that it was reached from."""
+    """A configuration of a tree, and the node from which it was reached."""
 
-    q: FloatArray
+    q: FloatArray  # rad, (k,)
     parent: _Node | None
 
     def branch(self) -> list[FloatArray]:
-        """Return the configurations from this one back to the root."""
+        """Return the configurations from this node back to the root."""
         branch = [self.q]
         node = self.parent
         while node is not None:
@@ -119,14 +115,14 @@ class _Node(NamedTuple):
 
 
 class _Search:
-    """Counts the effort, and grows two trees towards each other (RRT-connect)."""
+    """RRT-connect: grows two trees towards each other, and counts the effort."""
 
     def __init__(
         self, model: CollisionModel, start: FloatArray, end: FloatArray, most: int
     ) -> None:
         self._model, self._start, self._end = model, start, end
-        self._left = float(most)
-        # An arm that stands a little nearer than a planner would put it may still leave.
+        self._effort = float(most)
+        # An arm nearer to a body than a planner would place it may still leave.
         ends = np.array([start, end])
         self._extra = RESERVE_M
         self.is_blocked = False
@@ -136,28 +132,28 @@ class _Search:
 
     @property
     def is_out_of_effort(self) -> bool:
-        return self._left <= 0
+        return self._effort <= 0
 
     def is_free(self, a: FloatArray, b: FloatArray) -> bool:
-        self._left -= 1
+        self._effort -= 1
         return not self._model.path_trouble(np.array([a, b]), self._extra)
 
     def connect(self, rng: np.random.Generator) -> list[FloatArray] | None:
-        """Return a way found by growing trees from both ends; None where effort runs out."""
+        """Return a path found by growing trees from both ends; None if the effort is used up."""
         chain = self._model.chain
         low = np.maximum(chain.lower, np.minimum(self._start, self._end) - np.pi)
         high = np.minimum(chain.upper, np.maximum(self._start, self._end) + np.pi)
         trees = [_Node(self._start, None)], [_Node(self._end, None)]
         side = 0
         while not self.is_out_of_effort:
-            # Half of the draws lie about the straight way, where the way around often is.
+            # Half of the draws lie near the straight path, where detours often are.
             draw = low + rng.random(len(chain)) * (high - low)
             if rng.random() < 0.5:
                 along = self._start + rng.random() * (self._end - self._start)
-                beside = rng.normal(0.0, 0.6, len(chain)) * chain.per_radian
-                draw = np.clip(along + beside, low, high)
+                deviation = rng.normal(0.0, 0.6, len(chain)) * chain.per_radian
+                draw = np.clip(along + deviation, low, high)
             if not self._model.free_mask(draw[None], self._extra)[0]:
-                self._left -= _POINT_COST
+                self._effort -= _POINT_COST
                 continue
             new = self._extend(trees[side], draw)
             met = None if new is None else self._reach(trees[1 - side], new.q)
@@ -168,7 +164,7 @@ class _Search:
         return None
 
     def _extend(self, tree: list[_Node], goal: FloatArray) -> _Node | None:
-        """Grow a tree one step towards a configuration; return the new node."""
+        """Grow a tree one step towards a configuration; return the new node, None if blocked."""
         ways = np.abs(np.array([node.q for node in tree]) - goal)
         distances = np.max(ways / self._model.chain.per_radian, axis=1)
         nearest = tree[int(np.argmin(distances))]
@@ -180,7 +176,7 @@ class _Search:
         return new
 
     def _reach(self, tree: list[_Node], goal: FloatArray) -> _Node | None:
-        """Grow a tree until it is at a configuration; None where something is in the way."""
+        """Grow a tree until it reaches a configuration; None if an obstacle blocks it."""
         while not self.is_out_of_effort:
             new = self._extend(tree, goal)
             if new is None or np.max(np.abs(new.q - goal)) < 1e-12:
@@ -188,9 +184,9 @@ class _Search:
         return None
 
     def shortened(self, way: list[FloatArray], rng: np.random.Generator) -> FloatArray:
-        """Cut corners of a free way where the shorter way is free."""
+        """Return a free path with corners cut if the shorter path is free."""
         path = [np.asarray(q) for q in way]
-        self._left = max(self._left, 2 * _SHORTCUTS)
+        self._effort = max(self._effort, 2 * _SHORTCUTS)
         for _ in range(_SHORTCUTS):
             i = 0
             while i + 2 < len(path):
@@ -200,7 +196,7 @@ class _Search:
                     i += 1
             if len(path) < 3:
                 break
-            # Between any two points of the way, not between its corners alone.
+            # Between any two points of the path, not only between corners.
             a, b = np.sort(rng.uniform(0, len(path) - 1, 2))
             i, j = int(a), int(b)
             if i == j:
@@ -215,25 +211,13 @@ class _Search:
 def way_out(
     model: CollisionModel, start: ArrayLike, rng: np.random.Generator
 ) -> FloatArray | None:
-    """Return a short way to a free configuration for an arm within a margin or in contact.
+    """Return a short escape path to a free configuration, rad, (n, k), start included.
 
-    In each step the distances that are too small grow (by the tolerance of
-    `CollisionModel.escape_trouble` at most may one shrink), and nothing else comes nearer than
-    is kept.
+    For an arm within a clearance or in contact. In each step the violated distances grow (one may
+    shrink by the tolerance of `CollisionModel.escape_trouble`), and all other pairs keep their
+    clearance. n is 1 if the start is free. None if no path was found.
 
-    Parameters
-    ----------
-    model
-        The arm and all it can hit.
-    start
-        rad, (k,).
-    rng
-        Source of randomness.
-
-    Returns
-    -------
-    ndarray or None
-        rad, (n, k), start included; n is 1 where the start is free. None where no way was found.
+    ``model``: the arm and everything it can hit; ``start``: rad, (k,); ``rng``: for directions.
     """
     q = np.asarray(start, dtype=float)
     chain = model.chain
@@ -248,21 +232,21 @@ def way_out(
             path = _fewest_lines(model, np.array(way))
             return path if not model.escape_trouble(path) else None
         pairs = np.array([each.pair for each in short])
-        before = np.array([each.distance for each in short])
+        distances = np.array([each.distance for each in short])
         kept = np.array([each.kept for each in short])
         drawn = rng.standard_normal((12, len(chain)))
         tries = np.concatenate((heading[None], directions, drawn))
-        # The direction in which each joint alone helps, all together.
-        single = model.pair_distances(q + 1e-3 * np.eye(len(chain)), pairs) - before
-        tries = np.concatenate((tries, (single / (kept - before + 1e-3)).sum(axis=1)[None]))
+        # The sum of the directions in which each single joint increases the distances.
+        single = model.pair_distances(q + 1e-3 * np.eye(len(chain)), pairs) - distances
+        tries = np.concatenate((tries, (single / (kept - distances + 1e-3)).sum(axis=1)[None]))
         lengths = np.array([model.travel(np.zeros(len(chain)), d) for d in tries])
         tries = tries[lengths > 1e-9] / lengths[lengths > 1e-9, None]
         steps = np.clip(q + WAY_OUT_STEP_M * tries, chain.lower, chain.upper)
-        # A joint that stands outside its limits may stay there, and may come back.
+        # A joint outside its limits may stay there, or come back.
         steps = np.where((q < chain.lower) | (q > chain.upper), q + WAY_OUT_STEP_M * tries, steps)
         after = model.pair_distances(steps, pairs)
-        worst = np.min(np.minimum(after - before, kept - before), axis=1)
-        gain = np.sum(np.minimum(after, kept) - np.minimum(before, kept), axis=1)
+        worst = np.min(np.minimum(after - distances, kept - distances), axis=1)
+        gain = np.sum(np.minimum(after, kept) - np.minimum(distances, kept), axis=1)
         for best in np.argsort(-gain):
             if gain[best] <= 1e-7:
                 return None
@@ -279,14 +263,14 @@ def way_out(
 
 
 def _fewest_lines(model: CollisionModel, way: FloatArray) -> FloatArray:
-    """Leave out points of a way out, (n, k): the arm comes to rest at each that is kept."""
-    kept, here, last = [way[0]], 0, len(way) - 1
-    while here < last:
-        there = last
-        while there > here + 1 and model.escape_trouble(
-            way[[here, there]], ends_free=there == last
+    """Return an escape path (n, k) with fewer waypoints: the arm comes to rest at each of them."""
+    kept, corner, last = [way[0]], 0, len(way) - 1
+    while corner < last:
+        next_corner = last
+        while next_corner > corner + 1 and model.escape_trouble(
+            way[[corner, next_corner]], ends_free=next_corner == last
         ):
-            there = here + (there - here) // 2
-        kept.append(way[there])
-        here = there
+            next_corner = corner + (next_corner - corner) // 2
+        kept.append(way[next_corner])
+        corner = next_corner
     return np.array(kept)

@@ -7,21 +7,20 @@ least-squares angles, some of them wrong, or zero for an angle that is not deter
 the nearest arm that is exact; its results are corrected on the true model by Newton's method and
 kept only where forward kinematics confirms them.
 
-An arm of which that one is a little off (each delivered arm, by its own calibration) has other
-solutions where those of the exact arm are about to meet. They are found from the solutions of the
-exact arm at a few poses around the one that is asked for.
+A real arm differs a little from the exact one (by the maker's calibration of each arm), and near
+poses at which two solutions of the exact arm merge it has other solutions. They are found from the
+solutions of the exact arm at a few poses around the requested one.
 
-Where no exact arm is near, Newton's method starts from joint angles all over their turns. Its
-steps are damped (Levenberg [2]_) and limited, so that also starts far from any solution arrive at
-one: of a six-joint arm's starts spread evenly, nearly all do where the pose can be reached, and to
-each of its solutions about as often. How many solutions such starts may have missed follows from
-how often each was found [3]_ [4]_.
+If no exact arm is near, Newton's method starts from angles spread over whole turns. Its
+steps are damped (Levenberg [2]_) and limited, so that starts far from any solution still converge:
+of a six-joint arm's spread starts nearly all converge if the pose can be reached, to each of
+its solutions about equally often. How many solutions the starts may have missed follows from how
+often each solution was found [3]_ [4]_.
 
-An arm with fewer than six joints takes few of all poses: one of five axes brings its tool to a
-place and an axis of it into a direction, but not the tool's own axis into any, since the last
-joint turns about that one in nearly all of them; a SCARA's tool stays upright. So its poses are
-drawn among those that it takes (`planning.candidates`), and their solutions reach them in position
-and orientation, as those of other arms do.
+An arm with fewer than six joints reaches few of all poses: one with five axes reaches any position
+and direction of one tool axis, but not any direction of the axis of its last joint; a SCARA's tool
+stays upright. So its poses are drawn among those that it reaches (`planning.candidates`), and its
+solutions reach them in position and orientation, as those of other arms do.
 
 References
 ----------
@@ -55,80 +54,78 @@ from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.transforms import rotation_vector_to_matrix, transform
 from remaster_ros.types import FloatArray, IntArray
 
-# Newton's method from many starts at once: one row is one start for one pose.
-
 CERTIFIED = 1e-8
-"""What forward kinematics may leave of a solution: 10 nm and 10 nrad."""
+"""Largest error of a solution by forward kinematics: 10 nm and 10 nrad."""
 DISTINCT = 1e-4
-"""Solutions whose joints all agree within this, rad, are one."""
+"""Largest difference of any joint between two solutions that count as one, rad."""
 
-# Steps are taken until a hundredth of what is certified remains; where two solutions are about to
-# meet they halve the rest, as from 0.1 rad to 1e-4 rad in ten steps.
+# Most steps of Newton's method, which ends at a hundredth of `CERTIFIED`. Where two solutions
+# merge each step only halves the error, as from 0.1 rad to 1e-4 rad in ten steps.
 _STEPS = 60
-# Longer steps leave what the derivative at their start holds for: sin x is x to 4 % up to here. A
-# joint that slides moves the tool in proportion: steps of it alone have any length.
+# Longest step of a revolute joint, up to which the derivative at its start holds: sin x is x to
+# 4 %. A prismatic joint moves the tool in proportion, and its steps have any length.
 _LONGEST_RAD = 0.5
-# Rows computed at a time, which bounds the memory: some 2 kB each.
+# Rows computed at a time, which bounds the memory: about 2 kB per row.
 _ROWS = 20_000
 
 
 def reach_from(
     chain: SerialChain, free: Sequence[int], starts: FloatArray, T: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Bring starts to the poses that they are for.
+    """Solve poses by damped Newton steps from start configurations, one start for one pose each.
 
-    ``free``: joints that may move, at most six; ``starts``: rad or m, (m, k); ``T``: T_R_T of
-    each, (m, 4, 4).
-    Returns q: Where they arrive, (m, k), in [-pi, pi] for free joints that turn; left: The larger
-    of the translation, m, and rotation, rad, between tool and pose, (m,).
+    ``free``: indices of the joints that may move, at most six; ``starts``: rad or m, (m, k);
+    ``T``: pose T_R_T of each start, (m, 4, 4). Returns the final configurations, (m, k), with free
+    revolute joints in [-pi, pi], and their residuals, (m,): the larger of the translation, m, and
+    rotation, rad, between tool and pose. The caller checks convergence by the residual.
     """
-    q, left = starts.copy(), np.empty(len(starts))
+    q, residuals = starts.copy(), np.empty(len(starts))
     for first in range(0, len(q), _ROWS):
         rows = slice(first, first + _ROWS)
-        q[rows], left[rows] = _newton(chain, list(free), q[rows], T[rows])
+        q[rows], residuals[rows] = _newton(chain, list(free), q[rows], T[rows])
     turning = [joint for joint in free if not chain.slides[joint]]
     q[:, turning] = wrapped(q[:, turning])
-    return q, left
+    return q, residuals
 
 
 def _newton(
     chain: SerialChain, free: list[int], q: FloatArray, T: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    left = np.full(len(q), np.inf)
-    going = np.arange(len(q))
+    """Return final configurations and residuals of one chunk of starts; see `reach_from`."""
+    residuals = np.full(len(q), np.inf)
+    active = np.arange(len(q))
     diagonal, turning = np.arange(len(free)), ~chain.slides[free]
     for step in range(_STEPS + 1):
-        screws, rotation, position = screws_and_tool(chain, q[going])
-        missing = twists_to(T[going], rotation, position)
-        left[going] = np.sqrt(np.max(np.sum(missing.reshape(-1, 2, 3) ** 2, axis=-1), axis=-1))
-        wrong = left[going] > 0.01 * CERTIFIED
-        going = going[wrong]
-        if step == _STEPS or not len(going):
+        screws, rotation, position = screws_and_tool(chain, q[active])
+        twists = twists_to(T[active], rotation, position)
+        residuals[active] = np.sqrt(
+            np.max(np.sum(twists.reshape(-1, 2, 3) ** 2, axis=-1), axis=-1)
+        )
+        unsolved = residuals[active] > 0.01 * CERTIFIED
+        active = active[unsolved]
+        if step == _STEPS or not len(active):
             break
-        jacobian, missing = screws[wrong][:, :, free], missing[wrong]
+        jacobian, twists = screws[unsolved][:, :, free], twists[unsolved]
         transposed = np.swapaxes(jacobian, 1, 2)
         normal = transposed @ jacobian
-        # Damped in proportion to the square of what is missing, so that the last steps are
-        # Newton's; 1e-12 keeps them solvable where the arm is singular.
-        squared = np.sum(missing**2, axis=1)
+        # Damped in proportion to the squared error, so that the last steps are undamped Newton
+        # steps; 1e-12 keeps them solvable at singular configurations.
+        squared = np.sum(twists**2, axis=1)
         normal[:, diagonal, diagonal] += (0.01 * np.minimum(squared, 1.0) + 1e-12)[:, None]
-        moves = np.linalg.solve(normal, transposed @ missing[:, :, None])[:, :, 0]
+        moves = np.linalg.solve(normal, transposed @ twists[:, :, None])[:, :, 0]
         longest = np.max(np.abs(moves) * turning, axis=1, keepdims=True)
-        q[going[:, None], free] += moves * (_LONGEST_RAD / np.maximum(longest, _LONGEST_RAD))
-    return q, left
+        q[active[:, None], free] += moves * (_LONGEST_RAD / np.maximum(longest, _LONGEST_RAD))
+    return q, residuals
 
 
 def screws_and_tool(
     chain: SerialChain, q: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the joints' screws in R and the tool in R at q (m, k).
+    """Return joint screws in R, (m, 6, k), tool rotation, (m, 3, 3), and position, m, (m, 3).
 
-    A screw is o × a and a; a and 0 of a joint that slides.
-
-    The same as from `SerialChain.frames`, several times as fast: joint frames have their axis
-    as Z, and a turn about it costs no product of matrices.
-
-    Returns screws, rotation, position: (m, 6, k); (m, 3, 3); m, (m, 3).
+    At configurations q (m, k). A screw is (o × a, a) of a revolute joint with axis a through o,
+    (a, 0) of a prismatic one. Several times as fast as `SerialChain.frames`: with joint axes along
+    Z, a rotation needs no product of matrices.
     """
     m, k = q.shape
     fixed = chain.T_fixed_z[:, :3]
@@ -160,11 +157,11 @@ def screws_and_tool(
 
 
 def twists_to(T: FloatArray, rotation: FloatArray, position: FloatArray) -> FloatArray:
-    """Return the screw motions in R that bring tools to poses, (m, 6).
+    """Return the twists in R that move tools to poses T (m, 4, 4): the logarithm of SE(3), (m, 6).
 
-    Where two axes line up, a closed form leaves out a turn about them, of any size: a screw
-    motion holds it exactly, and one step makes up for it: the logarithm of SE(3), without what
-    SciPy's rotations cost.
+    ``rotation``, ``position``: those of the tools. The full logarithm, because a closed-form
+    solution at a singular pose may be off by a rotation of any size, which one step then corrects.
+    Faster than with SciPy's rotations.
     """
     turn = T[:, :3, :3] @ np.swapaxes(rotation, 1, 2)
     shift = T[:, :3, 3] - (turn @ position[:, :, None])[:, :, 0]
@@ -172,9 +169,9 @@ def twists_to(T: FloatArray, rotation: FloatArray, position: FloatArray) -> Floa
     axis = 0.5 * np.stack((across[:, 2, 1], across[:, 0, 2], across[:, 1, 0]), axis=-1)
     sine = np.sqrt(np.sum(axis**2, axis=1))
     angle = np.arctan2(sine, 0.5 * (np.trace(turn, axis1=1, axis2=2) - 1.0))
-    # To first order at small angles, where the quotient is rounded.
+    # First order at small angles, at which the quotient is inaccurate.
     axis *= np.where(sine < 1e-9, 1.0, angle / np.maximum(sine, 1e-9))[:, None]
-    # Half a turn has lost its axis: any will do, since the next step finds the right one.
+    # At half a turn the axis is undetermined: any will do, as the next step finds the right one.
     axis[(sine < 1e-9) & (angle > 1.0)] = (np.pi, 0.0, 0.0)
     half = 0.5 * np.maximum(angle, 1e-4)
     weight = np.where(angle < 1e-4, 1.0 / 12.0, (1.0 - half / np.tan(half)) / (4.0 * half**2))
@@ -184,7 +181,7 @@ def twists_to(T: FloatArray, rotation: FloatArray, position: FloatArray) -> Floa
 
 
 def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Return a × b of vectors (m, 3); NumPy's own takes several times as long."""
+    """Return a × b of vectors (m, 3), in a fraction of the time of `numpy.cross`."""
     return np.stack(
         (
             a[:, 1] * b[:, 2] - a[:, 2] * b[:, 1],
@@ -196,14 +193,14 @@ def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
 
 
 def wrapped(angles: FloatArray) -> FloatArray:
-    """Bring angles into [-pi, pi]."""
+    """Return angles shifted by whole turns into [-pi, pi]."""
     return angles - 2 * np.pi * np.round(angles / (2 * np.pi))
 
 
 def distinct(chain: SerialChain, q: FloatArray) -> tuple[FloatArray, IntArray]:
-    """Return the rows of q (m, k) that differ modulo whole turns, in order, and how often each is.
+    """Return distinct configurations of q (m, k), modulo whole turns, and how often each occurs.
 
-    Returns q, counts: rad or m, (n, k); (n,).
+    In order of first occurrence: rad or m, (n, k), and counts, (n,). Tolerance: `DISTINCT`.
     """
     gaps = q[:, None] - q[None]
     gaps = np.abs(np.where(chain.slides, gaps, wrapped(gaps)))
@@ -216,9 +213,9 @@ def distinct(chain: SerialChain, q: FloatArray) -> tuple[FloatArray, IntArray]:
 
 
 def spread(chain: SerialChain, free: Sequence[int], count: int) -> FloatArray:
-    """Return positions of joints, (count, n), spread evenly over whole turns, always the same.
+    """Return evenly spread positions of the free joints, (count, n), the same at every call.
 
-    Those of joints that slide are spread over their limits, m.
+    Over whole turns of revolute joints, rad, and over the limits of prismatic ones, m.
     """
     angles = spread_angles(count, len(free))
     slides, low, high = chain.slides[free], chain.lower[free], chain.upper[free]
@@ -227,12 +224,10 @@ def spread(chain: SerialChain, free: Sequence[int], count: int) -> FloatArray:
 
 
 def spread_angles(count: int, joints: int) -> FloatArray:
-    """Return joint angles spread evenly over whole turns, always the same ones, rad.
+    """Return evenly spread angles in [-pi, pi), (count, joints), the same at every call.
 
     An additive recurrence with the powers of the root of x^(d+1) = x + 1, of low discrepancy in
     d dimensions (M. Roberts, "The unreasonable effectiveness of quasirandom sequences", 2018).
-
-    Returns in [-pi, pi), (count, joints).
     """
     root = 2.0
     for _ in range(40):
@@ -244,107 +239,109 @@ def spread_angles(count: int, joints: int) -> FloatArray:
 
 @dataclass(frozen=True)
 class MissedSolutions:
-    """What poses solved from many starts tell about solutions that none of these found."""
+    """Estimates of how many solutions were missed when poses were solved from many starts."""
 
-    found: int  # Solutions of all poses
-    arrived: int  # Starts that arrived at one
-    # Solutions that were found so often
-    once: int
-    twice: int
+    found: int  # Distinct solutions of all poses
+    converged: int  # Starts that converged to a solution
+    once: int  # Solutions that one start found
+    twice: int  # Solutions that two starts found
 
     @property
     def chance_of_new(self) -> float:
-        """How likely one more start that arrives has a solution not found, at 95 % confidence.
+        """Upper bound on the probability that one more convergent start finds a new solution.
 
-        Good's estimate is once / arrived; in place of the count stands the upper limit of the
-        mean of a Poisson variable with that count, which is 3.0 at 0.
+        At 95 % confidence. Good's estimate is once / converged; here the count is replaced by the
+        upper limit of the mean of a Poisson variable with that count, which is 3.0 at 0.
         """
-        return float(gammaincinv(self.once + 1.0, 0.95)) / max(self.arrived, 1)
+        return float(gammaincinv(self.once + 1.0, 0.95)) / max(self.converged, 1)
 
     @property
     def missed(self) -> float:
-        """Chao's estimate of how many solutions were missed; a lower bound in expectation."""
+        """Chao's estimate of the number of missed solutions; a lower bound in expectation."""
         return self.once * (self.once - 1) / (2.0 * (self.twice + 1))
 
 
 FREE_JOINTS = 6
 FEWEST_JOINTS = 3
-"""With fewer the tool is led along a surface, where most zero-offsets look like one another."""
+"""Fewest joints: with two the tool moves on a surface, on which most zero-offsets look alike."""
 
 OWN_CONFIGURATIONS = (
     'poses cannot be planned for it; measure configurations of your own choice, and make a '
     'session of their table: remaster import TABLE --urdf FILE --out SESSION'
 )
-"""What can be done with an arm whose solutions are not sought."""
+"""Remedy, as the end of a message, for an arm whose inverse kinematics is not supported."""
 
-# An arm is near one with a closed form where no axis is turned by more than this against it, rad,
-# or shifted by more, m. Manufacture and wear leave a tenth of it. With three times as much, 3 of
-# 1,000 solutions would be missed (see `_Exact.around`).
+# Largest angle (rad) and distance (m) between the axes of an arm and those of the nearest arm with
+# a closed form. Manufacture and wear cause a tenth of it. With three times as much, 3 of 1,000
+# solutions would be missed (see `_ExactArm.perturbations`).
 NEAR_RAD = 0.02
 NEAR_M = 0.01
-# Nearer than this, m and rad at the tool, both are one arm, written with other digits.
+# Difference at the tool, m and rad, below which two arms are the same, written with other digits.
 EXACT = 1e-9
-# How many of these differences at the tool the poses around the one that is asked for are off. The
-# true arm's solutions are those of the exact one at some pose that is one of it off.
-AROUND = 2.0
-# Solutions of the exact arm as near to one another as this, rad, give one start of Newton's.
+# Distance of the perturbed poses from the requested one, as a multiple of the largest difference
+# between the arms at the tool. The true arm's solutions are those of the exact one at some pose
+# that is one such difference away.
+PERTURBATION = 2.0
+# Solutions of the exact arm nearer to one another than this, rad, give one Newton start.
 ONE_START_RAD = 0.05
-# Starts where no exact arm is near.
+# Starts of Newton's method for a pose if no exact arm is near.
 STARTS = 160
-# Poses by which it is judged what they miss.
+# Poses of the trial that estimates how many solutions these starts miss.
 TRIAL_POSES = 20
-# The free joints cannot move the tool in as many ways as they are where the smallest singular
-# value of the Jacobian (m, rad) stays below. Errors of axes of some mrad lend a held elbow no
-# more.
+# Smallest singular value of the Jacobian (m, rad) below which the free joints do not move the tool
+# independently. Errors of axes of some mrad give an arm with a held elbow no more.
 IMMOBILE = 5e-3
 
 
 @dataclass(frozen=True)
-class _Exact:
-    """The nearest arm with a closed form, with the held joints at one combination of values."""
+class _ExactArm:
+    """Nearest arm with a closed form, for one combination of values of the held joints."""
 
     chain: SerialChain  # Its six free joints
-    robot: HPRobot  # EAIK's model of it, which has no rotation of the tool at zero
-    # How far its tool is from that of the true arm at the same angles, at most
+    robot: HPRobot  # EAIK's model of the chain, whose tool is not rotated at zero angles
+    # Largest difference of the tool poses of this arm and the true one at the same angles
     difference_m: float
     difference_rad: float
 
     @property
-    def is_the_arm(self) -> bool:
-        """Whether the arm itself has the closed form."""
+    def is_true_arm(self) -> bool:
+        """Whether the true arm itself has a closed form."""
         return max(self.difference_m, self.difference_rad) < EXACT
 
     @cached_property
-    def around(self) -> tuple[FloatArray, FloatArray]:
-        """The pose itself and twelve around it: turns (n, 3, 3) and shifts, m, (n, 3).
+    def perturbations(self) -> tuple[FloatArray, FloatArray]:
+        """Perturbations of a pose, the first zero: rotations (n, 3, 3), translations, m, (n, 3).
 
-        Six orthogonal directions and their opposites, so that one of them leads to where the
-        exact arm has solutions which the true arm has at the pose itself.
+        Six orthogonal directions and their opposites, so that one of them leads to a pose at which
+        the exact arm has the solutions that the true arm has at the pose itself.
         """
-        if self.is_the_arm:
+        if self.is_true_arm:
             return np.eye(3)[None], np.zeros((1, 3))
         directions = np.linalg.qr(np.sin(np.arange(1.0, 37.0)).reshape(6, 6))[0]
-        twists = AROUND * np.vstack((np.zeros(6), directions, -directions))
-        turns = rotation_vector_to_matrix(self.difference_rad * np.sqrt(2.0) * twists[:, 3:])
-        return turns, self.difference_m * np.sqrt(2.0) * twists[:, :3]
+        twists = PERTURBATION * np.vstack((np.zeros(6), directions, -directions))
+        rotations = rotation_vector_to_matrix(self.difference_rad * np.sqrt(2.0) * twists[:, 3:])
+        return rotations, self.difference_m * np.sqrt(2.0) * twists[:, :3]
 
     def starts(self, T: FloatArray) -> FloatArray:
-        """Return angles near all solutions of the true arm at T (4, 4), and others, (m, 6)."""
-        turns, shifts = self.around
-        poses = np.broadcast_to(np.eye(4), (len(turns), 4, 4)).copy()
-        poses[:, :3, :3] = turns @ T[:3, :3] @ self.chain.T_fixed[-1, :3, :3].T
+        """Return start angles for Newton's method at a pose T (4, 4), rad, (m, 6).
+
+        Some are near each solution of the true arm; others may converge to none.
+        """
+        rotations, shifts = self.perturbations
+        poses = np.broadcast_to(np.eye(4), (len(rotations), 4, 4)).copy()
+        poses[:, :3, :3] = rotations @ T[:3, :3] @ self.chain.T_fixed[-1, :3, :3].T
         poses[:, :3, 3] = T[:3, 3] + shifts
         solved = [np.reshape(self.robot.IK(pose).Q, (-1, FREE_JOINTS)) for pose in poses]
         q = np.concatenate(solved)
         q = q[np.all(np.isfinite(q), axis=1)]
-        if self.is_the_arm or not len(q):
+        if self.is_true_arm or not len(q):
             return q
-        # Least-squares angles lie far from the pose.
+        # Least-squares angles, which reach another pose, are dropped.
         _, rotation, position = screws_and_tool(self.chain, q)
         off_m = np.linalg.norm(position - T[:3, 3], axis=1)
         # The Frobenius norm of a difference of rotations is 2 sqrt(2) sin(angle / 2).
         off_rad = np.linalg.norm(rotation - T[:3, :3], axis=(1, 2)) / np.sqrt(2.0)
-        near = 2.0 * AROUND
+        near = 2.0 * PERTURBATION
         q = q[
             (off_m <= near * self.difference_m + EXACT)
             & (off_rad <= near * self.difference_rad + EXACT)
@@ -354,28 +351,28 @@ class _Exact:
 
 
 class InverseKinematics:
-    """All joint solutions of a tool pose.
+    """All joint solutions of tool poses of one arm.
 
     A regular pose has up to eight solutions (sixteen for some arms) per value of the held joint.
     At a singular pose, where two joint axes line up or the shoulder's axis meets the wrist, a
-    whole curve of joint angles reaches the pose: each branch that survives gives one point of it.
-    Where branches meet (elbow straight), they are one solution. Everything returned satisfies
-    forward kinematics within 1e-8 m and 1e-8 rad.
+    whole curve of joint angles reaches the pose: each branch contributes one point of it.
+    Branches that meet (elbow straight) are one solution. All solutions satisfy forward kinematics
+    within 1e-8 m and 1e-8 rad.
 
     Parameters
     ----------
     chain
-        The arm: at most six joints, or more with the rest held.
+        The arm: at most six joints, or more with all but six held.
     held
-        Joint index (0 is the base's) -> the values, rad or m, at which it is held. None holds
-        nothing on up to six joints and the third joint at 0 on seven, as the counts of poses and
-        solutions in Van Wyk et al. suggest they did.
+        Held joints: joint index (0 is the base's) -> values at which to hold it, rad or m. None
+        holds nothing on up to six joints and the third joint at 0 on seven, as the counts of
+        poses and solutions in Van Wyk et al. suggest they did.
 
     Raises
     ------
     InputError
-        The arm has other than six free joints, or more than three where it has no more; a held
-        value lies outside the joint's limits, or the arm is singular wherever it is.
+        If the arm has not six free joints (or all of three to five), a held value lies outside
+        the joint's limits, or the arm is singular at every configuration.
     """
 
     def __init__(
@@ -388,24 +385,24 @@ class InverseKinematics:
         self.held = {joint: tuple(map(float, held[joint])) for joint in sorted(held)}
         self._free = [i for i in range(len(chain)) if i not in held]
         self._require_mobility()
-        self._parts: list[tuple[tuple[float, ...], _Exact | None]] = [
+        self._parts: list[tuple[tuple[float, ...], _ExactArm | None]] = [
             (values, self._nearest_exact(values)) for values in product(*self.held.values())
         ]
 
     @property
-    def way(self) -> Literal['closed form', 'near closed form', 'many starts']:
-        """How solutions are found, for the held values for which that is hardest."""
+    def method(self) -> Literal['closed form', 'near closed form', 'many starts']:
+        """Method by which solutions are found; the hardest one if held values differ in it."""
         exact = [part for _, part in self._parts]
         if None in exact:
             return 'many starts'
-        alike = all(part is not None and part.is_the_arm for part in exact)
+        alike = all(part is not None and part.is_true_arm for part in exact)
         return 'closed form' if alike else 'near closed form'
 
     @property
     def difference(self) -> tuple[float, float] | None:
-        """How far the nearest arm with a closed form is off at the tool, m and rad, at most.
+        """Largest difference at the tool to the nearest arm with a closed form, m and rad.
 
-        None where there is none for some held values.
+        None if there is no such arm for some held values.
         """
         found = [part for _, part in self._parts if part is not None]
         if len(found) < len(self._parts):
@@ -413,11 +410,11 @@ class InverseKinematics:
         return max(p.difference_m for p in found), max(p.difference_rad for p in found)
 
     def in_words(self) -> str:
-        """Return in one sentence how solutions are found, and what they may lack."""
+        """Return one sentence on how solutions are found, and how complete they are."""
         within = 'each is kept where forward kinematics reaches the pose to 1e-8 m and 1e-8 rad'
         if self.difference is not None:
             off_m, off_rad = self.difference
-            if self.way == 'closed form':
+            if self.method == 'closed form':
                 return f'All joint solutions of a pose are computed in closed form; {within}.'
             return (
                 "All joint solutions of a pose are found by Newton's method from those of the "
@@ -435,14 +432,14 @@ class InverseKinematics:
         return (
             f'{why} joint solutions are sought by '
             f"Newton's method from {STARTS} starts a pose; {within}. Of {TRIAL_POSES} poses "
-            f'{trial.arrived} starts arrived at {trial.found} solutions, {trial.once} of which '
+            f'{trial.converged} starts arrived at {trial.found} solutions, {trial.once} of which '
             f'were found once: {100.0 * share:.1f} % are missed (by Chao), and the chance that '
             f'one more start finds a further one is below {100.0 * trial.chance_of_new:.1g} % '
             '(by Good, at 95 % confidence).'
         )
 
     def missed_solutions(self) -> MissedSolutions:
-        """Return what many starts find of poses whose joint angles are spread evenly."""
+        """Run the trial of many starts at evenly spread poses, and return its counts."""
         seeds = spread(self.chain, range(len(self.chain)), TRIAL_POSES)
         counts = []
         for q in seeds:
@@ -450,18 +447,19 @@ class InverseKinematics:
             q[list(self.held)] = values
             pose = self.chain.forward(q)
             starts = self._with_held(spread(self.chain, self._free, STARTS), values)
-            found, left = reach_from(
+            found, residuals = reach_from(
                 self.chain, self._free, starts, np.broadcast_to(pose, (STARTS, 4, 4))
             )
-            counts.append(distinct(self.chain, found[left < CERTIFIED])[1])
+            counts.append(distinct(self.chain, found[residuals < CERTIFIED])[1])
         times = np.concatenate(counts)
         return MissedSolutions(
             len(times), int(times.sum()), int(np.sum(times == 1)), int(np.sum(times == 2))
         )
 
     def solutions_of_each(self, T: FloatArray) -> list[FloatArray]:
-        """Return the joint solutions in [-pi, pi] of many tool poses (n, 4, 4), limits aside.
+        """Return the joint solutions of each tool pose (n, 4, 4): n arrays (m_i, k), rad or m.
 
+        Revolute joints are in [-pi, pi]; limits are not checked. m_i is 0 for an unreachable pose.
         Much faster than pose by pose.
         """
         starts = [
@@ -469,39 +467,43 @@ class InverseKinematics:
             for pose in T
         ]
         owner = np.repeat(np.arange(len(T)), [len(q) for q in starts])
-        q, left = reach_from(
+        q, residuals = reach_from(
             self.chain,
             self._free,
             np.concatenate([np.empty((0, len(self.chain))), *starts]),
             T[owner],
         )
-        reached = left < CERTIFIED
+        reached = residuals < CERTIFIED
         ends = np.cumsum(np.bincount(owner[reached], minlength=len(T)))[:-1]
         return [distinct(self.chain, mine)[0] for mine in np.split(q[reached], ends)]
 
     def usable(self, q: FloatArray) -> FloatArray:
-        """Return those of joint solutions (m, k) that a turn brings within the limits, (n, k)."""
+        """Return the solutions of q (m, k) that lie within the joint limits, (n, k).
+
+        Each joint is first moved by whole turns as near as possible to the middle of its range.
+        """
         q = self._towards_middle(q)
         return q[self.chain.within_limits(q, tolerance=1e-9)]
 
     def _starts(
-        self, values: tuple[float, ...], exact: _Exact | None, T: FloatArray
+        self, values: tuple[float, ...], exact: _ExactArm | None, T: FloatArray
     ) -> FloatArray:
-        """Return where Newton's method starts for one combination of held values, (m, k)."""
+        """Return starts of Newton's method for a pose and one set of held values, (m, k)."""
         free = spread(self.chain, self._free, STARTS) if exact is None else exact.starts(T)
         return self._with_held(free, values)
 
     def _with_held(self, free: FloatArray, values: tuple[float, ...]) -> FloatArray:
+        """Return configurations (m, k) from free joints (m, n) and the held values."""
         q = np.empty((len(free), len(self.chain)))
         q[:, self._free] = free
         q[:, list(self.held)] = values
         return q
 
     def _require_mobility(self) -> None:
-        """Refuse held joints that leave the tool fewer ways to move than joints, wherever it is.
+        """Raise InputError if the arm is singular at all configurations.
 
-        Holding the elbow of an S-R-S arm does: the wrist stays at its distance to the shoulder,
-        and the arm still swings about the line between them.
+        With the elbow of an S-R-S arm held it is: the wrist keeps its distance to the
+        shoulder, and the arm still swings about the line between them.
         """
         chain = self.chain
         if _is_mobile(chain, {joint: values[0] for joint, values in self.held.items()}):
@@ -523,8 +525,8 @@ class InverseKinematics:
             f'singular everywhere; {remedy}'
         )
 
-    def _nearest_exact(self, values: tuple[float, ...]) -> _Exact | None:
-        """Return the nearest arm with a closed form; None where none is near."""
+    def _nearest_exact(self, values: tuple[float, ...]) -> _ExactArm | None:
+        """Return the nearest arm with a closed form; None if there is none within tolerance."""
         chain, free = self.chain, self._free
         if len(free) < FREE_JOINTS or chain.slides[free].any():
             return None
@@ -556,8 +558,8 @@ class InverseKinematics:
         turned = spread_angles(200, FREE_JOINTS)
         ours = chain.forward(self._with_held(turned, values))
         off = exact.forward(turned) - ours
-        # At most 2 sin(angle / 2) of sqrt(2) times it, see `_Exact.starts`.
-        return _Exact(
+        # The norm is 2 sqrt(2) sin(angle / 2); see `_ExactArm.starts`.
+        return _ExactArm(
             exact,
             robot,
             float(np.max(np.linalg.norm(off[:, :3, 3], axis=1))),
@@ -565,10 +567,7 @@ class InverseKinematics:
         )
 
     def _towards_middle(self, q: FloatArray) -> FloatArray:
-        """Turn joints by whole turns as near the middle of their ranges as they come.
-
-        What slides has no turns.
-        """
+        """Return q (m, k) with whole turns taken off towards the middle of the ranges."""
         bounded = np.isfinite(self.chain.lower) & np.isfinite(self.chain.upper)
         middle = np.zeros(len(self.chain))
         middle[bounded] = (self.chain.lower + self.chain.upper)[bounded] / 2
@@ -577,7 +576,7 @@ class InverseKinematics:
 
 
 def _is_mobile(chain: SerialChain, held: Mapping[int, float]) -> bool:
-    """Return whether the free joints move the tool in as many ways at any of a few places."""
+    """Return whether the Jacobian of the free joints has full rank at one of 8 configurations."""
     spread = np.sin(np.arange(8.0 * len(chain))).reshape(8, -1)
     spread[:, list(held)] = list(held.values())
     free = [i for i in range(len(chain)) if i not in held]
@@ -586,6 +585,7 @@ def _is_mobile(chain: SerialChain, held: Mapping[int, float]) -> bool:
 
 
 def _check_held(chain: SerialChain, held: Mapping[int, Sequence[float]]) -> None:
+    """Raise InputError if the number of free joints or a held value is not supported."""
     free = len(chain) - len(held)
     if free != min(len(chain), FREE_JOINTS) or free < FEWEST_JOINTS:
         raise InputError(
@@ -612,14 +612,14 @@ def _check_held(chain: SerialChain, held: Mapping[int, Sequence[float]]) -> None
 
 
 def _nearest_lines(axes: FloatArray, points: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Make axes exactly parallel, and let them meet exactly, where they nearly do.
+    """Return axes made exactly parallel, or exactly meeting, if they nearly are.
 
-    ``axes, points``: direction and a point of each of six axes at zero, (6, 3).
-    Returns axes, points: Those of the exact arm.
+    ``axes, points``: direction and a point of each of six joint axes at zero angles, (6, 3).
+    Returns directions and points of the exact arm, in the same shape.
     """
     axes, points = axes.copy(), points.copy()
     count = len(axes)
-    # Turned about points near the arm: the origin of a joint may be metres along its axis.
+    # Axes are rotated about points near the arm: a joint's origin may be metres along its axis.
     before = np.zeros(3)
     for i in range(count):
         before = points[i] = points[i] + axes[i] * (axes[i] @ (before - points[i]))
@@ -645,14 +645,14 @@ def _nearest_lines(axes: FloatArray, points: FloatArray) -> tuple[FloatArray, Fl
         normal /= np.linalg.norm(normal)
         gap = normal @ (points[i + 1] - points[i])
         if abs(gap) < NEAR_M:
-            # What follows is carried along, with what meets there.
+            # All later axes are shifted along, so that those that meet still do.
             points[i + 1 :] -= gap * normal
     return axes, points
 
 
 def _meeting_point(axes: FloatArray, points: FloatArray) -> tuple[FloatArray, float]:
-    """Return the point nearest to three lines, m, (3,), and how far the farthest is from it, m."""
-    # Sum of (I - a a^T)(x - o) = 0.
+    """Return the point nearest to three lines, m, (3,), and its largest distance from one, m."""
+    # Normal equations: the sum of (I - a a^T)(x - o) is zero.
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
     to_lines = np.einsum('nij,nj->ni', across, points)
     point = np.linalg.lstsq(across.sum(axis=0), to_lines.sum(axis=0), rcond=None)[0]
@@ -662,7 +662,7 @@ def _meeting_point(axes: FloatArray, points: FloatArray) -> tuple[FloatArray, fl
 def _may_have_closed_form(axes: FloatArray, origins: FloatArray) -> bool:
     """Return whether three successive axes are parallel, or the first or last three meet.
 
-    All of EAIK's decompositions need one of these; with other arms EAIK writes to the terminal.
+    All of EAIK's decompositions need one of these; for other arms EAIK prints to the terminal.
     """
     neighbours = np.linalg.norm(np.cross(axes[:-1], axes[1:]), axis=1) < 1e-9
     if np.any(neighbours[:-1] & neighbours[1:]):
@@ -674,7 +674,7 @@ def _may_have_closed_form(axes: FloatArray, origins: FloatArray) -> bool:
 
 
 def _middle(chain: SerialChain, joint: int) -> float:
-    """Return zero, or mid-range where the limits exclude it, rad or m."""
+    """Return a central joint position, rad or m: zero, or mid-range if limits exclude zero."""
     low, high = chain.lower[joint], chain.upper[joint]
     if not chain.slides[joint]:
         low, high = max(low, -np.pi), min(high, np.pi)

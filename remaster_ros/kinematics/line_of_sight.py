@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether the arm hides a marker from a sensor, with a capsule around each link.
+"""Occlusion of a marker by the arm itself, with a capsule around each link.
 
-A link is the set of points within ``radius`` of the straight line from its joint to the next one,
-which any URDF gives; meshes are not needed. Collisions are checked in `collision`.
+A link is the set of points within ``radius`` of the segment from its joint to the next one, which
+any URDF defines; meshes are not needed. Collisions are checked in `collision`.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from remaster_ros.types import BoolArray, FloatArray
 
 @dataclass(frozen=True)
 class LinkCapsules:
-    """The arm as capsules, each from the origin of a joint to that of the next one.
+    """The links of an arm as capsules, each from the origin of a joint to that of the next one.
 
-    The first one begins at the base frame. The link after the last joint carries the marker and is
-    left out: which way the marker faces decides there.
+    The first capsule begins at the base frame. The link after the last joint carries the marker
+    and is left out: whether it hides the marker is decided by the marker's viewing angle.
     """
 
     chain: SerialChain
@@ -37,21 +37,10 @@ class LinkCapsules:
             )
 
     def hides(self, q: ArrayLike, marker_T: ArrayLike, sensor_R: ArrayLike) -> BoolArray:
-        """Return whether a link stands between a marker and a sensor.
+        """Return whether a link stands between a marker and a sensor, (...).
 
-        Parameters
-        ----------
-        q
-            Joint angles, rad, (..., k).
-        marker_T
-            Marker in the tool frame, m, (3,).
-        sensor_R
-            The sensor's origin in R, m, (3,).
-
-        Returns
-        -------
-        ndarray
-            (...).
+        ``q``: joint angles, rad, (..., k); ``marker_T``: marker in the tool frame, m, (3,);
+        ``sensor_R``: the sensor's origin in R, m, (3,).
         """
         ends = self.chain.frames(q)[..., :3, 3]
         starts = np.zeros_like(ends)
@@ -62,17 +51,16 @@ class LinkCapsules:
 
 
 def segment_distance(a: ArrayLike, b: ArrayLike, c: ArrayLike, d: ArrayLike) -> FloatArray:
-    """Return the shortest distances between segments a–b and c–d, points among them.
+    """Return the shortest distances between segments a–b and c–d, (...); either may be a point.
 
     ``a, b, c, d``: end points, (..., 3), broadcast against each other.
-    Returns (...).
     """
     a, b, c, d = (np.asarray(point, dtype=float) for point in (a, b, c, d))
     along_1, along_2, gap = b - a, d - c, a - c
     length_1, length_2 = _dot(along_1, along_1), _dot(along_2, along_2)
     across, gap_1, gap_2 = _dot(along_1, along_2), _dot(along_1, gap), _dot(along_2, gap)
-    # The nearest points of the two lines, as shares s and t of the segments (parallel lines have
-    # many: any does), then t and s again where the other was cut off at an end.
+    # Nearest points of the two lines, as shares s and t of the segments (of parallel lines any
+    # does); t and s are computed again after the other was clipped to its segment.
     s = _share(across * gap_2 - gap_1 * length_2, length_1 * length_2 - across**2)
     t = _share(across * s + gap_2, length_2)
     s = _share(across * t - gap_1, length_1)
@@ -81,10 +69,11 @@ def segment_distance(a: ArrayLike, b: ArrayLike, c: ArrayLike, d: ArrayLike) -> 
 
 
 def _dot(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Return the dot product along the last axis."""
     return np.sum(a * b, axis=-1)
 
 
 def _share(numerator: FloatArray, denominator: FloatArray) -> FloatArray:
-    """Divide and cut to [0, 1]; 0 where there is nothing to divide by."""
+    """Return numerator / denominator clipped to [0, 1]; 0 if the denominator is about 0."""
     safe = np.where(denominator > 1e-15, denominator, 1.0)
     return np.clip(np.where(denominator > 1e-15, numerator / safe, 0.0), 0.0, 1.0)

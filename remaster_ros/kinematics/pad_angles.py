@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The angles on a robot's own pad and those of its URDF: sign, zero and coupling of joints.
+"""Angles on a robot's teach pendant ("pad") and those of its URDF: sign, zero and coupling.
 
 Of k joints, with the pad's angles p and the URDF's q,
 
@@ -7,8 +7,8 @@ Of k joints, with the pad's angles p and the URDF's q,
 
 where S has the signs, row i of K the joints whose pad angles are added to that of joint i, and a
 the URDF's angles at the pad's zero. A zero-offset δ of the URDF's joints (true angle = reported
-one + offset) is then one of d = (S (I + K))⁻¹ δ on the pad: in one place the pad has to show d
-more than it does, wherever the place is.
+angle + offset) is d = (S (I + K))⁻¹ δ on the pad: at any configuration the pad has to show d more
+than it does.
 """
 
 from __future__ import annotations
@@ -24,18 +24,18 @@ from remaster_ros.types import Controller, FloatArray
 
 @dataclass(frozen=True, eq=False)
 class PadAngles:
-    """The map between k angles on the pad and those of the URDF, rad."""
+    """Linear map between the k angles on the pad and those of the URDF, rad."""
 
     # S (I + K), (k, k), and its inverse, both of whole numbers
     matrix: FloatArray
     from_urdf: FloatArray
     zero: FloatArray  # a, rad, (k,)
-    # The joints in an order in which each stands behind those that are added to it
+    # Joint indices sorted so that each follows those whose angles are added to its angle
     order: tuple[int, ...]
 
     @classmethod
     def of(cls, controller: Controller | None, joint_names: Sequence[str]) -> PadAngles:
-        """Return the map of a controller; joints that it does not name are those of the URDF."""
+        """Return the map of a controller; joints that it does not name have equal angles."""
         k = len(joint_names)
         matrix, zero = np.eye(k), np.zeros(k)
         joints = {} if controller is None else controller.joints
@@ -56,24 +56,24 @@ class PadAngles:
         return cls(matrix, np.round(np.linalg.inv(matrix)), zero, tuple(order))
 
     def to_urdf(self, pad: FloatArray) -> FloatArray:
-        """Return the URDF's angles, rad, (..., k), of the pad's."""
+        """Convert the pad's angles to the URDF's, rad, (..., k)."""
         return pad @ self.matrix.T + self.zero
 
     def to_pad(self, q: FloatArray) -> FloatArray:
-        """Return the pad's angles, rad, (..., k), of the URDF's."""
+        """Convert the URDF's angles to the pad's, rad, (..., k)."""
         return self.offsets_on_pad(q - self.zero)
 
     def offsets_on_pad(self, offsets: FloatArray) -> FloatArray:
-        """Return how much more the pad has to show for offsets of the URDF, rad, (..., k)."""
+        """Convert zero-offsets of URDF joints to additions to pad angles, rad, (..., k)."""
         return offsets @ self.from_urdf.T
 
     def coupled(self, joint: int) -> tuple[int, ...]:
-        """Return the joints whose pad angles are added to that of a joint."""
+        """Return the indices of the joints whose pad angles are added to that of a joint."""
         return tuple(j for j in np.flatnonzero(self.matrix[joint]).tolist() if j != joint)
 
 
 def pad_in_words(controller: Controller) -> list[str]:
-    """Return how the URDF's angles come from the pad's, a joint each where they are not equal."""
+    """Return each URDF joint angle as a formula of pad angles, one line per joint that differs."""
     lines = []
     for joint, pad in controller.joints.items():
         if pad.sign == 1 and pad.zero_deg == 0.0 and not pad.coupling:
@@ -90,14 +90,17 @@ def pad_in_words(controller: Controller) -> list[str]:
 
 
 def coupled_in_circle(coupling: Mapping[str, Mapping[str, Any]]) -> str:
-    """Return a joint that is added to itself, directly or by way of others; '' where none is."""
+    """Return a joint whose angle depends on itself through couplings; '' if there is none.
+
+    ``coupling``: joint -> the joints whose pad angles are added to its angle.
+    """
     for joint in coupling:
-        reached, ahead = set(), list(coupling[joint])
-        while ahead:
-            other = ahead.pop()
+        reached, pending = set(), list(coupling[joint])
+        while pending:
+            other = pending.pop()
             if other not in reached:
                 reached.add(other)
-                ahead += coupling.get(other, {})
+                pending += coupling.get(other, {})
         if joint in reached:
             return joint
     return ''

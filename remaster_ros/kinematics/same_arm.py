@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether a robot description is that of the arm of a chain, as far as motion goes.
+"""Comparison of a robot description with the arm of a cell, as far as motion depends on it.
 
 A description on ``/robot_description`` may be written otherwise than the URDF of the cell: made
-from xacro, with other digits or frames of its links, with a gripper behind the tip, on a table.
-What counts is where the axes of the joints lie at zero, and how far and how fast they may turn or
-slide. Of a joint that slides the direction alone counts: it carries what is beyond it wherever its
-axis lies.
+from xacro, with other digits or link frames, with a gripper behind the tip, on a table. Compared
+are the joint axes with all joints at zero, position limits and velocity limits. Of a prismatic
+joint only the direction of its axis matters, not its position.
 """
 
 from __future__ import annotations
@@ -19,24 +18,18 @@ from remaster_ros.kinematics.urdf import parse_urdf
 from remaster_ros.types import FloatArray
 
 PLACE_M = 1e-4
-"""Two axes are the same up to this distance, m: descriptions give four digits at least."""
+"""Distance between axes that count as the same, m: descriptions give four digits at least."""
 TURN_RAD = 1e-4
-"""And up to this angle, rad; limits too, in rad and rad/s, or m and m/s."""
+"""Angle between axes that count as the same, rad; also the tolerance of limits, in their units."""
 
 
 def difference(chain: SerialChain, description: str) -> str:
-    """Return how a description contradicts an arm, ''.
+    """Return in words how a description contradicts an arm; '' if it does not.
 
-    The place of the first joint is compared where the description has the link of the arm's base,
-    the tip where it has that of its tip. Limits of the description may be wider than the arm's,
-    which then uses a part of them.
+    The position of the first joint is compared if the description has the arm's base link, the tip
+    if it has the arm's tip link. Limits of the description may be wider than the arm's.
 
-    Parameters
-    ----------
-    chain
-        The arm.
-    description
-        URDF text.
+    ``chain``: the arm; ``description``: URDF text.
     """
     read = _read(chain, description)
     if isinstance(read, str):
@@ -45,11 +38,11 @@ def difference(chain: SerialChain, description: str) -> str:
     for i, name in enumerate(chain.joint_names):
         if chain.slides[i] != other.slides[i]:
             return f'{name} {"slides" if other.slides[i] else "turns"} there'
-    # A place and a direction of each axis.
-    (places, own), (others, theirs) = _axes(chain, has_base), _axes(other, has_base)
-    apart = places - others
-    apart -= np.sum(apart * own, axis=1, keepdims=True) * own
-    far, turned = np.linalg.norm(apart, axis=1), np.linalg.norm(own - theirs, axis=1)
+    points, axes = _axes(chain, has_base)
+    other_points, other_axes = _axes(other, has_base)
+    gaps = points - other_points
+    gaps -= np.sum(gaps * axes, axis=1, keepdims=True) * axes
+    far, turned = np.linalg.norm(gaps, axis=1), np.linalg.norm(axes - other_axes, axis=1)
     for i, name in enumerate(chain.joint_names):
         if turned[i] > TURN_RAD:
             return (
@@ -73,9 +66,9 @@ def difference(chain: SerialChain, description: str) -> str:
 
 
 def axes_apart(chain: SerialChain, description: str) -> float:
-    """Return how far the axes of a description are turned from those of an arm, rad.
+    """Return the root sum of squares of the angles between an arm's axes and a description's, rad.
 
-    Root of the sum of the squares; infinite where it is another arm.
+    Infinite if the description lacks a joint of the arm, or has them in another order.
     """
     read = _read(chain, description)
     if isinstance(read, str):
@@ -85,7 +78,10 @@ def axes_apart(chain: SerialChain, description: str) -> float:
 
 
 def _read(chain: SerialChain, description: str) -> tuple[SerialChain, bool, bool] | str:
-    """Return the arm of a description, and whether it has base and tip; or why it is another."""
+    """Return the arm of a description, and whether it has the base link and the tip link.
+
+    Text that says why the description is of another arm, if it is.
+    """
     try:
         model = parse_urdf(description)
         links = {joint.name: link for link, joint in model.parent_joint.items()}
@@ -94,7 +90,7 @@ def _read(chain: SerialChain, description: str) -> tuple[SerialChain, bool, bool
             return f'it has no joint {", ".join(missing)}'
         has_base = chain.base_link in model.links
         base = chain.base_link if has_base else model.root
-        # A gripper or a tool changer behind the tip does not matter, nor that there is none.
+        # A gripper or tool changer behind the tip does not matter.
         last = links[chain.joint_names[-1]]
         has_tip = model.carrier(chain.tip_link, [last])[0] == last
         tip = chain.tip_link if has_tip else last
@@ -107,21 +103,21 @@ def _read(chain: SerialChain, description: str) -> tuple[SerialChain, bool, bool
 
 
 def _axes(chain: SerialChain, from_base: bool) -> tuple[FloatArray, FloatArray]:
-    """Return a point of each axis, m, and its direction, (k, 3) each, all joints at zero.
+    """Return a point of each joint axis, m, (k, 3), and its direction, (k, 3), all joints at zero.
 
-    In the base's frame, or in that of the first joint.
+    In the base frame if ``from_base``, else in that of the first joint.
     """
     frames = _from(chain, from_base) @ chain.frames(np.zeros(len(chain)))
     return frames[:, :3, 3], np.einsum('kij,kj->ki', frames[:, :3, :3], chain.axes)
 
 
 def _tip(chain: SerialChain, from_base: bool) -> FloatArray:
-    """Return the tip's frame, (4, 4), all joints at zero; in which frame as `_axes`."""
+    """Return the tip frame with all joints at zero, (4, 4); reference frame as of `_axes`."""
     return _from(chain, from_base) @ chain.forward(np.zeros(len(chain)))
 
 
 def _from(chain: SerialChain, base: bool) -> FloatArray:
-    """Return what brings a place in the base's frame into the one that is compared in, (4, 4)."""
+    """Return the transform from the base frame to the reference frame of `_axes`, (4, 4)."""
     return np.eye(4) if base else inverse(chain.T_fixed[0])
 
 

@@ -4,8 +4,8 @@
 The true joint angle is the reported one plus the zero-offset, everywhere. All methods take any
 number of leading dimensions in ``q``, ``points`` and ``joint_offsets``, and broadcast them.
 
-A joint that slides (prismatic) has metres where others have radians, in all of these arrays: its
-unit is that of `SerialChain.units`, for people that of `shown_units`.
+A prismatic joint has metres in all arrays in which a revolute joint has radians (`units`); text
+for users is in mm and degrees (`shown_units`).
 """
 
 from __future__ import annotations
@@ -28,37 +28,40 @@ from remaster_ros.kinematics.transforms import (
 from remaster_ros.kinematics.urdf import UrdfJoint, UrdfModel, parse_urdf
 from remaster_ros.types import BoolArray, FloatArray
 
-# Reported angles may be beyond a joint's limits by so much: both are rounded.
+# Accepted excess of a reported angle over a joint's limits: both are rounded.
 LIMIT_TOLERANCE_RAD = np.deg2rad(1.0)
-# An error of d at a joint that slides moves a marker by d, one of an angle a at distance r by a r.
-# Limits of angles, such as what is large for a zero-offset, so become lengths. The distance is on
-# the short side, a few tenths of an arm's reach: what counts as large is rather too small then.
+# Lever arm that converts limits of angles into lengths for prismatic joints, m: an error of d at a
+# prismatic joint moves a marker by d, one of an angle a at distance r by a r. It is on the short
+# side, a few tenths of an arm's reach, so that limits are too strict rather than too loose.
 LEVER_M = 0.25
 
 
 @dataclass(frozen=True, eq=False)
 class SerialChain:
-    """The joints between two links of a robot, base to tip; fixed joints are merged."""
+    """Kinematic chain of the moving joints between two links of a robot, base to tip.
+
+    Fixed joints are merged into the fixed transforms between the moving ones.
+    """
 
     name: str  # The robot's name in the URDF
     joint_names: tuple[str, ...]  # Names of the k joints
-    # Frame R and frame T
+    # Links whose frames are R and T
     base_link: str
     tip_link: str
-    # Joint limits, rad, m for joints that slide, (k,); infinite for continuous joints
+    # Joint limits, rad or m, (k,); infinite for continuous joints
     lower: FloatArray
     upper: FloatArray
-    velocity_limits: FloatArray  # rad/s or m/s, (k,); infinite where the URDF gives none
-    # What lies before each joint and, last, from the last joint's link to the tip, (k + 1, 4, 4)
+    velocity_limits: FloatArray  # rad/s or m/s, (k,); infinite if the URDF gives none
+    # Fixed transform before each joint, and from the last link to the tip, (k + 1, 4, 4)
     T_fixed: FloatArray
     axes: FloatArray  # Unit joint axes in the joint frames, (k, 3)
-    # Mass that moves with each joint (its link and all that is fastened to it), kg, (k,), and its
-    # centre in the frame after the joint, m, (k, 3)
+    # Mass that moves with each joint (its link and everything fixed to it), kg, (k,), and the
+    # centre of mass in the link's frame, m, (k, 3)
     masses: FloatArray
     centers_of_mass: FloatArray
-    # False where no moving link has a mass: gravity's effects cannot be computed
+    # False if no moving link has a mass: gravity torques cannot be computed
     has_inertials: bool
-    slides: BoolArray  # Which joints are prismatic, (k,)
+    slides: BoolArray  # Whether each joint is prismatic, (k,)
 
     @classmethod
     def from_urdf(
@@ -77,15 +80,16 @@ class SerialChain:
         text
             Contents of the URDF file.
         base_link
-            Frame R; the root link where None.
+            Link whose frame is R; None for the root link.
         tip_link
-            Frame T; where None, the only link that carries no other.
+            Link whose frame is the tool frame T; None for the only link without children.
 
         Raises
         ------
         InputError
-            Text that is no URDF, missing links, no way from base to tip, a joint on the way that
-            is not of a kind that is taken, or limits that are missing or reversed.
+            If the text is no URDF, a link is missing, the tip is not below the base, several links
+            have no children and no tip is named, a joint between them is floating, planar or a
+            mimic joint, or limits are missing or reversed.
         """
         model = parse_urdf(text)
         base_link = model.root if base_link is None else base_link
@@ -131,63 +135,64 @@ class SerialChain:
         )
 
     def __len__(self) -> int:
-        """Return the number of joints k."""
+        """Return the number of moving joints, k."""
         return len(self.joint_names)
 
     @cached_property
     def per_radian(self) -> FloatArray:
-        """How much of each joint's own unit counts as a radian, (k,): 1, or `LEVER_M` in m."""
+        """Amount of each joint's unit that counts as a radian, (k,): 1 rad, or `LEVER_M` in m."""
         return np.where(self.slides, LEVER_M, 1.0)
 
     @property
     def limit_tolerance(self) -> FloatArray:
-        """By how much reported positions may be beyond the limits, rad or m, (k,)."""
+        """Accepted excess of a reported position over its limits, rad or m, (k,)."""
         return LIMIT_TOLERANCE_RAD * self.per_radian
 
     @property
     def units(self) -> tuple[str, ...]:
-        """The unit of each joint's position, k names: rad or m."""
+        """Unit of each joint's position in all arrays, k names: rad or m."""
         return tuple('m' if slides else 'rad' for slides in self.slides)
 
     @property
     def torque_units(self) -> tuple[str, ...]:
-        """The unit of `gravity_torque` of each joint, k names: (N m) or N."""
+        """Unit of the `gravity_torque` of each joint, k names: (N m) or N."""
         return tuple('N' if slides else '(N m)' for slides in self.slides)
 
     @property
     def shown_units(self) -> tuple[str, ...]:
-        """The unit in which people read each joint's position, k names: deg or mm."""
+        """Unit in which a joint's position is displayed, k names: deg or mm."""
         return tuple('mm' if slides else 'deg' for slides in self.slides)
 
     @cached_property
     def shown_scale(self) -> FloatArray:
-        """How many of `shown_units` each joint's own unit has, (k,)."""
+        """Factor from each joint's unit to its displayed unit, (k,): deg/rad or mm/m."""
         return np.where(self.slides, 1e3, np.degrees(1.0))
 
     @cached_property
     def usual_range(self) -> tuple[FloatArray, FloatArray]:
-        """Limits, (k,) each; a turn from -pi to pi of joints that turn farther or without end."""
+        """Lower and upper limits, rad or m, (k,) each, within ±pi for revolute joints."""
         turn = np.where(self.slides, np.inf, np.pi)
         return np.maximum(self.lower, -turn), np.minimum(self.upper, turn)
 
     def shown_limits(self, joint: int) -> str:
-        """Return the limits of a joint as people read them, without a unit: degrees or mm."""
+        """Return the limits of a joint as text in its displayed unit, which is left out."""
         factor, ends = self.shown_scale[joint], (self.lower[joint], self.upper[joint])
         return ' to '.join(f'{factor * e:.0f}' if np.isfinite(e) else 'without end' for e in ends)
 
     def shown_offset(self, joint: int, value: float, digits: int = 2) -> str:
-        """Return an offset of a joint (rad or m) as people read it: in degrees or mm.
+        """Return an offset of a joint (rad or m) as text, in deg or mm with the unit.
 
-        A thousandth of a metre is about as much as a tenth of a degree: one digit less.
+        ``digits``: decimals of a value in degrees; one in mm has one fewer, as 1 mm at the tool is
+        about as much as 0.1 degrees.
         """
         digits = max(digits - bool(self.slides[joint]), 0)
         return f'{self.shown_scale[joint] * value:.{digits}f} {self.shown_units[joint]}'
 
     def with_offsets(self, joint_offsets: FloatArray) -> SerialChain:
-        """Return the arm with zero-offsets (rad, (k,)) built in: it takes reported angles.
+        """Return the chain with zero-offsets (rad or m, (k,)) built into its fixed transforms.
 
-        Where ``frames`` of reported angles q are is where the arm is, and its limits are those of
-        the reported angles at its stops.
+        Its `frames` take reported joint angles and give true frames; its limits are those of the
+        reported angles.
         """
         T_fixed = self.T_fixed.copy()
         T_fixed[:-1] = T_fixed[:-1] @ self.motions(np.asarray(joint_offsets, dtype=float))
@@ -199,16 +204,16 @@ class SerialChain:
         )
 
     def within_limits(self, q: ArrayLike, tolerance: float | FloatArray = 0.0) -> BoolArray:
-        """Return whether all joints of q (..., k) are within limits, (...).
+        """Return whether all joints of configurations q (..., k) are within their limits, (...).
 
-        ``tolerance``: how far beyond they may be, rad and m, one number or (k,).
+        ``tolerance``: accepted distance beyond the limits, rad or m, one number or (k,).
         """
         q = np.asarray(q, dtype=float)
         inside = (q >= self.lower - tolerance) & (q <= self.upper + tolerance)
         return np.all(inside, axis=-1)
 
     def frames(self, q: ArrayLike, joint_offsets: ArrayLike | None = None) -> FloatArray:
-        """Return the frame after each joint in R.
+        """Return the frame of each joint's link in R, T_R_link (..., k, 4, 4).
 
         Parameters
         ----------
@@ -216,11 +221,6 @@ class SerialChain:
             Joint angles, rad, (..., k).
         joint_offsets
             Zero-offsets added to q, rad, (..., k); None for the nominal robot.
-
-        Returns
-        -------
-        ndarray
-            T_R_link for each joint's link, (..., k, 4, 4).
         """
         angles = self._checked(q)
         if joint_offsets is not None:
@@ -232,7 +232,7 @@ class SerialChain:
         return frames
 
     def motions(self, q: FloatArray) -> FloatArray:
-        """Return what each joint does at its position in q (..., k), (..., k, 4, 4)."""
+        """Return the transform of each joint at positions q (..., k), (..., k, 4, 4)."""
         vectors = q[..., None] * self.axes
         if not self.slides.any():
             return transform(rotation_vector_to_matrix(vectors), np.zeros(3))
@@ -241,14 +241,13 @@ class SerialChain:
         return transform(turns, np.where(slides, vectors, 0.0))
 
     def forward(self, q: ArrayLike, joint_offsets: ArrayLike | None = None) -> FloatArray:
-        """Return the tool pose T_R_T, (..., 4, 4), for joint angles (..., k); see `frames`."""
+        """Return the tool pose T_R_T, (..., 4, 4); arguments as of `frames`."""
         return self.frames(q, joint_offsets)[..., -1, :, :] @ self.T_fixed[-1]
 
     def within_turns(self, q: FloatArray) -> FloatArray:
-        """Return joint angles (n, k) with whole turns taken off where the limits ask for it.
+        """Return joint angles (n, k) moved by up to two whole turns to lie within the limits.
 
-        Angles that no turn brings within the limits stay as they are. A controller that counts on
-        is not more than two turns off. What slides has no turns.
+        Angles that no such turn brings within the limits, and prismatic joints, are unchanged.
         """
         low, high = self.lower - self.limit_tolerance, self.upper + self.limit_tolerance
         turned = q.copy()
@@ -265,11 +264,12 @@ class SerialChain:
         joint_offsets: ArrayLike | None = None,
         turns: Mapping[int, FloatArray] | None = None,
     ) -> FloatArray:
-        """Return where points of the tool frame are in R: the fast path of the fit.
+        """Return the positions in R of points of the tool frame, m, (..., 3).
 
-        Turns vectors instead of multiplying matrices, and joins the sines of q (n, k) and of
-        joint_offsets (B, 1, k) by the addition theorem, so that a batch of offsets costs no
-        trigonometry over its whole shape but for the joints that are turned row by row.
+        Fast forward kinematics for the fit: rotates vectors instead of multiplying matrices, and
+        combines the sines of q (n, k) and of joint_offsets (B, 1, k) by the addition theorem, so
+        that a batch of offsets costs no trigonometry over its whole shape, except for joints with
+        an entry in `turns`.
 
         Parameters
         ----------
@@ -280,16 +280,11 @@ class SerialChain:
         joint_offsets
             Zero-offsets, rad, (..., k).
         turns
-            What some joints turn or slide further: index of the joint -> rad or m, (...).
-
-        Returns
-        -------
-        ndarray
-            m, (..., 3).
+            Additional motion of some joints: joint index -> rad or m, (...).
         """
-        q, further = self._checked(q), turns or {}
+        q, extra = self._checked(q), turns or {}
         offsets = np.zeros(len(self)) if joint_offsets is None else np.asarray(joint_offsets)
-        # Coordinates first: each turn takes whole arrays, each fixed step is one product.
+        # Coordinates are the first axis: each rotation works on whole arrays.
         vectors = np.moveaxis(np.asarray(points, dtype=float), -1, 0)
         for i in range(len(self), -1, -1):
             step = self.T_fixed_z[i]
@@ -298,13 +293,13 @@ class SerialChain:
             if i == 0:
                 break
             if self.slides[i - 1]:
-                along = vectors[2] + q[..., i - 1] + offsets[..., i - 1] + further.get(i - 1, 0.0)
+                along = vectors[2] + q[..., i - 1] + offsets[..., i - 1] + extra.get(i - 1, 0.0)
                 across = (np.broadcast_to(vectors[axis], along.shape) for axis in (0, 1))
                 vectors = np.stack((*across, along))
                 continue
             sine, cosine = np.sin(q[..., i - 1]), np.cos(q[..., i - 1])
-            if joint_offsets is not None or i - 1 in further:
-                added = offsets[..., i - 1] + further.get(i - 1, 0.0)
+            if joint_offsets is not None or i - 1 in extra:
+                added = offsets[..., i - 1] + extra.get(i - 1, 0.0)
                 s, c = np.sin(added), np.cos(added)
                 sine, cosine = sine * c + cosine * s, cosine * c - sine * s
             x = cosine * vectors[0] - sine * vectors[1]
@@ -318,22 +313,20 @@ class SerialChain:
     def position_jacobian(
         self, q: ArrayLike, points: ArrayLike, joint_offsets: ArrayLike | None = None
     ) -> FloatArray:
-        """Return the derivative of `positions` by q (or, the same, by the zero-offsets).
+        """Return the Jacobian of `positions` by q, equal to that by the zero-offsets, (..., 3, k).
 
-        Column i is axis_i × (p − o_i), the velocity of the point about joint i; axis_i of one that
-        slides.
-
-        Returns
-        -------
-        ndarray
-            m/rad, or m/m, (..., 3, k).
+        Column i is axis_i × (p − o_i), m/rad, for a revolute joint, and axis_i, m/m, for a
+        prismatic one.
         """
         frames = self.frames(q, joint_offsets)
         tip = frames[..., -1, :, :] @ self.T_fixed[-1]
         return self.velocities(frames, apply(tip, points))
 
     def velocities(self, frames: FloatArray, points: FloatArray) -> FloatArray:
-        """Return the same, (..., 3, k), for points in R (..., 3) and `frames` (..., k, 4, 4)."""
+        """Return the position Jacobian of points in R, (..., 3, k).
+
+        ``frames``: the link frames of `frames`, (..., k, 4, 4); ``points``: m, in R, (..., 3).
+        """
         arms, axes = points[..., None, :] - frames[..., :3, 3], self.axes_in_base(frames)
         moved = np.cross(axes, arms)
         if self.slides.any():
@@ -341,10 +334,11 @@ class SerialChain:
         return np.swapaxes(moved, -1, -2)
 
     def gravity_torque(self, q: ArrayLike, gravity: ArrayLike = (0.0, 0.0, -9.81)) -> FloatArray:
-        """Return gravity's torque about each joint: axis · (r × m g) over what hangs on it.
+        """Return gravity's torque about each joint, axis · (r × m g), N m, (..., k).
 
-        Positive where gravity turns the joint its own way; a motor that holds the arm still has
-        to apply the negative.
+        Summed over all links that the joint carries. Positive if gravity drives the joint in its
+        positive direction; a motor that holds the arm still applies the negative. Of a prismatic
+        joint the force along its axis, N. Zeros if the URDF has no masses (`has_inertials`).
 
         Parameters
         ----------
@@ -352,17 +346,11 @@ class SerialChain:
             Joint angles, rad, (..., k).
         gravity
             Acceleration in R, m/s², (3,).
-
-        Returns
-        -------
-        ndarray
-            N m, (..., k); zeros where the URDF has no masses (`has_inertials`). Of a joint that
-            slides gravity's force along it, N.
         """
         frames = self.frames(q)
         centers = apply(frames, self.centers_of_mass)
         moments = self.masses[:, None] * centers
-        # Sums over the joint's own link and all further out.
+        # Sums over the joint's link and all links beyond.
         carried_moment = np.cumsum(moments[..., ::-1, :], axis=-2)[..., ::-1, :]
         carried_mass = np.cumsum(self.masses[::-1])[::-1]
         arms = carried_moment - carried_mass[:, None] * frames[..., :3, 3]
@@ -373,11 +361,11 @@ class SerialChain:
         return np.sum(self.axes_in_base(frames) * torque, axis=-1)
 
     def axes_in_base(self, frames: FloatArray) -> FloatArray:
-        """Return the joint axes in R, (..., k, 3), of frames (..., k, 4, 4)."""
+        """Return the joint axes in R, unit vectors (..., k, 3), of link frames (..., k, 4, 4)."""
         return (frames[..., :3, :3] @ self.axes[:, :, None])[..., 0]
 
     def _checked(self, q: ArrayLike) -> FloatArray:
-        """Return joint angles (..., k) as an array; a ValueError where they are not so many."""
+        """Return joint angles as an array (..., k); raise ValueError if the last size is not k."""
         q = np.asarray(q, dtype=float)
         if q.ndim == 0 or q.shape[-1] != len(self):
             raise ValueError(f'q has shape {q.shape}; its last size must be {len(self)}')
@@ -385,14 +373,14 @@ class SerialChain:
 
     @cached_property
     def T_fixed_z(self) -> FloatArray:
-        """`T_fixed` of the same arm with every joint frame turned so that its axis is Z."""
+        """`T_fixed` of the same arm with joint frames rotated so that every joint axis is Z."""
         onto_axes = [np.eye(3), *map(with_z_along, self.axes), np.eye(3)]
         turns = transform(onto_axes, np.zeros(3))
         return inverse(turns[:-1]) @ self.T_fixed @ turns[1:]
 
 
 def _joints_between(model: UrdfModel, base_link: str, tip_link: str) -> list[UrdfJoint]:
-    """Return the joints from base to tip, in that order."""
+    """Return the joints from base to tip, in that order; raise InputError if there is no way."""
     for link in (base_link, tip_link):
         if link not in model.links:
             raise InputError(
@@ -400,17 +388,18 @@ def _joints_between(model: UrdfModel, base_link: str, tip_link: str) -> list[Urd
                 + did_you_mean(link, model.links)
             )
     joints = []
-    here = tip_link
-    while here != base_link:
-        if here not in model.parent_joint:
+    link = tip_link
+    while link != base_link:
+        if link not in model.parent_joint:
             raise InputError(f"URDF: link '{tip_link}' does not hang on link '{base_link}'")
-        joint = model.parent_joint[here]
+        joint = model.parent_joint[link]
         joints.append(joint)
-        here = joint.parent
+        link = joint.parent
     return joints[::-1]
 
 
 def _require_kind(joint: UrdfJoint) -> None:
+    """Raise InputError if a joint of the arm is floating, planar or a mimic joint."""
     if joint.kind not in ('revolute', 'continuous', 'prismatic'):
         raise InputError(
             f"URDF: joint '{joint.name}' is {joint.kind}; "
@@ -424,7 +413,10 @@ def _require_kind(joint: UrdfJoint) -> None:
 
 
 def _limits(joint: UrdfJoint) -> tuple[float, float, float]:
-    """Return lower, upper and velocity limit; a velocity of 0 or none means unknown."""
+    """Return lower, upper and velocity limit of a joint, rad or m and per s.
+
+    A velocity limit of 0 counts as infinite. Raises InputError if position limits are missing.
+    """
     velocity = joint.velocity or np.inf
     if velocity < 0.0:
         raise InputError(f"URDF: the velocity limit of joint '{joint.name}' is negative")
@@ -444,7 +436,10 @@ def _limits(joint: UrdfJoint) -> tuple[float, float, float]:
 
 
 def _carried_masses(model: UrdfModel, moving: list[UrdfJoint]) -> tuple[FloatArray, FloatArray]:
-    """Sum first moments (kg m, (k, 3), in the frame after each joint) and masses (kg, (k,))."""
+    """Return first moments (kg m, (k, 3)) and masses (kg, (k,)) that move with each joint.
+
+    A first moment is in the frame of the joint's link; `moving` are the k joints.
+    """
     index = {joint.child: i for i, joint in enumerate(moving)}
     first_moments, masses = np.zeros((len(moving), 3)), np.zeros(len(moving))
     for link in model.links.values():

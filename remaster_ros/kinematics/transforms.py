@@ -15,19 +15,9 @@ from remaster_ros.types import FloatArray
 
 
 def transform(rotation: ArrayLike, translation: ArrayLike) -> FloatArray:
-    """Assemble homogeneous transforms.
+    """Assemble homogeneous transforms (..., 4, 4).
 
-    Parameters
-    ----------
-    rotation
-        Rotation matrices, (..., 3, 3).
-    translation
-        Translations, m, (..., 3).
-
-    Returns
-    -------
-    ndarray
-        (..., 4, 4).
+    ``rotation``: matrices, (..., 3, 3); ``translation``: m, (..., 3).
     """
     rotation = np.asarray(rotation, dtype=float)
     translation = np.asarray(translation, dtype=float)
@@ -54,32 +44,29 @@ def apply(T: ArrayLike, points: ArrayLike) -> FloatArray:
 
 
 def rotation_vector_to_matrix(rotation_vector: ArrayLike) -> FloatArray:
-    """Turn rotation vectors (axis times angle, rad), (..., 3), into matrices (..., 3, 3)."""
+    """Convert rotation vectors (axis times angle, rad), (..., 3), to matrices (..., 3, 3)."""
     vectors = np.asarray(rotation_vector, dtype=float)
     matrices = Rotation.from_rotvec(vectors.reshape(-1, 3)).as_matrix()
     return np.reshape(matrices, (*vectors.shape, 3))
 
 
 def matrix_to_rotation_vector(rotation: ArrayLike) -> FloatArray:
-    """Turn rotation matrices (..., 3, 3) into rotation vectors (..., 3) of angle 0 to pi, rad."""
+    """Convert rotation matrices (..., 3, 3) to rotation vectors (..., 3) of angle 0 to pi, rad."""
     matrices = np.asarray(rotation, dtype=float)
     vectors = Rotation.from_matrix(matrices.reshape(-1, 3, 3)).as_rotvec()
     return np.reshape(vectors, matrices.shape[:-1])
 
 
 def quaternion_xyzw(rotation: ArrayLike) -> FloatArray:
-    """Turn a rotation matrix (3, 3) into its unit quaternion x, y, z, w (4,) with w >= 0."""
+    """Convert a rotation matrix (3, 3) to its unit quaternion x, y, z, w (4,) with w >= 0."""
     # q and -q are the same rotation; one sign makes files and messages comparable.
     return np.asarray(Rotation.from_matrix(np.asarray(rotation)).as_quat(canonical=True))
 
 
 def matrix_from_quaternion_xyzw(quaternion: ArrayLike) -> FloatArray:
-    """Turn a quaternion x, y, z, w (4,) of any length but zero into a matrix (3, 3).
+    """Convert a quaternion x, y, z, w (4,) of any length but zero to a matrix (3, 3).
 
-    Raises
-    ------
-    ValueError
-        Its length is zero or not finite.
+    Raises ValueError if its length is zero or not finite.
     """
     quaternion = np.asarray(quaternion, dtype=float)
     if not 0.0 < np.linalg.norm(quaternion) < np.inf:
@@ -88,10 +75,11 @@ def matrix_from_quaternion_xyzw(quaternion: ArrayLike) -> FloatArray:
 
 
 def mean_quaternion_xyzw(quaternions: ArrayLike) -> FloatArray:
-    """Return the mean of unit quaternions x, y, z, w (n, 4), n >= 1, whatever their signs, (4,).
+    """Return the mean rotation of unit quaternions x, y, z, w (n, 4) as a quaternion, (4,).
 
-    The rotation nearest to all of them in the chordal distance: the largest eigenvector of the
-    sum of their outer products (Markley et al., "Averaging quaternions", J. Guidance 30, 2007).
+    It minimises the sum of squared chordal distances, whatever the quaternions' signs: the
+    eigenvector of the largest eigenvalue of the sum of their outer products (Markley et al.,
+    "Averaging quaternions", J. Guidance 30, 2007).
     """
     values = np.asarray(quaternions, dtype=float)
     vector = np.linalg.eigh(values.T @ values)[1][:, -1]
@@ -99,13 +87,16 @@ def mean_quaternion_xyzw(quaternions: ArrayLike) -> FloatArray:
 
 
 def inverse_poses(position: ArrayLike, xyzw: ArrayLike) -> tuple[FloatArray, FloatArray]:
-    """Return where a is in b, m, (n, 3), and how it stands, (n, 4), of poses of b in a."""
+    """Return the positions, m, (n, 3), and quaternions, (n, 4), of frame a in b.
+
+    ``position``, ``xyzw``: those of frame b in a.
+    """
     back = Rotation.from_quat(np.asarray(xyzw, dtype=float)).inv()
     return np.asarray(-back.apply(np.asarray(position, dtype=float))), np.asarray(back.as_quat())
 
 
 def matrix_from_rpy(rpy: ArrayLike) -> FloatArray:
-    """Turn roll, pitch, yaw (3,) in rad, URDF's Rz(yaw) Ry(pitch) Rx(roll), into a matrix."""
+    """Convert roll, pitch, yaw (3,), rad, to URDF's matrix Rz(yaw) Ry(pitch) Rx(roll), (3, 3)."""
     return np.asarray(Rotation.from_euler('xyz', rpy).as_matrix())
 
 
@@ -118,30 +109,16 @@ def with_z_along(direction: ArrayLike) -> FloatArray:
 
 
 def looking_at(position: ArrayLike, target: ArrayLike, roll_rad: float = 0.0) -> FloatArray:
-    """Return the rotation of a sensor at one point that looks at another along its z axis.
+    """Return the rotation (3, 3) of a sensor whose z axis points from its position to a target.
 
-    Parameters
-    ----------
-    position, target
-        Where it stands and what it looks at, m, (3,).
-    roll_rad
-        Turn about its z axis; without one its x axis is level.
-
-    Returns
-    -------
-    ndarray
-        (3, 3).
-
-    Raises
-    ------
-    InputError
-        The two are one point.
+    ``position``, ``target``: m, (3,); ``roll_rad``: rotation about its z axis; at 0 its x axis is
+    level. Raises InputError if position and target coincide.
     """
     position, target = np.asarray(position, dtype=float), np.asarray(target, dtype=float)
     x, y, z = line = target - position
     if not np.linalg.norm(line) > 0.0:
         raise InputError(f'a sensor at {position} m cannot look at {target} m: give another place')
-    # About Z, then about the level x axis; straight up or down every x axis is level.
+    # Euler angles about Z, the level x axis and z; looking straight up or down any azimuth does.
     level = np.hypot(x, y)
     azimuth = np.arctan2(x, -y) if level > 1e-9 * abs(z) else 0.0
     angles = azimuth, np.arctan2(level, z), roll_rad

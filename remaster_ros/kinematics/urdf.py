@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A strict reader of URDF text: the links, joints, limits and masses, nothing else.
+"""A strict reader of the links, joints, limits and masses in URDF text.
 
-Meshes, materials and the like are ignored. Text that is wrong is refused with one line that names
-the joint or link; nothing is guessed.
+Meshes, materials and the like are ignored. Wrong text is refused with one line that names the
+joint or link; nothing is guessed.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ from remaster_ros.kinematics.transforms import matrix_from_rpy, transform
 from remaster_ros.types import FloatArray
 
 _LARGEST = 1e6
-"""No robot has a length (m), angle (rad) or mass (kg) above it; larger ones would overflow."""
+"""Largest length (m), angle (rad) or mass (kg) accepted; far larger ones would overflow."""
 _XACRO = (
     'URDF: this is xacro, from which a URDF is still to be made; let its name end in .xacro, and '
     'expand it: remaster init FILE (or ros2 run xacro xacro FILE > robot.urdf)'
 )
 MOST_LINKS, MOST_DEPTH = 2_000, 200
-"""Ten times the links of the largest description seen (a cell of two arms with hands, 190), and of
-those one behind the other (a humanoid's finger, 20)."""
+"""Most links of a description, and most in one chain: ten times those of the largest descriptions
+seen (190 links of a cell with two arms and hands; 20 from a humanoid's root to its finger)."""
 _NO_LIMIT = 1e300
-"""Some programs write a huge limit, such as 1e16, where they mean none."""
+"""Largest joint limit accepted: some programs write a huge one, such as 1e16, to mean none."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,19 +44,19 @@ class UrdfLink:
 
 @dataclass(frozen=True, eq=False)
 class UrdfJoint:
-    """One joint as written."""
+    """One joint as written in the URDF."""
 
     name: str
     kind: str  # ``type`` of the URDF: revolute, continuous, fixed, prismatic, floating, planar
     parent: str
     child: str
     origin: FloatArray  # T_parent_joint, (4, 4)
-    axis: FloatArray  # Unit vector in the joint frame, (3,); X for a joint that is fixed
-    # Limits as written, rad and rad/s; None where absent
+    axis: FloatArray  # Unit vector in the joint frame, (3,); X for a fixed joint
+    # Limits as written, rad and rad/s; None if absent
     lower: float | None
     upper: float | None
     velocity: float | None
-    mimic: bool  # True where the joint follows another one
+    mimic: bool  # Whether the joint follows another one
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,22 +70,22 @@ class UrdfModel:
 
     @cached_property
     def child_joints(self) -> Mapping[str, list[UrdfJoint]]:
-        """Map each link to the joints that it carries, in file order."""
+        """Joints that each link carries, in file order, by link name."""
         found: dict[str, list[UrdfJoint]] = {name: [] for name in self.links}
         for joint in self.parent_joint.values():
             found[joint.parent].append(joint)
         return found
 
     def leaves(self) -> list[str]:
-        """Return the links that carry nothing, in file order."""
+        """Return the links without child links, in file order."""
         parents = {joint.parent for joint in self.parent_joint.values()}
         return [name for name in self.links if name not in parents]
 
     def carrier(self, link: str, moving: Container[str]) -> tuple[str, FloatArray]:
-        """Return what carries a link, and T_carrier_link (4, 4), all joints between at zero.
+        """Return the nearest of the `moving` links on the way to the root, and the pose to it.
 
-        That is the nearest link of `moving` on the way to the root, itself included; else the
-        root.
+        The link itself counts; the root if there is no other. The pose is T_carrier_link (4, 4)
+        with all joints between the two at zero.
         """
         T = np.eye(4)
         while link not in moving and link in self.parent_joint:
@@ -95,25 +95,26 @@ class UrdfModel:
 
 
 def parse_urdf(text: str) -> UrdfModel:
-    """Read URDF text.
+    """Read URDF text into a tree of links and joints.
 
     Raises
     ------
     InputError
-        Malformed XML, a DOCTYPE or entity declaration, a joint to a missing link, two links or
-        joints of one name, a link with two parents, a loop, or a number that is none.
+        If the XML is malformed or declares a DOCTYPE or entities, a joint names a missing link,
+        two links or joints share a name, a link has two parents, links form a loop, or a number
+        is malformed.
     """
     # The keyword is case-sensitive in XML, so text without it cannot declare an entity.
     if '<!DOCTYPE' in text or '<!ENTITY' in text:
         raise InputError('URDF: it declares a DOCTYPE or entities; remove the declaration')
     try:
         robot = ElementTree.fromstring(text)
-    # A ValueError where the text holds what no encoding can write.
+    # ValueError: the text has characters that no encoding can write.
     except (ElementTree.ParseError, ValueError) as error:
-        if '<xacro:' in text:  # Without its namespace, which is not well-formed.
+        if '<xacro:' in text:  # Its namespace is undeclared, so that the XML is malformed.
             raise InputError(_XACRO) from None
         raise InputError(f'URDF: not well-formed XML ({error})') from None
-    # What xacro has expanded may still declare its namespace, but has no element of it.
+    # Expanded xacro may still declare the namespace, but has no elements of it.
     if any(_is_xacro(element) for element in robot.iter()):
         raise InputError(_XACRO)
     if robot.tag != 'robot':
@@ -167,7 +168,7 @@ def parse_urdf(text: str) -> UrdfModel:
 
 
 def _refuse_deep(model: UrdfModel) -> None:
-    """Refuse a robot with more links behind one another than any arm has."""
+    """Raise InputError if links form a longer chain than any arm has."""
     level, depth = [model.root], 0
     while level := [joint.child for link in level for joint in model.child_joints[link]]:
         depth += 1
@@ -179,13 +180,14 @@ def _refuse_deep(model: UrdfModel) -> None:
 
 
 def _is_xacro(element: ElementTree.Element) -> bool:
-    """Return whether an element is of xacro's namespace, of which there are several spellings."""
-    # Comments have a function for their tag.
+    """Return whether an element is in one of the namespaces of xacro."""
+    # The tag of a comment is a function.
     tag = element.tag if isinstance(element.tag, str) else ''
     return tag.startswith('{') and tag.partition('}')[0].endswith('xacro')
 
 
 def _link(element: ElementTree.Element) -> UrdfLink:
+    """Read a <link> element."""
     name = attribute(element, 'name', 'a link')
     where = f"link '{name}'"
     inertial = element.find('inertial')
@@ -201,6 +203,7 @@ def _link(element: ElementTree.Element) -> UrdfLink:
 
 
 def _joint(element: ElementTree.Element) -> UrdfJoint:
+    """Read a <joint> element."""
     name = attribute(element, 'name', 'a joint')
     where = f"joint '{name}'"
     ends = {}
@@ -231,7 +234,7 @@ def _joint(element: ElementTree.Element) -> UrdfJoint:
 
 
 def _check_unused_numbers(element: ElementTree.Element, where: str) -> None:
-    """Refuse text that is no number where only `compensation.export` needs the number."""
+    """Raise InputError for malformed numbers that only `compensation.export` reads."""
     for tag, keys in (
         ('mimic', ('multiplier', 'offset')),
         ('safety_controller', ('soft_lower_limit', 'soft_upper_limit')),
@@ -242,9 +245,9 @@ def _check_unused_numbers(element: ElementTree.Element, where: str) -> None:
 
 
 def _axis(element: ElementTree.Element, kind: str, where: str) -> FloatArray:
-    """Return the unit axis of a joint in its frame; X where it is not given, as URDF has it."""
+    """Return the unit axis of a joint in its frame, (3,); X if it is not given, URDF's default."""
     axis_element = element.find('axis')
-    # CAD exporters write an axis of 0 0 0 where there is none to move about.
+    # CAD exporters write an axis of 0 0 0 for joints that do not move.
     if axis_element is None or kind in ('fixed', 'floating'):
         return np.array([1.0, 0.0, 0.0])
     axis = numbers(attribute(axis_element, 'xyz', where), 3, f'the axis of {where}')
@@ -255,7 +258,7 @@ def _axis(element: ElementTree.Element, kind: str, where: str) -> FloatArray:
 
 
 def origin_of(element: ElementTree.Element, where: str) -> FloatArray:
-    """Return the place that ``<origin>`` gives, (4, 4); the identity where there is none."""
+    """Return the transform of the <origin> of an element, (4, 4); the identity if it has none."""
     origin = element.find('origin')
     if origin is None:
         return np.eye(4)
@@ -265,7 +268,7 @@ def origin_of(element: ElementTree.Element, where: str) -> FloatArray:
 
 
 def attribute(element: ElementTree.Element, key: str, where: str) -> str:
-    """Return an attribute that has to be there; `where` names its place in messages."""
+    """Return a required attribute; raise InputError, which names `where`, if it is missing."""
     value = element.get(key, '')
     if not value:
         raise InputError(f"URDF: {where} has no attribute '{key}'")
@@ -273,7 +276,7 @@ def attribute(element: ElementTree.Element, key: str, where: str) -> str:
 
 
 def numbers(text: str, count: int, what: str) -> FloatArray:
-    """Return so many numbers, (count,); `what` names them in messages."""
+    """Return the `count` numbers in a text, (count,); raise InputError, which names `what`."""
     parts = text.split()
     if len(parts) != count:
         needed = 'three numbers are needed' if count == 3 else f'{count} is needed'
@@ -282,11 +285,13 @@ def numbers(text: str, count: int, what: str) -> FloatArray:
 
 
 def _optional_number(element: ElementTree.Element, key: str, where: str) -> float | None:
+    """Return a number attribute, None if it is missing; InputError if it is malformed."""
     text = element.get(key)
     return None if text is None else _number(text, f'{key} of {where}', _NO_LIMIT)
 
 
 def _number(text: str, what: str, largest: float = _LARGEST) -> float:
+    """Return text as a finite number; raise InputError, which names `what`."""
     try:
         value = float(text)
     except ValueError:

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The geometry of a URDF: which shapes hang on which joint of the arm, and where.
+"""The geometry of a URDF: shapes, the joint that moves each, and their poses.
 
-Collision geometry is read strictly, as it decides what the arm may do; visual geometry is for
-pictures, where an element that cannot be read is one that is missing.
+Collision geometry is read strictly, as it decides where the arm may go; visual geometry is for
+pictures, and an element that cannot be read is skipped.
 """
 
 from __future__ import annotations
@@ -22,17 +22,17 @@ from remaster_ros.kinematics.urdf import attribute, numbers, origin_of, parse_ur
 from remaster_ros.types import FloatArray
 
 MeshReader = Callable[[str], FloatArray | None]
-"""Takes a mesh's file name as the URDF writes it; returns its vertices, m, (n, 3).
+"""From a mesh's file name, as the URDF writes it, to its vertices, m, (n, 3).
 
 None leaves that shape out."""
 
 
 @dataclass(frozen=True, eq=False)
 class LinkShape:
-    """One ``<collision>`` element: its link, its place in the link's frame, its shape."""
+    """One <collision> element of a link."""
 
-    link: str
-    T_link_shape: FloatArray
+    link: str  # The URDF's link
+    T_link_shape: FloatArray  # Pose of the shape in the link's frame, (4, 4)
     shape: Shape
 
 
@@ -41,27 +41,26 @@ class Visual:
     """One ``<visual>`` element of a link of the arm."""
 
     link_name: str  # The URDF's link
-    link: int  # 0 for what stands still, i for what moves with joint i
-    # Its place in the frame after that joint (in the base for 0), (4, 4)
+    link: int  # 0 for the base, i for the link after joint i
+    # Pose in the frame after that joint (in the base frame for 0), (4, 4)
     T_link_visual: FloatArray
     shape: Shape | None  # A box, cylinder or sphere; None for a mesh
-    # The mesh's file name as the URDF writes it; '' for none, with no shape either where the
-    # element cannot be read
+    # The mesh's file name as the URDF writes it; '' for none. Without shape and mesh the element
+    # could not be read
     mesh: str
     scale: FloatArray  # Of the mesh, (3,)
-    # Red, green and blue, 0 to 1; None where the URDF gives none
+    # Red, green and blue, 0 to 1; None if the URDF gives none
     color: tuple[float, float, float] | None
 
 
 def link_shapes(text: str, read_mesh: MeshReader) -> list[LinkShape]:
-    """Read all collision elements of URDF text (that `parse_urdf` accepts).
+    """Read all collision elements of URDF text (which `parse_urdf` accepts).
 
-    ``text``: contents of the URDF file; ``read_mesh``: called for each mesh; what it returns is
-    taken as its convex hull, scaled.
-    Raises InputError: a geometry that is missing, unknown or has no volume, or what `read_mesh`
-    raises.
+    ``read_mesh``: called for each mesh; the shape is the convex hull of the returned vertices,
+    scaled. Raises InputError if a geometry is missing, unknown or has no volume, or `read_mesh`
+    raises it.
     """
-    found = []
+    shapes = []
     for link in ElementTree.fromstring(text).findall('link'):
         name = link.get('name', '')
         for element in link.findall('collision'):
@@ -75,18 +74,19 @@ def link_shapes(text: str, read_mesh: MeshReader) -> list[LinkShape]:
                 place = '' if where in str(error) else f'URDF: {where}: '
                 raise InputError(f'{place}{error}') from None
             if shape is not None:
-                found.append(LinkShape(name, origin_of(element, where), shape))
-    return found
+                shapes.append(LinkShape(name, origin_of(element, where), shape))
+    return shapes
 
 
 def mesh_names(text: str) -> list[str]:
-    """Return the file names of the meshes of all collision elements, as they are written."""
+    """Return the file names of all collision meshes, as written, without repeats."""
     names: list[str] = []
     link_shapes(text, names.append)
     return list(dict.fromkeys(names))
 
 
 def _shape(element: ElementTree.Element, where: str, read_mesh: MeshReader) -> Shape | None:
+    """Read a geometry element; None if `read_mesh` leaves its mesh out. Raises InputError."""
     if element.tag == 'box':
         return box(numbers(attribute(element, 'size', where), 3, f'the size of {where}'))
     if element.tag == 'sphere':
@@ -95,7 +95,7 @@ def _shape(element: ElementTree.Element, where: str, read_mesh: MeshReader) -> S
         radius = numbers(attribute(element, 'radius', where), 1, f'the radius of {where}')
         length = numbers(attribute(element, 'length', where), 1, f'the length of {where}')
         core = cylinder(radius[0], length[0])
-        # The few programs that write capsules mean the length without the round ends.
+        # Programs that write capsules mean the length without the round ends.
         low, high = core.points
         return core if element.tag == 'cylinder' else capsule(low, high, core.disc)
     if element.tag == 'mesh':
@@ -110,32 +110,25 @@ def _shape(element: ElementTree.Element, where: str, read_mesh: MeshReader) -> S
 
 
 def chain_bodies(text: str, chain: SerialChain, read_mesh: MeshReader) -> list[Body]:
-    """Return the URDF's collision geometry as bodies on the links of the arm.
+    """Return the collision geometry of a URDF as bodies on the links of the arm.
 
-    What is fastened rigidly to a link moves with it. Joints off the arm (a gripper's fingers)
-    count as fixed at zero, as for the masses.
-
-    Parameters
-    ----------
-    text
-        The URDF that the chain was read from.
-    chain
-        The arm.
-    read_mesh
-        See `link_shapes`.
+    Bodies fixed rigidly to a link move with it. Joints off the arm (a gripper's fingers) count as
+    fixed at zero, as for the masses. ``text``: the URDF that the chain was read from;
+    ``read_mesh`` and errors as of `link_shapes`.
     """
     carrier = _carriers(text, chain)
     bodies = []
-    for found in link_shapes(text, read_mesh):
-        link, T = carrier(found.link)
-        bodies.append(Body(found.link, link, found.shape, T @ found.T_link_shape))
+    for element in link_shapes(text, read_mesh):
+        link, T = carrier(element.link)
+        bodies.append(Body(element.link, link, element.shape, T @ element.T_link_shape))
     return bodies
 
 
 def _carriers(text: str, chain: SerialChain) -> Callable[[str], tuple[int, FloatArray]]:
-    """Return what gives, for a link's name, the joint that it moves with and T_joint_link.
+    """Return a function from a link's name to the number of the joint that moves it, and its pose.
 
-    The joint is 0 for what stands still, whose place is then in the base.
+    The pose is T_joint_link, in the frame after that joint. The number is 0 for links that stand
+    still, whose pose is in the base frame.
     """
     model = parse_urdf(text)
     index = {
@@ -147,25 +140,20 @@ def _carriers(text: str, chain: SerialChain) -> Callable[[str], tuple[int, Float
 
     def carrier(link: str) -> tuple[int, FloatArray]:
         name, T = model.carrier(link, index)
-        # Where no joint of the arm carries it, this is its place in the root's frame.
+        # If no joint of the arm carries the link, T is its pose in the root's frame.
         return index.get(name, 0), T if name in index else inverse(T_root_base) @ T
 
     return carrier
 
 
 def chain_visuals(text: str, chain: SerialChain) -> list[Visual]:
-    """Return the visual elements of URDF text (that `parse_urdf` accepts), for pictures.
+    """Return the visual elements of URDF text (which `parse_urdf` accepts), for pictures.
 
-    Parameters
-    ----------
-    text
-        The URDF that the chain was read from.
-    chain
-        The arm.
+    ``text``: the URDF that the chain was read from.
     """
     carrier, robot = _carriers(text, chain), ElementTree.fromstring(text)
     colors = {element.get('name', ''): _color(element) for element in robot.findall('material')}
-    found = []
+    visuals = []
     for link in robot.findall('link'):
         name = link.get('name', '')
         number, T = carrier(name)
@@ -184,12 +172,12 @@ def chain_visuals(text: str, chain: SerialChain) -> list[Visual]:
             color = None
             if material is not None:
                 color = _color(material) or colors.get(material.get('name', ''))
-            found.append(Visual(name, number, T @ T_visual, shape, mesh, scale, color))
-    return found
+            visuals.append(Visual(name, number, T @ T_visual, shape, mesh, scale, color))
+    return visuals
 
 
 def _color(material: ElementTree.Element) -> tuple[float, float, float] | None:
-    """Return red, green and blue of a ``<material>``; None where it has no colour that is one."""
+    """Return red, green and blue of a <material>, 0 to 1; None if it has no valid colour."""
     element = material.find('color')
     with suppress(InputError):
         if element is not None:

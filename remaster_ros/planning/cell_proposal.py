@@ -98,7 +98,7 @@ def propose_held_joint(chain: SerialChain, facing: FloatArray) -> HeldJoint:
             f"robot '{chain.name}' is singular everywhere, whichever joint is held; "
             f'{OWN_CONFIGURATIONS}'
         )
-    near = {joint: k for joint, k in able.items() if k.way != 'many starts'}
+    near = {joint: k for joint, k in able.items() if k.method != 'many starts'}
     best: tuple[float, int] | None = None
     for joint, kinematics in able.items():
         name = chain.joint_names[joint]

@@ -355,7 +355,7 @@ def test_arms_without_a_closed_form_keep_all_solutions(make, errors, held, way, 
     urdf = with_errors(description.urdf, *errors, rng)
     chain = SerialChain.from_urdf(urdf, description.base_link, description.tip_link)
     ik = InverseKinematics(chain, {joint: (value,) for joint, value in held.items()})
-    assert ik.way == way
+    assert ik.method == way
     judge = InverseJudge(urdf, chain.base_link, chain.tip_link, chain.joint_names, held)
     free = [joint for joint in range(len(chain)) if joint not in held]
     q = rng.uniform(-np.pi, np.pi, (poses, len(chain)))
@@ -376,7 +376,7 @@ def test_arms_without_a_closed_form_keep_all_solutions(make, errors, held, way, 
         total += len(ours)
         judge_missed += sum(np.min(apart(a, judged), initial=np.inf) > 1e-3 for a in ours)
     print(
-        f'seed {seed}: {make.__name__}, {ik.way}, off {ik.difference}; of {total} solutions '
+        f'seed {seed}: {make.__name__}, {ik.method}, off {ik.difference}; of {total} solutions '
         f'of {poses} poses {missed} missed (by the judge {judge_missed}), {doubled} twice, '
         f'worst residual {worst[0]:.1e} m {worst[1]:.1e} rad'
     )
@@ -439,7 +439,7 @@ def test_what_many_starts_miss_is_estimated_by_how_often_each_was_found():
         once, twice = int(np.sum(counts == 1)), int(np.sum(counts == 2))
         trial = MissedSolutions(len(few), 12, once, twice)
         estimated.append(trial.missed)
-        chances.append(trial.once / trial.arrived)
+        chances.append(trial.once / trial.converged)
         new.append(np.mean([np.min(distance(row, few)) > 1e-4 for row in found[12:]]))
         missed, total = missed + len(every) - len(few), total + len(every)
     print(missed, np.sum(estimated), np.mean(chances), np.mean(new), 'of', total)
@@ -453,7 +453,7 @@ def test_an_arm_with_no_closed_form_near_is_solved_and_said_so(capfd):
     urdf = random_arm_urdf(np.random.default_rng(1))
     chain = SerialChain.from_urdf(urdf, tip_link='tool')
     ik = InverseKinematics(chain)
-    assert ik.way == 'many starts'
+    assert ik.method == 'many starts'
     assert ik.difference is None
     text = ik.in_words()
     assert text.startswith('No arm with a closed form is near this one')
@@ -484,5 +484,5 @@ def test_the_difference_to_the_nearest_closed_form_is_that_at_the_tool():
     assert 1e-4 < off_m < 0.9 * off_rad
     assert f'up to {1e3 * off_m:.2g} mm and' in ik.in_words()
     exact = InverseKinematics(SerialChain.from_urdf(urdf, 'base_link', 'tool0'))
-    assert exact.way == 'closed form'
+    assert exact.method == 'closed form'
     assert max(exact.difference) < 1e-9
