@@ -21,17 +21,17 @@ from remaster_ros.kinematics.inverse_kinematics import FREE_JOINTS, InverseKinem
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.urdf import parse_urdf
 from remaster_ros.kinematics.urdf_geometry import chain_bodies, mesh_names
-from remaster_ros.planning.candidates import Plan, PlanningScene, candidate_poses, taken_poses
+from remaster_ros.planning.candidates import Plan, PlanningScene, candidate_poses, reachable_poses
 from remaster_ros.planning.cell_proposal import (
+    facing_angle_deg,
     link_radius,
     marker_height,
     propose_held_joint,
     ranges_around,
     reach_of,
-    turned_to,
     widest_ranges,
 )
-from remaster_ros.planning.collection_plan import FITTED, outlook, with_free_way
+from remaster_ros.planning.collection_plan import FITTED, count_with_free_path, rough_collection
 from remaster_ros.planning.tour_order import Tour
 from remaster_ros.planning.tour_planner import TourPlanner
 from remaster_ros.reports.plan_json import outlook_text, outlook_to_dict
@@ -188,12 +188,13 @@ def _propose(
         ranges = widest_ranges(reach, floor)
         at = np.array(place)
         angles = {
-            name: turned_to(chain, at, SENSORS[name].max_angle_deg, rng) for name in args.sensors
+            name: facing_angle_deg(chain, at, SENSORS[name].max_angle_deg, rng)
+            for name in args.sensors
         }
         facing = candidate_poses(COMPARED, ranges, at, rng)
         if len(chain) < FREE_JOINTS:
             angle = np.radians(angles[args.sensors[0]])
-            facing = taken_poses(chain, facing, ranges, at, angle, rng)
+            facing = reachable_poses(chain, facing, ranges, at, angle, rng)
         held = propose_held_joint(chain, facing)
     except InputError as error:
         raise InputError(f'{args.robot}: {error}') from None
@@ -267,7 +268,7 @@ def _narrowed(
 
 def _reached(scene: PlanningScene, tour: Tour, seed: int) -> tuple[int, int]:
     """Return to how many poses to fit a free way leads, `FEWEST_FITTED` or fewer, of how many."""
-    return with_free_way(tour, scene.model, free_start(scene.model, seed), FEWEST_FITTED)
+    return count_with_free_path(tour, scene.model, free_start(scene.model, seed), FEWEST_FITTED)
 
 
 def _plan(
@@ -275,13 +276,15 @@ def _plan(
 ) -> tuple[dict[str, Any], str, tuple[int, int]]:
     """Plan in the new cell as the nodes do, with as few ways as tell whether there are any.
 
-    Returns it as JSON, in words, and what `with_free_way` does.
+    Returns it as JSON, in words, and what `count_with_free_path` does.
     """
     chain = cell.chain()
     scene = cell.planning_scene(chain, without_meshes=without_meshes)
     counts = {'optimization': CANDIDATES, 'validation': CANDIDATES}
     try:
-        tour, expected = outlook(TourPlanner(scene, counts, seed, design=cell.design_settings()))
+        tour, expected = rough_collection(
+            TourPlanner(scene, counts, seed, design=cell.design_settings())
+        )
     except InsufficientDataError as error:
         return (
             {'plan': None, 'why': str(error)},

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which pose is next, and with which of its solutions: registration first, then the collection."""
+"""The next visit of a collection: registration first, then the collection itself."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any, Protocol, TypeVar
 from remaster_ros.collection.events import Decided, PlannerState, RecorderState
 from remaster_ros.collection.peers import RequiredSensors
 from remaster_ros.errors import InputError, InsufficientDataError
-from remaster_ros.planning.collection_plan import Expected, with_expected
+from remaster_ros.planning.collection_plan import Expected, expected_collection
 from remaster_ros.planning.tour_order import FITTED, REFERENCE, REGISTRATION, PoseVisit, Tour
 from remaster_ros.planning.tour_planner import TourPlanner
 from remaster_ros.types import FloatArray
@@ -18,65 +18,65 @@ Result = TypeVar('Result')
 
 
 class PlanMemory(Protocol):
-    """What of a plan outlives the planner; see `session.plan_journal.PlanJournal`."""
+    """State of a plan that outlives the planner; see `session.plan_journal.PlanJournal`."""
 
     id: str
     tour: Tour | None
-    stop: PoseVisit | None
+    visit: PoseVisit | None
     trouble: str
     tours: list[Tour]
     decided: Decided
 
     def begin(self, tour: Tour, expected: Expected | None = None) -> None:
-        """Remember a new tour, and what its fit is expected to state where that is known."""
+        """Begin a tour; ``expected``: expected precision of its fit."""
 
-    def open_stop(self, stop: PoseVisit) -> None:
-        """Go to the next stop, and remember it."""
+    def open_visit(self, visit: PoseVisit) -> None:
+        """Begin a visit."""
 
-    def leave_rest(self) -> None:
-        """Remember that no more poses to fit are visited."""
+    def drop_remaining_fits(self) -> None:
+        """Drop the remaining poses to fit."""
 
 
 class Planning(Protocol):
-    """Does one thing at a time beside the callbacks; see `nodes.background`."""
+    """Runs one job at a time in the background; see `nodes.background`."""
 
     def ask(self, what: object, q: FloatArray, job: Callable[[], Result]) -> tuple[Result] | None:
-        """Return what a job found, in a tuple; None while it works."""
+        """Return the result of a job in a tuple; None while it runs."""
 
 
 class TourProgress:
-    """Go from pose to pose.
+    """Progress of a collection from visit to visit.
 
     Parameters
     ----------
     memory
-        The plan and the open pose.
+        The plan and the visit under way.
     tours
         Plans the tours.
     planning
-        Where that is done, as it takes a while.
+        Runs that in the background.
 
     Attributes
     ----------
     phase
         ``registration`` or ``collection``.
     decided
-        What became of configurations, as the recorder has it.
+        Outcomes of configurations, from the recorder.
     resumed
-        Whether poses were visited by a planner before this one.
+        Whether a planner before this one has visited poses.
     T_R_N
         The registrations so far: sensor -> (4, 4).
     is_complete
         Whether all of the tour was visited.
     enough
-        Whether enough is known: from then on only what is held out, and references, are visited.
+        Whether the precision goal is reached: then only poses to validate and references are
+        visited.
     standing
-        Why the next pose cannot be planned from where the arm stands; ''.
+        Why the next visit cannot be planned from the arm's configuration; ''.
     further
-        Plans what is measured further, once the collection is complete; None for nothing.
+        Plans measurements after the complete collection; None for none.
     judging
-        Plans, in place of registration and collection, poses by which an arm is judged; None for
-        nothing.
+        Plans an inspection in place of registration and collection; None for none.
     """
 
     def __init__(self, memory: PlanMemory, tours: TourPlanner, planning: Planning) -> None:
@@ -86,7 +86,7 @@ class TourProgress:
         collecting = tour is not None and REGISTRATION not in tour.plans
         self.phase = 'collection' if collecting else REGISTRATION
         self.T_R_N: dict[str, FloatArray] = {}
-        # What the recorder has reported; its transforms come on a topic of their own.
+        # Reported by the recorder; the transforms come on another topic.
         self._registered = False
         self.is_complete = False
         self.enough = False
@@ -95,28 +95,23 @@ class TourProgress:
         self.judging: Callable[[], Tour] | None = None
 
     def describe(self) -> str:
-        """Return how far the collection is, as text."""
+        """Return the progress as text."""
         tour = self._memory.tour
         poses = f'{tour.poses_begun} of {sum(tour.poses.values())}' if tour else 'none'
         done = sum(self.decided.outcomes.values())
         return f'{poses} {self.phase} poses begun, {done} configurations done'
 
     def follow(self, recorder: RecorderState) -> bool:
-        """Take what became of configurations; return whether that is new."""
-        before, self._registered = self.decided, recorder.registered
+        """Update outcomes from the recorder; return whether any is new."""
+        previous, self._registered = self.decided, recorder.registered
         if recorder.plan == self._memory.id:
             self.decided = recorder.decided
-        return self.decided != before
-
-    # What is next
+        return self.decided != previous
 
     def check_session(self, recorder: RecorderState, path: object) -> None:
-        """Refuse to add another plan's poses to a session.
+        """Raise InputError if the recorder's session has observations of another plan.
 
-        Raises
-        ------
-        InputError
-            The recorder's session holds observations of another plan than the one in `path`.
+        ``path``: of this plan, for the message.
         """
         if recorder.plan not in ('', self._memory.id) and recorder.observations:
             raise InputError(
@@ -127,54 +122,39 @@ class TourProgress:
 
     @property
     def open_pose(self) -> PoseVisit | None:
-        """The last pose with those of its solutions that have no outcome; None without any."""
-        tour, stop = self._memory.tour, self._memory.stop
-        if tour is None or stop is None:
+        """The last visit with its solutions without an outcome; None if there are none."""
+        tour, visit = self._memory.tour, self._memory.visit
+        if tour is None or visit is None:
             return None
-        done = self.decided.solutions if self.decided.pose == stop.pose else ()
-        left = [number for number in (*stop.ids, *stop.unreached) if number not in done]
-        return tour.along(stop, left) if left else None
+        done = self.decided.solutions if self.decided.pose == visit.pose else ()
+        remaining = [number for number in (*visit.ids, *visit.unreached) if number not in done]
+        return tour.with_route(visit, remaining) if remaining else None
 
     def rest(self, q: FloatArray) -> PoseVisit | None:
-        """Return what is left of the open pose, by ways that begin at `q`; None while planned.
-
-        Parameters
-        ----------
-        q
-            Where the arm stands, rad, (k,).
-        """
-        tour, stop = self._memory.tour, self.open_pose
+        """Return the remaining visit with paths from q, rad, (k,); None while it is planned."""
+        tour, visit = self._memory.tour, self.open_pose
         assert tour is not None
-        assert stop is not None
+        assert visit is not None
         self.standing = ''
-        what = (tour, stop.split, stop.pose, stop.ids)
-        found = self._planning.ask(what, q, lambda: tour.reroute(stop, q))
-        return found[0] if found else None
+        what = (tour, visit.split, visit.pose, visit.ids)
+        result = self._planning.ask(what, q, lambda: tour.reroute(visit, q))
+        return result[0] if result else None
 
     def next(self, q: FloatArray, sensors: RequiredSensors, words: str) -> PoseVisit | None:
-        """Open the next pose and return it; None while it is planned, and at the end.
+        """Begin the next visit and return it; None while it is planned, and at the end.
 
-        Parameters
-        ----------
-        q
-            Where the arm stands, rad, (k,).
-        sensors
-            Those that must be registered before the collection.
-        words
-            How far the recorder's registration is, for the error.
-
-        Raises
-        ------
-        InsufficientDataError
-            No registration after all poses for it, or no pose is left to fit on.
+        ``q``: configuration of the arm, rad, (k,); ``sensors``: must be registered before the
+        collection; ``words``: state of the registration, for the message.
+        Raises InsufficientDataError if there is no registration after all its poses, or no pose is
+        left to fit.
         """
         self.standing = ''
         if self.judging is not None:
-            judged = self._planning.ask('judging', q, self.judging)
-            if judged is None:
+            inspection = self._planning.ask('judging', q, self.judging)
+            if inspection is None:
                 return None
             self.phase, self.judging = 'collection', None
-            self._memory.begin(judged[0])
+            self._memory.begin(inspection[0])
         if self.phase == REGISTRATION and not sensors.are_among(self.T_R_N):
             return self._next_registration(q, sensors.names, words)
         self.phase = 'collection'
@@ -184,24 +164,27 @@ class TourProgress:
                 self.standing = 'waiting for the registrations of the recorder'
                 return None
             T_R_N = dict(self.T_R_N)
-            behind = self._planning.ask('further', q, lambda: plan_further(T_R_N))
-            if behind is None:
+            additions = self._planning.ask('further', q, lambda: plan_further(T_R_N))
+            if additions is None:
                 return None
             self.further = None
-            self._memory.begin(behind[0])
+            self._memory.begin(additions[0])
         elif self._memory.tour is None or REGISTRATION in self._memory.tour.plans:
             T_R_N = dict(self.T_R_N)
-            planned = self._planning.ask('plan', q, lambda: with_expected(self._tours, T_R_N))
+            planned = self._planning.ask(
+                'plan', q, lambda: expected_collection(self._tours, T_R_N)
+            )
             if planned is None:
                 return None
             self._memory.begin(*planned[0])
-        found = self._open(q)
-        self.is_complete = found == (None,)
-        return found[0] if found else None
+        result = self._open(q)
+        self.is_complete = result == (None,)
+        return result[0] if result else None
 
     def _next_registration(
         self, q: FloatArray, sensors: Collection[str], words: str
     ) -> PoseVisit | None:
+        """Begin the next visit of the registration; see `next`."""
         if self._registered:
             return None
         if self._memory.tour is None:
@@ -209,76 +192,73 @@ class TourProgress:
             if planned is None:
                 return None
             self._memory.begin(planned[0])
-        found = self._open(q)
-        if found == (None,):
+        result = self._open(q)
+        if result == (None,):
             missing = ', '.join(name for name in sensors if name not in self.T_R_N)
             visited = self._memory.tour.visited if self._memory.tour else 0
             raise InsufficientDataError(
                 f'no registration of {missing} after {visited} poses ({words}); the recorder '
                 'counts why readings were rejected'
             )
-        return found[0] if found else None
+        return result[0] if result else None
 
     def _open(self, q: FloatArray) -> tuple[PoseVisit | None] | None:
-        """Open the next stop, in a tuple; None in it at the end; None while it is planned."""
+        """Begin the next visit; return it in a tuple, (None,) at the end, None while planned."""
         tour = self._memory.tour
         assert tour is not None
         standing = self._tours.model.trouble(q)
         if standing:
-            # The bridge halts such an arm and offers a way out; after it the arm is elsewhere.
+            # The bridge halts such an arm and offers an escape path to another configuration.
             self.standing = f'the arm stands too near to something: {standing}'
             return None
-        what = (tour, tour.visited, tour.has_left(FITTED))
-        found = self._planning.ask(what, q, lambda: tour.propose(q))
-        if found is None or found[0] is None:
-            return found
-        if self.enough and tour.has_left(FITTED) and not tour.begin_at:
-            # Here, as nothing is being planned; what was proposed may be one of them.
-            self._memory.leave_rest()
+        what = (tour, tour.visited, tour.has_unvisited(FITTED))
+        result = self._planning.ask(what, q, lambda: tour.propose(q))
+        if result is None or result[0] is None:
+            return result
+        if self.enough and tour.has_unvisited(FITTED) and not tour.begin_at:
+            # Nothing is being planned now; the proposed visit may be one of the dropped ones.
+            self._memory.drop_remaining_fits()
             return None
-        self._memory.open_stop(found[0])
-        return found
+        self._memory.open_visit(result[0])
+        return result
 
     @property
     def planned(self) -> int:
-        """How many configurations to fit the collection was planned with; 0 before it is.
-
-        What is measured further is not among them.
-        """
+        """Number of configurations to fit as planned, without later additions; 0 before."""
         return sum(tour.to_fit for tour in self._memory.tours if not tour.begin_at)
 
     @property
     def planned_any(self) -> bool:
-        """Whether the tour has a configuration at all; nothing may separate two causes."""
+        """Whether the tour has configurations: there may be none that separate two causes."""
         tour = self._memory.tour
         return tour is not None and any(tour.configurations.values())
 
     @property
     def goes_further(self) -> bool:
-        """Whether something is, or will be, measured behind a complete collection."""
+        """Whether measurements after the complete collection are planned or under way."""
         tour = self._memory.tour
         return self.further is not None or (tour is not None and tour.begin_at > 0)
 
-    def is_last_reference(self, stop: PoseVisit) -> bool:
-        """Whether a stop is the last reference of its round."""
+    def is_last_reference(self, visit: PoseVisit) -> bool:
+        """Whether a visit is to the last reference of its round."""
         tour = self._memory.tour
-        return tour is not None and stop.split == REFERENCE and stop.index == tour.references - 1
+        return tour is not None and visit.split == REFERENCE and visit.index == tour.references - 1
 
     def state(self, state: str, run: str) -> PlannerState:
-        """Return what the other nodes act on: of the planner in this state and run."""
+        """Return the state message for the other nodes."""
         further = self._memory.id if self.goes_further else ''
         return PlannerState(state=state, run=run, planned=self.planned, further=further)
 
     def counts(self) -> dict[str, Any]:
-        """Return figures of the tour for people."""
+        """Return figures of the tour by name, for the status."""
         tour, outcomes = self._memory.tour, self.decided.outcomes
         tours = self._memory.tours
         values: dict[str, Any] = {
             'phase': self.phase,
-            'poses_done': sum(one.poses_begun for one in tours),
-            'poses': sum(sum(one.poses.values()) for one in tours),
+            'poses_done': sum(each.poses_begun for each in tours),
+            'poses': sum(sum(each.poses.values()) for each in tours),
             'configurations_done': sum(outcomes.values()),
-            'configurations': sum(sum(one.configurations.values()) for one in tours),
+            'configurations': sum(sum(each.configurations.values()) for each in tours),
             'references': tour.references if tour else 0,
         }
         tables: dict[str, Mapping[str, int]] = {'outcome': outcomes}

@@ -77,7 +77,7 @@ def enough_candidates(cell: Workcell, seed: int, asked: int) -> int:
     """
     scene = cell.planning_scene(cell.chain())
     for count in range(asked, MOST_CANDIDATES + 1):
-        if TourPlanner(scene, {'optimization': count}, seed).left_to_fit >= TO_FIT:
+        if TourPlanner(scene, {'optimization': count}, seed).usable_to_fit >= TO_FIT:
             return count
     return asked
 

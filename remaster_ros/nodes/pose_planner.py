@@ -183,7 +183,7 @@ class PosePlanner(RemasterNode):
     def _on_judge(self, kind: Kind, request: Trigger.Request, response: Trigger.Response) -> Any:
         """Begin, or go on with, visits by which the arm is judged; afterwards tell the verdict."""
         tour, recorder = self.journal.tour, self._peers.recorder
-        own = tour is not None and tour.judges == kind
+        own = tour is not None and tour.inspection == kind
         if own and self.run.state == 'complete':
             response.success, response.message = self._judging.told()
         elif self.run.state == 'running':
@@ -225,7 +225,7 @@ class PosePlanner(RemasterNode):
         if self.run.state != 'running':
             if recorder is not None and recorder.changed_run:
                 # A person has looked: how things are from now on is measured first.
-                self.journal.ask_round()
+                self.journal.request_reference_round()
             # The arm may have been stopped, or moved by hand, since it last settled.
             self._listen_again()
         with self._lock:
@@ -326,7 +326,7 @@ class PosePlanner(RemasterNode):
         tour, closed = self.journal.tour, recorder.exit_status == 'complete'
         if self.run.state == 'complete' and tour is not None and recorder.plan == self.journal.id:
             for kind in KINDS:
-                if closed and tour.judges == kind:
+                if closed and tour.inspection == kind:
                     self._judging.judge(kind)
 
     # The tour
@@ -405,7 +405,7 @@ class PosePlanner(RemasterNode):
         if tour is not None and self.progress.phase != REGISTRATION and not self._described:
             self._described = True
             planned = self._further.planned(tour)
-            if self._q is not None and not tour.begin_at and not tour.judges:
+            if self._q is not None and not tour.begin_at and not tour.inspection:
                 self._session_s = session_time_s(self._tours, tour, self._q)
                 minutes = f'{self._session_s / 60.0:.1f} min'
                 planned += f'; about {minutes} of robot time for the whole session'
@@ -428,7 +428,7 @@ class PosePlanner(RemasterNode):
         """Write the state down; a stop or pause came in a thread that must not wait for it."""
         with self._lock:
             state, token = self.run.state, self.run.token
-        self.journal.say_state(state, token)
+        self.journal.record_state(state, token)
 
     def _is_written(self) -> bool:
         """Whether the disk takes what it did not take before; looked at once a second."""

@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which poses to measure: spread over the workspace, facing the sensor, reachable and visible.
+"""Candidate poses: spread over the workspace, facing the sensor, reachable and visible.
 
 Candidates follow Van Wyk et al., section III-A, equations (2) to (5): a Latin hypercube over
-azimuth, radius, height and roll, the tool's Z axis at the sensor; for an arm with fewer than six
-joints, poses near these that it takes. Each is then reached in all its joint solutions, less those
-that the arm, its limits or the line of sight forbid; every one that is dropped is counted with the
-reason.
+azimuth, radius, height and roll, with the tool's Z axis towards the sensor; for an arm with fewer
+than six joints, reachable poses near these. Each pose has all its joint solutions except those
+outside limits, in collision or out of sight; every dropped one is counted with the reason.
 """
 
 from __future__ import annotations
@@ -29,14 +28,14 @@ from remaster_ros.types import BoolArray, FloatArray, IntArray
 
 OUT_OF_REACH = 'out of reach'
 JOINT_LIMITS = 'outside the joint limits'
-NO_LINE_OF_SIGHT = 'no line of sight to '  # the sensor's name follows
+NO_LINE_OF_SIGHT = 'no line of sight to '  # Followed by the sensor's name
 
 LIMIT_MARGIN_RAD = np.deg2rad(1.0)
-"""Distance kept from the joint limits by default, rad."""
+"""Default distance to keep from the joint limits, rad."""
 
-# Joint positions drawn at a time for an arm of few joints, and how many times at most: one in
-# thirty to one in several hundred turns the tool within 25 degrees to a sensor, in the ranges.
-# With so many as there are poses the last pose would have to take what is left, wherever it is.
+# Joint positions drawn at a time for an arm of few joints, and most such draws: one in thirty to
+# one in several hundred has the tool in the ranges and within 25 degrees of a sensor. `ENOUGH`
+# poses are found for each candidate, so that also the last candidate gets a pose near it.
 PLACES = 10_000
 PLACES_TIMES = 20
 ENOUGH = 3
@@ -46,13 +45,13 @@ _FULL_TURN = (0.0, 2 * np.pi)
 
 @dataclass(frozen=True)
 class PoseRanges:
-    """The box the candidates are drawn from; the defaults are the paper's."""
+    """Ranges from which candidate poses are drawn; the defaults are the paper's."""
 
     # Cylinder coordinates of the tool about the Z axis of R, (lower, upper)
     azimuth_rad: tuple[float, float] = _FULL_TURN
     radius_m: tuple[float, float] = (0.2, 0.5)
     height_m: tuple[float, float] = (0.4, 0.8)
-    roll_rad: tuple[float, float] = _FULL_TURN  # Turn about the tool's Z axis, (lower, upper)
+    roll_rad: tuple[float, float] = _FULL_TURN  # About the tool's Z axis, (lower, upper)
 
     def __post_init__(self) -> None:
         for spec in fields(self):
@@ -65,11 +64,11 @@ class PoseRanges:
             raise InputError(f'planning: radius_m starts at {self.radius_m[0]}; it must be >= 0')
 
     def contain(self, places: FloatArray) -> BoolArray:
-        """Return whether places (n, 3), m in R, lie in them, (n,)."""
+        """Return whether points (n, 3), m in R, lie in the ranges, (n,)."""
         x, y, height = places.T
-        # How far beyond the lower azimuth, less whole turns.
-        beyond = (np.arctan2(y, x) - self.azimuth_rad[0]) % (2 * np.pi)
-        inside = beyond <= self.azimuth_rad[1] - self.azimuth_rad[0]
+        # Angle from the lower azimuth, modulo whole turns.
+        angle = (np.arctan2(y, x) - self.azimuth_rad[0]) % (2 * np.pi)
+        inside = angle <= self.azimuth_rad[1] - self.azimuth_rad[0]
         for values, (low, high) in ((np.hypot(x, y), self.radius_m), (height, self.height_m)):
             inside &= (values >= low) & (values <= high)
         return np.asarray(inside)
@@ -79,71 +78,61 @@ class PoseRanges:
 class LineOfSight:
     """A sensor that has to see a marker at every configuration."""
 
-    sensor: str  # Its name, for the counts
-    sensor_R: FloatArray  # Its origin in R, m, (3,)
-    marker_T: FloatArray  # The marker it follows, in the tool frame, m, (3,)
+    sensor: str  # Name of the sensor
+    sensor_R: FloatArray  # Position of the sensor in R, m, (3,)
+    marker_T: FloatArray  # Position of its marker in the tool frame, m, (3,)
     # Largest angle between the tool's Z axis and the line to the sensor at which the marker is
-    # still seen; a quarter turn keeps the sensor in front of the tool plate
+    # visible; at 90 degrees the sensor is in front of the tool plate
     max_angle_rad: float = np.pi / 2
     marker: str = ''  # The marker's name
 
 
 @dataclass(frozen=True)
 class PlannedPose:
-    """A tool pose T_R_T, (4, 4), and its usable joint solutions, rad, (m, k), m >= 1.
+    """A tool pose and its usable joint solutions."""
 
-    `correction`: whether the bridge's correction has to be on or off at it; '' where that is not
-    asked.
-    """
-
-    T_R_T: FloatArray
-    solutions: FloatArray
+    T_R_T: FloatArray  # (4, 4)
+    solutions: FloatArray  # rad, (m, k), m >= 1
+    # State that the bridge's correction must have at this pose; '' for either
     correction: Literal['', 'on', 'off'] = ''
 
 
 @dataclass(frozen=True)
 class Plan:
-    """The poses to visit, and why the other candidates were dropped."""
+    """The poses to visit, and counts of dropped candidates by reason."""
 
     poses: tuple[PlannedPose, ...]  # In the order of the candidates
-    # Reason -> number of poses that lost all their solutions, most of them for this reason
+    # Reason -> number of poses without usable solutions; each counts for its commonest reason
     dropped: Mapping[str, int] = field(default_factory=dict)
-    # Reason -> number of joint solutions dropped, of kept poses too; the first reason counts
+    # Reason -> number of dropped joint solutions, those of kept poses included
     dropped_solutions: Mapping[str, int] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class PlanningScene:
-    """All that poses are planned from: an arm, what it can hit, and the sensors before it."""
+    """An arm, its obstacles and its sensors: everything from which poses are planned."""
 
-    # Of the arm; its held values decide how many solutions a pose has
-    inverse_kinematics: InverseKinematics
-    model: CollisionModel  # The arm with everything that it can hit
-    ranges: PoseRanges  # What the candidates are drawn from
-    sights: Sequence[LineOfSight]  # Every sensor, at its rough place
-    aim_at: str  # The sensor that the tool faces
+    inverse_kinematics: InverseKinematics  # With the values of held joints
+    model: CollisionModel  # The arm with its obstacles
+    ranges: PoseRanges  # Of the candidates
+    sights: Sequence[LineOfSight]  # Every sensor, at its rough position
+    aim_at: str  # Name of the sensor that the tool faces
     limit_margin_rad: float = LIMIT_MARGIN_RAD  # Distance to keep from the joint limits, rad
 
     @property
     def rough_R(self) -> dict[str, FloatArray]:
-        """Rough origin of each sensor in R, m, (3,)."""
+        """Rough position of each sensor in R, m, (3,)."""
         return {sight.sensor: sight.sensor_R for sight in self.sights}
 
     def plan(
         self, count: int, sensors_R: Mapping[str, FloatArray], rng: np.random.Generator
     ) -> Plan:
-        """Plan poses that face one sensor and that all of these sensors see.
+        """Draw candidate poses that face one sensor; return the usable ones.
 
-        Parameters
-        ----------
-        count
-            How many candidates are drawn.
-        sensors_R
-            Origin in R of each sensor that has to see its marker, m, (3,).
-        rng
-            Source of randomness.
+        ``count``: number of candidates; ``sensors_R``: position in R of each sensor that has to
+        see its marker, m, (3,); ``rng``: source of randomness.
         """
-        # A sensor that is not required may have no registration.
+        # A sensor that is not required may be unregistered.
         aim = {**self.rough_R, **sensors_R}[self.aim_at]
         sights = [
             replace(sight, sensor_R=sensors_R[sight.sensor])
@@ -154,7 +143,7 @@ class PlanningScene:
         if len(self.inverse_kinematics.chain) < FREE_JOINTS:
             (angle,) = (s.max_angle_rad for s in self.sights if s.sensor == self.aim_at)
             chain = self.inverse_kinematics.chain
-            candidates = taken_poses(chain, candidates, self.ranges, aim, angle, rng)
+            candidates = reachable_poses(chain, candidates, self.ranges, aim, angle, rng)
         return plan_poses(
             self.inverse_kinematics, self.model, candidates, sights, self.limit_margin_rad
         )
@@ -163,28 +152,10 @@ class PlanningScene:
 def candidate_poses(
     n: int, ranges: PoseRanges, sensor_R: ArrayLike, rng: np.random.Generator
 ) -> FloatArray:
-    """Draw tool poses that face a sensor: equations (2) to (5) of Van Wyk et al.
+    """Draw n tool poses that face a sensor, T_R_T (n, 4, 4): eq. (2) to (5) of Van Wyk et al.
 
-    Parameters
-    ----------
-    n
-        How many.
-    ranges
-        Where from.
-    sensor_R
-        The sensor's origin in R, m, (3,).
-    rng
-        Source of randomness.
-
-    Returns
-    -------
-    ndarray
-        T_R_T, (n, 4, 4).
-
-    Raises
-    ------
-    InputError
-        ``n`` below 1, or a sensor position that is not finite or is itself a candidate's.
+    ``ranges``: where to draw from; ``sensor_R``: the sensor's position in R, m, (3,).
+    Raises InputError if n is below 1, or the sensor position is not finite or among the poses.
     """
     sensor_R = np.asarray(sensor_R, dtype=float)
     if n < 1:
@@ -212,7 +183,7 @@ def candidate_poses(
     return transform(np.stack((x, y, z), axis=-1) @ about_z, positions)  # (5)
 
 
-def taken_poses(
+def reachable_poses(
     chain: SerialChain,
     poses: FloatArray,
     ranges: PoseRanges,
@@ -220,36 +191,36 @@ def taken_poses(
     max_angle_rad: float,
     rng: np.random.Generator,
 ) -> FloatArray:
-    """Return for each drawn pose one near it that an arm with fewer than six joints takes.
+    """Return for each pose one near it that an arm with fewer than six joints can reach.
 
-    Such an arm takes few of all poses: one of five axes brings its tool to a place, but the
-    tool's axis there only into directions of a plane. So joint positions are drawn all over their
-    limits, and each pose gets the nearest tool pose of them that lies in the ranges, faces the
-    sensor and is no other one's. A turn by a radian counts as a way of `LEVER_M`.
+    Such an arm reaches few of all poses: with five axes it brings its tool to a position, but the
+    tool's axis there only into directions of a plane. So joint positions are drawn within the
+    limits, and each pose is replaced by the nearest unused tool pose of them that lies in the
+    ranges and faces the sensor. A rotation by a radian counts as a distance of `LEVER_M`.
 
-    ``poses``: T_R_T, (n, 4, 4); ``sensor_R``: m, (3,); ``max_angle_rad``: between the tool's Z
-    axis and the line to the sensor.
-    Returns T_R_T, (n, 4, 4). Where so few were found that none is left, a pose stays as it is
-    drawn, out of the arm's reach.
+    ``poses``: T_R_T, (n, 4, 4); ``sensor_R``: m, (3,); ``max_angle_rad``: largest angle between
+    the tool's Z axis and the line to the sensor.
+    Returns T_R_T, (n, 4, 4). If fewer than n poses are found, the last ones are unchanged, and out
+    of the arm's reach.
     """
     low, high = chain.usual_range
-    there = np.empty((0, 4, 4))
+    reachable = np.empty((0, 4, 4))
     for _ in range(PLACES_TIMES):
         places = chain.forward(rng.uniform(low, high, (PLACES, len(chain))))
         to_sensor = sensor_R - places[:, :3, 3]
         facing = np.sum(places[:, :3, 2] * to_sensor, axis=1)
         seen = facing >= np.cos(max_angle_rad) * np.linalg.norm(to_sensor, axis=1)
-        there = np.concatenate((there, places[seen & ranges.contain(places[:, :3, 3])]))
-        if len(there) >= ENOUGH * len(poses):
+        reachable = np.concatenate((reachable, places[seen & ranges.contain(places[:, :3, 3])]))
+        if len(reachable) >= ENOUGH * len(poses):
             break
-    # The Frobenius norm of a difference of small turns is sqrt(2) of the angle.
+    # The Frobenius norm of the difference of two rotations is sqrt(2) times a small angle.
     weights = np.array([LEVER_M / np.sqrt(2.0)] * 3 + [1.0])
-    left, found = (weights * there[:, :3]).reshape(-1, 12), poses.copy()
-    for i in range(min(len(poses), len(there))):
-        off = np.sum((left - (weights * poses[i, :3]).ravel()) ** 2, axis=1)
+    unused, replaced = (weights * reachable[:, :3]).reshape(-1, 12), poses.copy()
+    for i in range(min(len(poses), len(reachable))):
+        off = np.sum((unused - (weights * poses[i, :3]).ravel()) ** 2, axis=1)
         nearest = int(np.argmin(off))
-        found[i], left[nearest] = there[nearest], np.inf
-    return found
+        replaced[i], unused[nearest] = reachable[nearest], np.inf
+    return replaced
 
 
 def plan_poses(
@@ -259,13 +230,13 @@ def plan_poses(
     lines_of_sight: Sequence[LineOfSight] = (),
     limit_margin_rad: float = 0.0,
 ) -> Plan:
-    """Keep the candidates' joint solutions that the arm can take and every sensor can see.
+    """Return the candidates with their collision-free joint solutions in sight of all sensors.
 
     ``inverse_kinematics``: of the arm; its held values decide how many solutions there are;
-    ``arm``: the same arm with everything it can hit; ``candidates``: T_R_T, (n, 4, 4);
-    ``lines_of_sight``: what has to be visible; ``limit_margin_rad``: distance to keep from the
-    joint limits, rad; of one that slides `SerialChain.per_radian` times as much, m.
-    Returns with `dropped` and `len(poses)` adding up to n.
+    ``arm``: the same arm with its obstacles; ``candidates``: T_R_T, (n, 4, 4); ``lines_of_sight``:
+    markers that have to be visible; ``limit_margin_rad``: distance to keep from the joint limits,
+    rad; of a prismatic joint `SerialChain.per_radian` times as much, m. The numbers of poses and
+    of dropped poses add up to n.
     """
     chain = inverse_kinematics.chain
     reachable = inverse_kinematics.solutions_of_each(candidates)
@@ -280,10 +251,10 @@ def plan_poses(
     dropped: Counter[str] = Counter()
     dropped_solutions: Counter[str] = Counter()
     for i, T in enumerate(candidates):
-        mine = owner == i
-        usable = mine & (reasons == '')
-        # Of equal counts the first entered wins: the reason that came nearest to success.
-        lost = Counter(reasons[mine & ~usable].tolist())
+        of_pose = owner == i
+        usable = of_pose & (reasons == '')
+        # Of equal counts the first entered wins, which is the latest check that failed.
+        lost = Counter(reasons[of_pose & ~usable].tolist())
         if len(within[i]) < len(reachable[i]):
             lost[JOINT_LIMITS] = len(reachable[i]) - len(within[i])
         dropped_solutions.update(lost)
@@ -297,16 +268,16 @@ def plan_poses(
 def _reasons(
     arm: CollisionModel, q: FloatArray, lines_of_sight: Sequence[LineOfSight]
 ) -> np.ndarray[tuple[int], np.dtype[np.str_]]:
-    """Return why each solution (m, k) is no good, or '', (m,); the first reason wins."""
-    # More than the bridge requires: an arm that stands a little off a planned way may still move.
+    """Return the first reason to drop each solution (m, k), '' if it is usable, (m,)."""
+    # More clearance than the bridge requires: an arm slightly off its path may still move.
     collisions = arm.reasons(q, RESERVE_M)
-    bad = [collisions != '', *(_unseen(arm, q, sight) for sight in lines_of_sight)]
+    bad = [collisions != '', *(_is_hidden(arm, q, sight) for sight in lines_of_sight)]
     names = [NO_LINE_OF_SIGHT + sight.sensor for sight in lines_of_sight]
     return np.select(bad, [collisions, *names], default='')
 
 
-def _unseen(arm: CollisionModel, q: FloatArray, sight: LineOfSight) -> BoolArray:
-    """Return where the marker faces away from the sensor, or the arm is in between, (m,)."""
+def _is_hidden(arm: CollisionModel, q: FloatArray, sight: LineOfSight) -> BoolArray:
+    """Return whether the marker faces away from the sensor or the arm hides it, (m,)."""
     T = arm.chain.forward(q)
     to_sensor = sight.sensor_R - arm.chain.positions(q, sight.marker_T)
     facing = np.sum(T[:, :3, 2] * to_sensor, axis=-1) / np.linalg.norm(to_sensor, axis=-1)
@@ -317,14 +288,12 @@ def _unseen(arm: CollisionModel, q: FloatArray, sight: LineOfSight) -> BoolArray
 def order_solutions(
     solutions: ArrayLike, q_current: ArrayLike, velocity_limits: ArrayLike = 1.0
 ) -> IntArray:
-    """Order joint solutions by how soon the arm can be there from where it is, nearest first.
+    """Return indices of joint solutions by travel time from q_current, the shortest first, (m,).
 
-    All distances are from ``q_current``, not from one solution to the next: the slowest joint's
-    travel, divided by its velocity limit.
+    The travel time is that of the slowest joint: its travel over its velocity limit.
 
-    ``solutions``: rad, (m, k); ``q_current``: rad, (k,); ``velocity_limits``: rad/s, (k,); where a
-    limit is unknown (infinite) it counts as 1 rad/s, or 1 m/s.
-    Returns indices into solutions, (m,).
+    ``solutions``: rad, (m, k); ``q_current``: rad, (k,); ``velocity_limits``: rad/s, (k,); an
+    infinite (unknown) one counts as 1 rad/s, or 1 m/s.
     """
     limits = np.asarray(velocity_limits, dtype=float)
     speeds = np.where(np.isfinite(limits), limits, 1.0)

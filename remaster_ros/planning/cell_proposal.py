@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a cell file may hold for an arm that is not known yet: which joint is held, which poses.
+"""Proposals for the cell file of an unknown arm: the held joint, the ranges of poses, the marker.
 
-Everything is tried on the arm itself: the inverse kinematics with each joint held, and which tool
-poses that face a sensor the arm can take within its limits.
+Everything is tried on the arm itself: the inverse kinematics with each joint held, and the tool
+poses facing a sensor that the arm can reach within its limits.
 """
 
 from __future__ import annotations
@@ -26,54 +26,47 @@ from remaster_ros.kinematics.transforms import apply, inverse
 from remaster_ros.planning.candidates import PoseRanges
 from remaster_ros.types import FloatArray
 
-# With fewer joint solutions of a pose on average the joint is held at several values, rad.
+# Mean number of solutions of a pose below which a joint is held at several values (added, rad).
 FEW_SOLUTIONS = 1.5
 OTHER_VALUES = tuple(np.radians((-40.0, 0.0, 40.0)).tolist())
-# A joint that slides is held at these shares of its way: what it carries is to be measured there.
+# Positions at which a prismatic joint is held, as shares of its travel.
 SHARES = (0.25, 0.5, 0.75)
-# Of 3,000 places of an arm so many face a sensor, or it is taken not to.
+# Least number of 3,000 random poses that face a sensor if the arm can face it; else the share of
+# poses within the proposed angle.
 FACING, MOST = 30, 0.95
-# A marker in front of the tool plate, and how far it is kept from the last link, m.
+# Least distance of a marker from the tool plate, and from the last link, m.
 LEAST_MARKER_M = 0.05
 CLEAR_M = 0.03
-# Arms that reach farther are taken to have links of the thickness that cell files have where they
-# give none, m; smaller arms are built alike.
+# Reach from which links have the default radius of cell files, m; smaller arms are scaled down.
 FULL_SIZE_M = 0.9
 
 
 @dataclass(frozen=True)
 class HeldJoint:
-    """Which joint to hold so that poses have joint solutions, and how these are found."""
+    """The joint to hold so that poses have joint solutions, and how these are found."""
 
-    joint: int | None  # Its index; None where the arm has at most six
-    values_held: tuple[float, ...]  # Where it is held, rad or m
-    # Mean number of joint solutions of a pose, those that cannot be reached among them
+    joint: int | None  # Its index; None if the arm has at most six joints
+    values_held: tuple[float, ...]  # rad or m
+    # Mean number of joint solutions of a pose, unreachable poses included
     solutions: float
-    # Name of each joint that was tried -> that number, or why it is not held
+    # Name of each joint tried -> mean number of solutions, or why it is not held
     tried: Mapping[str, float | str]
-    kinematics: InverseKinematics  # All joint solutions, with this joint held
+    kinematics: InverseKinematics  # With this joint held
 
     def values(self) -> dict[int, tuple[float, ...]]:
-        """Return what `InverseKinematics` takes."""
+        """Return the held joint and its values in the form of `InverseKinematics`."""
         return {} if self.joint is None else {self.joint: self.values_held}
 
 
 def propose_held_joint(chain: SerialChain, facing: FloatArray) -> HeldJoint:
-    """Find the joint whose holding gives poses the most joint solutions.
+    """Return the joint that gives poses the most joint solutions if it is held.
 
-    A joint that leaves an arm with a closed form, or one near it, is held before any other: the
-    solutions are then found a hundred times as fast, and none is missed.
+    A joint that leaves an arm with a closed form, or near one, is preferred: solutions are then
+    found a hundred times as fast, and none is missed.
 
-    Parameters
-    ----------
-    facing
-        Tool poses to try it on, (n, 4, 4), such as those drawn from `widest_ranges`.
-
-    Raises
-    ------
-    InputError
-        An arm with fewer than three or more than seven joints, or one that is singular
-        everywhere; with the reason.
+    ``facing``: tool poses to try, (n, 4, 4), such as those drawn from `widest_ranges`.
+    Raises InputError if the arm has fewer than three or more than seven joints, or is singular at
+    all configurations whichever joint is held.
     """
     if FEWEST_JOINTS <= len(chain) <= FREE_JOINTS:
         kinematics = InverseKinematics(chain, {})
@@ -87,22 +80,22 @@ def propose_held_joint(chain: SerialChain, facing: FloatArray) -> HeldJoint:
             f'{OWN_CONFIGURATIONS}'
         )
     tried: dict[str, float | str] = {}
-    able: dict[int, InverseKinematics] = {}
+    usable: dict[int, InverseKinematics] = {}
     for joint, name in enumerate(chain.joint_names):
         try:
-            able[joint] = InverseKinematics(chain, {joint: (_resting(chain, joint),)})
+            usable[joint] = InverseKinematics(chain, {joint: (_resting(chain, joint),)})
         except InputError:
             tried[name] = 'singular everywhere'
-    if not able:
+    if not usable:
         raise InputError(
             f"robot '{chain.name}' is singular everywhere, whichever joint is held; "
             f'{OWN_CONFIGURATIONS}'
         )
-    near = {joint: k for joint, k in able.items() if k.method != 'many starts'}
+    near_closed_form = {joint: k for joint, k in usable.items() if k.method != 'many starts'}
     best: tuple[float, int] | None = None
-    for joint, kinematics in able.items():
+    for joint, kinematics in usable.items():
         name = chain.joint_names[joint]
-        if near and joint not in near:
+        if near_closed_form and joint not in near_closed_form:
             tried[name] = 'no closed form near'
             continue
         count = tried[name] = _mean_solutions(kinematics, facing)
@@ -110,10 +103,10 @@ def propose_held_joint(chain: SerialChain, facing: FloatArray) -> HeldJoint:
             best = count, joint
     assert best is not None
     count, joint = best
-    kinematics, tried = able[joint], {name: tried[name] for name in chain.joint_names}
+    kinematics, tried = usable[joint], {name: tried[name] for name in chain.joint_names}
     if chain.slides[joint]:
         low, high = chain.lower[joint], chain.upper[joint]
-        # To millimetres, as cell files have them.
+        # Rounded to millimetres, as in cell files.
         values = tuple(round(low + share * (high - low), 3) for share in SHARES)
         kinematics = InverseKinematics(chain, {joint: values})
         count = _mean_solutions(kinematics, facing)
@@ -126,7 +119,7 @@ def propose_held_joint(chain: SerialChain, facing: FloatArray) -> HeldJoint:
 
 
 def _resting(chain: SerialChain, joint: int) -> float:
-    """Return 0 where it is well inside the limits of a joint, else their middle, rad or m."""
+    """Return a position to hold a joint at, rad or m: 0 if well inside limits, or mid-range."""
     low, high = chain.lower[joint], chain.upper[joint]
     if chain.slides[joint]:
         return float(low + high) / 2
@@ -138,26 +131,28 @@ def _resting(chain: SerialChain, joint: int) -> float:
 
 
 def _random_joints(chain: SerialChain, count: int, rng: np.random.Generator) -> FloatArray:
+    """Return random configurations within the usual ranges, rad or m, (count, k)."""
     return rng.uniform(*chain.usual_range, (count, len(chain)))
 
 
 def _mean_solutions(kinematics: InverseKinematics, poses: FloatArray) -> float:
-    found = kinematics.solutions_of_each(poses)
-    return float(np.mean([len(kinematics.usable(q)) for q in found]))
+    """Return the mean number of usable joint solutions of poses (n, 4, 4)."""
+    solutions = kinematics.solutions_of_each(poses)
+    return float(np.mean([len(kinematics.usable(q)) for q in solutions]))
 
 
 @dataclass(frozen=True)
 class Reach:
-    """How far an arm reaches."""
+    """Extent of the workspace of an arm."""
 
-    reach_m: float  # From the axis of the first joint, m
-    # Heights that the tool takes, m
+    reach_m: float  # Largest distance of the tool from the first joint's axis, m
+    # Lowest and highest tool position, m
     low_m: float
     high_m: float
 
 
 def reach_of(chain: SerialChain, rng: np.random.Generator) -> Reach:
-    """Return how far the tool gets from the axis of the first joint, and at which heights."""
+    """Return the extent of the workspace, estimated from random configurations."""
     places = chain.forward(_random_joints(chain, 3000, rng))[:, :3, 3]
     first = chain.T_fixed[0]
     radius = np.linalg.norm((places - first[:3, 3])[:, :2], axis=1)
@@ -165,20 +160,20 @@ def reach_of(chain: SerialChain, rng: np.random.Generator) -> Reach:
 
 
 def link_radius(reach: Reach, full_size: float) -> float:
-    """Return how thick links are, m, given what they are in arms of full size."""
+    """Return the radius of an arm's links, m, from that of full-size arms."""
     return round(full_size * min(reach.reach_m / FULL_SIZE_M, 1.0), 3)
 
 
-def turned_to(
+def facing_angle_deg(
     chain: SerialChain,
     sensor_R: FloatArray,
     max_angle_deg: float,
     rng: np.random.Generator,
 ) -> float:
-    """Return the angle within which the tool can face a sensor, degrees.
+    """Return the largest angle between tool axis and line to a sensor at usable poses, degrees.
 
-    That is `max_angle_deg`, but for an arm that cannot turn its tool so, like a SCARA, whose tool
-    stays upright: it has an angle within which nearly all of its places face the sensor.
+    `max_angle_deg`, unless the arm cannot turn its tool so far, like a SCARA, whose tool stays
+    upright: then an angle within which nearly all of its poses face the sensor.
     """
     T = chain.forward(_random_joints(chain, 3000, rng))
     to_sensor = sensor_R - T[:, :3, 3]
@@ -190,7 +185,7 @@ def turned_to(
 
 
 def widest_ranges(reach: Reach, floor_z: float | None) -> PoseRanges:
-    """Return ranges of poses everywhere around an arm."""
+    """Return ranges of poses that cover the whole workspace above the floor."""
     lowest = reach.low_m if floor_z is None else max(reach.low_m, floor_z + 0.1 * reach.reach_m)
     return PoseRanges(
         azimuth_rad=(-np.pi, np.pi),
@@ -200,7 +195,7 @@ def widest_ranges(reach: Reach, floor_z: float | None) -> PoseRanges:
 
 
 def ranges_around(places: FloatArray) -> PoseRanges:
-    """Return ranges around the middle of places that an arm can take, m, (n, 3)."""
+    """Return ranges around the middle of reachable tool positions, m, (n, 3)."""
     radius = np.quantile(np.linalg.norm(places[:, :2], axis=1), (0.1, 0.9))
     height = np.quantile(places[:, 2], (0.1, 0.9))
     azimuth = np.quantile(np.arctan2(places[:, 1], places[:, 0]), (0.05, 0.95))
@@ -213,36 +208,34 @@ def ranges_around(places: FloatArray) -> PoseRanges:
 
 
 def marker_height(chain: SerialChain, bodies: Sequence[Body], link_radius: float) -> float:
-    """Return where on the tool's Z axis a marker is clear of the arm, m.
+    """Return a position on the tool's Z axis at which a marker is clear of the arm, m.
 
-    It is in front of the last link, or behind it where Z points back along the arm.
+    In front of the last link, or negative if Z points back along the arm.
 
-    Parameters
-    ----------
-    bodies
-        The collision geometry.
-    link_radius
-        How thick links are for the line of sight, m.
+    ``bodies``: the collision geometry; ``link_radius``: of the links in the line of sight, m.
     """
-    # The last joint's origin ends the link before it.
+    # The previous link ends at the last joint's origin.
     T_T_joint = inverse(chain.T_fixed[-1])
     ends = [T_T_joint[2, 3] + link_radius, link_radius - T_T_joint[2, 3]]
-    before, (ahead, back) = list(ends), ends
+    previous_link, (front, back) = list(ends), ends
     for body in bodies:
         if body.link == len(chain):
             z = apply(T_T_joint, body.outline)[:, 2]
-            ahead, back = max(ahead, z.max()), max(back, -z.min())
+            front, back = max(front, z.max()), max(back, -z.min())
     for body in arm_bodies(chain, bodies, link_radius):
         if body.link == len(chain) - 1:
             outline = body.outline - chain.T_fixed[-2][:3, 3]
             points = apply(T_T_joint, outline @ chain.T_fixed[-2][:3, :3])
             points = points[np.hypot(*points[:, :2].T) < link_radius + CLEAR_M]
-            before = [max([e, *s]) for e, s in zip(before, (points[:, 2], -points[:, 2]))]
-    points_back = max(back, before[1]) < max(ahead, before[0])
-    clear = np.ceil(100.0 * ((back if points_back else ahead) + CLEAR_M)) / 100.0
+            previous_link = [
+                max([e, *s]) for e, s in zip(previous_link, (points[:, 2], -points[:, 2]))
+            ]
+    points_back = max(back, previous_link[1]) < max(front, previous_link[0])
+    clear = np.ceil(100.0 * ((back if points_back else front) + CLEAR_M)) / 100.0
     return float(max(LEAST_MARKER_M, clear) * (-1.0 if points_back else 1.0))
 
 
 def _rounded(values: FloatArray, step: float) -> tuple[float, float]:
+    """Return a range rounded to multiples of a step."""
     low, high = np.round(values / step) * step
     return float(low), float(high)

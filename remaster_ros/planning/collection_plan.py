@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A whole collection before anything moves: every visit with its way, times, what is expected."""
+"""A whole collection before anything moves: its visits, paths, times and expected precision."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from remaster_ros.errors import InsufficientDataError, RemasterError
 from remaster_ros.kinematics.collision import CollisionModel
 from remaster_ros.motion.trajectory import Trajectory
 from remaster_ros.planning.candidates import PlannedPose
-from remaster_ros.planning.planned_design import NO_FREE_PATH, Designed
+from remaster_ros.planning.planned_design import NO_FREE_PATH, DesignResult
 from remaster_ros.planning.separating_design import SeparatingDesign
 from remaster_ros.planning.tour_order import FITTED, PoseVisit, Tour
 from remaster_ros.planning.tour_planner import TourPlanner
@@ -22,23 +22,23 @@ from remaster_ros.planning.travel_time import TravelTime
 from remaster_ros.types import FloatArray
 
 REGISTERING = 3
-"""Poses that register the sensors; the others of their plan are visited where one is not seen."""
+"""Poses that register the sensors; further ones are visited only if a sensor misses one."""
 FEW_MISSED, MOST_MISSED = 4, 12
-"""A way that is not there takes seconds to look for: so many tell that others have none."""
+"""Poses without a path after which a count ends, since each takes seconds of search."""
 
 
 @dataclass(frozen=True, eq=False)
 class PlannedVisit:
-    """A configuration that is measured."""
+    """A configuration to be measured, and the motion to it."""
 
     split: str  # ``optimization``, ``validation``, ``reference`` or ``registration``
-    pose: int  # Which of the poses of its split
-    trajectory: Trajectory  # The way, from the configuration before to this one
-    tool_speed_m_s: float  # Largest speed of the fastest point of arm and tool on it, m/s
+    pose: int  # Index of the pose in the plan of its split
+    trajectory: Trajectory  # From the previous configuration to this one
+    tool_speed_m_s: float  # Largest speed of the fastest point of arm and tool, m/s
 
     @property
     def points(self) -> FloatArray:
-        """The way's polyline, rad, (n + 1, k) for n lines."""
+        """Corners of the path, rad, (n + 1, k) for n lines."""
         return self.trajectory.points
 
     @property
@@ -48,7 +48,7 @@ class PlannedVisit:
 
 
 class Expected(NamedTuple):
-    """What a fit is expected to state; see `CollectionPlan`."""
+    """Expected precision of a fit; the fields are those of `CollectionPlan`."""
 
     joint_std: Mapping[str, float | None]
     joint_rms: float
@@ -60,33 +60,32 @@ NOTHING_EXPECTED = Expected({}, np.nan, np.nan)
 
 @dataclass(frozen=True, eq=False)
 class CollectionPlan:
-    """What a collection will do, and what its fit is expected to state."""
+    """The visits of a collection, and the expected precision of its fit."""
 
     tour: Tour  # As planned
-    # All configurations in the order of their visits: registration, fit, held out, and references
-    # each time
+    # All visits in their order: registration, poses to fit and to validate, references each time
     visits: tuple[PlannedVisit, ...]
-    unreached: int  # Configurations that no free path leads to
-    measuring_s: float  # Settling and dwell at each of them, s
-    # Motion, settling and dwell of all visits, s: of the whole session where all of it is ahead
+    unreached: int  # Configurations without a free path
+    measuring_s: float  # Settling and dwell of each visit, s
+    # Motion, settling and dwell of all visits, s; of the whole session if none of it is done
     robot_time_s: float
     max_tool_speed_m_s: float  # Of the fastest point of arm and tool, m/s
-    # Expected standard deviation of each joint's offset, rad or m; None where not identifiable
+    # Expected standard deviation of each joint's offset, rad or m; None if not identifiable
     joint_std: Mapping[str, float | None]
     joint_rms: float  # Root mean square of them, rad; see `DesignInformation.joint_rms`
-    tool_rms: float  # Root mean square of the 3-D error of the predicted markers, m
-    designed: Designed | None  # Of an optimal design; None without one
-    # What these configurations do not determine at all, so that there are no standard deviations
-    # (None and NaN above); ''
+    tool_rms: float  # Root mean square 3-D error of the predicted markers, m
+    design_result: DesignResult | None  # Optimal design; None without one
+    # Why there are no standard deviations (none and NaN above), such as parameters that the
+    # configurations do not determine; ''
     undetermined: str = ''
-    # What was added to separate causes; None without causes
-    separated: SeparatingDesign | None = None
-    # Whether an optimal design reaches its goal and its floors, with what can be visited of it
+    # Configurations added to separate causes; None without causes
+    separating_design: SeparatingDesign | None = None
+    # Whether the reachable part of an optimal design reaches its goal and floors
     goal_reached: bool = False
 
     @property
     def poses(self) -> dict[str, int]:
-        """Split -> number of poses with at least one configuration that is visited."""
+        """Split -> number of poses with at least one visit."""
         return dict(Counter(split for split, _ in {(v.split, v.pose) for v in self.visits}))
 
     @property
@@ -102,29 +101,17 @@ def plan_collection(
     start: FloatArray,
     progress: Callable[[float], None] = lambda share: None,
 ) -> CollectionPlan:
-    """Go through a session from its registration to its end, as the planner's node does it.
+    """Plan a session from its registration to its end, in the same way as the planner's node.
 
-    Parameters
-    ----------
-    planner
-        Plans the tour.
-    T_R_N
-        Registration of each sensor, (4, 4).
-    start
-        Where the arm stands, rad, (k,).
-    progress
-        Is told which share is done.
-
-    Raises
-    ------
-    InsufficientDataError
-        No pose is left to fit on, no configuration can be reached, or those that can do not
-        determine the offsets.
+    ``planner``: plans the tours; ``T_R_N``: registration of each sensor, (4, 4); ``start``:
+    configuration of the arm, rad, (k,); ``progress``: called with the share that is done.
+    Raises InsufficientDataError if no pose is left to fit, no configuration can be reached, or
+    the reachable ones do not determine the offsets.
     """
     tour = planner.collection(T_R_N)
     tours = [tour]
     if planner.registers:
-        tours.insert(0, planner.registration().only_first(REGISTERING))
+        tours.insert(0, planner.registration().first_poses(REGISTERING))
     plan = look_ahead(planner, T_R_N, tours, start, progress=progress)
     if plan.undetermined:
         raise InsufficientDataError(
@@ -139,33 +126,23 @@ def look_ahead(
     T_R_N: Mapping[str, FloatArray],
     tours: Sequence[Tour],
     start: FloatArray,
-    stop: PoseVisit | None = None,
+    visit: PoseVisit | None = None,
     progress: Callable[[float], None] = lambda share: None,
 ) -> CollectionPlan:
-    """Go through what is left of tours, the collection's last, without changing them.
+    """Plan the remaining visits of tours, the collection's last, without changing the tours.
 
-    Parameters
-    ----------
-    planner, T_R_N, start, progress
-        See `plan_collection`.
-    tours
-        One after the other.
-    stop
-        What is left of the pose under way, visited first.
-
-    Raises
-    ------
-    InsufficientDataError
-        No configuration can be reached.
+    ``tours``: one after the other; ``visit``: remaining visit of the pose under way, which comes
+    first; other arguments as of `plan_collection`.
+    Raises InsufficientDataError if no configuration can be reached.
     """
     configurations = sum(sum(tour.configurations.values()) for tour in tours)
     steps = _Steps(start, planner.travel, lambda n: progress(min(n / configurations, 1.0)))
     for tour in tours:
-        left = tour.fork()
-        if stop is not None:
-            steps.go(left.reroute(stop, steps.here))
-            stop = None
-        while (following := left.next(steps.here)) is not None:
+        remaining = tour.fork()
+        if visit is not None:
+            steps.go(remaining.reroute(visit, steps.here))
+            visit = None
+        while (following := remaining.next(steps.here)) is not None:
             steps.go(following)
     if not steps.visits:
         standing = planner.model.trouble(start) or 'no free way leads from there'
@@ -173,27 +150,31 @@ def look_ahead(
             f'no configuration can be reached from where the arm stands: {standing}'
         )
     fitted = tours[-1].plans[FITTED].poses
-    lost = {(index, number) for split, index, number in steps.unreached if split == FITTED}
-    reached = [
+    unreached = {(index, number) for split, index, number in steps.unreached if split == FITTED}
+    reachable = [
         PlannedPose(
-            pose.T_R_T, np.array([q for i, q in enumerate(pose.solutions) if (at, i) not in lost])
+            pose.T_R_T,
+            np.array([q for i, q in enumerate(pose.solutions) if (at, i) not in unreached]),
         )
         for at, pose in enumerate(fitted)
     ]
-    reached = [pose for pose in reached if len(pose.solutions)]
-    judges = f'they are for /remaster/{tours[-1].judges}' if tours[-1].judges else 'none is left'
-    expected, undetermined = NOTHING_EXPECTED, '' if reached else f'none is fitted, {judges}'
+    reachable = [pose for pose in reachable if len(pose.solutions)]
+    purpose = (
+        f'they are for /remaster/{tours[-1].inspection}'
+        if tours[-1].inspection
+        else 'none is left'
+    )
+    expected, undetermined = NOTHING_EXPECTED, '' if reachable else f'none is fitted, {purpose}'
     try:
-        if reached:
-            expected = expected_precision(planner, T_R_N, reached)
+        if reachable:
+            expected = expected_precision(planner, T_R_N, reachable)
     except InsufficientDataError as error:
-        # What the arm does is known all the same.
         undetermined = str(error)
-    designed = planner.designed
-    goal_reached = designed is not None and designed.reached
-    if designed is not None and goal_reached and lost:
-        number = np.repeat(np.arange(len(reached)), [len(pose.solutions) for pose in reached])
-        goal_reached = designed.floors.hold(number) and designed.goal.is_met(
+    design_result = planner.design_result
+    goal_reached = design_result is not None and design_result.reached
+    if design_result is not None and goal_reached and unreached:
+        number = np.repeat(np.arange(len(reachable)), [len(pose.solutions) for pose in reachable])
+        goal_reached = design_result.floors.hold(number) and design_result.goal.is_met(
             expected.joint_rms, expected.tool_rms
         )
     visits = tuple(steps.visits)
@@ -206,78 +187,59 @@ def look_ahead(
         sum(visit.trajectory.duration_s + measuring_s for visit in visits),
         max((visit.tool_speed_m_s for visit in visits), default=0.0),
         *expected,
-        designed,
+        design_result,
         undetermined,
-        planner.separated,
+        planner.separating_design,
         goal_reached,
     )
 
 
 def session_time_s(planner: TourPlanner, tour: Tour, start: FloatArray) -> float:
-    """Return about how long the robot takes for a whole session, s, without looking for ways.
+    """Return the approximate robot time of a whole session, s, without a search for paths.
 
-    For the registration, what is fitted, what is held out and the references, with settling and
-    dwell. Every way counts as straight: looking for those around something takes nearly all of the
-    time that `plan_collection` takes.
+    Of registration, poses to fit and to validate, and references, with settling and dwell. Every
+    path counts as straight: the search takes nearly all the time of `plan_collection`.
 
-    Parameters
-    ----------
-    planner
-        Plans the tour.
-    tour
-        Of the collection, however far it is.
-    start
-        Where the arm stands, rad, (k,).
+    ``planner``: plans the tours; ``tour``: of the collection, in any state; ``start``:
+    configuration of the arm, rad, (k,).
     """
     tours = [tour]
     if planner.registers:
-        tours.insert(0, planner.registration().only_first(REGISTERING))
-    here, total = start, 0.0
-    for part in tours:
-        straight = part.afresh()
-        while (stop := straight.next(here)) is not None:
-            for q in stop.solutions:
-                total += float(planner.travel.straight(here, q[None])[0])
+        tours.insert(0, planner.registration().first_poses(REGISTERING))
+    position, total = start, 0.0
+    for each in tours:
+        straight = each.restarted_straight()
+        while (visit := straight.next(position)) is not None:
+            for q in visit.solutions:
+                total += float(planner.travel.straight(position, q[None])[0])
                 total += planner.travel.measuring_s
-                here = q
+                position = q
     return total
 
 
-def outlook(planner: TourPlanner) -> tuple[Tour, Expected]:
-    """Return a collection with the sensors at their rough places, without its ways.
+def rough_collection(planner: TourPlanner) -> tuple[Tour, Expected]:
+    """Return a collection with the sensors at their rough positions, without its paths.
 
-    These take nearly all of the time that `plan_collection` takes; without them it is not known
-    which configurations no free way leads to (`with_free_way` counts poses), nor how long it all
-    takes.
-
-    Raises
-    ------
-    InsufficientDataError
-        No pose is left to fit on, or the poses do not determine the offsets.
+    The search for paths takes nearly all the time of `plan_collection`; without it unreachable
+    configurations (`count_with_free_path` counts poses) and the robot time are unknown.
+    Raises InsufficientDataError if no pose is left to fit, or the poses do not determine the
+    offsets.
     """
     tour = planner.collection(planner.rough_places)
     return tour, expected_precision(planner, planner.rough_places, tour.plans[FITTED].poses)
 
 
-def with_free_way(
+def count_with_free_path(
     tour: Tour, model: CollisionModel, start: FloatArray, enough: int
 ) -> tuple[int, int]:
-    """Return how many poses to fit the arm gets to from where it stands, and of how many tried.
+    """Return how many poses to fit have a free path from the start, and how many were tried.
 
-    One joint solution of a pose is enough, so this takes a small part of what all ways take, but
-    where few are found so: then the whole tour is gone through, as a collection does it, up to
-    `MOST_MISSED` poses without a way.
+    One joint solution of a pose is enough, which takes a small part of the time of all paths. If
+    that finds few, the whole tour is searched as in a collection, up to `MOST_MISSED` poses
+    without a path.
 
-    Parameters
-    ----------
-    tour
-        Of poses that the arm can take.
-    model
-        The arm and all it can hit.
-    start
-        Where it stands, rad, (k,).
-    enough
-        So many that are reached are enough.
+    ``tour``: of reachable poses; ``model``: obstacles; ``start``: rad, (k,); ``enough``: number of
+    poses at which the count ends.
     """
     fitted = {FITTED: tour.plans[FITTED]}
     quick = Tour(tour.chain, fitted, one_solution=True, model=model)
@@ -285,42 +247,39 @@ def with_free_way(
     return found if found[0] >= enough else _reached(tour.fork(), start, enough, MOST_MISSED)
 
 
-def _reached(tour: Tour, here: FloatArray, enough: int, most_missed: int) -> tuple[int, int]:
-    """Go through a tour until so many poses to fit are reached, or so many poses are not."""
+def _reached(tour: Tour, q: FloatArray, enough: int, most_missed: int) -> tuple[int, int]:
+    """Count poses to fit with a free path, and poses tried, until `enough` or too many missed."""
     count = tried = missed = 0
-    while count < enough and missed < most_missed and (stop := tour.next(here)) is not None:
-        tried += stop.split == FITTED
-        if not len(stop.solutions):
+    while count < enough and missed < most_missed and (visit := tour.next(q)) is not None:
+        tried += visit.split == FITTED
+        if not len(visit.solutions):
             missed += 1
             continue
-        here, count = stop.solutions[-1], count + (stop.split == FITTED)
+        q, count = visit.solutions[-1], count + (visit.split == FITTED)
     return count, tried
 
 
-def with_expected(
+def expected_collection(
     planner: TourPlanner, T_R_N: Mapping[str, FloatArray]
 ) -> tuple[Tour, Expected | None]:
-    """Return a collection, and what it is expected to state; None where that is not known.
+    """Return a collection tour with its expected precision (None if it cannot be computed).
 
-    Raises
-    ------
-    InsufficientDataError
-        No pose is left to fit on.
+    Raises InsufficientDataError if no pose is left to fit.
     """
     tour = planner.collection(T_R_N)
     try:
         expected = expected_precision(planner, T_R_N, tour.plans[FITTED].poses)
     except (RemasterError, np.linalg.LinAlgError):
-        # A figure for people: the collection does not depend on it.
+        # The collection does not depend on the expected precision.
         return tour, None
     return tour, expected if np.isfinite(expected.tool_rms) else None
 
 
 class _Steps:
-    """Go from stop to stop.
+    """The motions of an arm from visit to visit.
 
-    ``here``: where the arm stands, rad, (k,); ``travel``: how long the robot takes; ``progress``:
-    is told how many configurations are done.
+    ``here``: the arm's configuration, rad, (k,); ``travel``: travel times; ``progress``: called
+    with the number of visits.
     """
 
     def __init__(
@@ -330,12 +289,12 @@ class _Steps:
         self.visits: list[PlannedVisit] = []
         self.unreached: list[tuple[str, int, int]] = []
 
-    def go(self, stop: PoseVisit) -> None:
-        """Visit the solutions of a stop."""
-        self.unreached += [(stop.split, stop.index, number) for number in stop.unreached]
-        for q, way in zip(stop.solutions, stop.paths, strict=True):
-            trajectory, speed = self._travel.trajectory(np.vstack((self.here, way, q)))
-            self.visits.append(PlannedVisit(stop.split, stop.index, trajectory, speed))
+    def go(self, visit: PoseVisit) -> None:
+        """Add the motions to all solutions of a visit."""
+        self.unreached += [(visit.split, visit.index, number) for number in visit.unreached]
+        for q, waypoints in zip(visit.solutions, visit.paths, strict=True):
+            trajectory, speed = self._travel.trajectory(np.vstack((self.here, waypoints, q)))
+            self.visits.append(PlannedVisit(visit.split, visit.index, trajectory, speed))
             self.here = q
         self._progress(len(self.visits))
 
@@ -343,9 +302,9 @@ class _Steps:
 def expected_precision(
     planner: TourPlanner, T_R_N: Mapping[str, FloatArray], poses: Sequence[PlannedPose]
 ) -> Expected:
-    """Return what a fit of these poses, in all their solutions, is expected to state."""
+    """Return the expected precision of a fit of these poses in all their solutions."""
     sensors_R = {name: T[:3, 3] for name, T in T_R_N.items()}
-    information = planner.design.before(sensors_R).information(planner.scene, poses)
+    information = planner.design.with_sensors_at(sensors_R).information(planner.scene, poses)
     chosen = range(len(information))
     return Expected(
         information.joint_std(chosen),

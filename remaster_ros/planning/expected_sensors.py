@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What sensors are expected to measure at configurations of the nominal arm, as a fit takes it."""
+"""Measurements that sensors are expected to make of the nominal arm, as input of a fit."""
 
 from __future__ import annotations
 
@@ -16,47 +16,50 @@ from remaster_ros.kinematics.transforms import matrix_from_quaternion_xyzw, tran
 from remaster_ros.types import BoolArray, FloatArray, IntArray, Measurements, Priors
 
 SIGMA_M = 0.1e-3
-"""Expected noise of a marker where nothing is stated, per axis, m."""
+"""Default of the expected noise of a marker, per axis, m."""
 POSE_SIGMA_M = 0.2e-3
-"""Expected error that all readings of a sensor at a pose share, per axis, m."""
+"""Default of the expected error common to all readings of a sensor at a pose, per axis, m."""
 
 
 @dataclass(frozen=True)
 class ExpectedSensor:
-    """A sensor, the markers that it measures in every frame, and its noise."""
+    """A sensor, the markers in each of its frames, and its noise."""
 
-    name: str  # Of the sensor
-    position_R: FloatArray  # Its origin in R, m, (3,)
+    name: str
+    position_R: FloatArray  # In R, m, (3,)
     markers: Mapping[str, FloatArray]  # Marker name -> position in the tool frame, m, (3,)
     sigma_m: float = SIGMA_M  # Noise of each marker, per axis, m
-    # Error that all its readings at one pose share, per axis, m
+    # Error common to all readings at one pose, per axis, m
     pose_sigma_m: float = POSE_SIGMA_M
-    # Error that the markers of one frame share, per axis, m: the arm's repeatability belongs here
+    # Error common to the markers of one frame, per axis, m, with the arm's repeatability
     frame_sigma_m: float = 0.0
 
 
 @dataclass(frozen=True)
 class ToolBox:
-    """A box in R in which the tool is to be accurate: middle and edges, m, (3,) each."""
+    """A box in R in which the tool has to be accurate."""
 
-    center_m: FloatArray
-    size_m: FloatArray
+    center_m: FloatArray  # In R, (3,)
+    size_m: FloatArray  # Edge lengths, (3,)
 
     def holds(self, points: FloatArray) -> BoolArray:
-        """Tell which points (n, 3), m, lie in it."""
+        """Return whether points (n, 3), m, lie in the box, (n,)."""
         return np.all(2.0 * np.abs(points - self.center_m) <= self.size_m, axis=-1)
 
 
 def nominal_model(
     chain: SerialChain, q: FloatArray, sensors: Sequence[ExpectedSensor], priors: Priors
 ) -> tuple[Model, FloatArray]:
-    """Return the model and its nominal parameters, (size,)."""
+    """Return the model of arm, sensors and markers, and its nominal parameters, (size,).
+
+    ``q``: configurations, rad, (n, k); their mean tool position is the registrations' centre.
+    """
     markers: dict[str, FloatArray] = {}
     for sensor in sensors:
         markers |= sensor.markers
     reference = np.array([transform(np.eye(3), sensor.position_R) for sensor in sensors])
     for index, sensor in enumerate(sensors):
-        # Which way a sensor looks changes nothing but what a prior on its registration tells.
+        # A sensor's orientation matters only to a prior on its registration.
         if sensor.name in priors.base:
             turn = matrix_from_quaternion_xyzw(priors.base[sensor.name].rotation_xyzw)
             reference[index] = transform(turn, sensor.position_R)
@@ -74,43 +77,49 @@ def nominal_model(
 def expected_priors(
     model: Model, x: FloatArray, marker_std_m: float, priors: Priors
 ) -> tuple[Prior, ...]:
-    """Return the priors that a fit would have; those on offsets count by their widths alone."""
+    """Return the priors of a fit; only the widths of those on offsets matter here.
+
+    ``x``: nominal parameters; ``marker_std_m``: of marker positions without a prior, per axis.
+    """
     markers = model.markers(x)
-    known = [
+    prior_list = [
         marker_prior(model, index, markers[index], priors.markers.get(name, (0, marker_std_m))[1])
         for index, name in enumerate(model.marker_names)
     ]
-    known += [
+    prior_list += [
         base_prior(model, model.sensor_names.index(name), prior)
         for name, prior in priors.base.items()
     ]
-    known += [
+    prior_list += [
         offset_prior(model, model.chain.joint_names.index(name), mean, std)
         for name, (mean, std) in priors.joint_offsets.items()
     ]
-    return tuple(known)
+    return tuple(prior_list)
 
 
 def expected_measurements(
     model: Model, q: FloatArray, pose: IntArray, sensors: Sequence[ExpectedSensor]
 ) -> Measurements:
-    """Return a row for every marker of every sensor at every configuration."""
+    """Return measurements with a row for every marker of every sensor at every configuration.
+
+    ``q``: rad, (n, k); ``pose``: number of the pose of each configuration, (n,). Positions are 0.
+    """
     configuration, sensor, marker = (
         np.concatenate(parts)
         for parts in zip(
             *(
                 (
-                    np.repeat(np.arange(len(q)), len(one.markers)),
-                    np.full(len(q) * len(one.markers), index),
-                    np.tile([model.marker_names.index(name) for name in one.markers], len(q)),
+                    np.repeat(np.arange(len(q)), len(each.markers)),
+                    np.full(len(q) * len(each.markers), index),
+                    np.tile([model.marker_names.index(name) for name in each.markers], len(q)),
                 )
-                for index, one in enumerate(sensors)
+                for index, each in enumerate(sensors)
             ),
             strict=True,
         )
     )
     n = len(sensor)
-    unknown = np.full((n, 3), np.nan)
+    missing = np.full((n, 3), np.nan)
     return Measurements(
         observation=np.arange(n),
         pose=pose[configuration],
@@ -122,21 +131,21 @@ def expected_measurements(
         q=q[configuration],
         from_q=np.full((n, q.shape[1]), np.nan),
         position=np.zeros((n, 3)),
-        std=unknown,
+        std=missing,
         samples=np.full(n, -1),
-        temperature_c=unknown[:, 0],
+        temperature_c=missing[:, 0],
     )
 
 
 def expected_rows(
     model: Model, x: FloatArray, measurements: Measurements, sensors: Sequence[ExpectedSensor]
 ) -> Rows:
-    """Return the rows with targets that the noise moves away from the prediction, as readings."""
+    """Return rows whose targets are predictions at x, displaced by the expected noise."""
     rows = Rows.of(measurements, np.arange(len(measurements)), model.reference)
     target = model.predict(model.pinned(x), rows)
     for index, span in rows.spans:
         sensor = sensors[index]
         noise = np.linalg.norm((sensor.sigma_m, sensor.frame_sigma_m, sensor.pose_sigma_m))
-        # The gauge needs the size of the errors, not their signs.
+        # The gauge depends on the size of the errors, not on their signs.
         target[span] += noise
     return replace(rows, target=target)

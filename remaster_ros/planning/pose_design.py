@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Choose poses that tell the most in the least time: greedy, then exchange.
+"""Optimal design of the poses to measure: greedy choice, then exchange.
 
 A-optimal for the joint offsets (least sum of their variances), I-optimal for the tool (least mean
-variance of the predicted markers in a box), or a mixture of both. What is chosen is a pose in all
-its joint solutions, with their information and their time, or single configurations. They are
-added one by one, each the one that lowers the criterion the most for its time, until the wanted
-standard deviations are reached; those that are not needed any more are left out. Then poses are
-exchanged while that saves robot time: one is brought in with all its solutions, or some are left
-out and what is missing is filled up, and again what is not needed is left out.
+variance of the predicted markers in a box), or a mixture of both. A unit of the choice is a pose
+with all its joint solutions, or a single configuration. Units are added one by one, each the one
+that lowers the criterion most for its time, until the wanted standard deviations are reached;
+units that are no longer needed are removed. Then poses are exchanged as long as that saves robot
+time: one is added with all its solutions, or some are removed and the design is filled up, and
+superfluous units are removed again.
 
 Single configurations are not exchanged, as V. V. Fedorov's and T. J. Mitchell's (DETMAX)
-algorithms do: the error that the configurations of a pose share makes the first of a pose tell
+algorithms do: because of the error common to the configurations of a pose, the first of them tells
 little, and all of them together much, so that such exchanges end in poor local optima. For the
 same reason the information of configurations does not add up: a design by weights (convex
 relaxation) has to weigh subsets of the solutions of a pose. benchmarks/RESULTS.md compares them.
@@ -30,63 +30,62 @@ from remaster_ros.planning.travel_time import TravelTime
 from remaster_ros.types import BoolArray, FloatArray, IntArray
 
 REPEATED_POSES = 6
-"""Poses measured in two solutions or more, at least. Their differences alone distinguish the noise
-of a reading from the error that a pose shares: with M markers, 6 of them give a standard deviation
-of the former that is known to 1 / sqrt(2 * 18 M), 17 % with one marker."""
+"""Least number of poses measured in two or more solutions. Only their differences distinguish the
+noise of a reading from the error common to a pose: with M markers, 6 of them give the standard
+deviation of the former to 1 / sqrt(2 * 18 M), 17 % with one marker."""
 HELD_OUT_POSES = 12
-"""Poses held out, at least: from 12 on the p-values of a search for causes come from flipped poses
-(`discovery.screening`), on held-out rows as on the others, and 12 poses of 3 coordinates give the
-RMS error on them to 12 %."""
+"""Least number of validation poses: from 12 on the p-values of a search for causes come from sign
+flips of poses (`discovery.screening`); 12 poses of 3 coordinates give their RMS error to 12 %."""
 HELD_OUT_SOLUTIONS = 2
-"""Solutions of each, where not all are visited: two are what the relative metric compares."""
+"""Solutions of each, if not all are visited: the relative metric compares two."""
 MOST_CONFIGURATIONS = 400
-"""A design that needs more is not reached."""
+"""Most configurations of a design."""
 MOST_EXCHANGES, EFFORT = 200, 6000
-"""Exchanges of poses that are tried; with many configurations fewer, as each takes longer."""
+"""Most exchanges of poses, and most exchanges times units: with many units each takes longer."""
 MOST_MORE = 6
-"""Configurations that a design may have more than before, before it is thinned."""
+"""Configurations that an exchange may add before superfluous ones are removed."""
 WORTHWHILE_S = 1e-3
-"""What an exchange must gain, s."""
+"""Least saving of an exchange, s."""
 URGENCY = 0.5
-"""Gain is weighed against this power of its time. With 0 the fewest configurations are chosen,
-with 1 many that are near to one another; between them lies the least time."""
+"""Exponent of the time by which a gain is divided. 0 leads to the fewest configurations, 1 to many
+that are near to one another; the least time lies between them."""
 FIRST, LOOKED_AT = 12, 64
-"""From so many chosen on, only the candidates that promise the most to first order are tried."""
+"""From `FIRST` chosen units on, only the `LOOKED_AT` best candidates to first order are tried."""
 
 
 @dataclass(frozen=True)
 class Floors:
-    """What a design has at the least, so that a search for causes finds what no one expected.
+    """Least contents of a design, so that a search for causes finds unexpected ones.
 
-    A design for the offsets alone would repeat few poses. The offsets' model is then fitted where
-    it is bent the most, and nothing looks whether it holds in between.
+    A design for the offsets alone would repeat few poses; they would lie where the offsets' model
+    is most sensitive, and nothing would test the model in between.
     """
 
-    # Different poses to fit; `discovery.screening` needs as many for its p-values
+    # Different poses to fit, as many as `discovery.screening` needs for its p-values
     poses: int = FEWEST_POSES
-    repeated: int = REPEATED_POSES  # Of them with at least two solutions
+    repeated: int = REPEATED_POSES  # Poses with at least two solutions
 
     def hold(self, pose: IntArray) -> bool:
-        """Tell whether chosen configurations of these poses (n,) reach them."""
+        """Return whether configurations of these poses (n,) are enough."""
         count = np.unique(pose, return_counts=True)[1]
         return len(count) >= self.poses and int(np.sum(count > 1)) >= self.repeated
 
 
 @dataclass(frozen=True)
 class Goal:
-    """What is to be reached, and what to weigh by."""
+    """The precision to reach, and the weights of joints and tool."""
 
     # Root mean square of the standard deviations of the identifiable joints, rad
     joint_std_rad: float
-    tool_std_m: float  # Root mean square of the 3-D error of the predicted markers in the box, m
-    # 0 for the joints alone (A-optimal), 1 for the tool alone (I-optimal); between them for a
-    # mixture, in which each counts in units of what is to be reached
+    tool_std_m: float  # Root mean square 3-D error of the predicted markers in the box, m
+    # Weight of the tool: 0 for joints only (A-optimal), 1 for tool only (I-optimal); in a mixture
+    # each counts in units of its standard deviation above
     tool_share: float = 0.0
 
     def weights(self, information: DesignInformation) -> FloatArray:
-        """Return L with criterion = trace(L' M^-1 L), (f, r), 1 or less at the goal.
+        """Return L (f, r) with criterion trace(L' M^-1 L), which is at most 1 at the goal.
 
-        Raises InsufficientDataError: no joint is identifiable.
+        Raises InsufficientDataError if no joint is identifiable.
         """
         parts = []
         if self.tool_share < 1.0:
@@ -105,16 +104,16 @@ class Goal:
         return np.concatenate(parts, axis=1)
 
     def is_met(self, joint_rms: float, tool_rms: float) -> bool:
-        """Tell whether these, rad and m, reach each of what counts."""
+        """Return whether standard deviations of joints, rad, and tool, m, reach the goal."""
         joints = self.tool_share == 1.0 or joint_rms <= self.joint_std_rad
         return joints and (self.tool_share == 0.0 or tool_rms <= self.tool_std_m)
 
     def is_reached(self, information: DesignInformation, chosen: Sequence[int]) -> bool:
-        """Tell whether each of what counts is reached."""
+        """Return whether chosen configurations reach the goal."""
         return self.is_met(information.joint_rms(chosen), information.tool_rms(chosen))
 
     def describe(self) -> str:
-        """Return what is to be reached, for people."""
+        """Return the goal as text."""
         joints = f'{np.degrees(self.joint_std_rad):.3g} deg for the offsets'
         tool = f'{self.tool_std_m * 1e3:.3g} mm for the tool'
         counting = [joints] * (self.tool_share < 1.0) + [tool] * (self.tool_share > 0.0)
@@ -123,10 +122,10 @@ class Goal:
 
 @dataclass(frozen=True)
 class Design:
-    """Chosen configurations."""
+    """The chosen configurations."""
 
     chosen: tuple[int, ...]  # Indices of the configurations, in no order
-    reached: bool  # Whether the goal and the floors are reached
+    reached: bool  # Whether goal and floors are reached
 
 
 def choose(
@@ -140,12 +139,12 @@ def choose(
     *,
     whole_poses: bool = True,
 ) -> Design:
-    """Choose configurations.
+    """Choose configurations that reach a goal in the least robot time.
 
-    ``information``: of all that can be measured; ``travel``: what they cost; ``goal, floors``:
-    what is to be reached; ``rng``: which poses are tried in exchange; ``most``: configurations
-    chosen at most; ``exchanges``: tried at most; ``whole_poses``: choose poses with all their
-    configurations; single ones otherwise.
+    ``information``: of all candidates; ``travel``: their cost; ``goal, floors``: what to reach;
+    ``rng``: for exchanges; ``most``: largest number of configurations; ``exchanges``: largest
+    number tried; ``whole_poses``: choose poses with all their configurations, not single ones.
+    If the goal cannot be reached, the design has `reached` False and `most` configurations or all.
     """
     units = _Units(information, travel, whole_poses)
     search = _Search(units, goal, floors)
@@ -163,11 +162,11 @@ def choose(
 
 
 class _Units:
-    """What is chosen one by one: configurations, or poses with all of theirs.
+    """The units of the choice: configurations, or poses with all their configurations.
 
-    ``whole``: whether they are poses; ``information``: of each of the n units; ``members``: which
-    configurations each is; ``solutions``: how many, (n,); ``stay_s``: time of measuring them and
-    of the ways between them, s, (n,).
+    ``whole``: whether they are poses; ``information``: of each of the n units; ``members``:
+    indices of each unit's configurations; ``solutions``: number of them, (n,); ``stay_s``: time of
+    measuring them and of the motions between them, s, (n,).
     """
 
     def __init__(self, information: DesignInformation, travel: TravelTime, whole: bool) -> None:
@@ -175,39 +174,44 @@ class _Units:
         self.members = list(np.arange(len(information))[:, None])
         if whole:
             self.information, self.members = information.whole_poses()
-        self.solutions: IntArray = np.array([len(mine) for mine in self.members])
-        self._travel, self._q = travel, [information.q[mine] for mine in self.members]
+        self.solutions: IntArray = np.array([len(from_solution) for from_solution in self.members])
+        self._travel, self._q = (
+            travel,
+            [information.q[from_solution] for from_solution in self.members],
+        )
         self._by_joints = replace(travel, limits=replace(travel.limits, tool_speed=np.inf))
         self._first = np.cumsum(self.solutions) - self.solutions
-        between = np.array([self._between(q) for q in self._q])
+        between = np.array([self._time_within(q) for q in self._q])
         self.stay_s: FloatArray = self.solutions * travel.measuring_s + between
         self._near: dict[int, FloatArray] = {}
 
-    def _between(self, q: FloatArray) -> float:
-        """Return the mean time through solutions (m, k) of a pose, nearest first, s."""
+    def _time_within(self, q: FloatArray) -> float:
+        """Return the mean time through all solutions (m, k) of a pose, nearest next, s."""
         times = self._travel.between(q)
         order = np.argsort(times, axis=1)
         along = np.take_along_axis(times[order[:, :-1]], order[:, 1:, None], axis=2)
         return float(np.mean(np.sum(along, axis=(1, 2))))
 
     def near(self, index: int) -> FloatArray:
-        """Return the time from one unit to each, s, (n,)."""
+        """Return the time from one unit to each unit, s, (n,); infinite to itself."""
         if index not in self._near:
-            # Which two are the nearest, by the joints alone; looking at the tool takes long.
-            q, own = np.concatenate(self._q), self._q[index]
-            joints = np.array([self._by_joints.straight(one, q) for one in own])
-            mine = np.argmin(joints, axis=0)
+            # The nearest pair is found without the limit of the tool's speed, which takes long.
+            q, solutions_of_unit = np.concatenate(self._q), self._q[index]
+            joints = np.array([self._by_joints.straight(each, q) for each in solutions_of_unit])
+            from_solution = np.argmin(joints, axis=0)
             least = np.min(joints, axis=0)
             ends = [
                 first + int(np.argmin(least[first : first + count]))
                 for first, count in zip(self._first, self.solutions, strict=True)
             ]
             near = np.empty(len(ends))
-            for start in np.unique(mine[ends]):
-                these = np.flatnonzero(mine[ends] == start)
-                near[these] = self._travel.straight(own[start], q[np.array(ends)[these]])
+            for start in np.unique(from_solution[ends]):
+                units_of_start = np.flatnonzero(from_solution[ends] == start)
+                near[units_of_start] = self._travel.straight(
+                    solutions_of_unit[start], q[np.array(ends)[units_of_start]]
+                )
             self._near[index] = near
-            # Its own place is no neighbour of it.
+            # A unit is no neighbour of itself.
             self._near[index][index] = np.inf
         return self._near[index]
 
@@ -217,65 +221,74 @@ class _Units:
 
 
 class _Search:
-    """The criterion of candidates, and what they cost."""
+    """Greedy choice and exchange of units, by their gain and cost."""
 
     def __init__(self, units: _Units, goal: Goal, floors: Floors) -> None:
         self._units, self._information, self._goal = units, units.information, goal
         self._floors, self._root = floors, goal.weights(units.information)
 
     def _criteria(self, matrices: FloatArray) -> FloatArray:
-        """Return trace(L' M^-1 L) of information (..., f, f), (...)."""
+        """Return trace(L' M^-1 L) of information matrices (..., f, f), (...)."""
         finite = self._information.finite(matrices)
         root = np.broadcast_to(self._root, (*finite.shape[:-2], *self._root.shape))
         return np.einsum('ij,...ij->...', self._root, np.linalg.solve(finite, root))
 
     def _with_each(self, chosen: Sequence[int], allowed: BoolArray) -> tuple[IntArray, FloatArray]:
-        """Return the units that promise the most, and the criterion with each, (m,)."""
+        """Return the most promising units of those allowed, and the criterion with each, (m,).
+
+        ``allowed``: (n,); the most promising are selected to first order if there are many.
+        """
         information = self._information
         allowed = allowed.copy()
         allowed[np.array(chosen, dtype=np.int64)] = False
-        among = np.flatnonzero(allowed)
-        if len(among) > LOOKED_AT and len(chosen) > FIRST:
+        candidates = np.flatnonzero(allowed)
+        if len(candidates) > LOOKED_AT and len(chosen) > FIRST:
             total = information.finite(information.total(chosen))
             steps = np.asarray(np.linalg.solve(total, self._root), dtype=np.float64)
-            gains = information.gains(chosen, steps)[among] / self._times(chosen)[among] ** URGENCY
-            among = among[np.argpartition(-gains, LOOKED_AT)[:LOOKED_AT]]
-        return among, self._criteria(information.with_each(chosen, among))
+            gains = (
+                information.gains(chosen, steps)[candidates]
+                / self._times(chosen)[candidates] ** URGENCY
+            )
+            candidates = candidates[np.argpartition(-gains, LOOKED_AT)[:LOOKED_AT]]
+        return candidates, self._criteria(information.with_each(chosen, candidates))
 
     def _times(self, chosen: Sequence[int]) -> FloatArray:
-        """Return what each unit adds to the robot's time beside the chosen, s, (n,)."""
+        """Return each unit's addition to the robot time of the chosen units, s, (n,)."""
         if not chosen:
             return self._units.stay_s
         near = np.min([self._units.near(index) for index in chosen], axis=0)
         return near + self._units.stay_s
 
     def is_done(self, chosen: Sequence[int]) -> bool:
+        """Return whether chosen units reach goal and floors."""
         return self._floors.hold(self._poses(chosen)) and self._goal.is_reached(
             self._information, chosen
         )
 
     def _poses(self, chosen: Sequence[int]) -> IntArray:
-        """Return the pose of each configuration of the chosen, (m,)."""
+        """Return the pose of each configuration of chosen units, (m,)."""
         which = np.array(chosen, dtype=np.int64)
         return np.repeat(self._information.pose[which], self._units.solutions[which])
 
     def _best_addition(self, chosen: Sequence[int]) -> int:
-        """Return which unit gains the most for its time."""
+        """Return the unit with the largest gain for its time."""
         allowed = np.ones(len(self._information), bool)
         if chosen and self._goal.is_reached(self._information, chosen):
             missing = self._missing(chosen)
             allowed = missing if missing.any() else allowed
             if self._units.whole and missing.any():
-                # Beyond the goal what its further solutions tell is not worth their time.
+                # The goal is reached: only the time counts.
                 return int(np.argmin(np.where(missing, self._times(chosen), np.inf)))
-        among, criteria = self._with_each(chosen, allowed)
+        candidates, criteria = self._with_each(chosen, allowed)
         now = self._criteria(self._information.total(chosen))
         return int(
-            among[np.argmax(np.log(now / criteria) / self._times(chosen)[among] ** URGENCY)]
+            candidates[
+                np.argmax(np.log(now / criteria) / self._times(chosen)[candidates] ** URGENCY)
+            ]
         )
 
     def _missing(self, chosen: Sequence[int]) -> BoolArray:
-        """Return which units come nearer to the floors, (n,)."""
+        """Return whether each unit brings the design nearer to the floors, (n,)."""
         pose, several = self._information.pose, self._units.solutions > 1
         count = np.bincount(self._poses(chosen), minlength=int(pose.max()) + 1)
         poses, repeated = np.sum(count > 0), np.sum(count > 1)
@@ -287,7 +300,7 @@ class _Search:
         return new
 
     def filled(self, chosen: Sequence[int], most: int) -> list[int]:
-        """Add what gains the most for its time until goal and floors are reached."""
+        """Return the units extended until the design is done or has `most` configurations."""
         chosen = list(chosen)
         while len(chosen) < len(self._information) and not self.is_done(chosen):
             if len(self._poses(chosen)) >= most:
@@ -296,33 +309,35 @@ class _Search:
         return chosen
 
     def with_other_poses(self, chosen: Sequence[int], rng: np.random.Generator) -> list[int]:
-        """Bring a pose in with all its solutions, or leave a few out and fill up again."""
+        """Return a random exchange: a pose added, or a few removed and the design filled up."""
         pose = self._information.pose
-        own = np.unique(pose[np.array(chosen, dtype=np.int64)])
+        poses_in = np.unique(pose[np.array(chosen, dtype=np.int64)])
         if rng.random() < 0.5:
-            others = np.setdiff1d(pose, own)
-            if not len(others):
+            poses_out = np.setdiff1d(pose, poses_in)
+            if not len(poses_out):
                 return list(chosen)
-            return [*chosen, *np.flatnonzero(pose == rng.choice(others)).tolist()]
-        out = rng.choice(own, rng.integers(1, max(2, min(5, len(own) // 3 + 1))), replace=False)
-        left = [index for index in chosen if pose[index] not in out]
-        return self.filled(left, len(self._poses(chosen)) + MOST_MORE)
+            return [*chosen, *np.flatnonzero(pose == rng.choice(poses_out)).tolist()]
+        removed = rng.choice(
+            poses_in, rng.integers(1, max(2, min(5, len(poses_in) // 3 + 1))), replace=False
+        )
+        remaining = [index for index in chosen if pose[index] not in removed]
+        return self.filled(remaining, len(self._poses(chosen)) + MOST_MORE)
 
     def thinned(self, chosen: Sequence[int]) -> list[int]:
-        """Leave out one after the other while goal and floors are reached."""
+        """Return the design with superfluous units removed."""
         chosen = list(chosen)
         while len(chosen) > 1 and self.is_done(fewer := self._without_least(chosen)):
             chosen = fewer
         return chosen
 
     def _without_least(self, chosen: Sequence[int]) -> list[int]:
-        """Leave out the one that tells the least for its time, the floors kept if possible."""
+        """Return the design without its least useful unit, floors kept if possible."""
         which = np.array(chosen, dtype=np.int64)
-        without = [[other for other in chosen if other != index] for index in chosen]
-        matrices = np.array([self._information.total(rest) for rest in without])
+        without = [[kept_unit for kept_unit in chosen if kept_unit != index] for index in chosen]
+        matrices = np.array([self._information.total(remaining) for remaining in without])
         near = np.array([self._units.near(index)[which] for index in chosen])
         stay_s = self._units.stay_s[which]
-        # One that is left alone has no neighbour, and no way.
+        # A single remaining unit has no neighbour, and no travel.
         near[~np.isfinite(near)] = np.inf if len(chosen) > 2 else 0.0
         spent = [
             np.sum(np.min(np.delete(np.delete(near, i, 0), i, 1), axis=0))
@@ -330,11 +345,11 @@ class _Search:
         ]
         times = np.array(spent) + np.sum(stay_s) - stay_s
         cost = np.log(self._criteria(matrices)) + URGENCY * np.log(times)
-        kept = np.array([self._floors.hold(self._poses(rest)) for rest in without])
-        return without[int(np.argmin(np.where(kept | ~kept.any(), cost, np.inf)))]
+        has_floors = np.array([self._floors.hold(self._poses(remaining)) for remaining in without])
+        return without[int(np.argmin(np.where(has_floors | ~has_floors.any(), cost, np.inf)))]
 
     def spent(self, chosen: Sequence[int]) -> float:
-        """Return about how long the robot takes, s: each is reached from the nearest other one."""
+        """Return the robot time of units, each reached from its nearest neighbour, s."""
         which = np.array(chosen, dtype=np.int64)
         near = np.min([self._units.near(index)[which] for index in chosen], axis=0)
         ways = float(np.sum(near)) if len(chosen) > 1 else 0.0

@@ -1,15 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Two causes that explain what was measured nearly as well: by how much they would differ.
+"""Pairs of causes that explain the measurements nearly equally well, and their separation.
 
-Of a cause A of a stated size and a look-alike B, what counts is how well the size of A is
-determined while B has any size, and so have offsets, registrations and markers: the
-non-centrality of the test between the two (T-optimality; Atkinson and Fedorov 1975,
-doi:10.1093/biomet/62.1.57), which for models that are linear in their sizes is c-optimality of the
-size of A in the joint model. With the amplitude s of A (1 as stated), 1 / std(s) is by how many
-standard deviations the two differ.
+For a cause A of a stated size and a look-alike B, the separation is how well the size of A is
+determined while the size of B, offsets, registrations and markers are free: the non-centrality of
+the test between the two (T-optimality; Atkinson and Fedorov 1975, doi:10.1093/biomet/62.1.57),
+which for models that are linear in their sizes is c-optimality of the size of A in the joint
+model. With the amplitude s of A (1 as stated), the two differ by 1 / std(s) standard deviations.
 
-Which of the two is true is not known, so both are asked: A of the size that was found against B,
-and B of the size with which it imitates that A best in what was measured against A.
+Either of the two may be true, so both separations are computed: of A with the size that was found
+from B, and of B, with the size that imitates that A best in the measurements, from A.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ import numpy as np
 from remaster_ros.discovery.effects.base import LARGEST_M, Cell
 from remaster_ros.discovery.effects.context import Context
 from remaster_ros.discovery.effects.registry import EFFECTS
-from remaster_ros.planning.design_information import DesignInformation, FurtherColumns
+from remaster_ros.planning.design_information import DesignInformation, ExtraColumns
 from remaster_ros.types import FloatArray
 
 if TYPE_CHECKING:
@@ -32,26 +31,25 @@ if TYPE_CHECKING:
 
 AMPLITUDE = 'amplitude'
 FREE_STD = 1e3
-"""Of the prior on an amplitude of about 1: nothing is known beforehand."""
-BY_THE_WAY = ('approach', 'last_move')
-"""Drivers that depend on the configuration before."""
+"""Standard deviation of the flat prior on an amplitude of about 1."""
+APPROACH_DRIVERS = ('approach', 'last_move')
+"""Drivers that depend on the previous configuration."""
 
 
 @dataclass(frozen=True)
 class FoundCause:
-    """A cause as discovery.json has it."""
+    """A cause of a discovery.json with its look-alikes."""
 
-    # What it is; joints 1-based
     name: str
-    joints: tuple[int, ...]
+    joints: tuple[int, ...]  # 1-based
     sizes: Mapping[str, float]  # Parameter -> value, in its unit
-    # Name, joints and, in words, which measurements separate it from each
+    # Name and joints of each look-alike, and a sentence on which measurements separate the two
     look_alikes: tuple[tuple[str, tuple[int, ...], str], ...]
-    driver: str = ''  # What drives it, where its name leaves that open; ''
+    driver: str = ''  # '' if the name implies it
 
     @classmethod
     def of(cls, effect: FoundEffect) -> FoundCause:
-        """Return an effect that was found with the look-alikes that can be separated from it."""
+        """Return a found effect with the look-alikes that measurements can separate from it."""
         return cls(
             effect.name,
             effect.joints,
@@ -67,62 +65,64 @@ class FoundCause:
 
 @dataclass(frozen=True, eq=False)
 class Rivals:
-    """A cause of a stated size, and another of any size."""
+    """A cause of a stated size, and a look-alike of any size."""
 
-    # Cells of the one and their parameters, (m,)
-    found: tuple[Cell, ...]
-    size: FloatArray
-    other: tuple[Cell, ...]  # Cells of the other
+    cause: tuple[Cell, ...]
+    size: FloatArray  # Parameters of the cause, in their units, (m,)
+    look_alike: tuple[Cell, ...]
 
     @property
-    def by_the_way(self) -> bool:
-        """Whether what they differ in depends on the configuration before."""
+    def depends_on_approach(self) -> bool:
+        """Whether the two causes differ by the approach direction."""
         return any(
-            name in cell.driver for cell in (*self.found, *self.other) for name in BY_THE_WAY
+            name in cell.driver
+            for cell in (*self.cause, *self.look_alike)
+            for name in APPROACH_DRIVERS
         )
 
     @property
     def nested(self) -> bool:
-        """Whether the other is a part of the one."""
-        own = {name for cell in self.found for name in cell.parameters}
-        return all(name in own for cell in self.other for name in cell.parameters)
+        """Whether all parameters of the look-alike are also parameters of the cause."""
+        names = {name for cell in self.cause for name in cell.parameters}
+        return all(name in names for cell in self.look_alike for name in cell.parameters)
 
-    def columns(self, context: Context) -> FurtherColumns:
-        """Return the amplitude of the one and the parameters of the other."""
+    def columns(self, context: Context) -> ExtraColumns:
+        """Return the amplitude of the cause and the parameters of the look-alike as columns."""
         std = []
-        for cell in self.other:
+        for cell in self.look_alike:
             largest = cell.largest
             shift = cell.columns(context).displacement(context)
             std.append(np.full(cell.size, largest) if largest else LARGEST_M / _rms(shift))
-        names = [name for cell in self.other for name in cell.parameters]
-        return FurtherColumns(
+        names = [name for cell in self.look_alike for name in cell.parameters]
+        return ExtraColumns(
             (AMPLITUDE, *names),
             partial(self._displacement, context),
             np.concatenate(([FREE_STD], *std)),
         )
 
     def _displacement(self, context: Context, nominal: Context) -> FloatArray:
-        one = _shifts(context, self.found) @ self.size
-        return np.concatenate((one[:, :, None], _shifts(context, self.other)), axis=2)
+        """Return the displacement of markers per unit of these columns, m, (n, 3, 1 + m)."""
+        amplitude = _shifts(context, self.cause) @ self.size
+        return np.concatenate((amplitude[:, :, None], _shifts(context, self.look_alike)), axis=2)
 
     def imitation(self, information: DesignInformation, measured: Sequence[int]) -> Rivals:
-        """Return the other way round: the other of the size that imitates the one best.
+        """Return the reversed pair: the look-alike with the size that imitates the cause best.
 
-        ``information``: with `columns`; ``measured``: the configurations on which it does.
+        ``information``: with the `columns` of this pair; ``measured``: configurations for the fit.
         """
         matrix = information.finite(information.total(measured))
         place = information.names.index(AMPLITUDE)
-        rest = np.delete(np.arange(len(matrix)), place)
+        free = np.delete(np.arange(len(matrix)), place)
         fitted = np.zeros(len(matrix))
-        fitted[rest] = np.linalg.solve(matrix[np.ix_(rest, rest)], matrix[rest, place])
+        fitted[free] = np.linalg.solve(matrix[np.ix_(free, free)], matrix[free, place])
         natural = fitted * information.scale / information.scale[place]
-        return Rivals(self.other, natural[place + 1 :], self.found)
+        return Rivals(self.look_alike, natural[place + 1 :], self.cause)
 
 
 def rivals_of(
     context: Context, cause: FoundCause, look_alike: tuple[str, tuple[int, ...]]
 ) -> Rivals | None:
-    """Return a cause and a look-alike; None where this context shows not both of them."""
+    """Return the pair of a cause and a look-alike; None if the context lacks data for one."""
     found = _found_cells(context, cause)
     other = _largest_cell(context, *look_alike)
     if not found or other is None:
@@ -132,29 +132,29 @@ def rivals_of(
 
 
 def _found_cells(context: Context, cause: FoundCause) -> tuple[Cell, ...]:
-    """Return the cells that have the parameters of a cause between them; none without all."""
+    """Return the candidates that have all parameters of a cause between them; () if none."""
     found: list[Cell] = []
-    left = {name for name in cause.sizes if name != 'moment'}
+    missing = {name for name in cause.sizes if name != 'moment'}
     cells = [
         cell
         for cell in _cells(context, cause.name)
-        if {*cell.parameters} <= left and cause.driver in ('', cell.driver)
+        if {*cell.parameters} <= missing and cause.driver in ('', cell.driver)
     ]
     for cell in sorted(cells, key=lambda cell: -cell.size):
-        if {*cell.parameters} <= left:
+        if {*cell.parameters} <= missing:
             found.append(cell)
-            left -= {*cell.parameters}
-    return () if left else tuple(found)
+            missing -= {*cell.parameters}
+    return () if missing else tuple(found)
 
 
 def _largest_cell(context: Context, name: str, joints: tuple[int, ...]) -> Cell | None:
-    """Return the variant of an effect with the most parameters, the most usual of these."""
-    # What has no name is of any kind: its joints alone do not tell which.
+    """Return the variant of an effect with the most parameters; None if there is none."""
     cells = [cell for cell in _cells(context, name) if cell.joints == joints]
     return max(cells, key=lambda cell: (cell.size, -cell.drawn_from), default=None)
 
 
 def _cells(context: Context, name: str) -> list[Cell]:
+    """Return all candidates of a named effect that this context has data for."""
     effect = EFFECTS.get(name)
     if effect is None or name == 'unnamed' or effect.needs(context):
         return []
@@ -162,22 +162,23 @@ def _cells(context: Context, name: str) -> list[Cell]:
 
 
 def _shifts(context: Context, cells: Sequence[Cell]) -> FloatArray:
+    """Return the displacements per unit of the parameters of candidates, m, (n, 3, m)."""
     return np.concatenate([c.columns(context).displacement(context) for c in cells], axis=2)
 
 
 def _rms(shift: FloatArray) -> FloatArray:
-    """Return the root mean square of each column's displacement, (m,)."""
+    """Return the root mean square of the displacement of each column (n, 3, m), (m,); 1 for 0."""
     rms: FloatArray = np.sqrt(np.mean(np.sum(shift**2, axis=1), axis=0))
     return np.where(rms > 0.0, rms, 1.0)
 
 
-def apart(information: DesignInformation, chosen: Sequence[int]) -> float:
-    """Return by how many standard deviations two causes differ with chosen configurations."""
+def separation(information: DesignInformation, chosen: Sequence[int]) -> float:
+    """Return the separation of two causes by chosen configurations, in standard deviations."""
     return 1.0 / float(np.sqrt(variances(information, information.total(chosen)[None])[0]))
 
 
 def variances(information: DesignInformation, matrices: FloatArray) -> FloatArray:
-    """Return the variance of the amplitude with information (n, f, f), (n,)."""
+    """Return the variance of the amplitude for n information matrices (n, f, f), (n,)."""
     place = information.names.index(AMPLITUDE)
     finite = information.finite(matrices)
     unit = np.zeros((len(finite), finite.shape[1], 1))
@@ -187,6 +188,6 @@ def variances(information: DesignInformation, matrices: FloatArray) -> FloatArra
 
 
 def in_words(name: str, joints: Sequence[int]) -> str:
-    """Return a cause in a few words."""
+    """Return a cause as text, such as "backlash of joint 4"."""
     at = f' of joint{"s" * (len(joints) > 1)} {", ".join(map(str, joints))}' if joints else ''
     return f'{name.replace("_", " ")}{at}'

@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Configurations that tell two causes apart, which explain what was measured nearly as well.
+"""Choice of configurations that separate causes from look-alikes, which fit nearly equally well.
 
-Configurations are added to those that were measured or are planned, each the one that adds the
-most to the difference of the two (`rival_causes`), over all pairs and both ways round. What
-depends on the way to a configuration counts as if they are visited in the order of the choice; so
-joints are approached from both sides, by small and by large moves, where that decides. Time and
-temperature are those at which they will be measured, as far as that is known.
+Configurations are added to those measured or planned, each the one that increases the separation
+of the two (`rival_causes`) most, over all pairs in both directions. The configuration before each
+counts as in the order of the choice; so joints are approached from both sides, by small and by
+large moves, if that matters. Time and temperature are those at which the configurations will be
+measured, as far as they are known.
 
-Where all that the ranges allow does not tell two causes apart, nothing is measured for them, and
-what would decide is said in words.
+If no configurations within the ranges separate two causes, none is measured for them, and a
+sentence says what would separate them.
 """
 
 from __future__ import annotations
@@ -32,68 +32,67 @@ from remaster_ros.planning.expected_sensors import (
 from remaster_ros.planning.rival_causes import (
     FoundCause,
     Rivals,
-    apart,
     in_words,
     rivals_of,
+    separation,
     variances,
 )
 from remaster_ros.types import FloatArray, IntArray, Measurements, Priors
 
-MOST_FURTHER = 25
-"""Configurations that may be added."""
+MOST_ADDED = 25
+"""Most configurations that are added to a session."""
 MOST_CANDIDATES = 1500
-"""Configurations that are chosen from at most: about as many for each pose."""
+"""Most candidate configurations, about equally many of each pose."""
 ELBOW_STEPS = np.radians([-60.0, -30.0, 0.0, 30.0, 60.0])
-"""Held joints are tried so far from their values in the cell file, rad; one that slides by as much
-as counts as that."""
+"""Additions to the values of held joints in the cell file, rad; of a prismatic joint in
+`SerialChain.per_radian`."""
 DECIDED = 6.0
-"""Standard deviations between two causes that decide: odds of more than 1,000 to 1 are left of
-them where the true one needs three parameters more, with a reserve for a smaller size."""
+"""Separation at which two causes are decided, in standard deviations: odds of more than 1,000 to 1
+even if the true one has three parameters more, with a reserve for a smaller size."""
 HOPELESS = 2.0
-"""A pair that all candidates together tell apart by less is not measured for."""
+"""Separation by all candidates together below which none is measured for a pair."""
 BREAK_S = 300.0
-"""How long after the last reading the next ones are taken, as long as nobody knows."""
+"""Assumed time from the last reading of a session to the next ones, s."""
 
 
 @dataclass(frozen=True)
-class Separated:
-    """How two causes are told apart."""
+class SeparatedPair:
+    """The separation of a cause from a look-alike."""
 
-    # In words
-    cause: str
-    look_alike: str
-    # Standard deviations between the two, by the plan alone and with what is added: of both ways
-    # round the smaller
+    cause: str  # As text
+    look_alike: str  # As text
+    # Separation in standard deviations by the plan alone and with the additions, the smaller of
+    # both directions
     before: float
     after: float
 
 
 @dataclass(frozen=True)
 class SeparatingDesign:
-    """What to measure."""
+    """Configurations to measure, and the separations that they give."""
 
-    poses: tuple[PlannedPose, ...]  # To add, each with the solutions that were chosen
-    pairs: tuple[Separated, ...]  # What they separate
-    otherwise: tuple[str, ...]  # Sentences on pairs that no choice of configurations separates
+    poses: tuple[PlannedPose, ...]  # To add, each with its chosen solutions
+    pairs: tuple[SeparatedPair, ...]  # Of the pairs that they separate
+    otherwise: tuple[str, ...]  # Sentences on pairs that no configurations separate
     # Pose and solution of each visit, in the order of the choice
     order: tuple[tuple[int, int], ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
 class MeasuredSoFar:
-    """What a session has of its configurations to fit, for causes that time or ways drive."""
+    """Conditions of the configurations of a session, for causes driven by time or moves."""
 
-    from_q: FloatArray  # Where the arm came from to each, rad, (n, k)
-    # (n,); NaN where unknown
+    from_q: FloatArray  # Previous configuration of each, rad, (n, k)
+    # (n,); NaN if unknown
     stamp_s: FloatArray
     temperature_c: FloatArray
-    last_q: FloatArray  # Where the arm stood last, rad, (k,)
+    last_q: FloatArray  # Last configuration of the arm, rad, (k,)
 
 
-def further_scene(scene: PlanningScene) -> PlanningScene:
-    """Return a scene whose poses are also reached with the held joints elsewhere.
+def scene_with_other_elbows(scene: PlanningScene) -> PlanningScene:
+    """Return a scene whose poses are also reached with the held joints at other values.
 
-    Other arms' postures at the same poses separate what the plan's own do not.
+    Other postures of the arm at a pose separate causes that the posture of the plan does not.
     """
     chain = scene.model.chain
     margin = scene.limit_margin_rad * chain.per_radian
@@ -112,17 +111,17 @@ def further_scene(scene: PlanningScene) -> PlanningScene:
 
 
 def measured_so_far(rows: Measurements) -> tuple[tuple[PlannedPose, ...], MeasuredSoFar]:
-    """Return the configurations to fit of a session by pose, and what is known of them."""
-    other = rows.is_validation if rows.is_reference is None else rows.is_reference
-    to_fit = np.flatnonzero(~(rows.is_validation | other))
+    """Return the configurations to fit of a session by pose, and their conditions."""
+    not_fitted = rows.is_validation if rows.is_reference is None else rows.is_reference
+    to_fit = np.flatnonzero(~(rows.is_validation | not_fitted))
     _, first = np.unique(rows.configuration[to_fit], return_index=True)
-    kept = to_fit[first]
-    kept = kept[np.argsort(rows.pose[kept], kind='stable')]
-    numbers = np.unique(rows.pose[kept])
-    poses = tuple(PlannedPose(np.eye(4), rows.q[kept[rows.pose[kept] == n]]) for n in numbers)
+    fitted = to_fit[first]
+    fitted = fitted[np.argsort(rows.pose[fitted], kind='stable')]
+    numbers = np.unique(rows.pose[fitted])
+    poses = tuple(PlannedPose(np.eye(4), rows.q[fitted[rows.pose[fitted] == n]]) for n in numbers)
     last = rows.q[int(np.argmax(rows.stamp_s))]
     return poses, MeasuredSoFar(
-        rows.from_q[kept], rows.stamp_s[kept], rows.temperature_c[kept], last
+        rows.from_q[fitted], rows.stamp_s[fitted], rows.temperature_c[fitted], last
     )
 
 
@@ -136,33 +135,33 @@ def separate(
     causes: Sequence[FoundCause],
     priors: Priors,
     measured: MeasuredSoFar | None = None,
-    most: int = MOST_FURTHER,
+    most: int = MOST_ADDED,
 ) -> SeparatingDesign:
     """Choose configurations that separate causes from their look-alikes.
 
-    ``chain``: the arm; ``planned``: what is measured anyway, or was; ``candidates``: poses that
-    can be added, each with the solutions that can be measured; ``sensors, marker_std_m, priors``:
-    as of `DesignInformation.of`; ``causes``: that were found; ``measured``: of the configurations
-    of `planned`, in their order, where they were measured: without it nothing is known of times
-    and ways; ``most``: configurations that may be added.
+    ``chain``: the arm; ``planned``: poses that were or will be measured anyway; ``candidates``:
+    poses that may be added, with their joint solutions; ``sensors, marker_std_m, priors``: as of
+    `DesignInformation.of`; ``causes``: with their look-alikes; ``measured``: conditions of the
+    configurations of `planned`, in their order; without it times and moves are unknown; ``most``:
+    largest number of added configurations.
     """
     poses = [*planned, *_thinned(candidates)]
     choice = _Choice(chain, poses, len(planned), sensors, marker_std_m, priors, measured, most)
-    otherwise = []
+    not_separable = []
     for cause in causes:
-        for name, joints, words in cause.look_alikes:
+        for name, joints, sentence in cause.look_alikes:
             first, second = in_words(cause.name, cause.joints), in_words(name, joints)
             rivals = rivals_of(choice.context(), cause, (name, joints))
             if rivals is None or not choice.add(first, second, rivals):
-                otherwise.append(f'{first} and {second}: {words}')
-    return choice.design(tuple(otherwise))
+                not_separable.append(f'{first} and {second}: {sentence}')
+    return choice.design(tuple(not_separable))
 
 
 def _thinned(candidates: Sequence[PlannedPose]) -> list[PlannedPose]:
-    """Return the candidates with fewer solutions of each where there are too many."""
+    """Return the candidates with fewer solutions of each pose, `MOST_CANDIDATES` in all."""
     count = sum(len(pose.solutions) for pose in candidates)
     step = max(1, -(-count // MOST_CANDIDATES))
-    # Others of each pose, so that all kinds of solutions remain.
+    # Different solutions of each pose, so that all kinds remain.
     thinned = [
         replace(pose, solutions=pose.solutions[index % step :: step])
         for index, pose in enumerate(candidates)
@@ -172,7 +171,7 @@ def _thinned(candidates: Sequence[PlannedPose]) -> list[PlannedPose]:
 
 @dataclass(eq=False)
 class _Choice:
-    """The pairs, and the configurations to choose from."""
+    """Choice of configurations for pairs of causes."""
 
     chain: SerialChain
     poses: Sequence[PlannedPose]  # Planned ones first, `given` of them
@@ -199,35 +198,36 @@ class _Choice:
             self._from_q[self.done] = self.measured.from_q
 
     def context(self) -> Context:
-        """Return what effects depend on, for an arm that comes from where it was last."""
-        context, known = nominal_context(*self._model, self._rows), self.measured
-        if known is None:
+        """Return the context of effects, for an arm that comes from its last configuration."""
+        context, measured = nominal_context(*self._model, self._rows), self.measured
+        if measured is None:
             return context
         n, row, from_q = len(self.q), self._rows.configuration, self._from_q
-        stamp_s = np.full(n, np.nanmax(known.stamp_s) + BREAK_S)
-        stamp_s[self.done] = known.stamp_s
-        last = known.temperature_c[int(np.nanargmax(known.stamp_s))]
+        stamp_s = np.full(n, np.nanmax(measured.stamp_s) + BREAK_S)
+        stamp_s[self.done] = measured.stamp_s
+        last = measured.temperature_c[int(np.nanargmax(measured.stamp_s))]
         temperature_c = np.full(n, last)
-        temperature_c[self.done] = known.temperature_c
+        temperature_c[self.done] = measured.temperature_c
         rows = replace(
             self._rows, from_q=from_q[row], stamp_s=stamp_s[row], temperature_c=temperature_c[row]
         )
         return replace(context, measurements=rows, timed=True)
 
     def add(self, first: str, second: str, rivals: Rivals) -> bool:
-        """Take a pair; return False where all candidates do not tell the two apart."""
+        """Add a pair; return False if all candidates together do not separate the two."""
         information = self._information(rivals)
         both: tuple[Rivals, ...] = rivals, rivals.imitation(information, self.done)
         every = range(len(self.q))
         if rivals.nested:
-            # The larger one explains whatever the other does: it is tested against that alone.
+            # The cause can imitate any nested look-alike: only this direction is tested.
             both = (rivals,)
-        if min(apart(self._information(one), every) for one in both) < HOPELESS:
+        if min(separation(self._information(pair), every) for pair in both) < HOPELESS:
             return False
         self._pairs.append((first, second, both))
         return True
 
     def _information(self, rivals: Rivals) -> DesignInformation:
+        """Return the information with the columns of a pair, computed once."""
         if rivals not in self._known:
             self._known[rivals] = DesignInformation.of(
                 self.chain,
@@ -235,70 +235,87 @@ class _Choice:
                 self.sensors,
                 self.marker_std_m,
                 self.priors,
-                further=rivals.columns(self.context()),
+                extra=rivals.columns(self.context()),
             )
         return self._known[rivals]
 
     def design(self, otherwise: tuple[str, ...]) -> SeparatingDesign:
-        """Choose."""
-        before = [self._apart(both, self.done) for _, _, both in self._pairs]
-        chosen = self._chosen()
-        kept, order = self._kept(chosen)
-        now = [*self.done, *chosen]
+        """Return the design: chosen configurations, and the separations before and after."""
+        separations = [self._separation(both, self.done) for _, _, both in self._pairs]
+        chosen = self._most_separating()
+        added, order = self._as_poses(chosen)
+        measured_indices = [*self.done, *chosen]
         return SeparatingDesign(
-            kept,
+            added,
             tuple(
-                Separated(first, second, was, self._apart(both, now))
-                for (first, second, both), was in zip(self._pairs, before, strict=True)
+                SeparatedPair(
+                    first, second, separation_before, self._separation(both, measured_indices)
+                )
+                for (first, second, both), separation_before in zip(
+                    self._pairs, separations, strict=True
+                )
             ),
             otherwise,
             order,
         )
 
-    def _apart(self, both: tuple[Rivals, ...], chosen: Sequence[int]) -> float:
-        return min(apart(self._information(one), chosen) for one in both)
+    def _separation(self, both: tuple[Rivals, ...], chosen: Sequence[int]) -> float:
+        """Return the smaller of the separations in both directions."""
+        return min(separation(self._information(pair), chosen) for pair in both)
 
-    def _chosen(self) -> list[int]:
-        """Return the configurations that add the most, one after the other, until decided."""
+    def _most_separating(self) -> list[int]:
+        """Return the most separating configurations, one by one, until all are separated."""
         chosen: list[int] = []
-        left = np.arange(len(self.done), len(self.q))
-        ways = [one for _, _, both in self._pairs for one in both]
-        while len(chosen) < self.most and len(left):
-            now = [*self.done, *chosen]
-            undecided = [one for one in ways if apart(self._information(one), now) < DECIDED]
+        remaining = np.arange(len(self.done), len(self.q))
+        directions = [pair for _, _, both in self._pairs for pair in both]
+        while len(chosen) < self.most and len(remaining):
+            measured_indices = [*self.done, *chosen]
+            undecided = [
+                pair
+                for pair in directions
+                if separation(self._information(pair), measured_indices) < DECIDED
+            ]
             if not undecided:
                 break
-            gain = np.zeros(len(left))
-            for one in undecided:
-                information = self._information(one)
-                before = variances(information, information.total(now)[None])[0]
-                gain += np.log(before / variances(information, information.with_each(now, left)))
-            best = int(left[int(np.argmax(gain))])
+            gain = np.zeros(len(remaining))
+            for pair in undecided:
+                information = self._information(pair)
+                separations = variances(information, information.total(measured_indices)[None])[0]
+                gain += np.log(
+                    separations
+                    / variances(information, information.with_each(measured_indices, remaining))
+                )
+            best = int(remaining[int(np.argmax(gain))])
             chosen.append(best)
-            left = left[left != best]
-            self._go_on(self.q[best], left, ways)
+            remaining = remaining[remaining != best]
+            self._approach_from(self.q[best], remaining, directions)
         return chosen
 
-    def _go_on(self, q: FloatArray, left: IntArray, ways: Sequence[Rivals]) -> None:
-        """Let the arm come to all that is left from these joints, rad, (k,)."""
+    def _approach_from(
+        self, q: FloatArray, remaining: IntArray, directions: Sequence[Rivals]
+    ) -> None:
+        """Set the previous configuration of all remaining ones to q, rad, (k,)."""
         if self.measured is not None:
-            self._from_q[left] = q
-            for one in ways:
-                if one.by_the_way:
-                    del self._known[one]
+            self._from_q[remaining] = q
+            for pair in directions:
+                if pair.depends_on_approach:
+                    del self._known[pair]
 
-    def _kept(
+    def _as_poses(
         self, chosen: Sequence[int]
     ) -> tuple[tuple[PlannedPose, ...], tuple[tuple[int, int], ...]]:
-        """Return the poses of what was chosen, and the order of the visits."""
+        """Return the poses of chosen configurations, and the order of the visits."""
         numbers = list(dict.fromkeys(int(self.number[index]) for index in chosen))
-        mine = [[i for i in chosen if self.number[i] == number] for number in numbers]
+        members = [[i for i in chosen if self.number[i] == number] for number in numbers]
         poses = tuple(
             PlannedPose(self.poses[number].T_R_T, self.q[which])
-            for number, which in zip(numbers, mine, strict=True)
+            for number, which in zip(numbers, members, strict=True)
         )
         order = tuple(
-            (numbers.index(int(self.number[i])), mine[numbers.index(int(self.number[i]))].index(i))
+            (
+                numbers.index(int(self.number[i])),
+                members[numbers.index(int(self.number[i]))].index(i),
+            )
             for i in chosen
         )
         return poses, order

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The order of a collection: which pose is next, and its joint solutions nearest first."""
+"""The order of a collection: the next pose, its joint solutions nearest first, and the paths."""
 
 from __future__ import annotations
 
@@ -25,34 +25,34 @@ REFERENCE = 'reference'
 FITTED = 'optimization'
 HELD_OUT = 'validation'
 FIRST_ROUNDS = 2
-"""The references are measured so often at the beginning: their difference is the noise."""
+"""Rounds of the references at the beginning: the noise is estimated from their difference."""
 
 
 class Route(NamedTuple):
-    """The way to joint solutions of one pose, in the order of the visits."""
+    """The paths to joint solutions of one pose, in the order of the visits."""
 
-    ids: Sequence[int]  # Which of the pose's planned solutions they are
-    # The way to each from the one before (to the first from where the arm stands): configurations
-    # to go through in between, rad, (n, k); n = 0 where the straight way is free
+    ids: Sequence[int]  # Indices into the pose's planned solutions
+    # Waypoints from the previous solution to each (to the first from the arm's configuration),
+    # rad, (n, k); n = 0 if the straight path is free
     paths: Sequence[FloatArray]
-    unreached: Sequence[int]  # The pose's other solutions that no free path leads to
+    unreached: Sequence[int]  # Indices of solutions without a free path
 
 
 @dataclass(frozen=True)
 class PoseVisit:
-    """A pose to visit now."""
+    """A visit to a pose: its number, its joint solutions in order, and the paths to them."""
 
-    # Its number in the session; registration poses have numbers of their own, below zero
+    # Number of the pose in the session; those of registration poses are negative
     pose: int
     split: str  # ``registration``, ``reference``, ``optimization`` or ``validation``
     T_R_T: FloatArray  # The tool's pose in the robot base, (4, 4)
     solutions: FloatArray  # Joint solutions, nearest first, rad, (m, k)
-    index: int  # Which of the poses planned for its split
-    # Which of that pose's planned solutions each of `solutions` is, and the way there: a `Route`
+    index: int  # Index of the pose in the plan of its split
+    # The `Route` to `solutions`
     ids: tuple[int, ...]
     paths: tuple[FloatArray, ...] = ()
     unreached: tuple[int, ...] = ()
-    correction: str = ''  # As of a `PlannedPose`
+    correction: str = ''  # See `PlannedPose`
 
     def __post_init__(self) -> None:
         if not self.paths:
@@ -61,15 +61,15 @@ class PoseVisit:
 
 
 class Tour:
-    """Poses by proximity to where the arm is, those to fit and those held out among each other.
+    """The visits of a collection, one pose after the other, the nearest pose next.
 
-    So what drifts or warms up meanwhile is met by both, and not extrapolated from the one to the
-    other; and a collection that ends early has some of both.
+    Poses of the splits ``optimization`` and ``validation`` are mixed, so that drift and warming
+    affect both alike, and a collection that ends early has some of both.
 
-    A plan of the split ``reference`` is visited again and again: a round of all its poses, twice
-    at the beginning, then before more than `reference_every` other configurations were visited,
-    and at the end. Its poses come in their order, and each is reached from the one before it, so
-    that backlash is the same each time.
+    A plan of the split ``reference`` is visited repeatedly: a round of all its poses, twice at the
+    beginning, then before more than `reference_every` other configurations were visited, and at
+    the end. References are visited in the order of the plan, each from the one before it, so that
+    backlash is the same in every round.
 
     Parameters
     ----------
@@ -78,20 +78,19 @@ class Tour:
     plans
         Split -> its plan.
     in_order
-        Visit the poses as they come, split by split, instead of the nearest first.
+        Visit the poses in the order of the plans, split by split, instead of the nearest next.
     one_solution
         Visit only the nearest solution of each pose.
     model
-        What the arm must not hit on its way; None where that does not matter (an arm that is
-        computed).
+        Obstacles that paths avoid; None for straight paths without checks (a simulated arm).
     reference_every
-        How many configurations lie between two rounds of the references at most; a pose with more
-        solutions than that is not interrupted.
+        Most configurations between two rounds of the references; a pose with more solutions is
+        not interrupted.
     order
-        Split, pose and solution of each visit, in order: a pose may be visited again for others of
-        its solutions. Without it the nearest pose is next, in all its solutions.
+        Split, pose and solution of each visit, in order, in which a pose may occur several times
+        with different solutions. Without it the nearest pose is next, in all its solutions.
     begin_at
-        Number of the first pose: of a tour behind others of its session.
+        Number of the first pose: that of a tour after others of its session.
     """
 
     def __init__(
@@ -111,25 +110,25 @@ class Tour:
         self.reference_every = reference_every
         self.in_order, self.one_solution = in_order, one_solution
         self.plans = dict(plans)
-        once = {split: plan for split, plan in plans.items() if split != REFERENCE}
+        visited_once = {split: plan for split, plan in plans.items() if split != REFERENCE}
         references = plans.get(REFERENCE)
         self.references = len(references.poses) if references is not None else 0
-        # Which reference is next, of how many rounds that are due; and what was visited since.
+        # Index of the next reference, rounds due, and configurations visited since the last round.
         self._reference, self._rounds_due = 0, FIRST_ROUNDS if self.references else 0
-        self._since = self.reference_stops = 0
-        # Of each pose the solutions that were not visited; poses without any are taken out.
-        self._left = {
+        self._since = self.reference_visits = 0
+        # Split -> pose -> its solutions that were not visited; poses without any are removed.
+        self._unvisited = {
             split: {
                 index: list(range(len(pose.solutions))) for index, pose in enumerate(plan.poses)
             }
-            for split, plan in once.items()
+            for split, plan in visited_once.items()
         }
         # A pose keeps its number when it is visited again.
         self._numbers: dict[tuple[str, int], int] = {}
-        self.poses = {split: len(plan.poses) for split, plan in once.items()}
+        self.poses = {split: len(plan.poses) for split, plan in visited_once.items()}
         self.configurations = {
             split: sum(1 if one_solution else len(pose.solutions) for pose in plan.poses)
-            for split, plan in once.items()
+            for split, plan in visited_once.items()
         }
         self.dropped: Counter[str] = Counter()
         self.dropped_solutions: Counter[str] = Counter()
@@ -140,35 +139,36 @@ class Tour:
 
     @property
     def to_fit(self) -> int:
-        """How many configurations to fit it was planned with."""
+        """Number of configurations planned for the fit."""
         return sum(len(pose.solutions) for pose in self.plans.get(FITTED, Plan(())).poses)
 
     @property
-    def judges(self) -> Literal['', 'verify', 'check']:
-        """What its poses are for, where that is not a calibration: they are all held out."""
+    def inspection(self) -> Literal['', 'verify', 'check']:
+        """Inspection that the tour serves, with all its poses held out; '' for a calibration."""
         if FITTED not in self.plans or self.plans[FITTED].poses:
             return ''
         held_out = self.plans.get(HELD_OUT, Plan(())).poses
         return 'verify' if any(pose.correction for pose in held_out) else 'check'
 
     def fork(self) -> Tour:
-        """Return a tour as far as this one, which can go on without it."""
+        """Return a copy of the tour in its present state, which does not change with this one."""
         other = copy(self)
-        other._left, other._numbers = deepcopy(self._left), dict(self._numbers)
+        other._unvisited, other._numbers = deepcopy(self._unvisited), dict(self._numbers)
         return other
 
-    def only_first(self, count: int) -> Tour:
-        """Return a tour of the first poses of each split alone."""
+    def first_poses(self, count: int) -> Tour:
+        """Return a new tour of the first `count` poses of each split."""
         plans = {
             split: replace(plan, poses=plan.poses[:count]) for split, plan in self.plans.items()
         }
-        return self._again(plans, self._model)
+        return self._restarted(plans, self._model)
 
-    def afresh(self) -> Tour:
-        """Return the tour from its beginning, with every way straight."""
-        return self._again(self.plans, None)
+    def restarted_straight(self) -> Tour:
+        """Return a new tour of the same plans, with straight paths that are not checked."""
+        return self._restarted(self.plans, None)
 
-    def _again(self, plans: Mapping[str, Plan], model: CollisionModel | None) -> Tour:
+    def _restarted(self, plans: Mapping[str, Plan], model: CollisionModel | None) -> Tour:
+        """Return a new tour with other plans and model, and the options of this one."""
         return Tour(
             self.chain,
             plans,
@@ -181,93 +181,100 @@ class Tour:
         )
 
     def next(self, q: FloatArray) -> PoseVisit | None:
-        """Return the next stop for an arm at joint positions `q` (rad, (k,)); None at the end."""
+        """Return the next visit for an arm at joint positions q (rad, (k,)); None at the end."""
         proposed = self.propose(q)
-        return None if proposed is None else self.take(proposed)
+        return None if proposed is None else self.accept(proposed)
 
     def propose(self, q: FloatArray) -> PoseVisit | None:
-        """Return what `next` would, and leave the tour as it is: a thread may do this."""
+        """Return the visit that `next` would, without counting it; safe in another thread."""
         if self._rounds_due:
             return self._propose_reference(q)
-        left = [(split, index) for split, indices in self._left.items() for index in indices]
-        if not left:
+        unvisited = [
+            (split, index) for split, indices in self._unvisited.items() for index in indices
+        ]
+        if not unvisited:
             return self._propose_reference(q) if self.references and self._since else None
-        split, index = self._nearest(left, q) if not self.order else self._in_order()[0][:2]
+        split, index = self._nearest(unvisited, q) if not self.order else self._in_order()[0][:2]
         route = self._route(split, index, self._due(split, index), q)
         after = self._since + len(route.ids)
         if self.references and self._since and after > self.reference_every:
             return self._propose_reference(q)
-        return self._stop(split, index, route)
+        return self._visit(split, index, route)
 
-    def _nearest(self, left: Sequence[tuple[str, int]], q: FloatArray) -> tuple[str, int]:
-        """Return which pose is next where no order is given."""
-        here = self.chain.forward(q)[:3, 3]
-        places = [self.plans[split].poses[index].T_R_T[:3, 3] for split, index in left]
-        distances = np.linalg.norm(np.array(places) - here, axis=1)
-        return left[0 if self.in_order else int(np.argmin(distances))]
+    def _nearest(self, unvisited: Sequence[tuple[str, int]], q: FloatArray) -> tuple[str, int]:
+        """Return split and index of the next pose of a tour without a given order."""
+        position = self.chain.forward(q)[:3, 3]
+        places = [self.plans[split].poses[index].T_R_T[:3, 3] for split, index in unvisited]
+        distances = np.linalg.norm(np.array(places) - position, axis=1)
+        return unvisited[0 if self.in_order else int(np.argmin(distances))]
 
     def _in_order(self) -> list[tuple[str, int, int]]:
-        """Return the visits of the given order that are left."""
-        return [v for v in self.order if v[2] in self._left[v[0]].get(v[1], ())]
+        """Return the visits of the given order that are not done."""
+        return [v for v in self.order if v[2] in self._unvisited[v[0]].get(v[1], ())]
 
     def _due(self, split: str, index: int) -> list[int]:
-        """Return the solutions of a pose to visit now: all, or those next to each other."""
+        """Return the solutions of a pose to visit now: all, or those consecutive in the order."""
         if not self.order:
-            return self._left[split][index]
+            return self._unvisited[split][index]
         run = takewhile(lambda visit: visit[:2] == (split, index), self._in_order())
         return [number for _, _, number in run]
 
     @property
     def poses_begun(self) -> int:
-        """How many poses were begun that are no references."""
+        """Number of poses begun, references not counted."""
         return len(self._numbers)
 
-    def ask_round(self) -> None:
-        """Begin a round of the references with the next stop."""
+    def request_reference_round(self) -> None:
+        """Start a round of the references with the next visit."""
         if self.references:
             self._reference, self._rounds_due = 0, max(self._rounds_due, 1)
 
     def _propose_reference(self, q: FloatArray) -> PoseVisit:
+        """Return the visit to the next reference."""
         index = self._reference
-        return self._stop(REFERENCE, index, self._route(REFERENCE, index, [0], q))
+        return self._visit(REFERENCE, index, self._route(REFERENCE, index, [0], q))
 
     def _route_to_reference(self, index: int, q: FloatArray) -> FloatArray | None:
-        """Return what to go through to a reference, by way of the one before it; None for no way.
+        """Return waypoints to a reference, rad, (n, k); None if there is no free path.
 
-        rad, (n, k). Where the one before it cannot be reached the way leads there directly.
+        The path goes by way of the previous reference, or directly if that cannot be reached.
         """
         goals = [pose.solutions[0] for pose in self.plans[REFERENCE].poses]
-        goal, before = goals[index], goals[index - 1]
-        last = free_way(self._model, before, goal, self.chain.velocity_limits, index)
-        if last is not None:
-            if nearest_solution(before[None], q, JointUnits.of(self.chain)) is not None:
-                return last
-            first = free_way(self._model, q, before, self.chain.velocity_limits, index)
-            if first is not None:
-                return np.concatenate((first, before[None], last))
-        return free_way(self._model, q, goal, self.chain.velocity_limits, index)
+        goal, previous = goals[index], goals[index - 1]
+        from_previous = free_waypoints(
+            self._model, previous, goal, self.chain.velocity_limits, index
+        )
+        if from_previous is not None:
+            if nearest_solution(previous[None], q, JointUnits.of(self.chain)) is not None:
+                return from_previous
+            to_previous = free_waypoints(
+                self._model, q, previous, self.chain.velocity_limits, index
+            )
+            if to_previous is not None:
+                return np.concatenate((to_previous, previous[None], from_previous))
+        return free_waypoints(self._model, q, goal, self.chain.velocity_limits, index)
 
-    def take(self, proposed: PoseVisit) -> PoseVisit:
-        """Count a proposed stop visited and return it with its number."""
-        route = proposed.ids, proposed.paths, proposed.unreached
-        return self.go_to(proposed.split, proposed.index, *route)
+    def accept(self, proposed: PoseVisit) -> PoseVisit:
+        """Count a proposed visit as made, and return it with its number."""
+        p = proposed
+        return self.record_visit(p.split, p.index, p.ids, p.paths, p.unreached)
 
-    def reroute(self, stop: PoseVisit, q: FloatArray) -> PoseVisit:
-        """Return a stop with the ways to its solutions, and their order, found anew from `q`."""
-        return self.along(stop, *self._route(stop.split, stop.index, stop.ids, q))
+    def reroute(self, visit: PoseVisit, q: FloatArray) -> PoseVisit:
+        """Return a visit with new paths to its solutions, and their new order, from q."""
+        return self.with_route(visit, *self._route(visit.split, visit.index, visit.ids, q))
 
-    def along(
+    def with_route(
         self,
-        stop: PoseVisit,
+        visit: PoseVisit,
         ids: Sequence[int],
         paths: Sequence[FloatArray] = (),
         unreached: Sequence[int] = (),
     ) -> PoseVisit:
-        """Return a stop at the same pose with another route (see `Route`)."""
-        other = self._stop(stop.split, stop.index, Route(ids, paths, unreached))
-        return replace(other, pose=stop.pose)
+        """Return a visit to the same pose with another route (see `Route`)."""
+        other = self._visit(visit.split, visit.index, Route(ids, paths, unreached))
+        return replace(other, pose=visit.pose)
 
-    def go_to(
+    def record_visit(
         self,
         split: str,
         index: int,
@@ -275,75 +282,79 @@ class Tour:
         paths: Sequence[FloatArray] = (),
         unreached: Sequence[int] = (),
     ) -> PoseVisit:
-        """Return the stop at one planned pose along a route (see `Route`), and count it visited.
+        """Count a visit to a planned pose as made, and return it; `Route` has the arguments.
 
-        A tour that was begun before is taken up by this: the stops so far, in their order.
+        A tour is resumed by calling this for all visits made so far, in their order.
         """
-        stop = self._stop(split, index, Route(ids, paths, unreached))
+        visit = self._visit(split, index, Route(ids, paths, unreached))
         if split == REFERENCE:
             self._begin_reference(index)
         else:
-            self._numbers.setdefault((split, index), stop.pose)
-            done = {*ids, *unreached} if self.order else set(self._left[split][index])
-            left = [number for number in self._left[split].pop(index) if number not in done]
-            if left:
-                self._left[split][index] = left
+            self._numbers.setdefault((split, index), visit.pose)
+            done = {*ids, *unreached} if self.order else set(self._unvisited[split][index])
+            unvisited = [
+                number for number in self._unvisited[split].pop(index) if number not in done
+            ]
+            if unvisited:
+                self._unvisited[split][index] = unvisited
             self._since += len(ids)
         self.visited += 1
-        return stop
+        return visit
 
-    def leave_out(self, split: str, reason: str) -> None:
-        """Visit nothing more of a split: what is left of it counts as dropped for this reason."""
-        left, self._left[split] = self._left[split], {}
-        for index, numbers in left.items():
+    def drop_remaining(self, split: str, reason: str) -> None:
+        """Drop the remaining visits of a split, with the reason."""
+        unvisited, self._unvisited[split] = self._unvisited[split], {}
+        for index, numbers in unvisited.items():
             self.dropped_solutions[reason] += len(numbers)
             self.configurations[split] -= len(numbers)
             if (split, index) not in self._numbers:
                 self.dropped[reason] += 1
                 self.poses[split] -= 1
 
-    def has_left(self, split: str) -> bool:
-        """Whether anything of a split is still to be visited."""
-        return bool(self._left.get(split))
+    def has_unvisited(self, split: str) -> bool:
+        """Whether visits of a split remain."""
+        return bool(self._unvisited.get(split))
 
     def _begin_reference(self, index: int) -> None:
-        """Count a reference visited: the round is over with its last one."""
-        self.reference_stops += 1
+        """Count a visit to a reference; the last one ends the round."""
+        self.reference_visits += 1
         self._rounds_due = max(self._rounds_due, 1)
         self._reference = index + 1
         if self._reference >= self.references:
             self._reference, self._since = 0, 0
             self._rounds_due -= 1
 
-    def _stop(self, split: str, index: int, route: Route) -> PoseVisit:
+    def _visit(self, split: str, index: int, route: Route) -> PoseVisit:
+        """Return the visit to a planned pose along a route."""
         pose = self.plans[split].poses[index]
         number = self.begin_at + self.visited if split != REGISTRATION else -1 - self.visited
         number = self._numbers.get((split, index), number)
         ids, paths, unreached = tuple(route.ids), tuple(route.paths), tuple(route.unreached)
         solutions = pose.solutions[list(ids)]
-        way = ids, paths, unreached
-        return PoseVisit(number, split, pose.T_R_T, solutions, index, *way, pose.correction)
+        return PoseVisit(
+            number, split, pose.T_R_T, solutions, index, ids, paths, unreached, pose.correction
+        )
 
     def _route(self, split: str, index: int, ids: Iterable[int], q: FloatArray) -> Route:
-        """Order these solutions of a pose; see `free_order`."""
+        """Return the route to solutions of a pose, in the order of `free_order`."""
         ids = list(ids)
         if split == REFERENCE:
-            way = self._route_to_reference(index, q) if ids else None
-            return Route((), (), ids) if way is None else Route(ids, [way], ())
+            waypoints = self._route_to_reference(index, q) if ids else None
+            return Route((), (), ids) if waypoints is None else Route(ids, [waypoints], ())
         solutions = self.plans[split].poses[index].solutions[ids]
-        # The same draws whenever this pose is planned: a tour can be repeated.
+        # Seeded by the pose, so that a tour is repeatable.
         rng = np.random.default_rng([index, *split.encode()])
         order, paths = free_order(
             self._model, q, solutions, self.chain.velocity_limits, rng, self.one_solution
         )
-        found = [ids[i] for i in order]
+        reached = [ids[i] for i in order]
         if self.one_solution:
-            # One is visited; where none can be, one is lost.
-            return Route(found, paths, () if found else ids[:1])
-        return Route(found, paths, [number for number in ids if number not in found])
+            # One solution is visited; if none can be, one counts as unreached.
+            return Route(reached, paths, () if reached else ids[:1])
+        return Route(reached, paths, [number for number in ids if number not in reached])
 
     def describe(self) -> str:
-        """Return what was planned and dropped, in a line."""
+        """Return the counts of planned and dropped poses in one line."""
         kept = ', '.join(
             f'{counted(count, f"{split} pose")} with '
             f'{counted(self.configurations[split], "configuration")}'
@@ -360,10 +371,10 @@ class Tour:
 def nearest_solution(
     solutions: FloatArray, q: FloatArray, units: JointUnits, tolerance_rad: float = 0.02
 ) -> int | None:
-    """Return which solution (m, k) the arm stands at, rad; None if no joint-wise match is near.
+    """Return the index of the solution (m, k) at which the arm stands; None if there is none.
 
-    The tolerance is far above what an arm that arrived is off by, and far below what tells two
-    solutions of a pose apart: ten times what the bridge takes for arrived by default.
+    All joints must agree within the tolerance, rad. It is ten times what the bridge accepts as
+    arrived by default, and far below the difference between two solutions of a pose.
     """
     distance = np.max(np.abs(solutions - q) / units.per_radian, axis=1)
     nearest = int(np.argmin(distance))
@@ -378,56 +389,58 @@ def free_order(
     rng: np.random.Generator,
     one: bool = False,
 ) -> tuple[list[int], list[FloatArray]]:
-    """Order joint solutions so that each can be reached from the one before.
+    """Return an order of joint solutions in which each can be reached from the one before.
 
-    The nearest to where the arm stands of those that a free straight way leads to is first, then
-    the next from there, and so on. Where no straight way is free, one around is looked for, to the
-    nearest first; a solution that cannot be reached is tried again from each that could be.
+    The nearest solution with a free straight path is next. If no straight path is free, a path
+    around obstacles is searched, to the nearest solution first; a solution that cannot be reached
+    is tried again from each later one.
 
-    ``model``: what must not be hit; with None every straight way is free; ``q``: where the arm
-    stands, rad, (k,); ``solutions``: rad, (m, k); ``velocity_limits``: rad/s, (k,); ``one``: one
-    solution is enough.
-    Returns order, paths: indices into solutions, without those that could not be reached, and for
-    each the configurations to go through before it, rad, (n, k).
+    ``model``: obstacles; with None every straight path is free; ``q``: start configuration, rad,
+    (k,); ``solutions``: rad, (m, k); ``velocity_limits``: rad/s, (k,); ``one``: stop after one
+    solution.
+    Returns indices into solutions, without unreachable ones, and for each the waypoints before it,
+    rad, (n, k).
     """
-    left = [int(i) for i in order_solutions(solutions, q, velocity_limits)]
+    remaining = [int(i) for i in order_solutions(solutions, q, velocity_limits)]
     straight = np.empty((0, solutions.shape[1]))
     if model is None:
-        left = left[:1] if one else left
-        return left, [straight] * len(left)
+        remaining = remaining[:1] if one else remaining
+        return remaining, [straight] * len(remaining)
     order: list[int] = []
     paths: list[FloatArray] = []
-    here = q
-    while left:
-        way = straight
-        found = next((i for i in left if is_straight_free(model, here, solutions[i])), None)
-        if found is None:
-            for i in left:
-                around = free_path(model, here, solutions[i], rng)
-                if around is not None:
-                    found, way = i, around[1:-1]
+    position = q
+    while remaining:
+        waypoints = straight
+        nearest = next(
+            (i for i in remaining if is_straight_free(model, position, solutions[i])), None
+        )
+        if nearest is None:
+            for i in remaining:
+                detour = free_path(model, position, solutions[i], rng)
+                if detour is not None:
+                    nearest, waypoints = i, detour[1:-1]
                     break
-        if found is None:
+        if nearest is None:
             break
-        order.append(found)
-        paths.append(way)
+        order.append(nearest)
+        paths.append(waypoints)
         if one:
             break
-        left.remove(found)
-        here = solutions[found]
+        remaining.remove(nearest)
+        position = solutions[nearest]
     return order, paths
 
 
-def free_way(
+def free_waypoints(
     model: CollisionModel | None,
     q: FloatArray,
     goal: FloatArray,
     velocity_limits: FloatArray,
     seed: int,
 ) -> FloatArray | None:
-    """Return what to go through from `q` to one configuration, rad, (n, k); None for no way.
+    """Return waypoints of a free path from q to one configuration, rad, (n, k); None if none.
 
-    The same way each time, for the same ends and seed.
+    Repeatable: the same ends and seed give the same path.
     """
     rng = np.random.default_rng([seed, *b'reference'])
     order, paths = free_order(model, q, goal[None], velocity_limits, rng)

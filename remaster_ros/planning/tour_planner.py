@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The tours of a session: for the registration, and for the collection with its references."""
+"""The tours of a session: registration, collection with references, inspections."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from remaster_ros.kinematics.transforms import transform
 from remaster_ros.planning.candidates import Plan, PlannedPose, PlanningScene, order_solutions
 from remaster_ros.planning.planned_design import (
     POOL_CANDIDATES,
-    Designed,
+    DesignResult,
     DesignSettings,
     designed_plans,
     visit_order,
@@ -27,8 +27,8 @@ from remaster_ros.planning.reference_choice import choose_references
 from remaster_ros.planning.rival_causes import FoundCause
 from remaster_ros.planning.separating_design import (
     SeparatingDesign,
-    further_scene,
     measured_so_far,
+    scene_with_other_elbows,
     separate,
 )
 from remaster_ros.planning.tour_order import (
@@ -37,7 +37,7 @@ from remaster_ros.planning.tour_order import (
     REFERENCE,
     REGISTRATION,
     Tour,
-    free_way,
+    free_waypoints,
 )
 from remaster_ros.planning.travel_time import TravelTime
 from remaster_ros.types import FloatArray, Measurements
@@ -49,14 +49,13 @@ def registration_tour(
     markers_T: Sequence[FloatArray],
     model: CollisionModel | None = None,
 ) -> Tour:
-    """Choose poses for a three-point registration: the first three span the largest triangle.
+    """Return the tour of a three-point registration, the best three poses first.
 
-    The others follow in case a sensor cannot see one of them.
+    The first three span the largest triangle; the others follow if a sensor misses one of them.
 
-    ``chain``: the arm; ``plan``: poses that face roughly towards the sensors; ``markers_T``: the
-    markers that are seen, in the tool frame, m, (3,) each; ``model``: what the arm must not hit on
-    its way.
-    Raises InsufficientDataError: if there are fewer than three poses.
+    ``chain``: the arm; ``plan``: poses that face roughly towards the sensors; ``markers_T``:
+    markers in the tool frame, m, (3,) each; ``model``: obstacles.
+    Raises InsufficientDataError if there are fewer than three poses.
     """
     if len(plan.poses) < 3:
         reasons = ', '.join(f'{count} {reason}' for reason, count in plan.dropped.items())
@@ -64,7 +63,7 @@ def registration_tour(
             f'only {len(plan.poses)} of the poses for the registration can be reached '
             f'({reasons}); correct rough_position_m of the sensors or the ranges of poses'
         )
-    # The triangle of the worst-off marker counts: every sensor is registered by its own.
+    # The smallest triangle of a marker counts, since every sensor is registered by its own marker.
     points = np.array(
         [[chain.positions(pose.solutions[0], m) for m in markers_T] for pose in plan.poses]
     )
@@ -74,22 +73,22 @@ def registration_tour(
         for a, b, c in candidates
     ]
     best = candidates[int(np.argmax(areas))]
-    rest = [i for i in range(len(plan.poses)) if i not in best]
-    poses = tuple(plan.poses[i] for i in (*best, *rest))
+    others = [i for i in range(len(plan.poses)) if i not in best]
+    poses = tuple(plan.poses[i] for i in (*best, *others))
     ordered = Plan(poses, plan.dropped, plan.dropped_solutions)
     return Tour(chain, {REGISTRATION: ordered}, in_order=True, one_solution=True, model=model)
 
 
 REGISTRATION_CANDIDATES = 12
-"""Candidate poses for the three-point registration, where nothing else is stated."""
+"""Default number of candidate poses for the three-point registration."""
 MORE_CANDIDATES = 10 * REGISTRATION_CANDIDATES
-"""Further ones where fewer than three of these can be taken."""
+"""Additional candidates if fewer than three of these are usable."""
 MOST_TRIES = 5
-"""So often poses are chosen anew where one has no free way to it."""
+"""Most repetitions of a choice if a pose has no free path to it."""
 VERIFIED_POSES = 10
-"""Of a verification: at 0.1 mm of noise they tell offsets of 0.1 degrees in 97 of 100 cases."""
+"""Poses of a verification: at 0.1 mm of noise they detect 0.1 degrees in 97 % of cases."""
 VERIFIED_CANDIDATES = 6 * VERIFIED_POSES
-"""As of a collection, of which arms reach a half to a sixth."""
+"""Candidates of a verification, of which arms reach a half to a sixth."""
 
 
 class TourPlanner:
@@ -98,30 +97,31 @@ class TourPlanner:
     Parameters
     ----------
     scene
-        The arm, what it can hit, and the sensors.
+        The arm, its obstacles, and the sensors.
     counts
-        Candidate poses of each split, the registration's among them.
+        Number of candidate poses of each split, the registration's among them.
     seed
-        Of the Latin hypercube.
+        Seed of the Latin hypercubes.
     reference_every
-        How many configurations lie between two rounds of the references; 0 for no references.
+        Most configurations between two rounds of the references; 0 for no references.
     design
-        Which of the poses are visited, and in which order; all of them, nearest first, by default.
+        Which poses are visited, and in which order; by default all of them, nearest next.
     travel
-        How long the robot takes; where None it moves with the bridge's defaults.
+        Travel times of the robot; None for the bridge's defaults.
     causes
-        Found before: configurations that separate them from their look-alikes are added.
+        Causes that were found: configurations that separate them from their look-alikes are
+        added.
 
     Attributes
     ----------
     scene, design, travel
         As given.
     model
-        The arm and all that it must not hit.
-    designed
-        What an optimal design has led to; None without one.
-    separated
-        What was added to separate causes; None without causes.
+        The arm with its obstacles.
+    design_result
+        Result of the optimal design; None without one.
+    separating_design
+        Configurations added to separate causes; None without causes.
     """
 
     def __init__(
@@ -139,25 +139,25 @@ class TourPlanner:
         self._chain, self.model = scene.model.chain, scene.model
         self.design = design or DesignSettings()
         self.travel = travel or TravelTime.of(scene.model)
-        self.designed: Designed | None = None
+        self.design_result: DesignResult | None = None
         self._causes = tuple(causes)
-        self.separated: SeparatingDesign | None = None
+        self.separating_design: SeparatingDesign | None = None
 
     @property
     def rough_places(self) -> dict[str, FloatArray]:
-        """T_R_N of each sensor at its rough place, (4, 4)."""
+        """T_R_N of each sensor at its rough position, (4, 4)."""
         return {name: transform(np.eye(3), at) for name, at in self.scene.rough_R.items()}
 
     @property
     def registers(self) -> bool:
-        """Whether the sensors are registered by poses of this planner's."""
+        """Whether this planner plans poses for a registration."""
         return REGISTRATION in self._counts
 
     def registration(self) -> Tour:
-        """Plan poses for the three-point registration, before sensors at their rough places.
+        """Return the tour of the three-point registration, for sensors at their rough positions.
 
-        Where the arm can take too few of the candidates, as one whose limits are narrow, more are
-        drawn.
+        If too few of the candidates are usable, more are drawn. Raises InsufficientDataError as
+        `registration_tour`.
         """
         plan = self._plan(REGISTRATION, self.scene.rough_R)
         if len(plan.poses) < 3:
@@ -172,17 +172,14 @@ class TourPlanner:
         return registration_tour(self._chain, plan, markers, self.model)
 
     @property
-    def left_to_fit(self) -> int:
-        """How many poses to fit the arm can take, before sensors at their rough places."""
+    def usable_to_fit(self) -> int:
+        """Number of usable poses to fit, for sensors at their rough positions."""
         return len(self._plan('optimization', self.scene.rough_R).poses)
 
     def collection(self, T_R_N: Mapping[str, FloatArray]) -> Tour:
-        """Plan the poses to fit and to validate, before sensors with these registrations.
+        """Return the tour of poses to fit and to validate, for sensors with these registrations.
 
-        Raises
-        ------
-        InsufficientDataError
-            No pose is left to fit on.
+        ``T_R_N``: (4, 4) each. Raises InsufficientDataError if no pose is left to fit.
         """
         sensors_R = {name: T[:3, 3] for name, T in T_R_N.items()}
         plans = {
@@ -191,14 +188,14 @@ class TourPlanner:
             if count and split != REGISTRATION
         }
         if not plans['optimization'].poses:
-            nothing = Tour(self._chain, plans).describe()
-            raise InsufficientDataError(f'{nothing}: no pose is left to fit on')
+            counts = Tour(self._chain, plans).describe()
+            raise InsufficientDataError(f'{counts}: no pose is left to fit on')
         if self.design.optimal:
             rng = np.random.default_rng([self._seed, *b'design'])
-            self.designed = designed_plans(
+            self.design_result = designed_plans(
                 self.scene, self.design, plans, sensors_R, self.travel, rng
             )
-            plans = dict(self.designed.plans)
+            plans = dict(self.design_result.plans)
         if self._causes:
             plans['optimization'] = self._separating(plans['optimization'], sensors_R)
         order = []
@@ -210,49 +207,42 @@ class TourPlanner:
         return Tour(self._chain, plans, model=self.model, reference_every=self._every, order=order)
 
     def _separating(self, plan: Plan, sensors_R: Mapping[str, FloatArray]) -> Plan:
-        """Add configurations to a plan that separate the causes."""
+        """Return a plan with configurations added that separate the causes."""
         rng = np.random.default_rng([self._seed, *b'separate'])
-        pool = further_scene(self.scene).plan(POOL_CANDIDATES, sensors_R, rng)
-        self.separated = separate(
+        pool = scene_with_other_elbows(self.scene).plan(POOL_CANDIDATES, sensors_R, rng)
+        self.separating_design = separate(
             self._chain,
             plan.poses,
             pool.poses,
-            self.design.before(sensors_R).sensors,
+            self.design.with_sensors_at(sensors_R).sensors,
             self.design.marker_std_m,
             self._causes,
             self.design.priors,
         )
-        return replace(plan, poses=(*plan.poses, *self.separated.poses))
+        return replace(plan, poses=(*plan.poses, *self.separating_design.poses))
 
-    def further(
+    def separating_tour(
         self,
         T_R_N: Mapping[str, FloatArray],
         causes: Sequence[FoundCause],
         rows: Measurements,
-        before: Tour,
+        previous: Tour,
         most: int,
     ) -> Tour:
-        """Plan what separates causes that were found in a session, to be measured behind it.
+        """Return a tour that separates causes found in a session, to be measured after it.
 
-        Parameters
-        ----------
-        T_R_N
-            Registrations of the sensors, (4, 4).
-        causes
-            With their look-alikes.
-        rows
-            What the session has.
-        before
-            Its last tour, whose references are visited again.
-        most
-            Configurations that may be added.
+        ``T_R_N``: registrations of the sensors, (4, 4); ``causes``: with their look-alikes;
+        ``rows``: the session's measurements; ``previous``: its last tour, whose references are
+        visited again; ``most``: largest number of configurations.
         """
         sensors_R = {name: T[:3, 3] for name, T in T_R_N.items()}
-        rng = np.random.default_rng([self._seed, *b'further', before.begin_at + before.visited])
-        pool = further_scene(self.scene).plan(POOL_CANDIDATES, sensors_R, rng)
+        rng = np.random.default_rng(
+            [self._seed, *b'further', previous.begin_at + previous.visited]
+        )
+        pool = scene_with_other_elbows(self.scene).plan(POOL_CANDIDATES, sensors_R, rng)
         planned, so_far = measured_so_far(rows)
-        design = self.design.before(sensors_R)
-        self.separated = separate(
+        design = self.design.with_sensors_at(sensors_R)
+        self.separating_design = separate(
             self._chain,
             planned,
             pool.poses,
@@ -263,33 +253,29 @@ class TourPlanner:
             so_far,
             most,
         )
-        plans = {FITTED: Plan(self.separated.poses)}
-        if before.references and self.separated.poses:
-            plans[REFERENCE] = before.plans[REFERENCE]
+        plans = {FITTED: Plan(self.separating_design.poses)}
+        if previous.references and self.separating_design.poses:
+            plans[REFERENCE] = previous.plans[REFERENCE]
         return Tour(
             self._chain,
             plans,
             model=self.model,
-            reference_every=before.reference_every if REFERENCE in plans else 0,
-            order=[(FITTED, *visit) for visit in self.separated.order],
-            begin_at=before.begin_at + before.visited,
+            reference_every=previous.reference_every if REFERENCE in plans else 0,
+            order=[(FITTED, *visit) for visit in self.separating_design.order],
+            begin_at=previous.begin_at + previous.visited,
         )
 
     def verification(self) -> Tour:
-        """Plan poses that no collection has, each with the correction off and on.
+        """Return a tour of new poses, each with the correction off and on in random order.
 
-        Which of the two is first is random at each: what drifts is in neither alone. The sensors
-        are taken to be at their rough places; nothing has to be registered.
-
-        Raises
-        ------
-        InsufficientDataError
-            Too few of the candidates can be reached, each from the one before it.
+        The random order keeps drift out of the difference. The sensors are assumed at their rough
+        positions; no registration is needed.
+        Raises InsufficientDataError if too few of the candidates can be reached from one another.
         """
         rng = np.random.default_rng([self._seed, *b'verify'])
         plan = self.scene.plan(VERIFIED_CANDIDATES, self.scene.rough_R, rng)
         poses = [replace(p, solutions=rng.permutation(p.solutions)[:1]) for p in plan.poses]
-        chosen = self._reached(poses)
+        chosen = self._reachable(poses)
         if len(chosen) < VERIFIED_POSES:
             raise InsufficientDataError(
                 f'{len(chosen)} poses can be reached of {VERIFIED_CANDIDATES} candidates, and a '
@@ -306,73 +292,71 @@ class TourPlanner:
         )
 
     def check(self, q: FloatArray) -> Tour:
-        """Plan a visit to each of these configurations, in their order, rad, (n, k).
+        """Return a tour through configurations q, rad, (n, k), in their order.
 
-        Raises
-        ------
-        InputError
-            The arm cannot stand at one of them.
+        Raises InputError if a configuration is in collision or too near to a joint limit.
         """
         margin = self.scene.limit_margin_rad * self._chain.per_radian
-        for number, (one, why) in enumerate(zip(q, self.model.reasons(q, RESERVE_M)), 1):
-            if why or not self._chain.within_limits(one, -margin):
+        for number, (each, why) in enumerate(zip(q, self.model.reasons(q, RESERVE_M)), 1):
+            if why or not self._chain.within_limits(each, -margin):
                 raise InputError(
                     f'configuration {number} of the check: {why or "too near to a joint limit"}; '
                     'choose others (remaster plan --check)'
                 )
-        poses = tuple(PlannedPose(self._chain.forward(one), one[None]) for one in q)
+        poses = tuple(PlannedPose(self._chain.forward(each), each[None]) for each in q)
         plans = {FITTED: Plan(()), HELD_OUT: Plan(poses)}
         return Tour(self._chain, plans, in_order=True, model=self.model)
 
-    def _reached(self, poses: list[PlannedPose]) -> list[PlannedPose]:
-        """Return some of the poses in an order in which each is reached from the one before."""
+    def _reachable(self, poses: list[PlannedPose]) -> list[PlannedPose]:
+        """Return `VERIFIED_POSES` of the poses in an order with a path from each to the next."""
         while True:
             q = np.array([pose.solutions[0] for pose in poses[:VERIFIED_POSES]])
-            chosen = [poses[i] for i in self._in_turn(q, list(range(len(q))))]
-            lost = self._without_way(chosen)
-            if not lost:
+            chosen = [poses[i] for i in self._nearest_order(q, list(range(len(q))))]
+            unreachable = self._unreachable(chosen)
+            if not unreachable:
                 return chosen
-            poses = [pose for pose in poses if all(pose is not other for other in lost)]
+            poses = [pose for pose in poses if all(pose is not each for each in unreachable)]
 
     def _references(self, plans: Mapping[str, Plan]) -> Plan:
-        """Choose references among the planned configurations, each with a way from the last."""
+        """Return references among planned configurations, with a path from each to the next."""
         poses = [
             PlannedPose(pose.T_R_T, q[None])
             for plan in plans.values()
             for pose in plan.poses
             for q in pose.solutions
         ]
-        seen = {sight.sensor: (sight.marker, sight.marker_T) for sight in self.scene.sights}
+        markers = {sight.sensor: (sight.marker, sight.marker_T) for sight in self.scene.sights}
         chosen: list[PlannedPose] = []
         for _ in range(MOST_TRIES):
             q = np.array([pose.solutions[0] for pose in poses])
-            picked = choose_references(self._chain, q, seen).indices
-            chosen = [poses[i] for i in self._in_turn(q, list(picked))]
-            lost = self._without_way(chosen)
-            if not lost:
+            picked = choose_references(self._chain, q, markers).indices
+            chosen = [poses[i] for i in self._nearest_order(q, list(picked))]
+            unreachable = self._unreachable(chosen)
+            if not unreachable:
                 break
-            poses = [pose for pose in poses if all(pose is not other for other in lost)]
+            poses = [pose for pose in poses if all(pose is not each for each in unreachable)]
         return Plan(tuple(chosen))
 
-    def _in_turn(self, q: FloatArray, left: list[int]) -> list[int]:
-        """Order the indices so that each is the nearest of those left to the one before."""
-        order = left[:1]
-        while rest := [i for i in left if i not in order]:
+    def _nearest_order(self, q: FloatArray, indices: list[int]) -> list[int]:
+        """Return indices into q (n, k) in nearest-neighbour order."""
+        order = indices[:1]
+        while remaining := [i for i in indices if i not in order]:
             limits = self._chain.velocity_limits
-            order.append(rest[int(order_solutions(q[rest], q[order[-1]], limits)[0])])
+            order.append(remaining[int(order_solutions(q[remaining], q[order[-1]], limits)[0])])
         return order
 
-    def _without_way(self, poses: Sequence[PlannedPose]) -> list[PlannedPose]:
-        """Return the references that no free way leads to from the one before."""
+    def _unreachable(self, poses: Sequence[PlannedPose]) -> list[PlannedPose]:
+        """Return the poses without a free path from the one before."""
         limits = self._chain.velocity_limits
         return [
             pose
             for i, pose in enumerate(poses)
-            if free_way(self.model, poses[i - 1].solutions[0], pose.solutions[0], limits, i)
+            if free_waypoints(self.model, poses[i - 1].solutions[0], pose.solutions[0], limits, i)
             is None
         ]
 
     def _plan(self, split: str, sensors_R: Mapping[str, FloatArray]) -> Plan:
-        # Each split has its own draws: the same plan, whatever was planned before a restart.
+        # Seeded by the split: the plan does not depend on what was planned before a restart.
+        """Return the plan of a split from its candidates."""
         rng = np.random.default_rng([self._seed, *split.encode()])
         return self.scene.plan(self._counts[split], sensors_R, rng)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How long an arm takes from one configuration to another, and for a whole tour.
+"""Travel time of an arm between configurations, and of a whole tour.
 
-The lines are those of `motion.trajectory`, at the speeds of the motion gate; here the same is
-computed for many pairs at a time.
+The straight lines are those of `motion.trajectory`, at the speeds of the motion gate; here they
+are computed for many pairs of configurations at a time.
 """
 
 from __future__ import annotations
@@ -18,20 +18,20 @@ from remaster_ros.motion.trajectory import HEADROOM, RAMP_S, STOPPABLE, Trajecto
 from remaster_ros.types import FloatArray
 
 SPEED_SHARE = 0.3
-"""Where nothing else is stated the arm moves and measures as bridge and recorder do by default."""
+"""Defaults of bridge and recorder, used unless stated otherwise."""
 SETTLE_S = 3.0
 DWELL_S = 0.5
 SAMPLES = 5
-"""Where on a line the speed of the fastest point is looked at."""
+"""Number of points of a line at which the speed of the fastest point is computed."""
 
 
 @dataclass(frozen=True, eq=False)
 class TravelTime:
-    """Times of motion and of measuring."""
+    """Model of the time that motion and measuring take."""
 
     limits: MotionLimits  # Speeds and accelerations of the bridge
     speeds: PointSpeeds  # Of the fastest point of arm and tool
-    # How long the arm stands still before a reading, and the reading takes, s
+    # Time that the arm stands still before a reading, and time of the reading, s
     settle_s: float = SETTLE_S
     dwell_s: float = DWELL_S
 
@@ -45,7 +45,7 @@ class TravelTime:
         settle_s: float = SETTLE_S,
         dwell_s: float = DWELL_S,
     ) -> TravelTime:
-        """Return the times of an arm.
+        """Return the model of an arm.
 
         Parameters
         ----------
@@ -56,7 +56,7 @@ class TravelTime:
         tool_speed
             Largest speed of the fastest point of arm and tool, m/s; infinite for none.
         acceleration
-            As of `MotionLimits.of`.
+            Acceleration limits, as of `MotionLimits.of`.
         settle_s, dwell_s
             See the attributes.
         """
@@ -68,16 +68,13 @@ class TravelTime:
 
     @property
     def measuring_s(self) -> float:
-        """Time at a configuration, s."""
+        """Time that one configuration takes besides motion: settling and dwell, s."""
         return self.settle_s + self.dwell_s
 
     def straight(self, start: FloatArray, ends: FloatArray) -> FloatArray:
-        """Return the time of the straight line from one configuration to each of n others, s.
+        """Return the times of the straight lines from one configuration to n others, s, (n,).
 
-        Parameters
-        ----------
-        start, ends
-            rad, (k,) and (n, k).
+        ``start``: rad, (k,); ``ends``: rad, (n, k).
         """
         way = ends - start
         size = np.maximum(np.abs(way), 1e-12)
@@ -92,11 +89,11 @@ class TravelTime:
         return 1.0 / np.minimum(HEADROOM * rate, 1.0 / RAMP_S) + RAMP_S
 
     def between(self, q: FloatArray) -> FloatArray:
-        """Return the times of the straight lines from each to each, s, (n, n), q is (n, k)."""
+        """Return the times of the straight lines between configurations q (n, k), s, (n, n)."""
         return np.array([self.straight(start, q) for start in q])
 
     def along(self, points: FloatArray) -> float:
-        """Return the time along a polyline (n + 1, k), with the rests between its lines, s."""
+        """Return the time along a polyline (n + 1, k), with the stops at its corners, s."""
         return self.trajectory(points)[0].duration_s
 
     def trajectory(self, points: FloatArray) -> tuple[Trajectory, float]:

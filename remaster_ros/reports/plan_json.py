@@ -29,7 +29,7 @@ def plan_to_dict(plan: CollectionPlan) -> dict[str, Any]:
     3-D error of the predicted markers.
     """
     visits = Counter(visit.split for visit in plan.visits)
-    design = plan.designed
+    design = plan.design_result
     return {
         'configurations': len(plan.visits),
         'poses': sum(count for split, count in plan.poses.items() if split != REFERENCE),
@@ -51,7 +51,11 @@ def plan_to_dict(plan: CollectionPlan) -> dict[str, Any]:
             'tool_share': design.goal.tool_share,
             'reached': plan.goal_reached,
         },
-        **({} if plan.separated is None else {'separate': _separated(plan.separated)}),
+        **(
+            {}
+            if plan.separating_design is None
+            else {'separate': _separated(plan.separating_design)}
+        ),
     }
 
 
@@ -101,8 +105,8 @@ def plan_text(plan: CollectionPlan, settings: DesignSettings) -> str:
         f'fastest point at {plan.max_tool_speed_m_s:.2f} m/s',
     ]
     lines += _expected_lines(plan.tour.chain, plan.joint_std, plan.joint_rms, plan.tool_rms)
-    if plan.separated is not None:
-        lines += _separated_text(plan.separated)
+    if plan.separating_design is not None:
+        lines += _separated_text(plan.separating_design)
     if missed := missed_goal(plan):
         lines.append(missed)
     return '\n'.join(lines)
@@ -188,12 +192,12 @@ def minutes_text(seconds: float) -> str:
 
 def missed_goal(plan: CollectionPlan) -> str:
     """Return which goal an optimal design does not reach, and what would help; '' for none."""
-    if plan.designed is None or plan.goal_reached:
+    if plan.design_result is None or plan.goal_reached:
         return ''
     return (
-        f'not reached: {plan.designed.goal.describe()}, with the poses that a search for causes '
-        'needs; wider ranges under poses, further values in held_values_deg or a longer lever of '
-        'the marker would help'
+        f'not reached: {plan.design_result.goal.describe()}, with the poses that a search for '
+        'causes needs; wider ranges under poses, further values in held_values_deg or a longer '
+        'lever of the marker would help'
     )
 
 

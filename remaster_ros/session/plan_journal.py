@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a planner keeps on the disk: its plan, and which of its poses was next.
+"""The plan of a collection on the disk: its tours, and the pose that is next.
 
 ``plan.jsonl`` in the session folder is a journal (see `journal`). The plan is in it before the
-arm first moves, each pose before the arm is sent there; a planner that is started again takes up
-the tour where it was. What became of a configuration is in the session's journal alone.
+arm first moves, each pose before the arm is sent there; a planner that is started again resumes
+the tour. Outcomes of configurations are in the session's journal alone.
 """
 
 from __future__ import annotations
@@ -31,27 +31,27 @@ from remaster_ros.session.session_journal import read_outcomes
 from remaster_ros.session.yaml_records import from_plain, to_plain
 
 
-class PlanBegun(msgspec.Struct, tag_field='kind', tag='plan'):
-    """The first record: the plan's name, and what it depends on."""
+class PlanHeader(msgspec.Struct, tag_field='kind', tag='plan'):
+    """First record: the identifier of the plan, and the settings that it depends on."""
 
     id: str
     settings: dict[str, Any]
 
 
-class TourNoted(msgspec.Struct, tag_field='kind', tag='tour'):
+class TourRecord(msgspec.Struct, tag_field='kind', tag='tour'):
     """A tour, as planned."""
 
     plans: dict[str, Plan]
     in_order: bool
     one_solution: bool
     reference_every: int
-    # Empty where the nearest pose is next.
+    # Empty if the nearest pose is next.
     order: tuple[tuple[str, int, int], ...]
-    # Above 0 behind another tour of the collection.
+    # Above 0 for a tour after another one of the collection.
     begin_at: int
 
     def tour(self, chain: SerialChain, model: CollisionModel | None = None) -> Tour:
-        """Return the tour of this arm, at its beginning; the model is what it must not hit."""
+        """Return the tour of this arm at its beginning; ``model``: obstacles."""
         return Tour(
             chain,
             self.plans,
@@ -64,48 +64,54 @@ class TourNoted(msgspec.Struct, tag_field='kind', tag='tour'):
         )
 
 
-class StopNoted(msgspec.Struct, tag_field='kind', tag='stop'):
-    """The next pose: which of its split, its solutions, and those that nothing leads to."""
+class VisitRecord(msgspec.Struct, tag_field='kind', tag='stop'):
+    """The next visit: a pose and its solutions, and those without a free path."""
 
     split: str
     index: int
     ids: tuple[int, ...]
     unreached: tuple[int, ...] = ()
 
-    def take(self, tour: Tour) -> PoseVisit:
-        """Go there in a tour; the ways to it are found anew from where the arm stands."""
-        return tour.go_to(self.split, self.index, self.ids, (), self.unreached)
+    def replay(self, tour: Tour) -> PoseVisit:
+        """Count the visit in a tour, and return it without paths, which are planned again."""
+        return tour.record_visit(self.split, self.index, self.ids, (), self.unreached)
 
 
-class RoundNoted(msgspec.Struct, tag_field='kind', tag='round'):
-    """A round of the references is next, by request."""
+class RoundRecord(msgspec.Struct, tag_field='kind', tag='round'):
+    """A round of the references was requested."""
 
 
-class EnoughNoted(msgspec.Struct, tag_field='kind', tag='enough'):
-    """Enough is known: no more poses to fit are visited."""
+class EnoughRecord(msgspec.Struct, tag_field='kind', tag='enough'):
+    """The precision goal is reached: no more poses to fit are visited."""
 
 
-class ExpectationNoted(msgspec.Struct, tag_field='kind', tag='expected'):
-    """What a fit of the tour before it is expected to state, at the noise of the cell file."""
+class ExpectationRecord(msgspec.Struct, tag_field='kind', tag='expected'):
+    """Expected precision of a fit of the tour before it, at the noise of the cell file."""
 
     joint_std_rad: dict[str, float | None]
     tool_rms_m: float
 
 
-class StateNoted(msgspec.Struct, tag_field='kind', tag='state'):
-    """The planner's state, and the token of the run that it is in."""
+class StateRecord(msgspec.Struct, tag_field='kind', tag='state'):
+    """State of the planner, and the token of its run."""
 
     state: str
     run: str = ''
 
 
 PlanRecord = (
-    PlanBegun | TourNoted | StopNoted | RoundNoted | EnoughNoted | ExpectationNoted | StateNoted
+    PlanHeader
+    | TourRecord
+    | VisitRecord
+    | RoundRecord
+    | EnoughRecord
+    | ExpectationRecord
+    | StateRecord
 )
 
 
 def plan_page_path(session: Path) -> Path:
-    """Return where the plan of a session is drawn for a person: beside its folder."""
+    """Return the path of the page that shows a session's plan, beside the session folder."""
     return session.absolute().with_name(f'{session.absolute().name}.plan.html')
 
 
@@ -115,70 +121,61 @@ Configuration = tuple[str, int, int]
 
 @dataclass
 class RecordedPlan:
-    """A planned collection and its end.
+    """A planned collection and its outcomes.
 
     Attributes
     ----------
     tour
         As planned.
     page
-        Where the planner draws it where a person has to confirm it (`confirm: true`).
+        Path of the plan's page, which exists if a person has to confirm it (`confirm: true`).
     expected
-        What its fit was expected to state; None where that was not known.
+        Expected precision of the fit; None if unknown.
     outcomes
-        What became of each configuration that was begun, references not among them: ``recorded``,
-        ``partial``, ``rejected``, ``failed`` or ``no_free_path``.
+        Outcome of each configuration begun, references excepted: ``recorded``, ``partial``,
+        ``rejected``, ``failed`` or ``no_free_path``.
     references
-        How many visits to references came to which end.
+        Number of visits to references by outcome.
     enough
-        Whether poses to fit were left out because enough was known.
+        Whether poses to fit were dropped because the precision goal was reached.
     """
 
     tour: Tour
     page: Path
-    expected: ExpectationNoted | None = None
+    expected: ExpectationRecord | None = None
     outcomes: dict[Configuration, str] = field(default_factory=dict)
     references: Counter[str] = field(default_factory=Counter)
     enough: bool = False
 
 
 def read_plan(folder: Path, chain: SerialChain) -> RecordedPlan | None:
-    """Return the plan of a session's collection; None where it has none.
+    """Return the plan of a session's collection; None if it has none.
 
-    Parameters
-    ----------
-    folder
-        The session's.
-    chain
-        Its arm.
-
-    Raises
-    ------
-    InputError
-        plan.jsonl or the session's journal is damaged, or it is no plan of this version.
+    ``folder``: the session's; ``chain``: its arm. Raises InputError if plan.jsonl or the session's
+    journal is damaged, or the plan is of another version.
     """
     path = folder / PLAN
     if not path.exists():
         return None
     plan: RecordedPlan | None = None
     try:
-        found = read_outcomes(folder)
+        outcomes = read_outcomes(folder)
         for record in from_plain(read_journal(path).records, list[PlanRecord]):
             match record:
-                case TourNoted():
+                case TourRecord():
                     collection = REGISTRATION not in record.plans
                     tour = record.tour(chain)
                     plan = RecordedPlan(tour, plan_page_path(folder)) if collection else None
-                case StopNoted() if plan is not None:
-                    _, ends = found.poses.get(record.take(plan.tour).pose, ('', {}))
+                case VisitRecord() if plan is not None:
+                    _, ends = outcomes.poses.get(record.replay(plan.tour).pose, ('', {}))
                     if record.split == REFERENCE:
                         plan.references.update(ends.values())
                     else:
                         place = record.split, record.index
                         plan.outcomes |= {(*place, number): end for number, end in ends.items()}
-                case ExpectationNoted() if plan is not None:
+                case ExpectationRecord() if plan is not None:
                     plan.expected = record
-                case EnoughNoted() if plan is not None:
+                case EnoughRecord() if plan is not None:
                     plan.enough = True
         return plan if plan is not None and plan.tour.plans[FITTED].poses else None
     except (KeyError, IndexError, TypeError, ValueError) as error:
@@ -189,50 +186,50 @@ def read_plan(folder: Path, chain: SerialChain) -> RecordedPlan | None:
 
 
 ENOUGH = 'enough is known'
-"""Why planned poses are not visited once the wanted precision is reached."""
+"""Reason for dropped poses once the precision goal is reached."""
 
 
 class PlanJournal:
-    """Keep the state of a planner; when a method returns, what it noted is on the disk.
+    """Journal of a planner; a method returns when its record is on the disk.
 
-    Unless the disk is full, which is in `trouble`: then it is kept until `write_out` succeeds.
+    If the disk is full (`trouble`), records are kept in memory until `write_out` succeeds.
 
     Parameters
     ----------
     folder
-        The session's; the file is made with the first record.
+        The session's; the file is created with the first record.
     settings
-        What the plan depends on, plain data by name.
+        Settings that the plan depends on, plain data by name.
     chain
         The arm.
     model
-        What the arm must not hit on its way; handed on to the tour.
+        Obstacles, for the tour.
 
     Attributes
     ----------
     id
-        Identifies this plan; '' before there is one.
+        Identifier of the plan; '' before there is one.
     tour
-        The tour under way, at the stop where it was; None where there is none.
-    stop
-        The last stop; None before the first.
+        The tour under way, in its present state; None before there is one.
+    visit
+        The last visit; None before the first.
     tours
-        Those of the collection so far, with the one under way; or that for the registration.
+        All tours of the collection so far; or that of the registration.
     decided
-        What the session's journal had of this plan at the beginning.
+        Outcomes of this plan that the session's journal had at the beginning.
     state
         The planner's last state, '' before the first.
     run
-        The token of the run that it was in, '' where none was under way.
+        Token of the run under way, '' for none.
     lost
-        What a crash has cut off, in a line; '' where nothing was.
+        What a crash has cut off, in one line; '' for nothing.
     trouble
-        Why something is not on the disk yet; '' where everything is.
+        Why a record is not on the disk yet; '' if all are.
 
     Raises
     ------
     InputError
-        Another planner is running there, the plan was made with other settings, or the file is
+        If another planner uses the file, the plan was made with other settings, or the file is
         damaged.
     """
 
@@ -249,7 +246,7 @@ class PlanJournal:
         self.id = self.state = self.run = self.lost = self.trouble = ''
         self._unwritten: deque[Record] = deque()
         self.tour: Tour | None = None
-        self.stop: PoseVisit | None = None
+        self.visit: PoseVisit | None = None
         self.tours: list[Tour] = []
         self.decided = Decided()
         if self.path.exists():
@@ -259,15 +256,16 @@ class PlanJournal:
                 self.decided = outcomes.decided()
 
     def _open(self) -> Journal:
+        """Open the file, and restore the state from its records."""
         self._journal = Journal(self.path)
         self.lost = self._journal.lost
         if not self._journal.records:
             self.id = uuid.uuid4().hex[:12]
-            self._journal.append(to_plain(PlanBegun(self.id, self._settings)))
+            self._journal.append(to_plain(PlanHeader(self.id, self._settings)))
             return self._journal
         try:
             begun, *records = from_plain(self._journal.records, list[PlanRecord])
-            if not isinstance(begun, PlanBegun):
+            if not isinstance(begun, PlanHeader):
                 raise ValueError('it does not begin with a plan')
             self.id = begun.id
             self._refuse_other_settings(begun.settings)
@@ -284,6 +282,7 @@ class PlanJournal:
         return self._journal
 
     def _refuse_other_settings(self, made: Mapping[str, Any]) -> None:
+        """Raise InputError if the plan was made with other settings."""
         other = [name for name, value in self._settings.items() if made.get(name) != value]
         if other:
             name = other[0]
@@ -294,22 +293,23 @@ class PlanJournal:
             )
 
     def _follow(self, record: PlanRecord) -> None:
-        """Go on by a record, new or of a planner before this one: both lead to the same state."""
+        """Update the state by a record, of this planner or of one before it."""
         tour = self.tour
         match record:
-            case TourNoted():
-                self.tour, self.stop = record.tour(self._chain, self._model), None
-                self.tours = [*(one for one in self.tours if FITTED in one.plans), self.tour]
-            case StopNoted() if tour is not None:
-                self.stop = record.take(tour)
-            case RoundNoted() if tour is not None:
-                tour.ask_round()
-            case EnoughNoted() if tour is not None:
-                tour.leave_out(FITTED, ENOUGH)
-            case StateNoted():
+            case TourRecord():
+                self.tour, self.visit = record.tour(self._chain, self._model), None
+                self.tours = [*(each for each in self.tours if FITTED in each.plans), self.tour]
+            case VisitRecord() if tour is not None:
+                self.visit = record.replay(tour)
+            case RoundRecord() if tour is not None:
+                tour.request_reference_round()
+            case EnoughRecord() if tour is not None:
+                tour.drop_remaining(FITTED, ENOUGH)
+            case StateRecord():
                 self.state, self.run = record.state, record.run
 
     def _note(self, record: PlanRecord) -> None:
+        """Write a record, and update the state by it."""
         if self._journal is None:
             make_folder(self.path.parent)
             self._journal = self._open()
@@ -318,7 +318,7 @@ class PlanJournal:
         self._follow(record)
 
     def write_out(self) -> None:
-        """Write what the disk has not taken yet; `trouble` has why it still does not."""
+        """Write the records that the disk has not taken yet; sets `trouble`."""
         try:
             while self._unwritten and self._journal is not None:
                 self._journal.append(self._unwritten[0])
@@ -328,35 +328,35 @@ class PlanJournal:
             self.trouble = str(error)
 
     def begin(self, tour: Tour, expected: Expected | None = None) -> None:
-        """Note a new tour, and what its fit is expected to state where that is known."""
+        """Begin a tour; ``expected``: expected precision of its fit."""
         how = tour.in_order, tour.one_solution, tour.reference_every, tour.order, tour.begin_at
-        self._note(TourNoted(tour.plans, *how))
+        self._note(TourRecord(tour.plans, *how))
         if expected is not None:
-            self._note(ExpectationNoted(dict(expected.joint_std), expected.tool_rms))
-        # As it was set before there was a file to keep it in.
-        self._note(StateNoted(self.state, self.run))
+            self._note(ExpectationRecord(dict(expected.joint_std), expected.tool_rms))
+        # The state was set before there was a file for it.
+        self._note(StateRecord(self.state, self.run))
 
-    def ask_round(self) -> None:
-        """Visit the references next, since a person has changed something; note that."""
+    def request_reference_round(self) -> None:
+        """Request a round of the references, since a person has changed the setup."""
         if self.tour is not None and self.tour.references:
-            self._note(RoundNoted())
+            self._note(RoundRecord())
 
-    def leave_rest(self) -> None:
-        """Visit no more poses to fit, since enough is known; note that."""
+    def drop_remaining_fits(self) -> None:
+        """Drop the remaining poses to fit, since the precision goal is reached."""
         if self.tour is not None:
-            self._note(EnoughNoted())
+            self._note(EnoughRecord())
 
-    def open_stop(self, stop: PoseVisit) -> None:
-        """Go to a stop that the tour proposes, and note it, before the arm is sent there."""
-        self._note(StopNoted(stop.split, stop.index, stop.ids, stop.unreached))
+    def open_visit(self, visit: PoseVisit) -> None:
+        """Begin a visit that the tour proposes, before the arm is sent there."""
+        self._note(VisitRecord(visit.split, visit.index, visit.ids, visit.unreached))
 
-    def say_state(self, state: str, run: str = '') -> None:
-        """Note the planner's state and run, once there is a plan."""
+    def record_state(self, state: str, run: str = '') -> None:
+        """Record the planner's state and run, once there is a plan."""
         before, (self.state, self.run) = (self.state, self.run), (state, run)
         if self._journal is not None and before != (state, run):
-            self._note(StateNoted(state, run))
+            self._note(StateRecord(state, run))
 
     def close(self) -> None:
-        """Let others go on with the plan."""
+        """Release the file for other planners."""
         if self._journal is not None:
             self._journal.close()

@@ -11,7 +11,7 @@ from worlds.hidden_pairs import measured_further, pair_session, separating, verd
 from remaster_ros.discovery.decision import Named, decisions
 from remaster_ros.discovery.discover import discover_session
 from remaster_ros.planning.rival_causes import FoundCause
-from remaster_ros.planning.separating_design import MOST_FURTHER
+from remaster_ros.planning.separating_design import MOST_ADDED
 
 pytestmark = pytest.mark.timeout(600)
 
@@ -27,7 +27,7 @@ def test_a_sag_that_looks_like_a_base_that_yields_is_decided():
     assert verdict(before, pair, pair.world, pair.truth) in ('open', 'wrong')
     causes = [FoundCause.of(effect) for effect in before.effects]
     design = separating(pair, causes)
-    assert 0 < len(design.order) <= MOST_FURTHER
+    assert 0 < len(design.order) <= MOST_ADDED
     session, world, truth = measured_further(pair, visits_of(pair, design))
     after = discover_session(session, rng=np.random.default_rng(number))
     assert verdict(after, pair, world, truth) == 'right'

@@ -8,7 +8,7 @@ from rigs.collection_rig import Cell
 from rigs.ros_rig import call, node_arguments
 
 from remaster_ros.collection.events import TourPlanned
-from remaster_ros.planning.separating_design import MOST_FURTHER
+from remaster_ros.planning.separating_design import MOST_ADDED
 from remaster_ros.session.bag import BagReader
 from remaster_ros.session.journal import read_journal
 from remaster_ros.session.reader import read_session
@@ -77,7 +77,7 @@ def test_what_separates_is_measured_behind_the_session_and_decides(start, client
     assert (cell.session / 'observations.csv').read_bytes().startswith(before)
     assert further.exit_status == 'complete'
     added = len(numbers) - count
-    assert 1 < added <= MOST_FURTHER
+    assert 1 < added <= MOST_ADDED
     assert int(cell.said['robot_bridge']['commanded']) >= commanded + added
     # In the order of the choice, with numbers of their own.
     records = read_journal(cell.session / 'plan.jsonl').records

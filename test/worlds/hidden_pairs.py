@@ -25,8 +25,8 @@ from remaster_ros.planning.planned_design import POOL_CANDIDATES
 from remaster_ros.planning.rival_causes import FoundCause
 from remaster_ros.planning.separating_design import (
     SeparatingDesign,
-    further_scene,
     measured_so_far,
+    scene_with_other_elbows,
     separate,
 )
 from remaster_ros.planning.tour_planner import TourPlanner
@@ -191,7 +191,7 @@ def measured_further(
 def separating(pair: PairSession, causes: Sequence[FoundCause]) -> SeparatingDesign:
     """Return what separates causes that were found in a session from their look-alikes."""
     planned_poses, so_far = measured_so_far(pair.session.measurements)
-    pool = further_scene(scene()).plan(POOL_CANDIDATES, scene().rough_R, pair.rng).poses
+    pool = scene_with_other_elbows(scene()).plan(POOL_CANDIDATES, scene().rough_R, pair.rng).poses
     chain = scene().model.chain
     return separate(chain, planned_poses, pool, [BAR], MARKER_STD_M, causes, Priors(), so_far)
 

@@ -2,7 +2,7 @@
 """Measurements after a complete collection, which separate causes from their look-alikes.
 
 /remaster/discover looks for causes; if it leaves look-alikes, the next /remaster/collect measures
-the configurations that tell them apart, at most `MOST_FURTHER` of them in a session.
+the configurations that tell them apart, at most `MOST_ADDED` of them in a session.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from pathlib import Path
 
 from remaster_ros.errors import InputError
 from remaster_ros.planning.rival_causes import FoundCause
-from remaster_ros.planning.separating_design import MOST_FURTHER
+from remaster_ros.planning.separating_design import MOST_ADDED
 from remaster_ros.planning.tour_order import Tour
 from remaster_ros.planning.tour_planner import TourPlanner
 from remaster_ros.session.files import read_limited
@@ -42,7 +42,7 @@ class FurtherMeasuring:
         """
         if state != 'complete':
             return '' if under_way else None, None
-        if self._journal.tour is not None and self._journal.tour.judges:
+        if self._journal.tour is not None and self._journal.tour.inspection:
             return 'it was no calibration; name a new session folder', None
         # Imported when it is needed, as it takes a while.
         from remaster_ros.reports.discovery_json import read_causes
@@ -55,9 +55,9 @@ class FurtherMeasuring:
             causes = read_causes(path, observations_sha256=self._digest())
         except InputError as error:
             return str(error), None
-        left = MOST_FURTHER - self._measured()
+        left = MOST_ADDED - self._measured()
         if left <= 0:
-            return f'{MOST_FURTHER} configurations were measured to separate causes already', None
+            return f'{MOST_ADDED} configurations were measured to separate causes already', None
         return '', partial(self._plan, causes, left)
 
     def _digest(self) -> str:
@@ -74,11 +74,11 @@ class FurtherMeasuring:
         before = self._journal.tour
         assert before is not None
         rows = read_session(self._session).measurements
-        return self._tours.further(T_R_N, causes, rows, before, most)
+        return self._tours.separating_tour(T_R_N, causes, rows, before, most)
 
     def planned(self, tour: Tour) -> str:
         """Return a tour of the collection with what is expected of it, in a line."""
-        designed = self._tours.designed
+        designed = self._tours.design_result
         expected = '' if designed is None else designed.describe()
         if tour.begin_at:
             expected = self.describe()
@@ -86,7 +86,7 @@ class FurtherMeasuring:
 
     def describe(self) -> str:
         """Return what is measured further and what is not, in a line; '' before it is planned."""
-        design = self._tours.separated
+        design = self._tours.separating_design
         if design is None:
             return ''
         words = [

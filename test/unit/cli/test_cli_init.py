@@ -350,7 +350,7 @@ def test_a_scara_is_prepared_and_planned(do, tmp_path):
 
 def test_a_rail_is_planned_with_the_arm_where_the_base_link_says_so(do, tmp_path, monkeypatch):
     # To look for the ways of this one takes minutes, and is for another test.
-    monkeypatch.setattr(init, 'with_free_way', lambda *_: (10, 10))
+    monkeypatch.setattr(init, 'count_with_free_path', lambda *_: (10, 10))
     path = on_rail(tmp_path)
     printed = do(path, '--base-link', 'hall').stdout
     assert 'rail is held at -500 mm, 0 mm, 500 mm' in printed

@@ -199,8 +199,8 @@ def test_what_no_way_leads_to_is_open_until_the_recorder_has_written_it_down(ben
     b = bench()
     b.next()
     tour = b.journal.tour
-    stop = tour.along(tour.propose(Q), (), (), (0, 1))
-    b.journal.open_stop(stop)
+    stop = tour.with_route(tour.propose(Q), (), (), (0, 1))
+    b.journal.open_visit(stop)
     assert b.progress.open_pose.ids == (0, 1)
     for number in (0, 1):
         b.end(stop, number, 'no_free_path')
@@ -362,4 +362,4 @@ def test_poses_to_judge_by_need_no_registration_and_keep_their_state_over_a_rest
         b.visit(stop)
     assert seen == [(i, 'validation', state) for i, state in enumerate(('off', 'on') * 2)]
     assert b.progress.is_complete
-    assert b.journal.tour.judges == 'verify'
+    assert b.journal.tour.inspection == 'verify'

@@ -16,7 +16,7 @@ def test_a_demo_of_few_candidates_takes_as_many_as_leave_enough_poses(asked):
     taken = []
     for seed in range(20):
         taken.append(enough_candidates(cell, seed, asked))
-        assert TourPlanner(scene, {'optimization': taken[-1]}, seed).left_to_fit >= TO_FIT
+        assert TourPlanner(scene, {'optimization': taken[-1]}, seed).usable_to_fit >= TO_FIT
     assert max(taken) > asked
     assert np.median(taken) < asked + 6
 

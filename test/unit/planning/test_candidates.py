@@ -19,7 +19,7 @@ from remaster_ros.planning.candidates import (
     candidate_poses,
     order_solutions,
     plan_poses,
-    taken_poses,
+    reachable_poses,
 )
 
 ROBOTS = Path(__file__).parents[3] / 'config' / 'robots'
@@ -75,7 +75,7 @@ def test_poses_of_an_arm_with_few_joints_are_its_own_face_the_sensor_and_differ(
     chain = SerialChain.from_urdf(description.urdf, 'base_link', 'link_5')
     ranges, rng = PoseRanges(radius_m=(0.2, 0.55), height_m=(0.1, 0.8)), np.random.default_rng(6)
     drawn = candidate_poses(30, ranges, SENSOR, rng)
-    T = taken_poses(chain, drawn, ranges, SENSOR, np.radians(30.0), rng)
+    T = reachable_poses(chain, drawn, ranges, SENSOR, np.radians(30.0), rng)
     ik = InverseKinematics(chain)
     assert all(len(ik.usable(q)) for q in ik.solutions_of_each(T))
     assert not any(len(q) for q in ik.solutions_of_each(drawn))
@@ -87,7 +87,7 @@ def test_poses_of_an_arm_with_few_joints_are_its_own_face_the_sensor_and_differ(
     # Where it takes none, the drawn pose stays, out of reach.
     far = PoseRanges(radius_m=(5.0, 6.0))
     drawn = candidate_poses(5, far, SENSOR, rng)
-    kept = taken_poses(chain, drawn, far, SENSOR, np.radians(30.0), rng)
+    kept = reachable_poses(chain, drawn, far, SENSOR, np.radians(30.0), rng)
     np.testing.assert_array_equal(kept, drawn)
 
 

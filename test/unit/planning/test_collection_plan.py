@@ -60,7 +60,7 @@ LATIN = 'latin_hypercube'
 def test_a_cell_has_by_default_designed_poses_each_in_all_its_free_solutions_nearest_first():
     _, whole = latin()
     scene, plan = planned(CellPoses())
-    assert plan.designed.reached
+    assert plan.design_result.reached
     assert plan.joint_rms <= max(whole.joint_rms, ENOUGH_RAD)
     assert plan.robot_time_s < whole.robot_time_s
     fitted, held_out = of(plan, 'optimization'), of(plan, 'validation')
@@ -179,11 +179,11 @@ def test_the_fastest_order_of_whole_poses_visits_each_once():
 
 def test_a_stated_goal_is_reached_or_said_not_to_be():
     _, easy = planned(CellPoses(design='optimal', joint_std_deg=0.01))
-    assert easy.designed.reached
+    assert easy.design_result.reached
     assert easy.goal_reached
     assert np.degrees(easy.joint_rms) <= 0.01
     _, hard = planned(CellPoses(design='optimal', joint_std_deg=1e-4), counts=(8, 0))
-    assert not hard.designed.reached
+    assert not hard.design_result.reached
     assert not hard.goal_reached
 
 
@@ -201,7 +201,7 @@ def test_a_goal_is_reached_by_what_free_ways_lead_to_alone(few, monkeypatch):
 
     monkeypatch.setattr(Tour, 'next', lost)
     _, plan = planned(CellPoses(design='optimal', joint_std_deg=0.01))
-    assert plan.designed.reached
+    assert plan.design_result.reached
     assert plan.unreached
     assert not plan.goal_reached
     assert not plan_to_dict(plan)['goal']['reached']
@@ -229,7 +229,7 @@ def test_looking_ahead_leaves_a_tour_as_it_is_and_begins_with_what_is_left_of_it
         visited.append(stop)
         stop = tour.next(stop.solutions[-1])
     # The last one is under way, with its first solution measured.
-    here, rest = stop.solutions[0], tour.along(stop, stop.ids[1:])
+    here, rest = stop.solutions[0], tour.with_route(stop, stop.ids[1:])
     done = sum(len(one.ids) for one in visited) + 1
     left = look_ahead(planner, planner.rough_places, [tour], here, rest)
     assert len(left.visits) == len(whole.visits) - done
@@ -243,7 +243,7 @@ def test_looking_ahead_leaves_a_tour_as_it_is_and_begins_with_what_is_left_of_it
 def test_a_verification_has_ten_poses_off_and_on_in_random_order_that_no_collection_has():
     planner, _ = planner_of(CellPoses(design=LATIN))
     tour = planner.verification()
-    assert tour.judges == 'verify'
+    assert tour.inspection == 'verify'
     visits, q = [], np.zeros(len(planner.model.chain))
     while (stop := tour.next(q)) is not None:
         visits.append(stop)
@@ -261,7 +261,7 @@ def test_a_verification_has_ten_poses_off_and_on_in_random_order_that_no_collect
     wanted = np.concatenate([one.solutions for one, _ in pairs])
     assert len(np.unique(wanted, axis=0)) == 10
     collected = planner.collection(planner.rough_places)
-    assert collected.judges == ''
+    assert collected.inspection == ''
     used = [q for plan in collected.plans.values() for pose in plan.poses for q in pose.solutions]
     away = np.max(np.abs(wanted[:, None] - np.array(used)), axis=2)
     assert away.min() > 0.02
@@ -281,10 +281,10 @@ def test_a_design_stays_in_one_part_of_what_is_free(monkeypatch):
         sides.append(q[3] > 0)
         return goal[None] if (q[3] > 0) == (goal[3] > 0) else None
 
-    monkeypatch.setattr(planned_design, 'free_way', way_in_a_half)
+    monkeypatch.setattr(planned_design, 'free_waypoints', way_in_a_half)
     planner, _ = planner_of(CellPoses())
     planner.collection(planner.rough_places)
-    poses = planner.designed.plans['optimization'].poses
+    poses = planner.design_result.plans['optimization'].poses
     assert {True, False} == set(sides)
     assert len({q[3] > 0 for pose in poses for q in pose.solutions}) == 1
-    assert planner.designed.reached
+    assert planner.design_result.reached

@@ -16,7 +16,11 @@ from remaster_ros.planning.expected_sensors import (
     nominal_model,
 )
 from remaster_ros.planning.rival_causes import FoundCause
-from remaster_ros.planning.separating_design import further_scene, measured_so_far, separate
+from remaster_ros.planning.separating_design import (
+    measured_so_far,
+    scene_with_other_elbows,
+    separate,
+)
 from remaster_ros.session.workcell import read_cell
 from remaster_ros.types import Priors
 
@@ -102,7 +106,7 @@ def test_what_is_chosen_tells_more_than_any_of_the_pool():
     found = separated(sag())
     (pair,) = found.pairs
     count = sum(len(pose.solutions) for pose in found.poses)
-    assert count == module.MOST_FURTHER
+    assert count == module.MOST_ADDED
     # As many taken blindly, pose after pose.
     rng = np.random.default_rng(3)
     blind = []
@@ -154,11 +158,11 @@ def test_several_pairs_share_what_is_added():
     found = separated(sag(), scale)
     assert len(found.pairs) == 2
     assert all(pair.after > 1.1 * pair.before for pair in found.pairs)
-    assert sum(len(pose.solutions) for pose in found.poses) <= module.MOST_FURTHER
+    assert sum(len(pose.solutions) for pose in found.poses) <= module.MOST_ADDED
 
 
 def test_other_postures_of_a_held_joint_are_candidates():
-    further = further_scene(SCENE)
+    further = scene_with_other_elbows(SCENE)
     np.testing.assert_allclose(
         further.inverse_kinematics.held[2], np.radians([-60, -30, 0, 30, 60]), atol=1e-9
     )
@@ -169,7 +173,7 @@ def test_other_postures_of_a_held_joint_are_candidates():
 def test_a_rail_is_held_elsewhere_by_as_much_as_an_elbow_counts(tmp_path):
     held = {'held_joint': 'rail', 'held_values_deg': [], 'held_values_m': [0.0]}
     cell = read_cell(sliding_cell(tmp_path, rail(), **held))
-    further = further_scene(cell.planning_scene(cell.chain()))
+    further = scene_with_other_elbows(cell.planning_scene(cell.chain()))
     steps = 0.25 * np.radians([-60, -30, 0, 30, 60])
     np.testing.assert_allclose(further.inverse_kinematics.held[0], steps, atol=1e-9)
 

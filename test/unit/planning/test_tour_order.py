@@ -201,7 +201,7 @@ def test_what_is_left_of_a_stop_is_reached_from_elsewhere():
     model = walled()
     tour = Tour(CHAIN, {'optimization': free_plan(model, 3, 2)}, model=model)
     stop = tour.next(np.zeros(7))
-    left = tour.along(stop, stop.ids[1:])
+    left = tour.with_route(stop, stop.ids[1:])
     assert len(left.paths) == len(left.ids)
     elsewhere = np.deg2rad([-150.0, 20, 0, 60, 0, 30, 0])
     again = tour.reroute(left, elsewhere)
@@ -220,7 +220,7 @@ def test_proposing_changes_nothing():
     tour = Tour(CHAIN, {'optimization': plan_of(random_joints(1, 3))})
     first, second = tour.propose(np.zeros(7)), tour.propose(np.zeros(7))
     assert (first.index, first.pose, tour.visited) == (second.index, second.pose, 0)
-    taken = tour.take(first)
+    taken = tour.accept(first)
     assert (taken.index, taken.pose, tour.visited) == (first.index, 0, 1)
     assert tour.propose(np.zeros(7)).pose == 1
 
@@ -300,7 +300,7 @@ def test_a_round_can_be_asked_for():
     for _ in range(5):
         stop = tour.next(q)
     assert stop.split == 'optimization'
-    tour.ask_round()
+    tour.request_reference_round()
     assert [tour.next(q).split for _ in range(3)] == ['reference', 'reference', 'optimization']
 
 

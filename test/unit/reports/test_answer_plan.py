@@ -24,7 +24,7 @@ from remaster_ros.reports.report import (
     require_ready,
 )
 from remaster_ros.reports.schemas import Fit, Judgement
-from remaster_ros.session.plan_journal import ExpectationNoted, RecordedPlan
+from remaster_ros.session.plan_journal import ExpectationRecord, RecordedPlan
 
 
 @pytest.fixture
@@ -57,7 +57,7 @@ def inputs(fit_result, tmp_path) -> Inputs:
 def expected(inputs, factor):
     """Return inputs whose fit states the offsets `factor` times less well than was expected."""
     stds = {r.joint: r.std_if_exactly_drawn / factor for r in inputs.fit.joint_offsets}
-    return replace(inputs, plan=replace(inputs.plan, expected=ExpectationNoted(stds, 2e-4)))
+    return replace(inputs, plan=replace(inputs.plan, expected=ExpectationRecord(stds, 2e-4)))
 
 
 def test_what_was_planned_and_what_became_of_it(inputs):

@@ -40,14 +40,14 @@ def killed_at_each_stop(chain, folder, rng, settings=SETTINGS, **tour):
     plan_id, q = book.id, np.zeros(len(chain))
     while (wanted := one_run.next(q)) is not None:
         stop = book.tour.propose(q)
-        book.open_stop(stop)
+        book.open_visit(stop)
         assert (stop.pose, stop.split, stop.ids) == (wanted.pose, wanted.split, wanted.ids)
         yield book, one_run
         book.close()
         book = PlanJournal(folder, settings, chain)
         assert book.id == plan_id
-        assert (book.stop.ids, book.stop.pose) == (stop.ids, stop.pose)
-        np.testing.assert_array_equal(book.stop.solutions, stop.solutions)
+        assert (book.visit.ids, book.visit.pose) == (stop.ids, stop.pose)
+        np.testing.assert_array_equal(book.visit.solutions, stop.solutions)
         q = rng.uniform(-1, 1, len(chain))
     assert book.tour.next(q) is None
     assert book.tour.describe() == one_run.describe()
@@ -69,7 +69,7 @@ def test_any_number_of_restarts_visits_what_one_run_visits(chain, tmp_path, orde
     order = [visits[i] for i in rng.permutation(len(visits))] if ordered else ()
     visited = []
     for book, _ in killed_at_each_stop(chain, tmp_path / 'a', rng, plans=plans, order=order):
-        visited += [(book.stop.split, book.stop.index, number) for number in book.stop.ids]
+        visited += [(book.visit.split, book.visit.index, number) for number in book.visit.ids]
     assert sorted(visited) == sorted(visits)
     assert not ordered or [v[:2] for v in visited] == [v[:2] for v in order]
 
@@ -78,14 +78,14 @@ def test_a_registration_tour_keeps_its_order_and_its_numbers(chain, tmp_path):
     plans = registration_tour(chain, plan_of(chain, 3, 6, 2), [np.array([0.1, 0.0, 0.02])]).plans
     rng, how = np.random.default_rng(3), {'in_order': True, 'one_solution': True}
     visited = killed_at_each_stop(chain, tmp_path / 'a', rng, plans=plans, **how)
-    stops = [book.stop for book, _ in visited]
+    stops = [book.visit for book, _ in visited]
     assert [stop.pose for stop in stops] == [-1, -2, -3, -4, -5, -6]
     assert {(stop.split, len(stop.ids)) for stop in stops} == {(REGISTRATION, 1)}
 
 
 def test_the_state_and_its_run_are_known(chain, tmp_path):
     book = PlanJournal(tmp_path, SETTINGS, chain)
-    book.say_state('running', 'abc')
+    book.record_state('running', 'abc')
     assert not book.path.exists()
     book.begin(Tour(chain, {'optimization': plan_of(chain, 1, 2, 2)}))
     with pytest.raises(InputError, match='another process'):
@@ -93,7 +93,7 @@ def test_the_state_and_its_run_are_known(chain, tmp_path):
     book.close()
     for state, run in (('running', 'abc'), ('running', 'def'), ('paused', '')):
         book = PlanJournal(tmp_path, SETTINGS, chain)
-        book.say_state(state, run)
+        book.record_state(state, run)
         book.close()
         book = PlanJournal(tmp_path, SETTINGS, chain)
         assert (book.state, book.run) == (state, run)
@@ -121,14 +121,14 @@ def test_a_torn_line_is_dropped_and_a_damaged_one_refused(chain, tmp_path):
     book = PlanJournal(tmp_path, SETTINGS, chain)
     book.begin(Tour(chain, {'optimization': plan_of(chain, 1, 2, 2)}))
     stop = book.tour.propose(np.zeros(len(chain)))
-    book.open_stop(stop)
-    book.say_state('running', 'abc')
+    book.open_visit(stop)
+    book.record_state('running', 'abc')
     book.close()
     whole = book.path.read_bytes()
     book.path.write_bytes(whole[:-5])
     book = PlanJournal(tmp_path, SETTINGS, chain)
     assert 'cut off' in book.lost
-    assert book.stop.ids == stop.ids
+    assert book.visit.ids == stop.ids
     book.close()
     book.path.write_bytes(whole.replace(b'"stop"', b'"step"', 1))
     with pytest.raises(InputError, match='line 4: damaged'):
@@ -140,8 +140,8 @@ def test_what_a_full_disk_does_not_take_is_kept(chain, tmp_path, full_disk):
     book.begin(Tour(chain, {'optimization': plan_of(chain, 1, 2, 2)}))
     stop = book.tour.propose(np.zeros(len(chain)))
     with full_disk():
-        book.open_stop(stop)
-        book.say_state('running', 'abc')
+        book.open_visit(stop)
+        book.record_state('running', 'abc')
         assert 'No space left' in book.trouble
         book.write_out()
         assert 'No space left' in book.trouble
@@ -149,7 +149,7 @@ def test_what_a_full_disk_does_not_take_is_kept(chain, tmp_path, full_disk):
     assert not book.trouble
     book.close()
     book = PlanJournal(tmp_path, SETTINGS, chain)
-    assert (book.stop.ids, book.run) == (stop.ids, 'abc')
+    assert (book.visit.ids, book.run) == (stop.ids, 'abc')
     book.close()
 
 
@@ -158,11 +158,11 @@ def test_what_no_way_leads_to_and_what_was_dropped_survive_a_restart(chain, tmp_
     book = PlanJournal(tmp_path / 'session', SETTINGS, chain)
     book.begin(Tour(chain, {'optimization': plan}))
     q = np.zeros(len(chain))
-    stop = book.tour.along(book.tour.propose(q), [2, 0], (), [1, 3])
-    book.open_stop(stop)
+    stop = book.tour.with_route(book.tour.propose(q), [2, 0], (), [1, 3])
+    book.open_visit(stop)
     book.close()
     book = PlanJournal(tmp_path / 'session', SETTINGS, chain)
-    assert (book.stop.ids, book.stop.unreached, book.stop.pose) == ((2, 0), (1, 3), stop.pose)
+    assert (book.visit.ids, book.visit.unreached, book.visit.pose) == ((2, 0), (1, 3), stop.pose)
     assert book.tour.dropped_solutions == {'self-collision': 3}
     book.close()
 
@@ -179,10 +179,10 @@ def test_references_are_visited_as_in_one_run_whatever_is_killed(chain, tmp_path
         number += 1
         if number in (7, 10):
             # In the middle of a round, and between two.
-            book.ask_round()
-            one_run.ask_round()
-        assert book.tour.reference_stops == one_run.reference_stops
-    assert book.tour.reference_stops == number - 6
+            book.request_reference_round()
+            one_run.request_reference_round()
+        assert book.tour.reference_visits == one_run.reference_visits
+    assert book.tour.reference_visits == number - 6
     with pytest.raises(InputError, match='another reference_every'):
         PlanJournal(tmp_path / 'a', {**settings, 'reference_every': 8}, chain)
 

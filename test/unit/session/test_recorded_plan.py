@@ -29,24 +29,24 @@ def collected(folder, expected=None):
     journal, recorder = PlanJournal(folder, {}, CHAIN), Journal(folder / 'journal.jsonl')
 
     def end(solution, result):
-        stop = {'pose': journal.stop.pose, 'split': journal.stop.split}
+        stop = {'pose': journal.visit.pose, 'split': journal.visit.split}
         end = {'solution': solution, 'result': result}
         recorder.append({'kind': 'configuration', **stop, **end})
 
     tour = Tour(CHAIN, {REGISTRATION: plan_of(1, 2, 1)}, in_order=True)
     journal.begin(tour)
     recorder.append({'kind': 'plan', 'id': journal.id})
-    journal.open_stop(tour.next(np.zeros(JOINTS)))
-    end(journal.stop.ids[0], 'recorded')
+    journal.open_visit(tour.next(np.zeros(JOINTS)))
+    end(journal.visit.ids[0], 'recorded')
     plans = {FITTED: plan_of(2, 2, 3), 'validation': plan_of(3, 2, 3)}
     plans[REFERENCE] = plan_of(4, 1, 1)
     tour = Tour(CHAIN, plans, reference_every=100)
     journal.begin(tour, expected)
     visited = []
     for _ in range(4):
-        journal.open_stop(tour.next(np.zeros(JOINTS)))
-        visited.append(journal.stop)
-        for number in journal.stop.ids:
+        journal.open_visit(tour.next(np.zeros(JOINTS)))
+        visited.append(journal.visit)
+        for number in journal.visit.ids:
             end(number, 'rejected')
             if number:
                 end(number, 'recorded')
@@ -79,7 +79,7 @@ def test_what_was_expected_is_kept_and_gone_on_with(tmp_path):
     assert plan.expected.tool_rms_m == 2e-4
     again = PlanJournal(tmp_path / 's', {}, CHAIN)
     assert again.tour.plans.keys() == tour.plans.keys()
-    assert again.stop is not None
+    assert again.visit is not None
     assert again.decided.outcomes == {'recorded': 4, 'rejected': 2}
     again.close()
 

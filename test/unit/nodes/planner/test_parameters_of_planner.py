@@ -37,7 +37,7 @@ def test_the_parameters_make_what_plans_the_tours(tmp_path, monkeypatch):
     planner = parameters.tour_planner(cell, chain, (CAUSE,))
     tour = planner.collection(planner.rough_places)
     plain = parameters.tour_planner(cell, chain, ()).collection(planner.rough_places)
-    added = sum(len(pose.solutions) for pose in planner.separated.poses)
+    added = sum(len(pose.solutions) for pose in planner.separating_design.poses)
     assert 0 < added <= 25
     assert tour.configurations['optimization'] == plain.configurations['optimization'] + added
     with pytest.raises(InputError, match=r'none\.json'):

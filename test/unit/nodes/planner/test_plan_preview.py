@@ -120,7 +120,7 @@ def test_another_plan_needs_another_confirmation(bench):
     bench.journal.begin(collection)
     bench.progress.phase = 'collection'
     stop = collection.next(START)
-    bench.journal.open_stop(stop)
+    bench.journal.open_visit(stop)
     bench.progress.decided = Decided(stop.pose, stop.ids[:1])
     assert preview.draw(START, bench.peers) == ''
     assert preview.asked() == ''
@@ -134,7 +134,7 @@ def test_a_planner_started_again_has_no_confirmation(bench, tmp_path):
     bench.preview.confirm()
     bench.journal.begin(collection)
     stop = collection.next(START)
-    bench.journal.open_stop(stop)
+    bench.journal.open_visit(stop)
     bench.journal.close()
     again = Bench(tmp_path)
     again.progress.decided = Decided(stop.pose, stop.ids[:1])
