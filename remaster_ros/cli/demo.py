@@ -20,10 +20,10 @@ WITHOUT_ROS = (
 
 
 DESIGNED_FROM, HELD_OUT_FROM = 30, 9
-"""Candidate poses to choose from, and to hold out from, where the poses are designed: three to six
-of the latter are left, each in all its solutions, which keeps the demo to some two minutes."""
+"""Candidates to fit and to validate of an optimal design: three to six of the latter remain, each
+in all its solutions, which keeps the demo to about two minutes."""
 WITH_CAUSES = 14
-"""Candidate poses, each, where causes are looked for."""
+"""Candidates of each split of a demo that looks for causes."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

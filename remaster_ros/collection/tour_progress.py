@@ -73,9 +73,9 @@ class TourProgress:
         visited.
     standing
         Why the next visit cannot be planned from the arm's configuration; ''.
-    further
+    additions
         Plans measurements after the complete collection; None for none.
-    judging
+    inspection
         Plans an inspection in place of registration and collection; None for none.
     """
 
@@ -91,8 +91,8 @@ class TourProgress:
         self.is_complete = False
         self.enough = False
         self.standing = ''
-        self.further: Callable[[dict[str, FloatArray]], Tour] | None = None
-        self.judging: Callable[[], Tour] | None = None
+        self.additions: Callable[[dict[str, FloatArray]], Tour] | None = None
+        self.inspection: Callable[[], Tour] | None = None
 
     def describe(self) -> str:
         """Return the progress as text."""
@@ -149,26 +149,26 @@ class TourProgress:
         left to fit.
         """
         self.standing = ''
-        if self.judging is not None:
-            inspection = self._planning.ask('judging', q, self.judging)
-            if inspection is None:
+        if self.inspection is not None:
+            result = self._planning.ask('inspection', q, self.inspection)
+            if result is None:
                 return None
-            self.phase, self.judging = 'collection', None
-            self._memory.begin(inspection[0])
+            self.phase, self.inspection = 'collection', None
+            self._memory.begin(result[0])
         if self.phase == REGISTRATION and not sensors.are_among(self.T_R_N):
             return self._next_registration(q, sensors.names, words)
         self.phase = 'collection'
-        if (plan_further := self.further) is not None:
+        if (plan_additions := self.additions) is not None:
             self.is_complete = False
             if not sensors.are_among(self.T_R_N):
                 self.standing = 'waiting for the registrations of the recorder'
                 return None
             T_R_N = dict(self.T_R_N)
-            additions = self._planning.ask('further', q, lambda: plan_further(T_R_N))
-            if additions is None:
+            result = self._planning.ask('additions', q, lambda: plan_additions(T_R_N))
+            if result is None:
                 return None
-            self.further = None
-            self._memory.begin(additions[0])
+            self.additions = None
+            self._memory.begin(result[0])
         elif self._memory.tour is None or REGISTRATION in self._memory.tour.plans:
             T_R_N = dict(self.T_R_N)
             planned = self._planning.ask(
@@ -177,9 +177,9 @@ class TourProgress:
             if planned is None:
                 return None
             self._memory.begin(*planned[0])
-        result = self._open(q)
-        self.is_complete = result == (None,)
-        return result[0] if result else None
+        opened = self._open(q)
+        self.is_complete = opened == (None,)
+        return opened[0] if opened else None
 
     def _next_registration(
         self, q: FloatArray, sensors: Collection[str], words: str
@@ -234,10 +234,10 @@ class TourProgress:
         return tour is not None and any(tour.configurations.values())
 
     @property
-    def goes_further(self) -> bool:
+    def measures_additions(self) -> bool:
         """Whether measurements after the complete collection are planned or under way."""
         tour = self._memory.tour
-        return self.further is not None or (tour is not None and tour.begin_at > 0)
+        return self.additions is not None or (tour is not None and tour.begin_at > 0)
 
     def is_last_reference(self, visit: PoseVisit) -> bool:
         """Whether a visit is to the last reference of its round."""
@@ -246,7 +246,7 @@ class TourProgress:
 
     def state(self, state: str, run: str) -> PlannerState:
         """Return the state message for the other nodes."""
-        further = self._memory.id if self.goes_further else ''
+        further = self._memory.id if self.measures_additions else ''
         return PlannerState(state=state, run=run, planned=self.planned, further=further)
 
     def counts(self) -> dict[str, Any]:

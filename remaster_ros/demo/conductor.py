@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The node of the demo: its parameters, calls of services, the status of the other nodes."""
+"""The node of the demo: its parameters, service calls, and the status of the other nodes."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class Parameters:
 
 
 class Conductor(Node):
-    """Calls the services and follows the status of the nodes."""
+    """Calls services, and follows the status of the nodes."""
 
     def __init__(self) -> None:
         super().__init__('demo')
@@ -63,15 +63,17 @@ class Conductor(Node):
         self._clients_by_name: dict[str, Any] = {}
 
     def _on_summary(self, node: str, message: str, values: dict[str, str]) -> None:
+        """Keep the last summary of a node."""
         self.summaries[node] = {'message': message, **values}
 
     def _on_record(self, record: EventRecord) -> None:
+        """Take an event of a node."""
         if isinstance(record.body, TourPlanned):
             self.planned = record.body.description
         self.times.add(record.body)
 
     def call(self, service: str) -> Any:
-        """Begin a call of a std_srvs/Trigger service; returns the future."""
+        """Call a std_srvs/Trigger service; return the future, None if it is not available."""
         if service not in self._clients_by_name:
             self._clients_by_name[service] = self.create_client(Trigger, service)
         client = self._clients_by_name[service]

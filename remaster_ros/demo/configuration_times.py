@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Time of each configuration, by motion, settling, measuring and software."""
+"""Time of each configuration in motion, settling, measuring and software."""
 
 from __future__ import annotations
 
@@ -17,13 +17,12 @@ from remaster_ros.collection.events import (
 
 
 class ConfigurationTimes:
-    """Where the time of each configuration went, from the nodes' events.
+    """Times of configurations, from the nodes' events.
 
-    Motion, settle and measuring are world time. Measuring is what the slowest instrument took:
-    the dwell of a stream, or search and integration of a laser tracker. Software is wall time:
-    from the bridge's report that the arm has settled to its next command, less the measuring.
-
-    ``rate``: world time over wall time.
+    Motion, settling and measuring are world time. Measuring is the time of the slowest
+    instrument: the dwell of a stream, or search and integration of a laser tracker. Software is
+    wall time: from the bridge's report that the arm has settled to its next command, less the
+    measuring. ``rate``: world time over wall time.
     """
 
     def __init__(self, rate: float) -> None:
@@ -35,7 +34,7 @@ class ConfigurationTimes:
         self.rows: list[dict[str, float]] = []
 
     def add(self, event: Event | State) -> None:
-        """Take what a node published; only events of a configuration count."""
+        """Take an event; only those of configurations count."""
         match event:
             case PoseAnnounced(split='registration', stamp=stamp):
                 self._registration.add(stamp)
@@ -44,7 +43,7 @@ class ConfigurationTimes:
                     self._last['until_command'] = since_s
                 self._last = None
                 if stamp not in self._registration:
-                    # A registration pose is followed by planning, which is not of its time.
+                    # After a registration pose there is planning, which does not count.
                     self._last = self._open.setdefault((stamp, solution), {})
             case SolutionSettled(stamp=stamp, solution=solution):
                 if (row := self._open.get((stamp, solution))) is not None:
@@ -58,10 +57,10 @@ class ConfigurationTimes:
                     self.rows.append(row)
 
     def columns(self) -> dict[str, np.ndarray]:
-        """Return motion, settle, measuring (world s) and software (wall s) of complete rows."""
+        """Return motion, settle, measuring (world s), software (wall s) of complete rows."""
         needed = ('motion', 'settle', 'measuring', 'until_command')
         rows = [row for row in self.rows if all(name in row for name in needed)]
         table = {name: np.array([row[name] for row in rows]) for name in needed}
-        # A reading begins when the arm stands, a moment before the bridge's report of it.
+        # A reading begins when the arm stands, slightly before the bridge's report of it.
         software = table.pop('until_command') - table['measuring'] / self._rate
         return {**table, 'software': np.maximum(software, 0.0)}

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The main job on fake hardware: start every node, collect, fit, and print what was found.
+"""The whole pipeline on fake hardware: start all nodes, collect, fit, and print the results.
 
-Real nodes in processes of their own, real DDS, real sockets; the fakes share a hidden World, whose
-truth is compared with the estimate only at the very end.
+Nodes are processes with real DDS and real sockets; the fakes share a hidden World, whose truth is
+compared with the estimate only at the end.
 """
 
 from __future__ import annotations
@@ -51,29 +51,29 @@ from remaster_ros.simulation.effect_sampling import EffectSpec
 from remaster_ros.simulation.setup import make_world
 
 ANSWER_WALL_S, WORK_WALL_S = 120.0, 3600.0
-"""So long a node may take to answer or to be ready, also anew, and to fit, s: on an idle computer
-they take a second and half a minute, and 40 processes for each processor are no fault of theirs.
-"""
+"""Most time of a node to answer or to be ready, and to fit, s. On an idle computer they take a
+second and half a minute; the limits allow for 40 processes per processor."""
 STANDS_WALL_S = 1800.0
-"""A collection of which nothing becomes for so long will not end, s."""
+"""Time without a new configuration after which a collection has failed, s."""
 CLEARING_CALLS = 2
-"""A halt of an arm that is reported elsewhere than it was led is cleared by a second call."""
+"""Calls that clear a halt: two if the arm is reported elsewhere than it was commanded."""
 AFTERWARDS = 5
-"""Candidate poses, each, that are visited with the correction on: with all their solutions a dozen
-or two of configurations, and `remaster verify` asks for ten."""
+"""Candidate poses of each split with the correction on: with all their solutions one or two dozen
+configurations, of which `remaster verify` needs ten."""
 TO_FIT, MOST_CANDIDATES = 4, 60
-"""Poses to fit of a demo, and candidates up to which they are looked for: a fit takes three, and
-where the sensors really stand one less may be seen than at the rough places."""
+"""Least number of poses to fit, and most candidates drawn to get them: a fit needs three, and from
+the true positions of the sensors one less may be visible than from the rough ones."""
 LAST_MESSAGES = 50
-"""So many messages of nodes that have ended may still be on their way to this one."""
+"""Most messages under way from nodes that have ended."""
 BEFORE_SESSION = {'log', 'ros_home', 'session'}
-"""What a demo that was interrupted leaves in its folder; while there is no session yet, all."""
+"""Contents of the folder of a demo that was interrupted before its session began."""
 
 
 def enough_candidates(cell: Workcell, seed: int, asked: int) -> int:
-    """Return how many candidates of each split leave `TO_FIT` poses to fit, `asked` at the least.
+    """Return the number of candidates of each split that leaves `TO_FIT` poses to fit.
 
-    `asked` as well where `MOST_CANDIDATES` do not leave so many: then the planner says why.
+    At least `asked`; `asked` as well if `MOST_CANDIDATES` are not enough, in which case the
+    planner says why.
     """
     scene = cell.planning_scene(cell.chain())
     for count in range(asked, MOST_CANDIDATES + 1):
@@ -83,29 +83,29 @@ def enough_candidates(cell: Workcell, seed: int, asked: int) -> int:
 
 
 class Keyboard:
-    """What a person types at the terminal, line by line."""
+    """Lines that a person types at the terminal."""
 
     @property
     def is_there(self) -> bool:
-        """Whether a person may be at the terminal."""
+        """Whether standard input is a terminal."""
         return sys.stdin is not None and sys.stdin.isatty()
 
     def line(self) -> str | None:
-        """Return what was typed since the last call, without waiting; None for nothing."""
+        """Return the last line typed since the last call, without waiting; None if none."""
         ready, _, _ = select.select([sys.stdin], [], [], 0.0)
-        # A terminal that was closed has an end, and nobody to ask.
+        # A closed terminal gives an empty line: nobody to ask.
         return (sys.stdin.readline() or 'f').strip().lower() if ready else None
 
 
 class Demo:
-    """One run of the demo; `stopping`, filled by a signal, is looked at between all steps."""
+    """One run of the demo; ``stopping``: filled by signals, checked between all steps."""
 
     def __init__(self, node: Conductor, stopping: list[int]) -> None:
         self.node, self.p, self._stopping = node, node.p, stopping
         self.console, self._keyboard = Console(quiet=self.p.quiet), Keyboard()
-        # Why a person is to go on, where that was said already.
-        self._told = ''
-        # Refused before anything is written.
+        # Last reason to resume that was printed.
+        self._printed_reason = ''
+        # Parsed first, so that an error comes before anything is written.
         self.requests = [EffectSpec.parse(text) for text in self.p.hide.split(',') if text]
         cell = read_cell(self.p.cell)
         chain = cell.chain()
@@ -144,15 +144,13 @@ class Demo:
             self.out / 'log',
             {
                 'PYTHONUNBUFFERED': '1',
-                # A halt of the fake arm is kept with its session, not with those of real arms.
+                # Halts of the fake arm must not be stored with those of real arms.
                 'ROS_HOME': str((self.out / 'ros_home').resolve()),
             },
         )
 
-    # Running
-
     def run(self) -> bool:
-        """Collect, fit, print; return whether the collection came to its end."""
+        """Collect, fit, print; return whether the collection is complete."""
         self.console.print(f'hidden world drawn with seed {self.p.seed}; starting the nodes')
         self.console.print(
             'the fake arm moves without a Cartesian speed limit (real.yaml: 0.25 m/s)'
@@ -169,7 +167,7 @@ class Demo:
             self._stay()
         self.processes.stop()
         print_times(self.console, times)
-        # Only here, after everything that estimates has ended, is the truth opened.
+        # The truth is opened after all estimating processes have ended.
         print_offsets(self.console, read_fit(self.fit / 'fit.json'), self.world.truth)
         if self.requests:
             discovery = read_discovery(self.discovery / 'discovery.json')
@@ -185,7 +183,7 @@ class Demo:
         return complete
 
     def _estimate(self) -> list[tuple[str, Path, str]]:
-        """Fit what was measured, and look for causes; return label, folder and file of each."""
+        """Fit the session, and look for causes; return label, folder and file of each result."""
         self.console.print('fitting')
         self._trigger('remaster/fit', 'optimizer', timeout_s=WORK_WALL_S)
         results = [('report', self.fit, 'fit.json')]
@@ -196,13 +194,13 @@ class Demo:
         return results
 
     def _apply(self) -> Path:
-        """Give the bridge the correction, and collect once more; return its file."""
+        """Collect again with the bridge's correction; return the file of the correction."""
         file = self.discovery / APPLY_FOLDER / COMPENSATION_FILE
         if not (self.requests and file.exists()):
             file = self.fit / APPLY_FOLDER / COMPENSATION_FILE
         self.console.print(f'correcting by {file}, and visiting other poses')
         self.processes.stop(CORE)
-        # What they sent last has arrived; it holds no more.
+        # Their last messages are outdated.
         for _ in range(LAST_MESSAGES):
             self._executor.spin_once(timeout_sec=0.01)
         for name in CORE:
@@ -215,7 +213,7 @@ class Demo:
         return file
 
     def _print_applied(self, file: Path) -> None:
-        """Print what `remaster verify` says of the corrected poses, and the truth of them."""
+        """Print the verdict of `remaster verify` on the corrected poses, and the true errors."""
         command = ['verify', str(self.corrected), '--compensation', str(file)]
         self.console.print(f'remaster {" ".join(command)}', soft_wrap=True)
         done = subprocess.run(
@@ -235,20 +233,21 @@ class Demo:
         )
 
     def _start(self) -> None:
+        """Start all nodes."""
         common = config_path('fake.yaml')
         command_port, data_port, tracker_port = free_ports(
             socket.SOCK_DGRAM, socket.SOCK_DGRAM, socket.SOCK_STREAM
         )
         ports = {'command_port': command_port, 'data_port': data_port}
         world = str(self.hidden)
-        own: dict[str, dict[str, Any]] = {
+        overrides: dict[str, dict[str, Any]] = {
             'fake_robot': {'world': world},
             'fake_optitrack': {'world': world, **ports},
             'fake_laser_tracker': {'world': world, 'port': tracker_port},
             'optitrack_markers': {**ports, 'cell': self.p.cell},
             'laser_tracker_markers': {'port': tracker_port, 'cell': self.p.cell},
         }
-        for name, values in own.items():
+        for name, values in overrides.items():
             self.processes.start(name, common, values)
         size = self.candidates
         held_out = self.p.held_out_candidates or size
@@ -261,12 +260,12 @@ class Demo:
     def _start_core(
         self, session: Path, seed: int, size: int, held_out: int, compensation: str = ''
     ) -> None:
-        """Start the nodes of a collection: the planner's seed, and how many candidates it has."""
+        """Start the nodes of a collection; ``seed``: of the planner; ``size``: poses to fit."""
         rate, cell = {'simulated_clock_rate': self.p.rate}, {'cell': self.p.cell}
-        # What is fitted of corrected poses, by hand, takes the place of nothing.
-        beside = f'_of_{session.name}' if compensation else ''
-        discovery = f'{self.discovery}{beside}'
-        own: dict[str, dict[str, Any]] = {
+        # A fit of the corrected poses by an operator must not overwrite the first one.
+        suffix = f'_of_{session.name}' if compensation else ''
+        discovery = f'{self.discovery}{suffix}'
+        overrides: dict[str, dict[str, Any]] = {
             'pose_planner': {
                 **cell,
                 'seed': seed,
@@ -280,26 +279,27 @@ class Demo:
             'recorder': {**cell, **rate, 'session': str(session)},
             'optimizer': {
                 'session': str(session),
-                'out': f'{self.fit}{beside}',
+                'out': f'{self.fit}{suffix}',
                 'discovery': discovery,
                 'seed': self.p.seed,
                 'figures': self.p.figures,
             },
         }
         for name in CORE:
-            self.processes.start(name, config_path('fake.yaml'), own[name])
+            self.processes.start(name, config_path('fake.yaml'), overrides[name])
 
     def _spin(self) -> None:
+        """Handle messages and restarts; raise KeyboardInterrupt after a signal."""
         self._executor.spin_once(timeout_sec=0.1)
         if self._stopping:
             raise KeyboardInterrupt
         for name in self.processes.check():
-            # The last summary of the killed process no longer holds.
+            # The last summary of the killed process is outdated.
             self.node.summaries.pop(name, None)
             self.console.print(f'{name} was killed, and is started again')
 
     def _stay(self) -> None:
-        """Leave the nodes to the live page until a signal."""
+        """Keep the nodes running for the live page until a signal."""
         self.console.print('the live page stays until Ctrl-C')
         with suppress(KeyboardInterrupt):
             while True:
@@ -307,6 +307,7 @@ class Demo:
         self._stopping.clear()
 
     def _wait(self, condition: Callable[[], bool], timeout_s: float, what: str) -> None:
+        """Wait for a condition; raise DeviceError after the timeout."""
         deadline = time.monotonic() + timeout_s
         while not condition():
             if time.monotonic() > deadline:
@@ -315,7 +316,7 @@ class Demo:
             self._spin()
 
     def _ready(self) -> bool:
-        """Whether every node is up, the robot reports and both sensors measure."""
+        """Whether all nodes are up, the robot reports and both sensors measure."""
         summaries = self.node.summaries
         return (
             summaries.keys() >= {*CORE, *SENSORS}
@@ -324,8 +325,8 @@ class Demo:
             and summaries['optitrack_markers']['published'] != '0'
         )
 
-    def _go_on(self) -> None:
-        """Do as a person does whose planner waits, again where it was started just now."""
+    def _collect_again(self) -> None:
+        """Call /remaster/collect, as an operator would, until it succeeds."""
         deadline = time.monotonic() + ANSWER_WALL_S
         while True:
             try:
@@ -338,14 +339,14 @@ class Demo:
                 self._spin()
 
     def _trigger(self, service: str, server: str, timeout_s: float = ANSWER_WALL_S) -> None:
-        """Call a service until it answers; its node may be killed meanwhile."""
+        """Call a service until it answers, also if its node is killed meanwhile."""
         future, process = None, self.processes.pid(server)
 
         def done() -> bool:
             nonlocal future, process
             if self.processes.pid(server) != process:
                 future, process = None, self.processes.pid(server)
-            # A dead node's service seems to be there for a while; its summary does not.
+            # The service of a dead node remains visible for a while; its summary does not.
             if future is None and server in self.node.summaries:
                 future = self.node.call(service)
             return future is not None and future.done()
@@ -356,7 +357,7 @@ class Demo:
             raise DeviceError(f'{service}: {response.message}')
 
     def _collect(self) -> bool:
-        """Visit all poses; return whether all were visited, and not the arm halted for good."""
+        """Wait for the end of the collection; return False if it ended with a halted arm."""
         columns = (
             TextColumn('{task.description}'),
             BarColumn(),
@@ -375,10 +376,10 @@ class Demo:
                         total=int(planner.get('configurations', 0)),
                         completed=int(planner.get('configurations_done', 0)),
                     )
-                self._go_on_alone()
+                self._resume_if_paused()
                 if halted := self.node.summaries.get('robot_bridge', {}).get('halted'):
                     progress.stop()
-                    if not self._goes_on(halted):
+                    if not self._wait_for_operator(halted):
                         return False
                     progress.start()
                     since_wall = time.monotonic()
@@ -401,25 +402,25 @@ class Demo:
         return True
 
     def _is_complete(self) -> bool:
-        """Whether all was visited, and the session is closed; DeviceError if that cannot be."""
+        """Whether collection and session are complete; raise DeviceError if the planner failed."""
         planner = self.node.summaries.get('pose_planner', {})
         if planner.get('state') == 'failed':
             raise DeviceError(f'the planner gave up: {planner["message"]}')
         closed = self.node.summaries.get('recorder', {}).get('exit_status')
         return planner.get('state') == 'complete' and closed == 'complete'
 
-    def _go_on_alone(self) -> None:
-        """Begin again where a person would: in the demo there is nothing to look at or to mend.
+    def _resume_if_paused(self) -> None:
+        """Resume where an operator would, since in the demo nothing has to be inspected.
 
-        With the live page there may be one, who is told.
+        With the live page an operator may be there, and gets a message instead.
         """
         summaries = self.node.summaries
         planner, bridge = (summaries.get(name, {}) for name in ('pose_planner', 'robot_bridge'))
         if planner.get('state') == 'idle' and planner.get('resuming') == 'no':
-            # It was killed and waits for a person to resume its run.
-            self._go_on()
+            # A killed planner waits for an operator.
+            self._collect_again()
         if planner.get('state') != 'paused' or bridge.get('halted'):
-            self._told = ''
+            self._printed_reason = ''
             return
         changed, asks = (
             summaries.get('recorder', {}).get('changed'),
@@ -428,15 +429,15 @@ class Demo:
         if changed or (asks and not self.p.watch):
             self._say(f'changed since the reference: {changed}' if changed else f'paused: {asks}')
             self._say('going on, as /remaster/collect does')
-            self._go_on()
-        elif (why := asks or planner['message']) != self._told:
+            self._collect_again()
+        elif (why := asks or planner['message']) != self._printed_reason:
             self._say(f'paused: {why}; the live page, or /remaster/collect, goes on')
-            self._told = why
+            self._printed_reason = why
 
-    def _goes_on(self, halted: str) -> bool:
-        """Say that the arm is halted, and let a person go on; return whether that was done.
+    def _wait_for_operator(self, halted: str) -> bool:
+        """Wait for a person to end a halt; return whether the collection goes on.
 
-        A halt is ended by a person alone: at the terminal, or on the live page.
+        At the terminal, or on the live page.
         """
         done = self.node.summaries.get('pose_planner', {}).get('configurations_done', '0')
         self._say(f'the arm is halted: {halted}. {done} configurations were measured')
@@ -468,37 +469,36 @@ class Demo:
         return True
 
     def _clear_halt(self) -> None:
-        """Do as a person does who has looked at the arm."""
+        """Clear the halt, and collect, as an operator does after looking at the arm."""
         for _ in range(CLEARING_CALLS):
             try:
                 self._trigger('remaster/clear_halt', 'robot_bridge')
             except DeviceError as error:
                 self._say(str(error))
                 continue
-            # The next one says that it is not halted any more.
+            # The next summary shows that the halt is over.
             self.node.summaries.pop('robot_bridge', None)
-            self._go_on()
+            self._collect_again()
             return
 
     def _say(self, text: str) -> None:
-        """Print what a person has to know, also where nothing but errors is printed."""
+        """Print a message for the operator, to stderr if the demo is quiet."""
         if self.p.quiet:
             print(text, file=sys.stderr)
         else:
             self.console.print(text, soft_wrap=True)
 
     def close(self) -> None:
-        """End every process and remove the hidden World."""
+        """End all processes, and remove the hidden World."""
         self.processes.stop()
         shutil.rmtree(self.hidden, ignore_errors=True)
 
 
 def output_folder(path: Path) -> Path:
-    """Make a new folder and its log/, use an empty one, or that of an interrupted demo.
+    """Create a folder and its log/; or use an empty one, or that of an interrupted demo.
 
-    A demo that was interrupted before its session began has left nothing but logs.
-
-    Raises InputError: if it holds something or cannot be written.
+    A demo that was interrupted before its session began has left only logs.
+    Raises InputError if the folder holds other files or cannot be written.
     """
     session = path / 'session'
     try:
@@ -518,8 +518,8 @@ def output_folder(path: Path) -> Path:
 
 
 def main(args: list[str] | None = None) -> int:
-    """Run the demo; returns its exit status."""
-    # The traffic of the demo and its nodes stays on this machine, and apart from other demos.
+    """Run the demo; return its exit status."""
+    # Messages stay on this machine, and do not reach other demos.
     os.environ.setdefault('ROS_DOMAIN_ID', str(1 + os.getpid() % 100))
     os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
     stopping: list[int] = []

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Processes of nodes, started and supervised, and the ports of the fake devices."""
+"""Processes of nodes, with restarts, and free ports for the fake devices."""
 
 from __future__ import annotations
 
@@ -22,29 +22,29 @@ from remaster_ros.errors import DeviceError
 _PR_SET_PDEATHSIG = 1
 
 SHORT_LIFE_S = 2.0
-"""A process that ends this soon has hardly begun, s."""
+"""Life of a process below which it counts as killed just after its start, s."""
 SHORT_LIVES = 5
-"""How many of these in a row are borne."""
+"""Most such restarts in a row."""
 
 
 def _die_with_parent() -> None:
-    """Ask Linux for SIGTERM when the parent dies, so that even a killed demo leaves nothing."""
+    """Ask Linux for SIGTERM when the parent dies, so that a killed demo leaves no processes."""
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
 
 
 class NodeProcesses:
-    """The node processes of a run, each with its output in a file ``<name>.log``."""
+    """The processes of nodes, each with its output in a file ``<name>.log``."""
 
     def __init__(self, log_folder: Path, environment: Mapping[str, str]) -> None:
         self._log_folder = log_folder
         self._environment = {**os.environ, **environment}
         self._running: dict[str, subprocess.Popen[bytes]] = {}
         self._commands: dict[str, list[str]] = {}
-        self._begun: dict[str, float] = {}
+        self._started_wall: dict[str, float] = {}
         self._short_lives: Counter[str] = Counter()
 
     def start(self, name: str, parameters_file: Path, parameters: Mapping[str, Any]) -> None:
-        """Start node `name` with a parameter file and values that override it."""
+        """Start the node `name`; ``parameters`` override those of the file."""
         command = [sys.executable, '-m', 'remaster_ros.nodes', name, '--ros-args']
         command += ['--params-file', str(parameters_file)]
         for key, value in parameters.items():
@@ -54,7 +54,8 @@ class NodeProcesses:
         self._spawn(name)
 
     def _spawn(self, name: str) -> None:
-        self._begun[name] = time.monotonic()
+        """Start the process of a node, or start it again."""
+        self._started_wall[name] = time.monotonic()
         with (self._log_folder / f'{name}.log').open('ab') as log:
             self._running[name] = subprocess.Popen(
                 self._commands[name],
@@ -62,22 +63,22 @@ class NodeProcesses:
                 stderr=subprocess.STDOUT,
                 stdin=subprocess.DEVNULL,
                 env=self._environment,
-                start_new_session=True,  # Ctrl-C on the terminal reaches us alone; we end them.
+                start_new_session=True,  # Ctrl-C on the terminal reaches only the demo.
                 preexec_fn=_die_with_parent,
             )
 
     def check(self) -> list[str]:
-        """Start again whoever was killed, as a supervisor does; return their names.
+        """Restart killed processes, as a supervisor does; return their names.
 
-        Raises DeviceError: with the last line of its log, if a process has ended by itself, or is
-        killed again and again as soon as it is there.
+        Raises DeviceError, with the last line of its log, if a process has ended by itself, or is
+        killed repeatedly just after its start.
         """
         killed = []
         for name, process in list(self._running.items()):
             status = process.poll()
             if status is None:
                 continue
-            lived_s = time.monotonic() - self._begun[name]
+            lived_s = time.monotonic() - self._started_wall[name]
             self._short_lives[name] = self._short_lives[name] + 1 if lived_s < SHORT_LIFE_S else 0
             if status < 0 and self._short_lives[name] <= SHORT_LIVES:
                 self._spawn(name)
@@ -89,14 +90,11 @@ class NodeProcesses:
         return killed
 
     def pid(self, name: str) -> int:
-        """Return the process that runs a node now."""
+        """Return the id of the present process of a node."""
         return self._running[name].pid
 
     def stop(self, names: Sequence[str] = (), grace_s: float = 20.0) -> list[str]:
-        """End processes within about `grace_s`, all by default; return those that were killed.
-
-        On an idle computer they take a second.
-        """
+        """End processes, all by default; return the names of those killed after `grace_s`."""
         ended = {name: self._running[name] for name in names or self._running}
         for process in ended.values():
             if process.poll() is None:
@@ -115,16 +113,17 @@ class NodeProcesses:
 
 
 def free_ports(*kinds: int) -> list[int]:
-    """Return a port on loopback for each kind of socket, all different and unused now.
+    """Return an unused port on loopback for each kind of socket, all different.
 
-    They lie above the ports that Linux gives to sockets without one (32768 to 60999): nine
-    processes open dozens of these before the ports found here are bound.
+    They lie above the ports that Linux assigns to sockets without one (32768 to 60999): nine
+    processes open dozens of these before the returned ports are bound.
     """
     candidates = iter(random.SystemRandom().sample(range(61001, 65001), 1000))
     return [next(port for port in candidates if _is_free(kind, port)) for kind in kinds]
 
 
 def _is_free(kind: int, port: int) -> bool:
+    """Return whether a socket can be bound to a port."""
     with socket.socket(socket.AF_INET, kind) as probe:
         try:
             probe.bind(('127.0.0.1', port))

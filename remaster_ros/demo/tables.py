@@ -23,11 +23,11 @@ from remaster_ros.simulation.truth import SessionTruth
 from remaster_ros.types import Session
 
 
-def _table(title: str, *headings: str, left: int = 1) -> Table:
-    """Return an empty table, its first `left` columns aligned to the left."""
+def _table(title: str, *headings: str, left_aligned: int = 1) -> Table:
+    """Return an empty table, its first `left_aligned` columns left-aligned."""
     table = Table(title=title)
     for column, heading in enumerate(headings):
-        table.add_column(heading, justify='left' if column < left else 'right')
+        table.add_column(heading, justify='left' if column < left_aligned else 'right')
     return table
 
 
@@ -59,7 +59,7 @@ def print_offsets(console: Console, fit: Fit, truth: SessionTruth) -> None:
             estimate, spread, narrower = f'{mean:.4f}', f'{std:.4f}', f'{drawn_std:.4f}'
             off = f'{(mean - true) / drawn_std:+.1f} std'
         else:
-            # An offset that the data leave free has the spread of a whole turn: no useful figure.
+            # The spread of an undetermined offset is a whole turn, which is no useful figure.
             estimate, spread = 'not identifiable', f'{std:.2f}' if std < 90 else 'n/a'
             narrower = off = ''
         name = f'{row.joint}, mm' if slides else row.joint
@@ -80,14 +80,14 @@ def print_offsets(console: Console, fit: Fit, truth: SessionTruth) -> None:
 
 
 def print_hidden(console: Console, discovery: Discovered, truth: SessionTruth) -> None:
-    """Print what was found beside what was hidden, and the gain."""
+    """Print the found causes beside the hidden ones, and the gain."""
     found: dict[Any, list[Effect]] = {}
     for claim in discovery.effects:
         for cause in named_cause(msgspec.to_builtins(claim)):
             found.setdefault(cause, []).append(claim)
     hidden = [(cause, effect) for effect in truth.effects for cause in causes(effect)]
     headings = ('hidden truth', 'found', 'parameter', 'estimate', 'std', 'truth', 'unit')
-    table = _table('beyond the zero-offsets', *headings, left=2)
+    table = _table('beyond the zero-offsets', *headings, left_aligned=2)
     for cause, effect in hidden:
         claims = found.pop(cause, [])
         table.add_row(describe(cause), 'yes' if claims else 'no')
@@ -108,26 +108,29 @@ def true_errors(
 ) -> tuple[float, float]:
     """Return the mean true error of the tool without and with a correction, mm.
 
-    At the configurations of a session that was measured with it on; against the nominal arm, base
-    and marker fitted to each.
+    At the configurations of a session measured with the correction on. The true positions are
+    compared with the nominal arm, base and marker fitted for each of the two.
     """
     m = session.measurements
     assert m.wanted is not None
     first = np.unique(m.configuration, return_index=True)[1]
-    tours = m.wanted[np.sort(first)], m.q[np.sort(first)]
+    commanded_and_reached = m.wanted[np.sort(first)], m.q[np.sort(first)]
     n, marker = len(first), next(iter(compensator.model.markers))
-    found = verify(
+    result = verify(
         compensator,
         Visits(
-            np.tile(tours[0], (2, 1)),
+            np.tile(commanded_and_reached[0], (2, 1)),
             np.repeat([False, True], n),
             np.tile(np.arange(n), 2),
             2 * n * ('truth',),
             2 * n * (marker,),
             np.concatenate(
-                [tool_points(compensator.model.chain, truth, q, marker) for q in tours]
+                [
+                    tool_points(compensator.model.chain, truth, q, marker)
+                    for q in commanded_and_reached
+                ]
             ),
         ),
     )
-    assert found.error_off is not None
-    return found.error_off.mean_mm, found.error_on.mean_mm
+    assert result.error_off is not None
+    return result.error_off.mean_mm, result.error_on.mean_mm

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The sensors of a cell as the recorder follows them: readings, heartbeats, measure services."""
+"""The sensors of a cell as the recorder follows them: readings, liveness, measure services."""
 
 from __future__ import annotations
 
@@ -30,7 +30,10 @@ from remaster_ros.session.workcell import Workcell
 
 
 class CellSensors:
-    """Subscribe to all sensors and find which are missing; `InputError` for a wrong require."""
+    """Subscriptions to all sensors of a cell, and their liveness.
+
+    Raises InputError if the parameter `require` names an unknown sensor.
+    """
 
     def __init__(self, node: RemasterNode, p: Parameters, cell: Workcell) -> None:
         try:
@@ -50,7 +53,7 @@ class CellSensors:
         )
 
     def subscribe(self, bag: BagRecorder, recorder: SessionRecorder) -> None:
-        """Subscribe to the readings, through the bag."""
+        """Subscribe to all readings, which go to the bag and to the recorder."""
         for name, sensor in self._sensors.items():
             for marker, topic in sensor.topics.items():
                 take = self._taker(recorder, name, marker)
@@ -62,6 +65,8 @@ class CellSensors:
             bag.subscribe(Temperature, topic, recorder.take_temperature)
 
     def _taker(self, recorder: SessionRecorder, sensor: str, marker: str) -> Callable[[Any], None]:
+        """Return the callback for readings of a marker."""
+
         def take(message: PointStamped | PoseStamped) -> None:
             if recorder.take_marker(sensor, marker, message):
                 self._liveness.reads(sensor, self._steady_s())
@@ -69,7 +74,7 @@ class CellSensors:
         return take
 
     def take(self, record: EventRecord, report: SensorReport) -> None:
-        """Take the state of a sensor's node."""
+        """Update the liveness of a sensor by its node's report."""
         self._liveness.node_reports(
             report.sensor,
             report.ready,
@@ -80,22 +85,23 @@ class CellSensors:
         )
 
     def missing(self) -> str:
-        """Return which sensors the arm has to wait for, and why; ''."""
+        """Return the required sensors that are absent, and why, as text; ''."""
         return self.required.missing(self._absent())
 
     def read_age_s(self) -> dict[str, float | None]:
-        """Return the time since the last reading of each sensor, s; None for never."""
+        """Return the time since the last reading of each sensor, s; None if there was none."""
         now = self._steady_s()
         ages_s = {name: self._liveness.read_age_s(name, now) for name in self._sensors}
         return {name: age_s if np.isfinite(age_s) else None for name, age_s in ages_s.items()}
 
     def trigger(self, pairing: Pairing) -> None:
-        """Have single-shot sensors measure for the reading under way."""
+        """Request the measurements of single-shot sensors for a reading."""
         self._shots.look(pairing, self._absent(), self._steady_s())
 
     def give_up(self, recording: Recording) -> None:
-        """Reject what does not come in time."""
+        """Reject readings that are overdue."""
         recording.give_up(self._absent(), self._liveness.reports)
 
     def _absent(self) -> dict[str, str]:
+        """Return the absent sensors, and why."""
         return self._liveness.absent(self._steady_s(), self.required.names)

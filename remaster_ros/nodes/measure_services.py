@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Measure services of single-shot sensors: measurements of a configuration, and of a preflight."""
+"""Measure services of single-shot sensors: for a configuration, and for a preflight."""
 
 from __future__ import annotations
 
@@ -15,23 +15,23 @@ from remaster_ros.collection.pairing import Pairing
 from remaster_ros.session.workcell import Workcell
 
 PATIENCE_WALL_S = 1.0
-"""An answer counts after so long: in this time the status of the node may show that the instrument
-is gone, and the reading of a measurement arrives."""
+"""Time from an answer until it counts: meanwhile the reading arrives, or the status of the node
+shows that the instrument is gone."""
 MISSING_WALL_S = 5.0
-"""A service that is not there counts after so long: by then a node that died is absent."""
+"""Time until a missing service counts as a failure: by then a dead node is known as absent."""
 
 
 @dataclass
 class _Shot:
-    """A measurement: since when it is needed, the request, and when it was answered."""
+    """A measurement by a service."""
 
-    since_wall: float
-    future: Future | None = None
+    since_wall: float  # When it was first needed
+    future: Future | None = None  # Of the request
     answered_wall: float | None = None
 
 
 class TriggeredSensors:
-    """The measurements that one configuration after the other needs, by service clients."""
+    """Requests the measurements of one configuration after the other."""
 
     def __init__(self, clients: Mapping[str, Client]) -> None:
         self._clients = clients
@@ -39,12 +39,10 @@ class TriggeredSensors:
         self._shots: dict[str, _Shot] = {}
 
     def look(self, pairing: Pairing, absent: Mapping[str, str], now: float) -> None:
-        """Send the requests that this pairing still needs, and note the refusals.
+        """Send the requests that a pairing still needs, and report refusals to it.
 
-        ``now`` is of the recorder's watchdogs, s.
-
-        The request is sent again to a sensor that was absent meanwhile, and to one whose reading
-        was lost.
+        A request is repeated to a sensor that was absent meanwhile, and to one whose reading was
+        lost. ``absent``: sensor -> why; ``now``: time of the recorder's watchdogs, s.
         """
         if pairing is not self._pairing:
             self._pairing, self._shots = pairing, {}
@@ -61,6 +59,7 @@ class TriggeredSensors:
                 pairing.fail(name, f'the service {client.srv_name} is not there')
 
     def _take_answer(self, name: str, shot: _Shot, pairing: Pairing, now: float) -> None:
+        """Report a refusal to the pairing; forget the request if its reading was lost."""
         assert shot.future is not None
         response = shot.future.result() if shot.future.done() else None
         if response is None:
@@ -76,11 +75,11 @@ class TriggeredSensors:
 
 
 MEASURE_EVERY_WALL_S = 5.0
-"""How often a single-shot sensor measures until its marker was seen, wall time."""
+"""Interval of a sensor's measurements until its marker was seen, s of wall time."""
 
 
 class MeasureCalls:
-    """Have single-shot sensors show that they see their markers."""
+    """Requests measurements until single-shot sensors have seen their markers."""
 
     def __init__(self, node: Node, cell: Workcell) -> None:
         self._clients: dict[str, Client] = {
@@ -91,7 +90,7 @@ class MeasureCalls:
         self._called_wall = dict.fromkeys(self._clients, float('-inf'))
 
     def call(self, names: Collection[str], now: float) -> None:
-        """Call the measure services of these sensors, each now and then; wall time, s."""
+        """Request a measurement of these sensors, at most every 5 s; ``now``: wall time, s."""
         for name, client in self._clients.items():
             due = now - self._called_wall[name] >= MEASURE_EVERY_WALL_S
             if name in names and due and client.service_is_ready():

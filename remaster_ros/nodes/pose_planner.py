@@ -1,21 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Plan poses in front of the sensors; publish them one by one, each with all its joint solutions.
+"""Node that plans poses in front of the sensors and publishes them one by one.
 
 ``/remaster/collect`` starts or resumes; ``/remaster/pause`` and ``/remaster/stop`` hold the arm.
-``/remaster/verify`` and ``/remaster/check`` begin visits by which the arm is judged, in place of a
-collection.
-Without a registration of every sensor the first poses serve the three-point registration.
+``/remaster/verify`` and ``/remaster/check`` begin an inspection of the arm in place of a
+collection. Until every sensor is registered, poses serve the three-point registration.
 
-What the planner does and in which run is decided in `collection.collection_run`, which pose is
-next in `collection.tour_progress`, whether it is announced again in `collection.announcements`.
+Decisions are made elsewhere: on the run in `collection.collection_run`, on the next visit in
+`collection.tour_progress`, on repeated announcements in `collection.announcements`.
 
-The plan and the pose under way are in the session folder before the arm moves; what became of
-each configuration is in the recorder's journal there alone, which the recorder's state tells of. A
-planner that was killed goes on by itself where it was, if the run still lives: recorder and bridge
-hold its token (see `LivingRun`).
+The plan and the visit under way are in the session folder before the arm moves; outcomes of
+configurations are in the recorder's journal alone, and come in the recorder's state. A killed
+planner resumes by itself if its run still lives: recorder and bridge hold its token (see
+`LivingRun`).
 
-Pause and stop have a thread of their own: neither planning nor the disk keeps them waiting. Their
-state goes out first; what the journal must remember is written afterwards.
+Pause and stop have a thread of their own: neither planning nor the disk delays them. Their state
+is published first and written to the journal afterwards.
 """
 
 from __future__ import annotations
@@ -50,8 +49,8 @@ from remaster_ros.nodes.messages import (
     transform_array,
 )
 from remaster_ros.nodes.parameters import declare
-from remaster_ros.nodes.planner.further_measuring import FurtherMeasuring
-from remaster_ros.nodes.planner.judging import KINDS, Judging, Kind
+from remaster_ros.nodes.planner.added_measurements import AddedMeasurements
+from remaster_ros.nodes.planner.inspections import KINDS, Inspection, Inspections
 from remaster_ros.nodes.planner.living_run import LivingRun, new_token, silence_s
 from remaster_ros.nodes.planner.parameters import Parameters
 from remaster_ros.nodes.planner.plan_preview import PlanPreview
@@ -73,11 +72,11 @@ from remaster_ros.session.workcell import read_cell
 from remaster_ros.types import FloatArray
 
 RETRY_WALL_S = 1.0
-"""How often a full disk is tried again, wall time."""
+"""Interval at which a failed write is repeated, s of wall time."""
 
 
 class PosePlanner(RemasterNode):
-    """See the module's text."""
+    """The node; see the module."""
 
     def __init__(self) -> None:
         super().__init__('pose_planner')
@@ -93,15 +92,15 @@ class PosePlanner(RemasterNode):
         self.journal = PlanJournal(folder, settings, self.chain, self._tours.model)
         planning = PlanningThread(Background(self), JointUnits.of(self.chain))
         self.progress = TourProgress(self.journal, self._tours, planning)
-        # Of the run, and of what may be published only while it is running.
+        # Guards the run, and publications that are allowed only while it is running.
         self._lock = threading.RLock()
         self.run = CollectionRun(self.p.resume_within_s)
-        self._further = FurtherMeasuring(self.p.discovery, folder, self.journal, self._tours)
-        # Every pose passes its gate in `_announce`.
+        self._additions = AddedMeasurements(self.p.discovery, folder, self.journal, self._tours)
+        # `_announce` asks it before each visit.
         self._preview = PlanPreview(
             self.cell, self._tours, self.journal, self.progress, folder, Background(self)
         )
-        self._judging = Judging(self, folder, self.p, self.cell, self._tours)
+        self._inspections = Inspections(self, folder, self.p, self.cell, self._tours)
         self._living: LivingRun | None = None
         self._tried_wall = 0.0
         self._resume()
@@ -118,7 +117,7 @@ class PosePlanner(RemasterNode):
         at_once = MutuallyExclusiveCallbackGroup()
         self.create_service(Trigger, 'remaster/collect', self._on_collect)
         for kind in KINDS:
-            self.create_service(Trigger, f'remaster/{kind}', partial(self._on_judge, kind))
+            self.create_service(Trigger, f'remaster/{kind}', partial(self._on_inspection, kind))
         self.create_service(Trigger, 'remaster/pause', self._on_pause, callback_group=at_once)
         self.create_service(Trigger, 'remaster/stop', self._on_stop, callback_group=at_once)
         model = self.cell.model()
@@ -132,23 +131,23 @@ class PosePlanner(RemasterNode):
         self.create_timer(0.05, self._step, clock=self.status.steady)
 
     def _resume(self) -> None:
-        """Take up what a planner before this one has left."""
+        """Restore the state that a planner before this one has left."""
         journal = self.journal
         if journal.tour is None:
             return
         if journal.lost:
             self.get_logger().warning(journal.lost)
-        # Plans that need a confirmation need it after every start.
+        # A confirmation does not outlive the planner.
         token = '' if self._preview.required else journal.run
         self.run.resume(journal.state, token, self.progress.describe())
         self.get_logger().warning(f'{journal.path}: going on; {self.progress.describe()}')
 
-    def _take_up_run(self) -> None:
-        """Go on with the run that a killed planner has left, if that certainly still lives."""
+    def _resume_run(self) -> None:
+        """Resume the run of a killed planner, if it certainly still lives."""
         left, peers = self.run.left, self._peers
         silent_s, progress = silence_s(left), self.progress.describe()
         with self._lock:
-            # A pause or a stop may have come meanwhile.
+            # A pause or stop may have been requested meanwhile.
             decided = self.run.left == left and self.run.take_up(
                 silent_s, peers.bridge, peers.recorder, progress
             )
@@ -158,8 +157,8 @@ class PosePlanner(RemasterNode):
             self.get_logger().warning(self.run.why)
 
     def _follow_run(self) -> None:
-        """Publish the state of the run, with its sign of life; called with the lock held."""
-        # First of all: a pause or a stop must not wait for the disk.
+        """Publish the run's state, and keep its liveness file; called with the lock held."""
+        # First, since a pause or stop must not wait for the disk.
         self.status.publish()
         living, token = self._living, self.run.token
         if living is not None and living.token != token:
@@ -170,25 +169,25 @@ class PosePlanner(RemasterNode):
         self._living = living
 
     def _end(self, state: str, why: str = '') -> None:
-        """End a run that is under way; `_step` writes that down."""
+        """End the run under way; `_step` writes that to the journal."""
         with self._lock:
             if self.run.end(state, why, only_from='running'):
                 self._follow_run()
 
-    # Services
-
     def _on_collect(self, request: Trigger.Request, response: Trigger.Response) -> Any:
         return self._collect(response)
 
-    def _on_judge(self, kind: Kind, request: Trigger.Request, response: Trigger.Response) -> Any:
-        """Begin, or go on with, visits by which the arm is judged; afterwards tell the verdict."""
+    def _on_inspection(
+        self, kind: Inspection, request: Trigger.Request, response: Trigger.Response
+    ) -> Any:
+        """Begin or resume an inspection; if it is complete, answer with the verdict."""
         tour, recorder = self.journal.tour, self._peers.recorder
-        own = tour is not None and tour.inspection == kind
-        if own and self.run.state == 'complete':
-            response.success, response.message = self._judging.told()
+        same_kind = tour is not None and tour.inspection == kind
+        if same_kind and self.run.state == 'complete':
+            response.success, response.message = self._inspections.answer()
         elif self.run.state == 'running':
-            response.message = 'something else is under way' if not own else 'under way'
-        elif (tour is not None and not own) or (
+            response.message = 'something else is under way' if not same_kind else 'under way'
+        elif (tour is not None and not same_kind) or (
             tour is None and recorder is not None and recorder.observations
         ):
             response.message = (
@@ -196,35 +195,39 @@ class PosePlanner(RemasterNode):
                 'new session folder'
             )
         else:
-            response.message = self._judging.refusal(kind, self._peers.bridge)
+            response.message = self._inspections.refusal(kind, self._peers.bridge)
             try:
-                plan, words = self._judging.tour(kind) if not response.message else (None, '')
+                plan, words = self._inspections.tour(kind) if not response.message else (None, '')
             except RemasterError as error:
                 response.message = str(error)
             if not response.message:
-                self._collect(response, None if own else plan)
+                self._collect(response, None if same_kind else plan)
                 response.message = words if response.success else response.message
         return response
 
     def _collect(
-        self, response: Trigger.Response, judging: Callable[[], Tour] | None = None
+        self, response: Trigger.Response, inspection: Callable[[], Tour] | None = None
     ) -> Any:
-        """Begin a run or go on; with `judging` that plans what is visited, once it is running."""
+        """Begin or resume a run; ``inspection``: plans an inspection instead of a collection."""
         bridge, recorder = self._peers.bridge, self._peers.recorder
-        further, plan = self._further.ask(self.run.state, under_way=self.progress.goes_further)
+        further, plan = self._additions.next_plan(
+            self.run.state, under_way=self.progress.measures_additions
+        )
         has_joints = self._q is not None
         refusal = self.run.refusal(bridge, recorder, has_joints=has_joints, further=further)
-        # What is still to be planned cannot be shown; `_announce` has it confirmed.
-        response.message = refusal or (self._preview.asked() if judging is None else '')
+        # An inspection is not planned yet and cannot be shown; `_announce` asks for confirmation.
+        response.message = refusal or (
+            self._preview.collect_refusal() if inspection is None else ''
+        )
         if response.message:
             return response
-        self.progress.judging = judging or self.progress.judging
+        self.progress.inspection = inspection or self.progress.inspection
         if plan is not None:
-            # What was looked at before the first motion is looked at again.
-            self.progress.further, self._described, self._cleared = plan, False, False
+            # The preflight is repeated.
+            self.progress.additions, self._described, self._cleared = plan, False, False
         if self.run.state != 'running':
             if recorder is not None and recorder.changed_run:
-                # A person has looked: how things are from now on is measured first.
+                # A person has changed the setup: the references are measured first.
                 self.journal.request_reference_round()
             # The arm may have been stopped, or moved by hand, since it last settled.
             self._listen_again()
@@ -237,6 +240,7 @@ class PosePlanner(RemasterNode):
     def _on_confirm(
         self, request: Trigger.Request, response: Trigger.Response, plan: str = ''
     ) -> Any:
+        """Confirm the plan on the page; ``plan``: its fingerprint, '' for any."""
         response.success, response.message = self._preview.confirm(plan)
         if response.success and self.run.state != 'running':
             self.run.why = response.message
@@ -244,7 +248,7 @@ class PosePlanner(RemasterNode):
         return response
 
     def _offer(self, plan: str) -> None:
-        """Offer a service that confirms this plan and no other; it stays, to refuse later on."""
+        """Create a service that confirms this plan only; it remains, to refuse later calls."""
         if plan and plan not in self._offered:
             self._offered.add(plan)
             path = f'remaster/confirm/{service_name(plan)}'
@@ -259,7 +263,7 @@ class PosePlanner(RemasterNode):
 
     def _on_stop(self, request: Trigger.Request, response: Trigger.Response) -> Any:
         with self._lock:
-            # The command first: nothing that fails behind it may keep the arm moving.
+            # The command first: no later failure may keep the arm moving.
             self._poses.stop()
             self._announcements.retract()
             self.run.stop()
@@ -267,18 +271,18 @@ class PosePlanner(RemasterNode):
         response.success, response.message = True, 'stopped'
         return response
 
-    # What comes in
-
     def _listen_to_the_arm(self) -> Subscription:
+        """Subscribe to the joint states."""
         return self.create_subscription(
             JointState, 'joint_states', self._on_joint_state, JOINT_STATES
         )
 
     def _listen_again(self) -> None:
+        """Subscribe to the joint states until the next one arrives."""
         self._joint_states = self._joint_states or self._listen_to_the_arm()
 
     def _on_joint_state(self, message: JointState) -> None:
-        """Learn where the arm is before the first pose; after that by /remaster/settled."""
+        """Set the arm's configuration before the first pose; later /remaster/settled does."""
         if not self._order.concerns(message):
             return
         self._on_settled(message)
@@ -287,8 +291,9 @@ class PosePlanner(RemasterNode):
             self._joint_states = None
 
     def _on_settled(self, message: JointState) -> None:
+        """Set the arm's configuration."""
         try:
-            # Where the nominal arm has its tool where the arm has it, if the bridge corrects.
+            # The nominal joint angles of the tool's pose, if the bridge corrects.
             wanted = wanted_of(message, self._order.names)
             self._q = self._order.positions(message) if wanted is None else wanted
         except InputError as error:
@@ -298,28 +303,30 @@ class PosePlanner(RemasterNode):
         self.progress.T_R_N[message.child_frame_id] = transform_array(message)
 
     def _on_record(self, record: events.EventRecord) -> None:
+        """Update the state by an event or state of another node."""
         now = time.monotonic()
         self._peers.take(record, now)
         self._models.take(record, now)
         match record.body:
             case events.ArmHalted(reason=why) | events.BridgeState(halted=why) if why:
-                # It goes on when a person has looked at the arm and calls /remaster/collect.
+                # A person looks at the arm and calls /remaster/collect.
                 self._end('paused', why)
             case events.BridgeState(asks_for_collect=why, run=run) if why:
-                # An earlier run's may come late: a person has begun another one since.
+                # A late message may be of an earlier run.
                 if run == self.run.token:
                     self._end('paused', why)
             case events.SetupChanged(stops=True, text=why):
                 self._end('paused', why)
             case OptimizerState(enough=True, plan=plan) if plan and plan == self.journal.id:
-                # The pose under way is finished, what is held out is measured: an ordinary end.
+                # The visit under way is finished and validation poses are measured, as usual.
                 self.progress.enough = True
             case events.RecorderState() as recorder:
                 self._on_recorder(recorder)
 
     def _on_recorder(self, recorder: events.RecorderState) -> None:
+        """Update the progress by the recorder's state; evaluate a finished inspection."""
         if self.run.token and recorder.changed_run == self.run.token:
-            # Found while this planner was not there; collect begins another run.
+            # The change was found while no planner was running; collect begins another run.
             self._end('paused', recorder.changed)
         if self.progress.follow(recorder):
             self._step()
@@ -327,17 +334,15 @@ class PosePlanner(RemasterNode):
         if self.run.state == 'complete' and tour is not None and recorder.plan == self.journal.id:
             for kind in KINDS:
                 if closed and tour.inspection == kind:
-                    self._judging.judge(kind)
-
-    # The tour
+                    self._inspections.evaluate(kind)
 
     def _step(self) -> None:
-        """Publish the next pose once every solution of the last one has its outcome."""
+        """Announce the next visit once every solution of the last one has its outcome."""
         living = self._living
         if living is not None:
             living.stay_alive()
         if self.run.left:
-            self._take_up_run()
+            self._resume_run()
         self._write_state()
         if self.journal.trouble and not self._is_written():
             return
@@ -354,11 +359,11 @@ class PosePlanner(RemasterNode):
             self.progress.check_session(recorder, self.journal.path)
             if self.progress.open_pose is None:
                 required = self._peers.required()
-                stop = self.progress.next(q, required, recorder.registration)
-                if stop is not None:
+                visit = self.progress.next(q, required, recorder.registration)
+                if visit is not None:
                     self._announcements.retract()
             elif (lack := self._announcements.lack()) is Lack.ANEW:
-                stop = self.progress.rest(q)
+                visit = self.progress.rest(q)
             else:
                 if lack is Lack.LATE:
                     self._repeat()
@@ -368,15 +373,15 @@ class PosePlanner(RemasterNode):
             self.get_logger().error(str(error))
             return
         if self.progress.is_complete:
-            self._end('complete', '' if self.progress.planned_any else self._further.describe())
+            self._end('complete', '' if self.progress.planned_any else self._additions.describe())
         if self.progress.standing:
             self.run.why = self.progress.standing
             self._listen_again()
-        if stop is not None and not self.journal.trouble:
-            self._announce(stop)
+        if visit is not None and not self.journal.trouble:
+            self._announce(visit)
 
     def _hindrance(self, now: float) -> str:
-        """Return why no pose can be announced now; ''."""
+        """Return why no pose can be announced now; '' if one can."""
         if self.clock_trouble:
             return self.clock_trouble
         if not self.status.alone(now):
@@ -386,7 +391,7 @@ class PosePlanner(RemasterNode):
         if not self._announcements.matched(self._poses.subscribers, now):
             return 'waiting for robot_bridge and recorder'
         if not self._cleared:
-            # Once, before the first motion. No pose was begun before a preflight was passed.
+            # Once, before the first motion. A resumed tour has passed a preflight before.
             seen_before = self.progress.resumed or bool(self.progress.T_R_N)
             facts = self._peers.facts(now, seen_before=seen_before)
             self._measure.call([s.name for s in facts.sensors if s.ready and s.read_age_s], now)
@@ -396,7 +401,8 @@ class PosePlanner(RemasterNode):
                 return f'preflight: {"; ".join(findings)}'
         return ''
 
-    def _announce(self, stop: PoseVisit) -> None:
+    def _announce(self, visit: PoseVisit) -> None:
+        """Publish a visit if its plan is confirmed, and the run is under way."""
         tour = self.journal.tour
         if not self._preview.allows(tour):
             self._preview.withdraw()
@@ -404,34 +410,34 @@ class PosePlanner(RemasterNode):
             return
         if tour is not None and self.progress.phase != REGISTRATION and not self._described:
             self._described = True
-            planned = self._further.planned(tour)
+            planned = self._additions.describe_tour(tour)
             if self._q is not None and not tour.begin_at and not tour.inspection:
                 self._session_s = session_time_s(self._tours, tour, self._q)
                 minutes = f'{self._session_s / 60.0:.1f} min'
                 planned += f'; about {minutes} of robot time for the whole session'
             self.status.event(events.TourPlanned(planned))
         with self._lock:
-            # Paused or stopped while the pose was chosen and written: collect announces it.
+            # If paused or stopped while the visit was planned, collect announces it.
             if self.run.state == 'running':
-                last = self.progress.is_last_reference(stop)
-                stamp = self._poses.announce(stop, self.journal.id, self.status, last=last)
+                last = self.progress.is_last_reference(visit)
+                stamp = self._poses.announce(visit, self.journal.id, self.status, last=last)
                 self._announcements.announced(stamp, time.monotonic())
 
     def _repeat(self) -> None:
-        """Send the open pose's announcement again, for a node that lags."""
+        """Repeat the announcement of the visit under way, for a node that missed it."""
         with self._lock:
             if self.run.state == 'running':
                 self._poses.repeat(self.status)
                 self._announcements.announced(self._announcements.stamp, time.monotonic())
 
     def _write_state(self) -> None:
-        """Write the state down; a stop or pause came in a thread that must not wait for it."""
+        """Write the state to the journal, which pause and stop leave to this thread."""
         with self._lock:
             state, token = self.run.state, self.run.token
         self.journal.record_state(state, token)
 
     def _is_written(self) -> bool:
-        """Whether the disk takes what it did not take before; looked at once a second."""
+        """Retry a failed write once a second; return whether all is written."""
         now = time.monotonic()
         if now - self._tried_wall < RETRY_WALL_S:
             return False
@@ -441,39 +447,40 @@ class PosePlanner(RemasterNode):
         return not self.journal.trouble
 
     def _summary(self) -> Summary:
+        """Return the state of the planner for the status."""
         run, trouble = self.run, self.journal.trouble
         full = f'waiting for room on the disk: {trouble}' if trouble else ''
         values = {
             'robot': 'silent' if self._q is None else 'heard',
             'plan': self.journal.id,
             'references_done': self.progress.decided.references,
-            # Whether it may still go on by itself.
+            # Whether the planner may still resume by itself.
             'resuming': 'yes' if run.left else 'no',
             **self._preview.values(),
             **self.progress.counts(),
-            'verdict': self._judging.verdict,
-            # Of the whole session; '' before its collection is planned.
+            'verdict': self._inspections.verdict,
+            # Of the whole session; '' before the collection is planned.
             'robot_time_s': f'{self._session_s:.0f}' if self._session_s else '',
             'dropped_solutions_no free path': self.progress.decided.outcomes.get(
                 events.NO_FREE_PATH, 0
             ),
         }
-        why = full or run.why or self._judging.trouble
+        why = full or run.why or self._inspections.trouble
         level = 'error' if run.state == 'failed' else 'warn' if why else 'ok'
         shown = 'held' if full and run.state == 'running' else run.state
         return Summary(level, why or run.state, values, self.progress.state(shown, run.token))
 
     def close(self) -> None:
-        """Publish that the planner has stopped, on which the bridge stops the arm."""
+        """Publish that the planner has stopped, at which the bridge stops the arm."""
         self._end('stopped')
         self._write_state()
-        self._judging.close()
+        self._inspections.close()
         self.journal.close()
 
 
 def main(args: list[str] | None = None) -> int:
     """Run the node."""
-    # One for the tour, one for pause and stop, one for the status.
+    # Threads for the tour, for pause and stop, and for the status.
     return run(PosePlanner, args, threads=3)
 
 

@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pair settled joints with marker readings; write the session and the bag; register the sensors.
+"""Node that pairs settled joints with marker readings, and writes the session and the bag.
 
-What becomes of a message is decided in `session.session_recorder`, which a bag gives the same
-session by; here are the topics, services and clocks. The bridge moves on only after the event of
-a configuration. While the disk is full the arm is held, and what is to be written is kept and
-tried again.
+The session is decided in `session.session_recorder`, which makes the same session from a bag; here
+are the topics, services and clocks. The bridge goes on only after the event of a configuration. If
+the disk is full, the arm waits, and the write is repeated.
 """
 
 from __future__ import annotations
@@ -58,7 +57,7 @@ from remaster_ros.types import FloatArray
 
 
 class Recorder(RemasterNode):
-    """See the module's text."""
+    """The node; see the module."""
 
     def __init__(self) -> None:
         super().__init__('recorder')
@@ -72,7 +71,7 @@ class Recorder(RemasterNode):
         self._registrations = self.create_publisher(
             TransformStamped, 'remaster/registration', LATCHED
         )
-        # Of /remaster/register, while the reading that it has begun is under way.
+        # Result of the reading that /remaster/register has begun, while it is under way.
         self._by_hand: Future | None = None
         header = session_header(self.cell, self.p.settle_s)
         began = events.RecorderBegan(
@@ -86,7 +85,7 @@ class Recorder(RemasterNode):
         self._states = ArmStates(self, chain.joint_names, self.p.heartbeat_s)
         self.recorder = SessionRecorder(self.cell, self.p, self.keeper, _Outlet(self))
         self._subscribe()
-        # A group of its own: while it waits for the reading, what makes the reading goes on.
+        # A separate group: it waits for a reading, which other callbacks make.
         group = ReentrantCallbackGroup()
         register = self._on_register
         self.create_service(Trigger, 'remaster/register', register, callback_group=group)
@@ -97,7 +96,7 @@ class Recorder(RemasterNode):
         self.create_timer(0.05, self._look, clock=self.status.steady)
 
     def _subscribe(self) -> None:
-        """Take each topic once, raw: into the bag as it came, then decoded."""
+        """Subscribe to each topic once, raw: the bag gets the bytes, then they are decoded."""
         bag, recorder = self.keeper.bag, self.recorder
         bag.subscribe(JointState, JOINTS, self._on_joint_state, JOINT_STATES, with_info=True)
         bag.subscribe(JointState, 'remaster/settled', recorder.take_settled)
@@ -109,6 +108,7 @@ class Recorder(RemasterNode):
         bag.subscribe_rest()
 
     def _on_joint_state(self, message: JointState, info: Mapping[str, Any]) -> None:
+        """Record joint states unless there are two publishers of them."""
         self._taken.take(message.header.stamp)
         self._states.note(message, info)
         if rival := self._states.rival():
@@ -117,6 +117,7 @@ class Recorder(RemasterNode):
             self.recorder.take_joints(message)
 
     def _on_record(self, record: events.EventRecord) -> None:
+        """Hand an event or state of another node on."""
         self._records[taken_key(record)] += 1
         if isinstance(record.body, events.SensorReport):
             self.sensors.take(record, record.body)
@@ -124,10 +125,10 @@ class Recorder(RemasterNode):
             self.recorder.take_record(record)
 
     def _on_taken(self, request: Trigger.Request, response: Trigger.Response) -> Any:
-        """Answer how many messages of each topic were taken: a replay waits for that.
+        """Answer how many messages of each topic were received, for which a replay waits.
 
-        On remaster/events this node and others publish beside the replay: its records are counted
-        by their nodes' starts.
+        Several nodes publish on remaster/events beside the replay: its records are counted by the
+        start times of their nodes.
         """
         topics = {k: n for k, n in self.keeper.bag.taken.items() if k != f'/{EVENTS}'}
         response.success = True
@@ -135,7 +136,7 @@ class Recorder(RemasterNode):
         return response
 
     def _look(self) -> None:
-        """Trigger sensors, give up readings, and publish at once what the arm has to wait for."""
+        """Trigger sensors, reject overdue readings, and publish why the arm has to wait."""
         if self.keeper.look():
             self.status.publish()
         recording = self.recorder.recording
@@ -150,10 +151,8 @@ class Recorder(RemasterNode):
             self._was_waiting = is_waiting
             self.status.publish()
 
-    # Registration by hand
-
     async def _on_register(self, request: Trigger.Request, response: Trigger.Response) -> Any:
-        """Take the point where the arm stands now; the third point completes the registration."""
+        """Register with the present position of the arm; the third point completes it."""
         if self.keeper.full or self.recorder.recording.pairing is not None:
             response.message = 'a reading is under way; try again when it is done'
             return response
@@ -170,14 +169,13 @@ class Recorder(RemasterNode):
         response.message = ended.why or self.recorder.registration.describe()
         return response
 
-    # State
-
     def _summary(self) -> Summary:
+        """Return the state of the recorder for the status."""
         recorder, recording = self.recorder, self.recorder.recording
         busy = self.keeper.full or recording.pairing is not None
         state = 'closed' if self.journal.closed else 'measuring' if busy else 'waiting'
-        another = recorder.another_correction
-        waiting_for = self.keeper.waits_for or another or self.sensors.missing()
+        other_correction = recorder.another_correction
+        waiting_for = self.keeper.waits_for or other_correction or self.sensors.missing()
         changed, pose = recorder.changes.describe(), recording.pose
         reasons = (
             recorder.trouble,
@@ -216,7 +214,7 @@ class Recorder(RemasterNode):
         return Summary('warn' if trouble else 'ok', trouble or state, values, report)
 
     def close(self) -> None:
-        """Close the session; what is recorded so far stays readable."""
+        """Close the session; its records remain readable."""
         if self._by_hand is not None:
             self._by_hand.cancel()
         try:
@@ -226,7 +224,7 @@ class Recorder(RemasterNode):
 
 
 class _Outlet(Outlet):
-    """Publishes what the recorder's node is to publish."""
+    """Publishes on behalf of the session recorder."""
 
     def __init__(self, node: Recorder) -> None:
         self._node = node
@@ -253,7 +251,7 @@ class _Outlet(Outlet):
 
     def log(self, level: int, text: str) -> None:
         logger = self._node.get_logger()
-        # Each on a line of its own: rclpy refuses a line that logs with several severities.
+        # Separate calls: rclpy refuses a line of code that logs with several severities.
         if level >= logging.ERROR:
             logger.error(text)
         elif level >= logging.WARNING:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The session and the bag of the recorder on a disk that may be full."""
+"""Session and bag of the recorder on a disk that may be full: failed writes are repeated."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from remaster_ros.session.session_yaml import ExitStatus
 from remaster_ros.types import Session
 
 RETRY_S = 1.0
-"""How often a full disk is tried again, s of wall time."""
+"""Interval at which a failed write is repeated, s of wall time."""
 CHECK_S = 1.0
-"""How often it is looked whether the session's files are still the ones that are written, s."""
+"""Interval at which the session's files are checked for changes by others, s."""
 
 
 class SessionKeeper:
-    """Write a session, one thing at a time.
+    """Writes a session, one record at a time.
 
-    ``began``: what a bag begins with; None to record none.
-    Attributes: ``journal, bag``: what is written; ``full``: why the disk does not take what waits;
-    '' where nothing waits; ``restored``: what was last found changed by others and restored; ''.
+    ``began``: first record of a bag; None for no bag.
+    Attributes: ``journal, bag``; ``full``: why a write waits, '' if none does; ``restored``: last
+    damage of the files by others that was repaired, ''.
     """
 
     def __init__(
@@ -42,11 +42,11 @@ class SessionKeeper:
 
     @property
     def waits_for(self) -> str:
-        """What has to happen before anything can be written; ''."""
+        """What has to happen before the waiting write can succeed; '' if none waits."""
         return self.full if self._moved or not self.full else f'room on the disk: {self.full}'
 
     def write(self, write: Callable[[], object]) -> None:
-        """Call `write`; where the disk does not take it, `look` tries it again."""
+        """Call `write`; if the disk is full, `look` repeats it."""
         self._waiting, self._tried_wall = None, time.monotonic()
         try:
             write()
@@ -59,10 +59,7 @@ class SessionKeeper:
             self.full = ''
 
     def look(self) -> bool:
-        """Try again what waits, and restore what others did to the files, once a second.
-
-        Returns whether something was restored.
-        """
+        """Repeat a waiting write, and repair files that others changed; return whether any was."""
         now = time.monotonic()
         if self._waiting is not None and now - self._tried_wall > RETRY_S:
             self.write(self._waiting)
@@ -74,6 +71,7 @@ class SessionKeeper:
         return self._report_restored()
 
     def _report_restored(self) -> bool:
+        """Log repairs; return whether there were any."""
         lines = self.journal.take_restored()
         for line in lines:
             self._node.get_logger().error(line)
@@ -81,12 +79,12 @@ class SessionKeeper:
         return bool(lines)
 
     def reopen(self, *, go_further: bool = False) -> None:
-        """Go on with a session that was stopped; with `go_further`, with one that is complete."""
+        """Reopen a stopped session; with `go_further`, a complete one."""
         self.journal.reopen(go_further=go_further)
         self.bag.reopen()
 
     def close(self, exit_status: ExitStatus) -> None:
-        """Close session and bag; `DiskError` where the session remains open."""
+        """Close session and bag; raise DiskError if the session remains open."""
         self.journal.close(exit_status)
         self._report_restored()
         if self.journal.closed != exit_status:

@@ -12,7 +12,7 @@ import numpy as np
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.motion.limits import SLOWEST_M_S
 from remaster_ros.nodes.parameters import parameter
-from remaster_ros.nodes.planner.judging import JudgingParameters
+from remaster_ros.nodes.planner.inspections import InspectionParameters
 from remaster_ros.planning.rival_causes import FoundCause
 from remaster_ros.planning.tour_order import REGISTRATION
 from remaster_ros.planning.tour_planner import REGISTRATION_CANDIDATES, TourPlanner
@@ -21,7 +21,7 @@ from remaster_ros.session.workcell import Workcell
 
 
 @dataclass(frozen=True)
-class Parameters(JudgingParameters):
+class Parameters(InspectionParameters):
     """Parameters of the planner."""
 
     cell: str = parameter('demo', 'cell file: a path, or the name of a shipped one')
@@ -92,7 +92,7 @@ class Parameters(JudgingParameters):
     def tour_planner(
         self, cell: Workcell, chain: SerialChain, causes: Sequence[FoundCause]
     ) -> TourPlanner:
-        """Return what plans the tours of a cell with this arm; causes as of `causes`."""
+        """Return the planner of the tours of a cell; ``causes``: from `causes`."""
         scene = cell.planning_scene(chain, np.deg2rad(self.limit_margin_deg))
         counts = {
             'optimization': self.optimization_candidates,
@@ -109,16 +109,16 @@ class Parameters(JudgingParameters):
         return TourPlanner(scene, counts, self.seed, self.reference_every, design, travel, causes)
 
     def causes(self, joint_names: Sequence[str]) -> tuple[FoundCause, ...]:
-        """Return the causes that the plan is to separate; errors as of `read_causes`."""
+        """Return the causes that the plan has to separate; errors as of `read_causes`."""
         if not self.separate:
             return ()
-        # Imported when it is needed, as it takes a while.
+        # Imported when needed, since the import is slow.
         from remaster_ros.reports.discovery_json import read_causes
 
         return read_causes(self.separate, joint_names)
 
     def plan_settings(self, cell: Workcell, causes: Sequence[FoundCause]) -> dict[str, Any]:
-        """Return what the plan depends on."""
+        """Return everything that the plan depends on, as plain data by name."""
         design = cell.design_settings()
         speeds = {
             'speed_share': self.speed_share,
@@ -132,7 +132,7 @@ class Parameters(JudgingParameters):
             'seed': self.seed,
             'reference_every': self.reference_every,
             'limit_margin_deg': self.limit_margin_deg,
-            # Other plans do not depend on them.
+            # Only these plans depend on them.
             **(speeds if design.optimal or design.fastest else {}),
             **({'separate': repr(causes)} if causes else {}),
         }

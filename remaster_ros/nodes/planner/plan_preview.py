@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The plan that is next as a page, for a person to look at before the arm moves: `confirm: true`.
+"""The next plan as a page, which a person confirms before the arm moves: `confirm: true`.
 
-The page is drawn in a background thread as soon as the arm's position is known, and again when
-another plan is next: after the registration, which the collection is planned from.
+The page is drawn in a background thread as soon as the arm's configuration is known, and again
+when another plan is next: after the registration, which the collection is planned from.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from remaster_ros.types import FloatArray
 
 
 class PlanPreview(PlanConfirmation):
-    """Draws the plan that is next beside the session's folder, until it is confirmed."""
+    """Draws the next plan beside the session's folder until it is confirmed."""
 
     def __init__(
         self,
@@ -40,15 +40,15 @@ class PlanPreview(PlanConfirmation):
         self._cell, self._tours = cell, tours
         self._memory, self._progress = memory, progress
         self._thread = PlanningThread(background, JointUnits.of(tours.model.chain))
-        self._drawn: object = None
+        self._drawn_id: object = None
 
     def withdraw(self) -> None:
-        """Have the page drawn anew before anything can be confirmed."""
+        """Mark the page as outdated, so that it is drawn again before a confirmation."""
         super().withdraw()
-        self._drawn = None
+        self._drawn_id = None
 
     def values(self) -> dict[str, str]:
-        """Return what people are shown of it."""
+        """Return the values for the status: page, plan shown, confirmed."""
         if not self.required:
             return {}
         done = self.shown and self.shown == self.confirmed
@@ -56,51 +56,53 @@ class PlanPreview(PlanConfirmation):
         confirmed = 'yes' if done else 'no'
         return {'plan_page': page, 'plan_shown': self.shown, 'confirmed': confirmed}
 
-    def asked(self) -> str:
-        """Return the refusal of a person's request; what could not be shown is tried again."""
+    def collect_refusal(self) -> str:
+        """Return why collect is refused, '' if it is not; a failed page is drawn again."""
         refusal = self.refusal()
         if self.trouble:
             self.withdraw()
         return refusal
 
     def draw(self, q: FloatArray, peers: Peers) -> str:
-        """Draw what is next, where the page has something else; return what a person is told.
+        """Draw the next plan if the page shows another one; return a message for the user.
 
-        ``peers``: they tell which sensors must be registered before the collection.
-        Returns '' while it is drawn, and where there is nothing new.
+        '' while it is drawn, and if nothing has changed. ``q``: the arm's configuration, rad,
+        (k,); ``peers``: tell which sensors must be registered before the collection.
         """
         if not self.required:
             return ''
         try:
-            what, tour = self._next(peers.required())
+            plan_id, tour = self._next(peers.required())
         except InputError as error:
             self.trouble = str(error)
             return ''
-        if self.confirmed and what == self.confirmed:
-            # Also where something else was drawn meanwhile.
+        if self.confirmed and plan_id == self.confirmed:
+            # Another plan may have been drawn meanwhile.
             self.show(self.confirmed)
-            self._drawn = what
-        if what == self._drawn:
+            self._drawn_id = plan_id
+        if plan_id == self._drawn_id:
             return ''
         if self.shown:
             self.withdraw()
-        T_R_N, stop = dict(self._progress.T_R_N), self._progress.open_pose
-        # As it is now: the thread must not see it change.
-        left = tour.fork() if tour is not None else None
+        T_R_N, visit = dict(self._progress.T_R_N), self._progress.open_pose
+        # A copy, since the thread must not see the tour change.
+        remaining = tour.fork() if tour is not None else None
         try:
-            found = self._thread.ask(what, q, lambda: self._draw(what, left, stop, T_R_N, q))
-            if found is None:
+            result = self._thread.ask(
+                plan_id, q, lambda: self._draw(plan_id, remaining, visit, T_R_N, q)
+            )
+            if result is None:
                 return ''
-            self.show(found[0])
+            self.show(result[0])
         except RemasterError as error:
             self.trouble = str(error)
-        self._drawn = what
+        self._drawn_id = plan_id
         return self.refusal()
 
     def _next(self, required: RequiredSensors) -> tuple[str, Tour | None]:
-        """Return what is next, as `TourProgress.next` has it, by a name of it; and its tour.
+        """Return an identifier of the next plan, and its tour; None if that is not planned yet.
 
-        That is the tour under way, by its fingerprint, or else one that is still to be planned.
+        The next plan is the one that `TourProgress.next` would visit.
         """
         T_R_N, tour = self._progress.T_R_N, self._memory.tour
         registered = self._progress.phase != REGISTRATION or required.are_among(T_R_N)
@@ -113,28 +115,28 @@ class PlanPreview(PlanConfirmation):
 
     def _draw(
         self,
-        what: str,
+        plan_id: str,
         tour: Tour | None,
-        stop: PoseVisit | None,
+        visit: PoseVisit | None,
         T_R_N: dict[str, FloatArray],
         q: FloatArray,
     ) -> str:
-        """Write the page of what is next, and return the fingerprint of its tour."""
-        # Only here: a planner without this page needs none of it.
+        """Write the page of the next plan; return the fingerprint of its tour."""
+        # Imported when needed: most planners draw no page.
         from remaster_ros.reports.plan_page import plan_page, write_plan_page
         from remaster_ros.reports.robot_scene import robot_scene
 
         planner, places = self._tours, T_R_N
         if tour is None:
-            stop = None
-            tour = planner.registration() if what == REGISTRATION else planner.collection(T_R_N)
+            visit = None
+            tour = planner.registration() if plan_id == REGISTRATION else planner.collection(T_R_N)
         tours, registered = [tour], REGISTRATION not in tour.plans
         if not registered:
-            # What is expected to follow; it is planned anew once the sensors are registered.
+            # A forecast of the collection, which is planned again after the registration.
             tours.append(planner.collection(planner.rough_places))
         if not registered or not T_R_N:
             places = planner.rough_places
-        plan = look_ahead(planner, places, tours, q, stop)
+        plan = look_ahead(planner, places, tours, q, visit)
         name = fingerprint(tour)
         scene = robot_scene(self._cell, planner.scene).with_sensors(places)
         html = plan_page(

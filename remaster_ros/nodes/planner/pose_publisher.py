@@ -25,7 +25,7 @@ from remaster_ros.planning.tour_order import PoseVisit
 
 
 class PosePublisher:
-    """Publishes poses, and the stop that takes them back."""
+    """Publishes poses with their joint solutions, and stops."""
 
     def __init__(self, node: RemasterNode, chain: SerialChain) -> None:
         self._node, self._chain = node, chain
@@ -36,26 +36,26 @@ class PosePublisher:
         self._solutions = node.create_publisher(
             JointTrajectory, 'remaster/joint_solutions', LEASED
         )
-        # The last announcement: its event, and its messages with their publishers.
+        # Event of the last announcement, and its messages with their publishers.
         self._event: PoseAnnounced | None = None
         self._messages: list[tuple[Publisher, PoseStamped | JointTrajectory]] = []
 
     @property
     def subscribers(self) -> int:
-        """How many nodes subscribe to the solutions, without those that only look on."""
-        found = self._node.get_subscriptions_info_by_topic(self._solutions.topic_name)
-        others = sum(info.node_name not in PEERS for info in found)
-        return int(self._solutions.get_subscription_count()) - others
+        """Number of nodes that subscribe to the solutions, viewers excluded."""
+        subscriptions = self._node.get_subscriptions_info_by_topic(self._solutions.topic_name)
+        viewers = sum(info.node_name not in PEERS for info in subscriptions)
+        return int(self._solutions.get_subscription_count()) - viewers
 
     def stop(self) -> None:
-        """Take the pose back, on which the bridge stops the arm."""
+        """Publish an empty message, at which the bridge stops the arm."""
         self._solutions.publish(JointTrajectory(joint_names=list(self._chain.joint_names)))
 
-    def announce(self, stop: PoseVisit, plan: str, status: NodeStatus, *, last: bool) -> str:
-        """Publish a pose with what is left of its solutions; return the announcement's stamp.
+    def announce(self, visit: PoseVisit, plan: str, status: NodeStatus, *, last: bool) -> str:
+        """Publish a visit with its solutions; return the stamp of the announcement.
 
-        ``plan``: the plan that poses and solutions are numbered by; ``last``: whether it is the
-        last reference of a round.
+        ``plan``: identifier of the plan that numbers pose and solutions; ``last``: whether the
+        visit is to the last reference of a round.
         """
         pose = PoseStamped()
         pose.header.stamp = self._node.get_clock().now().to_msg()
@@ -63,37 +63,36 @@ class PosePublisher:
         key = stamp_key(pose.header.stamp)
         self._event = PoseAnnounced(
             stamp=key,
-            pose=stop.pose,
-            split=stop.split,
-            ids=stop.ids,
-            unreached=stop.unreached,
+            pose=visit.pose,
+            split=visit.split,
+            ids=visit.ids,
+            unreached=visit.unreached,
             plan=plan,
             last=last,
         )
-        write_place(stop.T_R_T, pose.pose.position, pose.pose.orientation)
-        prefix = CORRECTED.get(stop.correction, '')
+        write_place(visit.T_R_T, pose.pose.position, pose.pose.orientation)
+        prefix = CORRECTED.get(visit.correction, '')
         names = [f'{prefix}{name}' for name in self._chain.joint_names]
         message = JointTrajectory(joint_names=names)
         message.header = pose.header
         message.points = [
             JointTrajectoryPoint(positions=q.tolist(), time_from_start=duration_of(i + 1.0))
-            for i, q in enumerate(stop.solutions)
+            for i, q in enumerate(visit.solutions)
         ]
-        # The solutions last: with those the bridge begins to move. Without a solution it would
-        # take the pose back, which nothing asks for.
-        waypoints = waypoints_message(stop, self._chain.joint_names, pose.header)
+        # The solutions last: they start the motion. A message without solutions would be a stop.
+        waypoints = waypoints_message(visit, self._chain.joint_names, pose.header)
         self._messages = [
             (self._poses, pose),
             (self._waypoints, waypoints),
             (self._solutions, message),
-        ] * bool(stop.ids)
+        ] * bool(visit.ids)
         self.repeat(status)
         return key
 
     def repeat(self, status: NodeStatus) -> None:
-        """Publish the last announcement (again), as it was."""
+        """Publish the last announcement again, unchanged."""
         assert self._event is not None
-        # The event goes first: the recorder must have the pose before the arm gets there.
+        # The event first: the recorder needs the pose before the arm arrives.
         status.event(self._event)
         for publisher, message in self._messages:
             publisher.publish(message)

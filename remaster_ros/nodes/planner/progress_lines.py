@@ -14,11 +14,11 @@ from remaster_ros.collection.pace import Pace, progress_text
 
 LOOK_S = 1.0
 EVERY_S = 20.0
-"""A line comes no more often than this, wall time, and only when there is something new."""
+"""Least interval between two lines while the state is unchanged, s of wall time."""
 
 
 class ProgressLines:
-    """Logs the progress of a collection while it runs, and where it ends."""
+    """Logs the progress of a collection while it runs, and its end."""
 
     def __init__(
         self,
@@ -32,6 +32,7 @@ class ProgressLines:
         node.create_timer(LOOK_S, self._look, clock=clock)
 
     def _look(self) -> None:
+        """Log a line if the progress has changed and the interval has passed."""
         now, counts, state = time.monotonic(), self._counts(), self._state()
         done, of = counts['configurations_done'], counts['configurations']
         self._pace.update(done, now, running=state == 'running')

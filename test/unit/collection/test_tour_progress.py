@@ -306,7 +306,7 @@ def test_what_is_measured_further_follows_a_complete_collection_also_after_a_res
     while (stop := b.next()) is not None:
         b.visit(stop)
     assert b.progress.is_complete
-    assert not b.progress.goes_further
+    assert not b.progress.measures_additions
     before = b.journal.tour
     planned, done = b.progress.planned, b.progress.counts()['configurations_done']
     plan = plan_of(9, 2, 2)
@@ -317,7 +317,7 @@ def test_what_is_measured_further_follows_a_complete_collection_also_after_a_res
         plans = {'optimization': plan, REFERENCE: before.plans[REFERENCE]}
         return Tour(CHAIN, plans, reference_every=100, order=order, begin_at=before.visited)
 
-    b.progress.further = further
+    b.progress.additions = further
     places, b.progress.T_R_N = b.progress.T_R_N, {}
     assert b.next() is None
     assert b.progress.standing == 'waiting for the registrations of the recorder'
@@ -333,7 +333,7 @@ def test_what_is_measured_further_follows_a_complete_collection_also_after_a_res
         b.visit(stop)
         b.restart()
     assert b.progress.is_complete
-    assert b.progress.goes_further
+    assert b.progress.measures_additions
     assert b.progress.planned_any
     assert splits[:4] == [REFERENCE] * 4
     assert min(numbers) == before.visited
@@ -351,7 +351,7 @@ def test_poses_to_judge_by_need_no_registration_and_keep_their_state_over_a_rest
     plan = plan_of(9, 2, 1)
     visits = [replace(p, correction=state) for p in plan.poses for state in ('off', 'on')]
     plans = {'optimization': Plan(()), 'validation': Plan(tuple(visits))}
-    b.progress.judging = lambda: Tour(CHAIN, plans, in_order=True)
+    b.progress.inspection = lambda: Tour(CHAIN, plans, in_order=True)
     seen = []
     while (stop := b.next()) is not None:
         seen.append((stop.pose, stop.split, stop.correction))

@@ -31,7 +31,7 @@ class HaltedDemo(Demo):
     """Of a bridge that is halted until a person clears it; no process and no ROS."""
 
     def __init__(self, lines, watch=False, quiet=False, spins=3, clears=1):
-        self.console, self._keyboard, self._told = Console(quiet=quiet), Keys(lines), ''
+        self.console, self._keyboard, self._printed_reason = Console(quiet=quiet), Keys(lines), ''
         self.p = SimpleNamespace(watch=watch, quiet=quiet)
         self.summaries = {
             'robot_bridge': {'halted': WHY, 'message': WHY},
@@ -64,7 +64,7 @@ class HaltedDemo(Demo):
 @pytest.mark.parametrize('quiet', [False, True])
 def test_where_nobody_is_at_the_terminal_what_was_measured_is_fitted(quiet, capsys):
     demo = HaltedDemo(None, quiet=quiet)
-    assert not demo._goes_on(WHY)
+    assert not demo._wait_for_operator(WHY)
     said = capsys.readouterr()
     said = said.err if quiet else said.out
     assert f'the arm is halted: {WHY}. 50 configurations were measured' in said
@@ -76,16 +76,16 @@ def test_where_nothing_was_measured_nothing_is_fitted(capsys):
     demo = HaltedDemo(None)
     demo.summaries['pose_planner']['configurations_done'] = '0'
     with pytest.raises(DeviceError, match='nothing to fit'):
-        demo._goes_on(WHY)
+        demo._wait_for_operator(WHY)
     assert f'the arm is halted: {WHY}' in capsys.readouterr().out
 
 
 def test_a_person_at_the_terminal_goes_on_or_has_it_fitted(capsys):
     demo = HaltedDemo([None, ''])
-    assert demo._goes_on(WHY)
+    assert demo._wait_for_operator(WHY)
     assert demo.calls == ['remaster/clear_halt', 'remaster/collect']
     demo = HaltedDemo([None, 'f'])
-    assert not demo._goes_on(WHY)
+    assert not demo._wait_for_operator(WHY)
     assert demo.calls == []
     said = capsys.readouterr().out
     assert 'Enter goes on' in said
@@ -94,20 +94,20 @@ def test_a_person_at_the_terminal_goes_on_or_has_it_fitted(capsys):
 
 def test_an_arm_that_is_elsewhere_is_cleared_twice_and_the_reason_is_said(capsys):
     demo = HaltedDemo([''], clears=2)
-    assert demo._goes_on(WHY)
+    assert demo._wait_for_operator(WHY)
     assert demo.calls == 2 * ['remaster/clear_halt'] + ['remaster/collect']
     assert 'the arm is reported elsewhere' in capsys.readouterr().out
 
 
 def test_with_the_live_page_it_is_said_and_fitted_and_the_page_may_go_on(capsys):
     demo = HaltedDemo(None, watch=True)
-    assert demo._goes_on(WHY)
+    assert demo._wait_for_operator(WHY)
     assert demo.calls == ['fit']
     said = capsys.readouterr().out
     assert f'the arm is halted: {WHY}' in said
     assert 'the live page goes on' in said
     demo = HaltedDemo(None, watch=True, clears=-1)
-    assert demo._goes_on(WHY)
+    assert demo._wait_for_operator(WHY)
     assert 'too few poses' in capsys.readouterr().out
 
 
@@ -117,7 +117,7 @@ def test_an_interruption_that_asks_for_a_person_is_said_once(watch, capsys):
     asks = 'the collection was interrupted for more than 5 s: /remaster/collect goes on'
     demo.summaries['robot_bridge'] = {'halted': '', 'asks_for_collect': asks}
     for _ in range(3):
-        demo._go_on_alone()
+        demo._resume_if_paused()
     said = capsys.readouterr().out
     assert said.count('the collection was interrupted') == (1 if watch else 3)
     assert demo.calls == ([] if watch else 3 * ['remaster/collect'])

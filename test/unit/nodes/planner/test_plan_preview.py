@@ -73,12 +73,12 @@ def bench(tmp_path):
 
 def test_the_plan_is_shown_and_followed_only_once_it_is_confirmed(bench):
     preview = bench.preview
-    assert 'it is being drawn' in preview.asked()
+    assert 'it is being drawn' in preview.collect_refusal()
     assert preview.confirm() == (False, preview.refusal())
     told = bench.draw()
     registration = bench.tours.registration()
     name = fingerprint(registration)
-    assert told == preview.asked()
+    assert told == preview.collect_refusal()
     assert told == (
         f'plan {name} is not confirmed: look at {bench.page}, then call /remaster/confirm and '
         '/remaster/collect'
@@ -89,7 +89,7 @@ def test_the_plan_is_shown_and_followed_only_once_it_is_confirmed(bench):
     assert f'ros2 service call /remaster/confirm/plan_{name} std_srvs' in html
     assert not preview.allows(registration)
     assert preview.confirm()[0]
-    assert preview.asked() == ''
+    assert preview.collect_refusal() == ''
     assert preview.allows(registration)
     assert not preview.allows(None)
     # Nothing new: the page stays as it is.
@@ -109,7 +109,7 @@ def test_another_plan_needs_another_confirmation(bench):
     # From now on the page is out of date, and cannot be confirmed.
     assert preview.draw(START, bench.peers) == ''
     assert not preview.confirm()[0]
-    assert 'it is being drawn' in preview.asked()
+    assert 'it is being drawn' in preview.collect_refusal()
     assert fingerprint(collection) in bench.draw()
     assert not preview.allows(collection)
     assert 'for the registration' not in bench.page.read_text(encoding='utf-8')
@@ -123,7 +123,7 @@ def test_another_plan_needs_another_confirmation(bench):
     bench.journal.open_visit(stop)
     bench.progress.decided = Decided(stop.pose, stop.ids[:1])
     assert preview.draw(START, bench.peers) == ''
-    assert preview.asked() == ''
+    assert preview.collect_refusal() == ''
     assert preview.allows(bench.journal.tour)
 
 
@@ -189,14 +189,14 @@ def test_a_page_that_cannot_be_written_holds_the_arm_and_is_tried_again(bench):
     assert str(bench.page) in told
     assert not bench.preview.confirm()[0]
     bench.page.unlink()
-    assert bench.preview.asked() == told
+    assert bench.preview.collect_refusal() == told
     assert 'is not confirmed: look at' in bench.draw()
 
 
 def test_cells_that_do_not_ask_for_it_go_without(tmp_path):
     bench = Bench(tmp_path, confirm=False)
     assert bench.preview.draw(START, bench.peers) == ''
-    assert bench.preview.asked() == ''
+    assert bench.preview.collect_refusal() == ''
     assert bench.preview.allows(bench.tours.registration())
     done, why = bench.preview.confirm()
     assert not done
@@ -231,7 +231,7 @@ def test_any_other_configuration_or_order_is_another_plan(bench):
 def test_poses_to_judge_by_are_shown_and_confirmed_like_any_other(bench):
     """They are planned before they can be shown: nothing was announced by then."""
     bench.draw()
-    bench.progress.judging = bench.tours.verification
+    bench.progress.inspection = bench.tours.verification
     until = time.monotonic() + 60.0
     required = bench.peers.required()
     while (stop := bench.progress.next(START, required, '')) is None:

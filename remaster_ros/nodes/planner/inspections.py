@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Visits by which an arm is judged, in place of a collection and in a session of their own.
+"""Inspections of an arm, in place of a collection and in a session of their own.
 
 /remaster/verify: is the correction of the bridge in use? /remaster/check: has the arm changed?
-When the recorder has closed the session the verb of that name judges it, in a process of its own:
-nothing that estimates runs beside what announces poses, and whoever judges the same session later
-gets the same.
+When the recorder has closed the session, the verb of that name evaluates it in another process: no
+estimation runs in the process that announces poses, and a later evaluation of the same session
+gives the same verdict.
 """
 
 from __future__ import annotations
@@ -31,16 +31,16 @@ from remaster_ros.planning.tour_order import Tour
 from remaster_ros.planning.tour_planner import TourPlanner
 from remaster_ros.session.workcell import Workcell
 
-Kind = Literal['verify', 'check']
-KINDS: tuple[Kind, ...] = ('verify', 'check')
+Inspection = Literal['verify', 'check']
+KINDS: tuple[Inspection, ...] = ('verify', 'check')
 VERDICT = 'remaster/verdict'
 LONGEST_WALL_S = 600.0
-"""A verdict takes seconds; a machine that takes longer does not give one."""
+"""Most time of an evaluation, which takes seconds."""
 
 
 @dataclass(frozen=True)
-class JudgingParameters:
-    """What an arm is judged by."""
+class InspectionParameters:
+    """Parameters of inspections."""
 
     compensation: str = parameter(
         '',
@@ -63,28 +63,33 @@ class JudgingParameters:
     )
 
 
-class Judging:
-    """Plans the visits, and has them judged."""
+class Inspections:
+    """Plans the visits of inspections, and starts their evaluation."""
 
     def __init__(
-        self, node: Node, session: Path, p: JudgingParameters, cell: Workcell, tours: TourPlanner
+        self,
+        node: Node,
+        session: Path,
+        p: InspectionParameters,
+        cell: Workcell,
+        tours: TourPlanner,
     ) -> None:
         self._log, self._session, self._p = node.get_logger(), session, p
         self._cell, self._tours = cell, tours
         self._publisher = node.create_publisher(String, VERDICT, LATCHED)
         self._background = Background(node)
-        self._asked = False
+        self._evaluating = False
         self.verdict = self.trouble = ''
 
     @property
     def page(self) -> Path:
-        """Where the trend of all checks is drawn, beside the session."""
+        """Path of the page with the trend of all checks, beside the session."""
         session = self._session.absolute()
         return session.with_name(f'{session.name}.check.html')
 
-    def refusal(self, kind: Kind, bridge: BridgeState | None) -> str:
-        """Return why these visits are not begun; ''."""
-        # Imported when it is needed, as it takes a while.
+    def refusal(self, kind: Inspection, bridge: BridgeState | None) -> str:
+        """Return why an inspection cannot begin; '' if it can."""
+        # Imported when needed, since the import is slow.
         from remaster_ros.compensation.file import read_compensation
 
         file = self._p.compensation
@@ -114,14 +119,14 @@ class Judging:
             )
         return ''
 
-    def tour(self, kind: Kind) -> tuple[Callable[[], Tour], str]:
-        """Return what plans the visits, and what a person is told before the arm moves.
+    def tour(self, kind: Inspection) -> tuple[Callable[[], Tour], str]:
+        """Return a function that plans the visits, and a message to show before the arm moves.
 
-        Raises InputError: the table of a check is none, or the arm cannot stand at one of its
-        configurations.
+        Raises InputError if the table of a check is invalid, or a configuration of it is in
+        collision.
         """
         if kind == 'check':
-            # Imported when it is needed, as it takes a while.
+            # Imported when needed, since the import is slow.
             from remaster_ros.compensation.check_visits import read_visits
 
             visits = read_visits(Path(self._p.check_poses), self._cell, self._tours.model.chain)
@@ -142,19 +147,20 @@ class Judging:
             f'/{VERDICT}'
         )
 
-    def judge(self, kind: Kind) -> None:
-        """Have the session judged that the recorder has closed, once."""
-        if not self._asked:
-            self._asked = True
+    def evaluate(self, kind: Inspection) -> None:
+        """Start the evaluation of the session that the recorder has closed, once."""
+        if not self._evaluating:
+            self._evaluating = True
             command = [kind, str(self._session), '--json']
             if kind == 'verify':
                 command += ['--compensation', self._p.compensation]
             else:
                 command += ['--baseline', self._p.compensation, '--history', self._p.history]
                 command += ['--smallest-mm', repr(self._p.smallest_mm), '--out', str(self.page)]
-            self._background.submit(lambda: _answer(command), self._on_answer)
+            self._background.submit(lambda: _output_of_verb(command), self._on_answer)
 
     def _on_answer(self, answer: str | Exception) -> None:
+        """Publish the verdict, or log why there is none."""
         if isinstance(answer, Exception):
             self.trouble = f'not judged: {answer}'
             self._log.error(self.trouble)
@@ -166,17 +172,17 @@ class Judging:
             self._log.warning(warning)
         self._publisher.publish(String(data=answer))
 
-    def told(self) -> tuple[bool, str]:
-        """Return whether there is a verdict of what was visited, and it or why there is none."""
+    def answer(self) -> tuple[bool, str]:
+        """Return whether there is a verdict, and the verdict or why there is none."""
         return bool(self.verdict), self.verdict or self.trouble or 'it is being judged'
 
     def close(self) -> None:
-        """Wait for no verdict."""
+        """End without waiting for a verdict."""
         self._background.close(0.0)
 
 
-def _answer(command: list[str]) -> str:
-    """Return what a verb of the command line prints; `InputError` with its line where it fails."""
+def _output_of_verb(command: list[str]) -> str:
+    """Return the output of a verb of the command line; raise InputError with its error line."""
     done = subprocess.run(
         [sys.executable, '-m', 'remaster_ros.cli.main', *command],
         capture_output=True,

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Measurements after a complete collection, which separate causes from their look-alikes.
+"""Measurements after a complete collection, which separate causes from look-alikes.
 
 /remaster/discover looks for causes; if it leaves look-alikes, the next /remaster/collect measures
-the configurations that tell them apart, at most `MOST_ADDED` of them in a session.
+the configurations that separate them, at most `MOST_ADDED` in a session.
 """
 
 from __future__ import annotations
@@ -25,8 +25,11 @@ from remaster_ros.types import FloatArray
 DISCOVER = '/remaster/discover'
 
 
-class FurtherMeasuring:
-    """Decides what is measured further, by the optimizer's discovery; nothing for folder ''."""
+class AddedMeasurements:
+    """Decides from the optimizer's discovery which measurements are added to a collection.
+
+    ``discovery``: its folder; '' for no additions.
+    """
 
     def __init__(
         self, discovery: str, session: Path, journal: PlanJournal, tours: TourPlanner
@@ -34,17 +37,17 @@ class FurtherMeasuring:
         self._discovery, self._session = discovery, session
         self._journal, self._tours = journal, tours
 
-    def ask(self, state: str, *, under_way: bool) -> tuple[str | None, partial[Tour] | None]:
-        """Return why nothing is measured further, '' where it is, and what plans it if it is new.
+    def next_plan(self, state: str, *, under_way: bool) -> tuple[str | None, partial[Tour] | None]:
+        """Return why nothing is added, and a function that plans new additions, if any.
 
-        With the planner's ``state``: behind a collection that is not complete nothing is measured,
-        None. ``under_way``: whether something is being measured further already.
+        The reason is '' if measurements are added, and None if the collection is not complete.
+        ``state``: the planner's; ``under_way``: whether additions are being measured already.
         """
         if state != 'complete':
             return '' if under_way else None, None
         if self._journal.tour is not None and self._journal.tour.inspection:
             return 'it was no calibration; name a new session folder', None
-        # Imported when it is needed, as it takes a while.
+        # Imported when needed, since the import is slow.
         from remaster_ros.reports.discovery_json import read_causes
         from remaster_ros.reports.fit_json import DISCOVERY_FILE
 
@@ -55,44 +58,48 @@ class FurtherMeasuring:
             causes = read_causes(path, observations_sha256=self._digest())
         except InputError as error:
             return str(error), None
-        left = MOST_ADDED - self._measured()
-        if left <= 0:
+        most = MOST_ADDED - self._added_so_far()
+        if most <= 0:
             return f'{MOST_ADDED} configurations were measured to separate causes already', None
-        return '', partial(self._plan, causes, left)
+        return '', partial(self._plan, causes, most)
 
     def _digest(self) -> str:
+        """Return the SHA-256 of the session's table of observations."""
         rows = read_limited(self._session / ROWS, OBSERVATIONS_LIMIT, 'it is part of a session')
         return hashlib.sha256(rows).hexdigest()
 
-    def _measured(self) -> int:
-        """Return how many configurations were planned for this so far."""
+    def _added_so_far(self) -> int:
+        """Return the number of configurations added so far."""
         return sum(tour.to_fit for tour in self._journal.tours if tour.begin_at)
 
     def _plan(
         self, causes: tuple[FoundCause, ...], most: int, T_R_N: Mapping[str, FloatArray]
     ) -> Tour:
-        before = self._journal.tour
-        assert before is not None
+        """Return the tour of the additions."""
+        previous = self._journal.tour
+        assert previous is not None
         rows = read_session(self._session).measurements
-        return self._tours.separating_tour(T_R_N, causes, rows, before, most)
+        return self._tours.separating_tour(T_R_N, causes, rows, previous, most)
 
-    def planned(self, tour: Tour) -> str:
-        """Return a tour of the collection with what is expected of it, in a line."""
-        designed = self._tours.design_result
-        expected = '' if designed is None else designed.describe()
+    def describe_tour(self, tour: Tour) -> str:
+        """Return a tour of the collection and its expected precision in one line."""
+        design = self._tours.design_result
+        expected = '' if design is None else design.describe()
         if tour.begin_at:
             expected = self.describe()
         return '; '.join(filter(None, (tour.describe(), expected)))
 
     def describe(self) -> str:
-        """Return what is measured further and what is not, in a line; '' before it is planned."""
+        """Return the separations by the additions in one line; '' before they are planned."""
         design = self._tours.separating_design
         if design is None:
             return ''
-        words = [
+        sentences = [
             f'{pair.cause} and {pair.look_alike}: {pair.before:.1f} standard deviations apart, '
             f'{pair.after:.1f} expected'
             for pair in design.pairs
         ]
-        words += [f'no poses of this cell separate {sentence}' for sentence in design.otherwise]
-        return ('' if design.order else 'nothing to measure: ') + '; '.join(words)
+        sentences += [
+            f'no poses of this cell separate {sentence}' for sentence in design.otherwise
+        ]
+        return ('' if design.order else 'nothing to measure: ') + '; '.join(sentences)
