@@ -35,7 +35,7 @@ from remaster_ros.planning.collection_plan import FITTED, count_with_free_path, 
 from remaster_ros.planning.tour_order import Tour
 from remaster_ros.planning.tour_planner import TourPlanner
 from remaster_ros.reports.plan_json import outlook_text, outlook_to_dict
-from remaster_ros.session.cell_template import SENSORS, CellProposal, cell_text, left_alone
+from remaster_ros.session.cell_template import SENSORS, CellProposal, cell_text, rail_advice
 from remaster_ros.session.files import (
     URDF_LIMIT,
     make_folder,
@@ -300,7 +300,7 @@ def _as_text(p: CellProposal) -> str:
     lines = [
         f'{chain.name}: {len(chain)} joints between {chain.base_link} and {chain.tip_link}'
         + (f' (or {", ".join(p.tips[1:4])})' if len(p.tips) > 1 else ''),
-        *([left_alone(p.before, chain.base_link)] if p.before else []),
+        *([rail_advice(p.before, chain.base_link)] if p.before else []),
         f'reach {p.reach.reach_m:.2f} m; the sensor is taken to be at '
         f'{", ".join(f"{value:.1f}" for value in p.sensor_R)} m',
     ]

@@ -55,7 +55,7 @@ from remaster_ros.kinematics.transforms import (
     with_z_along,
 )
 from remaster_ros.kinematics.urdf import parse_urdf
-from remaster_ros.session.yaml_records import YamlError, dump_yaml, load_yaml
+from remaster_ros.session.strict_yaml import YamlError, dump_yaml, load_yaml
 from remaster_ros.types import FloatArray
 
 Form = Literal['urdf', 'ur', 'ros2_control', 'rising', 'pad', 'json', 'csv']

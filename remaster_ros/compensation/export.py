@@ -26,7 +26,7 @@ from remaster_ros.compensation.mastering import MasteringStep, mastering
 from remaster_ros.kinematics.pad_angles import pad_in_words
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.transforms import matrix_from_rpy, rotation_vector_to_matrix
-from remaster_ros.session.yaml_records import dump_yaml
+from remaster_ros.session.strict_yaml import dump_yaml
 from remaster_ros.types import BoolArray, Controller, FloatArray
 
 if TYPE_CHECKING:

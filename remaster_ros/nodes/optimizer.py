@@ -51,8 +51,8 @@ from remaster_ros.nodes.status import (
 from remaster_ros.reports.fit_json import DISCOVERY_FILE, FIT_FILE, read_fit, uncertainty
 from remaster_ros.reports.precision_json import precision_json
 from remaster_ros.reports.result_folder import prepare_folder, save_fit
+from remaster_ros.session.priors_file import read_priors
 from remaster_ros.session.reader import read_session
-from remaster_ros.session.session_yaml import read_priors
 from remaster_ros.session.workcell import read_cell
 from remaster_ros.types import FloatArray, Priors
 

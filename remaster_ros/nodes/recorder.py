@@ -145,7 +145,7 @@ class Recorder(RemasterNode):
             self.sensors.give_up(recording)
         self.recorder.look()
         is_waiting = bool(
-            self.keeper.full or self.recorder.another_correction or self.sensors.missing()
+            self.keeper.full or self.recorder.other_correction or self.sensors.missing()
         )
         if is_waiting != self._was_waiting:
             self._was_waiting = is_waiting
@@ -174,7 +174,7 @@ class Recorder(RemasterNode):
         recorder, recording = self.recorder, self.recorder.recording
         busy = self.keeper.full or recording.pairing is not None
         state = 'closed' if self.journal.closed else 'measuring' if busy else 'waiting'
-        other_correction = recorder.another_correction
+        other_correction = recorder.other_correction
         waiting_for = self.keeper.waits_for or other_correction or self.sensors.missing()
         changed, pose = recorder.changes.describe(), recording.pose
         reasons = (

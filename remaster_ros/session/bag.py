@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Read rosbag2 bags (MCAP) without a ROS installation: raw messages, and one kind of error."""
+"""Reader of rosbag2 bags (MCAP) without a ROS installation; all damage is an InputError."""
 
 from __future__ import annotations
 
@@ -23,23 +23,23 @@ from mcap.writer import MCAP0_MAGIC
 from remaster_ros.errors import InputError
 from remaster_ros.session.files import reason
 from remaster_ros.session.manifest import check_file, read_manifest
-from remaster_ros.session.yaml_records import dump_yaml
+from remaster_ros.session.strict_yaml import dump_yaml
 
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
 
 METADATA_FILE = 'metadata.yaml'
 
-# rosbag2 writes an empty bag's start, and QoS "for ever", as these.
+# Values that rosbag2 writes for the start of an empty bag, and for an infinite QoS duration.
 _NEVER_NS = 2**63 - 1
 LATCHED_DEPTH = 10
-"""How many messages of a latched topic a late joiner gets: as the nodes' publishers have it."""
+"""History depth of latched topics, equal to that of the nodes' publishers."""
 _FOREVER = {'sec': 9223372036, 'nsec': 854775807}
 
 
 @dataclass
 class TopicMetadata:
-    """A topic as metadata.yaml lists it; ``count`` is the number of its messages so far."""
+    """A topic in metadata.yaml; ``count`` is the number of its messages so far."""
 
     topic: str
     msgtype: str
@@ -50,7 +50,7 @@ class TopicMetadata:
 
 @dataclass
 class FileMetadata:
-    """A file of a bag as metadata.yaml lists it; `first_ns` is None where it holds nothing."""
+    """A file of a bag in metadata.yaml; `first_ns` is None if it has no messages."""
 
     name: str
     first_ns: int | None = None
@@ -65,7 +65,7 @@ class FileMetadata:
         self.count += 1
 
     def span(self) -> dict[str, Any]:
-        """Return start, duration and number of messages as metadata.yaml has them."""
+        """Return start, duration and number of messages in the form of metadata.yaml."""
         first = self.first_ns
         return {
             'starting_time': {'nanoseconds_since_epoch': _NEVER_NS if first is None else first},
@@ -75,7 +75,7 @@ class FileMetadata:
 
 
 def all_of(files: list[FileMetadata]) -> FileMetadata:
-    """Return several files, in the order recorded, as one without a name."""
+    """Return the metadata of several files, in the order recorded, as one nameless file."""
     filled = [file for file in files if file.count]
     if not filled:
         return FileMetadata('')
@@ -113,15 +113,16 @@ def metadata_text(files: list[FileMetadata], topics: Iterable[TopicMetadata]) ->
 
 
 def qos_text(latched: bool) -> str:
-    """Return a topic's offered QoS as the MCAP channel keeps it."""
+    """Return the QoS offered on a topic in the form of the MCAP channel's metadata."""
     return dump_yaml(_qos(latched))
 
 
 def _qos(latched: bool) -> list[dict[str, Any]]:
+    """Return the QoS offered on a topic as plain data."""
     return [
         {
             'history': 'keep_last',
-            # As the publishers offer it: who joins late gets the registration of every sensor.
+            # As the publishers offer it: a late subscriber gets the registration of every sensor.
             'depth': LATCHED_DEPTH if latched else 10,
             'reliability': 'reliable',
             'durability': 'transient_local' if latched else 'volatile',
@@ -141,23 +142,24 @@ single larger message makes a larger one."""
 
 
 class CutOffError(Exception):
-    """A record reaches past the end of the file."""
+    """A record extends beyond the end of the file."""
 
 
 def without_zeros(file: IO[bytes], size: int) -> int:
-    """Return the size of a file without the zeros at its end, which a power cut may leave."""
+    """Return the size of a file without trailing zeros, which a power cut may leave."""
     block = 1024 * 1024
     for start in range((size - 1) // block * block, -1, -block):
         file.seek(start)
-        if kept := len(file.read(block if start + block < size else size - start).rstrip(b'\0')):
-            return start + kept
+        if solid := len(file.read(block if start + block < size else size - start).rstrip(b'\0')):
+            return start + solid
     return 0
 
 
 def frames(file: IO[bytes], size: int, crc: int | None, solid: int) -> Iterator[tuple[int, bytes]]:
     """Yield opcode and content of every record up to the end of the data section.
 
-    A record that ends among zeros, with more zeros behind it, was not all written.
+    A record that ends among zeros, followed by more zeros, was not written completely, and raises
+    CutOffError.
     """
     while True:
         head = file.read(9)
@@ -183,7 +185,7 @@ def frames(file: IO[bytes], size: int, crc: int | None, solid: int) -> Iterator[
 
 
 def unchunked(records: Iterator[tuple[int, bytes]]) -> Iterator[tuple[int, bytes]]:
-    """Unpack the chunks that other recorders write."""
+    """Yield records with chunks, which other recorders write, unpacked."""
     for opcode, body in records:
         if opcode != Opcode.CHUNK:
             yield opcode, body
@@ -197,14 +199,14 @@ def unchunked(records: Iterator[tuple[int, bytes]]) -> Iterator[tuple[int, bytes
 
 
 def _unpacked(chunk: Chunk) -> bytes:
-    """Unpack a chunk, and never more of it than the size that it states.
+    """Return the content of a chunk; raise an error if it exceeds its stated size.
 
-    A few megabytes of zeros, packed, are gigabytes; they are refused before they are in memory.
+    A few packed megabytes of zeros are gigabytes: they are refused before they fill the memory.
     """
     stated = chunk.uncompressed_size
     if stated > CHUNK_LIMIT:
         raise ValueError(f'a chunk states more than {CHUNK_LIMIT} bytes')
-    # One byte more than stated, so that a longer content is noticed.
+    # One byte more than stated, to detect longer content.
     if chunk.compression == 'zstd':
         import zstandard
 
@@ -274,11 +276,11 @@ class BagMessage(NamedTuple):
 
 
 class BagReader:
-    """Read a rosbag2 MCAP bag, a folder or one ``.mcap`` file; iterate for its messages.
+    """Reader of a rosbag2 MCAP bag, a folder or one ``.mcap`` file; iterates over its messages.
 
     The whole bag is checked when it is opened, closed files also by their checksum in SHA256SUMS:
-    no message of a damaged bag comes out, but an `InputError`. The bag of a killed writer is read
-    as far as it goes, with a warning.
+    a damaged bag raises InputError, and none of its messages is returned. The bag of a killed
+    writer is read up to its last whole message, with a warning.
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
@@ -309,15 +311,15 @@ class BagReader:
         self.whole = all_of(self.files)
 
     def __iter__(self) -> Iterator[BagMessage]:
-        """Yield the messages in the order they were recorded."""
+        """Yield the messages in the order recorded."""
         for file in self.files:
             yield from self.messages_of(file)
 
     def decoded(self, msgtype: str, cdr: bytes) -> Any:
-        """Return a message; an `InputError` names the bag where its bytes are none."""
+        """Return a decoded message; raise InputError, which names the bag, for invalid bytes."""
         try:
             return self._types(msgtype).deserialize_cdr(cdr, msgtype)
-        # rosbags raises whatever bad bytes lead to.
+        # rosbags raises various errors for invalid bytes.
         except Exception as error:
             what = ' '.join(str(error).split())[:120]
             raise InputError(
@@ -326,7 +328,7 @@ class BagReader:
             ) from None
 
     def _types(self, msgtype: str) -> Typestore:
-        """Return types with this one: of other packages, as the bag itself defines them."""
+        """Return the known types, with this one from its definition in the bag if necessary."""
         if msgtype in jazzy_types().types or msgtype not in self._definitions:
             return jazzy_types()
         from rosbags.typesys import Stores, get_types_from_msg, get_typestore
@@ -340,7 +342,7 @@ class BagReader:
         return store
 
     def messages_of(self, file: FileMetadata, first_look: bool = False) -> Iterator[BagMessage]:
-        """Yield the messages of one of `files`; the first look also notes where it breaks off."""
+        """Yield the messages of one of `files`; the first look records where it is cut off."""
         path = self.folder / file.name
         try:
             yield from self._messages_of(path, first_look)
@@ -348,11 +350,12 @@ class BagReader:
             raise
         except OSError as error:
             raise InputError(f'{path}: cannot be read ({reason(error)})') from None
-        # The MCAP decoder raises whatever bad bytes lead to: KeyError, struct.error, …
+        # The MCAP decoder raises various errors for invalid bytes: KeyError, struct.error, …
         except Exception as error:
             raise _damaged(path, f'{type(error).__name__}: {error}') from None
 
     def _messages_of(self, path: Path, first_look: bool) -> Iterator[BagMessage]:
+        """Yield the messages of a file; see `messages_of`."""
         schemas: dict[int, Schema] = {}
         channels: dict[int, tuple[str, str]] = {}
         size = path.stat().st_size
@@ -408,6 +411,7 @@ class BagReader:
 
 
 def _mcap_files(path: Path) -> list[Path]:
+    """Return the MCAP files of a bag in the order recorded; raise InputError if none."""
     if path.is_file() and path.suffix == '.mcap':
         return [path]
     if not path.is_dir():
@@ -424,5 +428,6 @@ def _mcap_files(path: Path) -> list[Path]:
 
 
 def _damaged(path: Path, what: str) -> InputError:
+    """Return the error for a damaged file."""
     what = ' '.join(what.split())[:120]
     return InputError(f'{path}: damaged ({what}); take another copy of the bag')

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A session from its bag, without ROS: its messages, in order, through the recorder's code.
+"""A session made from its bag without ROS: the messages, in order, go through the recorder's code.
 
-A recorder writes each message into the bag when it takes it, so the order is the one in which it
-had them. The times of wall clocks are in no message; what was decided by them is taken from the
-recorder's own events (`SessionRecorder.take_record`). So the same bag always gives the same rows.
+A recorder writes each message into the bag when it receives it, so the order of messages is known.
+Times of wall clocks are in no message; decisions that depended on them are taken from the
+recorder's events (`SessionRecorder.take_record`). So the same bag always gives the same rows.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ EVENTS = '/remaster/events'
 
 
 class _Keeper:
-    """Writes at once: nothing waits for room on a disk."""
+    """Writes the session at once."""
 
     full = ''
 
@@ -59,7 +59,7 @@ class _Keeper:
 
 
 class _Log(Outlet):
-    """What concerns a person is told; a registration and a summary are not."""
+    """Logs warnings and errors of the session recorder."""
 
     def log(self, level: int, text: str) -> None:
         if level >= logging.WARNING:
@@ -68,23 +68,23 @@ class _Log(Outlet):
 
 @dataclass(frozen=True)
 class Replayed:
-    """What came of a bag."""
+    """Results of the replay of a bag."""
 
-    # Rows that were written.
+    # Number of rows written.
     observations: int
-    # What became of readings and configurations.
+    # Outcomes of readings and configurations.
     counts: dict[str, int]
-    # At the end of the bag, of a message that is not whole.
+    # Message on an incomplete message at the end of the bag.
     torn_bytes: int
 
 
 def bag_folder(path: Path) -> Path:
-    """Return the bag at a path, which may be that of the session with it."""
+    """Return the bag at a path, which may be that of its session."""
     return path / 'bag' if (path / 'bag').is_dir() else path
 
 
 def session_beside(bag: Path) -> Path | None:
-    """Return the session that holds a bag; None where there is none."""
+    """Return the session that contains a bag; None if there is none."""
     folder = (bag if bag.is_dir() else bag.parent).absolute().parent
     return folder if (folder / HEADER).exists() else None
 
@@ -95,23 +95,11 @@ def record_from_bag(
     cell: Workcell | None = None,
     progress: Callable[[float], None] = lambda share: None,
 ) -> Replayed:
-    """Write the session of a bag.
+    """Write the session of a recorder's bag.
 
-    Parameters
-    ----------
-    bag
-        Of the recorder.
-    out
-        The session's folder, new or empty.
-    cell
-        In place of the cell that the recorder wrote into the bag.
-    progress
-        Called with the share done.
-
-    Raises
-    ------
-    InputError
-        No bag of a recorder, a damaged message, or a folder that holds something.
+    ``out``: the session folder, new or empty; ``cell``: replaces the cell in the bag;
+    ``progress``: called with the share that is done. Raises InputError if the bag is not a
+    recorder's, a message is damaged, or the folder is not empty.
     """
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise InputError(f'{out}: there is something already; name a new folder for the session')
@@ -145,7 +133,7 @@ def record_from_bag(
 
 
 def _takers(cell: Workcell, recorder: SessionRecorder) -> dict[str, Callable[[Any], object]]:
-    """Return what takes the messages of each topic."""
+    """Return the function that takes the messages of each topic."""
     take: dict[str, Callable[[Any], object]] = {
         '/joint_states': recorder.take_joints,
         '/remaster/settled': recorder.take_settled,
@@ -160,15 +148,17 @@ def _takers(cell: Workcell, recorder: SessionRecorder) -> dict[str, Callable[[An
 
 
 def _marker_taker(recorder: SessionRecorder, sensor: str, marker: str) -> Callable[[Any], object]:
+    """Return the function that takes the readings of a marker."""
     return lambda message: recorder.take_marker(sensor, marker, message)
 
 
 def _absolute(topic: str) -> str:
+    """Return an absolute topic name."""
     return f'/{topic.lstrip("/")}'
 
 
 def _records(bag: BagReader, kind: str, data: bytes) -> list[events.EventRecord]:
-    """Return the record in a message; one of no program that is known here is left out."""
+    """Return the event record in a message, in a list; [] for a record of an unknown program."""
     try:
         return [events.decode(bag.decoded(kind, data).data)]
     except InputError as error:
@@ -177,7 +167,7 @@ def _records(bag: BagReader, kind: str, data: bytes) -> list[events.EventRecord]
 
 
 def _first_start(bag: BagReader) -> tuple[events.RecorderBegan, Workcell | None]:
-    """Return the first start of a recorder in a bag, and its cell."""
+    """Return the first start of a recorder in a bag, and its cell, None if the bag lacks it."""
     for topic, kind, data, _ in bag:
         if topic != EVENTS:
             continue
@@ -191,6 +181,7 @@ def _first_start(bag: BagReader) -> tuple[events.RecorderBegan, Workcell | None]
 
 
 def _cell(bag: BagReader, text: str) -> Workcell | None:
+    """Return the cell that a recorder wrote into the bag; None if it lacks it."""
     if not text:
         return None
     try:
@@ -203,6 +194,7 @@ def _cell(bag: BagReader, text: str) -> Workcell | None:
 
 
 def _parameters(bag: BagReader, began: events.RecorderBegan) -> Parameters:
+    """Return the recorder's parameters in the bag, without unknown ones."""
     known = {field.name for field in fields(Parameters)}
     given: dict[str, Any] = {k: v for k, v in began.parameters.items() if k in known}
     p = Parameters(**given)
@@ -211,10 +203,10 @@ def _parameters(bag: BagReader, began: events.RecorderBegan) -> Parameters:
 
 
 def differences(session: Path, other: Path) -> list[str]:
-    """Return how the rows of a session and of that of its bag differ, a line for each row.
+    """Return the differences between a session and the replay of its bag, one line per row.
 
-    A row is found in the other by its pose, split, sensor and marker and by where the arm came
-    from, so that one which is missing is named alone.
+    Rows are matched by pose, split, sensor, marker and previous configuration, so that a missing
+    row is reported alone.
     """
     ours, theirs = _rows(session), _rows(other)
     found = []
@@ -235,7 +227,7 @@ def differences(session: Path, other: Path) -> list[str]:
 
 
 def _rows(session: Path) -> dict[tuple[str, ...], dict[str, str]]:
-    """Return the rows of a session by what they are of."""
+    """Observations of a session by (pose, split, sensor, marker, previous configuration)."""
     path = session / ROWS
     data = read_limited(path, OBSERVATIONS_LIMIT, 'it is part of a session')
     found: dict[tuple[str, ...], dict[str, str]] = {}
@@ -249,9 +241,10 @@ def _rows(session: Path) -> dict[tuple[str, ...], dict[str, str]]:
 
 _OF = ('pose', 'split', 'sensor', 'marker')
 _COUNTED = ('observation', 'configuration', 'frame')
-"""Columns that count the rows of their own session: one that is missing shifts all after it."""
+"""Columns that number the rows of their session: a missing row shifts all later ones."""
 
 
 def _name(row: dict[str, str]) -> str:
+    """Return a row in words, for a message."""
     place = f'pose {row["pose"]}, {row["sensor"]}, {row["marker"]}, {row["stamp_s"]} s'
     return f'observation {row["observation"]} ({place})'

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Write rosbag2 bags (MCAP) without a ROS installation, and finish those of killed writers.
+"""Writer of rosbag2 bags (MCAP) without a ROS installation, and recovery of unfinished bags.
 
 Written unchunked and flushed message by message, so that a killed writer leaves every message it
 wrote (with MCAP's default chunks, a kill loses the last megabyte). The price is that the file of a
@@ -55,26 +55,26 @@ def definition_of(msgtype: str) -> tuple[str, str]:
 
 
 WAITING_LIMIT = 64 * 1024**2
-"""So many bytes that a full disk does not take are kept in memory; later messages are refused."""
+"""Most bytes kept in memory while the disk is full; later messages are refused."""
 
 
 class BagWriter:
-    """Write a rosbag2 folder; what `write` returned from survives a kill of this process.
+    """Writer of a rosbag2 folder; messages survive a kill of this process once `write` returns.
 
-    While the disk is full, messages are kept in memory and written when there is room.
+    If the disk is full, messages are kept in memory and written later.
 
     Parameters
     ----------
     folder
-        New or empty; the bag's name is the folder's.
+        New or empty; the bag has the folder's name.
     resume
-        Go on with the bag that the folder holds: finish the file of a killed writer, and begin
-        the next one, as rosbag2 does where it splits a bag.
+        Continue the bag in the folder: finish the file of a killed writer, and begin the next
+        file, as rosbag2 does when it splits a bag.
 
     Raises
     ------
     InputError
-        The folder holds files, with `resume` a damaged bag, or cannot be written to.
+        If the folder holds files, with `resume` a damaged bag, or cannot be written to.
     """
 
     def __init__(self, folder: str | os.PathLike[str], *, resume: bool = False) -> None:
@@ -118,9 +118,9 @@ class BagWriter:
         """Write one message.
 
         Stamps that run backwards (a clock was set) are stored as the latest stamp so far, because
-        readers refuse an unindexed file out of order; the given stamp is kept as MCAP's
-        ``publish_time``. Where the clock has started anew since the file before, the whole file
-        is shifted to a second behind it.
+        readers refuse an unindexed file out of order; the given stamp is stored as MCAP's
+        ``publish_time``. If the clock has restarted since the previous file, the whole file is
+        shifted to a second after it.
 
         Parameters
         ----------
@@ -129,15 +129,15 @@ class BagWriter:
         cdr
             The serialised message.
         stamp_ns
-            When it was received, nanoseconds since the epoch.
+            Time of reception, nanoseconds since the epoch.
 
         Raises
         ------
         InputError
-            The message type is not one of ROS 2 Jazzy's, a topic changes its type, the stamp is
-            no time, or the bag is closed.
+            If the message type is not one of ROS 2 Jazzy's, a topic changes its type, the stamp is
+            invalid, or the bag is closed.
         DiskError
-            So much waits for the disk already that this message is not kept.
+            If the disk is full and `WAITING_LIMIT` is reached: this message is lost.
         """
         if self._file is None:
             raise InputError(f'{self.folder}: the bag is closed; start a new one')
@@ -166,12 +166,9 @@ class BagWriter:
         self._own.add(self._last_ns)
 
     def close(self) -> None:
-        """Finish file, metadata.yaml and checksums, durable on return; again does nothing.
+        """Finish file, metadata.yaml and checksums durably; a second call does nothing.
 
-        Raises
-        ------
-        DiskError
-            The disk does not take it; what was written before remains readable.
+        Raises DiskError if the disk is full; the messages written so far remain readable.
         """
         if self._file is None:
             return
@@ -204,7 +201,7 @@ class BagWriter:
         self._list_topics()
 
     def _list_topics(self) -> None:
-        """A player takes the topics from here, also those of a bag whose writer was killed."""
+        """Write metadata.yaml with the topics, which players need, before the bag is closed."""
         try:
             self._write_metadata()
             self._metadata_waits = False
@@ -219,8 +216,7 @@ class BagWriter:
 def recover_bag(folder: str | os.PathLike[str]) -> str:
     """Finish the bag of a killed writer, so that every MCAP and rosbag2 reader opens it.
 
-    Returns what could not be kept; '' where nothing was lost. A bag that was closed is left as it
-    is.
+    Returns what was lost, as text; '' for nothing. A closed bag is unchanged.
     """
     folder = Path(folder)
     remove_leftovers(folder)
@@ -258,6 +254,7 @@ def _topics_of(reader: BagReader) -> dict[str, TopicMetadata]:
 
 
 def _described(topic: str, msgtype: str, count: int = 0) -> TopicMetadata:
+    """Return the metadata of a topic."""
     _, type_hash = definition_of(msgtype)
     return TopicMetadata(topic, msgtype, type_hash, topic in LATCHED_TOPICS, count)
 
@@ -266,7 +263,7 @@ _WORK = '.recovery'
 
 
 def _remove_work(folder: Path) -> None:
-    """Remove the work of a recovery that was itself killed, or is done."""
+    """Remove the temporary folder of a recovery that is finished, or was killed."""
     work = folder / _WORK
     with writing(work):
         if work.is_dir():
@@ -277,7 +274,7 @@ def _remove_work(folder: Path) -> None:
 
 
 def _remove_beginnings(folder: Path) -> None:
-    """Remove what a writer has left that was killed before its first file was there."""
+    """Remove the files of a writer that was killed before its first file was complete."""
     if folder.is_dir():
         remove_leftovers(folder)
         if [path.name for path in folder.iterdir()] == [METADATA_FILE]:

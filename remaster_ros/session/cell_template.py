@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The text of a new cell file: every key with what it means, and why it is proposed so."""
+"""Text of a new cell file: every key with its meaning, and why its value is proposed."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ import numpy as np
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.planning.candidates import PoseRanges
 from remaster_ros.planning.cell_proposal import HeldJoint, Reach
+from remaster_ros.session.strict_yaml import load_yaml
 from remaster_ros.session.workcell import CellSensor
-from remaster_ros.session.yaml_records import load_yaml
 
 _PLAIN = re.compile(r'[A-Za-z/.][\w./+-]*')
 
@@ -32,12 +32,12 @@ SENSORS = {
     ),
     'mocap': CellSensor('sir', 'optitrack/marker', ANYWHERE, max_angle_deg=60.0),
 }
-"""What a new cell may have; where it stands is proposed."""
+"""Sensors of a new cell; their positions are proposed."""
 
 
 @dataclass(frozen=True)
 class CellProposal:
-    """What `cell_text` writes."""
+    """Contents of a new cell file."""
 
     source: str
     urdf: str  # As the cell file is to name it
@@ -60,8 +60,8 @@ class CellProposal:
     floor_z: float | None
 
 
-def left_alone(before: Sequence[str], base_link: str) -> str:
-    """Return what is to be done with joints that carry the whole arm."""
+def rail_advice(before: Sequence[str], base_link: str) -> str:
+    """Return advice on joints that carry the whole arm, such as a rail."""
     return (
         f'{", ".join(before)} carries the whole arm, and is no joint of it here: leave it where '
         f'it is until everything is measured; the result is of the arm from {base_link} on'
@@ -89,7 +89,7 @@ def cell_text(p: CellProposal) -> str:
             + (f' Other links behind the last joint: {others}.' if others else '')
         ),
         *_comment(f'Joints between base_link and tip_link, limits in degrees: {limits}.'),
-        *(_comment(left_alone(p.before, chain.base_link) + '.') if p.before else []),
+        *(_comment(rail_advice(p.before, chain.base_link) + '.') if p.before else []),
         'robot:',
         f'  urdf: {_value(p.urdf)}   # relative to this file',
         f'  base_link: {_value(chain.base_link)}',
@@ -153,6 +153,7 @@ def cell_text(p: CellProposal) -> str:
 
 
 def _held_lines(p: CellProposal) -> list[str]:
+    """Return the lines of the held joint."""
     held, chain = p.held, p.chain
     if held.joint is None:
         text = f'no joint is held. A pose has {held.solutions:.1f} joint solutions on average.'
@@ -178,6 +179,7 @@ def _held_lines(p: CellProposal) -> list[str]:
 
 
 def _sensor_lines(name: str, p: CellProposal) -> list[str]:
+    """Return the lines of a sensor."""
     sensor, place, angle = SENSORS[name], p.sensor_R, p.max_angle_deg[name]
     why = 'a retroreflector' if sensor.single_shot else 'a sphere is seen from far round'
     if angle > sensor.max_angle_deg:
@@ -195,6 +197,7 @@ def _sensor_lines(name: str, p: CellProposal) -> list[str]:
 
 
 def _mesh_lines(p: CellProposal) -> list[str]:
+    """Return the lines of the mesh path, with the meshes that were not found."""
     lines = _comment('Folders in which the meshes are that the robot description names.')
     if p.missing_meshes:
         lines += _comment(
@@ -207,11 +210,12 @@ def _mesh_lines(p: CellProposal) -> list[str]:
 
 
 def _comment(text: str) -> list[str]:
+    """Return a text as comment lines."""
     return [f'# {line}' for line in wrap(text, 97, break_long_words=False)]
 
 
 def _value(value: str | float | bool | None) -> str:
-    """Return a value as YAML has it, quoted where it must be."""
+    """Return a value as YAML, quoted if necessary."""
     if isinstance(value, str) and _PLAIN.fullmatch(value) and load_yaml(value) == value:
         return value
     return json.dumps(value)

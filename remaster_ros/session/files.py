@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reading files of unknown origin and writing files that survive a crash."""
+"""Reading of files of unknown origin, and writing of files that survive a crash."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from remaster_ros.errors import DiskError, InputError
 URDF_LIMIT = 16 * 1024**2
 """Largest robot description that is read, bytes."""
 
-# The new files and folders of an `undone_on_failure` under way, in the order made.
+# New files and folders of the present `undone_on_failure`, in the order made.
 _MADE: ContextVar[list[Path] | None] = ContextVar('made', default=None)
 
 
 @contextlib.contextmanager
 def undone_on_failure() -> Iterator[None]:
-    """Remove the files and folders that what follows makes, where it fails or is interrupted.
+    """Remove all files and folders made in the body if it fails or is interrupted.
 
-    What was there before stays, and what others put there meanwhile, with its folder.
+    Earlier files, and those that others put there meanwhile, remain, with their folder.
     """
     outer, made = _MADE.get(), list[Path]()
     token = _MADE.set(made)
@@ -33,7 +33,7 @@ def undone_on_failure() -> Iterator[None]:
         yield
     except BaseException:
         for path in reversed(made):
-            # A folder that holds what others made is not empty, and stays.
+            # A folder with files of others is not empty, and remains.
             with contextlib.suppress(OSError):
                 path.rmdir() if path.is_dir() else path.unlink()
         raise
@@ -44,16 +44,16 @@ def undone_on_failure() -> Iterator[None]:
 
 
 def made_if_new(path: Path) -> None:
-    """Note a file or folder that is about to be made, for `undone_on_failure`."""
+    """Register a file or folder that is about to be made, for `undone_on_failure`."""
     made = _MADE.get()
     if made is not None and not os.path.lexists(path):
         made.append(path)
 
 
 def read_limited(path: Path, limit: int, missing: str) -> bytes:
-    """Read a regular file of at most `limit` bytes; an `InputError` where that is not possible.
+    """Read a regular file of at most `limit` bytes; raise InputError if that is impossible.
 
-    Where there is no such file, the message ends with the remedy `missing`.
+    ``missing``: remedy at the end of the message if there is no such file.
     """
     try:
         if not path.exists():
@@ -72,15 +72,15 @@ def read_limited(path: Path, limit: int, missing: str) -> bytes:
 
 
 class _CpuTimeUsedUp(BaseException):
-    """Processor time is used up; no handler of ordinary errors on the way may take it."""
+    """Raised by the signal of `cpu_limited`; no handler of ordinary errors catches it."""
 
 
 @contextlib.contextmanager
 def cpu_limited(limit_s: float, refusal: str) -> Iterator[None]:
-    """Raise an `InputError` with the text `refusal` if the body takes longer, s of processor time.
+    """Raise InputError with the text `refusal` if the body takes more processor time, s.
 
-    A signal interrupts the body, also inside of a regular expression. Signals reach the main
-    thread alone: in any other thread there is no limit.
+    A signal interrupts the body, also within a regular expression. Signals reach the main thread
+    only: in any other thread there is no limit.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -101,20 +101,20 @@ def cpu_limited(limit_s: float, refusal: str) -> Iterator[None]:
 
 
 def refuse_utf16(data: bytes, path: Path) -> None:
-    """Raise an `InputError` for text in UTF-16 (or 32), which Windows programs like to save.
+    """Raise InputError for text in UTF-16 (or 32), which Windows programs like to save.
 
-    Of Latin text every second byte is zero there, with or without a byte order mark.
+    Every second byte of Latin text is zero in it, with or without a byte order mark.
     """
     even, odd = data[:64:2], data[1:64:2]
     marked = data.startswith((b'\xff\xfe', b'\xfe\xff'))
     latin = len(data) > 3 and sorted((any(even), any(odd))) == [False, True]
-    # A text that a power cut ended has zeros behind it, not between.
+    # A power cut leaves zeros at the end of a text, not between characters.
     if marked or (latin and (all(even) or all(odd))):
         raise InputError(f'{path}: this is UTF-16 text; save the file as UTF-8')
 
 
 def decode_text(data: bytes, path: Path) -> str:
-    """Decode UTF-8, with or without a byte order mark; an `InputError` names the line."""
+    """Decode UTF-8, with or without a byte order mark; an InputError names the line."""
     refuse_utf16(data, path)
     try:
         return data.decode('utf-8-sig')
@@ -124,19 +124,19 @@ def decode_text(data: bytes, path: Path) -> str:
 
 
 def make_folder(folder: Path) -> None:
-    """Create an output folder with its parents, durable on return; `InputError` if impossible."""
+    """Create an output folder with its parents, durably; raise InputError if impossible."""
     with writing(folder):
         new = [path for path in (folder, *folder.parents) if not path.exists()]
         for path in reversed(new):
             made_if_new(path)
         folder.mkdir(parents=True, exist_ok=True)
-        # From the top: a folder whose own name is lost takes all in it along.
+        # From the top: a folder that loses its name loses its content.
         for path in reversed(new):
             sync_folder(path.parent)
 
 
 def make_new_folder(folder: Path) -> None:
-    """Create an output folder, or take an empty one; `InputError` where it holds files."""
+    """Create an output folder, or accept an empty one; raise InputError if it has files."""
     make_folder(folder)
     with writing(folder):
         occupied = any(folder.iterdir())
@@ -147,9 +147,9 @@ def make_new_folder(folder: Path) -> None:
 
 
 def write_atomically(path: Path, data: str | bytes | bytearray) -> None:
-    """Replace a file in one step, durable on return: readers see the old text or the new.
+    """Replace a file in one step, durably: readers see the old content or the new.
 
-    A `DiskError` where the folder cannot be written to, or the disk is full.
+    Raises DiskError if the folder cannot be written to, or the disk is full.
     """
     temporary = path.with_name(f'.{path.name}.{os.getpid()}.tmp')
     made_if_new(path)
@@ -164,23 +164,23 @@ def write_atomically(path: Path, data: str | bytes | bytearray) -> None:
             os.replace(temporary, path)
             sync_folder(path.parent)
         except BaseException:
-            # Also of an interrupt: a folder with it would not be empty.
+            # Also after an interrupt, so that the folder is empty.
             with contextlib.suppress(OSError):
                 temporary.unlink()
             raise
 
 
 def remove_leftovers(folder: Path) -> None:
-    """Remove the temporary files of atomic writes that a crash cut short."""
+    """Remove temporary files of atomic writes that a crash interrupted."""
     for path in sorted(folder.glob('.*.tmp')):
         with writing(path):
             os.unlink(path)
 
 
 class AppendFile:
-    """A file that grows by pieces, each durable when `append` returns, or not there at all.
+    """A file to which pieces are appended, each durable once `append` returns, or absent.
 
-    It is made where there is none, its name durable.
+    Created durably if it does not exist.
     """
 
     def __init__(self, path: Path) -> None:
@@ -193,7 +193,7 @@ class AppendFile:
                 raise InputError(f'{path}: not a regular file; give another name')
             self._descriptor = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o666)
             self.size = os.fstat(self._descriptor).st_size
-            # Also where it is there: who made it may have been killed before this.
+            # Also if the file exists: its creator may have been killed before this.
             sync_folder(path.parent)
         except OSError as error:
             self.close()
@@ -201,16 +201,16 @@ class AppendFile:
 
     @property
     def descriptor(self) -> int:
-        """The open file; an `InputError` where it is closed."""
+        """Descriptor of the open file; raises InputError if it is closed."""
         if self._descriptor is None:
             raise InputError(f'{self.path}: closed; open it again')
         return self._descriptor
 
     def append(self, data: bytes) -> None:
-        """Write a piece; durable on return.
+        """Append a piece durably.
 
-        Where the disk does not take it (`DiskError`), the file ends as before. If it cannot be cut
-        to that either, it is closed: how it ends is unknown until it is read again.
+        Raises DiskError if the disk is full; the file then ends as before. If it cannot be
+        restored to that, it is closed: its end is unknown until it is read again.
         """
         descriptor = self.descriptor
         with writing(self.path):
@@ -218,14 +218,14 @@ class AppendFile:
                 write_all(descriptor, data)
                 os.fsync(descriptor)
             except OSError:
-                # Half a piece in the middle of the file would make all of it unreadable.
+                # Half a piece in the middle would make the whole file unreadable.
                 with contextlib.suppress(InputError):
                     self.truncate(self.size)
                 raise
         self.size += len(data)
 
     def truncate(self, size: int) -> None:
-        """Cut the file, durable on return; an `InputError` where the disk does not take it."""
+        """Truncate the file durably; raise InputError if that fails."""
         try:
             os.ftruncate(self.descriptor, size)
             os.fsync(self.descriptor)
@@ -235,16 +235,16 @@ class AppendFile:
         self.size = size
 
     def close(self) -> None:
-        """Close the file; closing again does nothing."""
+        """Close the file; a second call does nothing."""
         if self._descriptor is not None:
             os.close(self._descriptor)
             self._descriptor = None
 
 
 class PatientFile:
-    """A new file that holds in memory what a full disk does not take, and writes it later.
+    """A new file that keeps data in memory while the disk is full, and writes them later.
 
-    What `write` returned from survives a kill of this process unless it is `waiting`.
+    Data survive a kill of this process once `write` returns, unless they are `waiting`.
     """
 
     def __init__(self, path: Path) -> None:
@@ -257,11 +257,11 @@ class PatientFile:
 
     @property
     def waiting(self) -> int:
-        """Bytes that the disk has not taken yet."""
+        """Number of bytes not yet on the disk."""
         return len(self._waiting)
 
     def write(self, data: bytes) -> int:
-        """Take a piece."""
+        """Accept a piece; return its length."""
         self._waiting += data
         self._given += len(data)
         with contextlib.suppress(DiskError):
@@ -269,17 +269,17 @@ class PatientFile:
         return len(data)
 
     def tell(self) -> int:
-        """Return how many bytes were taken."""
+        """Return the number of bytes accepted."""
         return self._given
 
     def flush(self) -> None:
-        """Write what waits; `DiskError` where some of it has to wait on."""
+        """Write the waiting bytes; raise DiskError if some remain."""
         with writing(self.path):
             while self._waiting:
                 del self._waiting[: os.write(self._descriptor, self._waiting)]
 
     def close(self) -> None:
-        """Write what waits, durable on return; `DiskError` where the disk does not take it."""
+        """Write the waiting bytes durably; raise DiskError if that fails."""
         try:
             self.flush()
             with writing(self.path):
@@ -289,14 +289,14 @@ class PatientFile:
 
 
 def write_all(descriptor: int, data: bytes | bytearray) -> None:
-    """Write all of `data`, however many calls the system takes for it."""
+    """Write all of `data`, with as many system calls as necessary."""
     written = 0
     while written < len(data):
         written += os.write(descriptor, data[written:])
 
 
 def sync_folder(folder: Path) -> None:
-    """Make the names in a folder durable: without it a power cut may lose a new file's name."""
+    """Make the names in a folder durable: otherwise a power cut may lose that of a new file."""
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
         os.fsync(descriptor)
@@ -306,7 +306,7 @@ def sync_folder(folder: Path) -> None:
 
 @contextlib.contextmanager
 def writing(path: Path) -> Iterator[None]:
-    """Turn an error of the operating system into the `DiskError` that names path and remedy."""
+    """Convert an error of the operating system to a DiskError that names path and remedy."""
     try:
         yield
     except OSError as error:
@@ -314,7 +314,7 @@ def writing(path: Path) -> Iterator[None]:
 
 
 def cannot_write(path: Path, error: OSError) -> DiskError:
-    """Return the error with the reason why a file or folder cannot be written, and the remedy."""
+    """Return the DiskError for a file or folder, with reason and remedy."""
     return DiskError(
         f'{path}: cannot be written ({reason(error)}); '
         'name a folder you may write to, with free space'
@@ -322,5 +322,5 @@ def cannot_write(path: Path, error: OSError) -> DiskError:
 
 
 def reason(error: Exception) -> str:
-    """Return the text of an operating-system error, without the path that it repeats."""
+    """Return the text of an error of the operating system, without the path."""
     return getattr(error, 'strerror', None) or str(error)

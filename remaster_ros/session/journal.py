@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Append-only journals: JSON lines with a checksum each, durable before `append` returns.
 
-A crash can leave only the last line incomplete: cut anywhere, also inside a character, or with
-zeros where the file system had reserved blocks but not yet written them. Such a line was never
-acknowledged; it is reported and dropped. A damaged line that others follow is not a crash's work,
-and the file is refused.
+A crash can leave only the last line incomplete: truncated, also inside a character, or followed by
+zeros of blocks that the file system reserved. Such a line was never acknowledged; it is reported
+and dropped. A damaged line before another line is not the effect of a crash, and the file is
+refused.
 """
 
 from __future__ import annotations
@@ -25,21 +25,21 @@ Record = dict[str, Any]
 
 
 class JournalText(NamedTuple):
-    """A journal as read."""
+    """The content of a journal."""
 
-    # One for each whole line.
+    # One record for each whole line.
     records: list[Record]
-    # The bytes of these lines, and how many bytes behind them are no whole line.
+    # Bytes of the whole lines, and number of bytes of an incomplete line behind them.
     whole: bytes
     torn: int
 
 
 class Journal:
-    """Write a journal, or go on with one; what `append` returned from is on the disk.
+    """Writer of a journal, new or existing; a record is on the disk once `append` returns.
 
-    Opening cuts off what a crash has left of a line. While it is open, no other process can open
-    it for writing; the lock ends with the process, however that ends. The file is made where there
-    is none, its name durable. An `InputError` where another process writes it, or it is damaged.
+    Opening removes an incomplete last line. While it is open, no other process can open the file
+    for writing; the lock ends with the process, however that ends. Raises InputError if another
+    process writes the file, or it is damaged.
     """
 
     def __init__(self, path: Path) -> None:
@@ -47,10 +47,10 @@ class Journal:
         self._file = AppendFile(path)
         try:
             self._lock()
-            # Every record so far, and the bytes of all their lines.
+            # All records so far, and the bytes of their lines.
             self.records, whole, torn = read_journal(path)
             self.content = bytearray(whole)
-            # What was cut off, in a line; '' where nothing was.
+            # What was removed from the end, in one line; '' for nothing.
             self.lost = ''
             if torn:
                 self._file.truncate(len(whole))
@@ -64,13 +64,13 @@ class Journal:
 
     @property
     def names(self) -> int:
-        """How many names the open file has: 0 after it was removed."""
+        """Number of names (hard links) of the open file: 0 after it was removed."""
         return os.fstat(self._file.descriptor).st_nlink
 
     def restore(self) -> None:
-        """Write every record again, where the file is no longer the one that was opened.
+        """Write every record again if the file on the disk is not the open one any more.
 
-        An `InputError` where another process writes the file that is there.
+        Raises InputError if another process writes the file on the disk.
         """
         write_atomically(self.path, self.content)
         self._file.close()
@@ -78,6 +78,7 @@ class Journal:
         self._lock()
 
     def _lock(self) -> None:
+        """Lock the open file; raise InputError if another process has locked it."""
         with writing(self.path):
             try:
                 fcntl.flock(self._file.descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -88,28 +89,28 @@ class Journal:
                 ) from None
 
     def append(self, record: Record) -> None:
-        """Write one record; durable on return, and with a `DiskError` the file is as before."""
+        """Append one record durably; after a DiskError the file is as before."""
         line = format_record(record)
         self._file.append(line)
         self.content += line
         self.records.append(record)
 
     def take_back(self) -> None:
-        """Cut off the record that was appended last; `InputError` where that is not possible."""
-        before = self.content.rfind(b'\n', 0, -1) + 1
-        self._file.truncate(before)
-        del self.content[before:]
+        """Remove the last appended record; raise InputError if that is impossible."""
+        previous_size = self.content.rfind(b'\n', 0, -1) + 1
+        self._file.truncate(previous_size)
+        del self.content[previous_size:]
         self.records.pop()
 
     def close(self) -> None:
-        """Close the file and let others open it; closing again does nothing."""
+        """Close and unlock the file; a second call does nothing."""
         self._file.close()
 
 
 def read_journal(path: Path) -> JournalText:
-    """Read a journal that is perhaps just being written, or was when the power failed.
+    """Read a journal that may be in the process of being written, or cut off by a power failure.
 
-    An `InputError` where it cannot be read, or a line that others follow is damaged.
+    Raises InputError if it cannot be read, or a line before the last one is damaged.
     """
     data = read_limited(path, JOURNAL_LIMIT, 'without its journal a session cannot be resumed')
     records: list[Record] = []
@@ -121,26 +122,26 @@ def read_journal(path: Path) -> JournalText:
             break
         records.append(record)
         size += len(line) + 1
-    rest = data[size:]
+    remainder = data[size:]
     # Zeros may hide the line end of the torn line, and a whole line may only come before it.
-    following = rest.split(b'\n')[1:]
+    following = remainder.split(b'\n')[1:]
     if any(parse_record(line) is not None for line in following):
         raise InputError(
             f'{path}, line {len(records) + 1}: damaged, though whole lines follow; '
             'take another copy of the file'
         )
-    return JournalText(records, data[:size], len(rest))
+    return JournalText(records, data[:size], len(remainder))
 
 
 def format_record(record: Record) -> bytes:
-    """Return a record as one line: JSON whose last member is the CRC-32 of what is before it."""
+    """Return a record as one line: JSON whose last member is the CRC-32 of the rest."""
     text = json.dumps(record, ensure_ascii=False, separators=(',', ':'), allow_nan=False)
     body = text[:-1].encode()
     return body + _seal(body) + b'\n'
 
 
 def parse_record(line: bytes) -> Record | None:
-    """Undo `format_record` for a line without its end; None where it is not whole."""
+    """Return the record of a line without its end; None if the line is incomplete."""
     body, seal = line[:-_SEAL_LENGTH], line[-_SEAL_LENGTH:]
     if _seal(body) != seal:
         return None
@@ -152,6 +153,7 @@ def parse_record(line: bytes) -> Record | None:
 
 
 def _seal(body: bytes) -> bytes:
+    """Return the last member of a line: the CRC-32 of its body."""
     return b',"crc32":"%08x"}' % zlib.crc32(body)
 
 

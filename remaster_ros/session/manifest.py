@@ -26,7 +26,7 @@ _LINE = re.compile(r'([0-9a-f]{64}) [ *]([^\0]+)')
 
 
 def read_manifest(folder: Path) -> dict[str, str]:
-    """Return the checksum of every closed file by its name; nothing where there is no manifest."""
+    """Return the checksum of each closed file by name; {} if there is no manifest."""
     path = folder / MANIFEST
     if not path.exists():
         return {}
@@ -43,18 +43,18 @@ def read_manifest(folder: Path) -> dict[str, str]:
 
 
 def write_sums(folder: Path, sums: Mapping[str, str]) -> None:
-    """Write down checksums by name of the file, of what the caller put there."""
+    """Write a manifest with these checksums by file name."""
     lines = [f'{checksum}  {name}\n' for name, checksum in sorted(sums.items())]
     write_atomically(folder / MANIFEST, ''.join(lines))
 
 
 def add_to_manifest(folder: Path, name: str) -> None:
-    """Write down one more closed file; what is written down already stays."""
+    """Add the checksum of one more closed file to the manifest."""
     write_sums(folder, {**read_manifest(folder), name: sha256_of(folder / name)})
 
 
 def remove_manifest(folder: Path) -> None:
-    """Take the manifest away, durable on return, before its files are changed."""
+    """Remove the manifest durably, before its files are changed."""
     path = folder / MANIFEST
     with writing(path):
         if path.exists():
@@ -63,18 +63,18 @@ def remove_manifest(folder: Path) -> None:
 
 
 def check_data(sums: Mapping[str, str], path: Path, data: bytes) -> None:
-    """Refuse the content of a file that is not what was closed; unlisted files pass."""
+    """Raise InputError if the content of a listed file is not that which was closed."""
     _compare(sums, path, hashlib.sha256(data).hexdigest())
 
 
 def check_file(sums: Mapping[str, str], path: Path) -> None:
-    """As `check_data`, for a file too large to hold."""
+    """Check a file that is too large to read at once; see `check_data`."""
     if path.name in sums:
         _compare(sums, path, sha256_of(path))
 
 
 def sha256_of(path: Path) -> str:
-    """Return a file's checksum in hexadecimal."""
+    """Return the SHA-256 of a file in hexadecimal."""
     try:
         if path.exists() and not path.is_file():
             # A pipe or a device has no end.
@@ -86,6 +86,7 @@ def sha256_of(path: Path) -> str:
 
 
 def _compare(sums: Mapping[str, str], path: Path, found: str) -> None:
+    """Raise InputError if a listed file has another checksum."""
     if sums.get(path.name, found) != found:
         raise InputError(
             f'{path}: not as it was closed, by its checksum in {MANIFEST}; take another copy '

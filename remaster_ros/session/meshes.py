@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Meshes: found as a URDF names them, read into arrays.
+"""Mesh files: found by their name in a URDF, and read into arrays.
 
-Those of collision geometry as vertices alone, those of pictures with triangles and colours.
+Collision geometry has vertices only, visual geometry triangles and colours.
 """
 
 from __future__ import annotations
@@ -31,32 +31,32 @@ Taken = TypeVar('Taken')
 
 
 def mesh_reader(urdf: Path, mesh_path: Sequence[Path] = ()) -> Callable[[str], FloatArray]:
-    """Return what reads the meshes that a URDF file names.
+    """Return a function that reads the meshes named in a URDF file.
 
-    ``package://NAME/rest`` is looked for as ``NAME/rest`` in the folders of `mesh_path`, in the
-    share folders of AMENT_PREFIX_PATH, and beside and above the URDF (a package's own URDF lies
-    inside it), also where a package's folder has another name than the package. ``file://`` and
-    plain names are taken relative to the URDF's folder, then to those of `mesh_path`. What lies
-    neither in one of these folders nor in a ROS package is not read.
+    ``package://NAME/rest`` is searched as ``NAME/rest`` in the folders of `mesh_path`, in the
+    share folders of AMENT_PREFIX_PATH, and beside and above the URDF (a package's URDF lies inside
+    the package), also if the package's folder has another name. ``file://`` and plain names are
+    relative to the URDF's folder, then to those of `mesh_path`. Files in none of these folders and
+    in no ROS package are not read.
 
     Parameters
     ----------
     urdf
         The URDF file.
     mesh_path
-        Folders to look in.
+        Folders to search.
 
     Returns
     -------
     callable
-        File name as written -> vertices, m, (n, 3). It raises InputError where there is no such
-        file or none that can be read; a link without its mesh would be a link that hits nothing.
+        File name as written -> vertices, m, (n, 3). It raises InputError if the file is missing or
+        unreadable, since a link without its mesh would be a link that collides with nothing.
     """
     return cache(lambda name: read_mesh(find_mesh(name, urdf, mesh_path)))
 
 
 def find_mesh(name: str, urdf: Path, mesh_path: Sequence[Path]) -> Path:
-    """Return the file of a mesh; arguments as of `mesh_reader`, an `InputError` where none is."""
+    """Return the file of a mesh; raise InputError if there is none. Arguments as above."""
     folders: list[Path] = [*mesh_path]
     files = Confinement(urdf, mesh_path)
     candidates: list[Path] = []
@@ -101,7 +101,7 @@ def read_mesh(path: Path) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class MeshPart:
-    """A part of a mesh, for pictures."""
+    """A part of a mesh in one colour, for pictures."""
 
     vertices: FloatArray  # m, (n, 3)
     faces: IntArray  # Which three vertices each triangle has, (m, 3)
@@ -110,12 +110,9 @@ class MeshPart:
 
 
 def read_mesh_parts(path: Path) -> list[MeshPart]:
-    """Return the surfaces of a mesh file with their colours, those of one colour as one.
+    """Return the surfaces of a mesh file, one part for each colour.
 
-    Raises
-    ------
-    InputError
-        A file that cannot be read, or one without any triangle.
+    Raises InputError if the file cannot be read, or has no triangle.
     """
     parts = _loaded(path, _parts, skip_materials=False)
     if not parts:
@@ -124,12 +121,14 @@ def read_mesh_parts(path: Path) -> list[MeshPart]:
 
 
 def _vertices(loaded: list[Any], unit: float) -> FloatArray:
+    """Return the vertices of parts, m, (n, 3)."""
     points = [point for part in loaded for point in getattr(part, 'vertices', ())]
     vertices: FloatArray = np.array(points, dtype=float).reshape(-1, 3) * unit
     return vertices
 
 
 def _parts(loaded: list[Any], unit: float) -> list[MeshPart]:
+    """Return the surfaces of parts by colour."""
     by_color: dict[tuple[float, float, float] | None, list[Any]] = {}
     for part in loaded:
         if len(getattr(part, 'faces', ())) and np.all(np.isfinite(part.vertices)):
@@ -144,7 +143,7 @@ def _parts(loaded: list[Any], unit: float) -> list[MeshPart]:
 
 
 def _color(part: Any) -> tuple[float, float, float] | None:
-    """Return the colour of a part as trimesh has read it; None where none was given."""
+    """Return the colour of a part in trimesh; None if it has none."""
     visual = part.visual
     main = getattr(getattr(visual, 'material', None), 'main_color', None)
     if main is None and visual.defined:
@@ -158,7 +157,7 @@ def _color(part: Any) -> tuple[float, float, float] | None:
 def _loaded(
     path: Path, take: Callable[[list[Any], float], Taken], *, skip_materials: bool
 ) -> Taken:
-    """Return what is taken of the parts of a mesh file and the length of its unit, m."""
+    """Return the result of ``take`` on the parts of a mesh file and the length of its unit, m."""
     kind = path.suffix.lower()
     if kind not in KINDS:
         raise InputError(f'{path}: a mesh in a format that is not read; use {", ".join(KINDS)}')
@@ -180,7 +179,7 @@ def _loaded(
 
 
 def _refuse_entities(content: bytes, path: Path) -> None:
-    """Refuse a COLLADA file that is no plain XML, or declares entities: those name any file."""
+    """Raise InputError if a COLLADA file is not plain XML or declares entities."""
     refuse_utf16(content, path)
     text = content.removeprefix(b'\xef\xbb\xbf').lstrip()
     encoding = _ENCODING.match(text)
@@ -201,4 +200,5 @@ def _collada_unit(content: bytes) -> float:
 
 
 def _line(error: Exception) -> str:
+    """Return an error as one line."""
     return ' '.join(f'{type(error).__name__}: {error}'.split())[:200]

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An observation as a line, and as one of columns: observations.csv, its rules, its faults.
+"""observations.csv: format of its lines, and conversion of lines to checked columns.
 
-The journal keeps the same lines (see `session_writer`). Every fault is named by line and column.
+The journal has the same lines (see `session_writer`). Errors name line and column.
 """
 
 from __future__ import annotations
@@ -10,12 +10,11 @@ import csv
 import logging
 import math
 import re
-from collections import ChainMap
-from collections.abc import Collection, Iterator, Mapping, MutableMapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import repeat
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +23,13 @@ from remaster_ros.errors import InputError
 from remaster_ros.kinematics.serial_chain import LEVER_M, LIMIT_TOLERANCE_RAD, SerialChain
 from remaster_ros.kinematics.transforms import inverse_poses
 from remaster_ros.session.files import decode_text, refuse_utf16
+from remaster_ros.session.observation_rules import (
+    SPLITS,
+    RowKeys,
+    SequenceRules,
+    row_keys,
+    split_indices,
+)
 from remaster_ros.types import (
     FARTHEST_M,
     BoolArray,
@@ -33,6 +39,15 @@ from remaster_ros.types import (
     Observation,
 )
 
+log = logging.getLogger('remaster_ros')
+
+OPTIONAL = ('frame', 'orientation', 'effort', 'wanted', 'correction')
+"""Fields of an observation whose columns are optional."""
+OMITTABLE = ('from_q', 'std', 'samples', 'temperature_c')
+"""Fields whose columns are always written, but are optional in files of other programs."""
+STATES = ('off', 'on')
+LENGTH_TOLERANCE = 1e-3
+"""Largest accepted deviation of the length of a quaternion from 1."""
 _NUMBER = re.compile(r'[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?')
 _NUMBER_CHARACTERS = re.compile(r'[0-9+\-.eE,]*')
 _INTEGER_CHARACTERS = re.compile(r'[0-9+\-,]*')
@@ -40,7 +55,7 @@ _INTEGER = re.compile(r'[+-]?[0-9]{1,18}')
 
 
 class Table:
-    """Cells as text by column name, with what an error message needs to name a place."""
+    """Cells of a table as text by column name, with the places for error messages."""
 
     def __init__(self, path: Path, names: list[str], lines: list[str], first_line: int) -> None:
         self.path = path
@@ -68,16 +83,16 @@ class Table:
         return InputError(f'{self.path}, line {line}, column {column}: {shown} {problem}')
 
     def refuse(self, wrong: BoolArray, problems: Mapping[str, str]) -> None:
-        """Raise the fault of the first True of `wrong`, (n, columns); `problems` by column."""
+        """Raise the error of the first True of `wrong`, (n, columns); `problems`: by column."""
         for row, column in np.argwhere(wrong)[:1]:
             name = list(problems)[column]
             raise self.fault(int(row), name, problems[name])
 
     def integers(self, column: str, least: int | None = None) -> IntArray:
-        """Return a column of integers.
+        """Return a column of integers, (n,).
 
-        With `least` it is an optional column, of integers from `least` (above -1) on; -1 stands
-        for an empty cell.
+        With `least` the column is optional: integers from `least` (above -1) on, -1 for an empty
+        cell.
         """
         given = self.cells[column]
         cells = given if least is None else [cell or '-1' for cell in given]
@@ -97,7 +112,7 @@ class Table:
         return values
 
     def numbers(self, columns: Sequence[str], optional: bool = False) -> FloatArray:
-        """Return columns of finite numbers, (n, len(columns)); NaN where optional and empty."""
+        """Return columns of finite numbers, (n, len(columns)); NaN if optional and empty."""
         result = np.empty((self.rows, len(columns)))
         for i, column in enumerate(columns):
             cells = self.cells[column]
@@ -113,7 +128,7 @@ class Table:
         return result
 
     def whole_or_empty(self, columns: Sequence[str]) -> FloatArray:
-        """Return optional columns of which a row fills all or none."""
+        """Return optional columns, of which each row fills all or none, (n, len(columns))."""
         values = self.numbers(columns, optional=True)
         unknown = np.isnan(values)
         problem = (
@@ -124,13 +139,14 @@ class Table:
         return values
 
     def choices(self, column: str, names: Sequence[str], remedy: str) -> IntArray:
-        """Return the index of every cell among `names`."""
+        """Return the index of every cell among `names`, (n,)."""
         index = {name: i for i, name in enumerate(names)}
         values = np.array([index.get(cell, -1) for cell in self.cells[column]], dtype=np.int64)
         self.refuse(values[:, None] < 0, {column: remedy})
         return values
 
     def _not_a_number(self, column: str, optional: bool) -> InputError:
+        """Return the error of the first cell that is not a number."""
         row = next(
             row
             for row, cell in enumerate(self.cells[column])
@@ -142,7 +158,7 @@ class Table:
 
 
 def split_line(line: str, path: Path, number: int) -> list[str]:
-    """Return the cells of one line; an `InputError` where its quotes do not close."""
+    """Return the cells of one line; raise InputError if quotes are not closed."""
     if '"' not in line:
         return line.split(',')
     try:
@@ -151,143 +167,12 @@ def split_line(line: str, path: Path, number: int) -> list[str]:
         raise InputError(f'{path}, line {number}: {error}; correct the quotes') from None
 
 
-SPLITS = ('optimization', 'validation', 'reference')
-
-
-class RowKeys(NamedTuple):
-    """What the rules between rows are about, of one row."""
-
-    line: int
-    observation: int
-    pose: int
-    configuration: int
-    split: int
-    stamp_s: float
-    sensor: int
-    marker: int
-    frame: int
-
-
-class SequenceRules:
-    """What must hold between rows, given in their order.
-
-    Observation numbers are unique and grow with time, time never runs backwards, a pose belongs
-    to one split and a configuration to one pose. The rows of a frame are of one configuration and
-    of different markers.
-    """
-
-    def __init__(self) -> None:
-        self._last: RowKeys | None = None
-        self._of_observation: MutableMapping[int, RowKeys] = {}
-        self._of_pose: MutableMapping[int, RowKeys] = {}
-        self._of_configuration: MutableMapping[int, RowKeys] = {}
-        self._of_frame: MutableMapping[tuple[int, int], RowKeys] = {}
-        self._in_frame: MutableMapping[tuple[int, int, int], RowKeys] = {}
-
-    def branch(self) -> SequenceRules:
-        """Return rules after the same rows; rows that they accept change nothing here."""
-        rules = SequenceRules()
-        rules._last = self._last
-        rules._of_observation = ChainMap({}, self._of_observation)
-        rules._of_pose = ChainMap({}, self._of_pose)
-        rules._of_configuration = ChainMap({}, self._of_configuration)
-        rules._of_frame = ChainMap({}, self._of_frame)
-        rules._in_frame = ChainMap({}, self._in_frame)
-        return rules
-
-    def problem(self, row: RowKeys) -> str:
-        """Return '' or what is wrong with the next row: "column …: …; remedy"."""
-        same = self._of_observation.get(row.observation)
-        if same is not None:
-            return (
-                f'column observation: {row.observation} is already on line {same.line}; '
-                'number every row once'
-            )
-        last = self._last
-        if last is not None and row.observation < last.observation:
-            return (
-                f'column observation: {row.observation} comes after {last.observation}; '
-                'number the rows in the order measured'
-            )
-        if last is not None and row.stamp_s < last.stamp_s:
-            return (
-                f'column stamp_s: {row.stamp_s} is before the row above it ({last.stamp_s}): '
-                'time runs backwards; give the rows in the order measured'
-            )
-        same = self._of_pose.get(row.pose)
-        if same is not None and same.split != row.split:
-            return (
-                f'column split: pose {row.pose} is {SPLITS[same.split]} on line '
-                f'{same.line} and {SPLITS[row.split]} here; give a pose one split'
-            )
-        same = self._of_configuration.get(row.configuration)
-        if same is not None and same.pose != row.pose:
-            return (
-                f'column configuration: {row.configuration} belongs to pose {same.pose} on line '
-                f'{same.line} and to pose {row.pose} here; give a configuration one pose'
-            )
-        same = self._of_frame.get((row.sensor, row.frame))
-        if row.frame >= 0 and same is not None and same.configuration != row.configuration:
-            return (
-                f'column frame: {row.frame} belongs to configuration {same.configuration} on line '
-                f'{same.line} and to {row.configuration} here; give every frame its own number'
-            )
-        same = self._in_frame.get((row.sensor, row.frame, row.marker))
-        if row.frame >= 0 and same is not None:
-            return (
-                f'column marker: frame {row.frame} of this sensor has this marker on line '
-                f'{same.line} already; a frame has each marker once'
-            )
-        return ''
-
-    def accept(self, row: RowKeys) -> None:
-        """Take a row without a problem as the last one."""
-        self._last = row
-        self._of_observation[row.observation] = row
-        self._of_pose.setdefault(row.pose, row)
-        self._of_configuration.setdefault(row.configuration, row)
-        if row.frame >= 0:
-            self._of_frame.setdefault((row.sensor, row.frame), row)
-            self._in_frame[row.sensor, row.frame, row.marker] = row
-
-
-def split_indices(m: Measurements) -> IntArray:
-    """Return the index into `SPLITS` of every row, (n,)."""
-    index = m.is_validation.astype(np.int64)
-    if m.is_reference is not None:
-        index[m.is_reference] = SPLITS.index('reference')
-    return index
-
-
-def row_keys(m: Measurements, first_line: int) -> Iterator[RowKeys]:
-    """Yield the keys of every row, the first being on `first_line` of its file."""
-    lines = range(first_line, first_line + len(m))
-    frame = np.full(len(m), -1) if m.frame is None else m.frame
-    columns = (
-        *(m.observation, m.pose, m.configuration, split_indices(m), m.stamp_s),
-        *(m.sensor, m.marker, frame),
-    )
-    # Plain Python numbers: dictionaries of NumPy scalars are slow.
-    return map(RowKeys, lines, *(column.tolist() for column in columns))
-
-
-log = logging.getLogger('remaster_ros')
-
-OPTIONAL = ('frame', 'orientation', 'effort', 'wanted', 'correction')
-"""Fields of an observation whose columns a file need not have."""
-LEFT_OUT = ('from_q', 'std', 'samples', 'temperature_c')
-"""Fields whose columns are written always, though a file of others may leave them out."""
-STATES = ('off', 'on')
-LENGTH_TOLERANCE = 1e-3
-"""By so much the length of a quaternion may differ from 1."""
-
-
 def column_names(
     joints: int, slides: Sequence[bool] | BoolArray | None = None
 ) -> dict[str, list[str]]:
-    """Return the columns by the field of `Observation` that they hold, in the order written.
+    """Return the columns of each field of `Observation`, in the order written.
 
-    ``slides`` tells which joints do, (k,): their positions are in m, their efforts in N.
+    ``slides``: whether each joint is prismatic, (k,): its positions are in m, its efforts in N.
     """
     lengths = [False] * joints if slides is None else list(slides)
 
@@ -313,11 +198,11 @@ def column_names(
 
 
 class RowFormat:
-    """observations.csv of one session: observations to lines, and lines to checked columns.
+    """Format of observations.csv of one session.
 
-    Sensors and markers are in their order in session.yaml; `optional` are the `OPTIONAL` fields of
-    the lines that are to be written. With `within_limits` joint angles outside the robot's limits
-    are refused.
+    ``sensors``, ``markers``: names in the order of session.yaml; ``optional``: the `OPTIONAL`
+    fields of lines to be written; ``within_limits``: refuse joint angles outside the robot's
+    limits.
     """
 
     def __init__(
@@ -343,11 +228,11 @@ class RowFormat:
 
     @property
     def header(self) -> str:
-        """The first line of what is written, with its end."""
+        """The first line, with its end."""
         return ','.join(self._written) + '\n'
 
     def line(self, o: Observation) -> str:
-        """Return one observation without a line end; numbers survive the round trip exactly."""
+        """Return an observation as a line without its end; numbers are exact."""
         joints = len(o.q)
         cells: dict[str, list[str]] = {
             'observation': [str(int(o.observation))],
@@ -379,13 +264,13 @@ class RowFormat:
         return self.header + ''.join(f'{self.line(row)}\n' for row in rows)
 
     def parse(self, data: bytes) -> Measurements:
-        """Read the bytes of the file; an `InputError` names file, line, column and remedy.
+        """Read the bytes of the file; an InputError names file, line, column and remedy.
 
-        What was cut off while it was written is dropped with a warning: a last line without its
-        line end, and last lines with the zeros that a power cut leaves.
+        Lines that were cut off are dropped with a warning: a last line without its end, and last
+        lines with the zeros that a power cut leaves.
         """
         path = self._path
-        # Before its zeros are taken for those that a power cut leaves.
+        # Before the zeros of UTF-16 are taken for those of a power cut.
         refuse_utf16(data, path)
         end = _whole_lines(data, most=len(self._sensors) * len(self._markers))
         if end < len(data):
@@ -402,7 +287,7 @@ class RowFormat:
         if len(lines) < 2:
             raise InputError(f'{path}: no observations below the header; measure before fitting')
         table = Table(path, names, lines[1:], first_line=2)
-        for field in LEFT_OUT:
+        for field in OMITTABLE:
             for name in self._columns[field]:
                 table.cells.setdefault(name, [''] * table.rows)
         measurements = self._convert(table)
@@ -410,9 +295,10 @@ class RowFormat:
         return measurements
 
     def check(self, rows: Sequence[str], first_line: int, rules: SequenceRules) -> list[RowKeys]:
-        """Check lines that are to be written as a reader would; return their keys.
+        """Check lines to be written as a reader would; return their keys.
 
-        The first one is on `first_line` of the file; `rules` accepts them. Errors as of `parse`.
+        ``first_line``: line number of the first one; ``rules``: accept the rows. Errors as
+        `parse`.
         """
         if not rows:
             return []
@@ -420,6 +306,7 @@ class RowFormat:
         return self._accept(self._convert(table), first_line, rules)
 
     def _accept(self, m: Measurements, first_line: int, rules: SequenceRules) -> list[RowKeys]:
+        """Check rows against the rules, and add them; return their keys."""
         keys = list(row_keys(m, first_line))
         for row in keys:
             if problem := rules.problem(row):
@@ -428,7 +315,7 @@ class RowFormat:
         return keys
 
     def _convert(self, table: Table) -> Measurements:
-        """Convert and check every column by itself."""
+        """Return the columns, each checked by itself."""
         columns, chain = self._columns, self._chain
 
         def given(field: str) -> bool:
@@ -496,7 +383,7 @@ class RowFormat:
 
 
 def _refuse_other_separators(header: str, path: Path) -> None:
-    """Name the separator of a header that has one, but not the comma."""
+    """Raise InputError if a header has another separator than the comma."""
     for separator, name in ((';', 'semicolons'), ('\t', 'tabs')):
         if header.count(separator) > header.count(','):
             raise InputError(
@@ -506,10 +393,10 @@ def _refuse_other_separators(header: str, path: Path) -> None:
 
 
 def _whole_lines(data: bytes, most: int) -> int:
-    """Return how many bytes at the beginning are whole lines.
+    """Return the number of bytes at the beginning that are whole lines.
 
-    The rows of one configuration are written in one piece, `most` at most, a row for each marker
-    of each sensor: zeros further up are no crash's work, and left for the reader to refuse.
+    The rows of a configuration, `most` at most, are written together: zeros in earlier rows are
+    not the effect of a crash, and are left for the reader to refuse.
     """
     end = data.rfind(b'\n') + 1
     zero = data.find(b'\0')
@@ -521,7 +408,7 @@ def _whole_lines(data: bytes, most: int) -> int:
 def observations_of(
     m: Measurements, sensors: Sequence[str], markers: Sequence[str]
 ) -> Iterator[Observation]:
-    """Yield the rows of columns; what is NaN or -1 there is None here."""
+    """Yield the rows of columns as observations, with None for NaN or -1."""
 
     def rows(values: FloatArray | None) -> Iterator[FloatArray | None]:
         if values is None:
@@ -553,7 +440,7 @@ def optional_of(m: Measurements) -> list[str]:
 
 
 def stacked(parts: Sequence[Measurements]) -> Measurements:
-    """Return the rows of all parts; where only some have a field, it is unknown in the others."""
+    """Return the rows of all parts; fields that only some parts have are unknown in the others."""
     columns: dict[str, Any] = {}
     for name in vars(parts[0]):
         values = [getattr(part, name) for part in parts]
@@ -572,13 +459,13 @@ def stacked(parts: Sequence[Measurements]) -> Measurements:
 
 
 def _unknown(like: NDArray[Any], count: int) -> NDArray[Any]:
-    """Return a column in which nothing is known: NaN, -1 or False, (count, ...)."""
+    """Return a column of unknown values: NaN, -1 or False, (count, ...)."""
     fill = {'f': np.nan, 'i': -1, 'b': False}[like.dtype.kind]
     return np.full((count, *like.shape[1:]), fill, dtype=like.dtype)
 
 
 def _check_names(names: list[str], columns: Mapping[str, list[str]], path: Path) -> None:
-    """Refuse a header that does not have the columns of the format."""
+    """Raise InputError if a header lacks columns of the format."""
     where = f'{path}, line 1'
     for name in names:
         if names.count(name) > 1:
@@ -610,7 +497,7 @@ def _check_names(names: list[str], columns: Mapping[str, list[str]], path: Path)
                 f'of the robot between its base_link and tip_link; give {wanted[0]} to '
                 f'{wanted[-1]}, or the right URDF and links in session.yaml'
             )
-    needed = [field for field in columns if field not in (*OPTIONAL, *LEFT_OUT)]
+    needed = [field for field in columns if field not in (*OPTIONAL, *OMITTABLE)]
     missing = [name for field in needed for name in columns[field] if name not in names]
     if missing:
         raise InputError(
@@ -623,11 +510,11 @@ def _check_names(names: list[str], columns: Mapping[str, list[str]], path: Path)
         log.warning('%s: unknown columns are not used: %s', where, ', '.join(map(repr, unknown)))
 
 
-def turned_round(m: Measurements, sensors: Sequence[int], where: str) -> Measurements:
-    """Return rows with the readings of sensors on the tool the other way round.
+def inverted_readings(m: Measurements, sensors: Sequence[int], where: str) -> Measurements:
+    """Return rows in which readings of sensors on the tool are inverted.
 
-    Those of what stands, in the sensor's frame, become those of the sensor in the frame of what
-    stands, and back. An `InputError`, which begins with `where`, for one without an orientation.
+    Poses of a fixed body in the sensor's frame become poses of the sensor in the body's frame, and
+    back. Raises InputError, which begins with `where`, if one has no orientation.
     """
     mine = np.flatnonzero(np.isin(m.sensor, sensors))
     if len(mine) == 0:
@@ -645,11 +532,12 @@ def turned_round(m: Measurements, sensors: Sequence[int], where: str) -> Measure
 
 
 def _not_among(key: str, names: Sequence[str]) -> str:
+    """Return the message for an unknown name."""
     return f'is not among the {key} of session.yaml ({", ".join(names)}); correct either'
 
 
 def _numbers(values: FloatArray | Sequence[float] | None, count: int) -> list[str]:
-    """Return numbers as cells, empty where they are not known."""
+    """Return numbers as cells, empty if unknown."""
     if values is None:
         return [''] * count
     numbers = np.asarray(values, float).tolist()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""ROS packages as folders: where `package://NAME` and `$(find NAME)` are, also without ROS."""
+"""Folders of ROS packages: resolves `package://NAME` and `$(find NAME)`, also without ROS."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ _PACKAGE = re.compile(r'[A-Za-z][\w-]*')
 
 
 def find_package(name: str, beside: Path, package_path: Sequence[Path] = ()) -> Path | None:
-    """Return the folder of a ROS package that the file `beside` names; None where it is not found.
+    """Return the folder of a ROS package that the file `beside` names; None if not found.
 
-    It is looked for in the given folders (which may be the package itself), in the share folders
-    of AMENT_PREFIX_PATH, and above and beside the file that names it: by the name of the folder,
-    then by the name in its package.xml, which a clone's folder need not have.
+    Searched are the given folders (which may be the package itself), the share folders of
+    AMENT_PREFIX_PATH, and the folders above and beside the file: by the folder's name, then by the
+    name in its package.xml, from which a clone's folder may differ.
     """
     if not _PACKAGE.fullmatch(name):
         return None
@@ -36,23 +36,22 @@ def find_package(name: str, beside: Path, package_path: Sequence[Path] = ()) -> 
 
 
 def sourced() -> list[Path]:
-    """Return the share folders of the workspaces that are sourced."""
+    """Return the share folders of the sourced workspaces."""
     prefixes = os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep)
     return [Path(prefix) / 'share' for prefix in prefixes if prefix]
 
 
 def package_of(path: Path) -> Path | None:
-    """Return the folder of the ROS package that a file is in; None where it is in none."""
+    """Return the folder of the ROS package that contains a file; None if there is none."""
     return next((folder for folder in path.parents if (folder / 'package.xml').is_file()), None)
 
 
 class Confinement:
-    """Which files a robot description may name.
+    """The files that a robot description may name.
 
-    Those below its own folder, below the package that it is in, below the packages that it names,
-    below the folders that the user gives, and the files that the user has named. Links are
-    followed before that is judged, but for what a sourced workspace has: who builds a workspace
-    runs its code, and links of its files lead to their sources.
+    Files below its folder, below its package, below the packages that it names, below the folders
+    that the user gives, and files that the user has named. Symbolic links are resolved first,
+    except in a sourced workspace, whose links lead to its sources: its owner's code runs anyway.
     """
 
     def __init__(
@@ -63,13 +62,13 @@ class Confinement:
         self._folders: list[Path] = []
         for folder in package_path:
             self.add(folder)
-        for one in (path.absolute(), path.resolve()):
-            self.add(one.parent)
-            if (package := package_of(one)) is not None:
+        for file in (path.absolute(), path.resolve()):
+            self.add(file.parent)
+            if (package := package_of(file)) is not None:
                 self.add(package)
 
     def add(self, folder: Path) -> None:
-        """Take the files below a folder as well."""
+        """Allow the files below a folder."""
         self._folders.append(folder.resolve())
 
     def holds(self, path: Path) -> bool:
@@ -83,6 +82,7 @@ class Confinement:
 
 
 def _candidates(beside: Path, package_path: Sequence[Path]) -> Iterator[Path]:
+    """Yield the folders to search."""
     yield from package_path
     yield from sourced()
     for folder in beside.resolve().parents:
@@ -93,6 +93,7 @@ def _candidates(beside: Path, package_path: Sequence[Path]) -> Iterator[Path]:
 
 
 def _inside(folder: Path) -> list[Path]:
+    """Return a folder and its subfolders."""
     try:
         return sorted(path for path in folder.iterdir() if (path / 'package.xml').is_file())
     except OSError:
@@ -100,6 +101,7 @@ def _inside(folder: Path) -> list[Path]:
 
 
 def _declared_name(path: Path) -> str:
+    """Return the name in the package.xml of a folder; '' if there is none."""
     try:
         if not path.is_file():
             return ''

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Session folders: the strict reader, and the writer of a whole session."""
+"""Strict reader of session folders, and writer of whole sessions."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from remaster_ros.session.files import (
     write_atomically,
 )
 from remaster_ros.session.manifest import check_data, read_manifest
-from remaster_ros.session.observations import RowFormat, optional_of, stacked, turned_round
+from remaster_ros.session.observations import RowFormat, inverted_readings, optional_of, stacked
 from remaster_ros.session.session_yaml import (
     SessionHeader,
     parse_header,
@@ -45,16 +45,16 @@ _ATTEMPTS = 10
 
 
 def read_session(folder: str | os.PathLike[str], *, within_limits: bool = True) -> Session:
-    """Read a session folder (format ``remaster-session/1``), and refuse what does not fit it.
+    """Read a session folder (format ``remaster-session/1``); refuse one that does not conform.
 
     The folder may be read at any moment, also while it is being written and after a power cut.
 
     Parameters
     ----------
     folder
-        Holds session.yaml, observations.csv and the URDF that session.yaml names.
+        Has session.yaml, observations.csv and the URDF that session.yaml names.
     within_limits
-        Whether joint angles outside the robot's limits are refused.
+        Refuse joint angles outside the robot's limits.
 
     Returns
     -------
@@ -81,6 +81,7 @@ def read_session(folder: str | os.PathLike[str], *, within_limits: bool = True) 
 
 
 def _read(folder: Path, sums: dict[str, str], within_limits: bool) -> Session:
+    """Read a session whose checksums are known; see `read_session`."""
     header_path = folder / HEADER
     data = read_limited(header_path, YAML_LIMIT, 'a session folder holds session.yaml')
     check_data(sums, header_path, data)
@@ -93,7 +94,7 @@ def _read(folder: Path, sums: dict[str, str], within_limits: bool) -> Session:
     names = tuple(header.sensors), tuple(header.markers)
     measurements = RowFormat(rows_path, chain, *names, within_limits=within_limits).parse(data)
     on_tool = [i for i, name in enumerate(header.sensors) if name in header.on_tool]
-    measurements = turned_round(measurements, on_tool, str(rows_path))
+    measurements = inverted_readings(measurements, on_tool, str(rows_path))
     references = None
     if measurements.is_reference is not None:
         of_references = measurements.is_reference
@@ -109,7 +110,7 @@ def _read(folder: Path, sums: dict[str, str], within_limits: bool) -> Session:
 
 
 def read_header(folder: Path) -> SessionHeader:
-    """Read session.yaml alone."""
+    """Read session.yaml."""
     path = folder / HEADER
     return parse_header(read_limited(path, YAML_LIMIT, f'a session folder holds {HEADER}'), path)
 
@@ -117,7 +118,7 @@ def read_header(folder: Path) -> SessionHeader:
 def read_robot(
     folder: Path, header: SessionHeader, sums: Mapping[str, str] = MappingProxyType({})
 ) -> tuple[str, SerialChain]:
-    """Read the URDF of a session, held to its checksum in `sums` where it has one."""
+    """Read the URDF of a session, and check it against its checksum if that is listed."""
     path = folder / header.robot.urdf
     data = read_limited(path, URDF_LIMIT, 'robot.urdf in session.yaml names the URDF')
     check_data(sums, path, data)
@@ -127,12 +128,10 @@ def read_robot(
 
 
 def write_session(folder: str | os.PathLike[str], session: Session) -> None:
-    """Write a whole session into a new or empty folder; numbers survive the round trip exactly.
+    """Write a whole session into a new or empty folder; numbers are exact.
 
-    Raises
-    ------
-    InputError
-        The folder holds files or cannot be written to, or the session breaks the format.
+    Raises InputError if the folder has files, cannot be written to, or the session breaks the
+    format.
     """
     folder = Path(folder)
     chain = read_chain(session.urdf, folder / URDF, session.base_link, session.tip_link)
@@ -141,7 +140,7 @@ def write_session(folder: str | os.PathLike[str], session: Session) -> None:
     require_known_joints(parsed, chain.joint_names, folder / HEADER)
     names = session.sensor_names, session.marker_names
     on_tool = [i for i, name in enumerate(session.sensors) if name in session.on_tool]
-    measured = turned_round(all_rows(session), on_tool, 'session to be written')
+    measured = inverted_readings(all_rows(session), on_tool, 'session to be written')
     row_format = RowFormat(folder / ROWS, chain, *names, optional_of(measured))
     rows = row_format.text(measured).encode()
     row_format.parse(rows)
@@ -153,7 +152,7 @@ def write_session(folder: str | os.PathLike[str], session: Session) -> None:
 
 
 def all_rows(session: Session) -> Measurements:
-    """Return every row of a session in the order measured, those of the references among them."""
+    """Return all rows of a session, references included, in the order measured."""
     m, references = session.measurements, session.references
     if references is None:
         return m
@@ -162,7 +161,7 @@ def all_rows(session: Session) -> Measurements:
 
 
 def read_chain(urdf: str, path: Path, base_link: str, tip_link: str) -> SerialChain:
-    """Return the arm of a session; an `InputError` names the URDF file at `path`."""
+    """Return the arm of a session; an InputError names the URDF file at `path`."""
     try:
         return SerialChain.from_urdf(urdf, base_link, tip_link)
     except InputError as error:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Finish a session folder that a crash has left incomplete, and report what was lost."""
+"""Recovery of a session folder that a crash has left incomplete, with a report of losses."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from remaster_ros.types import Measurements
 
 @dataclass
 class Recovery:
-    """What a recovery found."""
+    """Findings of a recovery."""
 
     # Whether anything was to be finished; False where the folder was complete.
     finished: bool = False
@@ -30,14 +30,11 @@ class Recovery:
 def recover_session(folder: str | os.PathLike[str]) -> Recovery:
     """Finish the files of a session whose recorder was killed or lost its power.
 
-    Lines cut off while they were written are dropped, observations.csv is brought up to the
-    journal, the bag is finished, and SHA256SUMS is written. Nothing that was acknowledged is
-    ever dropped; a second recovery changes nothing. The exit status stays what it is.
-
-    Raises
-    ------
-    InputError
-        No session of a recorder, one that is being written, or a damaged one; names the file.
+    Incomplete lines are dropped, observations.csv is completed from the journal, the bag is
+    finished, and SHA256SUMS is written. Nothing acknowledged is ever dropped; a second recovery
+    changes nothing. The exit status is unchanged.
+    Raises InputError, which names the file, if there is no session of a recorder, another process
+    writes it, or it is damaged.
     """
     folder = Path(folder)
     header = read_header(folder)
@@ -65,6 +62,7 @@ def recover_session(folder: str | os.PathLike[str]) -> Recovery:
 
 
 def _finish_session(folder: Path, header: SessionHeader, recovery: Recovery) -> None:
+    """Complete the session files from the journal."""
     urdf, chain = read_robot(folder, header)
     session = header.session(urdf, Measurements.empty(len(chain)))
     writer = SessionWriter(folder, session, resume=True, even_complete=True)
@@ -78,6 +76,7 @@ def _finish_session(folder: Path, header: SessionHeader, recovery: Recovery) -> 
 
 
 def _note(recovery: Recovery, lost: str) -> None:
+    """Add a loss to the findings."""
     if lost:
         recovery.finished = True
         recovery.lost.append(lost)

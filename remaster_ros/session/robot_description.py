@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Robot descriptions as their makers ship them: URDF text, or xacro that is expanded to it.
+"""Robot descriptions as makers publish them: URDF text, or xacro that is expanded to it.
 
-A xacro file is expanded in a process of its own, with little time and memory, without this
-process's environment, and, unless it is trusted, with no more than descriptions need
-(`xacro_expansion`). A file of any other name is never expanded.
+A xacro file is expanded in a separate process with little time and memory, without this process's
+environment, and, unless it is trusted, with only the functions that descriptions need
+(`xacro_expansion`). A file with another extension is never expanded.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ log = logging.getLogger('remaster_ros')
 
 
 def is_xacro(path: Path) -> bool:
-    """Return whether a description is to be expanded: by its name, never by what is in it."""
+    """Return whether a description is xacro, by its name, never by its content."""
     return path.suffix == '.xacro'
 
 
@@ -55,15 +55,15 @@ def read_description(
     *,
     trusted: bool = False,
 ) -> str:
-    """Return the URDF text of a file, or of a .xacro file with these arguments.
+    """Return the URDF text of a file, or of an expanded .xacro file.
 
     Parameters
     ----------
     arguments
-        What ``xacro`` takes as NAME:=VALUE. A file that one of them names, from the working
-        folder, is read wherever it lies: it was named by the user, and not by the description.
+        Arguments of ``xacro``, NAME:=VALUE. A file that one of them names, relative to the
+        working folder, may be read anywhere, since the user has named it, not the description.
     package_path
-        Folders to look for ROS packages in, beside those around the file.
+        Folders to search for ROS packages, besides those around the file.
     trusted
         Whether a xacro file may do what a program may: any Python expression, any file, the
         environment.
@@ -122,7 +122,7 @@ def read_description(
 
 
 def _names_a_file(value: str) -> bool:
-    """Whether the value of an argument is a file of a description; a word may be one by chance."""
+    """Return whether the value of an argument is a file of a description, not a mere word."""
     path = Path(value)
     try:
         return path.suffix in _NAMED and path.is_file()
@@ -131,14 +131,15 @@ def _names_a_file(value: str) -> bool:
 
 
 def _from_here(value: str) -> str:
-    """Return the value of an argument; of a file in the working folder, its whole path.
+    """Return the value of an argument, as an absolute path if it is a file.
 
-    xacro would look for it beside the description.
+    xacro would search it relative to the description.
     """
     return str(Path(value).absolute()) if _names_a_file(value) else value
 
 
 def _too_slow(path: Path, after: str) -> InputError:
+    """Return the error of an expansion that takes too long."""
     return InputError(
         f'{path}: xacro: it is not expanded after {after}; does a macro call itself, or double '
         'what it is given?'
@@ -157,19 +158,9 @@ def read_arm(
 ) -> tuple[str, SerialChain]:
     """Read a URDF, or expand a xacro, and find the arm in it.
 
-    Parameters
-    ----------
-    base_link, tip_link
-        As told; None for the likely ones.
-    arguments, package_path, trusted
-        As of `read_description`.
-    tables
-        Whose joints are the arm's: of several arms it is the one that they name.
-
-    Raises
-    ------
-    InputError
-        Naming the file and the remedy.
+    ``base_link``, ``tip_link``: None for the likely ones; ``arguments, package_path, trusted``: as
+    of `read_description`; ``tables``: files whose column names decide which of several arms it is.
+    Raises InputError, naming the file and the remedy.
     """
     urdf = read_description(path, arguments, package_path, trusted=trusted)
     try:
@@ -183,7 +174,7 @@ def read_arm(
 
 
 def _words(tables: Sequence[Path]) -> set[str]:
-    """Return the words at the beginning of text files, where their columns are named."""
+    """Return the words at the beginning of text files, in which columns are named."""
     words: set[str] = set()
     for path in tables:
         if path.is_file():

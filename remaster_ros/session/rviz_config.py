@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Configuration of RViz for a workcell: the arm, its way, the topics of the cell's sensors."""
+"""Configuration of RViz for a workcell: the arm, its path, the topics of the sensors."""
 
 from __future__ import annotations
 
 from typing import Any
 
 from remaster_ros.session.files import read_limited
+from remaster_ros.session.strict_yaml import dump_yaml, load_yaml
 from remaster_ros.session.workcell import Workcell, config_path
-from remaster_ros.session.yaml_records import YAML_LIMIT, dump_yaml, load_yaml
+from remaster_ros.session.yaml_records import YAML_LIMIT
 
 # Those of the live page, as RViz writes them: red; green; blue.
 COLORS = ('59; 130; 196', '224; 123; 57', '168; 107; 192', '138; 143; 60')
@@ -18,7 +19,7 @@ HEAD = (
 
 
 def rviz_config(cell: Workcell) -> str:
-    """Text of an RViz configuration that shows everything which the nodes of a cell publish.
+    """Return an RViz configuration that shows everything the nodes of a cell publish.
 
     The shipped ``config/remaster.rviz`` with the base and the sensors of this cell.
     """
@@ -59,7 +60,7 @@ def rviz_config(cell: Workcell) -> str:
 
 
 def _topic(name: str) -> dict[str, Any]:
-    """Subscription to a topic of the nodes; a relative name is one of the root namespace."""
+    """Return the subscription to a topic; a relative name is in the root namespace."""
     return {
         'Depth': 50,
         'Durability Policy': 'Volatile',

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a recorder keeps on the disk: the session, and its decisions so far.
+"""State of a recorder on the disk: the session, and its decisions so far.
 
-A recorder that is started again finds here what it decided before, so that nothing is recorded
-twice, and the points that its sensors were registered by. What became of a configuration is noted
-here alone: planner and reports take it from this journal.
+A restarted recorder finds here its earlier decisions, so that nothing is recorded twice, and the
+points by which its sensors were registered. Outcomes of configurations are stored only here:
+planner and reports read them from this journal.
 """
 
 from __future__ import annotations
@@ -27,21 +27,21 @@ from remaster_ros.session.yaml_records import from_plain, to_plain
 from remaster_ros.types import Correction, FloatArray, Observation, Session, Split
 
 SHIFT_S = 1.0
-"""Time that is put between two rows where the clock ran backwards, s."""
+"""Time between two rows if the clock ran backwards between them, s."""
 
 _FINAL: tuple[Outcome, ...] = ('recorded', 'partial')
 
 
 class Outcomes:
-    """What became of the configurations of a plan, by the records of a session's journal."""
+    """Outcomes of the configurations of a plan, from the records of a session's journal."""
 
     def __init__(self) -> None:
         self.plan = ''  # By which they are numbered; '' before the first
-        # Of each pose the split and what became of its solutions; that of the last record is last
+        # Pose -> split and outcomes of its solutions; the pose of the last record is last
         self.poses: dict[int, tuple[str, dict[int, str]]] = {}
 
     def take(self, record: Record) -> None:
-        """Take the next record; the last one of a configuration counts."""
+        """Add the next record; the last one of a configuration counts."""
         if record['kind'] == 'plan':
             self.plan, self.poses = record['id'], {}
         elif record['kind'] == 'configuration' and record['pose'] != BY_HAND.pose:
@@ -49,21 +49,23 @@ class Outcomes:
             self.poses[record['pose']] = split, {**ends, record['solution']: record['result']}
 
     def of(self, pose: int, solution: int) -> str:
-        """Return what became of a configuration; '' before it has an outcome."""
+        """Return the outcome of a configuration; '' if it has none yet."""
         return self.poses.get(pose, ('', {}))[1].get(solution, '')
 
     def decided(self) -> Decided:
-        """Return what the planner has to know of them."""
+        """Return the outcomes in the form of the message to the planner."""
         last = next(reversed(self.poses), None)
         solutions = () if last is None else tuple(self.poses[last][1])
-        ends = [(split, end) for split, found in self.poses.values() for end in found.values()]
+        ends = [
+            (split, end) for split, outcomes in self.poses.values() for end in outcomes.values()
+        ]
         counts = Counter(end for split, end in ends if split not in (REFERENCE, REGISTRATION))
         references = sum(split == REFERENCE for split, _ in ends)
         return Decided(last, solutions, dict(counts), references)
 
 
 def read_outcomes(folder: Path) -> Outcomes:
-    """Return what became of the configurations of a session; none where it has no journal."""
+    """Return the outcomes in a session; none if it has no journal."""
     outcomes = Outcomes()
     if (folder / JOURNAL).exists():
         for record in read_journal(folder / JOURNAL).records:
@@ -72,20 +74,20 @@ def read_outcomes(folder: Path) -> Outcomes:
 
 
 class SessionJournal:
-    """Write a session, new or unfinished, and keep what was decided.
+    """Writer of a session, new or unfinished, and of its decisions.
 
     Parameters
     ----------
     folder
-        The session's. A complete session is not written to; `closed` is set from the start.
-        `reopen` may go further with it.
+        The session's. A complete session is not written to; `closed` is then set from the start,
+        and `reopen` may continue it.
     header
         Everything but the observations.
 
     Raises
     ------
     InputError
-        The folder holds something else, another process writes it, or it cannot be written to.
+        If the folder holds other files, another process writes it, or it cannot be written to.
     """
 
     def __init__(self, folder: Path, header: Session) -> None:
@@ -94,19 +96,19 @@ class SessionJournal:
         self.closed = ''  # The exit status once the session is closed, else ''
         self.outcomes = Outcomes()
         self.observations = 0
-        # The state in which the session was found, for the user, a line each
+        # Messages on the state in which the session was found
         self.notes: list[str] = []
-        # The readings that the sensors were registered by in the runs before
+        # Readings of earlier runs by which the sensors were registered
         self.registration: list[PairedReading] = []
-        # What was measured at the references in the runs before, in order: ``reference`` with the
-        # number of the configuration and its readings, ``other`` for any other configuration,
-        # ``accepted`` where a person had seen to a change
+        # Reference measurements of earlier runs, in order: ``reference`` with the number of the
+        # configuration and its readings, ``other`` for any other configuration, ``accepted`` when
+        # a person accepted a change
         self.watched: list[tuple[str, int, list[PairedReading]]] = []
         self._shift_s = 0.0
         self.reopen()
 
     def reopen(self, *, go_further: bool = False) -> None:
-        """Go on with a session that was stopped; with `go_further`, with one that is complete."""
+        """Continue a stopped session; with `go_further`, a complete one."""
         if is_complete(self.folder) and not go_further:
             rows = read_limited(self.folder / ROWS, OBSERVATIONS_LIMIT, 'it is part of a session')
             self.observations = rows.count(b'\n') - 1
@@ -126,6 +128,7 @@ class SessionJournal:
             self._replay(record)
 
     def _replay(self, record: Record) -> None:
+        """Restore the state by a record."""
         kind = record['kind']
         self.outcomes.take(record)
         if kind == 'configuration':
@@ -142,17 +145,18 @@ class SessionJournal:
             self._shift_s = record['shift_s']
 
     def _append(self, record: Record, observations: Sequence[Observation] = ()) -> None:
+        """Write a record and its observations, and update the state."""
         assert self._writer is not None
         self._writer.record(record, observations)
         self.outcomes.take(record)
 
     @property
     def plan_id(self) -> str:
-        """The plan that the configurations are numbered by; '' before the first."""
+        """Identifier of the plan that numbers the configurations; '' before the first."""
         return self.outcomes.plan
 
     def follow(self, plan_id: str) -> bool:
-        """Take the plan that the planner follows; False where the session is of another one."""
+        """Bind the session to a plan; return False if it belongs to another one."""
         if plan_id == self.plan_id:
             return True
         if self.observations and self.plan_id:
@@ -161,17 +165,17 @@ class SessionJournal:
         return True
 
     def result(self, pose: int, solution: int) -> Outcome | None:
-        """Return what a configuration was recorded as, None where it is still to be recorded."""
+        """Return the outcome of a configuration; None if it is not recorded yet."""
         result = self.outcomes.of(pose, solution)
         return next((final for final in _FINAL if final == result), None)
 
     @property
     def correction(self) -> Correction | None:
-        """The correction that the rows are measured with; None for none, or before the first."""
+        """Correction of the rows; None for none, or before the first."""
         return None if self._writer is None else self._writer.correction
 
     def take_correction(self, correction: Correction) -> None:
-        """Note before the first row that a correction is on; `DiskError` as of `write`."""
+        """Store, before the first row, that a correction is on; DiskError as `write`."""
         assert self._writer is not None
         self._writer.correct(correction)
 
@@ -188,32 +192,27 @@ class SessionJournal:
         temperatures_c: Sequence[float | None] = (),
         change: FloatArray | None = None,
     ) -> int:
-        """Write what became of a configuration; durable on return.
+        """Write the outcome of a configuration durably; return its number in the session.
 
         Parameters
         ----------
         pose, solution
-            As the planner numbers them.
+            The planner's numbers.
         split
             ``registration``, ``reference``, ``optimization`` or ``validation``.
         result, reason
             ``recorded``, ``partial``, ``rejected``, ``failed`` or ``no_free_path``, and why.
         readings, temperatures_c
-            What was accepted, and the temperature with each, degrees Celsius, None if unknown.
+            Accepted readings, and the temperature with each, degrees Celsius, None if unknown.
         from_q
-            Where the arm came from, rad, (k,); None if unknown.
+            Previous configuration of the arm, rad, (k,); None if unknown.
         change
-            What a correction changed of what was wanted, rad, (k,); None where it was off.
-
-        Returns
-        -------
-        int
-            The number that the configuration has in the session, where it has readings.
+            Commanded minus desired joint angles by a correction, rad, (k,); None if it was off.
 
         Raises
         ------
         DiskError
-            The disk does not take it; try again when there is room.
+            If the disk is full; call again when there is room.
         """
         record: Record = {
             'kind': 'configuration',
@@ -236,7 +235,7 @@ class SessionJournal:
         return number
 
     def note_accepted(self) -> None:
-        """Write that a person has seen to what had changed at the references."""
+        """Record that a person has accepted a change at the references."""
         self._append({'kind': 'accepted'})
 
     def _rows(
@@ -248,6 +247,7 @@ class SessionJournal:
         temperatures_c: Sequence[float | None],
         change: FloatArray | None,
     ) -> list[Observation]:
+        """Return the observations of readings, sorted by time."""
         writer = self._writer
         if not readings or writer is None:
             return []
@@ -262,11 +262,11 @@ class SessionJournal:
                 split=_split(split),
                 from_q=from_q,
                 temperature_c=temperature_c,
-                # Every stream has one frame in a configuration, single shots share none.
+                # A stream has one frame in a configuration; single shots have none in common.
                 frame=writer.configurations
                 if markers[reading.sensor] > 1 and reading.std is not None
                 else None,
-                # Less the change, not the target: what the arm stands off its command counts too.
+                # Reached minus change: the deviation from the command is part of the error.
                 wanted=None
                 if writer.correction is None
                 else reading.q - (0.0 if change is None else change),
@@ -277,14 +277,14 @@ class SessionJournal:
         ]
 
     def _columns(self, reading: PairedReading) -> dict[str, Any]:
-        """Return what a row has of a reading; what it left out is counted in the status."""
+        """Return the columns of a reading, without the number of dropped frames."""
         if reading.sensor in self._header.on_tool:
             reading = reading.turned_round()
         values = vars(replace(reading, stamp_s=reading.stamp_s + self._shift_s))
         return {name: value for name, value in values.items() if name != 'dropped'}
 
     def _keep_time(self, stamp_s: float) -> None:
-        """Time never runs backwards in a session, whatever the clock does between its rows."""
+        """Shift stamps if the clock ran backwards, so that time in a session never does."""
         assert self._writer is not None
         last_s = self._writer.last_stamp_s
         if last_s is None or stamp_s + self._shift_s >= last_s:
@@ -295,12 +295,12 @@ class SessionJournal:
         self.notes.append(f'the clock ran backwards: stamps are shifted by {self._shift_s:.3f} s')
 
     def check(self) -> None:
-        """Restore what others did to the files; `DiskError` where that is not possible (yet)."""
+        """Repair files that others changed; raise DiskError if that is impossible (yet)."""
         if not self.closed and self._writer is not None:
             self._writer.check()
 
     def take_restored(self) -> list[str]:
-        """Return what was restored since the last call, a line each."""
+        """Return the repairs since the last call, one line each."""
         if self._writer is None:
             return []
         lines, self._writer.restored = self._writer.restored, []
@@ -308,30 +308,30 @@ class SessionJournal:
 
     @property
     def beyond_repair(self) -> str:
-        """Why the session cannot be complete any more; '' where it can."""
+        """Why the session can no longer become complete; '' if it can."""
         return '' if self._writer is None else self._writer.beyond_repair
 
     def close(self, exit_status: ExitStatus) -> None:
-        """Close the session; closing again does nothing. `DiskError` where it remains open.
+        """Close the session; a second call does nothing. Raises DiskError if it remains open.
 
-        `closed` is what it was closed as; see `SessionWriter.close`.
+        Sets `closed` to the exit status; see `SessionWriter.close`.
         """
         if not self.closed and self._writer is not None:
             self.closed = self._writer.close(exit_status)
 
 
 def is_complete(folder: Path) -> bool:
-    """Whether a folder holds a session that is complete; `InputError` where it is none."""
+    """Whether a folder has a complete session; raise InputError for a damaged one."""
     return (folder / HEADER).exists() and read_header(folder).exit_status == 'complete'
 
 
 def _split(name: str) -> Split:
-    """Return the split of a row; what a planner of another version names otherwise is fitted."""
+    """Return the split of a row; unknown names of other versions count as optimization."""
     if name == 'validation':
         return 'validation'
     return 'reference' if name == REFERENCE else 'optimization'
 
 
 def _plain(readings: Sequence[PairedReading]) -> list[dict[str, Any]]:
-    """Return readings as the journal has them: what is None is left out."""
+    """Return readings as plain data without None."""
     return [{k: v for k, v in reading.items() if v is not None} for reading in to_plain(readings)]

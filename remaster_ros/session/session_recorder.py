@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From messages to a session: what the recorder's node does, and what a bag gives again.
+"""From messages to a session: the logic of the recorder, for its node and for bags.
 
-Messages and records come in through `SessionRecorder.take_joints` and the like, in the order in
-which they arrive. Which of them belong together is decided by their stamps, in
-`collection.recording`. The event of a configuration goes out after its observations are on the
-disk; the bridge moves on only then.
+Messages and event records come in through `SessionRecorder.take_joints` and the like, in the order
+of arrival. Which of them belong together is decided by their stamps, in `collection.recording`.
+The event of a configuration is published after its observations are on the disk; the bridge goes
+on only then.
 """
 
 from __future__ import annotations
@@ -149,78 +149,75 @@ def session_header(cell: Workcell, settle_s: float) -> Session:
 
 
 class Keeper(Protocol):
-    """Writes the session; what the disk does not take is written later."""
+    """Writes the session; failed writes are repeated later."""
 
     journal: SessionJournal
     # Why nothing can be written now; ''.
     full: str
 
     def write(self, write: Callable[[], object]) -> None:
-        """Call `write`, now or when there is room."""
+        """Call `write`, now or when the disk has room."""
 
     def reopen(self, *, go_further: bool = False) -> None:
-        """Go on with a session that was stopped; with `go_further`, with one that is complete."""
+        """Continue a stopped session; with `go_further`, a complete one."""
 
     def close(self, exit_status: ExitStatus) -> None:
         """Close the session."""
 
 
 class Outlet:
-    """What becomes known while a session is recorded; does nothing with it.
-
-    A node publishes it.
-    """
+    """Receives the results of recording; this one ignores them, that of a node publishes them."""
 
     def event(self, event: events.Event) -> None:
-        """Take an event of this recorder."""
+        """Publish an event of this recorder."""
 
     def state(self) -> None:
-        """Take it that the recorder's state has changed."""
+        """Publish the recorder's state, which has changed."""
 
     def registered(self, sensor: str, T_R_N: FloatArray) -> None:
-        """Take a registration, (4, 4)."""
+        """Publish a registration, T_R_N (4, 4)."""
 
     def measure(self) -> None:
-        """Take it that a reading has begun: single-shot sensors are to measure."""
+        """Request measurements from single-shot sensors: a reading has begun."""
 
     def ended_by_hand(self, ended: EndedReading) -> None:
-        """Take what became of a reading for a registration by hand."""
+        """Answer a registration by hand with its reading."""
 
     def log(self, level: int, text: str) -> None:
-        """Take a line for a person; `level` as of `logging`."""
+        """Log a line; `level` as in `logging`."""
 
 
 class SessionRecorder:
-    """See the module's text.
+    """Recorder of a session; see the module.
 
     Parameters
     ----------
     cell, p
-        What is measured, and how.
+        The workcell, and the recorder's parameters.
     keeper, outlet
-        Where it goes.
+        Destinations of the session and of results.
 
     Attributes
     ----------
     recording
         The readings under way.
     registration
-        Of the sensors, so far.
+        Registrations of the sensors so far.
     changes
-        At the references.
+        Changes of the setup found at the references.
     required
-        The sensors that the arm waits for.
+        Sensors that the arm waits for.
     counts, not_finite, waited_s
-        What became of readings and configurations; readings that are no numbers, and how long the
-        arm stood, s, per sensor.
+        Outcomes of readings and configurations; readings with non-finite numbers, and time the arm
+        stood still, s, per sensor.
     trouble
         What is wrong with the last message; ''.
     run
-        The token of the planner's run; in memory alone, so that it lives no longer than this.
+        Token of the planner's run; in memory only, so that it ends with this process.
     from_bag
-        Whether the messages are those of a bag.
+        Whether the messages are from a bag.
     correction
-        SHA-256 of the compensation.json that the bridge has on; '' for none, None before it tells.
+        SHA-256 of the compensation.json that the bridge applies; '' for none, None if unknown.
     """
 
     def __init__(self, cell: Workcell, p: Parameters, keeper: Keeper, outlet: Outlet) -> None:
@@ -234,7 +231,7 @@ class SessionRecorder:
         self.trouble = self.run = ''
         self.from_bag = False
         self.correction: str | None = None
-        # The one at the beginning of the reading under way.
+        # The correction at the beginning of the reading under way.
         self._read_with = ''
         # Their poses may be announced on their way here.
         self._failed: list[events.SolutionFailed] = []
@@ -243,11 +240,11 @@ class SessionRecorder:
 
     @property
     def journal(self) -> SessionJournal:
-        """What is on the disk."""
+        """The session on the disk."""
         return self.keeper.journal
 
     def _begin(self) -> None:
-        """Begin with what the session holds, as a recorder that was just started."""
+        """Restore the state from the session, as a recorder does when it starts."""
         cell, p = self.cell, self._p
         markers = {name: np.array(position) for name, position in cell.markers.items()}
         self.recording = Recording(
@@ -270,17 +267,15 @@ class SessionRecorder:
             },
         )
         self.changes = SetupChanges(self.chain, markers, p.reference_stop_m)
-        self._take_back()
+        self._restore_measurements()
 
-    def _take_back(self) -> None:
-        """Take up what the session holds of registration and references."""
+    def _restore_measurements(self) -> None:
+        """Restore registrations and reference measurements from the session."""
         self._register(self.journal.registration)
         self.changes.take_back(self.journal.watched, self.registration.T_R_N)
 
-    # What comes in
-
     def _positions(self, message: Any) -> FloatArray | None:
-        """Return the positions of the cell's joints, rad, (k,); None, with a reason, without."""
+        """Return the positions of the cell's joints, rad, (k,); None if invalid (`trouble`)."""
         try:
             return self._order.positions(message)
         except InputError as error:
@@ -288,7 +283,7 @@ class SessionRecorder:
             return None
 
     def take_joints(self, message: Any) -> None:
-        """Take a sensor_msgs/JointState of the robot; one of a gripper's joints is left out."""
+        """Take a sensor_msgs/JointState of the robot; those of a gripper are ignored."""
         if self._order.concerns(message) and (q := self._positions(message)) is not None:
             self.trouble = ''
             self.recording.take_joints(seconds(message.header.stamp), q)
@@ -304,7 +299,7 @@ class SessionRecorder:
         self.recording.take_solutions(stamp_key(message.header.stamp), solutions)
 
     def take_settled(self, message: Any) -> None:
-        """Take a sensor_msgs/JointState of an arm that has settled."""
+        """Take a sensor_msgs/JointState of a settled arm."""
         if (q := self._positions(message)) is None:
             return
         try:
@@ -313,7 +308,7 @@ class SessionRecorder:
             self.trouble = str(error)
             return
         if self.from_bag and self.recording.is_by_hand:
-            # Its end is in no message; the arm has gone on.
+            # The end of that reading is in no message; the arm has gone on.
             self._end_as_recorded('rejected', '')
         change = None if wanted is None else q - wanted
         if self.recording.take_settled(seconds(message.header.stamp), q, change):
@@ -325,7 +320,7 @@ class SessionRecorder:
             self.trouble = 'settled at no joint solution of an announced pose'
 
     def take_marker(self, sensor: str, marker: str, message: Any) -> bool:
-        """Take a geometry_msgs/PointStamped or PoseStamped; return whether it is a reading."""
+        """Take a geometry_msgs/PointStamped or PoseStamped; return whether it is valid."""
         body = getattr(message, 'pose', None)
         point = message.point if body is None else body.position
         position = np.array([point.x, point.y, point.z])
@@ -348,7 +343,7 @@ class SessionRecorder:
             self.recording.take_temperature(seconds(message.header.stamp), message.temperature)
 
     def take_record(self, record: events.EventRecord) -> None:
-        """Take a record of another node, or of the recorder of a bag."""
+        """Take an event record of another node, or of the recorder of a bag."""
         match record.body:
             case events.PoseAnnounced() as pose:
                 self._on_pose(pose)
@@ -363,7 +358,7 @@ class SessionRecorder:
             case events.RecorderBegan() as began:
                 self._on_began(began)
             case events.ConfigurationEnded() as end if self.from_bag:
-                # What is decided by now is decided by the messages; the rest as it was then.
+                # Sensors undecided by the messages are decided as the recorder did.
                 while self.recording.is_open(end.stamp, end.solution) and (
                     self.recording.pairing is not None
                 ):
@@ -374,7 +369,7 @@ class SessionRecorder:
                 self.recording.begin_by_hand(read.stamp_s, np.array(read.q))
 
     def _on_began(self, began: events.RecorderBegan) -> None:
-        """Begin anew where the recorder of a bag did, with what its session held then."""
+        """Restart as the recorder of a bag did, with the state of its session at that time."""
         first, self.from_bag = not self.from_bag, True
         if began.continued:
             return
@@ -384,17 +379,20 @@ class SessionRecorder:
         self._begin()
 
     def _end_as_recorded(self, result: str, reason: str) -> None:
+        """Decide the reading under way as the bag's recorder did."""
         self.recording.end_as_recorded(result, reason)
         self.end_reading()
 
     def _on_pose(self, pose: events.PoseAnnounced) -> None:
+        """Prepare for an announced pose."""
         self.recording.announced = pose
         self._failed = [failed for failed in self._failed if failed.stamp == pose.stamp]
         if pose.split not in (REFERENCE, REGISTRATION):
             self._report_change(self.changes.leave(self.registration.T_R_N))
-        self._note_unvisited()
+        self._record_unreached()
 
     def _on_planner(self, planner: events.PlannerState) -> None:
+        """Update the run, and reopen the session if the planner resumes."""
         self.run = planner.run_held(self.run)
         accepted = self.changes.follow(planner.state, self.run)
         if accepted and not self.keeper.full and not self.journal.closed:
@@ -411,19 +409,19 @@ class SessionRecorder:
             self.keeper.write(self._go_further)
 
     def _go_further(self) -> None:
-        """Open the complete session again, for what separates causes."""
+        """Reopen the complete session for measurements that separate causes."""
         try:
             self.keeper.reopen(go_further=True)
         except InputError as error:
             self.trouble = str(error)
         if not self.registration.T_R_N:
             # This recorder was started when the session was complete already.
-            self._take_back()
+            self._restore_measurements()
         self._outlet.state()
 
     @property
-    def another_correction(self) -> str:
-        """Why the rows of this session cannot go on with the bridge's correction; ''."""
+    def other_correction(self) -> str:
+        """Why the bridge's correction does not fit the rows of this session; ''."""
         noted, now = self.journal.correction, self.correction
         if not now or self.journal.closed or (noted is not None and noted.sha256 == now):
             return ''
@@ -436,21 +434,19 @@ class SessionRecorder:
             'as before'
         )
 
-    # A configuration
-
     def look(self) -> None:
-        """Take up what messages alone did not: what is known late, and what is due."""
+        """Do what no message triggers: late information, and overdue decisions."""
         self.end_reading()
         self.recording.look_again()
         self.take_next()
-        self._note_unvisited()
+        self._record_unreached()
 
-    def _note_unvisited(self) -> None:
-        """Write down the plan of the announced pose, and what the arm does not get to of it."""
+    def _record_unreached(self) -> None:
+        """Record the plan of the announced pose, and its unreachable solutions."""
         pose = self.recording.announced
         if pose is None or self.journal.closed or self.keeper.full:
             return
-        # Before the arm gets there: it is held where there is no room.
+        # Before the arm arrives: it waits if the disk is full.
         self.keeper.write(partial(self.journal.follow, pose.plan))
         ends = [(number, events.NO_FREE_PATH, '') for number in pose.unreached]
         ends += [
@@ -471,17 +467,15 @@ class SessionRecorder:
                 self._outlet.state()
 
     def take_next(self) -> None:
-        """Begin the reading that is due, unless one is under way or written down."""
+        """Begin the next reading, unless one is under way or being written."""
         while not self.keeper.full and (settled := self.recording.next()) is not None:
             pose = settled.pose
             if self.journal.closed or not self.journal.follow(pose.plan):
                 self.trouble = 'settled, but the session is closed, or was begun with another plan'
                 continue
             untold = settled.change is not None and not self.correction
-            if self.another_correction or untold:
-                self.trouble = (
-                    self.another_correction or 'the bridge does not tell what it corrects'
-                )
+            if self.other_correction or untold:
+                self.trouble = self.other_correction or 'the bridge does not tell what it corrects'
                 continue
             known = self.journal.result(pose.pose, settled.id)
             if known is None:
@@ -492,7 +486,7 @@ class SessionRecorder:
             self._report(settled.recorded_before(known, registered=self.is_registered))
 
     def read_by_hand(self) -> None:
-        """Begin to read where the arm stands now, for a registration by hand."""
+        """Begin a reading at the arm's present position, for a registration by hand."""
         q, now_s = self.recording.q, self.recording.now_s
         assert q is not None
         self._outlet.event(events.ReadByHand(stamp_s=now_s, q=tuple(q.tolist())))
@@ -501,11 +495,11 @@ class SessionRecorder:
 
     @property
     def is_registered(self) -> bool:
-        """Whether every sensor that the arm waits for is registered."""
+        """Whether every required sensor is registered."""
         return self.required.are_among(self.registration.T_R_N)
 
     def end_reading(self) -> None:
-        """Write down the configuration under way, once it is decided."""
+        """Write the outcome of the reading under way, once it is decided."""
         ended = self.recording.end(self.registration.T_R_N)
         if ended is None:
             return
@@ -517,17 +511,17 @@ class SessionRecorder:
             if item.dropped:
                 self.counts[f'{item.sensor}_frames_dropped'] += item.dropped
         self.counts.update(f'{name}_accepted' for name in {item.sensor for item in ended.accepted})
-        self.keeper.write(partial(self._write_down, ended))
+        self.keeper.write(partial(self._write_outcome, ended))
 
-    def _write_down(self, ended: EndedReading) -> None:
-        """Write what became of a configuration; publish it after that, and not before."""
+    def _write_outcome(self, ended: EndedReading) -> None:
+        """Write the outcome of a configuration; publish it afterwards."""
         settled, pose = ended.settled, ended.settled.pose
         if ended.result == 'rejected' and pose not in (self.recording.pose, BY_HAND):
-            # It was taken back, or announced again: it will be visited again.
+            # The pose was retracted, or announced again, and will be visited again.
             self._report(ended.event(registered=self.is_registered))
             return
         if self._read_with and ended.accepted and pose.split != REGISTRATION:
-            # Before the first row, also of one with it off: it decides which columns there are.
+            # Before the first row, even if it is off there: it decides the columns of the file.
             self.journal.take_correction(Correction(BRIDGE, self._read_with))
         number = self.journal.write(
             pose=pose.pose,
@@ -553,7 +547,7 @@ class SessionRecorder:
         self.take_next()
 
     def _register(self, readings: Sequence[PairedReading]) -> None:
-        """Take readings at registration poses; tell what they register."""
+        """Add readings of registration poses; publish completed registrations."""
         for name in self.registration.add(readings):
             self._outlet.registered(name, self.registration.T_R_N[name])
             self._outlet.log(logging.INFO, f'{name} is registered; {self.registration.describe()}')
@@ -561,15 +555,14 @@ class SessionRecorder:
             self._outlet.log(logging.WARNING, self.registration.troubles[name])
 
     def _report(self, end: events.ConfigurationEnded) -> None:
+        """Publish the outcome of a configuration."""
         self.counts[f'configurations_{end.result}'] += 1
         self._outlet.event(end)
-        # With what it has decided the planner goes on.
+        # The planner continues by the outcomes in the state.
         self._outlet.state()
 
-    # The references
-
     def _report_change(self, new: bool) -> None:
-        """Report what has changed at the references; the planner pauses where it is large."""
+        """Report a change at the references; the planner pauses if it is large."""
         event = self.changes.report(self.run) if new else None
         if event is not None:
             self._outlet.log(logging.ERROR, event.text)
@@ -577,12 +570,13 @@ class SessionRecorder:
             self._outlet.state()
 
     def _accept_change(self) -> None:
+        """Record that a person has accepted a change at the references."""
         self.journal.note_accepted()
         self.changes.accept()
         self._outlet.state()
 
     def close(self, exit_status: ExitStatus) -> None:
-        """Close the session; closing again does nothing."""
+        """Close the session; a second call does nothing."""
         if self.journal.closed:
             return
         self._report_change(self.changes.judge(self.registration.T_R_N))

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Write a session observation by observation, and go on with one after whatever has happened.
+"""Writer of a session, observation by observation, which can be resumed after any interruption.
 
 Each record goes into the journal first (a line with a checksum, synced), then its rows go into
-observations.csv (synced), and only then does the call return. All rows of a
-configuration are one record: after a crash they are all there or none is. What the journal holds
-and observations.csv does not is added when the session is opened again.
+observations.csv (synced), and only then does the call return. All rows of a configuration are one
+record: after a crash all of them are there, or none. Rows of the journal that are missing in
+observations.csv are added when the session is opened again.
 """
 
 from __future__ import annotations
@@ -12,17 +12,16 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from remaster_ros.errors import DiskError, InputError, MovedError
+from remaster_ros.errors import InputError, MovedError
 from remaster_ros.session.files import (
     URDF_LIMIT,
     AppendFile,
     make_folder,
     make_new_folder,
     read_limited,
-    reason,
     remove_leftovers,
     sync_folder,
     write_atomically,
@@ -30,7 +29,8 @@ from remaster_ros.session.files import (
 )
 from remaster_ros.session.journal import Journal, Record
 from remaster_ros.session.manifest import check_file, read_manifest, remove_manifest, write_sums
-from remaster_ros.session.observations import RowFormat, RowKeys, SequenceRules
+from remaster_ros.session.observation_rules import RowKeys, SequenceRules
+from remaster_ros.session.observations import RowFormat
 from remaster_ros.session.reader import (
     HEADER,
     JOURNAL,
@@ -41,6 +41,7 @@ from remaster_ros.session.reader import (
     read_chain,
     read_header,
 )
+from remaster_ros.session.session_guard import SessionGuard, rename_changed
 from remaster_ros.session.session_yaml import (
     ExitStatus,
     parse_header,
@@ -50,137 +51,29 @@ from remaster_ros.session.session_yaml import (
 )
 from remaster_ros.types import Correction, Observation, Session
 
-# Notice that the files of a session are no longer those that its writer opened.
-#
-# An editor that saves a file puts a new one in its place, and what is appended to the old one has
-# no name any more; a file can be changed in place, and a folder removed. What the writer
-# acknowledged it still has in memory, so it can write it again.
-
-
-Signature = tuple[int, int, int, int]
-"""Device, inode, bytes, time of change in ns."""
-
-
-def signature(path: Path) -> Signature | None:
-    """Return what identifies a file and its state; None where there is none."""
-    with writing(path):
-        try:
-            found = path.stat()
-        except FileNotFoundError:
-            return None
-    return found.st_dev, found.st_ino, found.st_size, found.st_mtime_ns
-
-
-class SessionGuard:
-    """Compare the files of a folder with what they were and with what they must hold.
-
-    `content` returns the bytes that the writer put into the file of a name.
-    """
-
-    def __init__(
-        self, folder: Path, names: Sequence[str], content: Callable[[str], bytes]
-    ) -> None:
-        self._folder, self._names, self._content = folder, names, content
-        self._descriptor = -1
-        self.take_place()
-        self._seen: dict[str, Signature | None] = {}
-
-    def note(self, name: str) -> None:
-        """Take a file as it is now; for the writer, after it has changed it."""
-        self._seen[name] = signature(self._folder / name)
-
-    def note_all(self) -> None:
-        """Take all files as they are now."""
-        for name in self._names:
-            self.note(name)
-
-    def is_in_place(self) -> bool:
-        """Return whether the folder of this name is still the one that was opened."""
-        found, mine = signature(self._folder), os.fstat(self._descriptor)
-        return found is not None and found[:2] == (mine.st_dev, mine.st_ino)
-
-    def take_place(self) -> None:
-        """Take the folder that has this name now for the session's.
-
-        It is kept open: the number of a folder that was removed is given to the next one.
-        """
-        self.close()
-        with writing(self._folder):
-            self._descriptor = os.open(self._folder, os.O_RDONLY | os.O_DIRECTORY)
-
-    def close(self) -> None:
-        """Let the folder go; closing again does nothing."""
-        descriptor, self._descriptor = self._descriptor, -1
-        if descriptor >= 0:
-            os.close(descriptor)
-
-    def differing(self, *, content: bool) -> dict[str, str]:
-        """Return the files that are not as the writer left them, and what is wrong with each.
-
-        With `content` every file is read, else only those of another size or time of change.
-        """
-        wrong = {}
-        for name in self._names:
-            path, seen = self._folder / name, self._seen.get(name)
-            now = signature(path)
-            if now is None:
-                wrong[name] = 'was removed'
-            elif seen is None or now[:2] != seen[:2] or not path.is_file():
-                wrong[name] = 'was replaced by another file, as editors do when they save'
-            elif content or now != seen:
-                if _read(path) == self._content(name):
-                    self._seen[name] = now
-                else:
-                    wrong[name] = 'was changed'
-        return wrong
-
-
-def set_aside(path: Path) -> str:
-    """Rename a file that is not the writer's; return its new name, '' where there is none."""
-    number, aside = 1, path.with_name(f'{path.name}.changed')
-    while os.path.lexists(aside):
-        number += 1
-        aside = path.with_name(f'{path.name}.changed{number}')
-    with writing(path):
-        try:
-            os.rename(path, aside)
-        except FileNotFoundError:
-            return ''
-    return aside.name
-
-
-def _read(path: Path) -> bytes:
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        raise DiskError(f'{path}: cannot be read ({reason(error)}); check the disk') from None
-
-
-# Begin a session folder, or take up one that its writer left unfinished, whatever stopped it.
-
 _COMPARED = ('robot', 'markers', 'sensors', 'settle_s', 'marker_std_m', 'base_prior')
 
 
 class ChangedError(InputError):
-    """observations.csv is not what the journal has, and no crash made it so."""
+    """observations.csv differs from the journal, and not by a crash."""
 
 
 def _begin(folder: Path, files: Mapping[str, bytes]) -> None:
     """Write the files of a session without rows into a new folder, or one with only a plan."""
-    # The planner may have been there first.
+    # The planner may have created the folder.
     if not (folder.is_dir() and os.listdir(folder) == [PLAN]):
         make_new_folder(folder)
     with writing(folder):
         sync_folder(folder.parent)
-    # session.yaml last: with it the folder is a session.
+    # session.yaml last: it makes the folder a session.
     for name in (URDF, ROWS, HEADER):
         write_atomically(folder / name, files[name])
 
 
 def _remove_beginnings(folder: Path, empty_rows: bytes) -> None:
-    """Remove what a writer has left that was killed before the folder was a session.
+    """Remove the files of a writer that was killed before the folder was a session.
 
-    A folder that holds a session, or anything else, is left as it is.
+    A folder with a session, or with other files, is unchanged.
     """
     names = {path.name for path in folder.iterdir() if path.suffix != '.tmp'} - {PLAN}
     if HEADER in names or names - {URDF, ROWS}:
@@ -194,11 +87,11 @@ def _remove_beginnings(folder: Path, empty_rows: bytes) -> None:
 
 
 def _refuse_another(folder: Path, files: Mapping[str, bytes], even_complete: bool) -> None:
-    """Refuse to go on with a session that is not the one to be recorded.
+    """Raise InputError if the folder has another session than the one to be recorded.
 
-    `files` are those of the session to be recorded, without rows. An `InputError` for another
-    robot, markers or sensors, a complete session, one without a journal, or files that changed
-    since the session was closed.
+    ``files``: those of the session to be recorded, without rows. Refused are another robot, other
+    markers or sensors, a complete session, one without a journal, and one whose files changed
+    after it was closed.
     """
     old, new = read_header(folder), parse_header(files[HEADER], folder / HEADER)
     if old.exit_status == 'complete' and not even_complete:
@@ -222,9 +115,9 @@ def _refuse_another(folder: Path, files: Mapping[str, bytes], even_complete: boo
 
 
 def _reopen(folder: Path, *, keep_status: bool) -> str:
-    """Take back that a session was closed; return the text of its session.yaml.
+    """Remove the marks of a closed session; return the text of its session.yaml.
 
-    Its exit status becomes ``aborted``, unless it is to be kept.
+    Its exit status becomes ``aborted``, unless `keep_status`.
     """
     path = folder / HEADER
     remove_leftovers(folder)
@@ -237,10 +130,10 @@ def _reopen(folder: Path, *, keep_status: bool) -> str:
 
 
 def _intact_size(path: Path, data: bytes, wanted: bytes, last_rows: Sequence[str]) -> int:
-    """Return how many bytes of observations.csv are whole lines as the journal has them.
+    """Return the number of bytes of observations.csv that are whole lines equal to the journal's.
 
-    `data` is what the file holds, `wanted` what it must hold by the journal, whose last record
-    with rows has `last_rows`: only these can be torn. A `ChangedError` where it differs before.
+    ``data``: content of the file; ``wanted``: content by the journal, whose last record with rows
+    has `last_rows`: only these can be torn. Raises ChangedError if an earlier byte differs.
     """
     if wanted.startswith(data):
         return len(data)
@@ -248,7 +141,7 @@ def _intact_size(path: Path, data: bytes, wanted: bytes, last_rows: Sequence[str
     good = next(differing, len(wanted))
     start = wanted.rfind(b'\n', 0, good) + 1
     torn_from = len(wanted) - sum(len(row.encode()) + 1 for row in last_rows)
-    # What a crash tore never reaches beyond what was being written.
+    # A crash damages only the rows that were being written.
     if start < torn_from or len(data) > len(wanted):
         line = data.count(b'\n', 0, start) + 1
         raise ChangedError(
@@ -260,6 +153,7 @@ def _intact_size(path: Path, data: bytes, wanted: bytes, last_rows: Sequence[str
 
 
 def _read_rows(folder: Path) -> bytes:
+    """Return the content of observations.csv; b'' if it is missing."""
     return read_limited(folder / ROWS, OBSERVATIONS_LIMIT, f'a session folder holds {ROWS}')
 
 
@@ -267,19 +161,19 @@ FILES = (HEADER, URDF, ROWS, JOURNAL)
 
 
 class SessionWriter:
-    """Write a session; what `append` or `record` returned from is on the disk.
+    """Writer of a session; data are on the disk once `append` or `record` returns.
 
-    The folder can be read at any moment: it has ``exit_status: aborted`` until `close`, and a
-    line cut off by a crash is the only thing a reader may find incomplete. A writer is also a
-    context manager: it closes as ``complete``, or as ``aborted`` where an exception passes.
+    The folder can be read at any moment: its ``exit_status`` is ``aborted`` until `close`, and
+    only the last line may be incomplete after a crash. A writer is also a context manager: it
+    closes as ``complete``, or as ``aborted`` after an exception.
 
     The folder is new or empty; with `resume` also that of an unfinished session of the same robot,
-    markers and sensors, which goes on. With `even_complete` a complete session is opened too, and
-    remains complete until it is closed (recovery); with `go_further` it is unfinished until it is
-    closed again. Of the header, measurements and exit status are not used.
+    markers and sensors, which is continued. With `even_complete` a complete session is opened too,
+    and remains complete (recovery); with `go_further` it is unfinished until it is closed again.
+    Measurements and exit status of the header are not used.
 
-    An `InputError` where the folder holds something else, a complete session, or one of another
-    robot; another process writes it; it cannot be written to; or the header breaks the format.
+    Raises InputError if the folder holds other files, a complete session, or one of another robot;
+    if another process writes it; if it cannot be written to; or if the header breaks the format.
     """
 
     def __init__(
@@ -297,15 +191,15 @@ class SessionWriter:
             header.urdf, self.folder / URDF, header.base_link, header.tip_link
         )
         self._names = header.sensor_names, header.marker_names
-        # Columns for what may come: of frames with several markers, of bodies' orientations.
+        # Columns that rows may need: frames with several markers, orientations of bodies.
         self._optional: tuple[str, ...] = ()
         self._add_columns(
             *['frame'] * bool(header.further_markers), *['orientation'] * bool(header.oriented)
         )
         plain_rows = self._empty_rows
-        # That `correct` was told of.
+        # The correction set by `correct`.
         self.correction: Correction | None = None
-        # Files that are to be written again for it.
+        # Files to be written again because of it.
         self._due: list[str] = []
         self._text = write_header(header, URDF, 'aborted')
         self._urdf = header.urdf.encode()
@@ -321,9 +215,9 @@ class SessionWriter:
             _begin(self.folder, files)
         self._closed = False
         self._closed_as: ExitStatus = 'aborted'
-        # What `check` found changed by others and restored, a line each.
+        # Repairs by `check`, one line each.
         self.restored: list[str] = []
-        # What others destroyed and the journal has not; such a session is not closed as complete.
+        # Loss that the journal cannot repair; such a session is not closed as complete.
         self.beyond_repair = ''
         with contextlib.ExitStack() as undo:
             self._journal = Journal(self.folder / JOURNAL)
@@ -332,20 +226,21 @@ class SessionWriter:
             undo.callback(self._guard.close)
             if self.resumed:
                 self._text = _reopen(self.folder, keep_status=even_complete)
-                self._take_up_correction(plain_rows)
+                self._complete_correction(plain_rows)
             self._rows = AppendFile(self._rows_path)
             undo.callback(lambda: self._rows.close())
-            self._take_up_rows(even_complete)
+            self._complete_rows(even_complete)
             self._guard.note_all()
             undo.pop_all()
 
     def _add_columns(self, *fields: str) -> None:
+        """Add optional columns to observations.csv, before its first row."""
         self._optional = (*self._optional, *fields)
         self._format = RowFormat(self._rows_path, self._chain, *self._names, self._optional)
         self._empty_rows = self._format.header.encode()
 
-    def _take_up_correction(self, plain_rows: bytes) -> None:
-        """Write columns and key of a correction that was noted, if a crash came in between."""
+    def _complete_correction(self, plain_rows: bytes) -> None:
+        """Complete columns and key of a recorded correction after a crash."""
         noted = [record for record in self.records if record['kind'] == 'correction']
         if not noted:
             return
@@ -356,14 +251,15 @@ class SessionWriter:
             write_atomically(self.folder / HEADER, self._text)
 
     def _use_correction(self, correction: Correction) -> None:
+        """Add columns and key of a correction."""
         self.correction = correction
         self._add_columns('wanted', 'correction')
         self._text = with_correction(self._text, correction)
 
     def correct(self, correction: Correction) -> None:
-        """Note the correction that is on, before the first row: what was wanted gets columns.
+        """Record the correction that is on, before the first row: desired angles get columns.
 
-        After a `DiskError` try again when there is room.
+        After a DiskError call again when there is room.
         """
         if self.correction is None:
             if self._closed or self.observations:
@@ -377,6 +273,7 @@ class SessionWriter:
         self._write_due()
 
     def _write_due(self) -> None:
+        """Write the files whose columns or keys have changed."""
         while self._due:
             name = self._due[0]
             write_atomically(self.folder / name, self._content(name))
@@ -388,11 +285,11 @@ class SessionWriter:
 
     @property
     def records(self) -> list[Record]:
-        """Every record of the journal, also those of the runs before."""
+        """All records of the journal, those of earlier runs included."""
         return self._journal.records
 
     def _content(self, name: str) -> bytes:
-        """Return what a file of the session must hold: all that was acknowledged."""
+        """Return the acknowledged content of a file of the session."""
         if name == ROWS:
             rows = (row for record in self.records for row in record.get('rows', ()))
             return self._empty_rows + ''.join(f'{row}\n' for row in rows).encode()
@@ -400,9 +297,9 @@ class SessionWriter:
             return bytes(self._journal.content)
         return self._text.encode() if name == HEADER else self._urdf
 
-    def _take_up_rows(self, even_changed: bool) -> None:
-        """Bring observations.csv up to the journal, and find the numbers to go on with."""
-        # What a crash has left incomplete, and was dropped; '' where nothing was.
+    def _complete_rows(self, even_changed: bool) -> None:
+        """Complete observations.csv from the journal, and find the next free numbers."""
+        # Incomplete line that was dropped after a crash; '' for none.
         self.lost = self._journal.lost
         wanted = self._content(ROWS)
         pieces = [record['rows'] for record in self.records if 'rows' in record]
@@ -429,15 +326,15 @@ class SessionWriter:
         self._accept(self._format.check(rows, self._line, self._rules.branch()))
 
     def append(self, observation: Observation) -> None:
-        """Write one observation; durable on return, or not there at all (see `record`)."""
+        """Write one observation durably, or not at all (see `record`)."""
         self.record({'kind': 'observation'}, [observation])
 
     def record(self, record: Record, observations: Sequence[Observation] = ()) -> None:
-        """Write one record and its observations; durable on return, or not there at all.
+        """Write one record and its observations durably, or not at all.
 
-        The record is plain data with a ``kind``; the observations are in the order measured. An
-        `InputError` where one breaks the format (and nothing is written), or the writer is closed;
-        a `DiskError` where the disk does not take it: try again when there is room.
+        ``record``: plain data with a ``kind``; ``observations``: in the order measured. Raises
+        InputError if one breaks the format (and writes nothing), or the writer is closed;
+        DiskError if the disk is full: call again when there is room.
         """
         if self._closed:
             raise InputError(f'{self.folder}: the session is closed; start a new one')
@@ -458,55 +355,58 @@ class SessionWriter:
                 self._journal.take_back()
                 self._guard.note(JOURNAL)
             except InputError:
-                # It is ahead now: only opening the session again brings the two together.
+                # The journal is ahead now: only opening the session again repairs that.
                 self.release()
             raise
         self._guard.note(ROWS)
         self._accept(keys)
 
     def check(self, *, content: bool = False) -> None:
-        """Notice what others did to the files, and restore them; `restored` lists what.
+        """Detect changes by others to the files, and repair them; `restored` lists the repairs.
 
-        A file that was replaced, removed or changed is written again from what is in memory: all
-        that was acknowledged. What is found in its place is renamed to ``NAME.changed``. A folder
-        that was removed is made again, though the bag and the plan in it are lost. With `content`
-        every byte is compared; else files of the same size and time of change pass.
+        A file that was replaced, removed or changed is written again from memory with all
+        acknowledged records. The foreign file is renamed to ``NAME.changed``. A removed folder is
+        made again, though the bag and the plan in it are lost. With `content` every byte is
+        compared; else size and time of change.
 
-        After a `MovedError` (the folder was renamed or replaced) or a `DiskError` nothing may be
-        recorded until it is as before: try again.
+        After a MovedError (the folder was renamed or replaced) or a DiskError nothing may be
+        recorded until the cause is removed: call again.
         """
         if self._closed:
             return
         if not self._guard.is_in_place():
             self._make_folder_again()
-        for name, what in self._guard.differing(content=content).items():
-            aside = self._restore(name)
+        for name, change in self._guard.differing(content=content).items():
+            renamed = self._restore(name)
             self._guard.note(name)
-            self._note_restored(name, what, aside)
-            self._journal.append({'kind': 'restored', 'file': name, 'what': what, 'aside': aside})
+            self._note_restored(name, change, renamed)
+            self._journal.append(
+                {'kind': 'restored', 'file': name, 'what': change, 'aside': renamed}
+            )
             self._guard.note(JOURNAL)
 
     def _restore(self, name: str) -> str:
-        """Write a file again; return the new name of what was found there."""
-        aside = set_aside(self.folder / name)
+        """Write a file again; return the new name of the foreign file in its place."""
+        renamed = rename_changed(self.folder / name)
         if name == JOURNAL:
             self._journal.restore()
-            return aside
+            return renamed
         write_atomically(self.folder / name, self._content(name))
         if name == ROWS:
             self._rows.close()
             self._rows = AppendFile(self._rows_path)
-        return aside
+        return renamed
 
-    def _note_restored(self, name: str, what: str, aside: str) -> None:
-        kept = f'; what was found there is {aside}' if aside else ''
+    def _note_restored(self, name: str, change: str, renamed: str) -> None:
+        """Add a repair to `restored`."""
+        kept = f'; what was found there is {renamed}' if renamed else ''
         self.restored.append(
-            f'{self.folder / name}: {what} while the session was written; it was restored with '
+            f'{self.folder / name}: {change} while the session was written; it was restored with '
             f'all that was acknowledged{kept}'
         )
 
     def _make_folder_again(self) -> None:
-        """Make the folder again if it was removed; `MovedError` if it is elsewhere now."""
+        """Make the folder again if it was removed; raise MovedError if it was moved."""
         if self._journal.names:
             raise MovedError(
                 f'{self.folder}: the session folder was renamed, replaced or unmounted while the '
@@ -517,7 +417,7 @@ class SessionWriter:
         self.beyond_repair = 'the folder was removed, and with it the bag and the plan'
 
     def _accept(self, keys: Sequence[RowKeys]) -> None:
-        """Take rows that are on the disk for the last ones."""
+        """Update numbers and rules by rows that are on the disk."""
         for key in keys:
             self._rules.accept(key)
             self._line = key.line + 1
@@ -526,13 +426,12 @@ class SessionWriter:
             self.last_stamp_s = key.stamp_s
 
     def close(self, exit_status: ExitStatus = 'complete') -> ExitStatus:
-        """Write to session.yaml how the session ended, and the checksums of all files.
+        """Write exit status and checksums of all files; return the exit status.
 
-        Before that every byte of them is compared with what was acknowledged (`check`), and the
-        checksums are of that. Closing again does nothing. Returns what it was closed as:
-        ``aborted`` instead of ``complete`` where something is `beyond_repair`.
+        Every byte is compared with the acknowledged content first (`check`). A second call does
+        nothing. ``aborted`` is returned instead of ``complete`` if something is `beyond_repair`.
 
-        After a `DiskError` try again when there is room. Until then the session remains readable,
+        After a DiskError call again when there is room. Until then the session remains readable,
         as aborted or without checksums.
         """
         if self._closed:
@@ -547,12 +446,12 @@ class SessionWriter:
         sums = {name: hashlib.sha256(self._content(name)).hexdigest() for name in FILES}
         write_sums(self.folder, sums)
         self._closed_as = exit_status
-        # After the checksums: until they are there no other process may write.
+        # After the checksums: until then no other process may write.
         self.release()
         return exit_status
 
     def release(self) -> None:
-        """Let others go on with the session as it is on the disk, closed or not."""
+        """Unlock the session, closed or not, for other processes."""
         self._closed = True
         self._rows.close()
         self._journal.close()

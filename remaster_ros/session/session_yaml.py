@@ -1,14 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""session.yaml: what was measured, with what, on which robot (format ``remaster-session/1``).
-
-And the file of priors, which has the same base frames.
-"""
+"""session.yaml: robot, markers, sensors and conditions of a session (``remaster-session/1``)."""
 
 from __future__ import annotations
 
 import logging
 import math
-import os
 from collections.abc import Mapping, Sequence
 from datetime import datetime
 from pathlib import Path, PurePosixPath
@@ -19,18 +15,9 @@ import numpy as np
 
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.pad_angles import coupled_in_circle
-from remaster_ros.session.files import decode_text, read_limited
-from remaster_ros.session.yaml_records import (
-    YAML_LIMIT,
-    Bounds,
-    Triple,
-    YamlError,
-    dump_yaml,
-    load_yaml,
-    out_of_bounds,
-    read_yaml,
-    to_plain,
-)
+from remaster_ros.session.files import decode_text
+from remaster_ros.session.strict_yaml import YamlError, dump_yaml, load_yaml
+from remaster_ros.session.yaml_records import Bounds, Triple, out_of_bounds, to_plain
 from remaster_ros.types import (
     AccuracyOption,
     BasePrior,
@@ -38,7 +25,6 @@ from remaster_ros.types import (
     Correction,
     Measurements,
     PadJoint,
-    Priors,
     Session,
 )
 
@@ -65,7 +51,7 @@ class _Sensor(msgspec.Struct):
 
 
 class BaseFrame(msgspec.Struct):
-    """A registration known beforehand, as files have it; see `BasePrior`."""
+    """A registration known in advance, as written in files; see `BasePrior`."""
 
     translation_m: Triple
     rotation_xyzw: tuple[float, float, float, float]
@@ -73,20 +59,20 @@ class BaseFrame(msgspec.Struct):
     std_rad: float
 
     def problem(self, key: str) -> str:
-        """Return what is wrong with the quaternion; '' where nothing is."""
+        """Return what is wrong with the quaternion; '' if valid."""
         norm = math.hypot(*self.rotation_xyzw)
         if abs(norm - 1.0) < 1e-3:
             return ''
         return f'{key}.rotation_xyzw has norm {norm:.6g}, not 1; give a unit quaternion x, y, z, w'
 
     def prior(self) -> BasePrior:
-        """Return it for the fit, the quaternion normalised."""
+        """Return the prior for the fit, its quaternion normalised."""
         rotation = np.array(self.rotation_xyzw) / np.linalg.norm(self.rotation_xyzw)
         return BasePrior(np.array(self.translation_m), rotation, self.std_m, self.std_rad)
 
 
 class SessionHeader(msgspec.Struct):
-    """session.yaml as validated; the fields are the keys of the file."""
+    """Validated content of session.yaml; the fields are the keys of the file."""
 
     format: str
     robot: _Robot
@@ -104,18 +90,18 @@ class SessionHeader(msgspec.Struct):
     controller: Controller | None = None
     correction: Correction | None = None
     accuracy_option: AccuracyOption = ''
-    # The keys that this version does not use, nested as they were.
+    # Keys unknown to this version, nested as in the file.
     extra: dict[str, Any] = {}
 
     @property
     def on_tool(self) -> frozenset[str]:
-        """Sensors on the tool."""
+        """Names of the sensors on the tool."""
         return frozenset(name for name, sensor in self.sensors.items() if sensor.mounted_on)
 
     def session(
         self, urdf: str, measurements: Measurements, references: Measurements | None = None
     ) -> Session:
-        """Return the session with this header, the robot and the rows."""
+        """Return the session with this header, robot and rows."""
         return Session(
             urdf=urdf,
             base_link=self.robot.base_link,
@@ -152,7 +138,7 @@ class SessionHeader(msgspec.Struct):
 
 
 def parse_header(data: bytes, path: Path) -> SessionHeader:
-    """Check the content of session.yaml; `path` is for messages."""
+    """Parse and validate session.yaml; `path` is for messages."""
     try:
         content = load_yaml(decode_text(data, path))
     except YamlError as error:
@@ -165,14 +151,14 @@ def parse_header(data: bytes, path: Path) -> SessionHeader:
         )
     header = _checked(content, f'{path}: ')
     known = msgspec.to_builtins(header)
-    # Known to the struct, but no key of the file: a file's own `extra` is an unknown key.
+    # A field of the struct, but no key of the file: `extra` in a file is an unknown key.
     del known['extra']
     header.extra = _unknown_keys(content, known, path)
     return header
 
 
 def write_header(session: Session, urdf_name: str, exit_status: str) -> str:
-    """Return the text of session.yaml; an `InputError` for what the format does not allow."""
+    """Return the text of session.yaml; raise InputError if the session breaks the format."""
     content: dict[str, Any] = {
         'format': FORMAT,
         'robot': {
@@ -226,12 +212,12 @@ def with_exit_status(text: str, exit_status: str) -> str:
 
 
 def with_correction(text: str, correction: Correction) -> str:
-    """Return the text of a session.yaml that states a correction."""
+    """Return the text of a session.yaml with a correction added."""
     return dump_yaml({**load_yaml(text), 'correction': to_plain(correction)})
 
 
 def _checked(content: Mapping[str, Any], where: str) -> SessionHeader:
-    """Return the header that `content` holds; an `InputError` begins with `where`."""
+    """Return the header in `content`; raise InputError, which begins with `where`."""
     known = {key: value for key, value in content.items() if key != 'extra'}
     try:
         header = msgspec.convert(known, SessionHeader)
@@ -243,7 +229,7 @@ def _checked(content: Mapping[str, Any], where: str) -> SessionHeader:
 
 
 def _problem(header: SessionHeader) -> str:
-    """Return what is wrong with names and times, in one line with the remedy; '' if nothing is."""
+    """First error in names and times, with the remedy; '' if valid."""
     urdf = PurePosixPath(header.robot.urdf)
     if urdf.is_absolute() or '..' in urdf.parts or not urdf.name or '\0' in header.robot.urdf:
         return (
@@ -294,7 +280,7 @@ def _problem(header: SessionHeader) -> str:
 
 
 def _controller_problem(controller: Controller) -> str:
-    """Return what is wrong with the pad's joints; '' where nothing is."""
+    """First error in the pad's joints; '' if valid."""
     if not controller.joints:
         return 'controller.joints: none given; name the joints of the URDF, or leave it out'
     names = [joint.name for joint in controller.joints.values()]
@@ -319,7 +305,7 @@ def _controller_problem(controller: Controller) -> str:
 
 
 def require_known_joints(header: SessionHeader, joint_names: Sequence[str], path: Path) -> None:
-    """Refuse pad's joints that the URDF has not; `path` is that of session.yaml."""
+    """Raise InputError if the pad has joints that the URDF lacks; `path`: of session.yaml."""
     for name in header.controller.joints if header.controller is not None else ():
         if name not in joint_names:
             raise InputError(
@@ -331,7 +317,7 @@ def require_known_joints(header: SessionHeader, joint_names: Sequence[str], path
 def _unknown_keys(
     content: Mapping[str, Any], known: Mapping[str, Any], path: Path, prefix: str = ''
 ) -> dict[str, Any]:
-    """Return what of nested dictionaries `known` has not, nested as it was, with a warning."""
+    """Return the keys of nested dictionaries that `known` lacks, with a warning."""
     extra = {}
     for key, value in content.items():
         if key not in known:
@@ -343,7 +329,7 @@ def _unknown_keys(
 
 
 def _merge(content: dict[str, Any], extra: Mapping[str, Any]) -> dict[str, Any]:
-    """Put the unknown keys back where they came from; a known key always wins."""
+    """Return content with unknown keys added at their places; known keys take precedence."""
     merged = dict(content)
     for key, value in extra.items():
         if key not in merged:
@@ -351,91 +337,3 @@ def _merge(content: dict[str, Any], extra: Mapping[str, Any]) -> dict[str, Any]:
         elif isinstance(merged[key], dict) and isinstance(value, Mapping):
             merged[key] = _merge(merged[key], value)
     return merged
-
-
-# What is known before a fit: offsets, markers, base frames, the drawing.
-
-
-class _Strict(msgspec.Struct, forbid_unknown_fields=True):
-    """A key that is misspelt must not be a prior that is silently missing."""
-
-
-class _OffsetPrior(_Strict):
-    """In degrees, or in mm of a joint that slides."""
-
-    mean_deg: Annotated[float | None, Bounds(-180.0, 180.0, 'degrees')] = None
-    std_deg: Annotated[float | None, Bounds(0.0, 180.0, 'degrees', above=True)] = None
-    mean_mm: Annotated[float | None, Bounds(-1000.0, 1000.0, 'mm')] = None
-    std_mm: Annotated[float | None, Bounds(0.0, 1000.0, 'mm', above=True)] = None
-
-    def known(self, where: str) -> tuple[float, float, bool]:
-        """Return mean and std, rad or m, and whether it is m; an `InputError` without a unit."""
-        degrees, lengths = (self.mean_deg, self.std_deg), (self.mean_mm, self.std_mm)
-        in_m = degrees == (None, None)
-        mean, std = lengths if in_m else degrees
-        if mean is None or std is None or not (in_m or lengths == (None, None)):
-            raise InputError(
-                f'{where} has not both of mean_deg and std_deg, or of mean_mm and std_mm where '
-                'the joint slides, and nothing else'
-            )
-        scale = 1e-3 if in_m else float(np.radians(1.0))
-        return scale * mean, scale * std, in_m
-
-
-class _MarkerPrior(_Strict):
-    position_m: Annotated[Triple, Bounds(-10.0, 10.0, 'm')]
-    std_m: Annotated[float, Bounds(0.0, 1.0, 'm', above=True)]
-
-
-class _StrictBase(BaseFrame, forbid_unknown_fields=True):
-    translation_m: Annotated[Triple, Bounds(-1000.0, 1000.0, 'm')]
-    std_m: Annotated[float, Bounds(0.0, 1000.0, 'm', above=True)]
-    std_rad: Annotated[float, Bounds(0.0, np.pi, 'rad', above=True)]
-
-
-class _Priors(_Strict):
-    """A file of priors; all keys are optional.
-
-    ::
-
-        joint_offsets: {joint_2: {mean_deg: 0.1, std_deg: 0.05}, rail: {mean_mm: 1, std_mm: 0.5}}
-        markers: {sir: {position_m: [0.1, 0.0, 0.02], std_m: 1.0e-4}}
-        base: {mocap: {translation_m: [2.0, 0.0, 1.0], rotation_xyzw: [0, 0, 0, 1],
-                       std_m: 1.0e-3, std_rad: 1.0e-3}}
-        geometry_tolerance_mm: 0.1
-    """
-
-    joint_offsets: dict[str, _OffsetPrior] = {}
-    markers: dict[str, _MarkerPrior] = {}
-    base: dict[str, _StrictBase] = {}
-    geometry_tolerance_mm: Annotated[float, Bounds(0.0, 100.0, 'mm', above=True)] = 0.1
-
-
-def read_priors(path: str | os.PathLike[str]) -> Priors:
-    """Read and check a file of priors; the fit checks that the session has these names.
-
-    Raises
-    ------
-    InputError
-        One line naming file, key and remedy.
-    """
-    path = Path(path)
-    data = read_limited(path, YAML_LIMIT, 'give a YAML file of priors')
-    content = read_yaml(data, path, _Priors, PRIORS_HELP)
-    for sensor, base in content.base.items():
-        if problem := base.problem(f'base.{sensor}'):
-            raise InputError(f'{path}: {problem}')
-    known = {
-        joint: prior.known(f'{path}: joint_offsets.{joint}')
-        for joint, prior in content.joint_offsets.items()
-    }
-    return Priors(
-        joint_offsets={joint: (mean, std) for joint, (mean, std, _) in known.items()},
-        in_m=frozenset(joint for joint, (_, _, in_m) in known.items() if in_m),
-        markers={
-            marker: (np.array(prior.position_m), prior.std_m)
-            for marker, prior in content.markers.items()
-        },
-        base={sensor: base.prior() for sensor, base in content.base.items()},
-        geometry_tolerance_m=1e-3 * content.geometry_tolerance_mm,
-    )

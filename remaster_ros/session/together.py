@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Several sessions of one arm as one: the arm is shared, all else is each session's own.
+"""Several sessions of one arm joined: the arm is common, everything else is each session's.
 
-Sensors and markers of a later session are further ones with names of their own: they stand
-elsewhere, err by themselves and have noise of their own. So registrations, markers, errors of the
-sensors and noise are fitted session by session, and the arm once.
+Sensors and markers of a later session get other names: their positions, errors and noise are those
+of that session. So registrations, markers, errors of sensors and noise are fitted for each
+session, and the arm once.
 """
 
 from __future__ import annotations
@@ -22,18 +22,11 @@ from remaster_ros.types import Measurements, Session
 
 
 def together(sessions: Sequence[tuple[str, Session]]) -> tuple[Session, list[str]]:
-    """Return one session of all rows, and for each later session a line on how its rows are named.
+    """Join sessions; return the joint session, and for each later one a line on its new names.
 
-    Parameters
-    ----------
-    sessions
-        Name of each, for messages, and the session. Names of sensors and markers of the second end
-        in ``_2``; to the numbers of its observations a power of ten is added.
-
-    Raises
-    ------
-    InputError
-        Sessions of different robots, or one given twice.
+    ``sessions``: name, for messages, and session. Names of sensors and markers of the second one
+    end in ``_2``; a power of ten is added to the numbers of its observations.
+    Raises InputError if sessions are of different robots, or one is given twice.
     """
     (first_name, first), *others = sessions
     for index, (name, session) in enumerate(others):
@@ -164,10 +157,12 @@ def disagreements(sessions: Sequence[tuple[str, Session]]) -> tuple[list[str], l
 
 
 def _words(apart: OffsetsApart) -> str:
+    """Return a difference of offsets as text."""
     return f'fitted one by one their zero-offsets differ, {apart.words}'
 
 
 def _require_same_arm(first_name: str, first: Session, name: str, session: Session) -> None:
+    """Raise InputError if two sessions have different robots."""
     inside = [
         str(given.correction)
         if given.correction is not None and given.correction.is_inside
@@ -194,7 +189,7 @@ def _require_same_arm(first_name: str, first: Session, name: str, session: Sessi
 
 
 def _renamed(session: Session, joined: Session, number: int) -> dict[str, str]:
-    """Return new names of a session's sensors and markers, none of which is taken."""
+    """Return new, unused names of a session's sensors and markers."""
     taken = {*joined.sensors, *joined.markers}
     names = {}
     for name in dict.fromkeys((*session.sensors, *session.markers)):
@@ -206,7 +201,7 @@ def _renamed(session: Session, joined: Session, number: int) -> dict[str, str]:
 
 
 def _counted_on(part: Measurements, added: Mapping[str, float], frames: int) -> Measurements:
-    """Return rows with something added to their columns, and to the frames that there are."""
+    """Return rows with numbers added to columns, and to the frames present."""
     columns = {name: getattr(part, name) + more for name, more in added.items()}
     if part.frame is not None:
         columns['frame'] = np.where(part.frame < 0, -1, part.frame + frames)
@@ -214,17 +209,21 @@ def _counted_on(part: Measurements, added: Mapping[str, float], frames: int) -> 
 
 
 def _power_of_ten(largest: int) -> int:
+    """Return the smallest power of ten above a number."""
     return int(10 ** len(str(largest)))
 
 
 def _largest(session: Session, column: str) -> int:
+    """Return the largest value of a column."""
     parts = [session.measurements, session.references]
     return max(int(getattr(part, column).max(initial=0)) for part in parts if part is not None)
 
 
 def _next_frame(rows: Measurements) -> int:
+    """Return the first unused frame number."""
     return 0 if rows.frame is None else int(rows.frame.max(initial=-1)) + 1
 
 
 def _last_stamp(session: Session) -> float:
+    """Return the latest stamp, s."""
     return float(session.measurements.stamp_s.max(initial=0.0))

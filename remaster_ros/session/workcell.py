@@ -43,87 +43,87 @@ if TYPE_CHECKING:
 
 POSE = 'geometry_msgs/msg/PoseStamped'
 MESSAGE_TYPES = ('geometry_msgs/msg/PointStamped', POSE, 'mocap4r2_msgs/msg/Markers')
-"""`sensors.topic.driver.READERS` reads them."""
+"""Message types of foreign nodes, which `sensors.topic.driver.READERS` reads."""
 
 
-# From the resolution of an interferometer to a depth camera's noise.
+# Standard deviations: from the resolution of an interferometer to the noise of a depth camera.
 NOISE = Bounds(1e-7, 0.05, 'm')
-# A retroreflector or sphere is seen from further round than this.
+# Viewing angles: the smallest is less than that of any retroreflector or sphere.
 VIEW = Bounds(3.5, 180.0, 'degrees')
-# Twice what a reading may at least be off before it counts as that of another marker.
+# Least distance of two markers: twice the smallest error at which a reading counts as another's.
 LEAST_APART_M = 2.0 * SMALLEST_M
 LAST_MEMBER = 65535
-"""The wire has 16 bits for the number of a marker in its rigid body."""
+"""Largest number of a marker in its rigid body, which has 16 bits in NatNet."""
 
 
 class CellSensor(msgspec.Struct, forbid_unknown_fields=True):
     """A sensor of a cell."""
 
-    # The marker it follows.
+    # Name of the marker that the sensor follows.
     marker: str
-    # Where its readings are published (geometry_msgs/PointStamped, sensor frame); relative to the
-    # nodes' namespace, unless it begins with ``/``. Further markers have topics of their own below
-    # it, ``TOPIC/NAME``; each has a message for every frame in which one of them was seen, NaN
-    # where this one was not.
+    # Topic of its readings (geometry_msgs/PointStamped, sensor frame); relative to the nodes'
+    # namespace, unless it begins with ``/``. Further markers have topics ``TOPIC/NAME``; each has
+    # a message for every frame in which any marker was seen, NaN if this one was not.
     topic: str
-    # Where it stands in the robot base, roughly.
+    # Rough position in base_link.
     rough_position_m: Annotated[Triple, Bounds(-FARTHEST_M, FARTHEST_M, 'm')]
     # True for an instrument that measures on request, by this service (std_srvs/Trigger).
     single_shot: bool = False
     measure_service: str = ''
-    # Between the tool's z axis and the line to the sensor, at most, where the marker is seen.
+    # Largest angle between the tool's z axis and the line to the sensor with a visible marker.
     max_angle_deg: Annotated[float, VIEW] = 60.0
-    # Standard deviations per axis that are expected: of a reading, of the error that all readings
-    # at one pose share, and of the one that the markers of one frame share. Only plans depend on
-    # them; a fit estimates its own.
+    # Expected standard deviations per axis: of a reading, of the error common to all readings at a
+    # pose, and of the error common to the markers of a frame. Only plans depend on them; a fit
+    # estimates the noise.
     noise_m: Annotated[float, NOISE] = SIGMA_M
     pose_noise_m: Annotated[float, Bounds(0.0, 0.05, 'm')] = POSE_SIGMA_M
     frame_noise_m: Annotated[float, Bounds(0.0, 0.05, 'm')] = 0.0
-    # By name: in the same frame, each with its number in the rigid body; or, where it is
-    # `single_shot`, one after another while the arm stands.
+    # Further markers: name -> number in the rigid body. They are measured in the same frame, or,
+    # by a `single_shot` sensor, one after another while the arm stands.
     further_markers: dict[str, int] = {}
-    # One of `MESSAGE_TYPES`, where `topic` is of a node that is not of this package.
+    # One of `MESSAGE_TYPES`, if `topic` is published by a foreign node.
     message_type: str = ''
-    # ``tool`` for a camera on the tool, whose poses are those of a board that stands: `marker` is
-    # its own origin on the tool, `rough_position_m` where the board is.
+    # ``tool`` for a camera on the tool, which measures poses of a fixed board: `marker` is then
+    # the camera's origin on the tool, `rough_position_m` the position of the board.
     mounted_on: Literal['', 'tool'] = ''
-    # No key of the file: the topic of such a node, whose readings are published on `topic` anew.
+    # No key of the file: topic of the foreign node, whose readings are published again on `topic`.
     source: str = ''
 
     def publish_anew(self, name: str) -> None:
-        """Read the topic of a node that is not of this package; publish it as others are."""
+        """Set the topic on which readings of a foreign node are published again."""
         if self.message_type:
             self.source, self.topic = self.topic, f'{name}/marker'
 
     @property
     def markers(self) -> tuple[str, ...]:
-        """Every marker that it measures, the one it follows first."""
+        """Names of all markers that the sensor measures, the one it follows first."""
         return (self.marker, *self.further_markers)
 
     @property
     def topics(self) -> dict[str, str]:
-        """Marker -> where its readings are published."""
-        further = {name: f'{self.topic}/{name}' for name in self.further_markers}
-        return {self.marker: self.topic, **further}
+        """Topic of the readings of each marker."""
+        of_further = {name: f'{self.topic}/{name}' for name in self.further_markers}
+        return {self.marker: self.topic, **of_further}
 
     @property
     def pose_topic(self) -> str:
-        """Where its full poses are published beside the positions; '' where it has none.
+        """Topic of full poses; '' if the sensor has none.
 
-        The recorder takes these: position and orientation then come in one message.
+        The recorder uses it instead of the topic of positions: one message has position and
+        orientation.
         """
         return f'{self.topic}/pose' if self.message_type == POSE else ''
 
     def problem(self, where: str, markers: Mapping[str, Triple]) -> str:
-        """Return what is wrong with it, being at `where` in the file; '' where nothing is."""
+        """First validation error of this sensor, prefixed by its YAML path; '' if valid."""
         if problem := self._marker_problem(where, markers):
             return problem
         if self.source and not self.message_type:
             return f'{where}.source is no key; write it as topic, and give its message_type'
         if self.message_type and self.message_type not in MESSAGE_TYPES:
             meant = did_you_mean(self.message_type, MESSAGE_TYPES)
-            known = ', '.join(MESSAGE_TYPES)
-            return f'{where}.message_type is {self.message_type!r}; it can be {known}{meant}'
+            types = ', '.join(MESSAGE_TYPES)
+            return f'{where}.message_type is {self.message_type!r}; it can be {types}{meant}'
         if self.message_type and self.single_shot:
             return (
                 f'{where}.single_shot is for instruments that measure on request; a topic streams'
@@ -136,14 +136,15 @@ class CellSensor(msgspec.Struct, forbid_unknown_fields=True):
         return ''
 
     def _marker_problem(self, where: str, markers: Mapping[str, Triple]) -> str:
-        known = ', '.join(markers)
+        """First validation error of the sensor's markers; '' if valid."""
+        names = ', '.join(markers)
         if self.marker not in markers:
             meant = did_you_mean(self.marker, markers)
-            return f'{where}.marker is {self.marker!r}; markers has {known}{meant}'
+            return f'{where}.marker is {self.marker!r}; markers has {names}{meant}'
         where += '.further_markers'
         for name, number in self.further_markers.items():
             if name not in markers:
-                return f'{where} has {name!r}; markers has {known}{did_you_mean(name, markers)}'
+                return f'{where} has {name!r}; markers has {names}{did_you_mean(name, markers)}'
             if name == self.marker:
                 return f'{where} has {name!r}, which is its marker already; leave it out there'
             if not re.fullmatch('[A-Za-z][A-Za-z0-9_]*', name):
@@ -155,18 +156,18 @@ class CellSensor(msgspec.Struct, forbid_unknown_fields=True):
                 return f'{where}.{name} is {number}; markers of a body have the numbers 1 to 65535'
             if list(self.further_markers.values()).count(number) > 1:
                 return f'{where}: two markers have the number {number}; give each its own'
-        for one, other in itertools.combinations(self.markers, 2):
-            apart = float(np.linalg.norm(np.subtract(markers[one], markers[other])))
-            if apart < LEAST_APART_M:
+        for first, second in itertools.combinations(self.markers, 2):
+            distance_m = float(np.linalg.norm(np.subtract(markers[first], markers[second])))
+            if distance_m < LEAST_APART_M:
                 return (
-                    f'{where}: {one} and {other} are {1e3 * apart:.0f} mm apart; below '
+                    f'{where}: {first} and {second} are {1e3 * distance_m:.0f} mm apart; below '
                     f'{1e3 * LEAST_APART_M:.0f} mm one could be taken for the other'
                 )
         return ''
 
 
 Range = tuple[float, float]
-# No arm or tool of those that this is for reaches so far.
+# Heights of poses: beyond the reach of any supported arm.
 REACH = Bounds(-10.0, 10.0, 'm')
 LATIN_HYPERCUBE, OPTIMAL = 'latin_hypercube', 'optimal'
 NEAREST, FASTEST = 'nearest', 'fastest'
@@ -175,34 +176,33 @@ RANGES = ('azimuth_deg', 'radius_m', 'height_m', 'roll_deg')
 
 
 class CellToolBox(msgspec.Struct, forbid_unknown_fields=True):
-    """Where the tool is to be accurate: a box in base_link."""
+    """Box in base_link in which the tool has to be accurate."""
 
     center_m: Triple
     size_m: Annotated[Triple, Bounds(0.0, 20.0, 'm', above=True)]
 
 
 class CellPoses(msgspec.Struct, forbid_unknown_fields=True):
-    """Ranges of the Latin hypercube of poses, which of them are visited, and in which order."""
+    """Ranges of the candidate poses, design of the visits, and their order."""
 
     azimuth_deg: Range = (0.0, 360.0)
     radius_m: Annotated[Range, Bounds(0.0, 10.0, 'm')] = (0.2, 0.5)
     height_m: Annotated[Range, REACH] = (0.4, 0.8)
     roll_deg: Range = (0.0, 360.0)
-    # `OPTIMAL` for the poses that tell the most, `LATIN_HYPERCUBE` for all of its poses.
+    # `OPTIMAL` for an optimal design, `LATIN_HYPERCUBE` for all of its poses.
     design: str = OPTIMAL
-    # `ALL` for each pose in all its free joint solutions, nearest first; `CHOSEN` for the
-    # configurations that take the fewest minutes, a pose again where that is shorter.
+    # `ALL` for each pose in all its free joint solutions; `CHOSEN` for the configurations that
+    # take the least time, and may return to a pose.
     solutions: str = ALL
-    # `NEAREST` for the nearest pose next, `FASTEST` for the least travel.
+    # `NEAREST` for the nearest pose next, `FASTEST` for the least travel time.
     order: str = NEAREST
-    # 0 for the joint offsets alone, 1 for the tool's error alone, between them for a mixture.
+    # Weight of the tool's error in the design: 0 for joint offsets only, 1 for the tool only.
     tool_share: Annotated[float, Bounds(0.0, 1.0)] = 0.0
-    # What is to be reached: an optimal design is made for it (without, for what the Latin
-    # hypercube reaches, of the joints no less than 0.005 degrees), and a collection ends where it
-    # is known to be.
+    # Precision to reach: an optimal design is made for it (by default for that of the Latin
+    # hypercube, of the joints at least 0.005 degrees), and a collection ends when it is reached.
     joint_std_deg: Annotated[float | None, Bounds(0.0, 5.0, 'degrees', above=True)] = None
     tool_std_m: Annotated[float | None, Bounds(0.0, 0.1, 'm', above=True)] = None
-    # Where the tool's error counts; without, at all candidate poses.
+    # Where the tool's error counts; by default at all candidate poses.
     tool_box: CellToolBox | None = None
 
     def ranges(self) -> PoseRanges:
@@ -215,8 +215,8 @@ class CellPoses(msgspec.Struct, forbid_unknown_fields=True):
         )
 
     def settings(self, sensors: tuple[ExpectedSensor, ...], marker_std_m: float) -> DesignSettings:
-        """Return what the design is chosen by, in SI units."""
-        # Here and below: most nodes read a cell and plan nothing.
+        """Return the settings of the design, in SI units."""
+        # Imported when needed, here and below: most nodes plan nothing.
         from remaster_ros.planning.planned_design import DesignSettings
 
         box = self.tool_box
@@ -233,19 +233,22 @@ class CellPoses(msgspec.Struct, forbid_unknown_fields=True):
         )
 
     def stopping_goal(self) -> StoppingGoal:
-        """Return what ends a collection, in SI units: all that counts, where it is stated."""
+        """Return the precision that ends a collection, in SI units.
+
+        Empty if an optimal design has a goal that the file does not state.
+        """
         from remaster_ros.collection.stopping_rule import StoppingGoal
 
         optimal, stated = self.design == OPTIMAL, (self.joint_std_deg, self.tool_std_m)
         counts = (self.tool_share < 1.0, self.tool_share > 0.0)
         if optimal and any(one and value is None for one, value in zip(counts, stated)):
-            # The design is made for what the Latin hypercube reaches, which no one has stated.
+            # The design then aims at the precision of the Latin hypercube, which is not stated.
             return StoppingGoal()
         settings = self.settings((), 0.0)
         return StoppingGoal(settings.joint_std_rad, settings.tool_std_m, settings.box)
 
     def given(self) -> Mapping[str, object]:
-        """Return the keys beside the ranges that are not as by default."""
+        """Return the keys that differ from their defaults, ranges excepted."""
         plain = CellPoses()
         return {
             key: getattr(self, key)
@@ -254,7 +257,7 @@ class CellPoses(msgspec.Struct, forbid_unknown_fields=True):
         }
 
     def problem(self) -> str:
-        """Return what is wrong between the keys; '' where nothing is."""
+        """First contradiction between keys; '' if there is none."""
         for key in RANGES:
             low, high = getattr(self, key)
             if low > high:
@@ -277,7 +280,7 @@ class CellPoses(msgspec.Struct, forbid_unknown_fields=True):
         return self._without_effect()
 
     def _without_effect(self) -> str:
-        """Return which key changes nothing beside the others; '' where each does."""
+        """First key that has no effect with the others; '' if there is none."""
         given = self.given()
         if self.solutions == CHOSEN and (self.design, self.order) == (LATIN_HYPERCUBE, NEAREST):
             return (
@@ -303,15 +306,15 @@ class CellPoses(msgspec.Struct, forbid_unknown_fields=True):
 
 
 ON_TOOL = Bounds(-3.0, 3.0, 'm')
-# A marker is placed better than this; a session file may give more, where nothing is known.
+# Prior of marker positions in cells; a session file may have a larger one.
 MARKER_STD = Bounds(0.0, 0.02, 'm', above=True)
-# Of arms of some 7 to 20 kg.
+# Typical radius of the links of arms of 7 to 20 kg.
 LINK_RADIUS_M = 0.075
 NO_MOTION = (
     'urdf_text', 'file', 'mesh_path', 'confirm', 'poses', 'aim_at', 'held_joint',
     'held_values_deg', 'held_values_m', 'marker_std_m', 'sensors',
 )  # fmt: skip
-"""What of a cell decides where an arm goes or where files lie, not whether it may go there."""
+"""Keys that do not affect whether a motion is allowed."""
 CLEARANCE = Bounds(HALF_STEP_M, 1.0, 'm', remedy='; half the step of a path check is the least')
 
 
@@ -331,13 +334,13 @@ class CellBox(msgspec.Struct, forbid_unknown_fields=True):
     yaw_deg: float = 0.0
 
     def body(self, name: str) -> Body:
-        """Return it for the collision checks."""
+        """Return the body for collision checks."""
         rotation = matrix_from_rpy(np.array([0.0, 0.0, radians(self.yaw_deg)]))
         return obstacle(name, self.center_m, self.size_m, rotation)
 
 
 class CellToolBody(msgspec.Struct, forbid_unknown_fields=True):
-    """A part of the tool, its middle at `center_m` of the tool frame, turned by `rpy_deg`.
+    """A part of the tool, centred at `center_m` of the tool frame, rotated by `rpy_deg`.
 
     A box (`size_m`), a cylinder along its z (`radius_m`, `length_m`) or a sphere (`radius_m`).
     """
@@ -349,7 +352,7 @@ class CellToolBody(msgspec.Struct, forbid_unknown_fields=True):
     length_m: float | None = None
 
     def shape(self) -> Shape:
-        """Return its shape, about its own middle."""
+        """Return the shape about its centre; raise InputError unless it is one of these."""
         given = (self.size_m is not None, self.radius_m is not None, self.length_m is not None)
         if given == (True, False, False):
             return box(np.array(self.size_m))
@@ -362,14 +365,14 @@ class CellToolBody(msgspec.Struct, forbid_unknown_fields=True):
         )
 
     def body(self, name: str, chain: SerialChain) -> Body:
-        """Return it for the collision checks, on the last joint of the arm."""
+        """Return the body for collision checks, on the last joint of the arm."""
         turn = matrix_from_rpy(np.deg2rad(self.rpy_deg))
         T = chain.T_fixed[-1] @ transform(turn, np.array(self.center_m))
         return Body(name, len(chain), self.shape(), T, 'tool')
 
 
 class Workcell(msgspec.Struct, forbid_unknown_fields=True):
-    """A cell file; see config/cells/demo.yaml for what each key means."""
+    """Content of a cell file; config/cells/demo.yaml explains each key."""
 
     robot: CellRobot
     markers: Annotated[dict[str, Triple], ON_TOOL]
@@ -378,7 +381,7 @@ class Workcell(msgspec.Struct, forbid_unknown_fields=True):
     marker_std_m: Annotated[float, MARKER_STD] = 0.5e-3
     held_joint: str | None = ''
     held_values_deg: list[float] | None = []
-    held_values_m: list[float] | None = []  # In place of these where the joint slides
+    held_values_m: list[float] | None = []  # Instead, if the joint is prismatic
     poses: CellPoses = msgspec.field(default_factory=CellPoses)
     link_radius_m: Annotated[float, Bounds(0.0, 1.0, 'm', above=True)] = LINK_RADIUS_M
     obstacles: dict[str, CellBox] = {}
@@ -389,28 +392,28 @@ class Workcell(msgspec.Struct, forbid_unknown_fields=True):
     unknown_offset_deg: Annotated[float, Bounds(0.0, 10.0, 'degrees')] = 1.0
     acceleration_limit_rad_s2: Annotated[float | list[float], Bounds(0.01, 1000.0, 'rad/s²')] = 5.0
     mesh_path: list[str] = []
-    # Whether the nodes show their plan and wait for /remaster/confirm before the arm moves.
+    # Whether the planner shows its plan and waits for /remaster/confirm before the arm moves.
     confirm: bool = False
     urdf_text: str = ''
-    # Where it was read from; nothing a plan depends on.
+    # Path of the cell file; no plan depends on it.
     file: str = ''
 
     def chain(self) -> SerialChain:
-        """Build the arm's kinematic chain."""
+        """Return the arm's kinematic chain."""
         ends = self.robot.base_link, self.robot.tip_link
         return SerialChain.from_urdf(self.urdf_text, *ends)
 
     def fingerprint(self) -> str:
-        """Return a checksum of all that a plan depends on."""
+        """Return a checksum of everything that a plan depends on."""
         plain = msgspec.to_builtins(msgspec.structs.replace(self, file=''))
         del plain['confirm']
         return hashlib.sha256(msgspec.json.encode(plain)).hexdigest()
 
     def model(self) -> ArmModel:
-        """Return checksums of the arm and of all that a motion is checked against.
+        """Return checksums of the arm and of everything that a motion is checked against.
 
-        Copies on two hosts are the same if they differ in their folders, in comments, in the
-        order of keys or attributes or in white space alone. Meshes are not part of it.
+        They are equal for copies on two hosts that differ in folders, comments, white space, or
+        the order of keys or attributes. Meshes are not part of them.
         """
         urdf = ElementTree.canonicalize(self.urdf_text, strip_text=True)
         plain = msgspec.to_builtins(self)
@@ -426,7 +429,7 @@ class Workcell(msgspec.Struct, forbid_unknown_fields=True):
         )
 
     def held(self, chain: SerialChain) -> dict[int, tuple[float, ...]] | None:
-        """Return the held joint's index and values (rad or m), or None."""
+        """Return index and values (rad or m) of the held joint; None if there is none."""
         if not self.held_joint:
             return None
         index = chain.joint_names.index(self.held_joint)
@@ -437,8 +440,8 @@ class Workcell(msgspec.Struct, forbid_unknown_fields=True):
     def acceleration_limits(self, chain: SerialChain) -> FloatArray:
         """Return each joint's acceleration limit, rad/s² or m/s², (k,).
 
-        One number is for joints that turn; those that slide have `SerialChain.per_radian` times
-        as much.
+        A single number in the file is for revolute joints; prismatic ones have
+        `SerialChain.per_radian` times as much.
         """
         given = self.acceleration_limit_rad_s2
         return np.array(given) if isinstance(given, list) else given * chain.per_radian
@@ -457,15 +460,14 @@ class Workcell(msgspec.Struct, forbid_unknown_fields=True):
         chain
             The arm of this cell.
         unknown_offset_rad
-            What a joint's zero-offset may still be off by, rad; `unknown_offset_deg` where None.
+            Bound of a joint's unknown zero-offset, rad; None for `unknown_offset_deg`.
         without_meshes
-            Take capsules in place of meshes, which then need not be there: for simulated arms,
-            never for one that moves.
+            Use capsules instead of meshes, which may then be missing: only for simulated arms.
 
         Raises
         ------
         InputError
-            A mesh of the URDF that cannot be found or read, or geometry that cannot be.
+            If a mesh of the URDF is missing or unreadable, or its geometry is invalid.
         """
         folder = Path(self.file).parent
         urdf = folder / self.robot.urdf
@@ -496,7 +498,7 @@ class Workcell(msgspec.Struct, forbid_unknown_fields=True):
         *,
         without_meshes: bool = False,
     ) -> PlanningScene:
-        """Return what the poses of this cell are planned from; arguments and errors as above."""
+        """Return the planning scene of this cell; arguments and errors as `collision_model`."""
         sights = [
             LineOfSight(
                 name,
@@ -517,7 +519,7 @@ class Workcell(msgspec.Struct, forbid_unknown_fields=True):
         )
 
     def design_settings(self) -> DesignSettings:
-        """Return which of the poses are to be visited, and in which order."""
+        """Return the settings of the design, with the expected noise of the sensors."""
         expected = [
             ExpectedSensor(
                 name,
@@ -533,17 +535,17 @@ class Workcell(msgspec.Struct, forbid_unknown_fields=True):
 
 
 def _no_mesh(name: str) -> None:
-    """Leave a mesh out."""
+    """Leave out any mesh."""
 
 
 def config_path(name: str) -> Path:
-    """Path of a shipped configuration file, such as ``cells/demo.yaml``.
+    """Return the path of a shipped configuration file, such as ``cells/demo.yaml``.
 
-    In a source checkout config/ lies beside the package; installed, it is package data.
+    In a source checkout config/ is beside the package; installed, it is package data.
     """
-    beside = Path(__file__).resolve().parents[2] / 'config'
-    if (beside / 'cells').is_dir():
-        return beside / name
+    folder = Path(__file__).resolve().parents[2] / 'config'
+    if (folder / 'cells').is_dir():
+        return folder / name
     spec = importlib.util.find_spec('remaster_ros.config')
     if spec is None or not spec.submodule_search_locations:
         raise InputError('the shipped configuration is missing; install the package again')
@@ -558,14 +560,14 @@ def read_cell(path: str | Path) -> Workcell:
     path = Path(path)
     if not path.suffix and not path.is_file():
         shipped = config_path(f'cells/{path}.yaml')
-        # A folder of that name, as `remaster demo --out demo` makes one, is no cell file.
+        # A folder of that name, as made by `remaster demo --out demo`, is no cell file.
         if shipped.exists() or not path.exists():
             path = shipped
     return parse_cell(read_limited(path, YAML_LIMIT, 'name a cell file'), path)
 
 
 def parse_cell(data: bytes, path: Path) -> Workcell:
-    """Check the content of a cell file, which need not be written yet; errors as `read_cell`."""
+    """Parse and validate the content of a cell file for `path`; errors as `read_cell`."""
     cell = read_yaml(data, path, Workcell)
     urdf = path.parent / cell.robot.urdf
     cell.file = str(path)
@@ -581,7 +583,7 @@ def parse_cell(data: bytes, path: Path) -> Workcell:
 
 
 def _check(path: Path, cell: Workcell, text: str) -> None:
-    """Refuse names that point nowhere and values that contradict each other."""
+    """Raise InputError for unknown names and contradictory values."""
     try:
         chain = cell.chain()
     except InputError as error:
@@ -591,11 +593,11 @@ def _check(path: Path, cell: Workcell, text: str) -> None:
 
 
 def _problem(cell: Workcell, chain: SerialChain) -> str:
-    """Return what is wrong between the keys of a cell file; '' where nothing is."""
+    """First contradiction between the keys of a cell file; '' if there is none."""
     if cell.held_joint and cell.held_joint not in chain.joint_names:
-        known = ', '.join(chain.joint_names)
+        names = ', '.join(chain.joint_names)
         meant = did_you_mean(cell.held_joint, chain.joint_names)
-        return f'held_joint {cell.held_joint!r} is none of {known}{meant}'
+        return f'held_joint {cell.held_joint!r} is none of {names}{meant}'
     slides = bool(cell.held_joint) and chain.slides[chain.joint_names.index(cell.held_joint)]
     if cell.held_values_m and not slides:
         return 'held_values_m is for a held_joint that slides; write held_values_deg'
@@ -627,7 +629,7 @@ def _problem(cell: Workcell, chain: SerialChain) -> str:
             f'acceleration_limit_rad_s2 has {len(limits)} values; give one number, or one for '
             f'each of the {len(chain)} joints'
         )
-    # Meshes are read when they are needed.
+    # Meshes are checked when they are needed.
     for key, parts in (('obstacles', cell.obstacles), ('tool', cell.tool)):
         for name, part in parts.items():
             try:

@@ -19,7 +19,7 @@ from remaster_ros.session.journal import Journal
 from remaster_ros.session.reader import PLAN, read_session
 from remaster_ros.session.recovery import recover_session
 from remaster_ros.session.session_writer import SessionWriter
-from remaster_ros.session.yaml_records import load_yaml
+from remaster_ros.session.strict_yaml import load_yaml
 from remaster_ros.types import Correction, Measurements, Observation, Session
 
 JOINT = """<joint name="joint_{n}" type="revolute">

@@ -48,7 +48,7 @@ def test_what_was_written_is_visited_in_its_order_and_expected_alike(planner, vi
     assert 'more than the 90 s' in visits.too_long(91.0)
 
     tour, q, seen = planner.check(again.q), np.array(again.q[0]), []
-    assert tour.judges == 'check'
+    assert tour.inspection == 'check'
     while (stop := tour.next(q)) is not None:
         q = stop.solutions[-1]
         seen.append(q)
@@ -71,7 +71,7 @@ def test_a_slide_of_a_check_is_written_and_read_in_mm(tmp_path):
     np.testing.assert_allclose(again.q, visits.q, atol=1e-8)
     assert set(np.abs(again.q[:, 0]).round(9)) == {0.3}
     planner = TourPlanner(scene, {}, 0, travel=TravelTime.of(scene.model))
-    assert planner.check(again.q).judges == 'check'
+    assert planner.check(again.q).inspection == 'check'
 
 
 def test_an_arm_that_cannot_stand_at_a_configuration_is_sent_to_none(planner):

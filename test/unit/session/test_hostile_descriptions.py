@@ -13,7 +13,7 @@ from remaster_ros.errors import InputError
 from remaster_ros.session import robot_description
 from remaster_ros.session.meshes import find_mesh, read_mesh
 from remaster_ros.session.robot_description import read_arm, read_description
-from remaster_ros.session.xacro_expansion import ExpressionError, evaluate, global_names
+from remaster_ros.session.xacro_expressions import ExpressionError, evaluate, global_names
 
 NAMESPACE = 'xmlns:xacro="http://www.ros.org/wiki/xacro"'
 # What xacro's own guard lets through: it looks at the names of the outer code alone.

@@ -14,8 +14,8 @@ from remaster_ros.kinematics.urdf import MOST_LINKS, parse_urdf
 from remaster_ros.reports import schemas
 from remaster_ros.reports.fit_json import fit_content, joint_offsets_of, read_fit
 from remaster_ros.session.reader import read_session, write_session
+from remaster_ros.session.strict_yaml import YamlError, load_yaml
 from remaster_ros.session.workcell import read_cell
-from remaster_ros.session.yaml_records import YamlError, load_yaml
 
 CONFIG = Path(__file__).parents[3] / 'config'
 SEED = random.SystemRandom().randrange(10**6)

@@ -46,7 +46,7 @@ class Bench(session_recorder.Outlet):
 
     def reject(self, solution, stamp):
         settled = SettledArm(Q[0], 1.0, replace(POSE, stamp=stamp), solution)
-        self.recorder._write_down(EndedReading(settled, None, [], [], [], {}, 2.0, None))
+        self.recorder._write_outcome(EndedReading(settled, None, [], [], [], {}, 2.0, None))
 
     def ends(self):
         return self.journal.outcomes.poses.get(4, ('', {}))[1]

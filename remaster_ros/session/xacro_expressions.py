@@ -1,0 +1,349 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Expressions ``${…}`` and ``$(eval …)`` of a xacro file, evaluated without Python's `eval`.
+
+xacro runs these expressions as Python, so that a robot description is a program of its author.
+Here an expression is parsed and its syntax tree is walked: numbers, strings, names, arithmetic,
+comparisons, lists and dictionaries, items of loaded YAML, and calls of the functions listed here.
+There is no other attribute, no lambda, no comprehension, no formatted string. No value grows
+beyond `LONGEST` characters or items, or `MOST_BITS` bits.
+"""
+
+from __future__ import annotations
+
+import ast
+import math
+import operator
+from collections.abc import Callable, Mapping
+from typing import Any
+
+LONGEST = 100_000
+"""Most characters of an expression or text, and items of a list: far above any description."""
+MOST_BITS = 4096
+"""Most bits of an integer, below Python's limit of conversion to text."""
+_PLAIN = (bool, int, float, str, type(None))
+
+
+class ExpressionError(Exception):
+    """An expression that is not supported; the text says why."""
+
+
+class Function:
+    """A function that an expression may call."""
+
+    def __init__(self, call: Callable[..., Any]) -> None:
+        self.call = call
+
+
+class Namespace(dict[str, Any]):
+    """Names after a dot, such as ``math.pi``."""
+
+
+def evaluate(expression: str, names: Mapping[str, Any]) -> Any:
+    """Return the value of an expression; raise ExpressionError if it is not supported.
+
+    ``names``: properties by name, and those of `global_names`.
+    """
+    if len(expression) > LONGEST:
+        raise ExpressionError(f'an expression of {len(expression)} characters')
+    try:
+        tree = ast.parse(expression.strip(), mode='eval')
+        value = _Evaluation(names).of(tree.body)
+    except SyntaxError as error:
+        raise ExpressionError(f'no expression ({error.msg})') from None
+    except (RecursionError, MemoryError):
+        raise ExpressionError('an expression too deep or too large') from None
+    except (ArithmeticError, LookupError, TypeError, ValueError) as error:
+        raise ExpressionError(f'{type(error).__name__}: {error}') from None
+    if isinstance(value, Function | Namespace):
+        raise ExpressionError('a function is no value; call it')
+    # Lists that contain one another repeatedly are small in memory and huge as text.
+    _count(value, LONGEST)
+    return value
+
+
+def global_names(**own: Any) -> dict[str, Any]:
+    """Return the names of every expression: xacro's, with keyword arguments in ``xacro``.
+
+    The caller provides replacements of functions with side effects.
+    """
+    xacro = Namespace({name: Function(call) for name, call in own.items()})
+    return {
+        **_PYTHON,
+        **_MATH,
+        'math': _MATH,
+        'python': _PYTHON,
+        'xacro': xacro,
+        **{name: xacro[name] for name in ('load_yaml', 'abs_filename', 'dotify') if name in xacro},
+        **_CONSTANTS,
+    }
+
+
+class _Evaluation:
+    """Evaluation of one syntax tree."""
+
+    def __init__(self, names: Mapping[str, Any]) -> None:
+        self._names = names
+
+    def of(self, node: ast.expr) -> Any:
+        visit = getattr(self, f'_of_{type(node).__name__}', None)
+        if visit is None:
+            raise ExpressionError(_REFUSED.get(type(node), f'{type(node).__name__} is not taken'))
+        return visit(node)
+
+    def _data(self, node: ast.expr) -> Any:
+        """Return a value; raise ExpressionError if it is a function."""
+        value = self.of(node)
+        if isinstance(value, Function | Namespace):
+            raise ExpressionError(f'{ast.unparse(node)} is a function and no value')
+        return value
+
+    def _of_Constant(self, node: ast.Constant) -> Any:
+        if type(node.value) not in _PLAIN:
+            raise ExpressionError(f'{ast.unparse(node)} is neither a number nor a text')
+        return _bounded(node.value)
+
+    def _of_Name(self, node: ast.Name) -> Any:
+        if node.id.startswith('__'):
+            raise ExpressionError(f'the name {node.id}')
+        try:
+            return self._names[node.id]
+        except KeyError:
+            raise ExpressionError(f"name '{node.id}' is not defined") from None
+
+    def _of_Attribute(self, node: ast.Attribute) -> Any:
+        holder = self.of(node.value)
+        # Loaded YAML, and properties of an included file: items, never attributes of the object.
+        if node.attr.startswith('_') or not isinstance(holder, Mapping):
+            raise ExpressionError(f'the attribute .{node.attr} of {ast.unparse(node.value)}')
+        try:
+            return holder[node.attr]
+        except (KeyError, AttributeError):
+            raise ExpressionError(f'{ast.unparse(node.value)} has no {node.attr}') from None
+
+    def _of_Subscript(self, node: ast.Subscript) -> Any:
+        holder = self._data(node.value)
+        if not isinstance(holder, str | list | tuple | dict):
+            raise ExpressionError(f'{ast.unparse(node.value)} has no items')
+        if isinstance(node.slice, ast.Slice):
+            parts = (node.slice.lower, node.slice.upper, node.slice.step)
+            return holder[slice(*(None if part is None else self._data(part) for part in parts))]
+        return _item(holder, self._data(node.slice))
+
+    def _of_UnaryOp(self, node: ast.UnaryOp) -> Any:
+        value = self._data(node.operand)
+        if isinstance(node.op, ast.Not):
+            return not value
+        if isinstance(node.op, ast.Invert) or not isinstance(value, int | float):
+            raise ExpressionError(f'a sign before {ast.unparse(node.operand)}')
+        return -value if isinstance(node.op, ast.USub) else +value
+
+    def _of_BinOp(self, node: ast.BinOp) -> Any:
+        operate = _ARITHMETIC.get(type(node.op))
+        if operate is None:
+            raise ExpressionError(f'the operator in {ast.unparse(node)}')
+        return _bounded(operate(self._data(node.left), self._data(node.right)))
+
+    def _of_BoolOp(self, node: ast.BoolOp) -> Any:
+        ends = isinstance(node.op, ast.Or)
+        value: Any = None
+        for part in node.values:
+            value = self._data(part)
+            if bool(value) is ends:
+                return value
+        return value
+
+    def _of_Compare(self, node: ast.Compare) -> Any:
+        left = self._data(node.left)
+        for op, part in zip(node.ops, node.comparators, strict=True):
+            right = self._data(part)
+            if not _COMPARISONS[type(op)](left, right):
+                return False
+            left = right
+        return True
+
+    def _of_IfExp(self, node: ast.IfExp) -> Any:
+        return self._data(node.body if self._data(node.test) else node.orelse)
+
+    def _of_List(self, node: ast.List) -> Any:
+        return [self._data(part) for part in node.elts]
+
+    def _of_Tuple(self, node: ast.Tuple) -> Any:
+        return tuple(self._data(part) for part in node.elts)
+
+    def _of_Dict(self, node: ast.Dict) -> Any:
+        if None in node.keys:
+            raise ExpressionError('** in a dictionary')
+        return {
+            self._data(key): self._data(value)
+            for key, value in zip(node.keys, node.values, strict=True)
+            if key is not None
+        }
+
+    def _of_Call(self, node: ast.Call) -> Any:
+        if any(isinstance(part, ast.Starred) for part in node.args):
+            raise ExpressionError('* in a call')
+        named = {
+            part.arg: self._data(part.value) for part in node.keywords if part.arg is not None
+        }
+        if len(named) < len(node.keywords):
+            raise ExpressionError('** in a call')
+        given = [self._data(part) for part in node.args]
+        if isinstance(node.func, ast.Attribute):
+            holder = self.of(node.func.value)
+            if isinstance(holder, str):
+                method = _OF_TEXTS.get(node.func.attr)
+                if method is None:
+                    raise ExpressionError(f'.{node.func.attr}() of a text')
+                return _bounded(method(holder, *given, **named))
+        called = self.of(node.func)
+        if not isinstance(called, Function):
+            raise ExpressionError(f'{ast.unparse(node.func)} is no function')
+        return _bounded(called.call(*given, **named))
+
+
+def _item(holder: Any, key: Any) -> Any:
+    if isinstance(holder, dict) and key not in holder:
+        raise ExpressionError(f'there is no item {key!r}')
+    return holder[key]
+
+
+def _bounded(value: Any) -> Any:
+    """Return a value; raise ExpressionError if it is too large."""
+    if isinstance(value, complex):
+        raise ExpressionError('no real number')
+    if isinstance(value, int) and value.bit_length() > MOST_BITS:
+        raise ExpressionError('a number that is too large')
+    if isinstance(value, str | list | tuple | dict) and len(value) > LONGEST:
+        raise ExpressionError('a text or list that is too long')
+    return value
+
+
+def _count(value: Any, left: int) -> int:
+    """Return how many more items than those of a value are allowed."""
+    if left < 0:
+        raise ExpressionError('a text or list that is too long')
+    if isinstance(value, dict):
+        for item in dict.values(value):
+            left = _count(item, left - 1)
+    elif isinstance(value, list | tuple):
+        for item in list.__iter__(value) if isinstance(value, list) else value:
+            left = _count(item, left - 1)
+    return left
+
+
+def _length(value: Any) -> int:
+    """Return the size of a number or text: bits, or characters and items."""
+    if isinstance(value, int):
+        return value.bit_length()
+    return len(value) if isinstance(value, str | list | tuple) else 0
+
+
+def _times(left: Any, right: Any) -> Any:
+    for text, count in ((left, right), (right, left)):
+        if isinstance(text, str | list | tuple) and isinstance(count, int):
+            if len(text) * count > LONGEST:
+                raise ExpressionError('a text or list that is too long')
+            return text * count
+    return _number(left) * _number(right)
+
+
+def _power(left: Any, right: Any) -> Any:
+    base, exponent = _number(left), _number(right)
+    whole = isinstance(base, int) and isinstance(exponent, int)
+    if whole and _length(base) * abs(exponent) > MOST_BITS:
+        raise ExpressionError('a number that is too large')
+    return base**exponent
+
+
+def _plus(left: Any, right: Any) -> Any:
+    if isinstance(left, str | list | tuple) and isinstance(right, str | list | tuple):
+        return operator.add(left, right)
+    return _number(left) + _number(right)
+
+
+def _number(value: Any) -> Any:
+    # Also of %, which formats a text.
+    if not isinstance(value, int | float):
+        raise ExpressionError(f'{value!r:.40} is no number')
+    return value
+
+
+def _of_numbers(operate: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
+    return lambda left, right: operate(_number(left), _number(right))
+
+
+def _replace(text: str, old: str, new: str) -> str:
+    if text.count(old) * len(new) > LONGEST:
+        raise ExpressionError('a text that is too long')
+    return text.replace(old, new)
+
+
+def _round(value: Any, ndigits: int = 0) -> Any:
+    # That of a whole number works out 10 to the power of the digits.
+    return round(_number(value), max(-400, min(ndigits, 400))) if ndigits else round(value)
+
+
+def _range(*given: Any) -> list[int]:
+    if len(values := range(*given)) > LONGEST:
+        raise ExpressionError('a list that is too long')
+    return list(values)
+
+
+_ARITHMETIC: dict[type[ast.operator], Callable[[Any, Any], Any]] = {
+    ast.Add: _plus,
+    ast.Sub: _of_numbers(operator.sub),
+    ast.Mult: _times,
+    ast.Div: _of_numbers(operator.truediv),
+    ast.FloorDiv: _of_numbers(operator.floordiv),
+    ast.Mod: _of_numbers(operator.mod),
+    ast.Pow: _power,
+}
+_COMPARISONS: dict[type[ast.cmpop], Callable[[Any, Any], bool]] = {
+    ast.Eq: operator.eq,
+    ast.NotEq: operator.ne,
+    ast.Lt: operator.lt,
+    ast.LtE: operator.le,
+    ast.Gt: operator.gt,
+    ast.GtE: operator.ge,
+    ast.Is: operator.is_,
+    ast.IsNot: operator.is_not,
+    ast.In: lambda left, right: left in right,
+    ast.NotIn: lambda left, right: left not in right,
+}
+_REFUSED: dict[type[ast.expr], str] = {
+    ast.Lambda: 'a lambda',
+    ast.JoinedStr: 'a formatted string',
+    ast.ListComp: 'a comprehension',
+    ast.SetComp: 'a comprehension',
+    ast.DictComp: 'a comprehension',
+    ast.GeneratorExp: 'a comprehension',
+    ast.NamedExpr: 'an assignment',
+}
+_OF_TEXTS: dict[str, Callable[..., Any]] = {
+    'split': str.split,
+    'startswith': str.startswith,
+    'endswith': str.endswith,
+    'strip': str.strip,
+    'lower': str.lower,
+    'upper': str.upper,
+    'replace': _replace,
+}
+_CONSTANTS = {'True': True, 'False': False, 'true': True, 'false': False, 'None': None}
+_MATH = Namespace(
+    {name: getattr(math, name) for name in ('pi', 'e', 'tau', 'inf', 'nan')}
+    | {
+        name: Function(getattr(math, name))
+        for name in (
+            *('sin', 'cos', 'tan', 'asin', 'acos', 'atan', 'atan2', 'radians', 'degrees'),
+            *('sinh', 'cosh', 'tanh', 'asinh', 'acosh', 'atanh', 'hypot', 'sqrt', 'pow', 'exp'),
+            *('log', 'log10', 'log2', 'ceil', 'floor', 'trunc', 'fabs', 'fmod', 'copysign'),
+            *('isclose', 'isfinite', 'isinf', 'isnan'),
+        )
+    }
+)
+_CALLS: dict[str, Callable[..., Any]] = {
+    **{'list': list, 'tuple': tuple, 'dict': dict, 'len': len, 'str': str, 'float': float},
+    **{'int': int, 'bool': bool, 'min': min, 'max': max, 'round': _round, 'abs': abs, 'sum': sum},
+    **{'any': any, 'all': all, 'sorted': sorted, 'range': _range},
+}
+_PYTHON = Namespace({name: Function(call) for name, call in _CALLS.items()})
