@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from remaster_ros.errors import InputError
+from remaster_ros.errors import InputError, did_you_mean
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.transforms import inverse
 from remaster_ros.kinematics.urdf import parse_urdf
@@ -87,7 +87,7 @@ def _read(chain: SerialChain, description: str) -> tuple[SerialChain, bool, bool
         links = {joint.name: link for link, joint in model.parent_joint.items()}
         missing = [name for name in chain.joint_names if name not in links]
         if missing:
-            return f'it has no joint {", ".join(missing)}'
+            return f'it has no joint {", ".join(missing)}{did_you_mean(missing[0], links)}'
         has_base = chain.base_link in model.links
         base = chain.base_link if has_base else model.root
         # A gripper or tool changer behind the tip does not matter.

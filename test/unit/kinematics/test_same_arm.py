@@ -89,6 +89,7 @@ J = CHAIN.joint_names
         (changed('upper', J[1], '0.5'), f'{J[1]} may go from .* to 28.65 deg only'),
         (changed('velocity', J[6], '0.1'), f'{J[6]} may turn at 5.73 deg/s only'),
         (TEXT.replace(f'"{J[2]}"', '"elbow"'), f'it has no joint {J[2]}'),
+        (TEXT.replace(f'"{J[2]}"', f'"{J[2]}_"'), f"{J[2]}; did you mean '{J[2]}_'"),
         ('<robot name="x"><link name="a"/></robot>', f'it has no joint {J[0]}, '),
         ('<robot', 'not well-formed'),
         ('', 'not well-formed'),
