@@ -5,16 +5,25 @@ from __future__ import annotations
 
 import argparse
 import logging
+import math
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from remaster_ros.calibration.gauge_words import listed
+from remaster_ros.calibration.gauge_words import counted, listed
 from remaster_ros.cli.console import tell
 from remaster_ros.cli.options import number
 from remaster_ros.cli.verify import require_same_arm
-from remaster_ros.compensation.checking import SMALLEST_M, Checked, JointCheck, Measured, judge
+from remaster_ros.compensation.checking import (
+    SMALLEST_M,
+    Checked,
+    JointCheck,
+    Measured,
+    Trend,
+    judge,
+)
 from remaster_ros.compensation.file import Compensation, read_compensation
 from remaster_ros.compensation.iso9283 import Visited, visited
 from remaster_ros.errors import InputError
@@ -115,7 +124,16 @@ def measured_of(session: Session) -> Measured:
         tuple(session.sensor_names[i] for i in m.sensor.tolist()),
         tuple(session.marker_names[i] for i in m.marker.tolist()),
         m.position,
+        _seconds(session.created),
     )
+
+
+def _seconds(created: str) -> float:
+    """Return the Unix time of an ISO 8601 one, UTC where it states no zone; NaN of ''."""
+    if not created:
+        return float('nan')
+    moment = datetime.fromisoformat(created)
+    return (moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp()
 
 
 def _record(one: Measured, name: str, sha256: str, baseline: Compensation) -> dict[str, Any]:
@@ -130,6 +148,7 @@ def _record(one: Measured, name: str, sha256: str, baseline: Compensation) -> di
         'sensor': list(one.sensor),
         'marker': list(one.marker),
         'position_m': one.position.tolist(),
+        'when_s': one.when_s if math.isfinite(one.when_s) else None,
     }
 
 
@@ -172,6 +191,9 @@ def _before(
             q, position = np.array(record['q_rad'], float), np.array(record['position_m'], float)
             sensor, marker = tuple(record['sensor']), tuple(record['marker'])
             names.append(str(record['session']))
+            # Of earlier versions without.
+            when = record.get('when_s')
+            when_s = float('nan' if when is None else when)
         except (KeyError, TypeError, ValueError):
             raise InputError(f'{where}: is not whole; take another copy of the file') from None
         rows, k = len(sensor), len(baseline.model.chain)
@@ -181,7 +203,7 @@ def _before(
         )
         if not (sound and known and np.isfinite(q).all() and np.isfinite(position).all()):
             raise InputError(f'{where}: is not whole; take another copy of the file')
-        checks.append(Measured(q, sensor, marker, position))
+        checks.append(Measured(q, sensor, marker, position, when_s))
     return checks, names
 
 
@@ -228,6 +250,9 @@ def content_of(
         'since_check': None if found.since is None else found.since + 1,
         'moved_mm': 1e3 * found.moved_m,
         'check_again': found.again,
+        'trend': None if found.trend is None else _trend(found, chain.joint_names, names),
+        'next_check': _next_date(found),
+        'next_in_checks': None if found.in_days else math.ceil(found.next_in),
         'checks': len(names),
         'noise': 1e3 * found.noise_m,
         'smallest_mm': smallest_mm,
@@ -236,12 +261,88 @@ def content_of(
             'repeatability_mm': (1e3 * iso.repeatability_m).tolist(),
             'text': iso.text(),
         },
-        'text': in_words(found, chain.joint_names, names),
+        'text': in_words(found, chain.joint_names, names, smallest_mm),
     }
 
 
-def in_words(found: Checked, joint_names: tuple[str, ...], names: list[str]) -> str:
+def _trend(found: Checked, joint_names: tuple[str, ...], names: list[str]) -> dict[str, Any]:
+    one = found.trend
+    assert one is not None
+    return {
+        'kind': one.kind,
+        'joints': [joint_names[joint] for joint in one.joints],
+        'tool': one.tool,
+        'size_mm': 1e3 * one.size_m,
+        'half_mm': 1e3 * one.half_m if np.isfinite(one.half_m) else None,
+        'since': names[one.since],
+        'since_check': one.since + 1,
+        'days': one.span if found.in_days else None,
+    }
+
+
+def _next_date(found: Checked) -> str | None:
+    """Return the day of the next check, ISO 8601; None where the times are not known."""
+    if not (found.in_days and math.isfinite(found.when_s)):
+        return None
+    last = datetime.fromtimestamp(found.when_s, UTC)
+    return (last + timedelta(days=found.next_in)).date().isoformat()
+
+
+def _next_in_words(found: Checked) -> str:
+    if (date := _next_date(found)) is not None:
+        return f'Next check on {date}.'
+    if (more := math.ceil(found.next_in)) > 1:
+        return f'Next check after {more} times the usual while.'
+    return 'Go on with the usual checks.'
+
+
+def _span(found: Checked, trend: Trend) -> str:
+    """Return how long a trend has taken."""
+    if not found.in_days:
+        return f'in {counted(max(1, round(trend.span)), "check")}'
+    if trend.span < 2.0:
+        return f'in {24.0 * trend.span:.0f} hours'
+    return f'in {trend.span:.0f} days'
+
+
+def _trend_in_words(
+    found: Checked, joint_names: tuple[str, ...], names: list[str], smallest_mm: float
+) -> str:
+    """Return a change that is certain and no alarm, and when to look again, in sentences."""
+    one = found.trend
+    assert one is not None
+    who = ' or '.join(
+        [*(joint_names[joint] for joint in one.joints), *(['the marker'] if one.tool else [])]
+    )
+    size, half = 1e3 * one.size_m, 1e3 * one.half_m
+    small = size + half <= smallest_mm
+    if one.kind == 'drift':
+        matters = f'{smallest_mm:g} mm would matter' if small else 'which may matter'
+        return (
+            f'Drifting: {who}, {size:.2f} mm at the tool {_span(found, one)}; {matters}. '
+            f'{_next_in_words(found)}'
+        )
+    about = (
+        f'less than what matters ({smallest_mm:g} mm)'
+        if small
+        else f'about what matters ({smallest_mm:g} mm): correct the arm anew if that is too much; '
+        'checks at once do not tell more'
+    )
+    return (
+        f'{who} has changed by {size:.2f} ± {half:.2f} mm at the tool since check '
+        f'{one.since + 1} ({names[one.since]}), {about}. {_next_in_words(found)}'
+    )
+
+
+def in_words(
+    found: Checked,
+    joint_names: tuple[str, ...],
+    names: list[str],
+    smallest_mm: float = 1e3 * SMALLEST_M,
+) -> str:
     """Return what was found and what to do, in sentences."""
+    if found.trend is not None:
+        return _trend_in_words(found, joint_names, names, smallest_mm)
     unseen = [n for n, one in zip(joint_names, found.joints) if np.isnan(one.detectable_m)]
     same = f', or the zero of {" or ".join(unseen)}, which looks the same' if unseen else ''
     if found.verdict == 'changed':
@@ -250,8 +351,9 @@ def in_words(found: Checked, joint_names: tuple[str, ...], names: list[str]) -> 
         several = ': these look alike in the poses of the check' if len(alike) > 1 else ''
         size = 1e3 * abs(found.joints[found.changed[0]].change)
         size *= found.joints[found.changed[0]].lever_m
+        how = 'Has drifted' if found.drifts else 'Changed'
         return (
-            f'Changed since check {_named(found, names)}: {who}{several}; {size:.2f} mm at the '
+            f'{how} since check {_named(found, names)}: {who}{several}; {size:.2f} mm at the '
             'tool. Look at it (a collision, a loose bolt, a new zero), then measure and correct '
             'the arm again.'
         )
@@ -280,8 +382,8 @@ def in_words(found: Checked, joint_names: tuple[str, ...], names: list[str]) -> 
         )
     if found.verdict == 'unclear' and not found.again:
         return (
-            'Something may have changed, and checks at once do not decide it: go on with the '
-            'usual checks. A change that matters is named as soon as it is certain.'
+            'Something may have changed, and checks at once do not decide it. A change that '
+            f'matters is named as soon as it is certain. {_next_in_words(found)}'
         )
     if found.verdict == 'unclear':
         return 'Something may have changed: check again at once.'
@@ -305,7 +407,9 @@ def _named(found: Checked, names: list[str]) -> str:
 
 
 def _text(content: dict[str, Any]) -> str:
-    lines = [f'{content["verdict"]}: {content["text"]}']
+    drifts = content['trend'] is not None and content['trend']['kind'] == 'drift'
+    # The sentence of a drift begins with the word.
+    lines = [content['text'] if drifts else f'{content["verdict"]}: {content["text"]}']
     if not content['changed']:
         lines.append('each joint as if it alone had changed:')
     for one in content['joints']:

@@ -30,6 +30,7 @@ from scipy.special import erfc, fdtri, stdtrit
 from remaster_ros.calibration.gauge_words import counted
 from remaster_ros.calibration.registration import register_points
 from remaster_ros.compensation.arm_model import ArmModel
+from remaster_ros.compensation.drift import LONGEST_DAYS, drift
 from remaster_ros.errors import InputError, InsufficientDataError
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.transforms import apply
@@ -38,6 +39,9 @@ from remaster_ros.types import BoolArray, FloatArray
 Verdict = Literal['unchanged', 'changed', 'setup_moved', 'unclear']
 ALARM = 100.0
 """Evidence of an alarm: at most one arm in so many ever has one without a change."""
+TOLD = 200.0
+"""Evidence of a drift, and of a step that may be less than what matters: two of them, and at most
+one arm in a hundred ever has either without a change."""
 DOUBT = 10.0
 """Evidence, and `BEYOND` standard deviations of a single result, that ask for another check."""
 BEYOND = 5.0
@@ -72,6 +76,7 @@ class Measured:
     sensor: tuple[str, ...]
     marker: tuple[str, ...]
     position: FloatArray  # In the sensor's frame, m, (n, 3)
+    when_s: float = np.nan  # Unix time of the check; NaN where it is not known
 
     def merged(self, chain: SerialChain) -> Measured:
         """Return the mean of the readings of each pose by each sensor of each marker."""
@@ -83,7 +88,7 @@ class Measured:
                 rows.append(row)
         sensor = tuple(self.sensor[row] for row in rows)
         marker = tuple(self.marker[row] for row in rows)
-        first = Measured(self.q[rows], sensor, marker, self.position[rows])
+        first = Measured(self.q[rows], sensor, marker, self.position[rows], self.when_s)
         return self.as_before(first, chain)
 
     def as_before(self, first: Measured, chain: SerialChain) -> Measured:
@@ -110,7 +115,7 @@ class Measured:
             rows.append(same)
         position = np.array([self.position[same].mean(axis=0) for same in rows])
         q = np.array([self.q[same].mean(axis=0) for same in rows])
-        return Measured(q, first.sensor, first.marker, position)
+        return Measured(q, first.sensor, first.marker, position, self.when_s)
 
 
 def together(chain: SerialChain, q: FloatArray, place: FloatArray) -> BoolArray:
@@ -319,6 +324,21 @@ class JointCheck:
 
 
 @dataclass(frozen=True)
+class Trend:
+    """A change that is certain, and not certainly larger than what matters."""
+
+    kind: Literal['drift', 'step']
+    joints: tuple[int, ...]  # Indices of those that it may be of
+    tool: bool  # Whether it may be the marker's
+    # Of the change at the tool since the first check that has it, m: half is that of its 95 %
+    # interval
+    size_m: float
+    half_m: float
+    since: int  # Index of that check
+    span: float  # In days, or in checks where the times are not known
+
+
+@dataclass(frozen=True)
 class Checked:
     """What all checks so far say."""
 
@@ -337,6 +357,13 @@ class Checked:
     # What each check says of each joint, at the tool, m, (T, k): where it alone has changed, or
     # beside what is named
     series_m: FloatArray
+    # What is certain and no alarm; None where nothing is
+    trend: Trend | None = None
+    in_days: bool = False  # Whether the times of all checks are known
+    # From the newest check to the next, in days, or in checks where the times are not known
+    next_in: float = 1.0
+    drifts: bool = False  # Whether what has changed did so little by little
+    when_s: float = np.nan  # Unix time of the newest check; NaN where it is not known
 
 
 def judge(model: ArmModel, checks: Sequence[Measured], smallest_m: float = SMALLEST_M) -> Checked:
@@ -368,6 +395,20 @@ def judge(model: ArmModel, checks: Sequence[Measured], smallest_m: float = SMALL
     before = looks[-2].T_R_N if T > 1 else model.T_R_N
     moved, moved_is = _moved(before, last, checks[-1], noise, max(T - 1, 1), smallest_m)
     clear = abs(found[best].size) - found[best].half > smallest_m
+    days, in_days = _days(checks)
+    lines = [drift(x_m[:, i], days) for i in range(x_m.shape[1])]
+    of_lines = float(np.mean([one.evidence for one, counted in zip(lines, counts) if counted]))
+    line = lines[max(np.flatnonzero(counts), key=lambda i: lines[i].evidence)]
+    drifts = of_lines >= TOLD and of_lines > total and abs(line.size) > line.half
+    if drifts:
+        weights, at = line.weights, min(line.at + 1, T - 1)
+        noise = _scatter(np.array([one.rest for one in looks]), days, line.at)
+        noise /= np.sqrt(last.freedom)
+        std = noise / np.sqrt(np.where(is_seen, information, np.inf))
+        smallest = detectable_m(last.joints, levers, noise)
+        clear = abs(line.size) - line.half > smallest_m
+    else:
+        weights = _before_and_after(T, at)
     asked = AT_ONCE < T and all(
         _is_doubtful(looks[:until], x_m[:until], counts, is_seen, smallest_m)
         for until in range(T - AT_ONCE, T)
@@ -376,10 +417,37 @@ def judge(model: ArmModel, checks: Sequence[Measured], smallest_m: float = SMALL
     named: tuple[int, ...] = ()
     tool = False
     again = False
-    if total >= ALARM and clear:
-        named, tool = _named(looks, at, noise, is_seen)
+    trend: Trend | None = None
+    next_in = float(np.median(np.diff(days))) if T > 1 else 1.0
+    if (drifts or total >= ALARM) and clear:
+        named, tool = _named(looks, weights, noise, is_seen)
         # A joint and the marker that look alike: nobody is told to correct the arm for that.
         verdict = 'unclear' if tool and named else 'setup_moved' if tool else 'changed'
+    elif drifts:
+        trend = Trend(
+            'drift',
+            *_named(looks, weights, noise, is_seen),
+            abs(line.size),
+            line.half,
+            at,
+            line.days,
+        )
+        if abs(line.size) + line.half > smallest_m:
+            verdict = 'unclear'
+        # Half of the time until it may matter; not before the next of the usual checks.
+        next_in = max(next_in, min(0.5 * line.days_left(smallest_m), LONGEST_DAYS))
+    elif total >= TOLD:
+        step_of = found[best]
+        trend = Trend(
+            'step',
+            *_named(looks, weights, noise, is_seen),
+            abs(step_of.size),
+            step_of.half,
+            at,
+            float(days[-1] - days[at]),
+        )
+        if abs(step_of.size) + step_of.half > smallest_m:
+            verdict = 'unclear'
     elif _is_doubtful(looks, x_m, counts, is_seen, smallest_m):
         verdict, again = 'unclear', not asked
     if named or tool:
@@ -391,7 +459,11 @@ def judge(model: ArmModel, checks: Sequence[Measured], smallest_m: float = SMALL
         found = [change(x_m[:, i]) for i in range(x_m.shape[1])]
     # Where nothing is named, the newest check against all before it: no place is chosen.
     place = at if named or tool else T - 1
-    sizes = [step(x, place) if T > 1 else (float(x[0]), np.inf) for x in x_m.T]
+    if drifts and (named or tool):
+        about = days, line.at
+        sizes = [(float(weights @ x), _scatter(x, *about) * _length(weights)) for x in x_m.T]
+    else:
+        sizes = [step(x, place) if T > 1 else (float(x[0]), np.inf) for x in x_m.T]
     return Checked(
         verdict,
         total,
@@ -412,7 +484,42 @@ def judge(model: ArmModel, checks: Sequence[Measured], smallest_m: float = SMALL
         again,
         noise,
         x_m[:, : len(levers)],
+        trend,
+        in_days,
+        next_in,
+        drifts,
+        checks[-1].when_s,
     )
+
+
+def _days(checks: Sequence[Measured]) -> tuple[FloatArray, bool]:
+    """Return when checks were made, days since the first, (T,), and whether that is known.
+
+    Where a time is missing, or none is later than the one before, they are numbered.
+    """
+    when = np.array([one.when_s for one in checks])
+    if np.isfinite(when).all() and np.all(np.diff(when) > 0.0):
+        return (when - when[0]) / 86_400.0, True
+    return np.arange(float(len(checks))), False
+
+
+def _before_and_after(T: int, at: int) -> FloatArray:
+    """Return weights whose sum with results is the change of their mean before one, (T,)."""
+    weights = np.full(T, 1.0 / (T - at))
+    weights[:at] = -1.0 / at if at else 0.0
+    return weights
+
+
+def _scatter(values: FloatArray, days: FloatArray, at: int) -> float:
+    """Return the scatter of results (T,) or (T, n) about drifts from one check on."""
+    line = np.maximum(0.0, days - days[at])
+    basis = np.linalg.qr(np.stack((np.ones(len(days)), line), axis=1))[0]
+    left = values - basis @ (basis.T @ values)
+    return float(np.sqrt(np.sum(left**2) / (len(days) - 2.0)))
+
+
+def _length(weights: FloatArray) -> float:
+    return float(np.linalg.norm(weights))
 
 
 def _without(one: Seen, taken: FloatArray) -> Seen:
@@ -522,12 +629,14 @@ def _single(looks: Sequence[Seen], x_m: FloatArray, counts: BoolArray, is_seen: 
 
 
 def _named(
-    looks: Sequence[Seen], at: int, noise: float, is_seen: BoolArray
+    looks: Sequence[Seen], weights: FloatArray, noise: float, is_seen: BoolArray
 ) -> tuple[tuple[int, ...], bool]:
-    """Return the joints that a change may be of, and whether it may be a marker's."""
-    rests = np.array([one.rest for one in looks])
-    step = rests[at:].mean(axis=0) - rests[:at].mean(axis=0)
-    variance = noise**2 * (1.0 / at + 1.0 / (len(looks) - at))
+    """Return the joints that a change may be of, and whether it may be a marker's.
+
+    ``weights``: (T,); the change of the readings is the sum of weights times checks.
+    """
+    step = weights @ np.array([one.rest for one in looks])
+    variance = noise**2 * float(weights @ weights)
     last = looks[-1]
     squares = np.where(is_seen, np.sum(last.joints**2, axis=0), np.inf)
     gains = 0.5 * (last.joints.T @ step) ** 2 / squares / variance

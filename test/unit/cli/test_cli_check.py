@@ -3,6 +3,7 @@
 
 import json
 from dataclasses import replace
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import numpy as np
@@ -72,6 +73,29 @@ def test_day_by_day_until_a_joint_has_changed(run, arm, tmp_path):
     text = remaster(*args, '--baseline', tmp_path / 'compensation.json').stdout
     assert 'changed: Changed since check 13 (day12): joint_4' in text
     assert 'joint_1: looks like a sensor that was moved' in text
+
+
+def test_a_drift_is_told_with_the_day_of_the_next_check(run, arm, tmp_path):
+    """A check a day by what sessions state; the history keeps the times."""
+    first = datetime(2026, 11, 1, tzinfo=UTC)
+    found = {}
+    for day in range(26):
+        folder = write(tmp_path / f'day{day}', arm.check(arm.joint(3, 1.2e-5 * max(0, day - 4))))
+        header = folder / 'session.yaml'
+        created = (first + timedelta(days=day)).isoformat()
+        header.write_text(f'{header.read_text()}created: "{created}"\n')
+        found = run(folder)
+        if found['trend'] is not None or found['verdict'] == 'changed':
+            break
+    assert found['trend'] is not None, found['text']
+    assert found['trend']['joints'] == ['joint_4']
+    assert found['text'].startswith('Drifting: joint_4, 0.')
+    assert found['next_check'].startswith('2026-1')
+    args = ('check', folder, '--baseline', tmp_path / 'compensation.json')
+    page = tmp_path / 'check.html'
+    text = remaster(*args, '--history', tmp_path / 'arm.jsonl', '--out', page).stdout
+    assert text.startswith(f'Drifting: joint_4, {found["trend"]["size_mm"]:.2f} mm at the tool in')
+    assert '<h1>Drifting</h1>' in page.read_text(encoding='utf-8')
 
 
 def test_no_check_that_shows_a_change_says_that_none_has_changed(run, arm, tmp_path):

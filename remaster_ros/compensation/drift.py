@@ -1,0 +1,108 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Does a series of checks drift, since when, how fast, and when does that matter?
+
+Results x₁ … x_T at times t are a constant and noise, until from a check s on they are a line of a
+slope that is not known: μ + β max(0, t − t_s). Mean and noise are integrated out under their
+invariant priors as for a step (`checking`), the slope under normal priors of several widths, in
+standard deviations of a result a day, and s under a prior: the mean of the odds is an e-process
+again, at most 1 as long as nothing changes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import stdtrit
+
+from remaster_ros.types import FloatArray
+
+RATES = (0.01, 0.03, 0.1, 0.3, 1.0)
+"""Widths of the priors of a slope, in standard deviations of a result a day: alike likely."""
+FROM_THE_FIRST = 0.5
+"""Prior that a drift has been there since the first check; the rest is for a later onset."""
+BATCHES = 6
+"""Batches that the wander about a drift is told from: two of their numbers are its parameters."""
+LONGEST_DAYS = 30.0
+"""A drift is looked after at least so often."""
+
+
+@dataclass(frozen=True)
+class Drift:
+    """A line in a series of T results from one of them on."""
+
+    evidence: float  # Of the e-process of all drifts
+    at: int  # The first check of the line
+    # From there to the newest check, where the drift is most likely; half of its 95 % interval,
+    # infinite where there are too few results
+    size: float
+    half: float
+    days: float  # How long that took
+    weights: FloatArray  # The size is the sum of weights times results, (T,)
+
+    def days_left(self, smallest: float) -> float:
+        """Days until a drift of the largest likely slope is as large as what matters; at least 0.
+
+        ``smallest``: what matters.
+        """
+        slope = (abs(self.size) + self.half) / self.days
+        return max(0.0, (smallest - abs(self.size)) / slope)
+
+
+def drift(x: FloatArray, days: FloatArray) -> Drift:
+    """Return the drift that a series (T,) shows; days (T,) rise."""
+    T = len(x)
+    none = Drift(1.0, 0, 0.0, np.inf, 0.0, np.zeros(T))
+    if T < 3 or days[-1] <= days[0]:
+        return none
+    onsets = np.arange(T - 1)
+    lines = np.maximum(0.0, days[None, :] - days[onsets, None])
+    lines = lines - lines.mean(axis=1, keepdims=True)
+    squares_of_line = np.sum(lines**2, axis=1)
+    # Of checks at one and the same time a line has none.
+    is_any = squares_of_line > 1e-12 * squares_of_line.max()
+    squares_of_line = np.where(is_any, squares_of_line, 1.0)
+    off = x - x.mean()
+    squares = float(off @ off)
+    slope = np.where(is_any, lines @ off / squares_of_line, 0.0)
+    share = np.zeros(T - 1) if squares <= 0.0 else slope**2 * squares_of_line / squares
+    share = np.minimum(share, 1.0)
+    odds = np.zeros(T - 1)
+    for rate in RATES:
+        # Variance of the slope over that with its prior.
+        kept = 1.0 / (1.0 + rate**2 * squares_of_line)
+        left = np.maximum(1.0 - share * (1.0 - kept), 1e-300)
+        odds += np.sqrt(kept) * left ** (-0.5 * (T - 1.0)) / len(RATES)
+    odds = np.where(is_any, odds, 1.0)
+    prior = np.full(T - 1, FROM_THE_FIRST)
+    later = onsets[1:].astype(float)
+    prior[1:] = (1.0 - FROM_THE_FIRST) / (later * (later + 1.0))
+    # What is left of the prior is for an onset that is still to come.
+    evidence = float(prior @ odds + (1.0 - FROM_THE_FIRST) / (T - 1.0))
+    at = int(np.argmax(np.where(is_any, prior * odds, 0.0)))
+    span = float(days[-1] - days[at])
+    weights = lines[at] / squares_of_line[at] * span
+    size = float(weights @ x)
+    half = np.inf
+    if T > 3:
+        left_over = off - slope[at] * lines[at]
+        variance = float(left_over @ left_over) / (T - 2.0)
+        std = float(np.sqrt(variance * float(weights @ weights)))
+        half = max(float(stdtrit(T - 2.0, 0.975)) * std, _wander(left_over, weights))
+    return Drift(evidence, at, size, half, span, weights)
+
+
+def _wander(left: FloatArray, weights: FloatArray) -> float:
+    """Return half of the 95 % interval of a drift by how what it leaves (T,) wanders.
+
+    Means of what is left of results that follow one another, of a sixth of the series at most:
+    where days resemble one another they differ by more than their scatter says.
+    """
+    T = len(left)
+    size = T // BATCHES
+    count = T // size if size else 0
+    if count < BATCHES:
+        return 0.0
+    means = left[T - count * size :].reshape(count, size).mean(axis=1)
+    variance = float(means @ means) / (count - 2.0) * size
+    return float(stdtrit(count - 2.0, 0.975)) * float(np.sqrt(variance * (weights @ weights)))
