@@ -12,8 +12,8 @@ PAGE = Path(__file__).parent / 'command-line.md'
 COMMON = {'--help', '--seed', '--quiet', '--no-figures'}
 HEAD = """# Command line
 
-Written by `make docs` from the parsers; a test keeps it equal. `remaster VERB --help` shows the
-same.
+This page lists the commands with all options. Written by `make docs` from the parsers; a test
+keeps it equal. `remaster VERB --help` shows the same.
 
 Every verb also takes `--help`, `--seed SEED` (of all randomness, default 0), `--quiet` (print
 nothing but errors) and `--no-figures`. `remaster --version` prints the version,

@@ -29,8 +29,9 @@ FIRST = (
 HEAD = """\
 # Parameters of the nodes
 
-Written by `make docs` from the dataclass `Parameters` of each node; a test keeps it equal.
-Set them in a parameter file (`--ros-args --params-file my.yaml`; config/real.yaml is one to copy)
+This page lists the parameters of the nodes, for parameter files. Written by `make docs` from the
+dataclass `Parameters` of each node; a test keeps it equal. Set them in a parameter file
+(`--ros-args --params-file my.yaml`; config/real.yaml is one to copy)
 or one by one (`--ros-args -p settle_s:=5.0`). ROS applies sections and `-p` in the order in which
 their names appear, `-p` under the name `/**`: behind a parameter file `-p` takes precedence,
 unless the file has a section `/**`; the shipped ones have none. A name that a node does not know,
