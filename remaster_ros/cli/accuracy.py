@@ -51,7 +51,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Judge the offsets, print a table, write JSON with --out."""
+    """Evaluate offsets on a session, print a table, write JSON with --out."""
     session = read_to_fit(args.session)
     fit = read_fit(args.offsets)
     chain = SerialChain.from_urdf(session.urdf, session.base_link, session.tip_link)
@@ -81,16 +81,16 @@ def run(args: argparse.Namespace) -> int:
 
 
 def shown_offsets(chain: SerialChain, offsets: FloatArray) -> dict[str, dict[str, float]]:
-    """Return the offsets in degrees and, where joints slide, theirs in mm."""
-    found: dict[str, dict[str, float]] = {'joint_offsets_deg': {}}
+    """Return the offsets by joint name, in degrees and, for prismatic joints, in mm."""
+    by_unit: dict[str, dict[str, float]] = {'joint_offsets_deg': {}}
     shown = (chain.shown_scale * offsets).tolist()
     for name, unit, value in zip(chain.joint_names, chain.shown_units, shown, strict=True):
-        found.setdefault(f'joint_offsets_{unit}', {})[name] = value
-    return found
+        by_unit.setdefault(f'joint_offsets_{unit}', {})[name] = value
+    return by_unit
 
 
 def warn_of_another_urdf(fit: Fit, session: Session, path: Path) -> None:
-    """Warn where the offsets were fitted on another model of the robot."""
+    """Warn if the offsets were fitted with another URDF."""
     if fit.robot and fit.robot.urdf_sha256 != session.urdf_sha256:
         log.warning(
             "%s: fitted with another URDF than this session's; the joints have the same names, "
@@ -100,7 +100,7 @@ def warn_of_another_urdf(fit: Fit, session: Session, path: Path) -> None:
 
 
 def warn_of_harm(judged: OffsetsJudgement, path: Path) -> None:
-    """Warn where the error is larger with the offsets than without them."""
+    """Warn if the error is larger with the offsets than without."""
     for split, metrics in judged.accuracy.items():
         errors = {} if metrics is None else metrics['post_registration']
         if errors is None or errors.get('after') is None:
@@ -119,7 +119,7 @@ def warn_of_harm(judged: OffsetsJudgement, path: Path) -> None:
 
 
 def table(judged: OffsetsJudgement) -> str:
-    """Return the metrics, one a line."""
+    """Return the metrics as text, one per line."""
     lines = [f'{"mean error [95 % interval], mm":{WIDTH + 2}s} {"before":28s} after']
     for split, metrics in judged.accuracy.items():
         if metrics is None:
@@ -144,7 +144,7 @@ def table(judged: OffsetsJudgement) -> str:
 
 
 def interval(metric: dict[str, Any]) -> str:
-    """Return mean and interval as text."""
+    """Return mean and interval of a metric as text."""
     if 'mean_deg' in metric:
         low, high = metric['interval95_deg']
         return f'{metric["mean_deg"]:.4f} [{low:.4f}, {high:.4f}] deg'

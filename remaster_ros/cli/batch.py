@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fit, discover and check many sessions: a row each, resumable, and a page over all.
 
-Sessions are handed out to workers that stay: processes of this computer, started anew and not
-forked, or those of a Dask scheduler. A row is known by what it was made of, so that a batch that
-was interrupted, by whatever, does the rest when it is called again.
+Sessions are distributed to workers that are kept: spawned processes of this computer, or those of
+a Dask scheduler. The key of a row is a checksum of its inputs, so that an interrupted batch does
+the remaining sessions when it is called again.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ log = logging.getLogger('remaster_ros')
 
 @dataclass(frozen=True)
 class Job:
-    """A session to work on; all of it can be sent to another process."""
+    """A session to evaluate; can be sent to another process."""
 
     key: str  # Of its files, this version, the seed and the baseline
     # Its folder, and where its results go
@@ -107,7 +107,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Do what is not done yet, a row each; then write the page."""
+    """Evaluate all sessions without a row yet; then write the page."""
     baseline = '' if args.baseline is None else str(args.baseline.resolve())
     folders = list(dict.fromkeys(folder.resolve() for folder in args.session))
     make_folder(args.out)
@@ -119,8 +119,8 @@ def run(args: argparse.Namespace) -> int:
             log.warning('%s', rows.lost)
         said = _said(rows, args.out / ROWS)
         done = {key: row for key, row in said.items() if row.get('status') in FINAL}
-        # Copies of a session are one.
-        left = list({job.key: job for job in jobs if job.key not in done}.values())
+        # Copies of a session have one row.
+        remaining = list({job.key: job for job in jobs if job.key not in done}.values())
         with progress_bar(args.quiet or args.json) as progress:
             worked_on = 0
 
@@ -131,29 +131,29 @@ def run(args: argparse.Namespace) -> int:
                 if row != said.get(job.key):
                     rows.append(row)
                 worked_on += 1
-                progress('sessions', worked_on / len(left))
+                progress('sessions', worked_on / len(remaining))
 
-            if left and args.scheduler is not None:
+            if remaining and args.scheduler is not None:
                 with _scheduler(args.scheduler, insecure=args.insecure) as (executor, workers):
-                    work_off(left, worked, lambda: executor, AHEAD * workers, finished)
-            elif left:
-                count = min(args.workers, len(left))
-                work_off(left, worked, lambda: _pool(count), count, finished)
+                    work_off(remaining, worked, lambda: executor, AHEAD * workers, finished)
+            elif remaining:
+                count = min(args.workers, len(remaining))
+                work_off(remaining, worked, lambda: _pool(count), count, finished)
     finally:
         rows.close()
     # A session may have been moved since, or be a copy.
-    found = [{**done[job.key], 'session': job.session} for job in jobs]
+    rows_of_page = [{**done[job.key], 'session': job.session} for job in jobs]
     from remaster_ros.reports.batch_page import summary_of, write_batch_page
 
-    over_all = summary_of(found)
-    write_batch_page(args.out / PAGE, found, over_all)
-    content = {'format': FORMAT, 'rows': found, **over_all}
+    over_all = summary_of(rows_of_page)
+    write_batch_page(args.out / PAGE, rows_of_page, over_all)
+    content = {'format': FORMAT, 'rows': rows_of_page, **over_all}
     tell(args, content, *over_all['lines'], f'written: {args.out / PAGE}')
-    return 0 if any(row['status'] == 'done' for row in found) else 1
+    return 0 if any(row['status'] == 'done' for row in rows_of_page) else 1
 
 
 def _refuse_foreign(folder: Path) -> None:
-    """Refuse a folder in which another command has put its results, or a session its rows."""
+    """Raise InputError if the folder has results of another command, or a session."""
     from remaster_ros.reports.fit_json import DISCOVERY_FILE, FIT_FILE, WRITTEN
     from remaster_ros.session.reader import HEADER
 
@@ -168,7 +168,7 @@ def _refuse_foreign(folder: Path) -> None:
 
 
 def _job(folder: Path, out: Path, seed: int, baseline: str) -> Job:
-    """Return the work on a session; what cannot be read becomes its row's error."""
+    """Return the job of a session; an unreadable file becomes the error of its row."""
     made_of = hashlib.sha256(f'{__version__} {seed}'.encode())
     files = sorted(
         path for path in folder.glob('*') if path.suffix in _READ or path.name == MANIFEST
@@ -181,9 +181,9 @@ def _job(folder: Path, out: Path, seed: int, baseline: str) -> Job:
 
 
 def _digest(path: Path) -> str:
-    """Return the SHA-256 of a file; '' of anything but a regular file that can be read.
+    """Return the SHA-256 of a file; '' if it is not a readable regular file.
 
-    A pipe has no end for a reader whose writer never comes, nor has a device.
+    Reading a pipe or a device may never end.
     """
     try:
         if not path.is_file():
@@ -198,23 +198,19 @@ _READ = ('.yaml', '.csv', '.urdf', '.xml')
 
 
 def _said(rows: Journal, path: Path) -> dict[str, dict[str, Any]]:
-    """Return the last row of each key."""
-    found = {}
+    """Return the last row of each key in the journal of rows."""
+    rows_by_key = {}
     for line, row in enumerate(rows.records, 1):
         if row.get('format') != FORMAT or not isinstance(row.get('key'), str):
             raise InputError(f'{path}, line {line}: is no row of a batch; name another folder')
-        found[row['key']] = {name: value for name, value in row.items() if name != 'crc32'}
-    return found
-
-
-# What a worker does
+        rows_by_key[row['key']] = {name: value for name, value in row.items() if name != 'crc32'}
+    return rows_by_key
 
 
 def worked(job: Job) -> dict[str, Any]:
-    """Fit, discover and check a session; return what its row says.
+    """Fit, discover and check a session in a worker; return the content of its row.
 
-    It is called in a worker. The results are those of the commands with this seed: nothing of them
-    depends on who works, or on what was done before.
+    The results are those of the commands with this seed, whichever worker computes them.
     """
     try:
         return {'status': 'done', **_results(job)}
@@ -230,6 +226,7 @@ def worked(job: Job) -> dict[str, Any]:
 
 
 def _results(job: Job) -> dict[str, Any]:
+    """Return the row of a session; its errors are raised."""
     import numpy as np
 
     from remaster_ros.calibration.fit import fit_session
@@ -246,9 +243,9 @@ def _results(job: Job) -> dict[str, Any]:
     save_fit(fitted, folder / 'fit', figures=False)
     row: dict[str, Any] = {'fit': _of_fit(folder / 'fit' / FIT_FILE)}
     try:
-        found = discover_session(session, rng=np.random.default_rng(job.seed))
+        discovery = discover_session(session, rng=np.random.default_rng(job.seed))
         make_folder(folder / 'discovery')
-        save_discovery(found, folder / 'discovery', figures=False)
+        save_discovery(discovery, folder / 'discovery', figures=False)
         row['discovery'] = _of_discovery(folder / 'discovery' / DISCOVERY_FILE)
     except InsufficientDataError as error:
         row['discovery'] = {'error': str(error)}
@@ -261,6 +258,7 @@ def _results(job: Job) -> dict[str, Any]:
 
 
 def _of_fit(path: Path) -> dict[str, Any]:
+    """Return the columns of a fit.json."""
     content = json.loads(path.read_bytes())
     held_out = (content['accuracy']['validation'] or {}).get('post_registration') or {}
     return {
@@ -275,17 +273,18 @@ def _of_fit(path: Path) -> dict[str, Any]:
     }
 
 
-def _offset(one: Mapping[str, Any]) -> dict[str, Any]:
-    """Return an offset of fit.json, in degrees, or in mm where it has no degrees."""
-    known, unit = one['identifiable'], one.get('unit', 'deg')
-    row = {'joint': one['joint'], 'mean_deg': None, 'std_deg': None}
+def _offset(offset: Mapping[str, Any]) -> dict[str, Any]:
+    """Return an offset of fit.json, in degrees, or in mm for a prismatic joint."""
+    known, unit = offset['identifiable'], offset.get('unit', 'deg')
+    row = {'joint': offset['joint'], 'mean_deg': None, 'std_deg': None}
     row |= {} if unit == 'deg' else {'unit': unit}
-    row |= {f'{key}_{unit}': one[f'{key}_{unit}'] if known else None for key in ('mean', 'std')}
+    row |= {f'{key}_{unit}': offset[f'{key}_{unit}'] if known else None for key in ('mean', 'std')}
     narrower = f'std_if_exactly_drawn_{unit}'
-    return row | ({narrower: one[narrower]} if known and narrower in one else {})
+    return row | ({narrower: offset[narrower]} if known and narrower in offset else {})
 
 
 def _of_discovery(path: Path) -> dict[str, Any]:
+    """Return the columns of a discovery.json."""
     content = json.loads(path.read_bytes())
     return {
         'verdict': content['verdict'],
@@ -302,6 +301,7 @@ def _of_discovery(path: Path) -> dict[str, Any]:
 
 
 def _of_check(job: Job, session: Any) -> dict[str, Any]:
+    """Return the columns of a check against the baseline."""
     from remaster_ros.cli.check import content_of, measured_of
     from remaster_ros.cli.verify import require_same_arm
     from remaster_ros.compensation.checking import SMALLEST_M, judge
@@ -326,10 +326,11 @@ def work_off(
     ahead: int,  # So many jobs are handed out at a time
     finished: Callable[[Any, dict[str, Any]], None],  # Called in the order in which they end
 ) -> None:
-    """Hand jobs out until all have a row.
+    """Distribute jobs to workers until all have a row.
 
-    Where a worker dies, all that were under way are done again, one at a time: so it is known
-    which of them it dies of, and that one's row says so.
+    If a worker dies, all jobs under way are repeated one at a time, so that the row of the fatal
+    job says so. ``make``: creates the workers; ``ahead``: jobs under way at a time; ``finished``:
+    called with each job and its row.
     """
     waiting, deaths = list(reversed(jobs)), dict.fromkeys(map(id, jobs), 0)
     suspects: list[Any] = []
@@ -385,12 +386,13 @@ def work_off(
 
 
 def _died(error: Exception) -> bool:
-    """Whether a worker has ended instead of its work."""
+    """Return whether an error means that a worker process has ended."""
     return isinstance(error, BrokenProcessPool) or type(error).__name__ == 'KilledWorker'
 
 
 def _pool(workers: int) -> ProcessPoolExecutor:
     # What a worker starts with is set before; the latter two would go before the first.
+    """Return the worker processes of this computer."""
     for name in ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS'):
         os.environ[name] = '1'
     # Forked, a worker would have the parent's locks and threads.
@@ -399,7 +401,7 @@ def _pool(workers: int) -> ProcessPoolExecutor:
 
 
 def _end_with_parent() -> None:
-    """End this worker when the batch is killed: it would wait for work for ever."""
+    """End this worker if its parent is killed."""
     parent = multiprocessing.parent_process()
     assert parent is not None
 
@@ -412,7 +414,7 @@ def _end_with_parent() -> None:
 
 @contextmanager
 def _scheduler(address: str, *, insecure: bool) -> Iterator[tuple[Executor, int]]:
-    """Connect to a Dask scheduler; yields its executor and how many workers it has."""
+    """Connect to a Dask scheduler; yield its executor and the number of workers."""
     _refuse_open(address, insecure=insecure)
     try:
         from distributed import Client
@@ -442,7 +444,7 @@ def _scheduler(address: str, *, insecure: bool) -> Iterator[tuple[Executor, int]
 
 
 def _require_this_version(client: Any, address: str) -> None:
-    """Refuse workers that would make rows of another version under the name of this one."""
+    """Raise InputError if workers have another version of this package."""
     try:
         versions = client.run(_version)
     except Exception as error:
@@ -458,11 +460,12 @@ def _require_this_version(client: Any, address: str) -> None:
 
 
 def _version() -> str:
+    """Return the version of this package."""
     return __version__
 
 
 def _refuse_open(address: str, *, insecure: bool) -> None:
-    """Refuse plain TCP to another computer: whoever reads or answers it decides what is run."""
+    """Raise InputError for plain TCP to another computer, whose peer decides what is executed."""
     parts = urllib.parse.urlsplit(address if '://' in address else f'tcp://{address}')
     host = parts.hostname or ''
     try:

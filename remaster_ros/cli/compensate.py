@@ -69,7 +69,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Read, correct, check, write and state what was done."""
+    """Correct the table, write it, and print a summary."""
     compensation = read_compensation(args.compensation)
     if args.out.exists() and args.out.samefile(args.table):
         raise InputError(f'{args.out}: is the table itself; name another file for --out')
@@ -113,11 +113,12 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _shown(chain: SerialChain, joint: int, value: float, digits: int = 2) -> str:
-    """Return a place or change of a joint with its unit."""
+    """Return a position or change of a joint with its unit."""
     return chain.shown_offset(joint, value, digits).replace('deg', 'degrees')
 
 
 def _temperature(table: TextTable, columns: Columns, told: float | None) -> FloatArray | None:
+    """Return the temperature of each row, degrees Celsius; None if unknown."""
     column = columns.one('temperature')
     if told is not None:
         return np.full(len(table.rows), told)
@@ -133,7 +134,7 @@ def _refuse_beyond(
     compensator: Compensator,
     args: argparse.Namespace,
 ) -> None:
-    """Refuse changes that no correction makes, and commands beyond the joints' limits."""
+    """Raise InputError for implausible changes, and commands beyond the joints' limits."""
     chain, joints = compensator.model.chain, compensator.joint_names
     change, most = np.abs(result - given), np.radians(args.max_change_deg) * chain.per_radian
     for row, j in np.argwhere(change > most + ROUNDING_RAD)[:1]:
@@ -154,7 +155,7 @@ def _refuse_beyond(
 
 
 def _text(table: TextTable, columns: Columns, joints: FloatArray, digits: Sequence[int]) -> str:
-    """Return the table with other joint positions, all else as it was."""
+    """Return the table with other joint positions, everything else unchanged."""
     separator = table.separator if len(table.separator) == 1 else ','
     text = io.StringIO()
     writer = csv.writer(text, delimiter=separator, lineterminator='\n')
@@ -176,6 +177,7 @@ def _facts(
     done: Correction,
     times_s: FloatArray | None,
 ) -> dict[str, Any]:
+    """Return the summary as plain data."""
     chain, joints = compensator.model.chain, compensator.joint_names
     shown = chain.shown_scale * np.abs(result - given).max(axis=0, initial=0.0)
     change: dict[str, dict[str, float]] = {'change_deg': {}}
@@ -206,6 +208,7 @@ def _facts(
 
 
 def _summary(facts: dict[str, Any], out: Path) -> str:
+    """Return the summary as text."""
     residual, most = facts['residual_mm'], []
     for unit in ('deg', 'mm'):
         if of_joints := facts.get(f'change_{unit}'):

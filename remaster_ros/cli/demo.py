@@ -71,7 +71,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> NoReturn:
-    """Become the demo's process."""
+    """Replace this process by that of the demo."""
     out = Path(args.out) if args.out else free_folder()
     become(
         'demo',
@@ -91,10 +91,10 @@ def run(args: argparse.Namespace) -> NoReturn:
 
 
 def _collection(candidates: int | None, hidden: bool) -> dict[str, object]:
-    """Return the cell and the number of candidates.
+    """Return the parameters of the collection: cell and number of candidates.
 
-    Poses that are chosen for the offsets keep the fewest that a search for causes needs; one that
-    is to show causes has more of them.
+    An optimal design for the offsets keeps the fewest poses that a search for causes needs; a demo
+    that looks for causes has more of them.
     """
     if candidates is None and not hidden:
         return {

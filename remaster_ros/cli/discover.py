@@ -52,11 +52,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Search, extend, measure the gain, write, and print a summary of a few lines."""
+    """Search for causes, write the results, and print a short summary."""
     session, named = read_together(args.session)
     other = None if args.confirm is None else read_session(args.confirm)
     if other is not None:
-        # Not after the long search.
+        # Before the long search.
         require_other_session(session, other)
     pairs: tuple[tuple[Named, Named], ...] = ()
     if args.decide is not None:
@@ -76,7 +76,7 @@ def run(args: argparse.Namespace) -> int:
             try:
                 confirmation = confirm(found, other, np.random.default_rng(args.seed))
             except InsufficientDataError as error:
-                # What was found stays, whatever the other session is like.
+                # The result of the first session remains, whatever the other one is.
                 refusal = InsufficientDataError(f'the other session: {error}')
         progress('writing', 0.0)
         report = save_discovery(

@@ -81,6 +81,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _motor(text: str) -> tuple[str, MotorNumber]:
+    """Argument type: a joint and the numbers of its motor."""
     name, _, rest = text.partition('=')
     parts = rest.split(',')
     try:
@@ -97,6 +98,7 @@ def _motor(text: str) -> tuple[str, MotorNumber]:
 
 
 def _frame(text: str) -> tuple[str, str]:
+    """Argument type: a sensor and its frame."""
     sensor, _, frame = text.partition('=')
     if not (sensor and frame):
         raise argparse.ArgumentTypeError(f'{text!r} is not SENSOR=FRAME, such as mocap=bar_link')
@@ -104,7 +106,7 @@ def _frame(text: str) -> tuple[str, str]:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Read, compare with the whole correction, write, and state what is left out."""
+    """Write a correction in a form, and print its difference to the whole correction."""
     for given, forms, option in (
         (args.base, ('ur', 'ros2_control', 'rising'), '--base'),
         (args.driver_param, ('ros2_control',), '--driver-param'),
@@ -149,7 +151,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _transforms(args: argparse.Namespace, compensation: Compensation) -> int:
-    """Write the registrations for tf, and the lines that publish them."""
+    """Write the registrations for tf, with a launch file that publishes them."""
     transforms = static_transforms(compensation, dict(args.frame))
     files = transform_files(transforms)
     _write(args.out, files)
@@ -171,6 +173,7 @@ def _transforms(args: argparse.Namespace, compensation: Compensation) -> int:
 
 
 def _write(folder: Path, files: Mapping[str, str]) -> None:
+    """Write files into a new folder."""
     with undone_on_failure():
         make_new_folder(folder)
         for name, text in files.items():

@@ -12,8 +12,8 @@ from pathlib import Path
 from remaster_ros.cli.console import progress_bar, tell
 from remaster_ros.cli.options import add_sessions, integer, number
 
-# What fits and draws is imported where it does so: SciPy and the rest take a second to load, and
-# neither `remaster fit --help` nor a mistyped option needs them.
+# Imports are in the functions that need them: SciPy and others take a second to load, and neither
+# `remaster fit --help` nor a mistyped option needs them.
 log = logging.getLogger('remaster_ros')
 
 
@@ -55,7 +55,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Fit, write, and print a summary of a few lines."""
+    """Fit, write the results, and print a short summary."""
     import numpy as np
 
     from remaster_ros.calibration.fit import fit_session

@@ -239,7 +239,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _couple(text: str) -> tuple[str, tuple[str, Literal[1, -1]]]:
-    """Argument type: a joint, and one that is added to it or subtracted."""
+    """Argument type: a joint, and another one that is added to it or subtracted."""
     name, sign, other = text.partition('=')
     if not (name and sign and other.lstrip('+-')):
         raise argparse.ArgumentTypeError(f'{text!r} is not JOINT=JOINT, such as J3=J2')
@@ -247,7 +247,7 @@ def _couple(text: str) -> tuple[str, tuple[str, Literal[1, -1]]]:
 
 
 def _stretch(text: str) -> Stretch:
-    """Argument type: what is moved, and between which observations."""
+    """Argument type: what was moved, and between which observations."""
     what, at, between = text.partition('@')
     since, dash, until = between.partition('-')
     if at and not (dash and all(end.isdigit() or not end for end in (since, until))):
@@ -266,7 +266,7 @@ def _turn(text: str) -> tuple[str, float]:
 
 
 def _pulses(text: str) -> tuple[float, ...]:
-    """Argument type: how many pulses are a degree, of each joint."""
+    """Argument type: pulses per degree of each joint."""
     counts = tuple(number(-1e9, 1e9)(part) for part in text.split(','))
     if not all(counts):
         raise argparse.ArgumentTypeError(f'{text!r}: no joint has 0 pulses a degree')
@@ -282,7 +282,7 @@ def _offset(text: str) -> tuple[str, float]:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Read, show what was read, try it against the robot, write."""
+    """Read the files, show what was read, test it with the robot, and write a session."""
     if len(args.files) == 1 and (args.files[0] / HEADER).exists():
         return _mend(args)
     if args.urdf is None and args.cell is None:
@@ -305,11 +305,11 @@ def run(args: argparse.Namespace) -> int:
         chain = SerialChain.from_urdf(urdf, base, args.tip_link or cell.robot.tip_link)
     with progress_bar(args.quiet or args.json) as progress:
         progress('reading', 0.0)
-        told = _session_options(args, cell)
-        rows = oriented(_read(args, urdf, chain).in_order(), chain, told)
+        options = _session_options(args, cell)
+        rows = oriented(_read(args, urdf, chain).in_order(), chain, options)
         if args.on_tool:
             rows = from_tool(rows)
-        options, counted = as_counted(rows, chain, told)
+        options, counted = as_counted(rows, chain, options)
         notes = f'imported from {", ".join(path.name for path in args.files)}'
         rng = np.random.default_rng(args.seed)
         session, how = assemble(rows, urdf, chain, options, rng, notes)
@@ -326,7 +326,7 @@ def run(args: argparse.Namespace) -> int:
         sense = check_sense(session, rows, progress, args.never_mastered)
     session, turned = without_whole_turns(session, chain)
     how += [*counted, *filter(None, [turned]), *_names_not_used(args, rows)]
-    # RAPID is written by others than ABB too: such targets do not tell the maker.
+    # Other makers than ABB use RAPID: such targets do not identify the maker.
     if rows.maker == 'KUKA' and not args.accuracy_option:
         how.append(
             "was the maker's accuracy option ($ABS_ACCUR) on? The result belongs to that state "
@@ -349,7 +349,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _mend(args: argparse.Namespace) -> int:
-    """Write a session as told, its mistake undone; refuse where it does not fit its robot then."""
+    """Write a session with its mistake corrected; raise InputError if it still does not fit."""
     folder: Path = args.files[0]
     points = [name.lower() for name in args.points]
     if args.points and points not in ([*'xyz'], [*'yxz'], ['y_m', 'x_m', 'z_m']):
@@ -396,10 +396,12 @@ def _mend(args: argparse.Namespace) -> int:
 
 
 def _written(out: Path) -> str:
+    """Return the message on the written session."""
     return f'written: {out}; go on with: remaster fit {quote(str(out))} --out …'
 
 
 def _read(args: argparse.Namespace, urdf: str, chain: SerialChain) -> RawRows:
+    """Return the rows of the files."""
     bags = [path for path in args.files if is_bag(path)]
     if bags:
         if len(args.files) > 1:
@@ -433,6 +435,7 @@ def _read(args: argparse.Namespace, urdf: str, chain: SerialChain) -> RawRows:
 
 
 def _session_options(args: argparse.Namespace, cell: Workcell | None) -> SessionOptions:
+    """Return the options of the session."""
     sensor, marker, place, std = args.sensor, args.marker, args.marker_mm, args.marker_std_mm
     if cell is not None:
         sensor = sensor or cell.aim_at
@@ -455,7 +458,7 @@ def _session_options(args: argparse.Namespace, cell: Workcell | None) -> Session
 
 
 def _names_not_used(args: argparse.Namespace, rows: RawRows) -> Iterator[str]:
-    """Say which names were given for rows that the table itself names otherwise."""
+    """Yield a warning for each name option that the table overrides."""
     for what, given in (('sensor', args.sensor), ('marker', args.marker)):
         named = sorted(set(rows.labels.get(what, ())))
         if given and named and given not in named:
@@ -463,7 +466,7 @@ def _names_not_used(args: argparse.Namespace, rows: RawRows) -> Iterator[str]:
 
 
 def _as_text(rows: RawRows, session: Session, how: list[str]) -> str:
-    """Return what was read and how it was understood."""
+    """Return what was read, and how it was interpreted, as text."""
     width = max(map(len, rows.columns))
     lines = [*rows.description]
     lines += [f'  {column:{width}s}  {meaning}' for column, meaning in rows.columns.items()]
@@ -480,6 +483,7 @@ def _as_text(rows: RawRows, session: Session, how: list[str]) -> str:
 
 
 def _as_json(out: Path | None, rows: RawRows, sense: Sense) -> dict[str, Any]:
+    """Return the same for --json."""
     return {
         'session': None if out is None else str(out),
         'columns': rows.columns,

@@ -48,18 +48,18 @@ from remaster_ros.session.packages import package_of
 from remaster_ros.session.robot_description import is_xacro, read_description
 from remaster_ros.session.workcell import LINK_RADIUS_M, Workcell, parse_cell
 
-# Tool poses by which the joints to hold are compared; poses that are planned to find the ranges.
+# Tool poses for the comparison of held joints; candidate poses for the ranges.
 COMPARED = 80
 TRIED = 200
-# Fewer that can be visited do not show ranges.
+# Least number of usable poses that determine ranges.
 FEWEST = 12
 # Poses to fit: places of sensor and marker and six offsets are 15 unknowns, for which five poses
 # give as many readings; ten leave as many to tell how well they agree.
 FEWEST_FITTED = 10
-# How far the sensor stands behind what the arm reaches, m.
+# Distance of the proposed sensor from the workspace, m.
 SENSOR_BEHIND_M = 1.2
 REMEDY = 'give another name with --out'
-# What the nodes are to be told of this robot before its arm moves; no description has it.
+# Parameters that the user has to set before the arm moves; no description has them.
 ASKED = (
     'does the robot publish that its own safety stops it (std_msgs/Bool)? set '
     'emergency_stop_topic of robot_bridge in your copy of real.yaml to that topic, or to none: '
@@ -101,7 +101,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Read the robot, try what is proposed, write the cell file, and plan in it."""
+    """Propose a cell for the robot, write the cell file, and plan in it."""
     for sensor in args.sensors:
         if sensor not in SENSORS:
             meant = did_you_mean(sensor, SENSORS)
@@ -136,7 +136,7 @@ def run(args: argparse.Namespace) -> int:
     written = f'written: {args.out}; look at its lines marked CHECK\n{ASKED}'
     tell(args, _as_json(args.out, proposal) | planned, _as_text(proposal), text, written)
     if reached < FEWEST_FITTED:
-        # The file stays: what it states may be what is wrong.
+        # The file remains, so that the user can correct it.
         found = f'{reached} poses can be planned in this cell'
         if reached < of:
             found = f'a free way leads to {reached} of the {of} poses that were tried in this cell'
@@ -153,7 +153,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _urdf_file(robot: Path, out: Path, text: str) -> Path:
-    """Return the URDF that the cell names: the robot's own, or what xacro was made into."""
+    """Return the URDF that the cell names: the given one, or the expanded xacro."""
     if not is_xacro(robot):
         return robot
     name = robot.name.removesuffix('.xacro').removesuffix('.urdf')
@@ -171,12 +171,13 @@ def _urdf_file(robot: Path, out: Path, text: str) -> Path:
 def _propose(
     args: argparse.Namespace, text: str, urdf: Path, rng: np.random.Generator
 ) -> CellProposal:
+    """Return the proposed cell."""
     try:
         model = parse_urdf(text)
         base = likely_base(model) if args.base_link is None else args.base_link
         tips = likely_tips(model, base)
         tip = tips[0] if args.tip_link is None else args.tip_link
-        before = moving_before(model, base)
+        carrying = moving_before(model, base)
         chain = SerialChain.from_urdf(text, base, tip)
         reach = reach_of(chain, rng)
         place = args.sensor_at or [
@@ -199,15 +200,15 @@ def _propose(
     except InputError as error:
         raise InputError(f'{args.robot}: {error}') from None
     thickness = link_radius(reach, LINK_RADIUS_M)
-    found, missing = _meshes(text, args.robot, args.package_path)
-    read_mesh = mesh_reader(urdf, [Path(folder) for folder in found])
+    folders, missing = _meshes(text, args.robot, args.package_path)
+    read_mesh = mesh_reader(urdf, [Path(folder) for folder in folders])
     bodies = chain_bodies(text, chain, lambda name: None if name in missing else read_mesh(name))
     return CellProposal(
         source=args.robot.name,
         urdf=os.path.relpath(urdf, args.out.parent),
         chain=chain,
         tips=tips,
-        before=before,
+        before=carrying,
         held=held,
         reach=reach,
         ranges=ranges,
@@ -217,14 +218,14 @@ def _propose(
         sensor_R=place,
         sensors=args.sensors,
         max_angle_deg=angles,
-        mesh_path=found,
+        mesh_path=folders,
         missing_meshes=missing,
         floor_z=floor,
     )
 
 
 def _meshes(text: str, robot: Path, package_path: list[Path]) -> tuple[list[str], list[str]]:
-    """Return the folders in which the collision meshes were found, and those that were not."""
+    """Return the folders of the collision meshes, and the meshes that were not found."""
     folders: dict[str, None] = {}
     missing = []
     for name in mesh_names(text):
@@ -247,13 +248,14 @@ def _meshes(text: str, robot: Path, package_path: list[Path]) -> tuple[list[str]
 
 
 def _cell(proposal: CellProposal, out: Path) -> Workcell:
+    """Return the cell of a proposal, parsed from its text."""
     return parse_cell(cell_text(proposal).encode(), out)
 
 
 def _narrowed(
     p: CellProposal, cell: Workcell, rng: np.random.Generator
 ) -> tuple[CellProposal, Plan]:
-    """Return the proposal with ranges around the poses that can be visited, and these poses."""
+    """Return the proposal with ranges around the usable poses, and these poses."""
     scene = cell.planning_scene(p.chain, without_meshes=bool(p.missing_meshes))
     plan = scene.plan(TRIED, scene.rough_R, rng)
     lost = ', '.join(f'{count} {why}' for why, count in plan.dropped.items())
@@ -267,16 +269,16 @@ def _narrowed(
 
 
 def _reached(scene: PlanningScene, tour: Tour, seed: int) -> tuple[int, int]:
-    """Return to how many poses to fit a free way leads, `FEWEST_FITTED` or fewer, of how many."""
+    """Return how many poses to fit have a free path (at most `FEWEST_FITTED`), and tried."""
     return count_with_free_path(tour, scene.model, free_start(scene.model, seed), FEWEST_FITTED)
 
 
 def _plan(
     cell: Workcell, without_meshes: bool, seed: int
 ) -> tuple[dict[str, Any], str, tuple[int, int]]:
-    """Plan in the new cell as the nodes do, with as few ways as tell whether there are any.
+    """Return a plan in the new cell as JSON and as text, and counts of poses with a free path.
 
-    Returns it as JSON, in words, and what `count_with_free_path` does.
+    Planned as by the nodes, with only as many paths as show whether there are any.
     """
     chain = cell.chain()
     scene = cell.planning_scene(chain, without_meshes=without_meshes)
@@ -296,6 +298,7 @@ def _plan(
 
 
 def _as_text(p: CellProposal) -> str:
+    """Return the proposal as text."""
     chain, held = p.chain, p.held
     lines = [
         f'{chain.name}: {len(chain)} joints between {chain.base_link} and {chain.tip_link}'
@@ -321,6 +324,7 @@ def _as_text(p: CellProposal) -> str:
 
 
 def _as_json(out: Path, p: CellProposal) -> dict[str, Any]:
+    """Return the proposal for --json."""
     held = p.held
     return {
         'cell': str(out),
@@ -337,6 +341,7 @@ def _as_json(out: Path, p: CellProposal) -> dict[str, Any]:
 
 
 def _kinematics_as_json(kinematics: InverseKinematics) -> dict[str, Any]:
+    """Return the inverse kinematics for --json."""
     off = kinematics.difference
     return {
         'way': kinematics.method,

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The ``remaster`` command: run the verb, turn errors into one line and an exit status."""
+"""The ``remaster`` command: runs a verb; errors become one line and an exit status."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ TRIM_THRESHOLD, MMAP_THRESHOLD = -1, -3
 
 
 def build_parser(chosen: str | None) -> argparse.ArgumentParser:
-    """Return the parser with every verb, and with the options of the chosen one."""
+    """Return the parser with all verbs, and the options of the chosen one."""
     parser = Parser(
         prog='remaster',
         description='Remaster a robot arm in place: joint zero-offsets with honest uncertainty.',
@@ -78,7 +78,7 @@ def build_parser(chosen: str | None) -> argparse.ArgumentParser:
 
 
 def _mending(args: argparse.Namespace, options: str) -> str:
-    """Return the command that writes the session at hand without the mistake found in it."""
+    """Return the command that writes the session again without the mistake found in it."""
     given = args.session if isinstance(args.session, list) else [args.session]
     if len(given) > 1:
         return 'fit each session by itself: the one with the mistake then names the command'
@@ -87,10 +87,10 @@ def _mending(args: argparse.Namespace, options: str) -> str:
 
 
 def _keep_freed_memory() -> None:
-    """Have the C library keep what arrays leave for the next ones.
+    """Make the C library reuse freed memory instead of returning it to the kernel.
 
-    Given back to the kernel and taken again, with zeros written into every page, it costs a tenth
-    of the time of a large session.
+    Returned and allocated again, with zeros in every page, it takes a tenth of the time of a large
+    session.
     """
     c_library = ctypes.CDLL(None)
     # Of other systems' libraries none has it.
@@ -157,7 +157,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _complete() -> None:
-    """Answer a shell that asks how the line goes on, and exit."""
+    """Answer a shell that completes a line, and exit."""
     # Imported here: it is only of use to a shell.
     import argcomplete
 
@@ -166,6 +166,7 @@ def _complete() -> None:
 
 
 def _complain(message: str) -> None:
+    """Print an error message."""
     print(f'error: {" ".join(message.split())}', file=sys.stderr)
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Argument types of the command line: what cannot be is refused before any work is done."""
+"""Argument types of the command line, which refuse invalid values before any work."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ CANDIDATES = 60
 
 
 class Parser(argparse.ArgumentParser):
-    """A parser whose errors are one line; an option's name is never guessed from its beginning."""
+    """Parser whose errors are one line; options cannot be abbreviated."""
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__(**{**kwargs, 'allow_abbrev': False})
@@ -28,7 +28,7 @@ class Parser(argparse.ArgumentParser):
 
 
 def integer(low: int) -> Callable[[str], int]:
-    """Return an argument type: a whole number of at least `low`."""
+    """Return an argument type: an integer of at least `low`."""
     return _bounded(int, 'a whole number', low)
 
 
@@ -40,7 +40,7 @@ def number(low: float = 0.0, high: float = math.inf, unit: str = '') -> Callable
 def _bounded(
     kind: type[Number], what: str, low: float, high: float = math.inf, unit: str = ''
 ) -> Callable[[str], Number]:
-    """Return an argument type: a finite number of a kind from `low` to `high`."""
+    """Return an argument type: a finite number of type `kind` from `low` to `high`."""
     unit = f' {unit}' if unit else ''
 
     def convert(text: str) -> Number:
@@ -60,7 +60,7 @@ def _bounded(
 
 
 def add_poses(parser: argparse.ArgumentParser) -> None:
-    """Add the numbers of candidate poses."""
+    """Add the options for numbers of candidate poses."""
     for option, low, what in (('--poses', 1, 'to fit'), ('--validation', 0, 'held out')):
         parser.add_argument(
             option,
@@ -83,7 +83,7 @@ def xacro_arguments(given: Iterable[object]) -> dict[str, str]:
 
 
 def add_description(parser: argparse.ArgumentParser) -> None:
-    """Add what a robot description is read with."""
+    """Add the options for reading a robot description."""
     parser.add_argument(
         '--package-path',
         metavar='DIR',
@@ -100,7 +100,7 @@ def add_description(parser: argparse.ArgumentParser) -> None:
 
 
 def names(text: str) -> tuple[str, ...]:
-    """Argument type: distinct names with commas between."""
+    """Argument type: distinct names separated by commas."""
     found = tuple(part.strip() for part in text.split(','))
     if not all(found):
         raise argparse.ArgumentTypeError(f'{text!r} is no list of names with commas between')
@@ -110,7 +110,7 @@ def names(text: str) -> tuple[str, ...]:
 
 
 def add_sessions(parser: argparse.ArgumentParser) -> None:
-    """Add the sessions of ``remaster fit`` and ``remaster discover``."""
+    """Add the session arguments of ``remaster fit`` and ``remaster discover``."""
     parser.add_argument(
         'session',
         metavar='SESSION',

@@ -30,7 +30,7 @@ from remaster_ros.session.files import write_atomically
 from remaster_ros.session.workcell import Workcell, read_cell
 from remaster_ros.types import FloatArray
 
-# Configurations at which the arm may begin that are tried, from zero outwards.
+# Start configurations that are tried, from zero outwards.
 TRIED_STARTS = 200
 
 
@@ -97,7 +97,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Plan, and print what is planned."""
+    """Plan, and print the plan."""
     if args.out is not None:
         check_plan_page(args.out)
     cell = read_cell(args.cell)
@@ -123,6 +123,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _travel(cell: Workcell, scene: PlanningScene, args: argparse.Namespace) -> TravelTime:
+    """Return the travel times of the arm."""
     return TravelTime.of(
         scene.model,
         args.speed_share,
@@ -136,7 +137,7 @@ def _travel(cell: Workcell, scene: PlanningScene, args: argparse.Namespace) -> T
 def _check(
     cell: Workcell, scene: PlanningScene, plan: CollectionPlan, args: argparse.Namespace
 ) -> tuple[dict[str, Any], str]:
-    """Choose and write the configurations of a check; return what is expected, and in words."""
+    """Choose and write the configurations of a check; return its sensitivity (JSON, text)."""
     chain = scene.model.chain
     q = np.unique([visit.q for visit in plan.visits], axis=0)
     if len(q) < CHECK_POSES:
@@ -174,7 +175,7 @@ def planned(
     args: argparse.Namespace,
     progress: Callable[[float], None] = lambda share: None,
 ) -> CollectionPlan:
-    """Return the collection as the nodes plan it, before sensors at their rough places."""
+    """Return the collection as the nodes plan it, with sensors at their rough positions."""
     travel = _travel(cell, scene, args)
     causes = read_causes(args.separate, scene.model.chain.joint_names) if args.separate else ()
     counts = {
@@ -190,9 +191,9 @@ def planned(
 
 
 def free_start(model: CollisionModel, seed: int) -> FloatArray:
-    """Return joints, (k,), at which the arm can stand: zero where it can, else near to it.
+    """Return a free configuration, (k,): zero, or near to it.
 
-    At zero some arms lie stretched out along the floor (a UR does), from where no way is free.
+    At zero some arms lie stretched out along the floor (a UR does), without a free path.
     """
     chain = model.chain
     spread = np.linspace(0.0, np.pi, TRIED_STARTS)[:, None]

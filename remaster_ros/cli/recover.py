@@ -10,7 +10,7 @@ from remaster_ros.cli.console import tell
 from remaster_ros.session.recovery import recover_session
 
 LOST = 3
-"""Exit status of a recovery that had to drop something."""
+"""Exit status of a recovery with losses."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -24,7 +24,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Recover the session; returns the exit status."""
+    """Recover the session; return the exit status."""
     recovery = recover_session(args.session)
     for line in () if args.json else recovery.lost:
         print(f'lost: {line}')

@@ -14,7 +14,7 @@ from remaster_ros.session.bag import BagReader
 from remaster_ros.session.files import undone_on_failure
 
 SHOWN = 5
-"""So many rows that differ are named; the rest is counted."""
+"""Most differing rows that are listed; the others are counted."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -52,7 +52,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Write the session of the bag, or become the replay node's process."""
+    """Write the session of the bag, or replace this process by the replay node."""
     if args.out is not None:
         return _write(args)
     if args.cell is not None:
@@ -70,6 +70,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _write(args: argparse.Namespace) -> int:
+    """Write the session of the bag; compare it with the recorded one."""
     given = {
         '--rate': args.rate is not None,
         '--no-clock': args.no_clock,
@@ -95,18 +96,18 @@ def _write(args: argparse.Namespace) -> int:
     with undone_on_failure(), progress_bar(args.quiet) as progress:
         done = record_from_bag(bag, args.out, cell, lambda share: progress('pairing', share))
     show(args.quiet, f'written: {args.out}, {done.observations} observations')
-    beside = session_beside(folder)
-    if beside is None:
+    recorded = session_beside(folder)
+    if recorded is None:
         show(args.quiet, 'no session holds this bag: there is nothing to compare the rows with')
     else:
-        found = differences(beside, args.out)
-        if found:
-            more = f'; and {len(found) - SHOWN} more' if len(found) > SHOWN else ''
+        lines = differences(recorded, args.out)
+        if lines:
+            more = f'; and {len(lines) - SHOWN} more' if len(lines) > SHOWN else ''
             raise InsufficientDataError(
-                f'{len(found)} rows of {args.out} are not those of {beside}: '
-                f'{"; ".join(found[:SHOWN])}{more}'
+                f'{len(lines)} rows of {args.out} are not those of {recorded}: '
+                f'{"; ".join(lines[:SHOWN])}{more}'
             )
-        show(args.quiet, f'all rows are those of {beside}')
+        show(args.quiet, f'all rows are those of {recorded}')
     if done.torn_bytes:
         raise InsufficientDataError(
             f'{folder}: the last {done.torn_bytes} bytes are no whole message (its writer was '

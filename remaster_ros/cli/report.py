@@ -46,7 +46,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Read or fit, write the page, print the answer in a few lines."""
+    """Read or fit, write the page, print a short answer."""
     fit_path, found_path = parts(args.results)
     session = read_to_fit(args.session)
     chain = SerialChain.from_urdf(session.urdf, session.base_link, session.tip_link)
@@ -80,7 +80,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def as_dict(answer: Answer, out: Path, plan: PlanFacts | None) -> dict[str, Any]:
-    """Return what ``remaster report --json`` prints."""
+    """Return the JSON output."""
     return {
         'report': str(out / REPORT_FILE),
         'mood': answer.mood,

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A session that is to be fitted, read for the verbs of the command line."""
+"""Reading of sessions to fit."""
 
 from __future__ import annotations
 
@@ -18,12 +18,9 @@ log = logging.getLogger('remaster_ros')
 
 
 def read_together(folders: Sequence[Path]) -> tuple[Session, list[str]]:
-    """Read one session or several of one arm, and lines on how their rows are named.
+    """Read one session or several of one arm; return it, and lines on renamed rows.
 
-    Raises
-    ------
-    InputError
-        What cannot be read, or sessions that are not of one arm, by their zero-offsets.
+    Raises InputError if a session cannot be read, or zero-offsets show that arms differ.
     """
     sessions = [(str(folder), read_to_fit(folder)) for folder in folders]
     if len(sessions) == 1:
@@ -36,7 +33,7 @@ def read_together(folders: Sequence[Path]) -> tuple[Session, list[str]]:
 
 
 def _one_arm(session: Session, folder: Path) -> Session:
-    """Refuse reported angles that mean two things: a correction in the controller on, and off."""
+    """Raise InputError if a correction was on for some rows and off for others."""
     on = session.is_corrected
     correction = session.correction
     if correction is not None and correction.is_inside and on.any() and not on.all():
@@ -49,7 +46,7 @@ def _one_arm(session: Session, folder: Path) -> Session:
 
 
 def read_to_fit(folder: Path) -> Session:
-    """Read a session; where joints are outside their limits, look for the mistake behind it."""
+    """Read a session; if joints are outside their limits, search for the mistake in its data."""
     try:
         return _one_arm(read_session(folder), folder)
     except InputError as refused:

@@ -56,7 +56,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Read, judge, print."""
+    """Evaluate a session, and print the verdict."""
     session, compensation = read_session(args.session), read_compensation(args.compensation)
     require_same_arm(session, compensation, args.session)
     found = verify(compensation.compensator, visits(session, args.session))
@@ -68,7 +68,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def visits(session: Session, folder: Path) -> Visits:
-    """Return the rows with what was wanted there; `folder` is for messages."""
+    """Return the rows with desired joint angles; `folder`: for messages."""
     m = session.measurements
     on = _on(session, folder)
     wanted = _wanted(session, folder, on)
@@ -83,22 +83,24 @@ def visits(session: Session, folder: Path) -> Visits:
 
 
 def _together(configuration: IntArray, wanted: FloatArray, units: JointUnits) -> IntArray:
-    """Return the configurations, (n,), those that were visited again as the first time."""
-    found, firsts = configuration.copy(), dict[int, FloatArray]()
-    for one in dict.fromkeys(configuration.tolist()):
-        mine = configuration == one
+    """Return configuration numbers, (n,), with repeated visits numbered as the first one."""
+    numbers, firsts = configuration.copy(), dict[int, FloatArray]()
+    for each in dict.fromkeys(configuration.tolist()):
+        mine = configuration == each
         q = wanted[mine][0]
         near = nearest_solution(np.array(list(firsts.values())), q, units) if firsts else None
-        same = one if near is None else list(firsts)[near]
-        found[mine], firsts[same] = same, firsts.get(same, q)
-    return found
+        same = each if near is None else list(firsts)[near]
+        numbers[mine], firsts[same] = same, firsts.get(same, q)
+    return numbers
 
 
 def _chain(session: Session) -> SerialChain:
+    """Return the arm of the session."""
     return SerialChain.from_urdf(session.urdf, session.base_link, session.tip_link)
 
 
 def _on(session: Session, folder: Path) -> BoolArray:
+    """Return whether the correction was on at each row, (n,)."""
     m = session.measurements
     state = np.full(len(m), -1) if m.correction is None else m.correction
     if session.correction is not None:
@@ -113,6 +115,7 @@ def _on(session: Session, folder: Path) -> BoolArray:
 
 
 def _wanted(session: Session, folder: Path, on: BoolArray) -> FloatArray:
+    """Return the desired joint angles, rad, (n, k)."""
     m = session.measurements
     wanted = np.full_like(m.q, np.nan) if m.wanted is None else m.wanted.copy()
     missing = np.isnan(wanted[:, 0])
@@ -132,17 +135,18 @@ def _wanted(session: Session, folder: Path, on: BoolArray) -> FloatArray:
 
 
 def require_same_arm(session: Session, compensation: Compensation, folder: Path) -> None:
-    """Refuse a session of another arm, and the one that the correction was made of."""
+    """Raise InputError for a session of another arm, and for the one of the correction."""
     chain, robot = _chain(session), compensation.content.robot
-    for what, own, other in (
+    for quantity, session_value, correction_value in (
         ('joints', list(chain.joint_names), robot.joint_names),
         ('base link', session.base_link, robot.base_link),
         ('tip link', session.tip_link, robot.tip_link),
     ):
-        if own != other:
+        if session_value != correction_value:
             raise InputError(
-                f'{folder}: its {what} {_named(own)} are not those of {compensation.path} '
-                f'({_named(other)}); give the correction of this arm'
+                f'{folder}: its {quantity} {_named(session_value)} are not those of '
+                f'{compensation.path} ({_named(correction_value)}); give the correction of this '
+                'arm'
             )
     for marker in {session.marker_names[i] for i in session.measurements.marker.tolist()}:
         if marker not in compensation.model.markers:
@@ -158,10 +162,12 @@ def require_same_arm(session: Session, compensation: Compensation, folder: Path)
 
 
 def _named(names: Any) -> str:
+    """Return names as text."""
     return names if isinstance(names, str) else ', '.join(names)
 
 
 def _warnings(session: Session, compensation: Compensation) -> list[str]:
+    """Return warnings on the session."""
     state = compensation.content.state
     stated, before = session.correction, state.get('correction')
     found = []
@@ -187,6 +193,7 @@ def _warnings(session: Session, compensation: Compensation) -> list[str]:
 
 
 def _content(found: Verified, warnings: list[str]) -> dict[str, Any]:
+    """Return the verdict for --json."""
     return {
         'format': FORMAT,
         'verdict': found.verdict,
@@ -206,6 +213,7 @@ def _content(found: Verified, warnings: list[str]) -> dict[str, Any]:
 
 
 def _in_words(found: Verified) -> str:
+    """Return the verdict as a sentence."""
     words = WORDS[found.verdict]
     if found.verdict != 'unclear':
         return words
@@ -218,6 +226,7 @@ def _in_words(found: Verified) -> str:
 
 
 def _text(found: Verified) -> str:
+    """Return the printed table and verdict."""
     lines = [f'{found.verdict}: {_in_words(found)}']
     lines.append(f'share that acts, of the rows with it on: {_share(found.absolute)}')
     if found.toggle is not None:
@@ -232,4 +241,5 @@ def _text(found: Verified) -> str:
 
 
 def _share(one: Estimate) -> str:
+    """Return a share with its interval as text."""
     return f'{one.share:+.3f} ± {one.std:.3f} ({one.verdict})'

@@ -48,7 +48,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Become the process of the node that serves the page, or write what RViz shows."""
+    """Replace this process by the node that serves the page, or write an RViz configuration."""
     if args.rviz is not None:
         if args.rviz.exists():
             raise InputError(f'{args.rviz}: already there, and not overwritten; give another name')
