@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Container, Iterator, Sequence
+from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -47,6 +47,8 @@ SEVERAL = {
     'tf2_msgs/msg/TFMessage': 'transforms',
 }
 _KINDS = (*PLACES, *SEVERAL)
+# Hundreds of turns; an arm has some at most.
+LARGEST_RAD = 1e4
 SUFFIXES = ('.mcap', '.db3', '.bag')
 
 
@@ -164,6 +166,8 @@ def read_bag(
             f'that is no link of the robot; it has {_topics(seen)}'
         )
     points = found[kind]
+    scale = LENGTHS[length or 'm']
+    _require_sensible(path, joints[joint_topic], points, scale)
     if kind in SEVERAL and not point_topics:
         # Frames of a camera and of the room stand still.
         extent = {
@@ -181,10 +185,32 @@ def read_bag(
         )
     rows = _Rows(path, chain, joints[joint_topic].stream(), joint_topic, clock_offset_s)
     for topic, own in sorted(points.items()):
-        rows.add(topic, own.stream(LENGTHS[length or 'm']))
+        rows.add(topic, own.stream(scale))
     used = {of[name] for name in points}
     seen = {topic: what for topic, what in seen.items() if topic not in used}
     return rows.raw(sorted(points), length or 'm', seen)
+
+
+def _require_sensible(
+    path: Path, joints: _Topic, points: Mapping[str, _Topic], scale: float
+) -> None:
+    """Refuse angles and points without sense, before anything is computed of them.
+
+    A NaN for what was not seen is none of them.
+    """
+    angles = np.array(joints.values, dtype=float)
+    if np.any(np.abs(angles) > LARGEST_RAD):
+        raise InputError(
+            f'{path}: joint states with angles beyond {LARGEST_RAD:g} rad, which no joint takes; '
+            'take another copy of the bag'
+        )
+    for one in points.values():
+        far = np.abs(scale * np.array(one.values, dtype=float)[:, :3]) > FARTHEST_M
+        if far.any():
+            raise InputError(
+                f'{path}: points further than {FARTHEST_M:g} m away, beyond any sensor; say their '
+                'unit with --length'
+            )
 
 
 def _stamp(header: Any, log_s: float) -> float:
@@ -305,11 +331,6 @@ class _Rows:
         orientation = np.array(turns)
         ends, q = self._still.end[[*at]], self._still.mean[[*at]]
         position = np.array(places)
-        if np.abs(position).max() > FARTHEST_M:
-            raise InputError(
-                f'{path}: points further than {FARTHEST_M:g} m away, beyond any sensor; say their '
-                'unit with --length'
-            )
         names = {topic: topic.strip('/').split('/')[0] for topic in topics}
         if len(set(names.values())) < len(names):
             names = {topic: topic.strip('/').replace('/', '_') for topic in topics}

@@ -175,9 +175,7 @@ def _standstills(stream: Stream, tolerance: float, fewest: int) -> Standstills:
                 continue
         if stamps[i - 1] - stamps[first] > SWING_S and i - first >= fewest:
             opened = first > 0 and stamps[first] - stamps[first - 1] <= gap
-            found.append(
-                (stamps[first], stamps[i - 1], values[first:i].mean(axis=0), opened, joined)
-            )
+            found.append((stamps[first], stamps[i - 1], mean_of(values[first:i]), opened, joined))
         if i < len(values):
             first, low, high = i, values[i], values[i]
     begin, end, mean, opened, closed = zip(*found, strict=True) if found else ((),) * 5
@@ -391,6 +389,14 @@ def _offsets_of_shots(shots: FloatArray, joints: Standstills) -> list[float]:
     return offsets
 
 
+def mean_of(rows: FloatArray) -> FloatArray:
+    """Return the mean of rows (n, m), (m,): of equal ones to the last digit.
+
+    A sum of many is rounded: of what stood still it would not be what each of them says.
+    """
+    return np.asarray(rows[0] + (rows - rows[0]).mean(axis=0))
+
+
 def reading_of(points: FloatArray) -> tuple[FloatArray, FloatArray, IntArray] | None:
     """Return mean and standard deviation of a marker at a standstill, and which points are of it.
 
@@ -403,10 +409,11 @@ def reading_of(points: FloatArray) -> tuple[FloatArray, FloatArray, IntArray] | 
     kept = of_the_marker(points)
     if are_too_many(len(points) - int(kept.sum()), len(points)):
         return None
-    std = points[kept].std(axis=0, ddof=1)
+    # Of equal points 0, as `mean_of`.
+    std = (points[kept] - points[kept][0]).std(axis=0, ddof=1)
     if std.max() > SensorRules('', '').max_std_m:
         return None
-    return points[kept].mean(axis=0), std, np.flatnonzero(kept)
+    return mean_of(points[kept]), std, np.flatnonzero(kept)
 
 
 def between(stream: Stream, begin: float, end: float) -> slice:
@@ -647,7 +654,9 @@ def _means(
             if reading is None:
                 unsteady += 1
                 continue
-            mean, std, kept = reading
+            _, std, kept = reading
+            # In the unit of the table, as one of its rows would have it.
+            mean = mean_of(values[kept, :3])
             if not cells:
                 first = int(values[kept[0], -1])
                 blank = {*columns.point, *columns.others.get('samples', ())}
@@ -656,7 +665,7 @@ def _means(
                 lines.append(table.lines[first])
             turned = columns.orientations.get(name, ())
             for column, value in (
-                *zip(columns.points[name], mean / scale),
+                *zip(columns.points[name], mean),
                 *zip(spread[name], std / scale),
                 *zip(turned, _mean_turn(values[kept, 3:-1]) if turned else ()),
             ):
@@ -706,4 +715,4 @@ def _at_rest(
 
 
 def _text(value: float, decimal: str) -> str:
-    return f'{value:.12g}'.replace('.', decimal)
+    return repr(float(value)).replace('.', decimal)

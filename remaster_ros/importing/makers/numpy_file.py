@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import io
 import zipfile
-import zlib
 from collections import defaultdict
 from typing import Any
 
@@ -13,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from remaster_ros.errors import InputError
+from remaster_ros.importing.makers.archive import damage_said
 
 _FEWEST_ROWS = 2
 # Of numbers in an array, unpacked.
@@ -32,16 +32,13 @@ def read(data: bytes) -> dict[str, str] | None:
     if not data.startswith(b'PK\x03\x04'):
         return None
     arrays: dict[str, NDArray[Any]] = {}
-    try:
-        with zipfile.ZipFile(io.BytesIO(data)) as parts:
-            for info in parts.infolist():
-                if info.filename.endswith('.npy'):
-                    if info.file_size > 8 * _LIMIT:
-                        raise InputError(f'{info.filename} in it has more than {_LIMIT} numbers')
-                    name = info.filename.removesuffix('.npy')
-                    arrays[name] = _loaded(parts.read(info), f'{name}: ')
-    except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError):
-        raise InputError('a zip archive that is damaged or locked; take another copy') from None
+    with damage_said(), zipfile.ZipFile(io.BytesIO(data)) as parts:
+        for info in parts.infolist():
+            if info.filename.endswith('.npy'):
+                if info.file_size > 8 * _LIMIT:
+                    raise InputError(f'{info.filename} in it has more than {_LIMIT} numbers')
+                name = info.filename.removesuffix('.npy')
+                arrays[name] = _loaded(parts.read(info), f'{name}: ')
     by_rows: dict[int, list[str]] = defaultdict(list)
     for name, array in arrays.items():
         if array.ndim and len(array) >= _FEWEST_ROWS:
@@ -61,7 +58,8 @@ def read(data: bytes) -> dict[str, str] | None:
 def _loaded(data: bytes, where: str) -> NDArray[Any]:
     try:
         array = np.load(io.BytesIO(data), allow_pickle=False)
-    except (ValueError, EOFError, OSError, SyntaxError, TypeError, MemoryError) as error:
+    except Exception as error:
+        # Of a damaged head NumPy raises what its tokens and types lead to.
         what = ' '.join(str(error).split())[:80]
         raise InputError(
             f'{where}no array of numbers that can be read ({what}); save it with numpy.save as '

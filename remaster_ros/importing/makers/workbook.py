@@ -7,12 +7,12 @@ import csv
 import io
 import re
 import zipfile
-import zlib
 from collections.abc import Iterator
 from datetime import datetime, timedelta
 from xml.etree import ElementTree
 
 from remaster_ros.errors import InputError
+from remaster_ros.importing.makers.archive import damage_said
 
 # Of an unpacked part, as of a text table.
 _LIMIT = 256 * 1024**2
@@ -39,11 +39,8 @@ def read(data: bytes) -> dict[str, str] | None:
         raise InputError('this is a workbook of an old form (.xls); save it as .xlsx or as CSV')
     if not data.startswith(b'PK\x03\x04'):
         return None
-    try:
-        with zipfile.ZipFile(io.BytesIO(data)) as parts:
-            return _sheets(parts)
-    except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError):
-        raise InputError('a zip archive that is damaged or locked; take another copy') from None
+    with damage_said(), zipfile.ZipFile(io.BytesIO(data)) as parts:
+        return _sheets(parts)
 
 
 def _sheets(parts: zipfile.ZipFile) -> dict[str, str] | None:

@@ -5,17 +5,25 @@ Each text is read as `remaster import` reads it, at two lengths: a reader that i
 sixteen times as long for four times the length. Processor time, and no absolute one.
 """
 
+import shutil
 import time
 from contextlib import suppress
 
+import numpy as np
 import pytest
+from foreign.bag_messages import STORE
+from foreign.workbooks import workbook
+from rosbags.rosbag2 import StoragePlugin, Writer
 
 from remaster_ros.errors import InputError
 from remaster_ros.importing import text_table
+from remaster_ros.importing.bags import read_bag
 from remaster_ros.importing.rows import TableOptions, read_rows
 from remaster_ros.importing.text_table import read_table
 from remaster_ros.kinematics.serial_chain import SerialChain
+from remaster_ros.session.journal import format_record, read_journal
 
+JOINT_STATE, POINT = 'sensor_msgs/msg/JointState', 'geometry_msgs/msg/PointStamped'
 PLANAR_URDF = '<robot name="r"><link name="base"/>' + ''.join(
     f'<joint name="j{i}" type="revolute"><parent link="{parent}"/><child link="{child}"/>'
     '<origin xyz="0.3 0 0"/><axis xyz="0 0 1"/>'
@@ -173,6 +181,120 @@ def test_time_is_in_proportion_to_length(name, tmp_path, chain):
         if long < max(SOON_S, min(MOST_TIMES * short, MOST_S_PER_MB * LONG / 1e6)):
             return
     pytest.fail(f'{SHORT} characters take {short:.2f} s, {LONG} {long:.2f} s')
+
+
+def workbook_of(folder, count):
+    path = folder / 't.xlsx'
+    rows = [[f'p{i}', 0.1, 0.2, float(i), 2.0, 3.0] for i in range(count)]
+    path.write_bytes(workbook({'Data': [COLUMNS.split(';'), *rows]}))
+    return path
+
+
+def array_of(folder, count):
+    path = folder / 't.npy'
+    np.save(path, np.random.default_rng(0).uniform(0.1, 0.9, (count, 5)))
+    return path
+
+
+def archive_of(folder, count):
+    path = folder / 't.npz'
+    values = np.random.default_rng(0).uniform(0.1, 0.9, (count, 5))
+    np.savez(path, joints=values[:, :2], points=values[:, 2:])
+    return path
+
+
+def of_table(path, chain):
+    with suppress(InputError):
+        read_rows([path], chain, TableOptions())
+
+
+def journal_of(folder, count):
+    path = folder / 'journal.jsonl'
+    record = {'row': 1, 'q_rad': [0.1] * 7, 'sensor': 'mocap', 'note': 'a' * 40}
+    path.write_bytes(b''.join(format_record({**record, 'row': i}) for i in range(count)))
+    return path
+
+
+def torn_journal_of(folder, count):
+    """Nothing but lines cut off: each may be the last one."""
+    path = folder / 'journal.jsonl'
+    path.write_bytes(b'{"row":1,"q_rad":[0.1\n' * count)
+    return path
+
+
+def of_journal(path, chain):
+    with suppress(InputError):
+        read_journal(path)
+
+
+def bag_of(folder, count, plugin):
+    path = folder / 'bag'
+    shutil.rmtree(path, ignore_errors=True)
+    kinds = STORE.types
+    with Writer(path, version=9, storage_plugin=plugin) as writer:
+        topics = {'/joint_states': JOINT_STATE, '/camera/marker': POINT}
+        to = {
+            topic: writer.add_connection(topic, kind, typestore=STORE)
+            for topic, kind in topics.items()
+        }
+        for i in range(count):
+            # Three quarters of a second of standing, a quarter of moving, again and again.
+            ns = 1_700_000_000_000_000_000 + 25_000_000 * i
+            stamp = kinds['builtin_interfaces/msg/Time'](ns // 10**9, ns % 10**9)
+            header = kinds['std_msgs/msg/Header'](stamp, '')
+            at = 0.1 * (i // 40 + max(0, i % 40 - 30) / 10.0)
+            at = at % 2.0
+            q, empty = np.array([at, 0.5 * at]), np.zeros(0)
+            state = kinds[JOINT_STATE](header, ['j1', 'j2'], q, empty, empty)
+            place = kinds['geometry_msgs/msg/Point'](at, 1.0, 0.5)
+            for topic, message in (
+                ('/joint_states', state),
+                ('/camera/marker', kinds[POINT](header, place)),
+            ):
+                writer.write(to[topic], ns, STORE.serialize_cdr(message, topics[topic]))
+    return path
+
+
+def of_bag(path, chain):
+    with suppress(InputError):
+        read_bag(path, chain)
+
+
+def mcap_of(folder, count):
+    return bag_of(folder, count, StoragePlugin.MCAP)
+
+
+def sqlite_of(folder, count):
+    return bag_of(folder, count, StoragePlugin.SQLITE3)
+
+
+# What makes a file of so many rows, how many, and what reads it.
+BINARY = {
+    'workbook': (workbook_of, 400, of_table),
+    'array': (array_of, 2000, of_table),
+    'archive': (archive_of, 2000, of_table),
+    'journal': (journal_of, 4000, of_journal),
+    'torn journal': (torn_journal_of, 20_000, of_journal),
+    'mcap': (mcap_of, 1500, of_bag),
+    'sqlite': (sqlite_of, 1500, of_bag),
+}
+
+
+@pytest.mark.timeout(300)
+@pytest.mark.parametrize('name', BINARY)
+def test_time_is_in_proportion_to_rows(name, tmp_path, chain):
+    make, count, read = BINARY[name]
+    for _ in range(TRIES):
+        took = []
+        for times_as_long in (1, 4):
+            path = make(tmp_path, times_as_long * count)
+            begun = time.process_time()
+            read(path, chain)
+            took.append(time.process_time() - begun)
+        print(f'{name}: {count} rows {took[0]:.3f} s, four times as many {took[1]:.3f} s')
+        if took[1] < max(SOON_S, MOST_TIMES * took[0]):
+            return
+    pytest.fail(f'{count} rows take {took[0]:.2f} s, four times as many {took[1]:.2f} s')
 
 
 def test_what_takes_too_long_all_the_same_ends_with_the_file_and_the_remedy(tmp_path, monkeypatch):
