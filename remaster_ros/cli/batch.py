@@ -198,7 +198,7 @@ _READ = ('.yaml', '.csv', '.urdf', '.xml')
 
 
 def _said(rows: Journal, path: Path) -> dict[str, dict[str, Any]]:
-    """Return the last row of each key in the journal of rows."""
+    """Return the last row of each key; raise InputError if the journal is of something else."""
     rows_by_key = {}
     for line, row in enumerate(rows.records, 1):
         if row.get('format') != FORMAT or not isinstance(row.get('key'), str):
@@ -210,7 +210,8 @@ def _said(rows: Journal, path: Path) -> dict[str, dict[str, Any]]:
 def worked(job: Job) -> dict[str, Any]:
     """Fit, discover and check a session in a worker; return the content of its row.
 
-    The results are those of the commands with this seed, whichever worker computes them.
+    The results are those of the commands with this seed, whichever worker computes them. An error
+    becomes the status and text of the row.
     """
     try:
         return {'status': 'done', **_results(job)}
@@ -414,7 +415,10 @@ def _end_with_parent() -> None:
 
 @contextmanager
 def _scheduler(address: str, *, insecure: bool) -> Iterator[tuple[Executor, int]]:
-    """Connect to a Dask scheduler; yield its executor and the number of workers."""
+    """Connect to a Dask scheduler; yield its executor and the number of workers.
+
+    Raises InputError if it cannot be reached, is insecure, or has other versions.
+    """
     _refuse_open(address, insecure=insecure)
     try:
         from distributed import Client

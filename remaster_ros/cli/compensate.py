@@ -69,7 +69,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Correct the table, write it, and print a summary."""
+    """Correct the table, write it, and print a summary.
+
+    Raises InputError if joint columns or their units are not known.
+    """
     compensation = read_compensation(args.compensation)
     if args.out.exists() and args.out.samefile(args.table):
         raise InputError(f'{args.out}: is the table itself; name another file for --out')

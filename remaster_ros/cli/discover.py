@@ -52,7 +52,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Search for causes, write the results, and print a short summary."""
+    """Search for causes, write the results, and print a short summary.
+
+    An error of the session of --confirm is raised after everything else was written.
+    """
     session, named = read_together(args.session)
     other = None if args.confirm is None else read_session(args.confirm)
     if other is not None:

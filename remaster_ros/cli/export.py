@@ -106,7 +106,10 @@ def _frame(text: str) -> tuple[str, str]:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Write a correction in a form, and print its difference to the whole correction."""
+    """Write a correction in a form, and print its difference to the whole correction.
+
+    Raises InputError for options that the form does not have, and unknown joints.
+    """
     for given, forms, option in (
         (args.base, ('ur', 'ros2_control', 'rising'), '--base'),
         (args.driver_param, ('ros2_control',), '--driver-param'),

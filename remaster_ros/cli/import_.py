@@ -282,7 +282,10 @@ def _offset(text: str) -> tuple[str, float]:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Read the files, show what was read, test it with the robot, and write a session."""
+    """Read the files, show what was read, test it with the robot, and write a session.
+
+    Raises InputError if files or options are invalid, InsufficientDataError if rows are missing.
+    """
     if len(args.files) == 1 and (args.files[0] / HEADER).exists():
         return _mend(args)
     if args.urdf is None and args.cell is None:
@@ -401,7 +404,7 @@ def _written(out: Path) -> str:
 
 
 def _read(args: argparse.Namespace, urdf: str, chain: SerialChain) -> RawRows:
-    """Return the rows of the files."""
+    """Return the rows of the files; raise InputError for a bag among several files."""
     bags = [path for path in args.files if is_bag(path)]
     if bags:
         if len(args.files) > 1:

@@ -101,7 +101,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Propose a cell for the robot, write the cell file, and plan in it."""
+    """Propose a cell for the robot, write the cell file, and plan in it.
+
+    Raises InputError for an invalid robot, InsufficientDataError if too few poses are usable.
+    """
     for sensor in args.sensors:
         if sensor not in SENSORS:
             meant = did_you_mean(sensor, SENSORS)
@@ -153,7 +156,10 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _urdf_file(robot: Path, out: Path, text: str) -> Path:
-    """Return the URDF that the cell names: the given one, or the expanded xacro."""
+    """Return the URDF that the cell names: the given one, or the expanded xacro.
+
+    Raises InputError if that would replace a file.
+    """
     if not is_xacro(robot):
         return robot
     name = robot.name.removesuffix('.xacro').removesuffix('.urdf')
@@ -171,7 +177,7 @@ def _urdf_file(robot: Path, out: Path, text: str) -> Path:
 def _propose(
     args: argparse.Namespace, text: str, urdf: Path, rng: np.random.Generator
 ) -> CellProposal:
-    """Return the proposed cell."""
+    """Return the proposed cell; raise InputError if poses cannot be planned for the robot."""
     try:
         model = parse_urdf(text)
         base = likely_base(model) if args.base_link is None else args.base_link

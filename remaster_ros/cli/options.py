@@ -72,7 +72,7 @@ def add_poses(parser: argparse.ArgumentParser) -> None:
 
 
 def xacro_arguments(given: Iterable[object]) -> dict[str, str]:
-    """Return the arguments of a xacro file, each given as NAME:=VALUE."""
+    """Return arguments given as NAME:=VALUE; raise InputError for another form."""
     found = {}
     for text in map(str, given):
         name, sign, value = text.partition(':=')

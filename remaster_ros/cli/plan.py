@@ -137,7 +137,10 @@ def _travel(cell: Workcell, scene: PlanningScene, args: argparse.Namespace) -> T
 def _check(
     cell: Workcell, scene: PlanningScene, plan: CollectionPlan, args: argparse.Namespace
 ) -> tuple[dict[str, Any], str]:
-    """Choose and write the configurations of a check; return its sensitivity (JSON, text)."""
+    """Choose and write the configurations of a check; return its sensitivity (JSON, text).
+
+    Raises InsufficientDataError if too few configurations can be reached.
+    """
     chain = scene.model.chain
     q = np.unique([visit.q for visit in plan.visits], axis=0)
     if len(q) < CHECK_POSES:
@@ -191,9 +194,10 @@ def planned(
 
 
 def free_start(model: CollisionModel, seed: int) -> FloatArray:
-    """Return a free configuration, (k,): zero, or near to it.
+    """Return a configuration to start from, (k,): zero if free, else a free one near to it.
 
-    At zero some arms lie stretched out along the floor (a UR does), without a free path.
+    At zero some arms lie stretched out along the floor (a UR does), without a free path. Zero also
+    if no tried configuration is free.
     """
     chain = model.chain
     spread = np.linspace(0.0, np.pi, TRIED_STARTS)[:, None]

@@ -52,7 +52,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Write the session of the bag, or replace this process by the replay node."""
+    """Write the session of the bag, or replace this process by the replay node.
+
+    Raises InputError for contradictory options.
+    """
     if args.out is not None:
         return _write(args)
     if args.cell is not None:
@@ -70,7 +73,10 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _write(args: argparse.Namespace) -> int:
-    """Write the session of the bag; compare it with the recorded one."""
+    """Write the session of the bag; compare it with the recorded one.
+
+    Raises InputError for an invalid bag, InsufficientDataError if rows differ.
+    """
     given = {
         '--rate': args.rate is not None,
         '--no-clock': args.no_clock,

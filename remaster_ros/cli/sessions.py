@@ -46,7 +46,11 @@ def _one_arm(session: Session, folder: Path) -> Session:
 
 
 def read_to_fit(folder: Path) -> Session:
-    """Read a session; if joints are outside their limits, search for the mistake in its data."""
+    """Read a session to fit.
+
+    If joints are outside their limits, MistakeFoundError names the mistake in the data that
+    explains it; InputError if none does.
+    """
     try:
         return _one_arm(read_session(folder), folder)
     except InputError as refused:

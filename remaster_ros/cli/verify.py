@@ -100,7 +100,7 @@ def _chain(session: Session) -> SerialChain:
 
 
 def _on(session: Session, folder: Path) -> BoolArray:
-    """Return whether the correction was on at each row, (n,)."""
+    """Return whether the correction was on at each row, (n,); raise InputError if unknown."""
     m = session.measurements
     state = np.full(len(m), -1) if m.correction is None else m.correction
     if session.correction is not None:
@@ -115,7 +115,11 @@ def _on(session: Session, folder: Path) -> BoolArray:
 
 
 def _wanted(session: Session, folder: Path, on: BoolArray) -> FloatArray:
-    """Return the desired joint angles, rad, (n, k)."""
+    """Return the desired joint angles, rad, (n, k).
+
+    Raises InputError if a row has none; ``on``: rows with the correction on, (n,), whose reported
+    angles are the desired ones if the correction is inside the controller.
+    """
     m = session.measurements
     wanted = np.full_like(m.q, np.nan) if m.wanted is None else m.wanted.copy()
     missing = np.isnan(wanted[:, 0])

@@ -48,7 +48,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Replace this process by the node that serves the page, or write an RViz configuration."""
+    """Replace this process by the node that serves the page, or write an RViz configuration.
+
+    Raises InputError if the file of the RViz configuration exists.
+    """
     if args.rviz is not None:
         if args.rviz.exists():
             raise InputError(f'{args.rviz}: already there, and not overwritten; give another name')

@@ -339,7 +339,10 @@ class Demo:
                 self._spin()
 
     def _trigger(self, service: str, server: str, timeout_s: float = ANSWER_WALL_S) -> None:
-        """Call a service until it answers, also if its node is killed meanwhile."""
+        """Call a service until it answers, also if its node is killed meanwhile.
+
+        Raises DeviceError if it refuses, or does not answer in time.
+        """
         future, process = None, self.processes.pid(server)
 
         def done() -> bool:
@@ -357,7 +360,10 @@ class Demo:
             raise DeviceError(f'{service}: {response.message}')
 
     def _collect(self) -> bool:
-        """Wait for the end of the collection; return False if it ended with a halted arm."""
+        """Wait for the end of the collection; return False if it ended with a halted arm.
+
+        Raises DeviceError if nothing is measured for `STANDS_WALL_S`.
+        """
         columns = (
             TextColumn('{task.description}'),
             BarColumn(),
@@ -435,9 +441,11 @@ class Demo:
             self._printed_reason = why
 
     def _wait_for_operator(self, halted: str) -> bool:
-        """Wait for a person to end a halt; return whether the collection goes on.
+        """Wait for a person to end a halt, at the terminal or on the live page.
 
-        At the terminal, or on the live page.
+        Returns whether the collection goes on: not if the person wants a fit, or nobody is there.
+        For the live page the rows so far are fitted meanwhile. Raises DeviceError if nobody is
+        there and nothing was measured.
         """
         done = self.node.summaries.get('pose_planner', {}).get('configurations_done', '0')
         self._say(f'the arm is halted: {halted}. {done} configurations were measured')

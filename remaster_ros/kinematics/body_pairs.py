@@ -32,10 +32,11 @@ class ConvexDistances:
     @cached_property
     def _coal(self) -> Any:
         # Imported here: commands that move nothing need not load it.
+        """The module coal, or hppfcl, its name before version 3."""
         try:
             import coal
         except ImportError:
-            # Its name before version 3, the last that goes with NumPy 1.
+            # The last version that supports NumPy 1.
             import hppfcl as coal
 
             coal.Transform3s, coal.StdVec_Vec3s = coal.Transform3f, coal.StdVec_Vec3f

@@ -160,6 +160,8 @@ class CollisionModel:
 
         ``waypoints``: configurations, straight in joint space between each two, rad, (n, k),
         n >= 1; ``extra``: added to the clearance, m.
+
+        Raises ValueError for waypoints of another shape.
         """
         q = np.asarray(waypoints, dtype=float)
         if q.ndim != 2 or q.shape[1] != len(self.chain) or not len(q):

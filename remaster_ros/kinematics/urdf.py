@@ -187,7 +187,7 @@ def _is_xacro(element: ElementTree.Element) -> bool:
 
 
 def _link(element: ElementTree.Element) -> UrdfLink:
-    """Read a <link> element."""
+    """Read a <link> element; raise InputError if it is invalid."""
     name = attribute(element, 'name', 'a link')
     where = f"link '{name}'"
     inertial = element.find('inertial')
@@ -203,7 +203,7 @@ def _link(element: ElementTree.Element) -> UrdfLink:
 
 
 def _joint(element: ElementTree.Element) -> UrdfJoint:
-    """Read a <joint> element."""
+    """Read a <joint> element; raise InputError if it is invalid."""
     name = attribute(element, 'name', 'a joint')
     where = f"joint '{name}'"
     ends = {}
@@ -245,7 +245,10 @@ def _check_unused_numbers(element: ElementTree.Element, where: str) -> None:
 
 
 def _axis(element: ElementTree.Element, kind: str, where: str) -> FloatArray:
-    """Return the unit axis of a joint in its frame, (3,); X if it is not given, URDF's default."""
+    """Return the unit axis of a joint in its frame, (3,); X if it is not given, URDF's default.
+
+    Raises InputError if its length is not that of a direction.
+    """
     axis_element = element.find('axis')
     # CAD exporters write an axis of 0 0 0 for joints that do not move.
     if axis_element is None or kind in ('fixed', 'floating'):

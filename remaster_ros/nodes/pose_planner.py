@@ -143,7 +143,10 @@ class PosePlanner(RemasterNode):
         self.get_logger().warning(f'{journal.path}: going on; {self.progress.describe()}')
 
     def _resume_run(self) -> None:
-        """Resume the run of a killed planner, if it certainly still lives."""
+        """Resume the run of a killed planner, if it certainly still lives.
+
+        Otherwise, once that is known, the run remains paused, and a warning says why.
+        """
         left, peers = self.run.left, self._peers
         silent_s, progress = silence_s(left), self.progress.describe()
         with self._lock:
@@ -262,6 +265,7 @@ class PosePlanner(RemasterNode):
         return response
 
     def _on_stop(self, request: Trigger.Request, response: Trigger.Response) -> Any:
+        """Stop the arm, end the run, and retract the announced pose."""
         with self._lock:
             # The command first: no later failure may keep the arm moving.
             self._poses.stop()

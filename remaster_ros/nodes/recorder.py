@@ -250,6 +250,7 @@ class _Outlet(Outlet):
             self._node._by_hand.set_result(ended)
 
     def log(self, level: int, text: str) -> None:
+        """Log a line with the severity of `level`."""
         logger = self._node.get_logger()
         # Separate calls: rclpy refuses a line of code that logs with several severities.
         if level >= logging.ERROR:

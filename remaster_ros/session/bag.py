@@ -185,7 +185,10 @@ def frames(file: IO[bytes], size: int, crc: int | None, solid: int) -> Iterator[
 
 
 def unchunked(records: Iterator[tuple[int, bytes]]) -> Iterator[tuple[int, bytes]]:
-    """Yield records with chunks, which other recorders write, unpacked."""
+    """Yield records with chunks, which other recorders write, unpacked.
+
+    Raises ValueError for a damaged chunk.
+    """
     for opcode, body in records:
         if opcode != Opcode.CHUNK:
             yield opcode, body
@@ -342,7 +345,10 @@ class BagReader:
         return store
 
     def messages_of(self, file: FileMetadata, first_look: bool = False) -> Iterator[BagMessage]:
-        """Yield the messages of one of `files`; the first look records where it is cut off."""
+        """Yield the messages of one of `files`; the first look records where it is cut off.
+
+        Raises InputError if the file is unreadable or damaged.
+        """
         path = self.folder / file.name
         try:
             yield from self._messages_of(path, first_look)

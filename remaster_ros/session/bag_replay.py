@@ -167,7 +167,10 @@ def _records(bag: BagReader, kind: str, data: bytes) -> list[events.EventRecord]
 
 
 def _first_start(bag: BagReader) -> tuple[events.RecorderBegan, Workcell | None]:
-    """Return the first start of a recorder in a bag, and its cell, None if the bag lacks it."""
+    """Return the first start of a recorder in a bag, and its cell, None if the bag lacks it.
+
+    Raises InputError if no recorder wrote the bag.
+    """
     for topic, kind, data, _ in bag:
         if topic != EVENTS:
             continue
@@ -181,7 +184,7 @@ def _first_start(bag: BagReader) -> tuple[events.RecorderBegan, Workcell | None]
 
 
 def _cell(bag: BagReader, text: str) -> Workcell | None:
-    """Return the cell that a recorder wrote into the bag; None if it lacks it."""
+    """Return the cell in a bag; None if it lacks it; raise InputError if it is invalid."""
     if not text:
         return None
     try:

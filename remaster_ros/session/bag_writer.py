@@ -40,7 +40,10 @@ from remaster_ros.version import __version__
 
 @cache
 def definition_of(msgtype: str) -> tuple[str, str]:
-    """Return the message definition of one of Jazzy's types and its RIHS01 hash."""
+    """Return the message definition of one of Jazzy's types and its RIHS01 hash.
+
+    Raises InputError for another message type.
+    """
     from rosbags.typesys.store import TypesysError
 
     types = jazzy_types()
@@ -187,6 +190,7 @@ class BagWriter:
         self.close()
 
     def _add_topic(self, topic: str, msgtype: str) -> None:
+        """Register a topic in the file; raise InputError if its type is unknown."""
         definition, type_hash = definition_of(msgtype)
         if msgtype not in self._schemas:
             self._schemas[msgtype] = self._writer.register_schema(

@@ -26,7 +26,10 @@ _LINE = re.compile(r'([0-9a-f]{64}) [ *]([^\0]+)')
 
 
 def read_manifest(folder: Path) -> dict[str, str]:
-    """Return the checksum of each closed file by name; {} if there is no manifest."""
+    """Return the checksum of each closed file by name; {} if there is no manifest.
+
+    Raises InputError if the manifest is damaged.
+    """
     path = folder / MANIFEST
     if not path.exists():
         return {}
@@ -74,7 +77,7 @@ def check_file(sums: Mapping[str, str], path: Path) -> None:
 
 
 def sha256_of(path: Path) -> str:
-    """Return the SHA-256 of a file in hexadecimal."""
+    """Return the SHA-256 of a file in hexadecimal; raise InputError if it is unreadable."""
     try:
         if path.exists() and not path.is_file():
             # A pipe or a device has no end.

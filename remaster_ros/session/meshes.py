@@ -92,7 +92,10 @@ def find_mesh(name: str, urdf: Path, mesh_path: Sequence[Path]) -> Path:
 
 
 def read_mesh(path: Path) -> FloatArray:
-    """Return the vertices of a mesh file (STL, OBJ, DAE or PLY), m, (n, 3)."""
+    """Return the vertices of a mesh file (STL, OBJ, DAE or PLY), m, (n, 3).
+
+    Raises InputError if the file cannot be read.
+    """
     vertices = _loaded(path, _vertices, skip_materials=True)
     if len(vertices) < 4 or not np.all(np.isfinite(vertices)):
         raise InputError(f'{path}: the mesh has {len(vertices)} vertices, or some not finite')
@@ -157,7 +160,10 @@ def _color(part: Any) -> tuple[float, float, float] | None:
 def _loaded(
     path: Path, take: Callable[[list[Any], float], Taken], *, skip_materials: bool
 ) -> Taken:
-    """Return the result of ``take`` on the parts of a mesh file and the length of its unit, m."""
+    """Return the result of ``take`` on the parts of a mesh file and the length of its unit, m.
+
+    Raises InputError if the file cannot be read. ``skip_materials``: do not read textures.
+    """
     kind = path.suffix.lower()
     if kind not in KINDS:
         raise InputError(f'{path}: a mesh in a format that is not read; use {", ".join(KINDS)}')
@@ -193,7 +199,7 @@ def _refuse_entities(content: bytes, path: Path) -> None:
 
 
 def _collada_unit(content: bytes) -> float:
-    """Return the length of a COLLADA file's unit, m."""
+    """Return the length of a COLLADA file's unit, m; 1 if it states none."""
     import collada
 
     return float(collada.Collada(BytesIO(content)).assetInfo.unitmeter or 1.0)

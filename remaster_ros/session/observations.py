@@ -92,7 +92,7 @@ class Table:
         """Return a column of integers, (n,).
 
         With `least` the column is optional: integers from `least` (above -1) on, -1 for an empty
-        cell.
+        cell. Raises InputError at the first other cell.
         """
         given = self.cells[column]
         cells = given if least is None else [cell or '-1' for cell in given]
@@ -112,7 +112,10 @@ class Table:
         return values
 
     def numbers(self, columns: Sequence[str], optional: bool = False) -> FloatArray:
-        """Return columns of finite numbers, (n, len(columns)); NaN if optional and empty."""
+        """Return columns of finite numbers, (n, len(columns)); NaN if optional and empty.
+
+        Raises InputError at the first other cell.
+        """
         result = np.empty((self.rows, len(columns)))
         for i, column in enumerate(columns):
             cells = self.cells[column]
@@ -139,7 +142,10 @@ class Table:
         return values
 
     def choices(self, column: str, names: Sequence[str], remedy: str) -> IntArray:
-        """Return the index of every cell among `names`, (n,)."""
+        """Return the index of every cell among `names`, (n,).
+
+        Raises InputError, with the remedy, at the first cell that is none of them.
+        """
         index = {name: i for i, name in enumerate(names)}
         values = np.array([index.get(cell, -1) for cell in self.cells[column]], dtype=np.int64)
         self.refuse(values[:, None] < 0, {column: remedy})
@@ -306,7 +312,7 @@ class RowFormat:
         return self._accept(self._convert(table), first_line, rules)
 
     def _accept(self, m: Measurements, first_line: int, rules: SequenceRules) -> list[RowKeys]:
-        """Check rows against the rules, and add them; return their keys."""
+        """Check rows against the rules, and add them; raise InputError at the first violation."""
         keys = list(row_keys(m, first_line))
         for row in keys:
             if problem := rules.problem(row):

@@ -256,7 +256,10 @@ class PlanJournal:
                 self.decided = outcomes.decided()
 
     def _open(self) -> Journal:
-        """Open the file, and restore the state from its records."""
+        """Open the file, and restore the state from its records.
+
+        Raises InputError if the file is damaged, or of other settings.
+        """
         self._journal = Journal(self.path)
         self.lost = self._journal.lost
         if not self._journal.records:

@@ -81,7 +81,7 @@ def read_session(folder: str | os.PathLike[str], *, within_limits: bool = True) 
 
 
 def _read(folder: Path, sums: dict[str, str], within_limits: bool) -> Session:
-    """Read a session whose checksums are known; see `read_session`."""
+    """Read a session with these checksums; errors as `read_session`."""
     header_path = folder / HEADER
     data = read_limited(header_path, YAML_LIMIT, 'a session folder holds session.yaml')
     check_data(sums, header_path, data)

@@ -139,7 +139,7 @@ def _from_here(value: str) -> str:
 
 
 def _too_slow(path: Path, after: str) -> InputError:
-    """Return the error of an expansion that takes too long."""
+    """Return the error of an expansion that takes longer than `after`, a time as text."""
     return InputError(
         f'{path}: xacro: it is not expanded after {after}; does a macro call itself, or double '
         'what it is given?'

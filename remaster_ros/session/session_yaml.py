@@ -138,7 +138,10 @@ class SessionHeader(msgspec.Struct):
 
 
 def parse_header(data: bytes, path: Path) -> SessionHeader:
-    """Parse and validate session.yaml; `path` is for messages."""
+    """Parse session.yaml; `path` is for messages.
+
+    Raises InputError if the content is invalid.
+    """
     try:
         content = load_yaml(decode_text(data, path))
     except YamlError as error:

@@ -30,6 +30,8 @@ class YamlError(ValueError):
 
 
 class _Loader(yaml.SafeLoader):
+    """Loader of plain data; raises YamlError for aliases, tags and repeated keys."""
+
     yaml_implicit_resolvers: dict[str, list[tuple[str, re.Pattern[str]]]] = {}  # noqa: RUF012
 
     def compose_node(self, parent: Any, index: Any) -> Any:

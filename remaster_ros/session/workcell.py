@@ -542,6 +542,8 @@ def config_path(name: str) -> Path:
     """Return the path of a shipped configuration file, such as ``cells/demo.yaml``.
 
     In a source checkout config/ is beside the package; installed, it is package data.
+
+    Raises InputError if the package was installed without it.
     """
     folder = Path(__file__).resolve().parents[2] / 'config'
     if (folder / 'cells').is_dir():

@@ -84,7 +84,10 @@ class Expansion:
         return text
 
     def _text(self, text: str, symbols: Any) -> Any:
-        """Return a text with its expressions and substitutions evaluated, as xacro.eval_text."""
+        """Return a text with its expressions and substitutions evaluated, as xacro.eval_text.
+
+        Raises InputError if the expansion becomes too long.
+        """
         parts, at = [], 0
         for token in _TOKENS.finditer(text):
             if token.start() != at:
@@ -110,17 +113,20 @@ class Expansion:
         return ''.join(joined)
 
     def _count(self, part: Any) -> None:
+        """Add a part to the length of the expansion; raise InputError above the limit."""
         self._written += len(part) if isinstance(part, str) else 1
         if self._written > URDF_LIMIT:
             raise InputError(f'{_here()}: it expands to more than {URDF_LIMIT} characters')
 
     def _evaluated(self, expression: str, symbols: Any, _: Any = None) -> Any:
+        """Return the value of ``${…}``; raise InputError if it is not supported."""
         try:
             return evaluate(expression, symbols)
         except ExpressionError as error:
             raise _refused(f'${{{expression}}}', str(error)) from None
 
     def _substituted(self, command: str) -> str:
+        """Return the value of ``$(…)``; raise InputError if it is not supported."""
         name, *given = command.split() or ['']
         if name == 'find' and len(given) == 1:
             return self._find(given[0])
@@ -133,6 +139,7 @@ class Expansion:
         raise _refused(f'$({command})', 'no substitution of a robot description')
 
     def _eval(self, expression: str) -> Any:
+        """Return the value of ``$(eval …)``; raise InputError if it is not supported."""
         given = xacro.substitution_args_context['arg']
         values = {name: _converted(value) for name, value in given.items()}
         functions = {
@@ -145,6 +152,7 @@ class Expansion:
             raise _refused(f'$(eval{expression})', str(error)) from None
 
     def _argument(self, name: str) -> str:
+        """Return an argument of the file; raise XacroException if it is not given."""
         try:
             value: str = xacro.substitution_args_context['arg'][name]
         except KeyError:
@@ -152,6 +160,7 @@ class Expansion:
         return value
 
     def _find(self, name: str) -> str:
+        """Return the folder of ``$(find NAME)``; raise InputError if there is no such package."""
         folder = find_package(name, self._path, self._package_path)
         if folder is None:
             raise InputError(
@@ -165,7 +174,10 @@ class Expansion:
         return str(folder.absolute())
 
     def _file(self, name: str) -> str:
-        """Return the path of a file named in the present one, if it may be read."""
+        """Return the path of a file named in the present one.
+
+        Raises InputError if it lies outside the folders that may be read.
+        """
         if not isinstance(name, str):
             raise _refused(str(name), 'no file name')
         path = Path(_here()).parent / name
@@ -178,6 +190,7 @@ class Expansion:
         return str(path)
 
     def _included(self, name: str, symbols: Any) -> Any:
+        """Return the files of <xacro:include>, which may have a wildcard, as xacro does."""
         name = str(self._text(name, symbols))
         if not re.search(r'[*?[]', name):
             yield self._file(name)
@@ -189,6 +202,7 @@ class Expansion:
             yield self._file(found)
 
     def _parsed(self, given: Any, filename: str = '') -> Any:
+        """Return the parsed XML of a text or file; raise InputError if it declares entities."""
         path = Path(filename)
         if not path.exists():
             # xacro's error, since it handles optional files.
@@ -201,6 +215,7 @@ class Expansion:
         return minidom.parseString(text)
 
     def _load_yaml(self, filename: str) -> Any:
+        """Return the content of a YAML file; raise InputError if it may not or cannot be read."""
         path = Path(self._file(filename))
         text = decode_text(read_limited(path, URDF_LIMIT, 'the description loads it'), path)
         for unit in xacro.ConstructUnits:
@@ -233,6 +248,7 @@ def _show(*given: Any, **_: Any) -> str:
 
 
 def _fatal(*given: Any) -> None:
+    """Raise InputError: xacro calls this to end the program."""
     raise InputError(f'{_here()}: {" ".join(map(str, given))}')
 
 

@@ -79,7 +79,7 @@ def global_names(**own: Any) -> dict[str, Any]:
 
 
 class _Evaluation:
-    """Evaluation of one syntax tree."""
+    """Evaluation of one syntax tree; ExpressionError for anything unsupported or too large."""
 
     def __init__(self, names: Mapping[str, Any]) -> None:
         self._names = names
@@ -202,6 +202,7 @@ class _Evaluation:
 
 
 def _item(holder: Any, key: Any) -> Any:
+    """Return an item of a list, dictionary or text; raise ExpressionError if there is none."""
     if isinstance(holder, dict) and key not in holder:
         raise ExpressionError(f'there is no item {key!r}')
     return holder[key]
@@ -219,7 +220,7 @@ def _bounded(value: Any) -> Any:
 
 
 def _count(value: Any, left: int) -> int:
-    """Return how many more items than those of a value are allowed."""
+    """Return the number of items left of a limit after a value; raise ExpressionError below 0."""
     if left < 0:
         raise ExpressionError('a text or list that is too long')
     if isinstance(value, dict):
@@ -239,6 +240,7 @@ def _length(value: Any) -> int:
 
 
 def _times(left: Any, right: Any) -> Any:
+    """Return a product; raise ExpressionError if it would be too large."""
     for text, count in ((left, right), (right, left)):
         if isinstance(text, str | list | tuple) and isinstance(count, int):
             if len(text) * count > LONGEST:
@@ -248,6 +250,7 @@ def _times(left: Any, right: Any) -> Any:
 
 
 def _power(left: Any, right: Any) -> Any:
+    """Return a power; raise ExpressionError if it would be too large."""
     base, exponent = _number(left), _number(right)
     whole = isinstance(base, int) and isinstance(exponent, int)
     if whole and _length(base) * abs(exponent) > MOST_BITS:
@@ -263,6 +266,7 @@ def _plus(left: Any, right: Any) -> Any:
 
 def _number(value: Any) -> Any:
     # Also of %, which formats a text.
+    """Return a number; raise ExpressionError for another value."""
     if not isinstance(value, int | float):
         raise ExpressionError(f'{value!r:.40} is no number')
     return value
@@ -273,6 +277,7 @@ def _of_numbers(operate: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]
 
 
 def _replace(text: str, old: str, new: str) -> str:
+    """Return text with a replaced part; raise ExpressionError if it would be too long."""
     if text.count(old) * len(new) > LONGEST:
         raise ExpressionError('a text that is too long')
     return text.replace(old, new)
@@ -284,6 +289,7 @@ def _round(value: Any, ndigits: int = 0) -> Any:
 
 
 def _range(*given: Any) -> list[int]:
+    """Return a range as a list; raise ExpressionError if it would be too long."""
     if len(values := range(*given)) > LONGEST:
         raise ExpressionError('a list that is too long')
     return list(values)

@@ -174,7 +174,10 @@ class Bounds:
 
 
 def read_yaml(data: bytes, path: Path, record: type[Record], remedy: str = '') -> Record:
-    """Read a YAML file into a struct within its bounds; ``remedy``: ends messages."""
+    """Read a YAML file into a struct within its bounds; ``remedy``: ends messages.
+
+    Raises InputError, which names file, key and remedy, if the content is invalid.
+    """
     text = decode_text(data, path)
     try:
         content = msgspec.convert(load_yaml(text), record)
