@@ -227,7 +227,7 @@ def worked(job: Job) -> dict[str, Any]:
 
 
 def _results(job: Job) -> dict[str, Any]:
-    """Return the row of a session; its errors are raised."""
+    """Return the row of a session; raise the errors of reading and fitting it."""
     import numpy as np
 
     from remaster_ros.calibration.fit import fit_session
@@ -392,8 +392,8 @@ def _died(error: Exception) -> bool:
 
 
 def _pool(workers: int) -> ProcessPoolExecutor:
-    # What a worker starts with is set before; the latter two would go before the first.
     """Return the worker processes of this computer."""
+    # What a worker starts with is set before; the latter two would go before the first.
     for name in ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS'):
         os.environ[name] = '1'
     # Forked, a worker would have the parent's locks and threads.

@@ -284,7 +284,8 @@ def _offset(text: str) -> tuple[str, float]:
 def run(args: argparse.Namespace) -> int:
     """Read the files, show what was read, test it with the robot, and write a session.
 
-    Raises InputError if files or options are invalid, InsufficientDataError if rows are missing.
+    Raises InputError if files or options are invalid, InsufficientDataError if the data do not
+    fit the robot (unless --unchecked).
     """
     if len(args.files) == 1 and (args.files[0] / HEADER).exists():
         return _mend(args)
@@ -399,7 +400,7 @@ def _mend(args: argparse.Namespace) -> int:
 
 
 def _written(out: Path) -> str:
-    """Return the message on the written session."""
+    """Return the message that names the written session and the next command."""
     return f'written: {out}; go on with: remaster fit {quote(str(out))} --out …'
 
 
@@ -486,7 +487,7 @@ def _as_text(rows: RawRows, session: Session, how: list[str]) -> str:
 
 
 def _as_json(out: Path | None, rows: RawRows, sense: Sense) -> dict[str, Any]:
-    """Return the same for --json."""
+    """Return what was read, for --json."""
     return {
         'session': None if out is None else str(out),
         'columns': rows.columns,

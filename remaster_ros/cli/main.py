@@ -78,7 +78,10 @@ def build_parser(chosen: str | None) -> argparse.ArgumentParser:
 
 
 def _mending(args: argparse.Namespace, options: str) -> str:
-    """Return the command that writes the session again without the mistake found in it."""
+    """Return the command that writes the session again with `options`, which correct its mistake.
+
+    For several sessions a sentence on what to do.
+    """
     given = args.session if isinstance(args.session, list) else [args.session]
     if len(given) > 1:
         return 'fit each session by itself: the one with the mistake then names the command'

@@ -111,7 +111,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Plan, draw a truth, write the session and the truth."""
+    """Plan, draw a truth, write the session and the truth.
+
+    Raises InputError for invalid options, InsufficientDataError if no pose can be planned.
+    """
     cell = read_cell(args.cell)
     chain = choose_robot(cell, args.robot, args.base_link, args.tip_link)
     choose_sensors(cell, args.sensors)

@@ -31,8 +31,8 @@ class ConvexDistances:
 
     @cached_property
     def _coal(self) -> Any:
-        # Imported here: commands that move nothing need not load it.
         """The module coal, or hppfcl, its name before version 3."""
+        # Imported here: commands that move nothing need not load it.
         try:
             import coal
         except ImportError:
@@ -73,7 +73,7 @@ class ConvexDistances:
         )
 
     def _object(self, shape: Shape, T: FloatArray) -> tuple[Any, FloatArray]:
-        """Return coal's object of a shape and its pose in the shape's frame."""
+        """Return coal's object of a shape, and the object's pose in the frame of T, (4, 4)."""
         coal = self._coal
         if shape.kind == 'box':
             return coal.Box(*(shape.points.max(axis=0) * 2).tolist()), T

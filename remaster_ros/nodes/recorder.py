@@ -236,6 +236,7 @@ class _Outlet(Outlet):
         self._node.status.publish()
 
     def registered(self, sensor: str, T_R_N: FloatArray) -> None:
+        """Publish a registration, T_R_N (4, 4)."""
         message = transform_message(self._node.base_link, sensor, T_R_N)
         message.header.stamp = self._node.get_clock().now().to_msg()
         self._node._registrations.publish(message)

@@ -356,7 +356,7 @@ class TourPlanner:
         ]
 
     def _plan(self, split: str, sensors_R: Mapping[str, FloatArray]) -> Plan:
-        # Seeded by the split: the plan does not depend on what was planned before a restart.
         """Return the plan of a split from its candidates."""
+        # Seeded by the split: the plan does not depend on what was planned before a restart.
         rng = np.random.default_rng([self._seed, *split.encode()])
         return self.scene.plan(self._counts[split], sensors_R, rng)

@@ -82,7 +82,7 @@ class Confinement:
 
 
 def _candidates(beside: Path, package_path: Sequence[Path]) -> Iterator[Path]:
-    """Yield the folders to search."""
+    """Yield the folders in which, or as which, a package is searched."""
     yield from package_path
     yield from sourced()
     for folder in beside.resolve().parents:
@@ -93,7 +93,7 @@ def _candidates(beside: Path, package_path: Sequence[Path]) -> Iterator[Path]:
 
 
 def _inside(folder: Path) -> list[Path]:
-    """Return a folder and its subfolders."""
+    """Return the ROS packages among the subfolders of a folder."""
     try:
         return sorted(path for path in folder.iterdir() if (path / 'package.xml').is_file())
     except OSError:

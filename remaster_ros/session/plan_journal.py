@@ -256,7 +256,7 @@ class PlanJournal:
                 self.decided = outcomes.decided()
 
     def _open(self) -> Journal:
-        """Open the file, and restore the state from its records.
+        """Open the file, and restore the state from its records; begin a plan in an empty file.
 
         Raises InputError if the file is damaged, or of other settings.
         """

@@ -343,7 +343,7 @@ class SessionRecorder:
             self.recording.take_temperature(seconds(message.header.stamp), message.temperature)
 
     def take_record(self, record: events.EventRecord) -> None:
-        """Take an event record of another node, or of the recorder of a bag."""
+        """Update the state by an event record of another node, or of the recorder of a bag."""
         match record.body:
             case events.PoseAnnounced() as pose:
                 self._on_pose(pose)
@@ -384,7 +384,10 @@ class SessionRecorder:
         self.end_reading()
 
     def _on_pose(self, pose: events.PoseAnnounced) -> None:
-        """Prepare for an announced pose."""
+        """Set the announced pose, and record which of its solutions are unreachable.
+
+        A pose after the references ends their round: changes of the setup are reported.
+        """
         self.recording.announced = pose
         self._failed = [failed for failed in self._failed if failed.stamp == pose.stamp]
         if pose.split not in (REFERENCE, REGISTRATION):
@@ -392,7 +395,11 @@ class SessionRecorder:
         self._record_unreached()
 
     def _on_planner(self, planner: events.PlannerState) -> None:
-        """Update the run, and reopen the session if the planner resumes."""
+        """Follow the planner's state, while no reading is under way.
+
+        The session is closed when the planner completes or stops, and reopened when it resumes or
+        adds measurements.
+        """
         self.run = planner.run_held(self.run)
         accepted = self.changes.follow(planner.state, self.run)
         if accepted and not self.keeper.full and not self.journal.closed:
@@ -435,7 +442,7 @@ class SessionRecorder:
         )
 
     def look(self) -> None:
-        """Do what no message triggers: late information, and overdue decisions."""
+        """End a decided reading, begin the next, record unreachable solutions; called often."""
         self.end_reading()
         self.recording.look_again()
         self.take_next()

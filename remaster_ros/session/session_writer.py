@@ -153,7 +153,7 @@ def _intact_size(path: Path, data: bytes, wanted: bytes, last_rows: Sequence[str
 
 
 def _read_rows(folder: Path) -> bytes:
-    """Return the content of observations.csv; b'' if it is missing."""
+    """Return the content of observations.csv; raise InputError if it is missing."""
     return read_limited(folder / ROWS, OBSERVATIONS_LIMIT, f'a session folder holds {ROWS}')
 
 

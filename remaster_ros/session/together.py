@@ -162,7 +162,7 @@ def _words(apart: OffsetsApart) -> str:
 
 
 def _require_same_arm(first_name: str, first: Session, name: str, session: Session) -> None:
-    """Raise InputError if two sessions have different robots."""
+    """Raise InputError if sessions have different robots, or corrections in the controller."""
     inside = [
         str(given.correction)
         if given.correction is not None and given.correction.is_inside

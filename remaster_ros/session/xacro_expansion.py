@@ -239,6 +239,7 @@ def _refused(what: str, why: str) -> InputError:
 
 
 def _converted(value: Any) -> Any:
+    """Return an argument as a bool, number or text, as xacro does."""
     return substitution_args.convert_value(value, 'auto') if isinstance(value, str) else value
 
 

@@ -265,8 +265,8 @@ def _plus(left: Any, right: Any) -> Any:
 
 
 def _number(value: Any) -> Any:
-    # Also of %, which formats a text.
     """Return a number; raise ExpressionError for another value."""
+    # Also of %, which formats a text.
     if not isinstance(value, int | float):
         raise ExpressionError(f'{value!r:.40} is no number')
     return value
