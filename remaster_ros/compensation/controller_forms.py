@@ -326,7 +326,9 @@ def _offsets(compensation: Compensation, one: Held) -> ZeroOffsets:
     was = content.state.get('accuracy_option', '')
     option = [f"Measured with the maker's accuracy option {was}: right in that state alone."]
     option = option if was else []
-    std = model.widening * np.linalg.norm(model.root[:, : model.joints], axis=0)
+    # With what links off their drawing do to the offsets, where the file has it.
+    root = model.widening * model.root if model.error_root is None else model.error_root
+    std = np.linalg.norm(root[:, : model.joints], axis=0)
     return ZeroOffsets(
         content.robot.urdf,
         model.chain,

@@ -22,6 +22,8 @@ from remaster_ros.types import FloatArray
 TF = 'tf'
 LAUNCH_FILE = 'static_transforms.launch.xml'
 MESSAGE_FILE = 'static_transforms.yaml'
+# Behind the name of a sensor on the tool: the board that it sees.
+BOARD = '_board'
 # Names that a launch line and a YAML need no quotes for; tf2 refuses a leading slash.
 FRAME = re.compile(r'[A-Za-z_][A-Za-z0-9_./-]*')
 _HEAD = (
@@ -110,7 +112,7 @@ def static_transforms(
                     tuple(model.widening * value for value in mount.std_rad),
                 )
             )
-            child = f'{child}_board'
+            child = f'{child}{BOARD}'
         shift, turn = (root[:, where] for where in model.registration(sensor))
         # The file has shifts of the base frame at its own origin; the child's origin also moves
         # by the turns, at the lever of its distance.

@@ -48,7 +48,7 @@ def print_offsets(console: Console, fit: Fit, truth: SessionTruth) -> None:
     """Print the offsets beside the true ones, and the error on validation poses."""
     title = 'joint zero-offsets, degrees'
     # The simulated arm is exactly its drawing: by that std the estimate is judged.
-    drawn = 'std if exactly drawn'
+    drawn = 'std as drawn'
     table = _table(title, 'joint', 'estimate', 'std', drawn, 'hidden truth', 'off by')
     for row, hidden in zip(fit.joint_offsets, truth.joint_offsets):
         slides = row.unit == 'mm'

@@ -8,7 +8,7 @@ installed: it comes with ROS 2, but there is no pip wheel of it.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Container, Mapping
 from importlib import import_module, util
 from typing import Any
 
@@ -18,6 +18,7 @@ from rclpy.node import Node
 from std_msgs.msg import ColorRGBA
 from visualization_msgs.msg import Marker, MarkerArray
 
+from remaster_ros.compensation.static_transforms import BOARD
 from remaster_ros.nodes.messages import transform_message, write_place
 from remaster_ros.nodes.status import LATCHED, RELIABLE
 from remaster_ros.reports.robot_scene import RobotScene, Surface, coarser
@@ -34,8 +35,11 @@ SENSOR_COLORS = ('#3b82c4', '#e07b39', '#2f9e78', '#a86bc0')
 class RvizMarkers:
     """Publishes the markers and, with `publish_tf`, the sensors' frames on /tf_static."""
 
-    def __init__(self, node: Node, scene: RobotScene, *, publish_tf: bool) -> None:
+    def __init__(
+        self, node: Node, scene: RobotScene, *, publish_tf: bool, on_tool: Container[str] = ()
+    ) -> None:
         self._node, self._scene, self._base = node, scene, scene.chain.base_link
+        self._on_tool = on_tool
         self._publisher = node.create_publisher(MarkerArray, TOPIC, RELIABLE)
         self._surfaces = [self._surface(i, s) for i, s in enumerate(scene.surfaces)]
         self._tf = None
@@ -100,14 +104,19 @@ class RvizMarkers:
         return markers
 
     def place_sensors(self, T_R_N: Mapping[str, FloatArray]) -> None:
-        """Publish where sensors stand, sensor -> (4, 4), to /tf_static."""
+        """Publish where sensors stand, sensor -> (4, 4), to /tf_static.
+
+        The registration of a sensor on the tool is the frame of the board that it sees, and is
+        called so, as in the transforms that `remaster export --to tf` writes.
+        """
         if self._tf is None:
             return
         kind, publisher = self._tf
         stamp = self._node.get_clock().now().to_msg()
         found: list[TransformStamped] = []
         for name, T in T_R_N.items():
-            found.append(transform_message(self._base, name, T))
+            child = f'{name}{BOARD}' if name in self._on_tool else name
+            found.append(transform_message(self._base, child, T))
             found[-1].header.stamp = stamp
         publisher.publish(kind(transforms=found))
 

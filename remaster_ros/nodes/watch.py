@@ -119,7 +119,8 @@ class Watch(RemasterNode):
         self._plan = ''
         self._subscribe({name: sensor.topics for name, sensor in cell.sensors.items()})
         scene = robot_scene(cell, cell.planning_scene(self.chain))
-        self._rviz = RvizMarkers(self, scene, publish_tf=self.p.publish_tf)
+        on_tool = [name for name, sensor in cell.sensors.items() if sensor.mounted_on]
+        self._rviz = RvizMarkers(self, scene, publish_tf=self.p.publish_tf, on_tool=on_tool)
         self.page = self._open_page(msgspec.json.encode(scene_to_dict(scene)))
         self.status = NodeStatus(self, self._summary)
         self.create_timer(EVERY_S, self._show, clock=self.status.steady)

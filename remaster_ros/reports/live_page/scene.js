@@ -113,7 +113,7 @@ function drawResiduals(sensors) {
   setText('residuals-note', made.length
     ? `Distance from each measured marker to where ${model} has it, registered by all configurations so far. The fit itself weighs them by their noise.${registering ? ' Open circles: at the registration poses, which are not among the configurations counted above.' : ''}`
     : 'After five measured points.');
-  flat('residuals', made, { xaxis: axis('measured point since this page was started'), yaxis: axis('mm', { rangemode: 'tozero' }), showlegend: true });
+  flat('residuals', made, { xaxis: axis('measured points, in order'), yaxis: axis('mm', { rangemode: 'tozero' }), showlegend: true });
 }
 
 function drawPrecision(precision) {
@@ -124,11 +124,14 @@ function drawPrecision(precision) {
       hovertemplate: '%{y:.4f}° after %{x} configurations, %{customdata:.1f} min',
     }));
   setText('precision-note', made.length
-    ? `Of each zero-offset, by fits of what was recorded up to then; the last: ${precision.message}`
+    ? `Of each zero-offset if the arm is exactly its drawing, by fits of what was recorded up to then; the last: ${precision.message}`
     : 'The optimizer fits what is recorded after every few configurations to fit.');
+  const known = made.flatMap((one) => one.y.filter((value) => value > 0));
+  // Over several decades only their powers of ten have room.
+  const decades = known.length ? Math.log10(Math.max(...known) / Math.min(...known)) : 0;
   flat('precision', made.concat(made.length ? minutesTrace(precision) : []), {
     xaxis: axis('configurations to fit'), xaxis2: minutesAxis(precision), margin: { l: 52, r: 24, t: 24, b: 40 },
-    yaxis: axis('std (°)', { type: 'log', tickformat: '~g' }), legend: { orientation: 'h', y: 1.14, yanchor: 'bottom' }, showlegend: true,
+    yaxis: axis('std (°)', { type: 'log', tickformat: '~g', ...(decades > 1.5 ? { dtick: 1 } : {}) }), legend: { orientation: 'h', y: 1.14, yanchor: 'bottom' }, showlegend: true,
   });
 }
 

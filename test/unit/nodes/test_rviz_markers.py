@@ -98,3 +98,14 @@ def test_where_sensors_stand_goes_to_tf_static_where_its_message_is_there(node, 
             (transform,) = node.topics['/tf_static'][-1].transforms
             assert (transform.header.frame_id, transform.child_frame_id) == ('base_link', 'mocap')
             assert np.allclose(transform_array(transform), T_R_N)
+
+
+def test_of_a_camera_on_the_tool_the_frame_that_stands_is_its_board(node, monkeypatch):
+    stand_in = types.ModuleType('tf2_msgs.msg')
+    stand_in.TFMessage = lambda transforms: types.SimpleNamespace(transforms=transforms)
+    monkeypatch.setitem(sys.modules, 'tf2_msgs.msg', stand_in)
+    monkeypatch.setattr(rviz_markers.util, 'find_spec', lambda name: object())
+    markers = RvizMarkers(node, SCENE, publish_tf=True, on_tool=['camera'])
+    markers.place_sensors({'mocap': T_R_N, 'camera': T_R_N})
+    sent = node.topics['/tf_static'][-1].transforms
+    assert [one.child_frame_id for one in sent] == ['mocap', 'camera_board']

@@ -8,6 +8,7 @@ import msgspec
 import numpy as np
 import pytest
 import yaml
+from rigs.command_line import remaster
 from worlds.arms import planar_arm
 
 from remaster_ros.calibration.residual_structure import ResidualStructure, StructureTest
@@ -81,6 +82,13 @@ def test_what_a_person_is_shown_contains_an_arm_off_its_drawing(fit_result, tmp_
         assert f'<td class="n">{wider[i]:.4f}</td>' in html
         assert np.degrees(next(in_layer)) == pytest.approx(wider[i])
         assert f'{wider[i]:.4f}' in (tmp_path / 'apply' / 'remaster.txt').read_text()
+    # And so has what is exported of the correction.
+    file = tmp_path / 'apply' / 'compensation.json'
+    remaster('export', file, '--to', 'pad', '--out', tmp_path / 'pad', '--quiet')
+    pages = (tmp_path / 'pad' / 'remaster.txt').read_text()
+    for joint, cells in ((line.split()[0], line.split()) for line in pages.splitlines() if line):
+        if joint in fit_result.joint_names and len(cells) == 4:
+            assert float(cells[2]) > 2.0 * drawn[fit_result.joint_names.index(joint)]
     assert 'std if the arm is exactly its drawing' in html
     assert 'off their drawing by 0.1 mm' in layer
 
