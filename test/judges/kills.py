@@ -73,7 +73,7 @@ def judge(out: Path, seen: set[str], truth: SessionTruth | None = None) -> dict[
     if fit_path.exists():
         fit = json.loads(fit_path.read_text())
         result['offsets'] = {
-            row['joint']: (row['mean_deg'], row['std_deg'])
+            row['joint']: (row['mean_deg'], row.get('std_if_exactly_drawn_deg', row['std_deg']))
             for row in fit['joint_offsets']
             if row['identifiable']
         }
