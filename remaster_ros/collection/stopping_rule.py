@@ -32,6 +32,7 @@ from remaster_ros.errors import InsufficientDataError
 from remaster_ros.kinematics.serial_chain import LEVER_M
 from remaster_ros.planning.expected_sensors import ToolBox
 from remaster_ros.planning.pose_design import Floors
+from remaster_ros.planning.pose_settings import OPTIMAL, PoseSettings
 from remaster_ros.types import IntArray, Priors, Session
 
 FREEDOM_PER_PARAMETER = 2
@@ -45,13 +46,24 @@ MOST_TESTS = 20
 
 @dataclass(frozen=True)
 class StoppingGoal:
-    """What is to be known at the end; None where it does not matter."""
+    """Precision at which a collection ends; None for one that does not matter."""
 
     # Root mean square of the standard deviations of the identifiable joints, rad
     joint_std_rad: float | None = None
     # Root mean square of the 3-D error of the predicted markers in the box, m
     tool_std_m: float | None = None
     box: ToolBox | None = None  # None for wherever the tool was measured
+
+    @classmethod
+    def of(cls, poses: PoseSettings) -> StoppingGoal:
+        """Return the goal of a cell file; an empty one if an optimal design's is not stated."""
+        stated = (poses.joint_std_deg, poses.tool_std_m)
+        matters = (poses.tool_share < 1.0, poses.tool_share > 0.0)
+        if poses.design == OPTIMAL and None in compress(stated, matters):
+            # The design then aims at the precision of the Latin hypercube, which is not stated.
+            return cls()
+        settings = poses.settings((), 0.0)
+        return cls(settings.joint_std_rad, settings.tool_std_m, settings.box)
 
     @property
     def stated(self) -> bool:

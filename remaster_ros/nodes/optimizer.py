@@ -190,7 +190,7 @@ class Optimizer(RemasterNode):
             serve = partial(self._serve, work)
             group = MutuallyExclusiveCallbackGroup()
             self.create_service(Trigger, service, serve, callback_group=group)
-        goal = read_cell(self.p.cell).poses.stopping_goal() if self.p.cell else StoppingGoal()
+        goal = StoppingGoal.of(read_cell(self.p.cell).poses) if self.p.cell else StoppingGoal()
         self._watch = PrecisionWatch(
             self, Path(self.p.session), goal, self.p.look_every, self._priors
         )

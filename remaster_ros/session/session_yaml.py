@@ -13,11 +13,12 @@ from typing import Annotated, Any, Literal
 import msgspec
 import numpy as np
 
+from remaster_ros.bounds import Bounds, Triple
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.pad_angles import coupled_in_circle
 from remaster_ros.session.files import decode_text
 from remaster_ros.session.strict_yaml import YamlError, dump_yaml, load_yaml
-from remaster_ros.session.yaml_records import Bounds, Triple, out_of_bounds, to_plain
+from remaster_ros.session.yaml_records import out_of_bounds, to_plain
 from remaster_ros.types import (
     AccuracyOption,
     BasePrior,

@@ -9,13 +9,14 @@ import itertools
 import re
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping
-from math import degrees, pi, radians
+from math import radians
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import msgspec
 import numpy as np
 
+from remaster_ros.bounds import Bounds, Triple
 from remaster_ros.collection.events import ArmModel
 from remaster_ros.collection.plausibility import SMALLEST_M
 from remaster_ros.errors import InputError, did_you_mean
@@ -29,16 +30,15 @@ from remaster_ros.planning.candidates import (
     LIMIT_MARGIN_RAD,
     LineOfSight,
     PlanningScene,
-    PoseRanges,
 )
-from remaster_ros.planning.expected_sensors import POSE_SIGMA_M, SIGMA_M, ExpectedSensor, ToolBox
+from remaster_ros.planning.expected_sensors import POSE_SIGMA_M, SIGMA_M, ExpectedSensor
+from remaster_ros.planning.pose_settings import PoseSettings
 from remaster_ros.session.files import URDF_LIMIT, decode_text, read_limited
 from remaster_ros.session.meshes import mesh_reader
-from remaster_ros.session.yaml_records import YAML_LIMIT, Bounds, Triple, read_yaml, with_line
+from remaster_ros.session.yaml_records import YAML_LIMIT, read_yaml, with_line
 from remaster_ros.types import FARTHEST_M, FloatArray
 
 if TYPE_CHECKING:
-    from remaster_ros.collection.stopping_rule import StoppingGoal
     from remaster_ros.planning.planned_design import DesignSettings
 
 POSE = 'geometry_msgs/msg/PoseStamped'
@@ -166,145 +166,6 @@ class CellSensor(msgspec.Struct, forbid_unknown_fields=True):
         return ''
 
 
-Range = tuple[float, float]
-# Heights of poses: beyond the reach of any supported arm.
-REACH = Bounds(-10.0, 10.0, 'm')
-LATIN_HYPERCUBE, OPTIMAL = 'latin_hypercube', 'optimal'
-NEAREST, FASTEST = 'nearest', 'fastest'
-ALL, CHOSEN = 'all', 'chosen'
-RANGES = ('azimuth_deg', 'radius_m', 'height_m', 'roll_deg')
-
-
-class CellToolBox(msgspec.Struct, forbid_unknown_fields=True):
-    """Box in base_link in which the tool has to be accurate."""
-
-    center_m: Triple
-    size_m: Annotated[Triple, Bounds(0.0, 20.0, 'm', above=True)]
-
-
-class CellPoses(msgspec.Struct, forbid_unknown_fields=True):
-    """Ranges of the candidate poses, design of the visits, and their order."""
-
-    azimuth_deg: Range = (0.0, 360.0)
-    radius_m: Annotated[Range, Bounds(0.0, 10.0, 'm')] = (0.2, 0.5)
-    height_m: Annotated[Range, REACH] = (0.4, 0.8)
-    roll_deg: Range = (0.0, 360.0)
-    # `OPTIMAL` for an optimal design, `LATIN_HYPERCUBE` for all of its poses.
-    design: str = OPTIMAL
-    # `ALL` for each pose in all its free joint solutions; `CHOSEN` for the configurations that
-    # take the least time, and may return to a pose.
-    solutions: str = ALL
-    # `NEAREST` for the nearest pose next, `FASTEST` for the least travel time.
-    order: str = NEAREST
-    # Weight of the tool's error in the design: 0 for joint offsets only, 1 for the tool only.
-    tool_share: Annotated[float, Bounds(0.0, 1.0)] = 0.0
-    # Precision to reach: an optimal design is made for it (by default for that of the Latin
-    # hypercube, of the joints at least 0.005 degrees), and a collection ends when it is reached.
-    joint_std_deg: Annotated[float | None, Bounds(0.0, 5.0, 'degrees', above=True)] = None
-    tool_std_m: Annotated[float | None, Bounds(0.0, 0.1, 'm', above=True)] = None
-    # Where the tool's error counts; by default at all candidate poses.
-    tool_box: CellToolBox | None = None
-
-    def ranges(self) -> PoseRanges:
-        """Return the ranges in SI units."""
-        return PoseRanges(
-            azimuth_rad=(radians(self.azimuth_deg[0]), radians(self.azimuth_deg[1])),
-            radius_m=self.radius_m,
-            height_m=self.height_m,
-            roll_rad=(radians(self.roll_deg[0]), radians(self.roll_deg[1])),
-        )
-
-    def settings(self, sensors: tuple[ExpectedSensor, ...], marker_std_m: float) -> DesignSettings:
-        """Return the settings of the design, in SI units."""
-        # Imported when needed, here and below: most nodes plan nothing.
-        from remaster_ros.planning.planned_design import DesignSettings
-
-        box = self.tool_box
-        return DesignSettings(
-            optimal=self.design == OPTIMAL,
-            whole_poses=self.solutions == ALL,
-            fastest=self.order == FASTEST,
-            sensors=sensors,
-            marker_std_m=marker_std_m,
-            tool_share=self.tool_share,
-            joint_std_rad=None if self.joint_std_deg is None else radians(self.joint_std_deg),
-            tool_std_m=self.tool_std_m,
-            box=None if box is None else ToolBox(np.array(box.center_m), np.array(box.size_m)),
-        )
-
-    def stopping_goal(self) -> StoppingGoal:
-        """Return the precision that ends a collection, in SI units.
-
-        Empty if an optimal design has a goal that the file does not state.
-        """
-        from remaster_ros.collection.stopping_rule import StoppingGoal
-
-        optimal, stated = self.design == OPTIMAL, (self.joint_std_deg, self.tool_std_m)
-        counts = (self.tool_share < 1.0, self.tool_share > 0.0)
-        if optimal and any(one and value is None for one, value in zip(counts, stated)):
-            # The design then aims at the precision of the Latin hypercube, which is not stated.
-            return StoppingGoal()
-        settings = self.settings((), 0.0)
-        return StoppingGoal(settings.joint_std_rad, settings.tool_std_m, settings.box)
-
-    def given(self) -> Mapping[str, object]:
-        """Return the keys that differ from their defaults, ranges excepted."""
-        plain = CellPoses()
-        return {
-            key: getattr(self, key)
-            for key in self.__struct_fields__
-            if key not in RANGES and getattr(self, key) != getattr(plain, key)
-        }
-
-    def problem(self) -> str:
-        """First contradiction between keys; '' if there is none."""
-        for key in RANGES:
-            low, high = getattr(self, key)
-            if low > high:
-                return (
-                    f'poses.{key} goes from {low:g} down to {high:g}; give the smaller one first'
-                )
-            if key.endswith('_deg') and low < high and max(abs(low), abs(high)) < 2.0 * pi + 0.01:
-                return (
-                    f'poses.{key} is {low:g} to {high:g}, a range of {high - low:.3g} degrees; if '
-                    f'radians were meant, write {degrees(low):.4g}, {degrees(high):.4g}'
-                )
-        choices = {
-            'design': (OPTIMAL, LATIN_HYPERCUBE),
-            'solutions': (ALL, CHOSEN),
-            'order': (NEAREST, FASTEST),
-        }
-        for key, words in choices.items():
-            if getattr(self, key) not in words:
-                return f'poses.{key} is {getattr(self, key)!r}; write {" or ".join(words)}'
-        return self._without_effect()
-
-    def _without_effect(self) -> str:
-        """First key that has no effect with the others; '' if there is none."""
-        given = self.given()
-        if self.solutions == CHOSEN and (self.design, self.order) == (LATIN_HYPERCUBE, NEAREST):
-            return (
-                f'poses.solutions: {CHOSEN} has no effect with design: {LATIN_HYPERCUBE} and '
-                f'order: {NEAREST}; leave it out'
-            )
-        if 'tool_share' in given and self.design != OPTIMAL:
-            return (
-                f'poses.tool_share has no effect with design: {self.design}; write design: '
-                f'{OPTIMAL}, or leave it out'
-            )
-        if self.design != OPTIMAL:
-            if 'tool_box' in given and 'tool_std_m' not in given:
-                return (
-                    'poses.tool_box has no effect without tool_std_m; write it, or leave both out'
-                )
-            return ''
-        if 'joint_std_deg' in given and self.tool_share == 1.0:
-            return 'poses.joint_std_deg has no effect with tool_share: 1; write less, such as 0.5'
-        if 'tool_std_m' in given and self.tool_share == 0.0:
-            return 'poses.tool_std_m has no effect with tool_share: 0; write more, such as 0.5'
-        return ''
-
-
 ON_TOOL = Bounds(-3.0, 3.0, 'm')
 # Prior of marker positions in cells; a session file may have a larger one.
 MARKER_STD = Bounds(0.0, 0.02, 'm', above=True)
@@ -382,7 +243,7 @@ class Workcell(msgspec.Struct, forbid_unknown_fields=True):
     held_joint: str | None = ''
     held_values_deg: list[float] | None = []
     held_values_m: list[float] | None = []  # Instead, if the joint is prismatic
-    poses: CellPoses = msgspec.field(default_factory=CellPoses)
+    poses: PoseSettings = msgspec.field(default_factory=PoseSettings)
     link_radius_m: Annotated[float, Bounds(0.0, 1.0, 'm', above=True)] = LINK_RADIUS_M
     obstacles: dict[str, CellBox] = {}
     floor_z_m: float | None = 0.0

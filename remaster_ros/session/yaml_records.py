@@ -1,19 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Records of YAML files, each declared once: a msgspec struct with the bounds of its numbers.
 
-Bounds are in the annotation of a field and hold for every number in it::
-
-    class Marker(msgspec.Struct, forbid_unknown_fields=True):
-        position_m: Annotated[Triple, Bounds(-10.0, 10.0, 'm')]
-
+Bounds (`remaster_ros.bounds`) are in the annotation of a field and hold for every number in it.
 They are not msgspec's (`msgspec.Meta`), whose messages lack the keys of dictionaries.
 """
 
 from __future__ import annotations
 
-import math
 import re
-from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar, get_type_hints
@@ -22,6 +16,7 @@ import msgspec
 import numpy as np
 import yaml
 
+from remaster_ros.bounds import Bounds
 from remaster_ros.errors import InputError, did_you_mean
 from remaster_ros.session.files import decode_text
 from remaster_ros.session.strict_yaml import YamlError, load_yaml
@@ -138,39 +133,9 @@ def from_plain(content: Any, record: Any) -> Any:
 
 YAML_LIMIT = 256 * 1024
 
-Triple = tuple[float, float, float]
+FINITE = Bounds()
+
 Record = TypeVar('Record', bound=msgspec.Struct)
-
-
-@dataclass(frozen=True)
-class Bounds:
-    """Range of the numbers of a file; they are always finite."""
-
-    least: float = -math.inf
-    most: float = math.inf
-    # For a value above `most` m, or below `least` degrees, the message also gives it converted
-    # from millimetres or radians.
-    unit: str = ''
-    # Whether `least` is excluded.
-    above: bool = False
-    # Further text of the message.
-    remedy: str = ''
-
-    def problem(self, key: str, value: float) -> str:
-        """Return what is wrong with a value, in one line with the remedy; '' if valid."""
-        if not math.isfinite(value):
-            return f'{key}: {value} is not a finite number; correct it'
-        if self.least < value <= self.most or (value == self.least and not self.above):
-            return ''
-        limits = [f'above {self.least:g}' if self.above else f'from {self.least:g}']
-        if math.isfinite(self.most):
-            limits.append(f'to {self.most:g}')
-        text = f'{key} is {value:g}; it must be {" ".join((*limits, self.unit)).rstrip()}'
-        if self.unit == 'm' and abs(value) > self.most:
-            text += f'; if millimetres were meant, write {value / 1e3:g}'
-        elif self.unit == 'degrees' and 0.0 < value < self.least:
-            text += f'; if radians were meant, write {math.degrees(value):.4g}'
-        return text + self.remedy
 
 
 def read_yaml(data: bytes, path: Path, record: type[Record], remedy: str = '') -> Record:
@@ -196,7 +161,7 @@ def _hints(record: type) -> dict[str, Any]:
     return get_type_hints(record, include_extras=True)
 
 
-def out_of_bounds(value: Any, key: str = '', bounds: Bounds = Bounds()) -> str:
+def out_of_bounds(value: Any, key: str = '', bounds: Bounds = FINITE) -> str:
     """Return what is wrong with the first number outside its bounds; '' if none is.
 
     ``value``: a record or a part of one; ``key``: its dotted key; ``bounds``: of its field.

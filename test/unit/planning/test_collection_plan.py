@@ -16,10 +16,11 @@ from remaster_ros.planning.candidates import order_solutions, plan_poses
 from remaster_ros.planning.collection_plan import look_ahead, plan_collection, session_time_s
 from remaster_ros.planning.planned_design import ENOUGH_RAD, NOT_NEEDED, DesignSettings
 from remaster_ros.planning.pose_design import HELD_OUT_POSES, HELD_OUT_SOLUTIONS, Floors
+from remaster_ros.planning.pose_settings import PoseSettings
 from remaster_ros.planning.tour_order import Tour
 from remaster_ros.planning.tour_planner import TourPlanner
 from remaster_ros.reports.plan_json import missed_goal, plan_text, plan_to_dict
-from remaster_ros.session.workcell import CellPoses, read_cell
+from remaster_ros.session.workcell import read_cell
 
 
 @pytest.fixture(autouse=True)
@@ -47,7 +48,7 @@ def planned(poses, counts=(24, 24), every=0, registration=0):
 @cache
 def latin():
     """Return the plan of all poses of the hypercube, which nothing writes into."""
-    return planned(CellPoses(design=LATIN))
+    return planned(PoseSettings(design=LATIN))
 
 
 def of(plan, split):
@@ -59,7 +60,7 @@ LATIN = 'latin_hypercube'
 
 def test_a_cell_has_by_default_designed_poses_each_in_all_its_free_solutions_nearest_first():
     _, whole = latin()
-    scene, plan = planned(CellPoses())
+    scene, plan = planned(PoseSettings())
     assert plan.design_result.reached
     assert plan.joint_rms <= max(whole.joint_rms, ENOUGH_RAD)
     assert plan.robot_time_s < whole.robot_time_s
@@ -99,7 +100,7 @@ def test_chosen_solutions_reach_what_all_poses_reach_in_the_fewest_minutes_on_fr
     _, whole = latin()
     stated = np.degrees(whole.joint_rms)
     assert stated < np.degrees(ENOUGH_RAD)
-    poses = CellPoses(solutions='chosen', order='fastest', joint_std_deg=stated)
+    poses = PoseSettings(solutions='chosen', order='fastest', joint_std_deg=stated)
     scene, plan = planned(poses)
     assert plan.joint_rms <= whole.joint_rms
     assert plan.robot_time_s < 0.7 * whole.robot_time_s
@@ -119,7 +120,7 @@ def test_chosen_solutions_reach_what_all_poses_reach_in_the_fewest_minutes_on_fr
 
 
 def test_the_robot_time_is_that_of_the_whole_session():
-    _, plan = planned(CellPoses(), every=25, registration=12)
+    _, plan = planned(PoseSettings(), every=25, registration=12)
     by_split = Counter()
     for visit in plan.visits:
         by_split[visit.split] += visit.trajectory.duration_s + plan.measuring_s
@@ -131,10 +132,10 @@ def test_the_robot_time_is_that_of_the_whole_session():
 
 
 def test_more_poses_are_drawn_where_too_few_can_be_taken_for_the_registration():
-    planner, _ = planner_of(CellPoses(), registration=1)
+    planner, _ = planner_of(PoseSettings(), registration=1)
     tour = planner.registration()
     assert sum(tour.poses.values()) >= 3
-    again, _ = planner_of(CellPoses(), registration=1)
+    again, _ = planner_of(PoseSettings(), registration=1)
     for one, other in zip(
         tour.plans['registration'].poses,
         again.registration().plans['registration'].poses,
@@ -145,7 +146,7 @@ def test_more_poses_are_drawn_where_too_few_can_be_taken_for_the_registration():
 
 @pytest.mark.qualify
 def test_the_time_without_looking_for_ways_is_that_of_the_plan():
-    planner, start = planner_of(CellPoses(), every=25, registration=12)
+    planner, start = planner_of(PoseSettings(), every=25, registration=12)
     plan = plan_collection(planner, planner.rough_places, start)
     tour = plan.tour.fork()
     # However far it is: what a planner that goes on states is the whole session too.
@@ -155,7 +156,7 @@ def test_the_time_without_looking_for_ways_is_that_of_the_plan():
 
 
 def test_every_candidate_is_accounted_for():
-    _, plan = planned(CellPoses(design='optimal'))
+    _, plan = planned(PoseSettings(design='optimal'))
     candidates = 24 + 60 + 24
     assert sum(plan.tour.poses.values()) + sum(plan.tour.dropped.values()) == candidates
     assert plan.tour.dropped[NOT_NEEDED] > 0
@@ -164,7 +165,7 @@ def test_every_candidate_is_accounted_for():
 @pytest.mark.qualify
 def test_the_fastest_order_of_the_same_configurations_takes_less_time():
     _, nearest = latin()
-    _, fastest = planned(CellPoses(design=LATIN, solutions='chosen', order='fastest'))
+    _, fastest = planned(PoseSettings(design=LATIN, solutions='chosen', order='fastest'))
     assert fastest.tour.configurations == nearest.tour.configurations
     assert len(fastest.visits) + fastest.unreached == len(nearest.visits) + nearest.unreached
     assert fastest.robot_time_s < 0.9 * nearest.robot_time_s
@@ -172,17 +173,17 @@ def test_the_fastest_order_of_the_same_configurations_takes_less_time():
 
 
 def test_the_fastest_order_of_whole_poses_visits_each_once():
-    _, plan = planned(CellPoses(design=LATIN, order='fastest'))
+    _, plan = planned(PoseSettings(design=LATIN, order='fastest'))
     found = [(stop[0].split, stop[0].pose) for stop in stops(plan)]
     assert len(found) == len(set(found)) == sum(plan.poses.values())
 
 
 def test_a_stated_goal_is_reached_or_said_not_to_be():
-    _, easy = planned(CellPoses(design='optimal', joint_std_deg=0.01))
+    _, easy = planned(PoseSettings(design='optimal', joint_std_deg=0.01))
     assert easy.design_result.reached
     assert easy.goal_reached
     assert np.degrees(easy.joint_rms) <= 0.01
-    _, hard = planned(CellPoses(design='optimal', joint_std_deg=1e-4), counts=(8, 0))
+    _, hard = planned(PoseSettings(design='optimal', joint_std_deg=1e-4), counts=(8, 0))
     assert not hard.design_result.reached
     assert not hard.goal_reached
 
@@ -200,7 +201,7 @@ def test_a_goal_is_reached_by_what_free_ways_lead_to_alone(few, monkeypatch):
         return replace(stop, **nothing, unreached=stop.ids)
 
     monkeypatch.setattr(Tour, 'next', lost)
-    _, plan = planned(CellPoses(design='optimal', joint_std_deg=0.01))
+    _, plan = planned(PoseSettings(design='optimal', joint_std_deg=0.01))
     assert plan.design_result.reached
     assert plan.unreached
     assert not plan.goal_reached
@@ -209,7 +210,7 @@ def test_a_goal_is_reached_by_what_free_ways_lead_to_alone(few, monkeypatch):
 
 
 def test_references_are_visited_between():
-    _, plan = planned(CellPoses(design='optimal', joint_std_deg=0.01), every=25)
+    _, plan = planned(PoseSettings(design='optimal', joint_std_deg=0.01), every=25)
     assert plan.tour.references >= 4
     assert len(of(plan, 'reference')) >= 3 * plan.tour.references
 
@@ -241,7 +242,7 @@ def test_looking_ahead_leaves_a_tour_as_it_is_and_begins_with_what_is_left_of_it
 
 
 def test_a_verification_has_ten_poses_off_and_on_in_random_order_that_no_collection_has():
-    planner, _ = planner_of(CellPoses(design=LATIN))
+    planner, _ = planner_of(PoseSettings(design=LATIN))
     tour = planner.verification()
     assert tour.inspection == 'verify'
     visits, q = [], np.zeros(len(planner.model.chain))
@@ -282,7 +283,7 @@ def test_a_design_stays_in_one_part_of_what_is_free(monkeypatch):
         return goal[None] if (q[3] > 0) == (goal[3] > 0) else None
 
     monkeypatch.setattr(planned_design, 'free_waypoints', way_in_a_half)
-    planner, _ = planner_of(CellPoses())
+    planner, _ = planner_of(PoseSettings())
     planner.collection(planner.rough_places)
     poses = planner.design_result.plans['optimization'].poses
     assert {True, False} == set(sides)

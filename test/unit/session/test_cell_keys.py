@@ -4,6 +4,7 @@
 import pytest
 from worlds.simple_cells import DEMO, edited_cell
 
+from remaster_ros.collection.stopping_rule import StoppingGoal
 from remaster_ros.errors import InputError
 from remaster_ros.session.workcell import read_cell
 
@@ -204,7 +205,7 @@ def test_a_plan_depends_on_the_keys_and_not_on_where_the_file_lies(tmp_path):
     ],
 )
 def test_what_ends_a_collection_is_what_counts_and_is_stated(tmp_path, keys, joint, tool):
-    goal = read_cell(cell_file(tmp_path, poses(keys))).poses.stopping_goal()
+    goal = StoppingGoal.of(read_cell(cell_file(tmp_path, poses(keys))).poses)
     assert goal.joint_std_rad == (joint if joint is None else pytest.approx(joint, rel=1e-3))
     assert goal.tool_std_m == tool
     assert goal.stated == (joint is not None or tool is not None)

@@ -8,9 +8,10 @@ import msgspec
 import numpy as np
 import pytest
 
+from remaster_ros.bounds import Bounds, Triple
 from remaster_ros.errors import InputError
 from remaster_ros.session.session_yaml import BaseFrame
-from remaster_ros.session.yaml_records import Bounds, Triple, read_yaml
+from remaster_ros.session.yaml_records import read_yaml
 
 
 class Part(msgspec.Struct, forbid_unknown_fields=True):
