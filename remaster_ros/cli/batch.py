@@ -54,6 +54,8 @@ AHEAD = 4
 
 log = logging.getLogger('remaster_ros')
 
+_READ = ('.yaml', '.csv', '.urdf', '.xml')
+
 
 @dataclass(frozen=True)
 class Job:
@@ -192,9 +194,6 @@ def _digest(path: Path) -> str:
             return hashlib.file_digest(file, 'sha256').hexdigest()
     except OSError:
         return ''
-
-
-_READ = ('.yaml', '.csv', '.urdf', '.xml')
 
 
 def _said(rows: Journal, path: Path) -> dict[str, dict[str, Any]]:

@@ -21,6 +21,10 @@ Result = TypeVar('Result')
 Work = Callable[[], Any]
 Then = Callable[[Any], object]
 
+MOVED_RAD = 0.005
+"""An arm this far from where a way begins, in any joint, gets another one (a slide 1.25 mm off).
+"""
+
 
 class Background:
     """One thread that does one thing after the other; a node's callbacks take the results."""
@@ -60,11 +64,6 @@ class Background:
         while self._results:
             then, result = self._results.popleft()
             then(result)
-
-
-MOVED_RAD = 0.005
-"""An arm this far from where a way begins, in any joint, gets another one (a slide 1.25 mm off).
-"""
 
 
 class PlanningThread:

@@ -20,6 +20,9 @@ shows that the instrument is gone."""
 MISSING_WALL_S = 5.0
 """Time until a missing service counts as a failure: by then a dead node is known as absent."""
 
+MEASURE_EVERY_WALL_S = 5.0
+"""Interval of a sensor's measurements until its marker was seen, s of wall time."""
+
 
 @dataclass
 class _Shot:
@@ -72,10 +75,6 @@ class TriggeredSensors:
             pairing.fail(name, response.message)
         elif not pairing.has_reading(name):
             del self._shots[name]
-
-
-MEASURE_EVERY_WALL_S = 5.0
-"""Interval of a sensor's measurements until its marker was seen, s of wall time."""
 
 
 class MeasureCalls:

@@ -21,7 +21,6 @@ from remaster_ros.planning.planned_design import (
     DesignResult,
     DesignSettings,
     designed_plans,
-    visit_order,
 )
 from remaster_ros.planning.reference_choice import choose_references
 from remaster_ros.planning.rival_causes import FoundCause
@@ -40,7 +39,19 @@ from remaster_ros.planning.tour_order import (
     free_waypoints,
 )
 from remaster_ros.planning.travel_time import TravelTime
+from remaster_ros.planning.visit_order import visit_order
 from remaster_ros.types import FloatArray, Measurements
+
+REGISTRATION_CANDIDATES = 12
+"""Default number of candidate poses for the three-point registration."""
+MORE_CANDIDATES = 10 * REGISTRATION_CANDIDATES
+"""Additional candidates if fewer than three of these are usable."""
+MOST_TRIES = 5
+"""Most repetitions of a choice if a pose has no free path to it."""
+VERIFIED_POSES = 10
+"""Poses of a verification: at 0.1 mm of noise they detect 0.1 degrees in 97 % of cases."""
+VERIFIED_CANDIDATES = 6 * VERIFIED_POSES
+"""Candidates of a verification, of which arms reach a half to a sixth."""
 
 
 def registration_tour(
@@ -77,18 +88,6 @@ def registration_tour(
     poses = tuple(plan.poses[i] for i in (*best, *others))
     ordered = Plan(poses, plan.dropped, plan.dropped_solutions)
     return Tour(chain, {REGISTRATION: ordered}, in_order=True, one_solution=True, model=model)
-
-
-REGISTRATION_CANDIDATES = 12
-"""Default number of candidate poses for the three-point registration."""
-MORE_CANDIDATES = 10 * REGISTRATION_CANDIDATES
-"""Additional candidates if fewer than three of these are usable."""
-MOST_TRIES = 5
-"""Most repetitions of a choice if a pose has no free path to it."""
-VERIFIED_POSES = 10
-"""Poses of a verification: at 0.1 mm of noise they detect 0.1 degrees in 97 % of cases."""
-VERIFIED_CANDIDATES = 6 * VERIFIED_POSES
-"""Candidates of a verification, of which arms reach a half to a sixth."""
 
 
 class TourPlanner:

@@ -39,6 +39,10 @@ log = logging.getLogger('remaster_ros')
 
 EVENTS = '/remaster/events'
 
+_OF = ('pose', 'split', 'sensor', 'marker')
+_COUNTED = ('observation', 'configuration', 'frame')
+"""Columns that number the rows of their session: a missing row shifts all later ones."""
+
 
 class _Keeper:
     """Writes the session at once."""
@@ -240,11 +244,6 @@ def _rows(session: Path) -> dict[tuple[str, ...], dict[str, str]]:
         found[*of, str(seen[of])] = row
         seen[of] += 1
     return found
-
-
-_OF = ('pose', 'split', 'sensor', 'marker')
-_COUNTED = ('observation', 'configuration', 'frame')
-"""Columns that number the rows of their session: a missing row shifts all later ones."""
 
 
 def _name(row: dict[str, str]) -> str:

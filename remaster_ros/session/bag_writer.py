@@ -37,6 +37,10 @@ from remaster_ros.session.files import (
 from remaster_ros.session.manifest import add_to_manifest, read_manifest
 from remaster_ros.version import __version__
 
+WAITING_LIMIT = 64 * 1024**2
+"""Most bytes kept in memory while the disk is full; later messages are refused."""
+_WORK = '.recovery'
+
 
 @cache
 def definition_of(msgtype: str) -> tuple[str, str]:
@@ -55,10 +59,6 @@ def definition_of(msgtype: str) -> tuple[str, str]:
             f'{msgtype!r}: not a message type of ROS 2 Jazzy; '
             'write it as in sensor_msgs/msg/JointState'
         ) from None
-
-
-WAITING_LIMIT = 64 * 1024**2
-"""Most bytes kept in memory while the disk is full; later messages are refused."""
 
 
 class BagWriter:
@@ -261,9 +261,6 @@ def _described(topic: str, msgtype: str, count: int = 0) -> TopicMetadata:
     """Return the metadata of a topic."""
     _, type_hash = definition_of(msgtype)
     return TopicMetadata(topic, msgtype, type_hash, topic in LATCHED_TOPICS, count)
-
-
-_WORK = '.recovery'
 
 
 def _remove_work(folder: Path) -> None:

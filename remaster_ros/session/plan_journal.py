@@ -30,6 +30,11 @@ from remaster_ros.session.reader import PLAN
 from remaster_ros.session.session_journal import read_outcomes
 from remaster_ros.session.yaml_records import from_plain, to_plain
 
+Configuration = tuple[str, int, int]
+"""Split, pose and solution, as in the plan."""
+ENOUGH = 'enough is known'
+"""Reason for dropped poses once the precision goal is reached."""
+
 
 class PlanHeader(msgspec.Struct, tag_field='kind', tag='plan'):
     """First record: the identifier of the plan, and the settings that it depends on."""
@@ -115,10 +120,6 @@ def plan_page_path(session: Path) -> Path:
     return session.absolute().with_name(f'{session.absolute().name}.plan.html')
 
 
-Configuration = tuple[str, int, int]
-"""Split, pose and solution, as in the plan."""
-
-
 @dataclass
 class RecordedPlan:
     """A planned collection and its outcomes.
@@ -183,10 +184,6 @@ def read_plan(folder: Path, chain: SerialChain) -> RecordedPlan | None:
             f'{path}: no plan of this version ({type(error).__name__}: {error}); '
             'move it out of the session folder to go without'
         ) from None
-
-
-ENOUGH = 'enough is known'
-"""Reason for dropped poses once the precision goal is reached."""
 
 
 class PlanJournal:

@@ -53,6 +53,8 @@ from remaster_ros.types import Correction, Observation, Session
 
 _COMPARED = ('robot', 'markers', 'sensors', 'settle_s', 'marker_std_m', 'base_prior')
 
+FILES = (HEADER, URDF, ROWS, JOURNAL)
+
 
 class ChangedError(InputError):
     """observations.csv differs from the journal, and not by a crash."""
@@ -155,9 +157,6 @@ def _intact_size(path: Path, data: bytes, wanted: bytes, last_rows: Sequence[str
 def _read_rows(folder: Path) -> bytes:
     """Return the content of observations.csv; raise InputError if it is missing."""
     return read_limited(folder / ROWS, OBSERVATIONS_LIMIT, f'a session folder holds {ROWS}')
-
-
-FILES = (HEADER, URDF, ROWS, JOURNAL)
 
 
 class SessionWriter:

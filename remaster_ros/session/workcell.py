@@ -45,7 +45,6 @@ POSE = 'geometry_msgs/msg/PoseStamped'
 MESSAGE_TYPES = ('geometry_msgs/msg/PointStamped', POSE, 'mocap4r2_msgs/msg/Markers')
 """Message types of foreign nodes, which `sensors.topic.driver.READERS` reads."""
 
-
 # Standard deviations: from the resolution of an interferometer to the noise of a depth camera.
 NOISE = Bounds(1e-7, 0.05, 'm')
 # Viewing angles: the smallest is less than that of any retroreflector or sphere.
@@ -54,6 +53,18 @@ VIEW = Bounds(3.5, 180.0, 'degrees')
 LEAST_APART_M = 2.0 * SMALLEST_M
 LAST_MEMBER = 65535
 """Largest number of a marker in its rigid body, which has 16 bits in NatNet."""
+
+ON_TOOL = Bounds(-3.0, 3.0, 'm')
+# Prior of marker positions in cells; a session file may have a larger one.
+MARKER_STD = Bounds(0.0, 0.02, 'm', above=True)
+# Typical radius of the links of arms of 7 to 20 kg.
+LINK_RADIUS_M = 0.075
+NO_MOTION = (
+    'urdf_text', 'file', 'mesh_path', 'confirm', 'poses', 'aim_at', 'held_joint',
+    'held_values_deg', 'held_values_m', 'marker_std_m', 'sensors',
+)  # fmt: skip
+"""Keys that do not affect whether a motion is allowed."""
+CLEARANCE = Bounds(HALF_STEP_M, 1.0, 'm', remedy='; half the step of a path check is the least')
 
 
 class CellSensor(msgspec.Struct, forbid_unknown_fields=True):
@@ -164,19 +175,6 @@ class CellSensor(msgspec.Struct, forbid_unknown_fields=True):
                     f'{1e3 * LEAST_APART_M:.0f} mm one could be taken for the other'
                 )
         return ''
-
-
-ON_TOOL = Bounds(-3.0, 3.0, 'm')
-# Prior of marker positions in cells; a session file may have a larger one.
-MARKER_STD = Bounds(0.0, 0.02, 'm', above=True)
-# Typical radius of the links of arms of 7 to 20 kg.
-LINK_RADIUS_M = 0.075
-NO_MOTION = (
-    'urdf_text', 'file', 'mesh_path', 'confirm', 'poses', 'aim_at', 'held_joint',
-    'held_values_deg', 'held_values_m', 'marker_std_m', 'sensors',
-)  # fmt: skip
-"""Keys that do not affect whether a motion is allowed."""
-CLEARANCE = Bounds(HALF_STEP_M, 1.0, 'm', remedy='; half the step of a path check is the least')
 
 
 class CellRobot(msgspec.Struct, forbid_unknown_fields=True):

@@ -26,6 +26,10 @@ Keys = tuple[str, ...]
 _AT = re.compile(r' - at `(?:key in )?\$([^`]*)`$')
 _UNKNOWN = re.compile(r'Object contains unknown field `([^`]*)`')
 
+YAML_LIMIT = 256 * 1024
+FINITE = Bounds()
+Record = TypeVar('Record', bound=msgspec.Struct)
+
 
 def key_lines(text: str) -> dict[Keys, int]:
     """Return the line number, from 1, of every key of YAML text; {} if it is not YAML."""
@@ -129,13 +133,6 @@ def from_plain(content: Any, record: Any) -> Any:
     Raises ValueError, which names the place of an error.
     """
     return msgspec.convert(content, record, dec_hook=lambda _, values: np.array(values, float))
-
-
-YAML_LIMIT = 256 * 1024
-
-FINITE = Bounds()
-
-Record = TypeVar('Record', bound=msgspec.Struct)
 
 
 def read_yaml(data: bytes, path: Path, record: type[Record], remedy: str = '') -> Record:

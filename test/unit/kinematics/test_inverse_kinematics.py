@@ -12,14 +12,9 @@ from worlds.random_arm import random_arm_urdf
 from worlds.robot_descriptions import Description, iiwa14, irb120, panda, ur5e, xarm6
 
 from remaster_ros.errors import InputError
-from remaster_ros.kinematics.inverse_kinematics import (
-    InverseKinematics,
-    MissedSolutions,
-    reach_from,
-    screws_and_tool,
-    twists_to,
-)
-from remaster_ros.kinematics.inverse_kinematics import distinct as distinct_rows
+from remaster_ros.kinematics.inverse_kinematics import InverseKinematics, MissedSolutions
+from remaster_ros.kinematics.pose_solver import distinct as distinct_rows
+from remaster_ros.kinematics.pose_solver import reach_from, screws_and_tool, twists_to
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.transforms import inverse, matrix_to_rotation_vector, transform
 

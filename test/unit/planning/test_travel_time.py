@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from remaster_ros.motion.trajectory import plan_trajectory
-from remaster_ros.planning.planned_design import fastest_order
 from remaster_ros.planning.travel_time import TravelTime
+from remaster_ros.planning.visit_order import fastest_order
 from remaster_ros.session.workcell import read_cell
 
 CELL = read_cell('demo')
