@@ -5,231 +5,27 @@ from __future__ import annotations
 
 import logging
 import os
-import struct
 import zlib
 from collections import Counter
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator
 from functools import cache
 from io import BytesIO
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
-from mcap.records import Channel, Chunk, Message, Schema
+from mcap.records import Channel, Message, Schema
 from mcap.writer import MCAP0_MAGIC
 
 from remaster_ros.errors import InputError
+from remaster_ros.session.bag_metadata import FileMetadata, all_of
 from remaster_ros.session.files import reason
 from remaster_ros.session.manifest import check_file, read_manifest
-from remaster_ros.session.strict_yaml import dump_yaml
+from remaster_ros.session.mcap_records import CutOffError, frames, unchunked, without_zeros
 
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
-
-METADATA_FILE = 'metadata.yaml'
-
-# Values that rosbag2 writes for the start of an empty bag, and for an infinite QoS duration.
-_NEVER_NS = 2**63 - 1
-LATCHED_DEPTH = 10
-"""History depth of latched topics, equal to that of the nodes' publishers."""
-_FOREVER = {'sec': 9223372036, 'nsec': 854775807}
-
-
-@dataclass
-class TopicMetadata:
-    """A topic in metadata.yaml; ``count`` is the number of its messages so far."""
-
-    topic: str
-    msgtype: str
-    type_hash: str
-    latched: bool
-    count: int = 0
-
-
-@dataclass
-class FileMetadata:
-    """A file of a bag in metadata.yaml; `first_ns` is None if it has no messages."""
-
-    name: str
-    first_ns: int | None = None
-    last_ns: int = 0
-    count: int = 0
-
-    def add(self, stamp_ns: int) -> None:
-        """Count a message."""
-        if self.first_ns is None:
-            self.first_ns = stamp_ns
-        self.last_ns = stamp_ns
-        self.count += 1
-
-    def span(self) -> dict[str, Any]:
-        """Return start, duration and number of messages in the form of metadata.yaml."""
-        first = self.first_ns
-        return {
-            'starting_time': {'nanoseconds_since_epoch': _NEVER_NS if first is None else first},
-            'duration': {'nanoseconds': 0 if first is None else self.last_ns - first},
-            'message_count': self.count,
-        }
-
-
-def all_of(files: list[FileMetadata]) -> FileMetadata:
-    """Return the metadata of several files, in the order recorded, as one nameless file."""
-    filled = [file for file in files if file.count]
-    if not filled:
-        return FileMetadata('')
-    count = sum(file.count for file in filled)
-    return FileMetadata('', filled[0].first_ns, filled[-1].last_ns, count)
-
-
-def metadata_text(files: list[FileMetadata], topics: Iterable[TopicMetadata]) -> str:
-    """Return metadata.yaml for a bag of these MCAP files, in the order recorded."""
-    information: dict[str, Any] = {
-        'version': 9,
-        'storage_identifier': 'mcap',
-        **all_of(files).span(),
-        'topics_with_message_count': [
-            {
-                'topic_metadata': {
-                    'name': topic.topic,
-                    'type': topic.msgtype,
-                    'serialization_format': 'cdr',
-                    'offered_qos_profiles': _qos(topic.latched),
-                    'type_description_hash': topic.type_hash,
-                },
-                'message_count': topic.count,
-            }
-            for topic in topics
-        ],
-        'compression_format': '',
-        'compression_mode': '',
-        'relative_file_paths': [file.name for file in files],
-        'files': [{'path': file.name, **file.span()} for file in files],
-        'custom_data': None,
-        'ros_distro': 'jazzy',
-    }
-    return dump_yaml({'rosbag2_bagfile_information': information})
-
-
-def qos_text(latched: bool) -> str:
-    """Return the QoS offered on a topic in the form of the MCAP channel's metadata."""
-    return dump_yaml(_qos(latched))
-
-
-def _qos(latched: bool) -> list[dict[str, Any]]:
-    """Return the QoS offered on a topic as plain data."""
-    return [
-        {
-            'history': 'keep_last',
-            # As the publishers offer it: a late subscriber gets the registration of every sensor.
-            'depth': LATCHED_DEPTH if latched else 10,
-            'reliability': 'reliable',
-            'durability': 'transient_local' if latched else 'volatile',
-            # Copies: YAML would write a shared object as an alias.
-            'deadline': dict(_FOREVER),
-            'lifespan': dict(_FOREVER),
-            'liveliness': 'automatic',
-            'liveliness_lease_duration': dict(_FOREVER),
-            'avoid_ros_namespace_conventions': False,
-        }
-    ]
-
-
-CHUNK_LIMIT = 256 * 1024**2
-"""Bytes of an unpacked chunk: recorders begin a new one after one or a few megabytes, and only a
-single larger message makes a larger one."""
-
-
-class CutOffError(Exception):
-    """A record extends beyond the end of the file."""
-
-
-def without_zeros(file: IO[bytes], size: int) -> int:
-    """Return the size of a file without trailing zeros, which a power cut may leave."""
-    block = 1024 * 1024
-    for start in range((size - 1) // block * block, -1, -block):
-        file.seek(start)
-        if solid := len(file.read(block if start + block < size else size - start).rstrip(b'\0')):
-            return start + solid
-    return 0
-
-
-def frames(file: IO[bytes], size: int, crc: int | None, solid: int) -> Iterator[tuple[int, bytes]]:
-    """Yield opcode and content of every record up to the end of the data section.
-
-    A record that ends among zeros, followed by more zeros, was not written completely, and raises
-    CutOffError.
-    """
-    while True:
-        head = file.read(9)
-        if not head and crc is None:
-            return
-        if len(head) < 9:
-            raise CutOffError
-        opcode, length = struct.unpack('<BQ', head)
-        end = file.tell() + length
-        # MCAP has no opcodes 0 and 0x10 to 0x7f.
-        known = 0x01 <= opcode <= 0x0F or opcode >= 0x80
-        if not known or end > size or solid < end < size:
-            raise CutOffError
-        body = file.read(length)
-        if opcode == Opcode.DATA_END:
-            (stated,) = struct.unpack('<I', body)
-            if stated and stated != crc:
-                raise ValueError('its checksum does not match')
-            return
-        if crc is not None:
-            crc = zlib.crc32(body, zlib.crc32(head, crc))
-        yield opcode, body
-
-
-def unchunked(records: Iterator[tuple[int, bytes]]) -> Iterator[tuple[int, bytes]]:
-    """Yield records with chunks, which other recorders write, unpacked.
-
-    Raises ValueError for a damaged chunk.
-    """
-    for opcode, body in records:
-        if opcode != Opcode.CHUNK:
-            yield opcode, body
-            continue
-        chunk = Chunk.read(ReadDataStream(BytesIO(body)))
-        data = _unpacked(chunk)
-        try:
-            yield from frames(BytesIO(data), len(data), crc=None, solid=len(data))
-        except CutOffError:
-            raise ValueError('a record does not fit its chunk') from None
-
-
-def _unpacked(chunk: Chunk) -> bytes:
-    """Return the content of a chunk; raise an error if it exceeds its stated size.
-
-    A few packed megabytes of zeros are gigabytes: they are refused before they fill the memory.
-    """
-    stated = chunk.uncompressed_size
-    if stated > CHUNK_LIMIT:
-        raise ValueError(f'a chunk states more than {CHUNK_LIMIT} bytes')
-    # One byte more than stated, to detect longer content.
-    if chunk.compression == 'zstd':
-        import zstandard
-
-        with zstandard.ZstdDecompressor().stream_reader(chunk.data) as reader:
-            data = reader.read(stated + 1)
-    elif chunk.compression == 'lz4':
-        import lz4.frame
-
-        data = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=stated + 1)
-    elif chunk.compression == '':
-        data = chunk.data
-    else:
-        raise ValueError(f'a chunk is packed as {chunk.compression!r}, which is not known')
-    if len(data) != stated:
-        more = 'more' if len(data) > stated else 'less'
-        raise ValueError(f'a chunk holds {more} than the {stated} bytes that it states')
-    if chunk.uncompressed_crc and zlib.crc32(data) != chunk.uncompressed_crc:
-        raise ValueError('the checksum of a chunk does not match')
-    return data
-
 
 log = logging.getLogger('remaster_ros')
 
@@ -245,8 +41,10 @@ RECORDED = {
         'remaster/joint_waypoints',
     )
 }
-"""What moves an arm -> its name in bags. A controller obeys the one and a bridge the other,
-whoever publishes it: a player that takes a bag as it is must not drive an arm."""
+"""Topic that moves an arm -> its name in bags: a controller or bridge obeys whoever publishes the
+former, and a player that publishes a bag unchanged must not drive an arm."""
+
+_LIVE = {recorded: live for live, recorded in RECORDED.items()}
 
 
 @cache
@@ -261,9 +59,6 @@ def jazzy_types() -> Typestore:
 def live_name(topic: str) -> str:
     """Return the name that a topic of a bag had when it was recorded."""
     return _LIVE.get(topic, topic)
-
-
-_LIVE = {recorded: live for live, recorded in RECORDED.items()}
 
 
 class BagMessage(NamedTuple):

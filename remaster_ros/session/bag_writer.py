@@ -16,13 +16,11 @@ from pathlib import Path
 from mcap.writer import CompressionType, Writer
 
 from remaster_ros.errors import DiskError, InputError
-from remaster_ros.session.bag import (
-    LATCHED_TOPICS,
+from remaster_ros.session.bag import LATCHED_TOPICS, BagReader, jazzy_types
+from remaster_ros.session.bag_metadata import (
     METADATA_FILE,
-    BagReader,
     FileMetadata,
     TopicMetadata,
-    jazzy_types,
     metadata_text,
     qos_text,
 )

@@ -20,7 +20,8 @@ from rosbags.rosbag2 import Writer as RosbagsWriter
 
 from remaster_ros.errors import DiskError, InputError
 from remaster_ros.session import bag_writer
-from remaster_ros.session.bag import LATCHED_DEPTH, METADATA_FILE, BagReader
+from remaster_ros.session.bag import BagReader
+from remaster_ros.session.bag_metadata import LATCHED_DEPTH, METADATA_FILE
 from remaster_ros.session.bag_writer import BagWriter, recover_bag
 from remaster_ros.session.manifest import MANIFEST
 

@@ -11,7 +11,8 @@ from foreign.bag_messages import abandon, messages, part
 from rosbags.rosbag2 import Reader
 
 from remaster_ros.errors import InputError
-from remaster_ros.session.bag import METADATA_FILE, BagReader
+from remaster_ros.session.bag import BagReader
+from remaster_ros.session.bag_metadata import METADATA_FILE
 from remaster_ros.session.bag_writer import BagWriter, recover_bag
 from remaster_ros.session.manifest import MANIFEST
 

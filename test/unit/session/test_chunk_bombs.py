@@ -11,7 +11,8 @@ import zstandard
 from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 
 from remaster_ros.errors import InputError
-from remaster_ros.session.bag import CHUNK_LIMIT, BagReader
+from remaster_ros.session.bag import BagReader
+from remaster_ros.session.mcap_records import CHUNK_LIMIT
 
 REALLY = 3 * 1024**3
 """What a bomb unpacks to, bytes."""
