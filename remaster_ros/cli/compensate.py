@@ -120,11 +120,11 @@ def _shown(chain: SerialChain, joint: int, value: float, digits: int = 2) -> str
     return chain.shown_offset(joint, value, digits).replace('deg', 'degrees')
 
 
-def _temperature(table: TextTable, columns: Columns, told: float | None) -> FloatArray | None:
+def _temperature(table: TextTable, columns: Columns, stated: float | None) -> FloatArray | None:
     """Return the temperature of each row, degrees Celsius; None if unknown."""
     column = columns.one('temperature')
-    if told is not None:
-        return np.full(len(table.rows), told)
+    if stated is not None:
+        return np.full(len(table.rows), stated)
     return None if column is None else numbers(table, (column,))[:, 0]
 
 

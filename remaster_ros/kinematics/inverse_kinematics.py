@@ -292,16 +292,16 @@ class InverseKinematics:
             np.concatenate([self._starts(values, exact, pose) for values, exact in self._parts])
             for pose in T
         ]
-        owner = np.repeat(np.arange(len(T)), [len(q) for q in starts])
+        pose_index = np.repeat(np.arange(len(T)), [len(q) for q in starts])
         q, residuals = reach_from(
             self.chain,
             self._free,
             np.concatenate([np.empty((0, len(self.chain))), *starts]),
-            T[owner],
+            T[pose_index],
         )
         reached = residuals < CERTIFIED
-        ends = np.cumsum(np.bincount(owner[reached], minlength=len(T)))[:-1]
-        return [distinct(self.chain, mine)[0] for mine in np.split(q[reached], ends)]
+        ends = np.cumsum(np.bincount(pose_index[reached], minlength=len(T)))[:-1]
+        return [distinct(self.chain, of_pose)[0] for of_pose in np.split(q[reached], ends)]
 
     def usable(self, q: FloatArray) -> FloatArray:
         """Return the solutions of q (m, k) that lie within the joint limits, (n, k).
@@ -446,9 +446,9 @@ def _nearest_lines(axes: FloatArray, points: FloatArray) -> tuple[FloatArray, Fl
     axes, points = axes.copy(), points.copy()
     count = len(axes)
     # Axes are rotated about points near the arm: a joint's origin may be metres along its axis.
-    before = np.zeros(3)
+    previous = np.zeros(3)
     for i in range(count):
-        before = points[i] = points[i] + axes[i] * (axes[i] @ (before - points[i]))
+        previous = points[i] = points[i] + axes[i] * (axes[i] @ (previous - points[i]))
     first = 0
     for i in range(1, count + 1):
         if i < count and np.linalg.norm(np.cross(axes[i - 1], axes[i])) < NEAR_RAD:

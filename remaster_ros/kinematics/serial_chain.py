@@ -443,9 +443,9 @@ def _carried_masses(model: UrdfModel, moving: list[UrdfJoint]) -> tuple[FloatArr
     index = {joint.child: i for i, joint in enumerate(moving)}
     first_moments, masses = np.zeros((len(moving), 3)), np.zeros(len(moving))
     for link in model.links.values():
-        here, T_here_link = model.carrier(link.name, index)
-        if here in index:
-            i = index[here]
+        carrier, T_carrier_link = model.carrier(link.name, index)
+        if carrier in index:
+            i = index[carrier]
             masses[i] += link.mass
-            first_moments[i] += link.mass * apply(T_here_link, link.center_of_mass)
+            first_moments[i] += link.mass * apply(T_carrier_link, link.center_of_mass)
     return first_moments, masses

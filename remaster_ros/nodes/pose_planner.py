@@ -147,11 +147,11 @@ class PosePlanner(RemasterNode):
 
         Otherwise, once that is known, the run remains paused, and a warning says why.
         """
-        left, peers = self.run.left, self._peers
-        silent_s, progress = silence_s(left), self.progress.describe()
+        token, peers = self.run.left, self._peers
+        silent_s, progress = silence_s(token), self.progress.describe()
         with self._lock:
             # A pause or stop may have been requested meanwhile.
-            decided = self.run.left == left and self.run.take_up(
+            decided = self.run.left == token and self.run.take_up(
                 silent_s, peers.bridge, peers.recorder, progress
             )
             if decided:

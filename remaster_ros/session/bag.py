@@ -95,7 +95,7 @@ class BagReader:
         self.topics: dict[str, str] = {}
         self.counts: Counter[str] = Counter()
         self._definitions: dict[str, str] = {}  # Message type -> its text, and what it uses
-        self._own_types: Typestore | None = None
+        self._bag_types: Typestore | None = None
         for file in self.files:
             for message in self.messages_of(file, first_look=True):
                 known = self.topics.setdefault(message.topic, message.msgtype)
@@ -131,12 +131,14 @@ class BagReader:
             return jazzy_types()
         from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-        if self._own_types is None:
-            self._own_types = get_typestore(Stores.ROS2_JAZZY)
-        store = self._own_types
+        if self._bag_types is None:
+            self._bag_types = get_typestore(Stores.ROS2_JAZZY)
+        store = self._bag_types
         if msgtype not in store.types:
-            found = get_types_from_msg(self._definitions[msgtype], msgtype)
-            store.register({name: own for name, own in found.items() if name not in store.types})
+            types = get_types_from_msg(self._definitions[msgtype], msgtype)
+            store.register(
+                {name: definition for name, definition in types.items() if name not in store.types}
+            )
         return store
 
     def messages_of(self, file: FileMetadata, first_look: bool = False) -> Iterator[BagMessage]:

@@ -262,7 +262,7 @@ class RowFormat:
         }
         for field in self._absent:
             del cells[field]
-        return ','.join(cell for own in cells.values() for cell in own)
+        return ','.join(cell for of_field in cells.values() for cell in of_field)
 
     def text(self, m: Measurements) -> str:
         """Return all observations as the text of the file."""

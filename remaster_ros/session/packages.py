@@ -14,8 +14,8 @@ _NAME = re.compile(r'<name>\s*([^<\s]+)\s*</name>')
 _PACKAGE = re.compile(r'[A-Za-z][\w-]*')
 
 
-def find_package(name: str, beside: Path, package_path: Sequence[Path] = ()) -> Path | None:
-    """Return the folder of a ROS package that the file `beside` names; None if not found.
+def find_package(name: str, file: Path, package_path: Sequence[Path] = ()) -> Path | None:
+    """Return the folder of a ROS package that `file` names; None if not found.
 
     Searched are the given folders (which may be the package itself), the share folders of
     AMENT_PREFIX_PATH, and the folders above and beside the file: by the folder's name, then by the
@@ -23,12 +23,12 @@ def find_package(name: str, beside: Path, package_path: Sequence[Path] = ()) -> 
     """
     if not _PACKAGE.fullmatch(name):
         return None
-    for folder in _candidates(beside, package_path):
+    for folder in _candidates(file, package_path):
         if (folder / name).is_dir():
             return folder / name
         if folder.name == name:
             return folder
-    for folder in _candidates(beside, package_path):
+    for folder in _candidates(file, package_path):
         for path in (folder, *_inside(folder)):
             if _declared_name(path / 'package.xml') == name:
                 return path
@@ -81,11 +81,11 @@ class Confinement:
         )
 
 
-def _candidates(beside: Path, package_path: Sequence[Path]) -> Iterator[Path]:
+def _candidates(file: Path, package_path: Sequence[Path]) -> Iterator[Path]:
     """Yield the folders in which, or as which, a package is searched."""
     yield from package_path
     yield from sourced()
-    for folder in beside.resolve().parents:
+    for folder in file.resolve().parents:
         # Above a package lies its workspace; further up there are none.
         yield folder
         if folder.name in ('src', 'share') or folder.parent == folder.parent.parent:

@@ -26,12 +26,16 @@ def rviz_config(cell: Workcell) -> str:
     shipped = read_limited(config_path('remaster.rviz'), YAML_LIMIT, 'install the package again')
     content: Any = load_yaml(shipped.decode('utf-8'))
     manager = content['Visualization Manager']
-    general = [one for one in manager['Displays'] if not one['Class'].endswith('/PointStamped')]
-    own: list[dict[str, Any]] = []
+    general = [
+        display
+        for display in manager['Displays']
+        if not display['Class'].endswith('/PointStamped')
+    ]
+    of_sensors: list[dict[str, Any]] = []
     for number, (name, sensor) in enumerate(cell.sensors.items()):
         color = COLORS[number % len(COLORS)]
         for marker, topic in sensor.topics.items():
-            own.append(
+            of_sensors.append(
                 {
                     'Class': 'rviz_default_plugins/PointStamped',
                     'Name': f'{name}: {marker}',
@@ -43,7 +47,7 @@ def rviz_config(cell: Workcell) -> str:
                 }
             )
         if sensor.pose_topic:
-            own.append(
+            of_sensors.append(
                 {
                     'Class': 'rviz_default_plugins/Pose',
                     'Name': f'{name}: pose of {sensor.marker}',
@@ -54,7 +58,7 @@ def rviz_config(cell: Workcell) -> str:
                     'Topic': _topic(sensor.pose_topic),
                 }
             )
-    manager['Displays'] = general + own
+    manager['Displays'] = general + of_sensors
     manager['Global Options']['Fixed Frame'] = cell.robot.base_link
     return HEAD + dump_yaml(content)
 

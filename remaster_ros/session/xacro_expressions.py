@@ -61,12 +61,12 @@ def evaluate(expression: str, names: Mapping[str, Any]) -> Any:
     return value
 
 
-def global_names(**own: Any) -> dict[str, Any]:
+def global_names(**functions: Any) -> dict[str, Any]:
     """Return the names of every expression: xacro's, with keyword arguments in ``xacro``.
 
     The caller provides replacements of functions with side effects.
     """
-    xacro = Namespace({name: Function(call) for name, call in own.items()})
+    xacro = Namespace({name: Function(call) for name, call in functions.items()})
     return {
         **_PYTHON,
         **_MATH,

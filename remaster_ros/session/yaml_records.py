@@ -38,9 +38,9 @@ def key_lines(text: str) -> dict[Keys, int]:
     def visit(node: Any, path: Keys) -> None:
         if isinstance(node, yaml.MappingNode):
             for key, value in node.value:
-                here = (*path, str(key.value))
-                lines.setdefault(here, key.start_mark.line + 1)
-                visit(value, here)
+                keys = (*path, str(key.value))
+                lines.setdefault(keys, key.start_mark.line + 1)
+                visit(value, keys)
 
     try:
         visit(yaml.compose(text, Loader=yaml.SafeLoader), ())
