@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which nodes have the pose under way: an announcement that one of them missed is repeated.
+"""Announcements of the visit under way: repeated if bridge or recorder missed one.
 
-A node that lags is sent the same announcement, with the same stamp: nodes that have it already
-take it for the one that they have, and go on. Only for a node that was started anew the pose is
-announced anew, with what is left of it.
+A late node gets the same announcement again, with the same stamp; nodes that have it already
+ignore it. If a node was restarted, the remaining solutions are announced with a new stamp.
 
 Times are wall time and arguments.
 """
@@ -16,18 +15,17 @@ from remaster_ros.collection.events import BridgeState, RecorderState
 from remaster_ros.collection.peers import Heard, Peers
 
 ANNOUNCE_WALL_S = 5.0
-"""A node that does not have an announcement so long after it has missed it, s: at first."""
+"""First time after which an announcement counts as missed, s."""
 LONGEST_WALL_S = 80.0
-"""That wait doubles with each repetition up to this, s: the node or its network is overloaded, and
-what is sent to it delays what it has still to take."""
+"""Longest such time, s: it doubles with each repetition, as the node or network is overloaded."""
 MATCH_WALL_S = 0.5
-"""The other side of a DDS match comes so much later than ours at most, s."""
+"""Longest delay of the other side of a DDS match, s."""
 PEERS = BridgeState.sender, RecorderState.sender
-"""Nodes that a pose is announced to. A viewer or `ros2 topic echo` stands for none of them."""
+"""Nodes that need an announcement, unlike viewers or `ros2 topic echo`."""
 
 
 class Lack(Enum):
-    """Why bridge or recorder has not the open pose."""
+    """Why bridge or recorder does not have the visit under way."""
 
     NOTHING = 'both have it, or may still get it'
     LATE = 'it lags: the announcement is repeated as it was'
@@ -35,27 +33,22 @@ class Lack(Enum):
 
 
 class Announcements:
-    """Follow the announcements of the open pose, as bridge and recorder have them."""
+    """State of the announcement of the visit under way at bridge and recorder."""
 
     def __init__(self, peers: Peers) -> None:
         self._peers = peers
-        # Of the last announcement, by which the others name it; '' where the pose is to be
-        # announced anew.
+        # Stamp of the last announcement; '' if a new one is necessary.
         self.stamp = ''
         self._announced_wall, self._wait_wall = 0.0, ANNOUNCE_WALL_S
-        # Which start of each peer was there when the pose was announced.
-        self._told: dict[str, str] = {}
+        # Start time of each node that was there at the announcement.
+        self._started: dict[str, str] = {}
         self._matched_wall: float | None = None
 
     def matched(self, subscribers: int, now: float) -> bool:
-        """Whether bridge and recorder are there for the next pose.
+        """Whether bridge and recorder are ready for the next pose.
 
-        A recorder with a complete session has to open that again first.
-
-        Parameters
-        ----------
-        subscribers
-            How many subscribe to the solutions, as DDS shows it.
+        Not if the recorder's session is complete, until it has reopened it. ``subscribers``:
+        number of subscribers of the solutions by DDS; ``now``: wall time, s.
         """
         recorder = self._peers.recorder
         if subscribers < len(PEERS) or self._peers.bridge is None or recorder is None:
@@ -68,33 +61,36 @@ class Announcements:
         return now - self._matched_wall > MATCH_WALL_S
 
     def announced(self, stamp: str, now: float) -> None:
-        """Note that the pose is announced; with an unchanged stamp the next wait doubles."""
-        again = stamp == self.stamp
-        self._wait_wall = min(2.0 * self._wait_wall, LONGEST_WALL_S) if again else ANNOUNCE_WALL_S
+        """Note an announcement; with an unchanged stamp the next wait doubles."""
+        is_repeated = stamp == self.stamp
+        self._wait_wall = (
+            min(2.0 * self._wait_wall, LONGEST_WALL_S) if is_repeated else ANNOUNCE_WALL_S
+        )
         self.stamp, self._announced_wall = stamp, now
-        self._told = {node: heard.started for node, heard in self._heard()}
+        self._started = {node: heard.started for node, heard in self._heard()}
 
     def lack(self) -> Lack:
-        """Return whether the open pose is to be announced (again), and how.
+        """Return whether the visit under way has to be announced (again), and how.
 
-        A peer that was started after the announcement lacks it, and one whose state shows another
-        pose some time later. While the recorder measures nothing is announced: what comes of that
-        is not left of the pose any more.
+        A node that was restarted after the announcement lacks it, and one whose state shows
+        another pose some time later. While the recorder measures nothing is announced, since the
+        outcome changes the remaining solutions.
         """
         if (recorder := self._peers.recorder) is not None and recorder.state == 'measuring':
             return Lack.NOTHING
         if not self.stamp:
             return Lack.ANEW
-        without = [(node, one) for node, one in self._heard() if one.body.pose != self.stamp]
-        if any(one.started != self._told.get(node) for node, one in without):
+        lacking = [(node, state) for node, state in self._heard() if state.body.pose != self.stamp]
+        if any(state.started != self._started.get(node) for node, state in lacking):
             return Lack.ANEW
         missed_wall = self._announced_wall + self._wait_wall
-        return Lack.LATE if any(one.wall > missed_wall for _, one in without) else Lack.NOTHING
+        return Lack.LATE if any(state.wall > missed_wall for _, state in lacking) else Lack.NOTHING
 
     def _heard(self) -> list[tuple[str, Heard]]:
-        found = [(node, self._peers.heard(node)) for node in PEERS]
-        return [(node, heard) for node, heard in found if heard is not None]
+        """Return the last states of bridge and recorder, as far as received."""
+        states = [(node, self._peers.heard(node)) for node in PEERS]
+        return [(node, heard) for node, heard in states if heard is not None]
 
     def retract(self) -> None:
-        """Have what is left of the open pose announced anew before anything else."""
+        """Have the remaining solutions announced with a new stamp."""
         self.stamp = ''

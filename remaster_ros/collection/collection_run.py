@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the planner does: idle, running, paused, stopped, complete or failed; and in which run.
+"""State of the planner (idle, running, paused, stopped, complete or failed), and its run.
 
-Each /remaster/collect begins a run, named by a token. Recorder and bridge hold the token in
-memory. A planner that was killed goes on by itself only in a run that still lives, which both of
-them must confirm: a person may stand beside an arm that has not moved for a while.
+Each /remaster/collect begins a run, identified by a token, which recorder and bridge keep in
+memory. A killed planner resumes by itself only a run that still lives, which both of them must
+confirm: a person may stand beside an arm that has not moved for a while.
 """
 
 from __future__ import annotations
@@ -14,12 +14,12 @@ NOT_LIVING = 'its run was in another boot of this computer, or was ended'
 
 
 class CollectionRun:
-    """The state of the planner and the token of its run.
+    """State of the planner and token of its run.
 
     Parameters
     ----------
     resume_within_s
-        A run that has been without a planner for longer is not gone on with, s.
+        Longest time without a planner after which a run is resumed, s.
 
     Attributes
     ----------
@@ -30,7 +30,7 @@ class CollectionRun:
     token
         Of the run under way, '' for none.
     left
-        Token of the run of a planner before this one, until it is known whether that still lives.
+        Token of the run of a killed planner, until it is known whether that run still lives.
     """
 
     def __init__(self, resume_within_s: float) -> None:
@@ -38,14 +38,9 @@ class CollectionRun:
         self.state, self.why, self.token, self.left = 'idle', '', '', ''
 
     def resume(self, state: str, token: str, progress: str) -> None:
-        """Take up what a planner before this one did.
+        """Restore the state of a planner before this one.
 
-        Parameters
-        ----------
-        state, token
-            As it last wrote them down.
-        progress
-            How far the collection is, as text.
+        ``state``, ``token``: as last written; ``progress``: of the collection, as text.
         """
         if state == 'complete':
             self.state = state
@@ -60,17 +55,11 @@ class CollectionRun:
         recorder: RecorderState | None,
         progress: str,
     ) -> bool:
-        """Go on with the run that was left, if it still lives; return whether that is decided.
+        """Resume the run of a killed planner if it still lives; return whether that is decided.
 
-        Parameters
-        ----------
-        silence_s
-            For how long the planner of that run has given no sign of life, s; None where it gave
-            none in this boot of the computer, or has ended the run.
-        bridge, recorder
-            Their last states; None before the first.
-        progress
-            How far the collection is, as text.
+        ``silence_s``: time since that planner renewed its liveness file, s; None if it did not in
+        this boot of the computer, or has ended the run; ``bridge, recorder``: last states, None
+        before the first; ``progress``: of the collection, as text.
         """
         reason = ''
         if silence_s is None:
@@ -105,17 +94,11 @@ class CollectionRun:
         has_joints: bool,
         further: str | None = None,
     ) -> str:
-        """Return why /remaster/collect does not begin or go on; ''.
+        """Return why /remaster/collect does not begin or resume a run; '' if it does.
 
-        Parameters
-        ----------
-        bridge, recorder
-            Their last states; None before the first.
-        has_joints
-            Whether it is known where the arm is.
-        further
-            Why nothing can be measured further behind a complete collection, '' where something
-            can; None where that is not asked.
+        ``bridge, recorder``: last states, None before the first; ``has_joints``: whether the arm's
+        configuration is known; ``further``: why nothing is added to a complete collection, '' if
+        something is, None if that is not the question.
         """
         if not has_joints:
             return 'no joint_states yet: is the robot running?'
@@ -139,19 +122,19 @@ class CollectionRun:
         self.state, self.why = 'running', ''
 
     def pause(self) -> bool:
-        """Pause, also a run that would have gone on by itself; return whether it is paused."""
+        """Pause the run, also one that would be resumed; return whether it is paused."""
         if self.left or self.state == 'running':
             self.left = ''
             self.end('paused')
         return self.state == 'paused'
 
     def stop(self) -> None:
-        """End the run; what is left can be collected in another one."""
+        """End the run; the remaining poses can be collected in another one."""
         self.left = ''
         self.end('stopped')
 
     def end(self, state: str, why: str = '', *, only_from: str = '') -> bool:
-        """End the run in a state; return False where it is not in the state `only_from`."""
+        """End the run in a state; return False if its state is not `only_from`."""
         if only_from and self.state != only_from:
             return False
         self.state, self.why, self.token = state, why, ''
@@ -159,5 +142,5 @@ class CollectionRun:
 
 
 def _waits(progress: str, reason: str) -> str:
-    """Return that, and why, the planner does not go on by itself."""
+    """Return a message on a planner that waits for /remaster/collect."""
     return f'{progress}; /remaster/collect goes on{f" ({reason})" if reason else ""}'

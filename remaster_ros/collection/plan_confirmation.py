@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether a person has looked at the plan that the arm is about to follow.
+"""Confirmation by a person of the plan that the arm is about to follow.
 
-What counts is the plan itself, by its fingerprint, not that something was confirmed: the tour for
-the registration, that of the collection, and a tour that was planned anew are different plans.
-Nothing of it is written down: a planner that is started again has no confirmation.
+A confirmation is of one plan, by its fingerprint: the tours of registration and collection, and a
+tour that was planned again, are different plans. It is kept in memory only: a restarted planner
+has none.
 """
 
 from __future__ import annotations
@@ -18,39 +18,39 @@ CONFIRM, COLLECT = '/remaster/confirm', '/remaster/collect'
 
 
 def fingerprint(tour: Tour) -> str:
-    """Return a short name of a tour: equal poses, solutions and order have the same."""
-    found = hashlib.sha256(repr((tour.order, tour.reference_every)).encode())
+    """Return a short checksum of the poses, solutions and order of a tour."""
+    digest = hashlib.sha256(repr((tour.order, tour.reference_every)).encode())
     for split, plan in sorted(tour.plans.items()):
-        found.update(f'{split} {len(plan.poses)} '.encode())
+        digest.update(f'{split} {len(plan.poses)} '.encode())
         for pose in plan.poses:
-            found.update(f'{pose.solutions.shape} {pose.correction}'.encode())
-            found.update(np.ascontiguousarray(pose.solutions).tobytes())
-    return found.hexdigest()[:8]
+            digest.update(f'{pose.solutions.shape} {pose.correction}'.encode())
+            digest.update(np.ascontiguousarray(pose.solutions).tobytes())
+    return digest.hexdigest()[:8]
 
 
 def service_name(plan: str) -> str:
-    """Return the name below /remaster/confirm of the service that confirms this plan alone."""
+    """Return the name below /remaster/confirm of the service that confirms only this plan."""
     return f'plan_{plan}'
 
 
 class PlanConfirmation:
-    """Which plan is shown, and which was confirmed.
+    """The plan that is shown, and the one that was confirmed.
 
     Parameters
     ----------
     required
-        Whether the arm waits for a confirmation; without, every plan may be followed.
+        Whether the arm waits for a confirmation; otherwise every plan may be followed.
     page
-        Where plans are shown, for messages.
+        Path of the page with the plan, for messages.
 
     Attributes
     ----------
     required
         As given.
     shown
-        Fingerprint of the plan on the page; '' while there is none.
+        Fingerprint of the plan on the page; '' if there is none.
     confirmed
-        Of the plan that was confirmed; '' for none.
+        Fingerprint of the confirmed plan; '' for none.
     trouble
         Why the next plan cannot be shown; ''.
     """
@@ -58,15 +58,15 @@ class PlanConfirmation:
     def __init__(self, required: bool, page: str) -> None:
         self.required, self._page = required, page
         self.shown = self.confirmed = self.trouble = ''
-        # Shown and never confirmed: a person may be looking at one of them still.
+        # Plans shown and never confirmed: a person may still look at one of them.
         self._pending: set[str] = set()
 
     def withdraw(self) -> None:
-        """Take it that the page is out of date: another plan is to be shown."""
+        """Mark the page as outdated: another plan is next."""
         self.shown = self.trouble = ''
 
     def show(self, plan: str) -> None:
-        """Take it that the page shows this plan."""
+        """Mark a plan as shown on the page."""
         self.shown, self.trouble = plan, ''
         if plan != self.confirmed:
             self._pending.add(plan)
@@ -78,7 +78,7 @@ class PlanConfirmation:
         return tour is not None and self.confirmed == fingerprint(tour)
 
     def refusal(self) -> str:
-        """Return why the arm may not move, with what to do about it; ''."""
+        """Return why the arm may not move, and what to do; '' if it may."""
         if not self.required:
             return ''
         if self.trouble:
@@ -96,13 +96,11 @@ class PlanConfirmation:
         return ''
 
     def confirm(self, plan: str = '') -> tuple[bool, str]:
-        """Confirm the plan that is shown; return whether there is one, and the answer.
+        """Confirm the plan that is shown; return whether that succeeded, and the answer.
 
-        Parameters
-        ----------
-        plan
-            Which one the person has seen: no other is confirmed, however late the request comes.
-            '' for the one that is shown, which is refused where it has taken the place of another.
+        ``plan``: fingerprint of the plan that the person has seen: no other is confirmed, however
+        late the request comes. '' for the plan on the page, which is refused if the page showed
+        another one before.
         """
         if not self.required:
             return False, 'no plan waits for that; confirm: true in the cell file asks for it'

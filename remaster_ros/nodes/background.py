@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Slow work beside the callbacks of a node: path checks, planning, writing to a disk."""
+"""Slow work of a node in a thread beside its callbacks: path checks, planning, disk writes."""
 
 from __future__ import annotations
 
@@ -22,12 +22,11 @@ Work = Callable[[], Any]
 Then = Callable[[Any], object]
 
 MOVED_RAD = 0.005
-"""An arm this far from where a way begins, in any joint, gets another one (a slide 1.25 mm off).
-"""
+"""Motion of any joint after which a path is planned again, rad (1.25 mm of a prismatic joint)."""
 
 
 class Background:
-    """One thread that does one thing after the other; a node's callbacks take the results."""
+    """A thread that does one job after the other; a node's callbacks get the results."""
 
     def __init__(self, node: Node) -> None:
         self._work: SimpleQueue[tuple[Work, Then] | None] = SimpleQueue()
@@ -37,14 +36,14 @@ class Background:
         self._thread.start()
 
     def submit(self, work: Work, then: Then) -> None:
-        """Do `work` in the thread, and call `then` with its result among the node's callbacks.
+        """Queue a job for the thread; call `then` with its result among the node's callbacks.
 
-        The result is the exception where `work` raises one.
+        If the job raises an exception, that is the result.
         """
         self._work.put((work, then))
 
     def close(self, timeout_s: float = 5.0) -> None:
-        """End the thread when all is done, or after a time; results are no longer taken."""
+        """End the thread when all jobs are done, or after a timeout; drop later results."""
         self._work.put(None)
         self._thread.join(timeout_s)
 
@@ -53,10 +52,10 @@ class Background:
             work, then = item
             try:
                 result = work()
-            except Exception as error:  # Whatever it is, the node must go on.
+            except Exception as error:  # Any error, since the node must go on.
                 result = error
             self._results.append((then, result))
-            # A node that has ended meanwhile takes no result, and has no guard any more.
+            # A node that has ended meanwhile has no guard condition any more.
             with contextlib.suppress(InvalidHandle):
                 self._guard.trigger()
 
@@ -67,36 +66,37 @@ class Background:
 
 
 class PlanningThread:
-    """Does one thing at a time in the background: a stop must not wait for the planning."""
+    """Runs one job at a time in the background, so that a stop does not wait for planning."""
 
     def __init__(self, background: Background, units: JointUnits = TURNING) -> None:
         self._background, self._units = background, units
         self._q: FloatArray = np.empty(0)
         self._what: object = None
-        self._works = False
-        # What the last job gave, in a tuple; None where it was taken.
-        self._found: tuple[Any] | None = None
+        self._is_working = False
+        # Result of the last job in a tuple; None if it was fetched.
+        self._result: tuple[Any] | None = None
 
     def ask(self, what: object, q: FloatArray, job: Callable[[], Result]) -> tuple[Result] | None:
-        """Return what a job found, in a tuple, or raise what it raised; None while it works.
+        """Return the result of a job in a tuple, or raise its exception; None while it works.
 
-        `what` names the job: the result of another one, or for an arm that has moved since from
-        `q`, rad or m, (k,), is forgotten.
+        ``what``: identifier of the job; ``q``: configuration of the arm, rad or m, (k,). A result
+        of another job, or for an arm that has moved by more than `MOVED_RAD` since, is dropped.
         """
-        if self._works:
+        if self._is_working:
             return None
-        found, self._found = self._found, None
+        result, self._result = self._result, None
         if (
-            found is None
+            result is None
             or self._what != what
             or not self._units.largest(self._q - q) <= MOVED_RAD
         ):
-            self._what, self._q, self._works = what, q, True
-            self._background.submit(job, self._take)
+            self._what, self._q, self._is_working = what, q, True
+            self._background.submit(job, self._store)
             return None
-        if isinstance(found[0], Exception):
-            raise found[0]
-        return found
+        if isinstance(result[0], Exception):
+            raise result[0]
+        return result
 
-    def _take(self, result: Any) -> None:
-        self._found, self._works = (result,), False
+    def _store(self, result: Any) -> None:
+        """Store the result of a job."""
+        self._result, self._is_working = (result,), False

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Subscribe raw, write the bytes into the bag as they came, then hand the message on."""
+"""Raw subscriptions: the bag gets the bytes as received, then the message is decoded."""
 
 from __future__ import annotations
 
@@ -24,22 +24,21 @@ from remaster_ros.session.bag import RECORDED
 from remaster_ros.session.bag_writer import BagWriter
 
 DEEP = QoSProfile(depth=2000, reliability=ReliabilityPolicy.RELIABLE)
-"""What a busy recorder has not yet taken is kept for it: seconds of the fastest stream."""
+"""Queue of a busy recorder: seconds of the fastest stream."""
 MOST_AT_ONCE = 100
-"""Of one topic, before the others have their turn: some 20 ms of a processor."""
+"""Most messages of one topic before others have their turn: about 20 ms of a processor."""
 MOST_EARLY = 20_000
-"""Messages that are kept while there is no clock: some ten seconds of the fastest streams."""
+"""Most messages kept while the node has no time: about ten seconds of the fastest streams."""
 
 
 class BagRecorder:
-    """Record topics of a node into a bag.
+    """Records topics of a node into a bag.
 
-    ``folder``: the bag's folder, gone on with where there is one; ``began``: what it begins with;
-    None records nothing and only hands messages on; ``begin``: false to record nothing before
-    `reopen`.
-    Attributes: ``notes``: how the bag was found, for the user; ``dropped``: messages that found no
-    room, neither on the disk nor in memory; ``taken``: how many messages of each topic, by its
-    name in bags, were handed on and received.
+    ``folder``: the bag's, resumed if it exists; ``began``: first record of the bag; None to record
+    nothing and only hand messages on; ``begin``: False to record nothing before `reopen`.
+    Attributes: ``notes``: messages on the state of the bag; ``dropped``: messages lost for lack of
+    space on the disk and in memory; ``taken``: number of messages received and handed on, by the
+    topic's name in bags.
     """
 
     def __init__(
@@ -48,7 +47,7 @@ class BagRecorder:
         self._node, self._folder, self._began = node, folder, began
         self.taken: Counter[str] = Counter()
         self._writer: BagWriter | None = None
-        # Received while the node's clock, a simulated one, had no time: topic, type, bytes.
+        # Messages received before the simulated clock had a time: topic, type, bytes.
         self._early: list[tuple[str, str, bytes]] = []
         self.notes: list[str] = []
         self.dropped = 0
@@ -56,26 +55,26 @@ class BagRecorder:
             self.reopen()
 
     def reopen(self) -> None:
-        """Go on with the bag after it was closed."""
+        """Resume the bag after it was closed; begin another one if it is damaged."""
         if self._began is None:
             return
         try:
             self._writer = BagWriter(self._folder, resume=True)
         except InputError as error:
-            # The bag is never the only copy of an observation: its damage stops nothing.
+            # The bag is never the only copy of an observation: recording continues.
             self._folder = _free(self._folder)
             self.notes.append(f'{error}; recording into {self._folder}')
             self._writer = BagWriter(self._folder)
-        # First in each file: a replay begins anew there, as this recorder did.
+        # First in each file: a replay restarts there, as this recorder did.
         began = EventRecord(node=self._node.get_fully_qualified_name(), body=self._began)
         self._began = msgspec.structs.replace(self._began, continued=True)
         data = serialize_message(String(data=encode(began)))
         self._write(name_in_bag(EVENTS), 'std_msgs/msg/String', data)
 
     def _write(self, topic: str, type_name: str, data: bytes) -> None:
-        """Write a message under the node's time; what came before there was one comes first.
+        """Write a message with the node's time; earlier ones wait until the node has a time.
 
-        A bag that began at time 0 would last as long as the simulation has been running.
+        A bag that began at time 0 would be as long as the time of the simulation.
         """
         if self._writer is None:
             return
@@ -104,10 +103,10 @@ class BagRecorder:
     ) -> None:
         """Record `topic`; call `receive` with each decoded message, if given.
 
-        ``with_info`` gives it the message's info of rclpy as well.
+        ``with_info``: call it with rclpy's info of the message as well.
 
-        In the bag it has the name of `name_in_bag`: without this node's namespace and as if it was
-        not remapped, so that a bag can be replayed in any namespace.
+        In the bag the topic is named by `name_in_bag`, without namespace and remapping, so that a
+        bag can be replayed in any namespace.
         """
         module = kind.__module__.split('.')[0]
         type_name = f'{module}/msg/{kind.__name__}'
@@ -121,7 +120,7 @@ class BagRecorder:
                 try:
                     message = deserialize_message(data, kind)
                 except Exception as error:
-                    # Bytes that are no message: rclpy raises whatever the middleware does.
+                    # Invalid bytes: rclpy raises various errors of the middleware.
                     raise InputError(f'not a {type_name} ({type(error).__name__})') from None
             # Raw, because serialising again can leave uninitialised bytes behind the message.
             self._write(name, type_name, data)
@@ -135,10 +134,10 @@ class BagRecorder:
             take(data, info)
             for _ in range(MOST_AT_ONCE):
                 with subscription.handle:
-                    further = subscription.handle.take_message(kind, True)
-                if further is None:
+                    message_and_info = subscription.handle.take_message(kind, True)
+                if message_and_info is None:
                     return
-                take(*further)
+                take(*message_and_info)
 
         # rclpy's types have no callback with a message's info beside raw bytes.
         subscription = self._node.create_subscription(
@@ -150,7 +149,7 @@ class BagRecorder:
         )
 
     def subscribe_rest(self) -> None:
-        """Record the topics that the recorder itself has no use for."""
+        """Record the topics that the recorder does not use itself."""
         if self._began is None:
             return
         self.subscribe(PoseStamped, 'remaster/target_pose')
@@ -160,9 +159,9 @@ class BagRecorder:
         self.subscribe(JointState, 'remaster/joint_offsets_std', qos=LATCHED)
 
     def close(self) -> None:
-        """Close the bag; messages that come later are not recorded.
+        """Close the bag; later messages are not recorded.
 
-        Where the disk does not take its end, it stays as that of a killed recorder.
+        If the disk is full, the bag remains like that of a killed recorder, with a warning.
         """
         writer, self._writer = self._writer, None
         self.dropped += len(self._early)
@@ -175,16 +174,16 @@ class BagRecorder:
 
 
 def name_in_bag(topic: str) -> str:
-    """Return the name in bags of a topic as this package's code names it, relative or not.
+    """Return the name in bags of a topic, relative or not, of this package's code.
 
-    What moves an arm has another one there (`session.bag.RECORDED`).
+    Topics that move an arm have other names there (`session.bag.RECORDED`).
     """
     name = f'/{topic.lstrip("/")}'
     return RECORDED.get(name, name)
 
 
 def _free(folder: Path) -> Path:
-    """Return the first of bag_1, bag_2, … that is not there."""
+    """Return the first of bag_1, bag_2, … that does not exist."""
     number = 1
     while (free := folder.with_name(f'{folder.name}_{number}')).exists():
         number += 1
