@@ -29,7 +29,6 @@ from remaster_ros.calibration.estimate import Estimate, Problem, estimate
 from remaster_ros.calibration.identifiability import WEAK_ANGLE
 from remaster_ros.calibration.noise import Noise
 from remaster_ros.calibration.priors import STEP_STD
-from remaster_ros.discovery.causes import NAMED, NEEDED
 from remaster_ros.discovery.discover import Discovery
 from remaster_ros.discovery.effects.base import Cell, Design
 from remaster_ros.discovery.effects.context import Context
@@ -41,6 +40,7 @@ from remaster_ros.discovery.gain import rms
 from remaster_ros.discovery.random_effects import Family, kinds
 from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.discovery.thinning import draw_rows
+from remaster_ros.discovery.walk import NAMED, NEEDED
 from remaster_ros.discovery.words import joint_words, percent
 from remaster_ros.errors import InputError
 from remaster_ros.linear_algebra import one_thread

@@ -14,11 +14,11 @@ from typing import Literal, NamedTuple
 import numpy as np
 from scipy.special import ndtri_exp
 
-from remaster_ros.discovery.causes import NEEDED
 from remaster_ros.discovery.discover import Discovery
 from remaster_ros.discovery.effects.base import Cell
 from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.discovery.evidence import solve
+from remaster_ros.discovery.walk import NEEDED
 from remaster_ros.discovery.words import called
 from remaster_ros.linear_algebra import one_thread
 
@@ -100,8 +100,19 @@ def _decision(found: Discovery, cause: Named, look_alike: Named) -> Decision:
 
 
 def _rest(found: Discovery, *causes: Named) -> tuple[Cell, ...]:
-    cells = found.named.cells
-    return tuple(cell for cell in cells if not any(_belongs(cell, one) for one in causes))
+    """Return the other causes, and the background without the kinds of these."""
+    named = [cell for group in found.groups for cell in group]
+    kinds = {cause.name for cause in causes}
+    have = {name for cell in named for name in cell.parameters}
+    return (
+        *(cell for cell in named if not any(_belongs(cell, one) for one in causes)),
+        *(
+            family.cell
+            for family in found.background
+            if kinds.isdisjoint(member.name for member in family.members)
+            and have.isdisjoint(family.parameters)
+        ),
+    )
 
 
 def _belongs(cell: Cell, cause: Named) -> bool:
@@ -110,23 +121,21 @@ def _belongs(cell: Cell, cause: Named) -> bool:
 
 
 def _without(found: Discovery, *causes: Named) -> float:
-    solution = found.named
     rest = _rest(found, *causes)
-    bare = solve(found.residuals, rest, solution)
+    bare = solve(found.residuals, rest, found.solution)
     return -np.inf if bare is None else bare.log_evidence
 
 
 def _evidence(found: Discovery, cause: Named, other: Named) -> float | None:
     """Return the log evidence with a cause in place of another; None where it cannot be fitted."""
-    solution, every = found.named, _cells(found)
-    rest = _rest(found, cause, other)
-    present = tuple(cell for cell in solution.cells if _belongs(cell, cause))
+    every, rest = _cells(found), _rest(found, cause, other)
+    named = [cell for group in found.groups for cell in group]
+    present = tuple(cell for cell in named if _belongs(cell, cause))
     whole = {joint for cell in present for joint in cell.joints} == {*cause.joints}
     sets = [present] if present and whole else _variants(every, cause)
     best = None
     for cells in sets:
-        together = (*rest, *cells)
-        fit = solve(found.residuals, together, solution)
+        fit = solve(found.residuals, (*rest, *cells), found.solution)
         if fit is None or fit.unphysical():
             continue
         if best is None or fit.log_evidence > best:

@@ -1,16 +1,16 @@
 """What the simulation gets wrong: its cause by name, the model extended by it, the gain measured.
 
-One model holds every kind of error (`random_effects`): what stands out of it is named (`causes`),
-and what does not keeps a variance of its own, so that offsets and predictions state what errors
-that nobody can name would do to them. Optimization rows decide; validation rows only measure the
-gain, and refuse a model that predicts them worse than the offsets do.
+A walk over models (`walk`) finds which sets of causes explain the residuals, beside a background
+of all kinds of errors. The best model is sampled on all rows; what the other models would do to
+the offsets is in their uncertainty. Optimization rows decide; validation rows measure the gain,
+and refuse a model that predicts them worse than the offsets do.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -21,14 +21,12 @@ from remaster_ros.calibration.mistakes import sound_estimate
 from remaster_ros.calibration.outliers import find_outliers
 from remaster_ros.calibration.result import FitResult
 from remaster_ros.calibration.sampling import Progress, silent
-from remaster_ros.discovery.causes import NAMED, NEEDED, Search, p_value
 from remaster_ros.discovery.effects.base import Cell
 from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.discovery.evidence import solve
 from remaster_ros.discovery.explain import FoundEffect, describe
 from remaster_ros.discovery.gain import (
     Gain,
-    fails_held_out,
     gain_of,
     noise_by_range,
     pose_common_fraction,
@@ -38,26 +36,23 @@ from remaster_ros.discovery.geometry_model import GeometryModel, geometry_model
 from remaster_ros.discovery.guard import Unexplained, harm_of, is_harmful, nameless, unfitted
 from remaster_ros.discovery.marker_offsets import loosened, moved_markers
 from remaster_ros.discovery.omnibus import beyond_noise, structure_left
-from remaster_ros.discovery.random_effects import (
-    Family,
-    by_members,
-    fit_kinds,
-    kinds,
-    with_kinds,
-)
+from remaster_ros.discovery.random_effects import Family
 from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.discovery.solution import Solution
 from remaster_ros.discovery.thinning import Thinning, draw_rows, judge_by_others
 from remaster_ros.discovery.to_extension import (
+    drawn_kinds,
     extension_of,
-    moved_by,
-    moved_by_names,
+    moved_by_drawing,
+    moved_by_models,
     moved_by_open_offsets,
     offsets_of,
+    std_of_offsets,
 )
+from remaster_ros.discovery.walk import DATED_TO, NAMED, Walk, at_other_moments, p_value
 from remaster_ros.errors import InsufficientDataError
 from remaster_ros.linear_algebra import one_thread
-from remaster_ros.types import FloatArray, IntArray, Session
+from remaster_ros.types import BoolArray, FloatArray, IntArray, Session
 
 Verdict = Literal['effects', 'none', 'undetermined', 'unexplained']
 # Of the means, in standard deviations: 400 effective draws, enough for values of two figures.
@@ -90,9 +85,10 @@ class Discovery:
         Name of an effect -> why this session cannot show it.
     groups
         The cells of each effect that was searched for, in the order of ``effects``.
-    empty, named, solution
-        Fits of the offsets alone, of these with the causes and located structure, and of the whole
-        model with all kinds of errors that have no name of their own.
+    background
+        Kinds of errors beside the causes in the best model.
+    empty, solution
+        Fits of the offsets alone, and of the best model: causes, located structure, background.
     residuals
         What the search worked on.
     offsets_before
@@ -110,6 +106,9 @@ class Discovery:
     alone
         The sampled fit whose zero-offsets are right where nothing else of the arm is corrected:
         with errors of the measurement taken out where they are certain, and no other.
+    std_if_drawn
+        Standard deviation of the zero-offsets of ``fit`` if the arm is exactly its drawing; NaN
+        where the gauge holds them, rad, (k,).
     geometry
         All lengths and tilts beside the zero-offsets, the same taken out; None where they cannot
         be fitted.
@@ -124,13 +123,14 @@ class Discovery:
     untestable: Mapping[str, str]
     offsets_before: tuple[FloatArray, FloatArray]
     groups: tuple[tuple[Cell, ...], ...]
+    background: tuple[Family, ...]
     empty: Solution
-    named: Solution
     solution: Solution
     residuals: Residuals
     fit: FitResult
     residuals_before: FloatArray
     alone: FitResult
+    std_if_drawn: FloatArray
     geometry: GeometryModel | None
     thinning: Thinning | None = None
     unexplained: tuple[Unexplained, ...] = ()
@@ -194,40 +194,40 @@ def discover_session(
         if name not in untestable and not effect.moves_the_fit
         for cell in effect.cells(residuals.context)
     ]
-    search = Search(residuals, cells, lambda share: report('searching causes', share))
-    named = search.run()
-    if (judged := _judged(found, residuals, named, search, pool)) is not residuals:
-        search, named = search.again(judged, named)
-    named, groups, described = _that_help(search, named, report)
-    search.let_go()
+
+    def walked(data: Residuals, start: Walk | None) -> Walk:
+        first = None if start is None else start.models[0]
+        return Walk(data, cells, rng, partial(report, 'searching causes'), first)
+
+    walk = walked(residuals, None)
+    data = _judged(found, residuals, walk.best, pool)
+    if data is not residuals:
+        walk = walked(data, walk)
+    groups, described = describe(walk, partial(report, 'comparing look-alikes'))
     unexplained: tuple[Unexplained, ...] = ()
-    sampled: _Sampled | None = None
-    # Kinds that nobody named may be what does harm, or what the poses do not determine. Where
-    # their model does not hold on held-out poses, these decide between it and the names alone.
-    beside = _Beside(search, named)
-    for every in (True, False):
-        try:
-            tried = _sampled(session, before, found, beside, every, rng, report, clock)
-        except InsufficientDataError as error:
-            if described and not every and sampled is None:
-                unexplained = (unfitted(residuals.errors, described, error),)
-            continue
-        if is_harmful(tried.gain):
-            if described and tried.by_name and sampled is None:
-                unexplained = (harm_of(before, tried.fit, tried.gain, described),)
-        elif sampled is None or tried.predicts_better_than(sampled):
-            sampled = tried
-        holds = sampled is tried and not fails_held_out(search.data, tried.solution, tried.fit)
-        if tried.by_name or holds:
-            break
-    if sampled is None:
-        found, search = before, Search(Residuals.of(before), ())
-        empty = search.fit(())
-        assert empty is not None
-        named, groups, described = empty, (), ()
-        beside = _Beside(search, named)
-        sampled = _sampled(session, before, found, beside, False, rng, report, clock)
-    data, solution, fit, gain = search.data, sampled.solution, sampled.fit, sampled.gain
+    models, background = walk.solutions, walk.models[0].families
+    solution = models[0][0]
+    gain_of_all = walk.models[0].value - walk.bare.value
+    # Its columns are most of the memory.
+    del walk
+    sampled = partial(_sampled, session, before, rng=rng, report=report, clock=clock)
+    named = [cell for group in groups for cell in group]
+    try:
+        fit, gain, if_drawn = sampled(found, data, models, named)
+    except InsufficientDataError as error:
+        if described:
+            unexplained = (unfitted(data.errors, described, error),)
+        fit = None
+    if fit is not None and is_harmful(gain):
+        if described:
+            unexplained = (harm_of(before, fit, gain, described),)
+        fit = None
+    if fit is None:
+        found, data = before, Residuals.of(before)
+        bare = solve(data, ())
+        assert bare is not None
+        solution, groups, described, background, gain_of_all = bare, (), (), (), 0.0
+        fit, gain, if_drawn = sampled(found, data, [(bare, 1.0)], ())
     is_cause = [EFFECTS[group[0].name].is_cause for group in groups]
     structure = tuple(e for e, cause in zip(described, is_cause, strict=True) if not cause)
     left, gross = structure_left(data, solution, fit, structure)
@@ -239,12 +239,13 @@ def discover_session(
     ]
     causes.sort(key=lambda cause: -cause[0].size_m)
     effects, groups = zip(*causes, strict=True) if causes else ((), ())
-    effects += tuple(effect.sampled(fit) for effect in moved_markers(found, data, named))
-    empty = search.fit(())
+    named = [cell for group in groups for cell in group]
+    moved = moved_markers(found, data, solution.noise, named)
+    effects += tuple(effect.sampled(fit) for effect in moved)
+    empty = solve(data, ())
     assert empty is not None
-    if not effects and not sampled.by_name:
-        gain_of_kinds = solution.log_evidence - empty.log_evidence
-        unexplained += (nameless(data, solution, p_value(gain_of_kinds)),)
+    if not effects and not unexplained and gain_of_all > NAMED:
+        unexplained += (nameless(data, solution, p_value(gain_of_all)),)
     if not effects and not unexplained:
         unexplained = tuple(beyond_noise(data, fit))
     verdict: Verdict = 'effects' if effects else 'unexplained' if unexplained else 'none'
@@ -263,7 +264,7 @@ def discover_session(
     alone = fit
     # Kinds that nobody named are in no file with zero-offsets either.
     if not {*solution.cells} <= {*measured}:
-        errors = search.fit(measured) if measured else None
+        errors = solve(data, measured) if measured else None
         alone = fit_session(
             session,
             rng=rng,
@@ -290,13 +291,14 @@ def discover_session(
         untestable=untestable,
         offsets_before=offsets_of(before),
         groups=groups,
+        background=background,
         empty=empty,
-        named=named,
         solution=solution,
         residuals=data,
         fit=fit,
         residuals_before=residuals_of(before),
         alone=alone,
+        std_if_drawn=if_drawn,
         geometry=geometry,
         thinning=thinning,
         unexplained=unexplained,
@@ -313,7 +315,7 @@ def _to_search(
     """Return the fit to search beside, its residuals, and the rows that may be searched."""
     found, residuals = before, Residuals.of(before)
     bare = solve(residuals, ())
-    moved = moved_markers(found, residuals, bare) if bare is not None else ()
+    moved = moved_markers(found, residuals, bare.noise, ()) if bare is not None else ()
     if moved:
         # A marker that is pulled to where it is not leaves errors for other causes to explain.
         found = estimate(Problem.of(session, loosened(session, moved)))
@@ -324,71 +326,27 @@ def _to_search(
     return found, residuals, pool
 
 
-def _that_help(
-    search: Search, named: Solution, report: Progress
-) -> tuple[Solution, tuple[tuple[Cell, ...], ...], tuple[FoundEffect, ...]]:
-    """Return the causes without those that take the held-out poses further off.
-
-    What they explain of the fitted rows is left to the variances of all kinds of errors.
-    """
-    while True:
-        groups, effects = describe(
-            search, named, lambda share: report('comparing look-alikes', share)
-        )
-        if not search.data.context.measurements.is_validation.any():
-            return named, groups, effects
-        worst = min(
-            (index for index, effect in enumerate(effects) if (effect.share or 0.0) < 0.0),
-            key=lambda index: effects[index].share or 0.0,
-            default=None,
-        )
-        if worst is None:
-            return named, groups, effects
-        out = set(groups[worst])
-        out |= {one.cell for one in search.families if out & set(one.members)}
-        fewer = search.fit([cell for cell in named.cells if cell not in out], named)
-        if fewer is None:
-            return named, groups, effects
-        named = fewer
-
-
-@dataclass(frozen=True, eq=False)
-class _Sampled:
-    """A sampled model, its gain, and whether it has nothing but what has a name."""
-
-    solution: Solution
-    fit: FitResult
-    gain: Gain
-    by_name: bool
-
-    def predicts_better_than(self, other: _Sampled) -> bool:
-        """Return whether its errors on held-out poses are smaller."""
-        mine, others = self.gain.held_out_rms_after_m, other.gain.held_out_rms_after_m
-        return mine is not None and others is not None and mine < others
-
-
 def _sampled(
     session: Session,
     before: Estimate,
     found: Estimate,
-    beside: _Beside,
-    every: bool,
+    data: Residuals,
+    models: Sequence[tuple[Solution, float]],
+    named: Sequence[Cell],
+    *,
     rng: np.random.Generator,
     report: Progress,
     clock: Callable[[], float] | None,
-) -> _Sampled:
-    """Sample the model of the causes, or of all kinds of errors, and measure its gain."""
-    data = beside.search.data
-    solution = of_all_kinds(beside) if every else None
-    by_name = solution is None
-    if solution is None:
-        solution, unmodelled = by_names(found, beside)
-    else:
-        unmodelled = moved_by_names(found, data, beside.members, solution)
+) -> tuple[FitResult, Gain, FloatArray]:
+    """Sample the first of some models, each with its share, and measure its gain.
+
+    Returns also the std of the zero-offsets if the arm is exactly its drawing, rad, (k,).
+    """
+    solution = models[0][0]
+    by_drawing = moved_by_drawing(found, data, solution, drawn_kinds(found, data, named))
+    moves = [moved_by_models(found, data, models), by_drawing]
     if solution.cells:
-        unmodelled = np.concatenate(
-            (unmodelled, moved_by_open_offsets(found, data, solution)), axis=1
-        )
+        moves.append(moved_by_open_offsets(found, data, solution))
     fit = fit_session(
         session,
         rng=rng,
@@ -397,105 +355,59 @@ def _sampled(
         priors=None if found is before else found.problem.priors,
         precision=PRECISION,
         extension=extension_of(data, solution, found) if solution.cells else None,
-        unmodelled=unmodelled,
+        unmodelled=np.concatenate(moves, axis=1),
         progress=lambda _, share: report('sampling the extended model', share),
     )
-    return _Sampled(solution, fit, gain_of(before, data, solution, fit, rng), by_name)
-
-
-@dataclass(frozen=True, eq=False)
-class _Beside:
-    """The causes that have a name, and all other kinds of errors beside them."""
-
-    search: Search
-    named: Solution
-
-    @cached_property
-    def members(self) -> Solution:
-        """The causes by members."""
-        return by_members(self.named, self.search.families)
-
-    @cached_property
-    def kinds(self) -> list[Family]:
-        """All kinds of errors without the members that have a name."""
-        search = self.search
-        return kinds(search.data, search.cells, self.members.cells)
-
-    @cached_property
-    def fit(self) -> Solution | None:
-        """The fit of the causes with these; None where they agree with a cause."""
-        return with_kinds(self.search.data, self.named, self.kinds)
-
-
-def of_all_kinds(beside: _Beside) -> Solution | None:
-    """Return the model of all kinds of errors, by members; None where the causes say more.
-
-    A name is a choice among thousands: two halves of one session are not given the same names.
-    Offsets, lengths and predictions come from all kinds at once, each with one variance for all
-    its members, named or not. Not where so many members explain less than the few causes and
-    nothing is beside these (one joint errs and no other), or where nothing is there at all.
-    """
-    search, named = beside.search, beside.named
-    data, cells = search.data, search.cells
-    of_a_kind = {name for family in kinds(data, cells) for name in family.parameters}
-    members = by_members(named, search.families).cells
-    # A curve has a smoothness of its own: that of all together fits none of them.
-    own = [
-        cell
-        for cell in members
-        if cell.penalty is not None or not of_a_kind.issuperset(cell.parameters)
-    ]
-    every = kinds(data, cells, own)
-    of_a_name = {name for cell in members for name in cell.parameters}
-    unnamed = [family for family in every if of_a_name.isdisjoint(family.parameters)]
-    whole = fit_kinds(data, own, [one for one in every if one not in unnamed], unnamed)
-    # What only has a place is no kind of error of the arm: what it explains tells nothing of that.
-    located = search.fit(
-        [one for one in named.cells if one.name in EFFECTS and not EFFECTS[one.name].is_cause]
-    )
-    if whole is None or located is None or whole.log_evidence < located.log_evidence + NAMED:
-        return None
-    if whole.log_evidence < named.log_evidence:
-        both = beside.fit
-        if both is None or both.log_evidence < named.log_evidence + NEEDED:
-            return None
-    return by_members(whole, every)
-
-
-def by_names(found: Estimate, beside: _Beside) -> tuple[Solution, FloatArray]:
-    """Return the model of the causes alone, by members, and how all other kinds would move it.
-
-    That of all its natural parameters and those of the solution, one standard deviation of each
-    weight of a kind that is not in it, (size + m, c).
-    """
-    data = beside.search.data
-    members = by_members(beside.named, beside.search.families)
-    weights = {} if beside.fit is None else beside.fit.weight_precisions()
-    unseen = (
-        data.columns([family.cell]) * weights[family.cell] ** -0.5
-        for family in beside.kinds
-        if family.cell in weights
-    )
-    return members, moved_by(found, data, members, unseen)
+    if_drawn = std_of_offsets(found, data, solution, [moves[0], *moves[2:]])
+    return fit, gain_of(before, data, solution, fit, rng), if_drawn
 
 
 def _judged(
-    found: Estimate, residuals: Residuals, solution: Solution, search: Search, pool: IntArray
+    found: Estimate, residuals: Residuals, solution: Solution, pool: IntArray
 ) -> Residuals:
-    """Return the residuals of the rows of the pool that the causes do not show to be gross."""
-    problem = found.problem
+    """Return the residuals of the rows of the pool that a model does not show to be gross."""
     every = residuals.only(pool)
-    if any(np.isfinite(cell.moment) for cell in solution.cells):
-        # Rows just before or after a step look gross where it is dated without them.
-        cells = search.again(every, solution)[1].cells
-        solution = search.fit(cells, solution) or solution
-    left = every.left(by_members(solution, search.families))
-    try:
-        gross = find_outliers(every.rows, lambda keep: left, left, problem.sensor_names).gross
-    except InsufficientDataError:
-        # What is left has long tails: no reason to set a tenth of the rows aside.
-        return residuals
+    gross = None
+    for left in _left_by_moment(every, solution):
+        try:
+            off = find_outliers(
+                every.rows, partial(_as_it_is, left), left, found.problem.sensor_names
+            ).gross
+        except InsufficientDataError:
+            if gross is None:
+                # What is left has long tails: no reason to set a tenth of the rows aside.
+                return residuals
+            # Of a moment that cannot be.
+            continue
+        gross = off if gross is None else gross & off
+    assert gross is not None
     kept = np.sort(every.rows.source[~gross])
     if np.array_equal(kept, np.sort(residuals.rows.source)):
         return residuals
     return residuals.only(kept)
+
+
+def _as_it_is(left: FloatArray, kept: BoolArray) -> FloatArray:
+    """Return what a model leaves, whichever rows are kept: it is not fitted again."""
+    return left
+
+
+def _left_by_moment(data: Residuals, solution: Solution) -> list[FloatArray]:
+    """Return what a model leaves, m, (n, 3), as it is and with each step sooner and later.
+
+    Rows just before or after a step look gross where it is dated without them.
+    """
+    left = [data.left(solution)]
+    reach = DATED_TO * float(np.ptp(data.context.elapsed_s))
+    for cell, where in zip(solution.cells, solution.slices(), strict=True):
+        others = [
+            other
+            for other in at_other_moments(
+                cell, data.context, cell.moment - reach, cell.moment + reach
+            )
+            if other.variant == cell.variant
+        ]
+        for other in (others[0], others[-1]) if others else ():
+            moved = data.columns([cell]) - data.columns([other])
+            left.append(left[0] + moved @ solution.parameters[where])
+    return left

@@ -4,43 +4,35 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import reduce
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
 from remaster_ros.calibration.gauge_words import the
 from remaster_ros.calibration.result import FitResult
-from remaster_ros.discovery.causes import (
-    FEWEST_MEMBERS,
-    NEEDED,
-    Search,
-    grouped,
-    is_special_case,
-    p_value,
-)
 from remaster_ros.discovery.effects.base import Cell
 from remaster_ros.discovery.effects.context import Context
 from remaster_ros.discovery.effects.registry import EFFECTS
-from remaster_ros.discovery.random_effects import by_members
 from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.discovery.solution import Solution
+from remaster_ros.discovery.walk import NEEDED, Walk, p_value
 from remaster_ros.discovery.words import (
     KIND_OF_SUBJECT,
     clock_time,
     joint_words,
+    percent,
     place_words,
     sentence_case,
     titled,
 )
 from remaster_ros.types import BoolArray, FloatArray, IntArray
 
-# Look-alikes within this of the evidence are named; within the other, the leaders tie.
-CONFUSABLE = 5.0
-SHORTLIST = 10
-# A cause of a smaller size, in its standard deviations, was as often wrong as right in the hidden
-# world (benchmarks/RESULTS.md).
-UNCERTAIN = 2.0
+# A cause of at least this probability is stated as one; the odds are twenty to one.
+CERTAIN = 0.95
+# A look-alike of a smaller probability is not mentioned.
+MENTIONED = 0.01
+# Of the size of a part of a cause, in its standard deviations: below it a sentence leaves it out.
+CLEAR = 2.0
 # Columns that agree to this in every pose are the same change under two names.
 SAME = 1.0 - 1e-6
 # Of a matrix with ones on its diagonal.
@@ -69,6 +61,7 @@ class LookAlike:
     same: bool = False  # No measurement of these markers could: the two displace every pose alike
     general: bool = False  # It is a free form, and the effect one of the shapes that it can have
     title: str = ''  # A heading for people
+    probability: float | None = None  # That it is there and the effect is not; None: not known
 
 
 @dataclass(frozen=True)
@@ -99,6 +92,9 @@ class FoundEffect:
     of_measurement: bool = False  # It lies in how the arm was measured and not in the arm
     # When it happened, s since the first reading, where it came at one moment and stayed
     moment_s: float | None = None
+    # That it is there, whichever of its indistinguishable names it has; None in files of earlier
+    # versions
+    probability: float | None = None
 
     def sampled(
         self, result: FitResult, group: Sequence[Cell] = (), data: Residuals | None = None
@@ -124,27 +120,14 @@ class FoundEffect:
                 for cell, where in zip(group, wheres, strict=True)
             )
             size_m = _size(data, group, [result.theta[where] for where in wheres])
-            if round(1e3 * size_m, 3) == 0.0:
-                # Its size is that of the search, where it stands alone.
-                elsewhere = (
-                    'In the model of all kinds of errors another kind has all of it: these poses '
-                    'do not tell which of them it is. Measure more poses before it is acted on.'
-                )
-                return replace(
-                    self,
-                    parameters=parameters,
-                    cause=f'{self.cause} {elsewhere}',
-                    remedy=_later(self.remedy),
-                )
             found = replace(found, sizes=sizes, size_m=size_m)
         found = replace(found, parameters=parameters)
         found = replace(found, cause=with_sizes(self.cause, found._clear_sizes(group)))
         if found.is_certain:
             return found
         doubt = (
-            f'With what the choice of causes costs this is {found.sigmas:.1f} standard deviations '
-            'from nothing, and may be chance or another cause: measure more poses before it is '
-            'acted on.'
+            f'Not certain: its probability is {percent(found.probability or 0.0)}. Measure more '
+            'poses before it is acted on.'
         )
         return replace(found, cause=f'{found.cause} {doubt}', remedy=_later(found.remedy))
 
@@ -154,8 +137,7 @@ class FoundEffect:
         clear = tuple(
             size
             for size, cell in zip(self.sizes, group, strict=False)
-            if max((sigmas.get(name, np.inf) for name in cell.parameters), default=np.inf)
-            >= UNCERTAIN
+            if max((sigmas.get(name, np.inf) for name in cell.parameters), default=np.inf) >= CLEAR
         )
         others = len(self.sizes) - len(clear)
         if not clear or not others:
@@ -170,8 +152,8 @@ class FoundEffect:
 
     @property
     def is_certain(self) -> bool:
-        """Whether its clearest parameter is clearly not nothing."""
-        return self.sigmas >= UNCERTAIN
+        """Whether its probability is that of a statement."""
+        return self.probability is None or self.probability >= CERTAIN
 
     @property
     def is_taken_out(self) -> bool:
@@ -200,35 +182,40 @@ def with_sizes(cause: str, sizes: Sequence[str]) -> str:
 
 
 def describe(
-    search: Search, solution: Solution, progress: Callable[[float], None]
+    walk: Walk, progress: Callable[[float], None]
 ) -> tuple[tuple[tuple[Cell, ...], ...], tuple[FoundEffect, ...]]:
-    """Return the cells of a solution grouped to causes, and the causes, the largest first."""
-    data = search.data
-    members = by_members(solution, search.families)
-    if not members.cells:
-        return (), ()
-    groups = sorted(grouped(members.cells), key=lambda group: -size_of(data, members, group))
-    parts = shares(data, groups, members)
+    """Return the cells of the best model grouped to causes, and the causes, the largest first."""
+    data, solution = walk.data, walk.best
+    groups = sorted(grouped(walk.claimed), key=lambda group: -size_of(data, solution, group))
+    parts = shares(data, groups, solution)
     effects = []
     for count, (group, share) in enumerate(zip(groups, parts, strict=True)):
         progress(count / len(groups))
-        effects.append(_described(search, solution, members, group, share))
+        effects.append(_described(walk, group, share))
     return tuple(groups), tuple(effects)
 
 
-def _described(
-    search: Search, solution: Solution, members: Solution, group: tuple[Cell, ...], share: float
-) -> FoundEffect:
-    data, first = search.data, group[0]
-    wheres = dict(zip(members.cells, members.slices(), strict=True))
+def grouped(cells: Sequence[Cell]) -> list[tuple[Cell, ...]]:
+    """Return the cells of each cause together, in the order of their first."""
+    groups: dict[tuple[str, ...], list[Cell]] = {}
+    for cell in cells:
+        key: tuple[str, ...] = (cell.name, cell.driver, cell.form, cell.subject)
+        cause_per = EFFECTS[cell.name].cause_per
+        if cause_per != 'effect':
+            key += (str(cell.joints), cell.label if cause_per == 'variant' else '')
+        groups.setdefault(key, []).append(cell)
+    return [tuple(group) for group in groups.values()]
+
+
+def _described(walk: Walk, group: tuple[Cell, ...], share: float) -> FoundEffect:
+    data, solution, first = walk.data, walk.best, group[0]
+    wheres = dict(zip(solution.cells, solution.slices(), strict=True))
+    variance = np.diag(solution.covariance)
     parameters = tuple(
-        Parameter(name, float(value), float(np.sqrt(variance)), cell.unit)
+        Parameter(name, float(value), float(np.sqrt(square)), cell.unit)
         for cell in group
-        for name, value, variance in zip(
-            cell.parameters,
-            members.parameters[wheres[cell]],
-            np.diag(members.covariance)[wheres[cell]],
-            strict=True,
+        for name, value, square in zip(
+            cell.parameters, solution.parameters[wheres[cell]], variance[wheres[cell]], strict=True
         )
     )
     if first.happened:
@@ -237,15 +224,11 @@ def _described(
         gap = elapsed[elapsed > first.moment].min() - elapsed[elapsed <= first.moment].max()
         std = float(np.hypot(first.moment_std, gap / np.sqrt(12.0)))
         parameters += (Parameter('moment', first.moment, std, 's'),)
-    # A family is one cell of the search, whichever of its kinds this is.
-    families = {family.cell for family in search.families if set(group) & set(family.members)}
-    mine = [cell for cell in solution.cells if cell in group or cell in families]
-    without = search.fit([cell for cell in solution.cells if cell not in mine], solution)
-    # What cannot be fitted without it is there by all that is known.
-    gain = np.inf if without is None else solution.log_evidence - without.log_evidence
-    alike: tuple[LookAlike, ...] = ()
-    if without is not None and len(mine) < FEWEST_MEMBERS and families.isdisjoint(mine):
-        alike = _look_alikes(search, solution, without, mine, group)
+    gain = walk.log_gain(group)
+    alike = _look_alikes(walk, group, gain)
+    probability = max(walk.probability_of(cell) for cell in group)
+    # No measurement distinguishes names of the same displacement: it is there under any of them.
+    probability += sum(other.probability or 0.0 for other in alike if other.same)
     return FoundEffect(
         name=EFFECTS[first.name].reported_as or first.name,
         joints=_joints(group),
@@ -254,10 +237,10 @@ def _described(
         form=first.form,
         parameters=parameters,
         p_value=p_value(gain),
-        log_evidence_gain=float(min(gain, solution.log_evidence)),
+        log_evidence_gain=gain,
         confusable_with=alike,
         cause=in_words(group, data.part) + _also_called(alike),
-        size_m=size_of(data, members, group),
+        size_m=size_of(data, solution, group),
         share=share,
         remedy=EFFECTS[first.name].remedy_of(first),
         title=titled(first, _joints(group)),
@@ -265,9 +248,11 @@ def _described(
         of_measurement=first.of_measurement,
         moment_s=first.moment if first.happened else None,
         tied=any(
-            not (other.same or other.general) and other.log_evidence_gain > gain - NEEDED
+            not (other.same or other.general)
+            and (other.probability or 0.0) > probability * np.exp(-NEEDED)
             for other in alike
         ),
+        probability=min(1.0, probability),
     )
 
 
@@ -288,45 +273,30 @@ def _joints(group: Sequence[Cell]) -> tuple[int, ...]:
     return tuple(sorted({joint for cell in group for joint in cell.joints}))
 
 
-def _look_alikes(
-    search: Search,
-    solution: Solution,
-    without: Solution,
-    mine: Sequence[Cell],
-    group: tuple[Cell, ...],
-) -> tuple[LookAlike, ...]:
-    """Return the other causes that explain nearly as much in the place of ``mine``, a group.
-
-    Of one cell; those of two cells may be one of the two alone.
-    """
-    data, cell = search.data, group[0]
+def _look_alikes(walk: Walk, group: tuple[Cell, ...], gain: float) -> tuple[LookAlike, ...]:
+    """Return the other causes that models have in the place of a group, the likeliest first."""
+    cell, own = group[0], max(walk.probability_of(cell) for cell in group)
     best: dict[tuple[str, tuple[int, ...]], LookAlike] = {}
-    rest = reduce(search.without, mine, solution)
-    least = solution.log_evidence - CONFUSABLE
-    for found in search.in_place(rest, least):
-        other = next(one for one in found.cells if one not in without.cells)
-        if (other.name, other.joints) == (cell.name, _joints(group)):
-            continue
-        if found.log_evidence < least:
-            continue
-        gain = found.log_evidence - without.log_evidence
+    for other, chance in walk.instead_of(group).items():
         key = (other.name, other.joints)
-        if key in best and best[key].log_evidence_gain >= gain:
+        if chance < MENTIONED or key == (cell.name, _joints(group)):
             continue
-        same = len(group) == 1 and _same(data, solution, cell, other)
+        if key in best and (best[key].probability or 0.0) >= chance:
+            continue
+        same = len(group) == 1 and _same(walk.data, cell, other)
         best[key] = LookAlike(
-            other.name,
-            other.joints,
-            float(gain),
+            *key,
+            float(gain + np.log(chance / max(own, MENTIONED))),
             separate_by(cell, other, same),
             same,
-            len(group) == 1 and is_special_case(cell, other),
+            len(group) == 1 and cell.is_shape_of(other),
             titled(other, other.joints),
+            chance,
         )
-    return tuple(sorted(best.values(), key=lambda alike: -alike.log_evidence_gain))
+    return tuple(sorted(best.values(), key=lambda alike: -(alike.probability or 0.0)))
 
 
-def _same(data: Residuals, solution: Solution, cell: Cell, other: Cell) -> bool:
+def _same(data: Residuals, cell: Cell, other: Cell) -> bool:
     """Return whether two cells displace the marker alike in every row."""
     if cell.size != other.size or cell.driver != other.driver:
         return False

@@ -11,14 +11,17 @@ from collections.abc import Sequence
 
 import numpy as np
 import scipy
+from scipy.special import expit
 
 from remaster_ros.calibration.estimate import Estimate
 from remaster_ros.calibration.gauge_words import the
+from remaster_ros.calibration.noise import Noise
+from remaster_ros.discovery.effects.base import Cell
 from remaster_ros.discovery.effects.marker_offset import EFFECT as MARKER_OFFSET
 from remaster_ros.discovery.effects.sizes import number
 from remaster_ros.discovery.explain import FoundEffect, Parameter
 from remaster_ros.discovery.residuals import Residuals
-from remaster_ros.discovery.solution import Solution
+from remaster_ros.discovery.surface import KIND_ODDS
 from remaster_ros.types import BoolArray, FloatArray, Priors, Session
 
 # The prior pulls the fitted marker back: its true place may be this many times further off.
@@ -34,15 +37,20 @@ ROUNDING = 1e-9
 HIDDEN = 0.1
 
 
-def moved_markers(found: Estimate, data: Residuals, solution: Solution) -> tuple[FoundEffect, ...]:
-    """Return an effect for every marker that the fit moved beyond its stated accuracy."""
+def moved_markers(
+    found: Estimate, data: Residuals, noise: Noise, causes: Sequence[Cell]
+) -> tuple[FoundEffect, ...]:
+    """Return an effect for every marker that the fit moved beyond its stated accuracy.
+
+    The causes are fitted beside them.
+    """
     model, problem = found.model, found.problem
     x = model.natural(found.mode.z)
     jacobian = model.natural_jacobian(x, data.rows)
-    columns = data.columns(solution.cells)
+    columns = data.columns(causes)
     joined = np.concatenate((jacobian, columns), axis=2)
-    white = data.noise_model.whitened(joined, solution.noise).reshape(3 * len(data), -1)
-    error = data.noise_model.whitened(data.errors, solution.noise).ravel()
+    white = data.noise_model.whitened(joined, noise).reshape(3 * len(data), -1)
+    error = data.noise_model.whitened(data.errors, noise).ravel()
     std = max(problem.session.marker_std_m, 1e-6)
     effects = []
     for index, name in enumerate(problem.marker_names):
@@ -59,14 +67,14 @@ def moved_markers(found: Estimate, data: Residuals, solution: Solution) -> tuple
         if not seen.any():
             continue
         u = axes[:, seen].T @ pull
-        noise = np.diag(values[seen])
-        square = float(u @ np.linalg.solve(noise + np.diag((values[seen] * std) ** 2), u))
+        spread = np.diag(values[seen])
+        square = float(u @ np.linalg.solve(spread + np.diag((values[seen] * std) ** 2), u))
         p_value = float(scipy.special.chdtrc(seen.sum(), square))
         if p_value * len(problem.marker_names) > SIGNIFICANCE:
             continue
         inverse = axes[:, seen] / values[seen]
         by_data = inverse @ u
-        covariance = inverse @ noise @ inverse.T + _unseen(
+        covariance = inverse @ spread @ inverse.T + _unseen(
             by_data, problem.markers[index], axes, seen
         )
         blind = np.sum(axes[:, ~seen] ** 2, axis=1) > HIDDEN
@@ -146,6 +154,7 @@ def _effect(
         ),
         p_value=p_value,
         log_evidence_gain=0.5 * (square - rank),
+        probability=float(expit(0.5 * (square - rank) + np.log(KIND_ODDS))),
         confusable_with=(),
         cause=cause,
         size_m=way,

@@ -20,13 +20,10 @@ from functools import partial
 
 import numpy as np
 
-from remaster_ros.calibration.noise import Noise
 from remaster_ros.discovery.effects.base import RANDOM, Cell, Design
 from remaster_ros.discovery.effects.context import Context
 from remaster_ros.discovery.effects.registry import EFFECTS
-from remaster_ros.discovery.evidence import GAIN, solve
 from remaster_ros.discovery.residuals import Residuals
-from remaster_ros.discovery.screening import rises
 from remaster_ros.discovery.solution import Covariances, Solution
 from remaster_ros.types import FloatArray
 
@@ -35,16 +32,6 @@ NOTHING = 1e-12
 # Directions of a penalised member with a smaller share of its largest displacement, in square.
 # Coarser, and a fit of curves ends on a plateau, four times as far from held-out poses.
 LEAST_SHARE = 1e-7
-# Share of the offsets model's errors that is noise, where the rest is of the arm: a search for the
-# likelihood's maximum begins there as well as at one.
-SMALL_NOISE = 0.3
-# With so many numbers measured for each member there is one maximum of the likelihood, and kinds
-# of more than so many weights are looked at after the others: they are most of all columns, and
-# most of them have no variance.
-MANY_ROWS, FEW_WEIGHTS = 2.0, 50
-# The price of one variance more (Akaike 1974): chance gives half of all kinds one, and a kind of
-# hundreds of members that gains less takes memory and time for every row of the session.
-PRICE = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,14 +54,20 @@ class Family:
 
     @classmethod
     def of(
-        cls, data: Residuals, name: str, members: Sequence[Cell], least: float = 0.0
+        cls,
+        data: Residuals,
+        name: str,
+        members: Sequence[Cell],
+        least: float = 0.0,
+        alike: Sequence[Cell] = (),
     ) -> Family | None:
         """Make the family of some cells; None where none of them displaces a marker.
 
-        Its weights have a standard deviation of no less than ``least``, m.
+        Its weights have a standard deviation of no less than ``least``, m. ``alike``: cells whose
+        joints move the marker as much as theirs count to; the members by default.
         """
         seen, maps, scales, largest = [], [], [], []
-        lever = _lever(data, members)
+        lever = _lever(data, alike or members)
         for member in members:
             moved = data.columns([member])
             parts = np.sum(moved**2, axis=(0, 1)) / len(data) > NOTHING**2
@@ -154,75 +147,6 @@ def kinds(data: Residuals, cells: Sequence[Cell], apart: Sequence[Cell] = ()) ->
             taken |= set(cell.parameters)
     families = (Family.of(data, f'every {name}', mine) for name, mine in members.items())
     return [family for family in families if family is not None]
-
-
-def fit_kinds(
-    data: Residuals,
-    cells: Sequence[Cell],
-    named: Sequence[Family],
-    families: Sequence[Family] = (),
-) -> Solution | None:
-    """Fit cells and all members of some kinds; None where they cannot be distinguished.
-
-    Of ``named`` some member has a name; of the other ``families`` those that the likelihood does
-    not show are left out: to within what Newton's steps leave of it (`GAIN`) their variance is
-    nothing, and all that is computed later on would carry along hundreds of members.
-
-    The likelihood has two maxima where rows are few: errors are noise, or they are all of the arm
-    and the noise is small. Newton's steps go to the nearer one, so they begin at either. Where
-    rows are many, kinds with many members have a variance only where it raises the likelihood, by
-    its price.
-    """
-    many = 3 * len(data) > MANY_ROWS * sum(one.cell.size for one in (*named, *families))
-    later = [family for family in families if many and family.cell.size > FEW_WEIGHTS]
-    at_once = [*named, *(family for family in families if family not in later)]
-    every = (*cells, *(family.cell for family in at_once))
-    found = solve(data, every)
-    if found is None or not at_once:
-        return found
-    noise, least = data.noise, SMALL_NOISE
-    quiet = Noise(least * noise.sigma, least * noise.pose_sigma, least * noise.frame_sigma)
-    variance = float(np.max(data.noise_model.sensor_noise(noise).total)) ** 2 / len(at_once)
-    shared = [variance**-1.0 if cell.form == RANDOM else np.nan for cell in found.cells]
-    start = replace(found, noise=quiet, smoothness=np.array(shared))
-    other = solve(data, every, start)
-    best = found if other is None or other.log_evidence < found.log_evidence else other
-    whole = with_kinds(data, best, later)
-    if whole is None:
-        return None
-    whole = _without_nothing(whole, [one for one in families if one not in later], len(data), GAIN)
-    return _without_nothing(whole, [one for one in families if one in later], len(data), PRICE)
-
-
-def with_kinds(data: Residuals, solution: Solution, families: Sequence[Family]) -> Solution | None:
-    """Return a fit with those of some kinds beside it that raise the likelihood.
-
-    None where they cannot be distinguished from what is there.
-    """
-    left = list(families)
-    while left:
-        shown = rises(data, solution, [family.cell for family in left])
-        if not any(shown):
-            break
-        more = [family.cell for family, so in zip(left, shown, strict=True) if so]
-        found = solve(data, (*solution.cells, *more), solution)
-        if found is None:
-            return None
-        solution, left = found, [f for f, so in zip(left, shown, strict=True) if not so]
-    return solution
-
-
-def _without_nothing(
-    solution: Solution, families: Sequence[Family], rows: int, gain: float
-) -> Solution:
-    """Return a fit without those of some families that the likelihood does not show."""
-    for family in families:
-        if family.cell in solution.cells:
-            index = solution.cells.index(family.cell)
-            evidence = solution.evidence_without(index, rows)
-            if evidence > solution.log_evidence - gain:
-                solution = solution.less(index, evidence)
-    return solution
 
 
 def by_members(solution: Solution, families: Sequence[Family]) -> Solution:

@@ -21,6 +21,8 @@ from remaster_ros.types import FloatArray, IntArray, Measurements
 
 MOST_ROWS = 3_000
 """Sessions of fewer are searched whole."""
+FEWEST_TO_SEARCH = 12
+"""Poses from which on a search for causes is worth its while."""
 FEWEST_POSES = 500
 """Of the poses that the same sensors measured: fewer rows of each are drawn before fewer poses."""
 FEWEST_ROWS = 2

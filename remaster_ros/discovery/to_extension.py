@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -11,6 +12,8 @@ from remaster_ros.calibration.extension import Extension, Start, Term
 from remaster_ros.calibration.priors import OFFSET_STD, STEP_STD, prior_rows
 from remaster_ros.discovery.effects.base import Cell
 from remaster_ros.discovery.effects.context import Context
+from remaster_ros.discovery.effects.registry import EFFECTS
+from remaster_ros.discovery.random_effects import Family, kinds
 from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.discovery.solution import Solution
 from remaster_ros.types import FloatArray, IntArray
@@ -102,44 +105,90 @@ def _solved(
     return white, root, np.concatenate((free, size + np.arange(own.shape[2])))
 
 
-def moved_by(
-    found: Estimate, data: Residuals, solution: Solution, displacements: Iterable[FloatArray]
+def moved_by_models(
+    found: Estimate, data: Residuals, models: Sequence[tuple[Solution, float]]
 ) -> FloatArray:
-    """Return how displacements (n, 3, …), m, beside the model move all fitted, (size + m, c)."""
-    white, root, where = _solved(found, data, solution)
-    parts = [np.zeros((len(root), 0))]
-    for some in displacements:
-        others = data.noise_model.whitened(some, solution.noise).reshape(3 * len(data), -1)
-        parts.append(root @ (root.T @ (white.T @ others)))
-    together = np.concatenate(parts, axis=1)
-    moves = np.zeros((found.model.size + len(solution.parameters), together.shape[1]))
-    moves[where] = together
-    return moves
+    """Return how all that is fitted moves from the first of some models to each other one.
 
-
-def moved_by_names(
-    found: Estimate, data: Residuals, named: Solution, every: Solution
-) -> FloatArray:
-    """Return how all fitted moves if each cause has its size, of which kinds have a part.
-
-    In a model of all kinds of errors another one may take over what a cause explains: a curve has
-    the mean of a scale in the zero-offset beside it. Which of them it is these data do not tell.
-    Predictions stay. Of all natural parameters and the m of the model of all kinds, (size + m, c).
+    Each by the root of its share, so that their squares are the variance among the models. Of all
+    natural parameters and the m of the first model, (size + m, c).
     """
-    places = {name: i for i, name in enumerate(n for c in every.cells for n in c.parameters)}
-    kept = [
-        (cell, named.parameters[where], [places[name] for name in cell.parameters])
-        for cell, where in zip(named.cells, named.slices(), strict=True)
-        if places.keys() >= {*cell.parameters}
-    ]
-    missing = [values - every.parameters[at] for _, values, at in kept]
-    shifts = (
-        data.columns([cell]) @ less for (cell, _, _), less in zip(kept, missing, strict=True)
-    )
-    moves = -moved_by(found, data, every, shifts)
-    for column, ((_, _, at), less) in enumerate(zip(kept, missing, strict=True)):
-        moves[found.model.size + np.array(at), column] += less
+    first = models[0][0]
+    free, size = found.posterior.free, found.model.size
+    place = {name: size + i for i, name in enumerate(_names(first))}
+    columns = data.full_jacobian[data.rows.source][:, :, free].reshape(-1, len(free))
+    scale = np.linalg.norm(columns, axis=0)
+    scale[scale == 0.0] = 1.0
+    base = data.base.reshape(len(columns), -1)
+    moves = np.zeros((size + len(place), len(models) - 1))
+    for column, (other, share) in enumerate(models[1:]):
+        step = base @ (other.base - first.base)
+        moves[free, column] = np.linalg.lstsq(columns / scale, step, rcond=None)[0] / scale
+        moves[size:, column] = -first.parameters
+        for name, value in zip(_names(other), other.parameters, strict=True):
+            if name in place:
+                moves[place[name], column] += value
+        moves[:, column] *= np.sqrt(share)
     return moves
+
+
+def drawn_kinds(found: Estimate, data: Residuals, named: Sequence[Cell]) -> list[Family]:
+    """Return lengths and tilts without a name, each kind with the tolerance of a drawing."""
+    cells = [
+        cell
+        for effect in EFFECTS.values()
+        if effect.place in ('link_translation', 'link_rotation') and not effect.needs(data.context)
+        for cell in effect.cells(data.context)
+        if cell.model_change is not None
+    ]
+    tolerance_m = found.problem.priors.geometry_tolerance_m
+    families = kinds(data, cells, named)
+    return [replace(one, cell=replace(one.cell, least=tolerance_m)) for one in families]
+
+
+def moved_by_drawing(
+    found: Estimate, data: Residuals, solution: Solution, drawn: Sequence[Family]
+) -> FloatArray:
+    """Return how lengths and tilts within the tolerance of a drawing move all that is fitted.
+
+    No session proves that an arm is its drawing. Of each weight one standard deviation, of those
+    that the model has what it lacks of that. Of all natural parameters and the m of the cells,
+    (size + m, c).
+    """
+    white, root, where = _solved(found, data, solution)
+    size = found.model.size
+    place = {name: size + i for i, name in enumerate(_names(solution))}
+    precision = dict(zip(_names(solution), np.diag(solution.prior_precision()), strict=True))
+    parts = [np.zeros((size + len(place), 0))]
+    for family in drawn:
+        for member, mapping, scale in zip(family.members, family.maps, family.scales, strict=True):
+            known = np.array([precision.get(name, np.inf) for name in member.parameters])
+            variance = np.maximum(family.cell.least**2 - (scale / known), 0.0)
+            shift = data.columns([member]) @ (mapping * np.sqrt(variance))
+            others = data.noise_model.whitened(shift, solution.noise).reshape(3 * len(data), -1)
+            moves = np.zeros((len(parts[0]), others.shape[1]))
+            moves[where] = root @ (root.T @ (white.T @ others))
+            parts.append(moves)
+    return np.concatenate(parts, axis=1)
+
+
+def std_of_offsets(
+    found: Estimate, data: Residuals, solution: Solution, moves: Sequence[FloatArray]
+) -> FloatArray:
+    """Return the std of the zero-offsets beside a model, and by what moves them, rad, (k,).
+
+    NaN where the gauge holds them. ``moves``: columns of one standard deviation each.
+    """
+    _, root, where = _solved(found, data, solution)
+    variance = np.full(found.model.size + len(solution.parameters), np.nan)
+    variance[where] = np.sum(root**2, axis=1)
+    for columns in moves:
+        variance += np.sum(columns**2, axis=1)
+    return np.sqrt(variance[: found.model.joints])
+
+
+def _names(solution: Solution) -> list[str]:
+    return [name for cell in solution.cells for name in cell.parameters]
 
 
 def root_of_inverse(precision: FloatArray) -> FloatArray:

@@ -23,7 +23,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from remaster_ros.discovery.screening import FEWEST_POSES
+from remaster_ros.discovery.thinning import FEWEST_TO_SEARCH
 from remaster_ros.errors import InsufficientDataError
 from remaster_ros.planning.design_information import DesignInformation
 from remaster_ros.planning.travel_time import TravelTime
@@ -61,8 +61,8 @@ class Floors:
     is most sensitive, and nothing would test the model in between.
     """
 
-    # Different poses to fit, as many as `discovery.screening` needs for its p-values
-    poses: int = FEWEST_POSES
+    # Different poses to fit, as many as a search for causes needs
+    poses: int = FEWEST_TO_SEARCH
     repeated: int = REPEATED_POSES  # Poses with at least two solutions
 
     def hold(self, pose: IntArray) -> bool:

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
@@ -55,6 +55,17 @@ from remaster_ros.types import FloatArray
 from remaster_ros.version import __version__
 
 
+def _with_exact_drawing(
+    discovery: Discovery, rows: Sequence[Mapping[str, Any]]
+) -> list[dict[str, Any]]:
+    """Return the zero-offsets with their std if the arm is exactly its drawing."""
+    drawn = of_joints(discovery.fit.chain, std_if_exactly_drawn=discovery.std_if_drawn)
+    return [
+        {**row, **(exact if row['identifiable'] else {})}
+        for row, exact in zip(rows, drawn, strict=True)
+    ]
+
+
 def predictions_of(discovery: Discovery) -> Predictions:
     """Return where the final model predicts every row of the session."""
     context = discovery.residuals.context
@@ -97,7 +108,7 @@ def discovery_content(
                 strict=True,
             )
         ],
-        'joint_offsets_after': fit['joint_offsets'],
+        'joint_offsets_after': _with_exact_drawing(discovery, fit['joint_offsets']),
         'sampler': fit['sampler'],
         'registration': fit['registration'],
         'markers': fit['markers'],

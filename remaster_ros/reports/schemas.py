@@ -18,7 +18,7 @@ from msgspec import UNSET, Struct, UnsetType
 
 from remaster_ros.calibration.identifiability import GaugeDirection
 from remaster_ros.calibration.predictions import Coverage
-from remaster_ros.discovery.explain import UNCERTAIN, LookAlike, Parameter, clearest
+from remaster_ros.discovery.explain import CERTAIN, LookAlike, Parameter
 from remaster_ros.discovery.thinning import Thinning
 from remaster_ros.kinematics.serial_chain import LEVER_M
 
@@ -421,12 +421,13 @@ class Effect(Struct):
     in_robot_model: bool = False
     of_measurement: bool = False
     moment_s: float | None = None
+    probability: float | None = None
 
     @property
     def is_taken_out(self) -> bool:
         """As of `FoundEffect`."""
-        known = clearest((one.value, one.std or 0.0) for one in self.parameters)
-        return self.of_measurement and known >= UNCERTAIN
+        known = self.probability is None or self.probability >= CERTAIN
+        return self.of_measurement and known
 
 
 class Gain(Struct):

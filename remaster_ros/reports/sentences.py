@@ -433,9 +433,13 @@ def _would_show(discovery: Discovery) -> bool:
 
 
 def _uncertain(discovery: Discovery) -> str:
-    """Return which causes may be chance by their own standard deviations; ''."""
-    names = [sentence_case(effect.title) for effect in discovery.effects if not effect.is_certain]
-    return f' Not certain by its own standard deviation: {", ".join(names)}.' if names else ''
+    """Return which causes are not certain, each with its probability; ''."""
+    names = [
+        f'{sentence_case(effect.title)} (probability {percent(effect.probability or 0.0)})'
+        for effect in discovery.effects
+        if not effect.is_certain
+    ]
+    return f' Not certain: {", ".join(names)}.' if names else ''
 
 
 def headline(

@@ -75,7 +75,7 @@ def test_each_form_holds_the_offset_in_mm(folder, tmp_path):
         json.loads((folder / 'f/fit.json').read_text())['joint_offsets'], OFFSETS
     ):
         if row['joint'] == 'j3':
-            assert row['std_mm'] < 0.05
+            assert row['std_if_exactly_drawn_mm'] < 0.05
             assert abs(row['mean_mm'] - 1e3 * truth) < 4.5 * row['std_mm']
     file = folder / 'f/apply/compensation.json'
     found = read_compensation(file)

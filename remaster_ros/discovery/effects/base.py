@@ -126,6 +126,15 @@ class Cell:
             self.place == 'marker' and self.driver == 'constant'
         )
 
+    def is_shape_of(self, form: Cell) -> bool:
+        """Return whether it is one of the shapes that a free form can have."""
+        return (
+            form.penalty is not None
+            and self.penalty is None
+            and (self.place, self.driver, self.joints, self.subject)
+            == (form.place, form.driver, form.joints, form.subject)
+        )
+
     @cached_property
     def roughness(self) -> FloatArray:
         """Eigenvalues of the penalty, ascending, (m,); none where there is none."""

@@ -37,7 +37,6 @@ from remaster_ros.discovery.discover import Discovery, discover_session
 from remaster_ros.discovery.effects.base import Design
 from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.discovery.evidence import System, solve
-from remaster_ros.discovery.screening import Catalogue, screen
 from remaster_ros.discovery.words import p_value_text, percent
 from remaster_ros.errors import InputError, InsufficientDataError
 from remaster_ros.simulation.simulated_workcell import simulate_session
@@ -187,13 +186,12 @@ def test_the_extended_model_is_sampled_and_gains_on_held_out_poses():
     assert found.gain.held_out_rms_before_m is not None
     assert found.gain.held_out_rms_after_m < found.gain.held_out_rms_before_m
     assert found.gain.held_out_rms_after_m < 1.25 * found.gain.noise_floor_m
-    assert found.fit.theta_names == ('compliance_2', 'compliance_4')
-    for parameter, mean, std in zip(
-        found.effects[0].parameters, found.fit.theta, found.fit.theta_std, strict=True
-    ):
-        assert parameter.value == mean
-        # With what the search has it otherwise.
-        assert std <= parameter.std < 1.1 * std
+    # Lengths and tilts within the tolerance of the drawing are in the model, too.
+    assert {'compliance_2', 'compliance_4'} < {*found.fit.theta_names}
+    where = {name: i for i, name in enumerate(found.fit.theta_names)}
+    for parameter in found.effects[0].parameters:
+        assert parameter.value == found.fit.theta[where[parameter.name]]
+        assert parameter.std == found.fit.theta_std[where[parameter.name]]
     assert [e.share for e in found.effects] == [pytest.approx(1.0)]
 
 
@@ -249,41 +247,6 @@ def test_a_curve_has_a_plausible_size_where_the_data_leave_it_open():
     assert np.abs(fit.parameters).max() < 3.0 * cell.largest
 
 
-def test_screening_scores_agree_with_a_least_squares_fit_of_each_cell():
-    data = residuals()
-    cells = [
-        c for n in ('encoder_scale', 'encoder_eccentricity', 'backlash') for c in cells_named(n)
-    ]
-    empty = solve(data, ())
-    assert empty is not None
-    scores = screen(data, Catalogue.of(data, cells), empty)
-    base = data.noise_model.whitened(data.base, empty.noise).reshape(3 * len(data), -1)
-    errors = data.noise_model.whitened(data.errors, empty.noise).ravel()
-    n = 3 * len(data) - base.shape[1]
-
-    def squares(columns: np.ndarray) -> float:
-        solution = np.linalg.lstsq(columns, errors, rcond=None)[0]
-        return float(np.sum((errors - columns @ solution) ** 2))
-
-    compared = 0
-    for cell, score in zip(cells, scores, strict=True):
-        alone = solve(data, (cell,))
-        if alone is None or alone.unphysical():
-            continue
-        compared += 1
-        white = data.noise_model.whitened(data.columns([cell]), empty.noise)
-        white = white.reshape(3 * len(data), -1)
-        white /= np.maximum(np.linalg.norm(white, axis=0), 1e-30)
-        left = white - base @ np.linalg.lstsq(base, white, rcond=None)[0]
-        # Of joint 3, which takes three angles only, sines and cosines are partly one and the same.
-        if np.linalg.svd(left, compute_uv=False)[-1] < 2e-3:
-            continue
-        ratio = squares(base) / squares(np.concatenate((base, white), axis=1))
-        expected = 0.5 * n * np.log(ratio) - 0.5 * cell.size * np.log(n) - np.log(cell.drawn_from)
-        assert score == pytest.approx(expected, abs=0.05)
-    assert compared > len(cells) // 2
-
-
 def test_a_joint_that_moves_only_in_gross_errors_suggests_nothing():
     """Its columns are zero in all rows that are searched; a warning would end this test."""
     print('seed', seed := 5)
@@ -306,8 +269,8 @@ def test_a_joint_that_moves_only_in_gross_errors_suggests_nothing():
 @pytest.mark.parametrize(
     'seed', [2, *(pytest.param(seed, marks=pytest.mark.qualify) for seed in (4, 10))]
 )
-def test_held_out_poses_decide_where_the_model_of_all_kinds_does_not_hold(seed):
-    """Five poses do not tell a soft joint from a soft base; the name alone predicts others."""
+def test_five_poses_have_no_background_but_lengths_and_tilts(seed):
+    """They do not tell a soft joint from a soft base; the name alone predicts others."""
     few = {'poses': 5, 'validation': 3, 'sigma_m': 0.01e-3, 'pose_sigma_m': 0.02e-3}
     found = discovered(session_with(seed, soft, **few))
     assert [(effect.name, effect.joints) for effect in found.effects] == [
@@ -351,8 +314,11 @@ def test_readings_that_remember_say_nothing_of_the_arm(seed):
     assert found.verdict == 'unexplained'
     assert {cell.name for cell in found.solution.cells} == {'sensor_wander'}
     # The registration is that of the whole session, not of its first reading.
-    (cell,) = found.solution.cells
-    shift = found.residuals.columns([cell]) @ found.solution.parameters
+    shift = sum(
+        found.residuals.columns([cell]) @ found.solution.parameters[where]
+        for cell, where in zip(found.solution.cells, found.solution.slices(), strict=True)
+        if cell.name == 'sensor_wander'
+    )
     assert np.linalg.norm(shift.mean(axis=0)) < 0.02 * np.linalg.norm(shift, axis=1).mean()
 
 

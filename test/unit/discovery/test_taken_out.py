@@ -23,7 +23,7 @@ def test_only_a_certain_error_of_the_measurement_is_taken_out(monkeypatch):
         return discover_session(session, rng=np.random.default_rng(0))
 
     with monkeypatch.context() as doubting:
-        doubting.setattr(explain, 'UNCERTAIN', np.inf)
+        doubting.setattr(explain, 'CERTAIN', np.inf)
         doubtful = found()
     certain = found()
     for one in certain, doubtful:

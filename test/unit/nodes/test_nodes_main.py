@@ -38,7 +38,7 @@ def test_an_unknown_node_is_refused_with_the_one_that_was_meant(capsys):
             ('pose_planner', 'optimizer', 'watch'),
             [
                 f'remaster_ros.{name}'
-                for name in ('calibration.estimate', 'discovery.screening', 'planning.pose_design')
+                for name in ('calibration.estimate', 'discovery.walk', 'planning.pose_design')
             ],
         ),
     ],

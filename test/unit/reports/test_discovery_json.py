@@ -27,7 +27,7 @@ from remaster_ros.discovery.gain import Gain
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.reports import discovery_json, figures
-from remaster_ros.reports.discovery_json import loadable, read_discovery
+from remaster_ros.reports.discovery_json import discovery_content, loadable, read_discovery
 from remaster_ros.reports.fit_json import model_text
 from remaster_ros.reports.report import discovery_html
 from remaster_ros.reports.result_folder import save_discovery
@@ -91,7 +91,7 @@ def test_discovery_json_keeps_its_contract(saved):
         keys = {'name', 'joints', 'log_evidence_gain', 'separate_by', 'same', 'general'}
         assert other.keys() == keys
         assert other['separate_by']
-    assert re.search(r'joint 2 errs by up to [45]\.\d+′ ± 0\.\d+′', effect['cause'])
+    assert re.search(r'joint 2 errs by up to [45]\.\d+′ ± [01]\.\d+′', effect['cause'])
     assert effect['sizes'][0] in effect['cause']
     assert effect['remedy'].endswith('.')
     assert content['gain']['held_out_rms_after_m'] < content['gain']['held_out_rms_before_m']
@@ -571,19 +571,26 @@ def test_a_wave_has_no_band_where_nothing_was_measured(scenes, monkeypatch):
     assert all(x.max() < middle - 20.0 or x.min() > middle + 20.0 for x in sides)
 
 
-def test_a_cause_that_may_be_chance_by_its_own_deviation_is_said_and_not_green(scenes, tmp_path):
-    """It is named because the evidence is for it; what the choice of causes costs comes after."""
+def test_a_cause_of_less_than_certainty_is_said_with_its_probability_and_not_green(
+    scenes, tmp_path
+):
     bent = scenes['bent']
     (effect,), group = bent.effects, bent.groups[0]
-    most = max(abs(parameter.value) for parameter in effect.parameters)
-    wide = replace(bent.fit, theta_std=np.full_like(bent.fit.theta_std, most / 1.5))
-    doubtful = effect.sampled(wide, group, bent.residuals)
-    assert doubtful.sigmas == pytest.approx(1.5)
-    assert 'is 1.5 standard deviations from nothing' in doubtful.cause
-    assert 'from nothing' not in effect.cause
+    doubtful = replace(effect, probability=0.7).sampled(bent.fit, group, bent.residuals)
+    assert 'Not certain: its probability is 70 %.' in doubtful.cause
+    assert 'Not certain' not in effect.cause
     # Nobody is sent to the gearbox before it is sure.
     assert doubtful.remedy == f'Measure more poses first. If it stays: {effect.remedy}'
     assert doubtful.size_m == pytest.approx(effect.size_m)
     page, mood, _ = shown(replace(bent, effects=(doubtful,)), tmp_path, figures=False)
     assert mood == 'caution'
-    assert 'Not certain by its own standard deviation: encoder eccentricity of joint 2.' in page
+    assert 'Not certain: encoder eccentricity of joint 2 (probability 70 %).' in page
+
+
+def test_offsets_have_their_std_if_the_arm_is_exactly_its_drawing(scenes):
+    found = scenes['bent']
+    rows = [row for row in discovery_content(found).joint_offsets_after if row.identifiable]
+    assert rows
+    # A joint about which lengths and tilts turn nothing is as sure; the draws have some noise.
+    assert all(0.0 < row.std_if_exactly_drawn_deg < 1.1 * row.std_deg for row in rows)
+    assert any(row.std_if_exactly_drawn_deg < 0.5 * row.std_deg for row in rows)

@@ -151,8 +151,6 @@ def test_a_scale_that_a_curve_takes_over_leaves_the_zero_unsure(made, seed):
     fit = found.fit
     off = (fit.joint_offsets - run.truth.joint_offsets) / fit.joint_offsets_std
     assert np.abs(off[fit.identifiable]).max() < 4.5
-    # Kinds of all errors are there with the one, the scale alone with the other.
-    assert (len(found.solution.cells) > 1) == (seed == 100)
 
 
 def test_what_such_an_arm_cannot_show_is_refused(made, tmp_path):

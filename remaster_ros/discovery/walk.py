@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The models visited by the walk, each at its own noise and background, and averages over them.
 
-The background is in every model: all kinds of errors as random effects (`random_effects`), each
-with a variance that the restricted likelihood gives, lengths and tilts of no less than the
-tolerance of the drawing. What offsets imitate exactly has no evidence, but for its prior. A kind
-that the data do not show has no variance and costs nothing.
+Beside the causes a model has a background: kinds of errors as random effects (`random_effects`),
+each with a variance that the restricted likelihood gives. A kind that the data do not show has no
+variance and is left out.
 
 A cause is in a model as a block, or as a member of the background that stands out of it: by the
 ratio of the densities at nothing before and after the data (Savage & Dickey; Dickey 1971, Ann.
@@ -23,15 +22,14 @@ import numpy as np
 from scipy.special import log_expit, logsumexp
 
 from remaster_ros.calibration.noise import Noise
-from remaster_ros.discovery.causes import is_special_case
 from remaster_ros.discovery.effects.base import Cell
+from remaster_ros.discovery.effects.context import Context
 from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.discovery.evidence import System
 from remaster_ros.discovery.random_effects import Family, kinds
 from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.discovery.solution import Covariances, Solution
-from remaster_ros.types import FloatArray, IntArray
-from walk.surface import (
+from remaster_ros.discovery.surface import (
     KIND_ODDS,
     LEVELS_M,
     NOTHING,
@@ -42,23 +40,33 @@ from walk.surface import (
     Walker,
     candidates,
 )
+from remaster_ros.discovery.thinning import FEWEST_TO_SEARCH
+from remaster_ros.types import FloatArray, IntArray
 
 # Variant of a kind that is one free form, with a variance of its own.
 ALONE = 'alone'
 # Share of the displacement by a wave that a curve of the same joint has, from which on the wave is
 # a part of the curve.
 PART_OF_A_CURVE = 0.9
-# What the likelihood must lose without a kind of the background for it to stay: the price of one
-# variance (Akaike 1974).
-PRICE = 1.0
 # Rounds of a chain at most, each with noise and background of the one before; steps of a round at
 # most; steps without a better model after which a round ends, and so many more for each block.
 ROUNDS, STEPS, PATIENCE, PATIENCE_EACH = 8, 300, 40, 5
+# Share of a session's time within which a step may have been sooner or later than a walk has it
+# that had no row beside it, which the offsets alone leave as gross: two of its moments.
+DATED_TO = 0.05
+# Log of the least evidence for a kind of the background that pays no odds (Akaike 1974).
+PRICE = 1.0
 # A log posterior that rises by less is settled.
 SETTLED = 0.1
+# Odds of twenty to one decide between two causes; so many kinds of errors are tried that the best
+# of them gains `NAMED` at a probability of one in twenty where nothing is there (Markov).
+NEEDED = 3.0
+NAMED = float(np.log(len(EFFECTS) / 0.05))
 # Models that are evaluated in the end at most, the log posterior below the best at which none is,
 # and the share below which none is kept.
 MOST_MODELS, NEGLIGIBLE, LEAST_SHARE = 24, 7.0, 1e-3
+# Exchanges of each block of the best model that are looked at.
+MOST_EXCHANGED = 8
 
 
 Identity = tuple[str, tuple[int, ...], str, str, str]
@@ -68,6 +76,29 @@ Identity = tuple[str, tuple[int, ...], str, str, str]
 def identity(cell: Cell) -> Identity:
     """Return which cause a candidate is, at whatever moment, order or axis."""
     return cell.name, cell.joints, cell.place, cell.driver, cell.subject
+
+
+def at_other_moments(cell: Cell, context: Context, low: float, high: float) -> list[Cell]:
+    """Return what happened in the place of a cell in the gaps between two moments, s."""
+    between = EFFECTS[cell.name].between
+    if not cell.happened or between is None:
+        return []
+    return [
+        replace(other, drawn_from=cell.drawn_from)
+        for other in between(context, low, high)
+        if (other.place, other.joints, other.subject) == (cell.place, cell.joints, cell.subject)
+    ]
+
+
+def p_value(log_evidence_gain: float) -> float:
+    """Return the largest probability that anything gains so much where nothing is there.
+
+    Cells of K kinds are tried. With the prior probability 1/K of its kind and 1/c of one of c
+    cells of it, the sum of all Bayes factors has the expectation 1 where nothing is there; by
+    Markov's inequality the best raises the log evidence by g with a probability of at most
+    K exp(-g).
+    """
+    return float(min(1.0, len(EFFECTS) * np.exp(-log_evidence_gain)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,8 +180,7 @@ class Evaluated:
     def standing_out(self) -> dict[Cell, float]:
         """Probability of each member of the background that it is there, given the model.
 
-        The kind has to be there, which it is for lengths and tilts, and among its m causes this
-        one, at odds of 1 to m - 1.
+        The kind has to be there, and among its m causes this one, at odds of 1 to m - 1.
         """
         found = {}
         for family in self.families:
@@ -158,10 +188,8 @@ class Evaluated:
             causes: dict[Identity, list[tuple[Cell, IntArray]]] = {}
             for _, member, where, _ in mine:
                 causes.setdefault(identity(member), []).append((member, where))
-            kind = 0.0
-            if family.cell.least == 0.0:
-                price = np.log(KIND_ODDS / len(LEVELS_M))
-                kind = float(log_expit(self.log_factor_of_kind(family) + price))
+            price = np.log(KIND_ODDS / len(LEVELS_M))
+            kind = float(log_expit(self.log_factor_of_kind(family) + price))
             count = max(len(causes), max(member.drawn_from for member in family.members))
             for parts in causes.values():
                 where = np.concatenate([part for _, part in parts])
@@ -197,17 +225,21 @@ def evaluated(
     )  # fmt: skip
 
 
-def background(data: Residuals, cells: Sequence[Cell], tolerance_m: float) -> list[Family]:
-    """Return the kinds of errors that are in every model."""
-    families = []
-    for family in kinds(data, cells):
-        # No session proves that an arm is its drawing.
-        if family.members[0].model_change is not None:
-            drawn = Family.of(data, family.cell.name, family.members, tolerance_m)
-            families += [drawn] if drawn is not None else []
-        else:
-            families.append(family)
-    return families
+def background(data: Residuals, cells: Sequence[Cell]) -> list[Family]:
+    """Return the kinds of errors that may be beside the causes.
+
+    Of few poses none: these tell of no variance more than that of the noise.
+    """
+    poses = np.unique(data.context.measurements.pose[data.rows.source])
+    if len(poses) < FEWEST_TO_SEARCH:
+        return []
+    # What comes alone is no kind: a variance of its own would be a cause without its price.
+    return [
+        family
+        for family in kinds(data, cells)
+        if family.members[0].penalty is not None
+        or len({identity(member) for member in family.members}) > 1
+    ]
 
 
 def by_form(data: Residuals, families: Sequence[Family]) -> list[Family]:
@@ -218,20 +250,23 @@ def by_form(data: Residuals, families: Sequence[Family]) -> list[Family]:
             found.append(family)
             continue
         for member in family.members:
-            one = Family.of(data, ' '.join(map(str, member.key)), [member])
+            name = ' '.join(map(str, member.key))
+            one = Family.of(data, name, [member], alike=family.members)
             assert one is not None
             found.append(replace(one, cell=replace(one.cell, variant=ALONE)))
     return found
 
 
 def log_price(families: Sequence[Family]) -> float:
-    """Return the log prior odds of the free forms that have a variance of their own.
+    """Return the log prior odds of the kinds of a background.
 
-    Each is a candidate by itself; kinds of errors that strike all members cost nothing.
+    A kind pays what the first block of a kind does, and a free form with a variance of its own
+    what a block pays.
     """
     forms = [one.members[0] for one in families if one.cell.variant == ALONE]
     each = -sum(np.log(form.drawn_from * len(LEVELS_M)) for form in forms)
-    return float(each + len({form.name for form in forms}) * np.log(KIND_ODDS))
+    paid = {one.members[0].name for one in families if one.members[0].model_change is None}
+    return float(each + len(paid) * np.log(KIND_ODDS))
 
 
 @dataclass(frozen=True, eq=False)
@@ -259,33 +294,40 @@ class Walk:
         data: Residuals,
         cells: Sequence[Cell],
         rng: np.random.Generator,
-        tolerance_m: float,
         progress: Callable[[float], None] = lambda share: None,
         start: Evaluated | None = None,
     ) -> None:
         self.data, self.rng = data, rng
-        self.families = background(data, cells, tolerance_m)
+        self.families = background(data, cells)
         # The same with a variance for each free form: one smoothness for all may fit none of them.
         self.by_form = by_form(data, self.families)
         of_background = {member.key for one in self.families for member in one.members}
         singles = [cell for cell in cells if cell.penalty is None or cell.key not in of_background]
-        self.pool = Pool(data, candidates(data, singles))
+        tried = {cell.key for cell in singles}
+        dated: dict[object, Cell] = {}
+        for cell, _ in () if start is None else start.blocks:
+            # Rows that were not worked on before may tell of another moment.
+            reach = DATED_TO * float(np.ptp(data.context.elapsed_s))
+            others = at_other_moments(cell, data.part, cell.moment - reach, cell.moment + reach)
+            dated |= {one.key: one for one in (cell, *others) if one.key not in tried}
+        self.pool = Pool(data, candidates(data, [*singles, *dated.values()]))
         self._known: dict[Model, Evaluated | None] = {}
         # Models whose kinds of the background have been chosen anew.
         self._wholes: dict[Model, Evaluated | None] = {}
         empty = self._whole((), None)
         assert empty is not None
         self.empty = empty
-        bare = evaluated(self.pool, [one for one in self.families if one.cell.least > 0.0], ())
-        self.bare = self.empty if bare is None else bare
+        bare = evaluated(self.pool, [], ())
+        assert bare is not None
+        self.bare = bare
         self.chains = []
-        if start is None:
-            starts = [self.bare, self.empty]
+        if start is not None:
+            self.chains.append(self._chain(self._again(start), hot=False, before=start))
+            progress(1.0)
         else:
-            starts = [self._again(start)]
-        for index, first in enumerate(starts):
-            self.chains.append(self._chain(first, hot=index > 0))
-            progress((index + 1) / len(starts))
+            for index, first in enumerate((self.bare, self.empty)):
+                self.chains.append(self._chain(first, hot=index > 0))
+                progress(0.5 * (index + 1))
         if self._dated():
             best = max((chain.best for chain in self.chains), key=lambda one: one.value)
             self.chains.append(self._chain(best, hot=False))
@@ -298,18 +340,15 @@ class Walk:
         added = False
         for position, (block, _) in enumerate(best.model):
             cell = self.pool.blocks[block].cell
-            between = EFFECTS[cell.name].between
-            if not cell.happened or between is None:
+            if not cell.happened:
                 continue
             moments = np.unique([one.moment for one in tried if one.name == cell.name])
             low = np.max(moments[moments < cell.moment], initial=-np.inf)
             high = np.min(moments[moments > cell.moment], initial=np.inf)
             nearby = [
-                replace(other, drawn_from=cell.drawn_from)
-                for other in between(context, float(low), float(high))
-                if (other.place, other.joints, other.subject)
-                == (cell.place, cell.joints, cell.subject)
-                and other.key not in self.pool.place
+                other
+                for other in at_other_moments(cell, context, float(low), float(high))
+                if other.key not in self.pool.place
             ]
             first = len(self.pool.blocks)
             self.pool.extend(candidates(self.data, nearby))
@@ -324,10 +363,9 @@ class Walk:
             for i in near:
                 one = self.pool.blocks[i]
                 self.pool.blocks[i] = replace(one, cell=replace(one.cell, moment_std=spread))
-            added = added or len(near) > 1
-        if added:
             self._known.clear()
             self._wholes.clear()
+            added = added or len(near) > 1
         return added
 
     def _again(self, start: Evaluated) -> Evaluated:
@@ -340,17 +378,24 @@ class Walk:
         return self.empty if again is None else again
 
     def _shown(self, found: Evaluated) -> Evaluated:
-        """Return a model without the kinds of the background that the likelihood does not show."""
-        shown = [
-            family
-            for family in found.families
-            if family.cell.least > 0.0
-            or found.log_factor_of_kind(family) > max(PRICE, -log_price([family]))
-        ]
-        if len(shown) == len(found.families):
-            return found
-        fewer = evaluated(self.pool, shown, found.model, found)
-        return found if fewer is None else fewer
+        """Return a model without the kinds of the background that the likelihood does not show.
+
+        The half of these that it shows least at a time: one of two that imitate each other stays.
+        """
+        while True:
+            worth = [
+                found.log_factor_of_kind(family) - max(PRICE, -log_price([family]))
+                for family in found.families
+            ]
+            hidden = sorted(value for value in worth if value <= 0.0)
+            if not hidden:
+                return found
+            most = hidden[(len(hidden) - 1) // 2]
+            shown = [f for f, value in zip(found.families, worth, strict=True) if value > most]
+            fewer = evaluated(self.pool, shown, found.model, found)
+            if fewer is None:
+                return found
+            found = fewer
 
     def evaluate(self, model: Model, start: Evaluated) -> Evaluated | None:
         """Return a model at its own noise and background; None if it cannot be fitted."""
@@ -358,10 +403,17 @@ class Walk:
             self._known[model] = evaluated(self.pool, start.families, model, start)
         return self._known[model]
 
-    def _chain(self, current: Evaluated, hot: bool) -> Chain:
-        anew = current is self.bare
-        for _ in range(ROUNDS):
-            surface = Surface(self.pool, current.noise, current.std)
+    def _chain(self, current: Evaluated, hot: bool, before: Evaluated | None = None) -> Chain:
+        """Walk from a model; in the first round with the noise and the background of another."""
+        anew = current is self.bare or before is not None
+        for index in range(ROUNDS):
+            noise, std = current.noise, current.std
+            if before is not None and index == 0:
+                known = {cell.key: value for cell, value in before.std.items()}
+                every = (*self.families, *self.by_form)
+                noise = before.noise
+                std = {f.cell: known[f.cell.key] for f in every if f.cell.key in known}
+            surface = Surface(self.pool, noise, std)
             walker = Walker(State.of(surface, current.model), self.rng)
             trace = self._run(walker, hot)
             best = max(walker.seen, key=lambda model: walker.seen[model])
@@ -441,8 +493,16 @@ class Walk:
         for chain in self.chains:
             for model, value in chain.visited.items():
                 pooled[model] = max(value, pooled.get(model, -np.inf))
+        for chain in self.chains:
+            known = self._known.get(chain.best.model)
+            if known is None or known.value < chain.best.value:
+                # With its own background; candidates may have been dated since.
+                again = evaluated(self.pool, chain.best.families, chain.best.model, chain.best)
+                self._known[chain.best.model] = again
         pooled |= {model: one.value for model, one in self._known.items() if one is not None}
         start = max((chain.best for chain in self.chains), key=lambda one: one.value)
+        for model, value in self._exchanges(start).items():
+            pooled[model] = max(value, pooled.get(model, -np.inf))
         order = sorted(pooled, key=lambda model: -pooled[model])[:MOST_MODELS]
         models = [
             one
@@ -457,13 +517,63 @@ class Walk:
         self.models = models[:count]
         self.share = share[:count] / share[:count].sum()
 
+    def log_gain(self, causes: Sequence[Cell]) -> float:
+        """Return what the log posterior of the best model would lose without some causes of it."""
+        best, mine = self.models[0], {identity(cell) for cell in causes}
+        wheres, stds, price = [], [], 0.0
+        for block, level in best.model:
+            one = self.pool.blocks[block]
+            if identity(one.cell) in mine:
+                part = best.where[one.weights(level)]
+                wheres.append(np.arange(part.start, part.stop))
+                stds.append(np.full(one.size, LEVELS_M[level]))
+                price += one.log_prior
+        for family, member, where, _ in best.members:
+            if identity(member) in mine:
+                wheres.append(where)
+                stds.append(np.full(len(where), best.std[family.cell]))
+                price -= np.log(member.drawn_from) if not price else 0.0
+        return best.log_factor(np.concatenate(wheres), np.concatenate(stds)) + float(price)
+
+    @cached_property
+    def solutions(self) -> list[tuple[Solution, float]]:
+        """All models by the parameters of their cells, each with its share."""
+        shares = self.share.tolist()
+        return [
+            (self.solution(one), share) for one, share in zip(self.models, shares, strict=True)
+        ]
+
+    @property
+    def best(self) -> Solution:
+        """The model of the largest share."""
+        return self.solutions[0][0]
+
+    def _exchanges(self, best: Evaluated) -> dict[Model, float]:
+        """Return what is nearly as likely as a model with one block exchanged for another.
+
+        A chain visits few of them, and look-alikes are among these.
+        """
+        found: dict[Model, float] = {}
+        state = State.of(Surface(self.pool, best.noise, best.std), best.model)
+        for position in range(len(best.model)):
+            rest = state.left(position)
+            order = np.argsort(-rest.gains, axis=None)[:MOST_EXCHANGED]
+            for block, level in zip(*np.unravel_index(order, rest.gains.shape), strict=True):
+                if rest.value + rest.gains[block, level] > state.value - NEGLIGIBLE:
+                    other = rest.joined(int(block), int(level))
+                    found[other.key] = best.value + other.value - state.value
+        return found
+
     def probability_of(self, cell: Cell) -> float:
         """Return the probability that a cause is there, at any moment or order."""
         return self.probability.get(identity(cell), 0.0)
 
     @cached_property
     def claimed(self) -> list[Cell]:
-        """Causes of the best model that are there, or of which one of several look-alikes is."""
+        """Causes of the best model that are there, or of which one of several look-alikes is.
+
+        As cells of `best`.
+        """
         found = []
         best = self.models[0]
         named = self.named(best)
@@ -480,12 +590,17 @@ class Walk:
                     continue
             chance = self.probability_of(cell)
             if chance >= 0.5 or chance + sum(self.instead_of([cell]).values()) >= 0.5:
-                found.append(cell)
+                # A member may be a part of a block.
+                found += [
+                    one
+                    for one in self.best.cells
+                    if one not in found and {*one.parameters}.issuperset(cell.parameters)
+                ]
         return found
 
     def _is_part(self, cell: Cell, form: Cell) -> bool:
         """Return whether one of thousands of shapes is a part of a free form that is there."""
-        if not (EFFECTS[cell.name].many and is_special_case(cell, form)):
+        if not (EFFECTS[cell.name].many and cell.is_shape_of(form)):
             return False
         both = [self.data.columns([one]).reshape(3 * len(self.data), -1) for one in (cell, form)]
         rest = both[0] - both[1] @ np.linalg.lstsq(both[1], both[0], rcond=None)[0]

@@ -2,7 +2,7 @@
 """Posterior over models: a Metropolis walk over sets of candidate causes.
 
 A model is a set of blocks beside what every model contains: the columns of the offsets model,
-with flat priors, and the background (`models`). A block is one candidate cause; its weights are
+with flat priors, and the background (`walk`). A block is one candidate cause; its weights are
 N(0, s²) with s, the RMS displacement of the marker by a weight, one of `LEVELS_M`. With all
 weights integrated out, the log posterior of a model S is::
 
@@ -129,10 +129,22 @@ def candidates(data: Residuals, cells: Sequence[Cell]) -> list[Block]:
                 continue
             seen = share > LEAST_SHARE * share.max()
             total = share[seen].sum()
-            mapping, scale, largest = root[:, seen] / np.sqrt(total), np.array([total]), np.inf
-        allowed = max(min(largest, LARGEST_M), LEVELS_M[0]) >= LEVELS_M
-        blocks.append(Block(cell, mapping, scale, allowed))
+            mapping, scale = root[:, seen] / np.sqrt(total), np.array([total])
+            largest = _largest(data, cell)
+        allowed = min(largest, LARGEST_M) >= LEVELS_M
+        # Near the axis of its joint a marker would let degrees be as likely as minutes.
+        if allowed.any():
+            blocks.append(Block(cell, mapping, scale, allowed))
     return blocks
+
+
+def _largest(data: Residuals, cell: Cell) -> float:
+    """Return the RMS displacement by the plausible size of a joint curve, m; else infinity."""
+    at = cell.columns(data.part).at
+    if at is None or cell.largest is None:
+        return np.inf
+    lever = np.sqrt(np.sum(data.part.jacobian[:, :, at] ** 2) / len(data))
+    return float(cell.largest * lever)
 
 
 class Pool:
