@@ -20,7 +20,6 @@ import numpy as np
 from remaster_ros.errors import RemasterError
 from remaster_ros.motion.limits import LONGEST_S, MotionLimits
 from remaster_ros.motion.path_check import FreePath, PointSpeeds
-from remaster_ros.motion.pieces import AHEAD_S, JOINS_S, Piece, joined, piece_of
 from remaster_ros.motion.stopping import STOP_S, stop_on_line
 from remaster_ros.motion.trajectory import (
     HEADROOM,
@@ -84,8 +83,6 @@ class Admitted:
     trajectory: Trajectory | None = None
     # Whether the controller is given no velocities, and draws straight lines
     is_straight: bool = False
-    # Which part of `trajectory` the waypoints are; None where they are no part of one
-    piece: Piece | None = None
 
 
 class MotionGate:
@@ -108,11 +105,11 @@ class MotionGate:
 
     def __init__(self, limits: MotionLimits, speeds: PointSpeeds | None = None) -> None:
         self.limits, self._speeds = limits, speeds
-        self._under_way: tuple[Trajectory, MotionLimits, FreePath] | None = None
+        self._under_way: tuple[Trajectory, MotionLimits] | None = None
         self.refused = 0
 
-    def admit(self, path: FreePath, q: FloatArray, horizon_s: float = 0.0) -> Admitted:
-        """Return a move along a path that was found free, with its first piece.
+    def admit(self, path: FreePath, q: FloatArray) -> Admitted:
+        """Return a move along a path that was found free.
 
         Parameters
         ----------
@@ -120,8 +117,6 @@ class MotionGate:
             The path.
         q
             Where the arm stands, rad or m, (k,).
-        horizon_s
-            As of `pieces.piece_of`; 0 for all of the move at once.
 
         Raises
         ------
@@ -135,82 +130,13 @@ class MotionGate:
                 text = limits.units.in_radians(off, 4)
                 raise StartMovedError(f'the arm stands {text} from the start of the path')
             trajectory = plan_trajectory(limits, path.points, path.peaks_m)
-            stands = Waypoint(0.0, q, np.zeros_like(q))
-            # All of the way first: an arm is not sent where it could not go on.
-            waypoints, piece = trajectory.waypoints(), None
-            self._check(waypoints, stands, path, limits)
-            if horizon_s:
-                piece = piece_of(trajectory, 0.0, horizon_s)
-                waypoints = piece.waypoints
-                # With a stamp it may come sooner or later than it begins.
-                for time_s in (-AHEAD_S, 0.0, AHEAD_S):
-                    self._check(waypoints, replace(stands, time_s=time_s), path, limits)
+            waypoints = trajectory.waypoints()
+            self._check(waypoints, q, path, limits)
         except MotionRefusedError:
             self.refused += 1
             raise
-        self._under_way = trajectory, limits, path
-        return Admitted(waypoints, trajectory, piece=piece)
-
-    def renew(self, sent_s: float, horizon_s: float) -> Admitted:
-        """Return the piece that replaces the one under way.
-
-        ``sent_s``: the time since the start of the move, s; ``horizon_s``: as of `admit`.
-        Raises MotionRefusedError: as of `admit`; LookupError: no move is under way.
-        """
-        if self._under_way is None:
-            raise LookupError('no move is under way')
-        trajectory, limits, path = self._under_way
-        piece = piece_of(trajectory, sent_s, horizon_s)
-        first, *rest = piece.waypoints
-        try:
-            if not rest:
-                raise MotionRefusedError('nothing is left of the move')
-            self._check(rest, first, path, limits)
-        except MotionRefusedError:
-            self.refused += 1
-            raise
-        return Admitted(piece.waypoints, trajectory, piece=piece)
-
-    def rejoin(self, low_s: float, high_s: float, horizon_s: float) -> tuple[Admitted, float]:
-        """Return the piece that replaces the one under way, at once, and when it begins.
-
-        For a controller that begins it where the arm is, or where it has led the arm to: from all
-        places between two times on the trajectory it keeps the limits, and does not lead back.
-        The waypoints have times from its beginning; the second value is that time on the
-        trajectory, s.
-
-        ``low_s, high_s``: as of `stop`; ``horizon_s``: as of `admit`.
-        Raises MotionRefusedError: there is none from here; LookupError: no move is under way.
-        """
-        if self._under_way is None:
-            raise LookupError('no move is under way')
-        trajectory, limits, path = self._under_way
-        index, _ = trajectory.line_at(low_s)
-        line, start_s = trajectory.lines[index], trajectory.starts_s[index]
-        joins_s: tuple[float, ...] = JOINS_S
-        latest_s = start_s + line.duration_s
-        if line is not trajectory.lines[-1]:
-            # Behind it the arm rests until the next one begins: there it may be joined as well.
-            latest_s = trajectory.starts_s[index + 1]
-            joins_s = (*joins_s, latest_s - low_s)
-        why = 'the arm is not on one line'
-        for join_s in joins_s:
-            # On the same line, or in the rest behind it.
-            if not start_s < low_s <= high_s < low_s + join_s <= latest_s:
-                continue
-            piece = joined(trajectory, low_s, join_s, horizon_s)
-            try:
-                self._check(piece.waypoints[1:], piece.waypoints[0], path, limits)
-                for at_s in np.linspace(low_s, high_s, BETWEEN):
-                    begins = Waypoint(low_s, *trajectory.at(float(at_s)))
-                    _check_forward(line, begins, piece.waypoints[0])
-                    self._check(piece.waypoints[:1], begins, path, limits, at_rest=False)
-            except MotionRefusedError as error:
-                why = str(error)
-                continue
-            sent = tuple(replace(p, time_s=p.time_s - low_s) for p in piece.waypoints)
-            return Admitted(sent, trajectory, piece=piece), low_s
-        raise MotionRefusedError(why)
+        self._under_way = trajectory, limits
+        return Admitted(waypoints, trajectory)
 
     def admit_probe(self, path: FreePath, q: FloatArray, doubtful: BoolArray) -> Admitted:
         """Return a move of next to nothing that is harmless where the arm is not as reported.
@@ -245,7 +171,7 @@ class MotionGate:
         trajectory = Trajectory((Line(start, end, 1.0 / (time_s - RAMP_S)),))
         waypoints = (Waypoint(time_s, end, np.zeros_like(end)),)
         try:
-            self._check(waypoints, Waypoint(0.0, q, np.zeros_like(q)), path, limits)
+            self._check(waypoints, q, path, limits)
         except MotionRefusedError:
             self.refused += 1
             raise
@@ -267,7 +193,7 @@ class MotionGate:
         """
         if self._under_way is None:
             raise LookupError('no move is under way')
-        trajectory, limits, _ = self._under_way
+        trajectory, limits = self._under_way
         index, since_s = trajectory.line_at(high_s)
         low_since_s = max(low_s - trajectory.starts_s[index], 0.0)
         line = trajectory.lines[index]
@@ -278,20 +204,14 @@ class MotionGate:
         return Admitted((stop,))
 
     def _check(
-        self,
-        waypoints: Sequence[Waypoint],
-        start: Waypoint,
-        path: FreePath,
-        limits: MotionLimits,
-        *,
-        at_rest: bool = True,
+        self, waypoints: Sequence[Waypoint], q: FloatArray, path: FreePath, limits: MotionLimits
     ) -> None:
-        """Look at each cubic from a state on; `at_rest`: whether the last one must end so."""
-        units, q = limits.units, start.q
+        """Look at each cubic from the present state on."""
+        units = limits.units
         low = np.minimum(limits.lower + limits.margins, q)
         high = np.maximum(limits.upper - limits.margins, q)
-        points = [start, *waypoints]
-        if at_rest and np.any(points[-1].velocity != 0.0):
+        points = [Waypoint(0.0, q, np.zeros_like(q)), *waypoints]
+        if np.any(points[-1].velocity != 0.0):
             raise MotionRefusedError('the move does not end at rest')
         for before, after in pairwise(points):
             piece = Cubic.between(before, after)
@@ -434,16 +354,6 @@ class ForeignGate:
             raise StartMovedError(f'it begins {text} from where {self.limits.names[joint]} is')
         if not units.largest(velocity) <= SLOW_RAD_S:
             raise StartMovedError('it begins at once while the arm moves')
-
-
-def _check_forward(line: Line, before: Waypoint, after: Waypoint) -> None:
-    """Refuse a cubic that leads back on a line, or faster along it than it cruises."""
-    piece = Cubic.between(before, after)
-    # Along the joint that goes farthest: all of them are in proportion.
-    joint = int(np.argmax(np.abs(line.way)))
-    rates = piece.velocity(np.linspace(0.0, piece.duration_s, BETWEEN))[:, joint] / line.way[joint]
-    if np.min(rates) < -TOLERANCE * line.rate or np.max(rates) * HEADROOM > line.rate:
-        raise MotionRefusedError('the piece would not go on evenly along the line')
 
 
 def _too_long() -> str:

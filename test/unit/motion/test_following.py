@@ -445,17 +445,3 @@ def test_a_servo_that_lags_and_overshoots_is_never_called_slow(trajectory):
     for until in np.arange(0.05, trajectory.duration_s + 1.0, 0.05):
         assert arm.run(until, lambda t: joints.at(t)[0]) is None
         assert arm.lost == '', until
-
-
-def test_an_arm_whose_way_is_sent_anew_may_still_be_as_far_ahead_as_it_was():
-    """Its controller begins where it has led it to, and joins the way sent anew."""
-    arm = Arm()
-    arm.run(1.0, lambda t: arm.trajectory.at(max(t - 0.125, 0.0))[0])
-    low, high = arm.window
-    arm.following.set_back(0.15)
-    low_then, high_then = arm.window
-    assert low_then <= low
-    # The same places, on a schedule that is later.
-    assert high_then == pytest.approx(high)
-    arm.run(2.2, lambda t: arm.trajectory.at(max(t - 0.275, 0.0))[0])
-    assert arm.window[1] == pytest.approx(2.2 - 0.15 + JITTER_S, abs=0.02)
