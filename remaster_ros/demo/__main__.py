@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Run the demo: ``python -m remaster_ros.demo --ros-args …``."""
 
+import importlib
+import signal
 import sys
 
-from remaster_ros.demo.demo import main
-
 if __name__ == '__main__':
-    raise SystemExit(main(sys.argv[1:]))
+    # It takes a second to import; stopped meanwhile it ends like any program, without output.
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    raise SystemExit(importlib.import_module('remaster_ros.demo.demo').main(sys.argv[1:]))

@@ -81,15 +81,6 @@ def gain_of(
     )
 
 
-def fails_held_out(data: Residuals, solution: Solution, fit: FitResult) -> bool:
-    """Return whether more held-out rows are beyond a model's noise than single errors are."""
-    m = data.context.measurements
-    held_out = m.is_validation
-    limit = GROSS * data.noise_model.sensor_noise(solution.noise).total[m.sensor]
-    off = np.linalg.norm(fit.residuals_after, axis=1)[held_out] > limit[held_out]
-    return bool(off.sum() > max(1.0, LARGEST_SHARE * held_out.sum()))
-
-
 def residuals_of(found: Estimate) -> FloatArray:
     """Return measured minus modelled position of every row of an estimate, m, (n, 3)."""
     predicted = predicted_rows(found.problem, found.model, found.mode.z)

@@ -29,9 +29,6 @@ from remaster_ros.types import FloatArray, IntArray
 
 # Directions of the offsets model below this share of the largest are its gauge.
 ROUNDING = 1e-8
-# With more unpenalised parameters than this share of the numbers measured nothing is left to judge
-# the noise by.
-MOST_PARAMETERS = 0.75
 # Bytes of displacements, and of Gram matrices, that are kept for the next fit; only those of large
 # sessions are more.
 KEPT_BYTES = 1 << 27
@@ -182,12 +179,6 @@ class Residuals:
     def poses(self) -> int:
         """Number of poses."""
         return int(self.pose_of_row.max()) + 1
-
-    def leaves_noise(self, cells: Sequence[Cell]) -> bool:
-        """Return whether cells leave enough of the numbers measured to judge the noise by."""
-        free = sum(len(cell.parameters) for cell in cells if cell.penalty is None)
-        most = MOST_PARAMETERS * 3 * len(self)
-        return free == 0 or self.base.shape[2] + free <= most
 
     def columns(self, cells: Sequence[Cell]) -> FloatArray:
         """Return what a unit of each parameter displaces in the rows worked on, (n, 3, c)."""

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -70,52 +70,6 @@ class Solution:
         first = [where.start for where in self.slices()]
         return dict(zip(self.cells, self.smoothness + self.ridge[first], strict=True))
 
-    def evidence_without(self, index: int, rows: int) -> float:
-        """Return the log evidence without one cell, with noise and smoothness as they are.
-
-        Exact, from the covariance C alone: the square that is left rises by b_i' C_ii⁻¹ b_i, the
-        determinant of what is estimated falls by that of C_ii. Log evidence of the columns: the
-        prior probability of the cells is that of the larger set.
-        """
-        cell, p, where = self.cells[index], len(self.base), self.slices()[index]
-        own = self.covariance[where, where]
-        worth = 0.5 * self.parameters[where] @ np.linalg.solve(own, self.parameters[where])
-        determinant = np.linalg.slogdet(own)[1]
-        if cell.penalty is not None:
-            prior = self.smoothness[index] * cell.roughness + self.ridge[where.start]
-            price = 0.5 * (determinant + np.sum(np.log(prior)))
-        else:
-            among = self._among_unpenalised(index)
-            alone = np.linalg.slogdet(self.covariances.both[1][among, among])[1]
-            # Half log N in place of the determinant that the unpenalised ones have by themselves.
-            price = 0.5 * (determinant - alone - cell.size * np.log(3.0 * rows - p))
-        return float(self.log_evidence - worth - price)
-
-    def less(self, index: int, log_evidence: float) -> Solution:
-        """Return the fit without one cell, with noise and smoothness as they are."""
-        p, where = len(self.base), self.slices()[index]
-        out = slice(p + where.start, p + where.stop)
-        pull = _regression(self.full_covariance, out)
-        every = np.concatenate((self.base, self.parameters))
-        every = np.delete(every, out) - pull @ every[out]
-        among = self._among_unpenalised(index) if self.cells[index].penalty is None else None
-        return replace(
-            self,
-            cells=(*self.cells[:index], *self.cells[index + 1 :]),
-            parameters=every[p:],
-            base=every[:p],
-            smoothness=np.delete(self.smoothness, index),
-            ridge=np.delete(self.ridge, where),
-            covariances=Covariances(partial(_without, self.covariances, out, among)),
-            log_evidence=log_evidence,
-        )
-
-    def _among_unpenalised(self, index: int) -> slice:
-        """Return where an unpenalised cell is among the unpenalised ones."""
-        before = sum(other.size for other in self.cells[:index] if other.penalty is None)
-        first = len(self.base) + before
-        return slice(first, first + self.cells[index].size)
-
     def unphysical(self) -> set[int]:
         """Return the indices of the cells with a parameter of the sign that physics excludes."""
         return {
@@ -131,31 +85,3 @@ class Solution:
             if cell.penalty is not None:
                 precision[where, where] += factor * cell.penalty
         return precision
-
-
-def _without(
-    before: Covariances, out: slice, among: slice | None
-) -> tuple[FloatArray, FloatArray]:
-    """Return covariances were the parameters of a cell known: where it is in both of them."""
-    full, unpenalised = before.both
-    if among is not None:
-        unpenalised = _conditioned(unpenalised, among)
-    return _conditioned(full, out), unpenalised
-
-
-def _regression(covariance: FloatArray, out: slice) -> FloatArray:
-    """Return the regression of the other parameters on some."""
-    across = np.delete(covariance[out], out, axis=1)
-    return np.asarray(np.linalg.solve(covariance[out, out], across).T)
-
-
-def _conditioned(covariance: FloatArray, out: slice) -> FloatArray:
-    """Return the covariance of the others were some parameters known."""
-    size, first, last = len(covariance), out.start, out.stop
-    across = np.delete(covariance[out], out, axis=1)
-    conditioned: FloatArray = _regression(covariance, out) @ -across
-    # In four parts: nothing is copied twice.
-    for to, of in ((slice(first), slice(first)), (slice(first, None), slice(last, size))):
-        conditioned[to, :first] += covariance[of, :first]
-        conditioned[to, first:] += covariance[of, last:]
-    return conditioned

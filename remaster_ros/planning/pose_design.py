@@ -34,8 +34,8 @@ REPEATED_POSES = 6
 noise of a reading from the error common to a pose: with M markers, 6 of them give the standard
 deviation of the former to 1 / sqrt(2 * 18 M), 17 % with one marker."""
 HELD_OUT_POSES = 12
-"""Least number of validation poses: from 12 on the p-values of a search for causes come from sign
-flips of poses (`discovery.screening`); 12 poses of 3 coordinates give their RMS error to 12 %."""
+"""Least number of validation poses, as many as a search for causes needs;
+12 poses of 3 coordinates give their RMS error to 12 %."""
 HELD_OUT_SOLUTIONS = 2
 """Solutions of each, if not all are visited: the relative metric compares two."""
 MOST_CONFIGURATIONS = 400

@@ -46,5 +46,4 @@ EFFECT = Effect(
     size=_play,
     cells=cells,
     needs=needs_approach,
-    family='backlashes',
 )

@@ -180,16 +180,13 @@ class Effect:
     cells: Callable[[Context], Iterable[Cell]]  # All of its cells for a context
     # Returns why a context cannot show it; '' where it can
     needs: Callable[[Context], str] = field(default=lambda context: '')
-    # Effects of one family strike all joints or links alike: they are tried together, too, and
-    # share their prior probability. '' for an effect that comes alone.
-    family: str = ''
-    # Which of its cells are tried with the family: one for each joint, not every variant
+    # Which of its cells are members of its kind: one for each joint, not every variant
     in_family: Callable[[Cell], bool] = field(default=lambda cell: True)
     # How cells make causes: all cells of an ``effect`` are one cause, those of the same
     # ``joints``, or those of the same joints and ``variant``
     cause_per: Literal['effect', 'joints', 'variant'] = 'effect'
     costly: bool = False  # It has too many cells to be tried again and again
-    many: bool = False  # Its cells are drawn from thousands: they are no family of one variance
+    many: bool = False  # Its cells are drawn from thousands: they are no kind of one variance
     # The offsets model absorbs it: it is judged by how far that fit moved the markers
     # (`marker_offsets`), not by the residuals
     moves_the_fit: bool = False

@@ -49,6 +49,5 @@ EFFECT = Effect(
     'disc of the encoder centred.',
     size=up_to('joint {joint} errs'),
     cells=cells,
-    family='encoder eccentricities',
     in_family=lambda cell: cell.variant == '1+2',
 )

@@ -55,5 +55,4 @@ EFFECT = Effect(
     'the controller.',
     size=_scaled,
     cells=cells,
-    family='encoder scales',
 )

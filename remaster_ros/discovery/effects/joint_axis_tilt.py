@@ -70,6 +70,5 @@ EFFECT = Effect(
     remedy='Load apply/robot_model.urdf: tilts, with the zero-offsets that belong to them.',
     size=_tilt,
     cells=cells,
-    family='geometry',
     in_family=lambda cell: cell.size == 1,
 )

@@ -49,5 +49,4 @@ EFFECT = Effect(
     size=_turned,
     cells=cells,
     needs=needs_gravity,
-    family='joint compliances',
 )

@@ -84,5 +84,4 @@ EFFECT = Effect(
     'measured; where it grows from session to session, have screw or rack checked.',
     size=_range,
     cells=cells,
-    family='joint error curves',
 )

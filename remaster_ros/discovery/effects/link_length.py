@@ -76,6 +76,5 @@ EFFECT = Effect(
     remedy='Load apply/robot_model.urdf: lengths, with the zero-offsets that belong to them.',
     size=_longer,
     cells=cells,
-    family='geometry',
     in_family=lambda cell: cell.size == 1,
 )

@@ -46,5 +46,4 @@ EFFECT = Effect(
     size=_short,
     cells=cells,
     needs=needs_approach,
-    family='settling joints',
 )

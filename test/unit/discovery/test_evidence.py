@@ -10,7 +10,7 @@ from worlds.discovery_scenes import residuals_of, session_with
 from remaster_ros.discovery import evidence, packed
 from remaster_ros.discovery.effects.base import Cell
 from remaster_ros.discovery.effects.registry import EFFECTS
-from remaster_ros.discovery.evidence import log_prior_one_by_one, solve
+from remaster_ros.discovery.evidence import solve
 from remaster_ros.discovery.residuals import Residuals, units
 from remaster_ros.discovery.solution import Solution
 
@@ -86,39 +86,6 @@ def test_what_a_caller_does_to_norms_and_matrices_stays_with_the_caller(scene, c
             values[:] = 0.0
     for values, before in zip(data.gram_matrices(cells), kept, strict=True):
         assert np.array_equal(values, before)
-
-
-@pytest.mark.parametrize('dropped', range(6))
-def test_a_fit_less_a_cell_is_the_fit_of_the_others_with_the_same_noise(
-    scene, dropped, monkeypatch
-):
-    data: Residuals = residuals_of(scene[0])
-    whole = solve(data, scene[1][1:7])
-    assert whole is not None
-    cells = whole.cells
-    rest = [cell for cell in cells if cell is not cells[dropped]]
-    held = whole.less(dropped, whole.evidence_without(dropped, len(data)))
-    settled = solve(data, rest, whole)
-    with monkeypatch.context() as patch:
-        patch.setattr(evidence, 'STEPS', 0)
-        same_noise = solve(data, rest, whole)
-    assert settled is not None
-    assert same_noise is not None
-    assert held.cells == same_noise.cells
-    assert held.noise.sigma == pytest.approx(same_noise.noise.sigma, rel=1e-12)
-    # The prior probability is still that of the larger set.
-    prior = log_prior_one_by_one(rest) - log_prior_one_by_one(cells)
-    assert held.log_evidence + prior == pytest.approx(same_noise.log_evidence, abs=1e-6)
-    std = np.sqrt(np.diag(same_noise.full_covariance))
-    assert np.max(np.abs(held.parameters - same_noise.parameters) / std[len(held.base) :]) < 1e-6
-    error = (held.full_covariance - same_noise.full_covariance) / np.outer(std, std)
-    assert np.abs(error).max() < 1e-6
-    assert held.ridge == pytest.approx(same_noise.ridge, rel=1e-9)
-    # ½ log N in place of a determinant: the maxima of evidence and likelihood differ a little.
-    assert held.log_evidence + prior < settled.log_evidence + 0.05
-    again = solve(data, rest, held)
-    assert again is not None
-    assert again.log_evidence == pytest.approx(settled.log_evidence, abs=0.05)
 
 
 def test_noise_and_smoothness_are_where_no_small_step_raises_the_likelihood(scene):
