@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
+from scipy.special import expit
 
 from remaster_ros.calibration.gauge_words import the
 from remaster_ros.calibration.result import FitResult
@@ -186,13 +187,24 @@ def describe(
 ) -> tuple[tuple[tuple[Cell, ...], ...], tuple[FoundEffect, ...]]:
     """Return the cells of the best model grouped to causes, and the causes, the largest first."""
     data, solution = walk.data, walk.best
-    groups = sorted(grouped(walk.claimed), key=lambda group: -size_of(data, solution, group))
+    groups = [group for group in grouped(walk.claimed) if not _may_be_memory(walk, group)]
+    groups.sort(key=lambda group: -size_of(data, solution, group))
     parts = shares(data, groups, solution)
     effects = []
     for count, (group, share) in enumerate(zip(groups, parts, strict=True)):
         progress(count / len(groups))
         effects.append(_described(walk, group, share))
     return tuple(groups), tuple(effects)
+
+
+def _may_be_memory(walk: Walk, group: tuple[Cell, ...]) -> bool:
+    """Return whether a cause is no more likely than not by the readings that are independent.
+
+    Noise that remembers looks like whatever changes as slowly.
+    """
+    share = walk.independent_share
+    is_cause = EFFECTS[group[0].name].is_cause
+    return is_cause and share < 1.0 and walk.log_gain(group, share) < 0.0
 
 
 def grouped(cells: Sequence[Cell]) -> list[tuple[Cell, ...]]:
@@ -227,6 +239,8 @@ def _described(walk: Walk, group: tuple[Cell, ...], share: float) -> FoundEffect
     gain = walk.log_gain(group)
     alike = _look_alikes(walk, group, gain)
     probability = max(walk.probability_of(cell) for cell in group)
+    if walk.independent_share < 1.0 and EFFECTS[first.name].is_cause:
+        probability = min(probability, float(expit(walk.log_gain(group, walk.independent_share))))
     # No measurement distinguishes names of the same displacement: it is there under any of them.
     probability += sum(other.probability or 0.0 for other in alike if other.same)
     return FoundEffect(
@@ -304,7 +318,11 @@ def _same(data: Residuals, cell: Cell, other: Cell) -> bool:
     spaces = []
     for columns in (data.columns([cell]), data.columns([other])):
         flat = columns.reshape(3 * len(data), -1)
-        flat = flat / np.linalg.norm(flat, axis=0)
+        norm = np.linalg.norm(flat, axis=0)
+        if not norm.all():
+            # A part of a free form that no row shows.
+            return False
+        flat = flat / norm
         spaces.append(np.linalg.qr(flat - base @ (base.T @ flat))[0])
     cosines = np.linalg.svd(spaces[0].T @ spaces[1], compute_uv=False)
     return bool(cosines.min() > SAME)

@@ -25,6 +25,7 @@ from remaster_ros.calibration.noise import Noise
 from remaster_ros.discovery.effects.base import Cell
 from remaster_ros.discovery.effects.context import Context
 from remaster_ros.discovery.effects.registry import EFFECTS
+from remaster_ros.discovery.effects.sensor_wander import EFFECT as SENSOR_WANDER
 from remaster_ros.discovery.evidence import System
 from remaster_ros.discovery.random_effects import Family, kinds
 from remaster_ros.discovery.residuals import Residuals
@@ -517,8 +518,38 @@ class Walk:
         self.models = models[:count]
         self.share = share[:count] / share[:count].sum()
 
-    def log_gain(self, causes: Sequence[Cell]) -> float:
-        """Return what the log posterior of the best model would lose without some causes of it."""
+    @cached_property
+    def independent_share(self) -> float:
+        """Number of independent readings over that of all, by what successive poses remember.
+
+        With the correlation r of successive errors, (1 - r) / (1 + r) (Bartlett 1946): what the
+        best model leaves, and what wanders with the sensor. 1 where r may be chance.
+        """
+        data, best, m = self.data, self.best, self.data.part.measurements
+        left = data.left(best)
+        for cell, where in zip(best.cells, best.slices(), strict=True):
+            if cell.name == SENSOR_WANDER.name:
+                left = left + data.columns([cell]) @ best.parameters[where]
+        order = np.lexsort((data.part.elapsed_s, data.part.marker, data.part.sensor))
+        one, other = order[:-1], order[1:]
+        follows = (
+            (data.part.sensor[one] == data.part.sensor[other])
+            & (data.part.marker[one] == data.part.marker[other])
+            # Errors of one pose have a part in common all the same.
+            & (m.pose[one] != m.pose[other])
+        )
+        one, other = one[follows], other[follows]
+        squares = np.sum(left[one] ** 2) * np.sum(left[other] ** 2)
+        if not squares:
+            return 1.0
+        r = float(np.sum(left[one] * left[other]) / np.sqrt(squares))
+        return 1.0 if r < 2.0 / np.sqrt(3.0 * len(one)) else (1.0 - r) / (1.0 + r)
+
+    def log_gain(self, causes: Sequence[Cell], share: float = 1.0) -> float:
+        """Return what the log posterior of the best model would lose without some causes of it.
+
+        ``share``: of the readings that are independent.
+        """
         best, mine = self.models[0], {identity(cell) for cell in causes}
         wheres, stds, price = [], [], 0.0
         for block, level in best.model:
@@ -533,7 +564,7 @@ class Walk:
                 wheres.append(where)
                 stds.append(np.full(len(where), best.std[family.cell]))
                 price -= np.log(member.drawn_from) if not price else 0.0
-        return best.log_factor(np.concatenate(wheres), np.concatenate(stds)) + float(price)
+        return share * best.log_factor(np.concatenate(wheres), np.concatenate(stds)) + float(price)
 
     @cached_property
     def solutions(self) -> list[tuple[Solution, float]]:
