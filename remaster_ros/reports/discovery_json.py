@@ -60,10 +60,12 @@ def _with_exact_drawing(
 ) -> list[dict[str, Any]]:
     """Return the zero-offsets with their std if the arm is exactly its drawing."""
     drawn = of_joints(discovery.fit.chain, std_if_exactly_drawn=discovery.std_if_drawn)
-    return [
-        {**row, **(exact if row['identifiable'] else {})}
-        for row, exact in zip(rows, drawn, strict=True)
-    ]
+    found = []
+    for row, exact in zip(rows, drawn, strict=True):
+        key = f'std_if_exactly_drawn_{row["unit"]}'
+        known = row['identifiable'] and np.isfinite(exact[key])
+        found.append({**row, key: exact[key]} if known else {**row})
+    return found
 
 
 def predictions_of(discovery: Discovery) -> Predictions:
