@@ -44,6 +44,8 @@ MOST_FAULTS = 100
 
 ANSWERS_DELIVERED_S = 3.0
 """How long a node that has failed, and is closed, waits for its last answers to arrive, s."""
+LEAVES_WITHIN_S = 20
+"""The middleware takes a second to let go of a node, some on a busy computer."""
 
 
 class RemasterNode(Node):
@@ -303,6 +305,10 @@ def run(
                 # An answer sent just now is lost with its sender if the caller has not got it yet.
                 time.sleep(ANSWERS_DELIVERED_S)
             executor.shutdown(2.0)
+            # The middleware may wait for ever for peers that were killed, and holds Python's lock:
+            # the kernel ends the process then. All that the node writes is written.
+            signal.signal(signal.SIGALRM, signal.SIG_DFL)
+            signal.alarm(LEAVES_WITHIN_S)
             node.destroy_node()
         if node.failure is not None:
             raise node.failure
@@ -313,6 +319,7 @@ def run(
         return report(fault_of_this_program(error))
     finally:
         rclpy.try_shutdown()
+        signal.alarm(0)
 
 
 def spin_once(executor: Executor, node: RemasterNode, timeout_s: float) -> None:

@@ -556,6 +556,10 @@ def look_alike_name(effect: Effect, other: LookAlike) -> str:
     return fewer or sentence_case(other.title or called(other.name, other.joints))
 
 
+def _of_probability(other: LookAlike) -> str:
+    return '' if other.probability is None else f' (probability {percent(other.probability)})'
+
+
 def coverage_words(held_out: Coverage, gross: int) -> str:
     """Return how many held-out rows lie where they were predicted; '' where there are none.
 
@@ -701,7 +705,8 @@ def discovery_lines(found: Discovered) -> list[str]:
         if effect.remedy:
             lines.append(f'    to do: {effect.remedy}')
         lines += [
-            f'    could be {look_alike_name(effect, other)}; to decide: {other.separate_by}'
+            f'    could be {look_alike_name(effect, other)}{_of_probability(other)}; to decide: '
+            f'{other.separate_by}'
             for other in effect.confusable_with
         ]
     lines += [f'unexplained: {left.next}' for left in found.unexplained or ()]
