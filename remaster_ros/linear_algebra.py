@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Linear algebra in one thread, whatever the machine has.
+"""Linear algebra in one thread, whatever the machine has, and with a second way where one fails.
 
 Products of matrices of some hundred parameters in several threads take many times as long as in
 one: the threads wait for each other at full speed. A search for causes takes six times the
@@ -15,7 +15,11 @@ from collections.abc import Callable, Iterator
 from functools import wraps
 from typing import ParamSpec, TypeVar
 
+import numpy as np
+import scipy.linalg
 from threadpoolctl import threadpool_limits
+
+from remaster_ros.types import FloatArray
 
 _Given = ParamSpec('_Given')
 _Result = TypeVar('_Result')
@@ -36,6 +40,21 @@ def one_thread(function: Callable[_Given, _Result]) -> Callable[_Given, _Result]
             return function(*args, **given)
 
     return limited
+
+
+def svd(matrix: FloatArray, *, full_matrices: bool) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the singular value decomposition, as of `numpy.linalg.svd`.
+
+    LAPACK's divide and conquer does not converge for some finite matrices of hundreds of columns;
+    its older QR iteration does.
+    """
+    try:
+        left, singular, right = np.linalg.svd(matrix, full_matrices=full_matrices)
+    except np.linalg.LinAlgError:
+        left, singular, right = scipy.linalg.svd(
+            matrix, full_matrices=full_matrices, lapack_driver='gesvd'
+        )
+    return left, singular, right
 
 
 @contextlib.contextmanager

@@ -26,6 +26,7 @@ from remaster_ros.calibration.model import Model
 from remaster_ros.calibration.priors import Prior, prior_rows
 from remaster_ros.errors import InsufficientDataError
 from remaster_ros.kinematics.serial_chain import SerialChain
+from remaster_ros.linear_algebra import svd
 from remaster_ros.types import BoolArray, FloatArray, IntArray
 
 # Singular values (of unit columns, relative to the largest) that are rounding errors.
@@ -196,7 +197,7 @@ def _null_space(
         unseen[model.core :] = np.where(known > 0.0, known, scale.max())
     scale = np.where(scale > ROUNDING * scale.max(), scale, unseen)
     triangle = triangle / scale
-    _, singular, vectors = np.linalg.svd(triangle, full_matrices=True)
+    _, singular, vectors = svd(triangle, full_matrices=True)
     rank = np.count_nonzero(singular >= ROUNDING * singular[0])
     basis, pivots = _reduce(vectors[rank:].T.copy(), scale, _kinds(model))
     # For what is badly determined a prior on effects counts as data: it separates them.

@@ -57,7 +57,7 @@ class OffsetsApart:
 
     @property
     def words(self) -> str:
-        """Return which joints differ by how many standard deviations."""
+        """Return the joints that differ, each with its difference in standard deviations."""
         shown = [
             f'{joint} by {abs(by):.0f}'
             for joint, by in zip(self.joints, self.sigmas, strict=True)

@@ -297,7 +297,7 @@ def _next_in_words(found: Checked) -> str:
 
 
 def _span(found: Checked, trend: Trend) -> str:
-    """Return how long a trend has taken."""
+    """Return the duration of a trend, in words."""
     if not found.in_days:
         return f'in {counted(max(1, round(trend.span)), "check")}'
     if trend.span < 2.0:

@@ -470,7 +470,7 @@ def _names_not_used(args: argparse.Namespace, rows: RawRows) -> Iterator[str]:
 
 
 def _as_text(rows: RawRows, session: Session, how: list[str]) -> str:
-    """Return what was read, and how it was interpreted, as text."""
+    """Return a summary of the tables and of their interpretation, as text."""
     width = max(map(len, rows.columns))
     lines = [*rows.description]
     lines += [f'  {column:{width}s}  {meaning}' for column, meaning in rows.columns.items()]
@@ -487,7 +487,7 @@ def _as_text(rows: RawRows, session: Session, how: list[str]) -> str:
 
 
 def _as_json(out: Path | None, rows: RawRows, sense: Sense) -> dict[str, Any]:
-    """Return what was read, for --json."""
+    """Return the same summary for --json."""
     return {
         'session': None if out is None else str(out),
         'columns': rows.columns,

@@ -275,7 +275,7 @@ def _narrowed(
 
 
 def _reached(scene: PlanningScene, tour: Tour, seed: int) -> tuple[int, int]:
-    """Return how many poses to fit have a free path (at most `FEWEST_FITTED`), and tried."""
+    """Return the number of fitted poses with a free path (at most `FEWEST_FITTED`), and tried."""
     return count_with_free_path(tour, scene.model, free_start(scene.model, seed), FEWEST_FITTED)
 
 

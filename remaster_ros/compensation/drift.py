@@ -88,11 +88,11 @@ def drift(x: FloatArray, days: FloatArray) -> Drift:
         left_over = off - slope[at] * lines[at]
         variance = float(left_over @ left_over) / (T - 2.0)
         std = float(np.sqrt(variance * float(weights @ weights)))
-        half = max(float(stdtrit(T - 2.0, 0.975)) * std, _wander(left_over, weights))
+        half = max(float(stdtrit(T - 2.0, 0.975)) * std, _interval_of_batches(left_over, weights))
     return Drift(evidence, at, size, half, span, weights)
 
 
-def _wander(left: FloatArray, weights: FloatArray) -> float:
+def _interval_of_batches(left: FloatArray, weights: FloatArray) -> float:
     """Return half of the 95 % interval of a drift by how what it leaves (T,) wanders.
 
     Means of what is left of results that follow one another, of a sixth of the series at most:

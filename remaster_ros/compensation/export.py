@@ -63,7 +63,7 @@ class ZeroOffsets:
 
     @classmethod
     def of(cls, result: FitResult, std: FloatArray | None = None) -> ZeroOffsets:
-        """Return those of a fit, with other standard deviations (k,) where they are given."""
+        """Return the zero-offsets of a fit; ``std`` (k,) replaces its standard deviations."""
         return cls(
             result.session.urdf,
             result.chain,

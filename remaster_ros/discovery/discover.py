@@ -40,15 +40,8 @@ from remaster_ros.discovery.random_effects import Family
 from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.discovery.solution import Solution
 from remaster_ros.discovery.thinning import Thinning, draw_rows, judge_by_others
-from remaster_ros.discovery.to_extension import (
-    drawn_kinds,
-    extension_of,
-    moved_by_drawing,
-    moved_by_models,
-    moved_by_open_offsets,
-    offsets_of,
-    std_of_offsets,
-)
+from remaster_ros.discovery.to_extension import extension_of, offsets_of
+from remaster_ros.discovery.unmodelled import Unmodelled
 from remaster_ros.discovery.walk import DATED_TO, NAMED, Walk, at_other_moments, p_value
 from remaster_ros.errors import InsufficientDataError
 from remaster_ros.linear_algebra import one_thread
@@ -343,10 +336,12 @@ def _sampled(
     Returns also the std of the zero-offsets if the arm is exactly its drawing, rad, (k,).
     """
     solution = models[0][0]
-    by_drawing = moved_by_drawing(found, data, solution, drawn_kinds(found, data, named))
-    moves = [moved_by_models(found, data, models), by_drawing]
+    unmodelled = Unmodelled.of(found, data, solution)
+    moves = [unmodelled.by_models(models[1:])]
     if solution.cells:
-        moves.append(moved_by_open_offsets(found, data, solution))
+        moves.append(unmodelled.by_open_offsets())
+    if_drawn = unmodelled.std_of_offsets(moves)
+    moves.append(unmodelled.by_drawing(named))
     fit = fit_session(
         session,
         rng=rng,
@@ -358,7 +353,6 @@ def _sampled(
         unmodelled=np.concatenate(moves, axis=1),
         progress=lambda _, share: report('sampling the extended model', share),
     )
-    if_drawn = std_of_offsets(found, data, solution, [moves[0], *moves[2:]])
     return fit, gain_of(before, data, solution, fit, rng), if_drawn
 
 

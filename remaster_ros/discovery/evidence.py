@@ -214,14 +214,17 @@ class System:
             zip(self.penalised, self.penalties, factors, strict=True)
         ):
             where = self.where[index]
-            prior = factor * self.spectra[i] + self.ridges[i]
-            smooth = np.sum(factor * self.spectra[i] / prior)
+            ridge = self.ridges[i]
+            smooth = np.sum(factor * self.spectra[i] / (factor * self.spectra[i] + ridge))
             quadratic = factor * beta[where] @ penalty @ beta[where]
             own = inverse[where, where] * penalty
             spread = factor * (2.0 * np.sum(own) - np.trace(own))
             slope[count + i] = 0.5 * (smooth - spread - quadratic)
-            # Roughly, beside a ridge: it decides how far to step, not where to end.
-            turns[where, i] = beta[where] * smooth / len(prior)
+            turns[where, i] = beta[where]
+            if ridge > 0.0:
+                # The change of the covariance by a logarithm of the factor is that of its inverse.
+                prior = factor * penalty + ridge * np.eye(len(penalty))
+                turns[where, i] -= ridge * np.linalg.solve(prior, beta[where])
         # ½ q_j' P q_k with q_j = (∂V/∂eta_j) P y and P = W − W X H⁻¹ X' W.
         moved = np.zeros_like(turns)
         for i, turn in enumerate(turns.T):

@@ -25,6 +25,7 @@ from remaster_ros.calibration.priors import STEP_STD
 from remaster_ros.discovery import packed
 from remaster_ros.discovery.effects.base import Cell
 from remaster_ros.discovery.effects.context import BLOCK_ROWS, Context
+from remaster_ros.linear_algebra import svd
 from remaster_ros.types import FloatArray, IntArray
 
 # Directions of the offsets model below this share of the largest are its gauge.
@@ -297,7 +298,7 @@ def _orthonormal(jacobian: FloatArray) -> FloatArray:
     flat = jacobian.reshape(-1, jacobian.shape[2])
     scale = np.linalg.norm(flat, axis=0)
     scale = np.where(scale > 0.0, scale, 1.0)
-    _, singular, vectors = np.linalg.svd(flat / scale, full_matrices=False)
+    _, singular, vectors = svd(flat / scale, full_matrices=False)
     seen = singular > ROUNDING * singular[0]
     combinations: FloatArray = (vectors[seen] / scale).T / singular[seen]
     return combinations

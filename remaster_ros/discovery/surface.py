@@ -306,7 +306,7 @@ class State:
         """Return a model."""
         state = cls.empty(surface)
         for block, level in model:
-            state = state.joined(block, level)
+            state = state.with_block(block, level)
         return state
 
     @cached_property
@@ -328,7 +328,8 @@ class State:
     def gains(self) -> FloatArray:
         """What each block at each level adds to the log posterior, (blocks, levels).
 
-        Of blocks of several weights by the diagonal of their Gram matrix, until `joined` tells.
+        Of blocks of several weights by the diagonal of their Gram matrix, until `with_block`
+        has the exact value.
         """
         pool = self.surface.pool
         precision = LEVELS_M[:, None] ** -2.0
@@ -356,7 +357,7 @@ class State:
             lost.append(worth + self._prior(block, self.kinds.count(pool.kind[block]) > 1))
         return np.array(lost)
 
-    def joined(self, block: int, level: int) -> State:
+    def with_block(self, block: int, level: int) -> State:
         """Return the model with a block more."""
         pool, columns = self.surface.pool, self.surface.columns
         own = pool.of[block]
@@ -390,7 +391,7 @@ class State:
             regression,
         )
 
-    def left(self, position: int) -> State:
+    def without(self, position: int) -> State:
         """Return the model without a block."""
         out = np.zeros(len(self.weights), bool)
         out[self.places[position]] = True
@@ -446,29 +447,29 @@ class Walker:
         """Make one move: a block joins, leaves, is exchanged, or a pair is changed."""
         u, state = self.rng.random(), self.state
         if not state.model or u < 0.25:
-            self._join(state, heat)
+            self._add(state, heat)
         elif u < 0.4:
-            self._to(state.left(self._which(state, heat)), heat)
+            self._accept(state.without(self._which(state, heat)), heat)
         elif u < 0.7:
-            self._join(state.left(self._which(state, heat)), heat)
+            self._add(state.without(self._which(state, heat)), heat)
         else:
             # What needs a partner: one block drawn widely, then what goes best with it.
             drawn = self._draw(state, 0.3 * heat)
             if drawn is None:
                 return
-            more = state.joined(*drawn)
+            more = state.with_block(*drawn)
             if state.model and self.rng.random() < 0.5:
-                self._to(more.left(int(np.argmin(more.losses[:-1]))), heat)
+                self._accept(more.without(int(np.argmin(more.losses[:-1]))), heat)
             else:
-                self._join(more, heat)
+                self._add(more, heat)
 
-    def _join(self, state: State, heat: float) -> None:
+    def _add(self, state: State, heat: float) -> None:
         drawn = self._draw(state, heat)
         # By the diagonal far worse: the exact gain is hardly ever that much more.
         if drawn is not None and state.value + state.gains[drawn] > self.state.value - FAR:
-            self._to(state.joined(*drawn), heat)
+            self._accept(state.with_block(*drawn), heat)
 
-    def _to(self, state: State, heat: float) -> None:
+    def _accept(self, state: State, heat: float) -> None:
         """Go to a model, by Metropolis."""
         self.seen[state.key] = state.value
         if np.log(self.rng.random()) < heat * (state.value - self.state.value):

@@ -276,7 +276,6 @@ class Chain:
 
     best: Evaluated  # Its best model
     visited: Mapping[Model, float]  # Log posterior of the models of its last round
-    trace: FloatArray  # Log posterior by step of that round
 
 
 class Walk:
@@ -416,7 +415,7 @@ class Walk:
                 std = {f.cell: known[f.cell.key] for f in every if f.cell.key in known}
             surface = Surface(self.pool, noise, std)
             walker = Walker(State.of(surface, current.model), self.rng)
-            trace = self._run(walker, hot)
+            self._run(walker, hot)
             best = max(walker.seen, key=lambda model: walker.seen[model])
             found = self._settled(best, current, anew)
             if current is not self.bare and found.value < current.value + SETTLED:
@@ -430,20 +429,18 @@ class Walk:
             current, hot = found, False
         offset = current.value - walker.seen.get(current.model, walker.seen[best])
         visited = {model: value + offset for model, value in walker.seen.items()}
-        return Chain(current, visited, trace + offset)
+        return Chain(current, visited)
 
-    def _run(self, walker: Walker, hot: bool) -> FloatArray:
-        """Walk until no better model was found for a while; return the trace."""
-        best, since, trace = -np.inf, 0, []
+    def _run(self, walker: Walker, hot: bool) -> None:
+        """Walk until no better model was found for a while."""
+        best, since = -np.inf, 0
         for step in range(STEPS):
             walker.step(min(1.0, 0.3 + step / (0.5 * STEPS)) if hot else 1.0)
-            trace.append(walker.state.value)
             since += 1
             if walker.state.value > best + SETTLED:
                 best, since = walker.state.value, 0
             if since > PATIENCE + len(walker.state.model) * PATIENCE_EACH:
                 break
-        return np.array(trace)
 
     def _whole(self, model: Model, start: Evaluated | None) -> Evaluated | None:
         """Return a model with the kinds of the background chosen anew among all."""
@@ -587,11 +584,11 @@ class Walk:
         found: dict[Model, float] = {}
         state = State.of(Surface(self.pool, best.noise, best.std), best.model)
         for position in range(len(best.model)):
-            rest = state.left(position)
+            rest = state.without(position)
             order = np.argsort(-rest.gains, axis=None)[:MOST_EXCHANGED]
             for block, level in zip(*np.unravel_index(order, rest.gains.shape), strict=True):
                 if rest.value + rest.gains[block, level] > state.value - NEGLIGIBLE:
-                    other = rest.joined(int(block), int(level))
+                    other = rest.with_block(int(block), int(level))
                     found[other.key] = best.value + other.value - state.value
         return found
 

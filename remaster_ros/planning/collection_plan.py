@@ -232,7 +232,7 @@ def rough_collection(planner: TourPlanner) -> tuple[Tour, Expected]:
 def count_with_free_path(
     tour: Tour, model: CollisionModel, start: FloatArray, enough: int
 ) -> tuple[int, int]:
-    """Return how many poses to fit have a free path from the start, and how many were tried.
+    """Return the numbers of fitted poses with a free path from the start, and of those tried.
 
     One joint solution of a pose is enough, which takes a small part of the time of all paths. If
     that finds few, the whole tour is searched as in a collection, up to `MOST_MISSED` poses

@@ -16,6 +16,7 @@ from msgspec import UNSET
 from scipy.spatial.transform import Rotation
 
 from remaster_ros.calibration.predictions import predict
+from remaster_ros.calibration.priors import DRAWING_TAILS
 from remaster_ros.compensation.arm_model import ArmModel, Geometry
 from remaster_ros.compensation.export import (
     APPLY_FOLDER,
@@ -137,13 +138,6 @@ def geometry_of(result: FitResult) -> GeometryModel | None:
     return replace(geometry.beside(result, gross), errors=loaded, drawing_errors=drawn)
 
 
-# How far a drawing is off is no normal variable: most links are within its tolerance, and one is
-# many times beyond. With the tails of Student's t with four degrees of freedom, for which this is
-# the standard deviation over the scale, 95 % are within 1.96 standard deviations as of a normal
-# one. With 1 the intervals held 91.7 % of 300 offsets of arms with an elbow 0.1 to 1 mm off.
-TAILS = 2.0**0.5
-
-
 class Uncertainty(NamedTuple):
     """Of the zero-offsets of k joints; rad, m of joints that slide."""
 
@@ -162,7 +156,7 @@ def uncertainty(result: FitResult) -> Uncertainty:
     geometry = geometry_of(result)
     if geometry is None:
         return drawn
-    moved = TAILS * np.linalg.norm(geometry.offset_moves, axis=1)
+    moved = DRAWING_TAILS * np.linalg.norm(geometry.offset_moves, axis=1)
     std = np.where(result.identifiable, np.hypot(drawn.std, moved), drawn.std)
     mean, times = result.joint_offsets[:, None], (std / drawn.std)[:, None]
     return Uncertainty(std, mean + times * (drawn.interval95 - mean))

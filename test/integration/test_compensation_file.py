@@ -81,7 +81,7 @@ def test_lengths_and_tilts_are_corrected_where_the_arm_is_and_all_over_its_limit
     low, high = (0.7 * limit for limit in file.model.chain.usual_range)
     q = np.random.default_rng(1).uniform(low, high, (300, 7))
     everywhere = replace(visits, q=q, pose=np.arange(300), is_validation=np.zeros(300, dtype=bool))
-    for tour, most_m in ((visits, 0.06e-3), (everywhere, 0.18e-3)):
+    for tour, most_m in ((visits, 0.06e-3), (everywhere, 0.15e-3)):
         found = judged(hidden, file.compensator, tour)
         assert found.rms_m < most_m
         assert found.rms_m < 1.5 * found.predicted_m
@@ -217,4 +217,4 @@ def test_a_marker_near_an_axis_turns_no_joint_by_degrees():
     model = everything(fit, cells, found.residuals).model
     change = model.added_angles(model.drivers(m.q, model.warming(len(m.q), None)))
     assert np.abs(change - change.mean(axis=0)).max() < np.radians(2.0)
-    assert model.steepest() < 0.3
+    assert model.steepest() < 0.15

@@ -19,7 +19,7 @@ from worlds.calibration_scenes import scene
 from remaster_ros import linear_algebra
 from remaster_ros.calibration.fit import fit_session
 from remaster_ros.discovery.discover import discover_session
-from remaster_ros.linear_algebra import one_thread
+from remaster_ros.linear_algebra import one_thread, svd
 
 
 @pytest.fixture
@@ -89,3 +89,16 @@ def test_an_interrupt_while_the_libraries_are_looked_up_is_not_lost(monkeypatch)
         linear_algebra.one_thread(worked.append)(1)
     assert worked == []
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_a_decomposition_that_does_not_converge_is_made_otherwise(monkeypatch):
+    matrix = np.random.default_rng(3).standard_normal((7, 4))
+    expected = np.linalg.svd(matrix, full_matrices=True)
+
+    def fails(*args, **given):
+        raise np.linalg.LinAlgError('SVD did not converge')
+
+    monkeypatch.setattr(np.linalg, 'svd', fails)
+    left, singular, right = svd(matrix, full_matrices=True)
+    np.testing.assert_allclose(singular, expected[1], rtol=1e-12)
+    np.testing.assert_allclose((left[:, :4] * singular) @ right, matrix, atol=1e-12)

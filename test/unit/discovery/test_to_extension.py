@@ -14,11 +14,8 @@ from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.discovery.evidence import solve
 from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.discovery.solution import Solution
-from remaster_ros.discovery.to_extension import (
-    extension_of,
-    moved_by_open_offsets,
-    offsets_of,
-)
+from remaster_ros.discovery.to_extension import extension_of, offsets_of
+from remaster_ros.discovery.unmodelled import Unmodelled
 
 
 def searched(marker_std_m: float) -> tuple[Estimate, Residuals, Solution]:
@@ -48,7 +45,7 @@ def test_an_offset_that_only_a_prior_determines_is_known_no_better_for_it(marker
     found, data, nothing = searched(marker_std_m)
     std = offsets_of(found)[1][6]
     print('std by the fit, deg', np.degrees(std))
-    moves = moved_by_open_offsets(found, data, nothing)
+    moves = Unmodelled.of(found, data, nothing).by_open_offsets()
     held = (std**-2.0 + STEP_STD**-2.0 - OFFSET_STD**-2.0) ** -0.5
     if held > 0.95 * std:
         assert moves.shape[1] == 0
@@ -68,7 +65,7 @@ def test_all_else_goes_along_with_an_open_offset():
     data = Residuals.of(found)
     nothing = solve(data, ())
     assert nothing is not None
-    moves = moved_by_open_offsets(found, data, nothing)
+    moves = Unmodelled.of(found, data, nothing).by_open_offsets()
     predict, rows = found.model.predict, found.posterior.rows
     before = predict(found.mode.z, rows)
     x = found.model.natural(found.mode.z)
@@ -95,4 +92,29 @@ def test_an_offset_that_the_data_determine_beside_the_causes_needs_no_more():
     assert solution is not None
     std = offsets_of(found)[1][1:6]
     print('std without the cause, deg', np.degrees(std))
-    assert moved_by_open_offsets(found, data, solution).shape[1] == 0
+    assert Unmodelled.of(found, data, solution).by_open_offsets().shape[1] == 0
+
+
+def test_what_other_models_have_is_the_variance_among_them():
+    found, data, nothing = searched(0.5e-3)
+    other = replace(nothing, base=nothing.base + 1e-4)
+    (move,) = Unmodelled.of(found, data, nothing).by_models([(other, 0.25)]).T
+    columns = data.full_jacobian[data.rows.source]
+    free = found.posterior.free
+    shift = columns[:, :, free] @ move[free]
+    expected = 0.5 * (data.base @ (other.base - nothing.base))
+    np.testing.assert_allclose(shift, expected, atol=1e-6 * np.abs(expected).max())
+
+
+def test_the_tolerance_of_a_drawing_widens_offsets_beside_what_is_named():
+    found, data, nothing = searched(0.5e-3)
+    equations = Unmodelled.of(found, data, nothing)
+    drawn = equations.by_drawing(())
+    lengths = list(EFFECTS['link_length'].cells(data.context))
+    fewer = equations.by_drawing(lengths)
+    known = ~np.isnan(offsets_of(found)[1])
+    every, less = (equations.std_of_offsets([moves])[known] for moves in (drawn, fewer))
+    exact = equations.std_of_offsets([])[known]
+    assert (every >= less).all()
+    assert (less >= exact).all()
+    assert (every > 2.0 * exact).any()

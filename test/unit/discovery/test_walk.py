@@ -74,14 +74,15 @@ def test_the_log_posterior_is_that_of_the_mixed_model_equations():
         eta = np.log(np.concatenate((data.noise.sigma, shared)))
         exact = system.marginal(eta) + pool().prior(model)
         off.append(exact - State.of(surface(), model).value)
-    assert np.ptp(off) < 2e-3 * max(1.0, np.ptp([State.of(surface(), m).value for m in [()]]) + 50)
+    # The surface is in single precision.
+    assert np.ptp(off) < 0.01
 
 
 def test_a_block_that_joins_and_leaves_changes_nothing():
     for model in drawn_models(4):
         state = State.of(surface(), model)
         for position, (block, level) in enumerate(model):
-            again = state.left(position).joined(block, level)
+            again = state.without(position).with_block(block, level)
             assert again.key == state.key
             assert again.value == pytest.approx(state.value, abs=1e-2)
             np.testing.assert_allclose(
@@ -97,7 +98,7 @@ def test_the_gain_of_a_block_of_one_weight_is_exact():
         for level in np.flatnonzero(pool().allowed[block])[:2].tolist():
             if np.isfinite(state.gains[block, level]):
                 expected = state.gains[block, level]
-                assert state.joined(block, level).value == pytest.approx(expected, abs=1e-3)
+                assert state.with_block(block, level).value == pytest.approx(expected, abs=1e-3)
 
 
 def test_a_chain_visits_models_by_their_posterior():

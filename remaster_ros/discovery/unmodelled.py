@@ -1,0 +1,156 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Movement of zero-offsets and causes by errors that are not in the model that is sampled.
+
+Each source gives columns of one standard deviation, (size + m, c), of all natural parameters of
+the offsets model and the m parameters of a solution's cells: other models of the walk, lengths and
+tilts within the tolerance of a drawing, zero-offsets that the prior on steps alone holds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from remaster_ros.calibration.estimate import Estimate
+from remaster_ros.calibration.priors import DRAWING_TAILS, OFFSET_STD, STEP_STD, prior_rows
+from remaster_ros.discovery.effects.base import Cell
+from remaster_ros.discovery.effects.registry import EFFECTS
+from remaster_ros.discovery.random_effects import kinds
+from remaster_ros.discovery.residuals import Residuals
+from remaster_ros.discovery.solution import Solution
+from remaster_ros.discovery.to_extension import natural_steps, root_of_inverse
+from remaster_ros.types import FloatArray, IntArray
+
+# Where the prior on steps takes a smaller share of its variance off an offset nothing is added.
+NOTICEABLE = 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class Unmodelled:
+    """The normal equations of all that is fitted, with a solution's noise and priors.
+
+    ``found``: the fit that is searched beside; ``data``: its residuals.
+    """
+
+    found: Estimate
+    data: Residuals
+    solution: Solution
+    white: FloatArray  # Columns in units of the noise, (3n, P)
+    root: FloatArray  # Of the covariance, (P, P)
+    where: IntArray  # Places of the P among natural parameters and those of the cells
+
+    @classmethod
+    def of(cls, found: Estimate, data: Residuals, solution: Solution) -> Unmodelled:
+        """Assemble the equations of a solution."""
+        free, size = found.posterior.free, found.model.size
+        own = data.columns(solution.cells)
+        columns = np.concatenate((data.full_jacobian[data.rows.source][:, :, free], own), axis=2)
+        x = found.model.natural(found.mode.z)
+        rows = prior_rows(found.model, found.posterior.priors, x, natural=True)[1][:, free]
+        precision = np.zeros((columns.shape[2],) * 2)
+        precision[: len(free), : len(free)] = rows.T @ rows
+        precision[len(free) :, len(free) :] = solution.prior_precision()
+        white = data.noise_model.whitened(columns, solution.noise).reshape(3 * len(data), -1)
+        root = root_of_inverse(white.T @ white + precision)
+        where = np.concatenate((free, size + np.arange(own.shape[2])))
+        return cls(found, data, solution, white, root, where)
+
+    @property
+    def size(self) -> int:
+        """Number of natural parameters and of those of the cells."""
+        return int(self.found.model.size + len(self.solution.parameters))
+
+    def by_models(self, models: Sequence[tuple[Solution, float]]) -> FloatArray:
+        """Return the movement to each other model, by the root of its share.
+
+        The squares of the columns are the variance among the models.
+        """
+        first, names = self.solution, _names(self.solution)
+        size = self.found.model.size
+        place = {name: size + i for i, name in enumerate(names)}
+        moves = np.zeros((self.size, len(models)))
+        for column, (other, share) in enumerate(models):
+            steps = natural_steps(self.data, self.found, other.base - first.base)
+            moves[self.found.posterior.free, column] = steps
+            moves[size:, column] = -first.parameters
+            for name, value in zip(_names(other), other.parameters, strict=True):
+                if name in place:
+                    moves[place[name], column] += value
+            moves[:, column] *= np.sqrt(share)
+        return moves
+
+    def by_drawing(self, named: Sequence[Cell]) -> FloatArray:
+        """Return the movement by each length and tilt without a name, off its drawing.
+
+        No session proves that an arm is its drawing. Of those that the model has, what their prior
+        lacks of the tolerance.
+        """
+        cells = [
+            cell
+            for effect in EFFECTS.values()
+            if effect.place in ('link_translation', 'link_rotation')
+            if not effect.needs(self.data.context)
+            for cell in effect.cells(self.data.context)
+            if cell.model_change is not None
+        ]
+        tolerance = DRAWING_TAILS * self.found.problem.priors.geometry_tolerance_m
+        diagonal = np.diag(self.solution.prior_precision())
+        precision = dict(zip(_names(self.solution), diagonal, strict=True))
+        parts = [np.zeros((self.size, 0))]
+        for family in kinds(self.data, cells, named):
+            for member, mapping, scale in zip(
+                family.members, family.maps, family.scales, strict=True
+            ):
+                known = np.array([precision.get(name, np.inf) for name in member.parameters])
+                variance = np.maximum(tolerance**2 - scale / known, 0.0)
+                shift = self.data.columns([member]) @ (mapping * np.sqrt(variance))
+                others = self.data.noise_model.whitened(shift, self.solution.noise)
+                moves = np.zeros((self.size, others.shape[2]))
+                pull = self.white.T @ others.reshape(len(self.white), -1)
+                moves[self.where] = self.root @ (self.root.T @ pull)
+                parts.append(moves)
+        return np.concatenate(parts, axis=1)
+
+    def by_open_offsets(self) -> FloatArray:
+        """Return the movement by offsets that the prior on steps holds.
+
+        It is no knowledge of the arm: an offset is known no better than by the data and by what is
+        known of any mastering.
+        """
+        found = self.found
+        names = found.problem.chain.joint_names
+        joints = np.array(
+            [
+                place
+                for place, joint in enumerate(found.posterior.free)
+                if joint < len(names) and names[joint] not in found.problem.priors.joint_offsets
+            ],
+            dtype=np.int64,
+        )
+        covariance = self.root @ self.root[joints].T
+        free = covariance[joints]
+        taken = STEP_STD**-2.0 - OFFSET_STD**-2.0
+        per_radian = found.problem.chain.per_radian[found.posterior.free[joints]]
+        held = np.linalg.inv(np.linalg.inv(free) + np.diag(taken / per_radian**2))
+        variance, less = np.diag(free), np.diag(free) - np.diag(held)
+        noticeable = less > NOTICEABLE * variance
+        moves = np.zeros((self.size, int(noticeable.sum())))
+        # All else goes along, so that the predictions stay.
+        moves[self.where] = (covariance / variance * np.sqrt(np.maximum(less, 0.0)))[:, noticeable]
+        return moves
+
+    def std_of_offsets(self, moves: Sequence[FloatArray]) -> FloatArray:
+        """Return the std of the zero-offsets with some movements, rad, (k,).
+
+        NaN where the gauge holds them.
+        """
+        variance = np.full(self.size, np.nan)
+        variance[self.where] = np.sum(self.root**2, axis=1)
+        variance += sum(np.sum(columns**2, axis=1) for columns in moves)
+        return np.sqrt(variance[: self.found.model.joints])
+
+
+def _names(solution: Solution) -> list[str]:
+    return [name for cell in solution.cells for name in cell.parameters]
