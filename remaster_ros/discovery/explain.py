@@ -21,8 +21,8 @@ from remaster_ros.discovery.words import (
     KIND_OF_SUBJECT,
     clock_time,
     joint_words,
-    percent,
     place_words,
+    probability_text,
     sentence_case,
     titled,
 )
@@ -127,7 +127,7 @@ class FoundEffect:
         if found.is_certain:
             return found
         doubt = (
-            f'Not certain: its probability is {percent(found.probability or 0.0)}. Measure more '
+            f'Not certain: its probability is {probability_text(found.probability)}. Measure more '
             'poses before it is acted on.'
         )
         return replace(found, cause=f'{found.cause} {doubt}', remedy=_later(found.remedy))

@@ -82,10 +82,13 @@ class Unmodelled:
         return moves
 
     def by_drawing(self, named: Sequence[Cell]) -> FloatArray:
-        """Return the movement by each length and tilt without a name, off its drawing.
+        """Return the movement by lengths and tilts without a name, off their drawing.
 
-        No session proves that an arm is its drawing. Of those that the model has, what their prior
-        lacks of the tolerance.
+        No session proves that an arm is its drawing. As random effects of its tolerance beside
+        the model they add L U G⁻¹ U'L' to the covariance LL' of all that is fitted, with their
+        columns Z, those of the model A, U = L'A'Z and G = I + Z'Z - U'U: what the data show them
+        not to be counts as little. Of those that the model has, what their prior lacks of the
+        tolerance.
         """
         cells = [
             cell
@@ -98,20 +101,21 @@ class Unmodelled:
         tolerance = DRAWING_TAILS * self.found.problem.priors.geometry_tolerance_m
         diagonal = np.diag(self.solution.prior_precision())
         precision = dict(zip(_names(self.solution), diagonal, strict=True))
-        parts = [np.zeros((self.size, 0))]
+        shifts = [np.zeros((len(self.data), 3, 0))]
         for family in kinds(self.data, cells, named):
             for member, mapping, scale in zip(
                 family.members, family.maps, family.scales, strict=True
             ):
                 known = np.array([precision.get(name, np.inf) for name in member.parameters])
                 variance = np.maximum(tolerance**2 - scale / known, 0.0)
-                shift = self.data.columns([member]) @ (mapping * np.sqrt(variance))
-                others = self.data.noise_model.whitened(shift, self.solution.noise)
-                moves = np.zeros((self.size, others.shape[2]))
-                pull = self.white.T @ others.reshape(len(self.white), -1)
-                moves[self.where] = self.root @ (self.root.T @ pull)
-                parts.append(moves)
-        return np.concatenate(parts, axis=1)
+                shifts.append(self.data.columns([member]) @ (mapping * np.sqrt(variance)))
+        white = self.data.noise_model.whitened(np.concatenate(shifts, axis=2), self.solution.noise)
+        Z = white.reshape(len(self.white), -1)
+        U = self.root.T @ (self.white.T @ Z)
+        G = np.eye(Z.shape[1]) + Z.T @ Z - U.T @ U
+        moves = np.zeros((self.size, Z.shape[1]))
+        moves[self.where] = self.root @ np.linalg.solve(np.linalg.cholesky(G), U.T).T
+        return moves
 
     def by_open_offsets(self) -> FloatArray:
         """Return the movement by offsets that the prior on steps holds.

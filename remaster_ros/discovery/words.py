@@ -35,6 +35,9 @@ EARLIEST_S, LATEST_S = 1e9, 4.1e9
 # Below it a p-value's figures tell nobody more.
 LEAST_P_VALUE = 1e-4
 
+# A probability by a finite number of models visited is not stated beyond this.
+MOST_STATED = 0.99
+
 
 def shown(value: float, std: float, unit: str) -> tuple[str, str, str]:
     """Return value, standard deviation and unit of a parameter as people read them."""
@@ -45,6 +48,15 @@ def shown(value: float, std: float, unit: str) -> tuple[str, str, str]:
 def percent(share: float) -> str:
     """Return a share as whole per cent: '35 %', never '-0 %'."""
     return f'{round(100.0 * share)} %'.replace('-', '−')
+
+
+def probability_text(probability: float | None) -> str:
+    """Return a probability as whole per cent, never '100 %'; 'unknown' for None."""
+    if probability is None:
+        return 'unknown'
+    if probability > MOST_STATED:
+        return f'over {percent(MOST_STATED)}'
+    return percent(probability)
 
 
 def p_value_text(p_value: float) -> str:

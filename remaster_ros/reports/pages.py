@@ -22,6 +22,7 @@ from remaster_ros.discovery.explain import LookAlike
 from remaster_ros.discovery.words import (
     p_value_text,
     percent,
+    probability_text,
     shown,
 )
 from remaster_ros.reports.figures import GRID, INK, PAPER
@@ -61,6 +62,7 @@ def page(template: str, **content: Any) -> str:
         'fixed': _fixed,
         'signed': _signed,
         'percent': percent,
+        'probability': probability_text,
         'p_value': p_value_text,
         'shown': shown,
         'heading': lambda words: words[:1].upper() + words[1:],

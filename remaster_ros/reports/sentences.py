@@ -18,7 +18,14 @@ from remaster_ros.calibration.residual_structure import FEWEST_POSES
 from remaster_ros.compensation.export import APPLY_FOLDER, LAYER_FILE, REMASTER_FILE, URDF_FILE
 from remaster_ros.discovery.explain import LookAlike
 from remaster_ros.discovery.thinning import Thinning
-from remaster_ros.discovery.words import called, part_words, percent, sentence_case, shown
+from remaster_ros.discovery.words import (
+    called,
+    part_words,
+    percent,
+    probability_text,
+    sentence_case,
+    shown,
+)
 from remaster_ros.reports.rows_csv import lengths_mm
 from remaster_ros.reports.schemas import (
     Confirmed,
@@ -200,8 +207,8 @@ def verdict(result: FitResult) -> Judgement:
     if unknown:
         points.append(
             f'{count - len(unknown)} of {count} zero-offsets '
-            f'{"is" if count - len(unknown) == 1 else "are"} measured; the data do not '
-            f'distinguish {listed(unknown)} from what stands beside them.'
+            f'{"is" if count - len(unknown) == 1 else "are"} measured; that of {listed(unknown)} '
+            'cannot be told from other errors, which the table of zero-offsets names.'
         )
     else:
         points.append(f'All {count} zero-offsets are measured.')
@@ -435,7 +442,7 @@ def _would_show(discovery: Discovery) -> bool:
 def _uncertain(discovery: Discovery) -> str:
     """Return which causes are not certain, each with its probability; ''."""
     names = [
-        f'{sentence_case(effect.title)} (probability {percent(effect.probability or 0.0)})'
+        f'{sentence_case(effect.title)} (probability {probability_text(effect.probability)})'
         for effect in discovery.effects
         if not effect.is_certain
     ]
@@ -557,7 +564,9 @@ def look_alike_name(effect: Effect, other: LookAlike) -> str:
 
 
 def _of_probability(other: LookAlike) -> str:
-    return '' if other.probability is None else f' (probability {percent(other.probability)})'
+    if other.probability is None:
+        return ''
+    return f' (probability {probability_text(other.probability)})'
 
 
 def coverage_words(held_out: Coverage, gross: int) -> str:

@@ -91,7 +91,7 @@ def test_discovery_json_keeps_its_contract(saved):
         keys = {'name', 'joints', 'log_evidence_gain', 'separate_by', 'same', 'general'}
         assert other.keys() == keys
         assert other['separate_by']
-    assert re.search(r'joint 2 errs by up to [45]\.\d+′ ± [01]\.\d+′', effect['cause'])
+    assert re.search(r'joint 2 errs by up to [45]\.\d+′ ± 0\.\d+′', effect['cause'])
     assert effect['sizes'][0] in effect['cause']
     assert effect['remedy'].endswith('.')
     assert content['gain']['held_out_rms_after_m'] < content['gain']['held_out_rms_before_m']
