@@ -424,7 +424,7 @@ def _moved(problem: Problem, rows: Rows, errors: FloatArray) -> str:
     text = ''
     for sensor, span in rows.of_points.spans:
         moved = moved_since(problem.measurements, rows.source[span], errors[span])
-        if moved is not None:
+        if moved is not None and moved.is_step:
             text += (
                 f'; {problem.sensor_names[sensor]} is off by '
                 f'{1e3 * np.linalg.norm(moved.shift):.1f} mm from about observation '

@@ -1,32 +1,48 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From when on a sensor's readings are off: it, or its marker, was moved in mid-session."""
+"""From when on a sensor's readings are off: it, or its marker, was moved, or the readings drift.
+
+Errors that grow with the temperature, or that differ in another region, also have other means
+late in a session than early. A step is claimed only if it is more probable than all drifts and
+fields, and if the places before and after it are not others.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
 import scipy
+from numpy.polynomial import legendre
 
 from remaster_ros.types import FloatArray, IntArray, Measurements
 
 FEWEST_POSES = 8
 # Of any step, at all moments at which one is tried.
 SIGNIFICANCE = 1e-3
+# Time constants of a warm-up that are tried, as shares of the session.
+WARM_UP = 0.03, 0.1, 0.3
+# Moments at which a drift may begin or end, as shares of the session.
+BENDS = np.arange(0.1, 1.0, 0.1)
+# A session whose places tell early from late poses by more than this share of the variance cannot
+# tell a step from another region: half of what is seen of the step is then seen of the place.
+SEPARATED = 0.5
 
 
 class Moved(NamedTuple):
-    """About which observation is the first after it, and the shift of the readings, m, (3,)."""
+    """A change of the readings in time."""
 
-    observation: int
-    shift: FloatArray
+    observation: int  # About the first one after it
+    shift: FloatArray  # Of the readings from then on against those before, m, (3,)
+    is_step: bool  # Whether a drift is ruled out
 
 
 def moved_since(measurements: Measurements, rows: IntArray, errors: FloatArray) -> Moved | None:
-    """Return from when on errors are others than before; None where nothing shows it.
+    """Return from when on errors are others than before; None if time does not explain them.
 
     The moment is the one between two poses that divides the means of the poses best. The step is
-    tested by F, at all moments (Bonferroni).
+    tested by F, at all moments (Bonferroni), and against drifts and places by the Bayesian
+    information criterion (Schwarz 1978): it has to be 1 / `SIGNIFICANCE` times as probable.
 
     Parameters
     ----------
@@ -43,21 +59,91 @@ def moved_since(measurements: Measurements, rows: IntArray, errors: FloatArray) 
         return None
     _, first, pose = np.unique(measurements.pose[rows], return_index=True, return_inverse=True)
     # Poses in the order of their first row.
-    place, poses = np.argsort(np.argsort(first))[pose], len(first)
+    index, poses = np.argsort(np.argsort(first))[pose], len(first)
     if poses < FEWEST_POSES:
         return None
-    count = np.bincount(place)
-    means = np.column_stack([np.bincount(place, axis) / count for axis in errors.T])
+    means = _of_poses(errors, index)
     before = np.arange(1, poses)[:, None]
     after = poses - before
     sums = np.cumsum(means, axis=0)
     step = (sums[-1] - sums[:-1]) / after - sums[:-1] / before
     explained = (before * after / poses)[:, 0] * np.sum(step**2, axis=1)
     at = int(np.argmax(explained))
-    left = float(np.sum((means - means.mean(axis=0)) ** 2) - explained[at])
+    unexplained = max(float(np.sum((means - means.mean(axis=0)) ** 2) - explained[at]), 1e-30)
     freedom = 3 * (poses - 2)
-    ratio = explained[at] / 3.0 / (max(left, 1e-30) / freedom)
+    ratio = explained[at] / 3.0 / (unexplained / freedom)
     p_value = scipy.special.fdtrc(3, freedom, ratio) * len(step)
     if p_value > SIGNIFICANCE:
         return None
-    return Moved(int(measurements.observation[rows[place > at][0]]), step[at])
+    time = _of_poses(measurements.stamp_s[rows][:, None], index)[:, 0]
+    place = _standardised(_of_poses(measurements.position[rows], index))
+    is_late = (np.arange(poses) > at).astype(float)
+    if 1.0 - _unexplained(is_late[:, None], place) / float(poses * np.var(is_late)) > SEPARATED:
+        return None
+    # The moment is a parameter too.
+    step_criterion = _criterion(unexplained, 2 + 1 / 3, poses) + 2.0 * np.log(1.0 / SIGNIFICANCE)
+    drifts = [_criterion_of(means, columns) for columns in _drifts(time)]
+    places = [_criterion_of(means, columns) for columns in _places(time, place)]
+    if min(places, default=np.inf) < min(step_criterion, *drifts):
+        return None
+    is_step = step_criterion < min(drifts)
+    return Moved(int(measurements.observation[rows[index > at][0]]), step[at], is_step)
+
+
+def _of_poses(values: FloatArray, index: IntArray) -> FloatArray:
+    """Return the means of the rows (n, m) of each pose, (poses, m)."""
+    count = np.bincount(index)
+    return np.column_stack([np.bincount(index, axis) / count for axis in values.T])
+
+
+def _standardised(values: FloatArray) -> FloatArray:
+    centred = values - values.mean(axis=0)
+    return centred / max(float(np.std(centred)), 1e-9)
+
+
+def _drifts(time: FloatArray) -> Iterator[FloatArray]:
+    """Give the columns of each drift over times (n,), (n, p)."""
+    share = (time - time.min()) / np.ptp(time)
+    polynomials = _polynomials(time)
+    for degree in range(1, polynomials.shape[1] + 1):
+        yield polynomials[:, :degree]
+    for constant in WARM_UP:
+        yield np.exp(-share / constant)[:, None]
+    for bend in BENDS:
+        yield np.maximum(share - bend, 0.0)[:, None]
+        yield np.minimum(share - bend, 0.0)[:, None]
+
+
+def _places(time: FloatArray, place: FloatArray) -> Iterator[FloatArray]:
+    """Give the columns of each field over places (n, 3), also of one that grows with time."""
+    first, second = np.triu_indices(3)
+    fields = place, np.concatenate((place, place[:, first] * place[:, second]), axis=1)
+    drift = _polynomials(time)[:, :1]
+    # Growth is an error along the place that increases with time.
+    for field in (*fields, *(np.concatenate((f, drift, drift * place), axis=1) for f in fields)):
+        if field.shape[1] < len(time) // 2:
+            yield field
+
+
+def _polynomials(time: FloatArray) -> FloatArray:
+    """Return Legendre polynomials of degrees 1 to 3 over the range of times (n,), (n, 3)."""
+    share = (time - time.min()) / np.ptp(time)
+    return legendre.legvander(2.0 * share - 1.0, 3)[:, 1:]
+
+
+def _unexplained(values: FloatArray, columns: FloatArray) -> float:
+    """Return the sum of squares of values (n, m) left by a constant and columns (n, p)."""
+    columns = np.column_stack((np.ones(len(values)), columns))
+    fitted = columns @ np.linalg.lstsq(columns, values, rcond=None)[0]
+    return max(float(np.sum((values - fitted) ** 2)), 1e-30)
+
+
+def _criterion_of(means: FloatArray, columns: FloatArray) -> float:
+    """Return the criterion of means (n, 3) explained by columns (n, p) and a constant."""
+    return _criterion(_unexplained(means, columns), columns.shape[1] + 1, len(means))
+
+
+def _criterion(unexplained: float, columns: float, poses: int) -> float:
+    """Return the Bayesian information criterion of three axes with common noise."""
+    count = 3 * poses
+    return float(count * np.log(unexplained / count) + 3 * columns * np.log(count))

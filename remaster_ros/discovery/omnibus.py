@@ -223,8 +223,15 @@ class _Checks:
         x, y, z = 1e3 * moved.shift
         off = (
             f'the readings of {context.sensor_names[sensor]} are off by ({x:+.2f}, {y:+.2f}, '
-            f'{z:+.2f}) mm in its frame: the sensor or its marker was moved'
+            f'{z:+.2f}) mm in its frame'
         )
+        if not moved.is_step:
+            return (
+                f'From about observation {moved.observation} on, {off} against those before; a '
+                'step and a drift cannot be told apart. Fasten the sensor and its marker, let '
+                'sensor and arm warm up, and measure the session again.'
+            )
+        off = f'{off}: the sensor or its marker was moved'
         m = context.measurements.select(rows)
         before = m.observation < moved.observation
         if m.is_validation[~before].all() and len(np.unique(m.pose[before & m.is_validation])) < 2:
