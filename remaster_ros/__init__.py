@@ -74,6 +74,7 @@ def session_from(
     reverse: Sequence[str] = (),
     offset_deg: Mapping[str, float] | None = None,
     never_mastered: bool = False,
+    sensor_kind: Literal['', 'camera', 'tracker', 'controller'] = '',
     seed: int = 0,
 ) -> Session:
     """Make a session of arrays, or of two data frames.
@@ -99,6 +100,8 @@ def session_from(
         As of `import_table`.
     never_mastered
         Zero-offsets may be of any size (hobby servos, a motor that was replaced).
+    sensor_kind
+        What measured the points; '' where it is unknown, or shows from names and files.
     seed
         Of the poses that are held out.
 
@@ -131,10 +134,10 @@ def session_from(
         )
     choices = in_python.Choices(
         TableOptions(angles=angles, length=length),
-        SessionOptions.of(couple, reverse, offset_deg),
+        SessionOptions.of(couple, reverse, offset_deg, sensor_kind),
         (
             *('joints', 'points', 'base_link', 'tip_link', 'angles', 'length', 'couple'),
-            *('reverse', 'offset_deg', 'never_mastered'),
+            *('reverse', 'offset_deg', 'never_mastered', 'sensor_kind'),
         ),
         never_mastered,
         seed,
@@ -162,6 +165,7 @@ def import_table(
     reverse: Sequence[str] = (),
     offset_deg: Mapping[str, float] | None = None,
     never_mastered: bool = False,
+    sensor_kind: Literal['', 'camera', 'tracker', 'controller'] = '',
     seed: int = 0,
 ) -> Session:
     """Make a session of one table with joints and points, or of two, as ``remaster import`` does.
@@ -170,7 +174,7 @@ def import_table(
     ----------
     files
         Tables, or makers' own texts; or data frames, which are read as the same tables.
-    urdf, base_link, tip_link, never_mastered, seed
+    urdf, base_link, tip_link, never_mastered, sensor_kind, seed
         As of `session_from`.
     joints, points, time, names, join
         Names of columns, and how two tables are joined, where that is not found.
@@ -217,11 +221,11 @@ def import_table(
             pulses_per_degree=tuple(pulses_per_degree),
             sheets=tuple(sheets),
         ),
-        SessionOptions.of(couple, reverse, offset_deg),
+        SessionOptions.of(couple, reverse, offset_deg, sensor_kind),
         (
             *('joints', 'points', 'join', 'angles', 'length', 'time', 'names', 'sheets'),
             *('pulses_per_degree', 'clock_offset_s', 'base_link', 'tip_link', 'couple'),
-            *('reverse', 'offset_deg', 'never_mastered'),
+            *('reverse', 'offset_deg', 'never_mastered', 'sensor_kind'),
         ),
         never_mastered,
         seed,

@@ -19,6 +19,9 @@ BoolArray = NDArray[np.bool_]
 
 Split = Literal['optimization', 'validation', 'reference']
 AngleUnit = Literal['deg', 'rad', 'gon']
+SensorKind = Literal['camera', 'tracker', 'controller']
+"""What may be wrong with an instrument: a camera has lenses, a tracker has none, and points that a
+controller computed were seen by no instrument."""
 AccuracyOption = Literal['', 'active', 'inactive']
 """Whether a controller corrects by a calibration of its maker's; '' where it is not known."""
 
@@ -344,6 +347,9 @@ class Session:
         Sensor name -> further markers that it measures in the same frame, where it does.
     oriented
         Sensors that measure the orientation of a body, too.
+    sensor_kinds
+        Sensor name -> ``camera``, ``tracker``, or ``controller`` where the robot itself computed
+        the points; without an entry where it is unknown.
     on_tool
         Those of them that are on the tool, and what they measure beside the robot: their readings
         are those of the sensor itself, in the frame of what it measures.
@@ -402,6 +408,7 @@ class Session:
     correction: Correction | None = None
     accuracy_option: AccuracyOption = ''
     disagreements: tuple[str, ...] = ()
+    sensor_kinds: Mapping[str, SensorKind] = field(default_factory=dict)
 
     @property
     def urdf_sha256(self) -> str:

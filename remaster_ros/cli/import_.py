@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from shlex import quote
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 
@@ -37,7 +37,7 @@ from remaster_ros.kinematics.urdf import parse_urdf
 from remaster_ros.session.reader import HEADER, read_session, write_session
 from remaster_ros.session.robot_description import read_arm
 from remaster_ros.session.workcell import Workcell, read_cell
-from remaster_ros.types import Session
+from remaster_ros.types import SensorKind, Session
 
 SEPARATORS = {'comma': ',', 'semicolon': ';', 'tab': '\t', 'bar': '|', 'blank': ' '}
 DECIMALS = {'comma': ',', 'point': '.'}
@@ -195,6 +195,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         'stands (a board), in its frame',
     )
     session.add_argument('--sensor', metavar='NAME', help='default: sensor')
+    session.add_argument(
+        '--sensor-kind',
+        choices=get_args(SensorKind),
+        default='',
+        help='what measured the points: no lens is looked for in a tracker, and no error of a '
+        "sensor in points that the robot's controller computed (default: by names and files, "
+        'else unknown)',
+    )
     session.add_argument('--marker', metavar='NAME', help='default: marker')
     session.add_argument(
         '--marker-mm',
@@ -458,6 +466,7 @@ def _session_options(args: argparse.Namespace, cell: Workcell | None) -> Session
         hold_out=args.hold_out,
         visited_in_order=args.visited_in_order,
         on_tool=args.on_tool,
+        sensor_kind=args.sensor_kind,
     )
 
 

@@ -359,8 +359,13 @@ def errors_by_place(
             next=(
                 f'From pose to pose the errors follow the place in front of {the("sensor", name)} '
                 f'more than chance would ({1e3 * size_m:.3f} mm RMS), but no cause stands out '
-                'from all that were tried. Measure the same poses with the sensor moved and '
-                'turned: what follows its volume is its own; or measure more poses.'
+                'from all that were tried. '
+                + (
+                    'Measure more poses.'
+                    if (sensor, name) not in data.context.sensors('controller')
+                    else 'Measure the same poses with the sensor moved and turned: what follows '
+                    'its volume is its own; or measure more poses.'
+                )
             ),
         )
 

@@ -90,6 +90,9 @@ class Residuals:
             model.markers(x),
             model.T_R_N(x),
             timed=problem.session.timed,
+            sensor_kinds=tuple(
+                problem.session.sensor_kinds.get(name, '') for name in problem.sensor_names
+            ),
         )
         count = len(context)
         every = Rows.of(problem.measurements, np.arange(count), model.reference)

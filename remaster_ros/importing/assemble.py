@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
@@ -27,6 +28,7 @@ from remaster_ros.types import (
     IntArray,
     Measurements,
     PadJoint,
+    SensorKind,
     Session,
 )
 
@@ -43,6 +45,14 @@ FIRST_DATE_S = 946_684_800.0 + 2 * 86_400.0
 _SPLITS = {
     **dict.fromkeys(('optimization', 'fit', 'train', 'training', 'calibration', 'opt'), 0),
     **dict.fromkeys(('validation', 'test', 'held_out', 'holdout', 'val', 'check'), 1),
+}
+
+
+_WORDS_OF_KINDS: dict[SensorKind, re.Pattern[str]] = {
+    'tracker': re.compile(r'(?i)tracker|leica|faro|smr|at9\d\d|at40\d'),
+    'camera': re.compile(
+        r'(?i)camera|mocap|optitrack|motive|vicon|qualisys|april.?tag|aruco|charuco|realsense|kinect'
+    ),
 }
 
 
@@ -64,6 +74,7 @@ class SessionOptions:
     hold_out: float = 1.0 / HOLD_OUT_ONE_OF
     visited_in_order: bool = False  # Each row's configuration was reached from that before
     on_tool: bool = False  # The sensor is, and measures the pose of what stands
+    sensor_kind: Literal['', SensorKind] = ''
 
     @classmethod
     def of(
@@ -71,6 +82,7 @@ class SessionOptions:
         couple: Mapping[str, str] | None,
         reverse: Sequence[str],
         offset_deg: Mapping[str, float] | None,
+        sensor_kind: Literal['', SensorKind] = '',
     ) -> SessionOptions:
         """Return corrections of the joints as Python's functions take them."""
         added: dict[str, tuple[str, Literal[1, -1]]] = {
@@ -81,6 +93,7 @@ class SessionOptions:
             couple=tuple(added.items()),
             reverse=tuple(reverse),
             add_deg=tuple((offset_deg or {}).items()),
+            sensor_kind=sensor_kind,
         )
 
 
@@ -209,11 +222,26 @@ def assemble(
         created=_date(rows),
         notes=notes,
         controller=controller,
+        sensor_kinds=_kinds(sensors, rows, options),
     )
     if options.on_tool:
         every = frozenset(session.sensors)
         session = replace(session, oriented=every, on_tool=every)
     return session, [how_pose, how_split]
+
+
+def _kinds(
+    sensors: Sequence[str], rows: RawRows, options: SessionOptions
+) -> dict[str, SensorKind]:
+    """Return kinds of instruments: by the option, by their names, or by whose file it is."""
+    kinds: dict[str, SensorKind] = {}
+    for name in sensors:
+        by_name = [kind for kind, words in _WORDS_OF_KINDS.items() if words.search(name)]
+        kind = options.sensor_kind or (by_name[0] if len(by_name) == 1 else rows.instrument)
+        kind = kind or ('camera' if options.on_tool else '')
+        if kind:
+            kinds[name] = kind
+    return kinds
 
 
 def as_counted(

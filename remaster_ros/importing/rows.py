@@ -44,7 +44,7 @@ from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.transforms import inverse_poses
 from remaster_ros.session.files import read_limited
 from remaster_ros.session.observations import LENGTH_TOLERANCE
-from remaster_ros.types import AngleUnit, BoolArray, FloatArray, IntArray
+from remaster_ros.types import AngleUnit, BoolArray, FloatArray, IntArray, SensorKind
 
 # Which row of the joints belongs to which row of the points: by name, by time or by order.
 
@@ -381,6 +381,8 @@ class RawRows:
     # Joint column -> (another one, 1 or -1), as the controller of this file counts
     coupling: Mapping[str, tuple[str, Literal[1, -1]]] = field(default_factory=dict)
     maker: str = ''  # Of the controller; '' where it is not known
+    # Kind of the instrument that measured the points; '' where it is not known
+    instrument: Literal['', SensorKind] = ''
     effort: FloatArray | None = None  # Measured torques, N m, (n, k); None where there are none
 
     def in_order(self) -> RawRows:
@@ -694,6 +696,8 @@ def _values(
         ),
         coupling=joints[0].coupling,
         maker=joints[0].maker,
+        # A controller's own file has points that were computed from its joints.
+        instrument=table.instrument or ('controller' if table.maker else ''),
         effort=None if effort is None else effort[row],
     )
 

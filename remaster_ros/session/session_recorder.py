@@ -141,6 +141,7 @@ def session_header(cell: Workcell, settle_s: float) -> Session:
         },
         oriented=frozenset(name for name, sensor in cell.sensors.items() if sensor.pose_topic),
         on_tool=frozenset(name for name, sensor in cell.sensors.items() if sensor.mounted_on),
+        sensor_kinds=cell.sensor_kinds,
         measurements=Measurements.empty(len(chain)),
         marker_std_m=cell.marker_std_m,
         settle_s=settle_s,

@@ -26,6 +26,7 @@ from remaster_ros.types import (
     Correction,
     Measurements,
     PadJoint,
+    SensorKind,
     Session,
 )
 
@@ -49,6 +50,7 @@ class _Sensor(msgspec.Struct):
     further_markers: tuple[str, ...] = ()
     orientation: bool = False
     mounted_on: Literal['', 'tool'] = ''
+    kind: Literal['', SensorKind] = ''
 
 
 class BaseFrame(msgspec.Struct):
@@ -120,6 +122,9 @@ class SessionHeader(msgspec.Struct):
                 if sensor.orientation or sensor.mounted_on
             ),
             on_tool=self.on_tool,
+            sensor_kinds={
+                name: sensor.kind for name, sensor in self.sensors.items() if sensor.kind
+            },
             measurements=measurements,
             marker_std_m=self.marker_std_m,
             settle_s=self.settle_s,
@@ -177,6 +182,7 @@ def write_header(session: Session, urdf_name: str, exit_status: str) -> str:
                 'further_markers': session.further_markers.get(name, ()),
                 'orientation': name in session.oriented,
                 'mounted_on': 'tool' if name in session.on_tool else '',
+                'kind': session.sensor_kinds.get(name, ''),
             }
             for name, marker in session.sensors.items()
         },
@@ -196,7 +202,7 @@ def write_header(session: Session, urdf_name: str, exit_status: str) -> str:
     header = _checked(to_plain(content), 'session to be written: ')
     given = {key: value for key, value in to_plain(header).items() if value not in ('', {}, None)}
     for sensor in given['sensors'].values():
-        for key in ('further_markers', 'orientation', 'mounted_on'):
+        for key in ('further_markers', 'orientation', 'mounted_on', 'kind'):
             if not sensor[key]:
                 del sensor[key]
     if controller := given.get('controller'):

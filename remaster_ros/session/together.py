@@ -86,6 +86,10 @@ def together(sessions: Sequence[tuple[str, Session]]) -> tuple[Session, list[str
                 **joined.base_prior,
                 **{names[one]: prior for one, prior in session.base_prior.items()},
             },
+            sensor_kinds={
+                **joined.sensor_kinds,
+                **{names[one]: kind for one, kind in session.sensor_kinds.items()},
+            },
             on_tool=joined.on_tool | {names[one] for one in session.on_tool},
             oriented=joined.oriented | {names[one] for one in session.oriented},
             # The less is known of any marker, the less is said of each.

@@ -36,7 +36,7 @@ from remaster_ros.planning.pose_settings import PoseSettings
 from remaster_ros.session.files import URDF_LIMIT, decode_text, read_limited
 from remaster_ros.session.meshes import mesh_reader
 from remaster_ros.session.yaml_records import YAML_LIMIT, read_yaml, with_line
-from remaster_ros.types import FARTHEST_M, FloatArray
+from remaster_ros.types import FARTHEST_M, FloatArray, SensorKind
 
 if TYPE_CHECKING:
     from remaster_ros.planning.planned_design import DesignSettings
@@ -65,6 +65,10 @@ NO_MOTION = (
 )  # fmt: skip
 """Keys that do not affect whether a motion is allowed."""
 CLEARANCE = Bounds(HALF_STEP_M, 1.0, 'm', remedy='; half the step of a path check is the least')
+
+
+KIND_OF_TOPIC: Mapping[str, SensorKind] = {'optitrack': 'camera', 'laser_tracker': 'tracker'}
+"""Kinds of the instruments that have a driver of this package, by their first word."""
 
 
 class CellSensor(msgspec.Struct, forbid_unknown_fields=True):
@@ -97,6 +101,8 @@ class CellSensor(msgspec.Struct, forbid_unknown_fields=True):
     # ``tool`` for a camera on the tool, which measures poses of a fixed board: `marker` is then
     # the camera's origin on the tool, `rough_position_m` the position of the board.
     mounted_on: Literal['', 'tool'] = ''
+    # What kind of instrument it is; '' where that is not known but by its topic.
+    kind: Literal['', 'camera', 'tracker'] = ''
     # No key of the file: topic of the foreign node, whose readings are published again on `topic`.
     source: str = ''
 
@@ -104,6 +110,12 @@ class CellSensor(msgspec.Struct, forbid_unknown_fields=True):
         """Set the topic on which readings of a foreign node are published again."""
         if self.message_type:
             self.source, self.topic = self.topic, f'{name}/marker'
+
+    @property
+    def known_kind(self) -> SensorKind | None:
+        """Kind of the instrument, also by the driver that publishes its topic; None if unknown."""
+        by_topic = KIND_OF_TOPIC.get(self.topic.lstrip('/').partition('/')[0])
+        return self.kind or by_topic or ('camera' if self.mounted_on else None)
 
     @property
     def markers(self) -> tuple[str, ...]:
@@ -257,6 +269,12 @@ class Workcell(msgspec.Struct, forbid_unknown_fields=True):
     # Path of the cell file; no plan depends on it.
     file: str = ''
 
+    @property
+    def sensor_kinds(self) -> dict[str, SensorKind]:
+        """Kinds of the sensors, where they are known."""
+        kinds = {name: sensor.known_kind for name, sensor in self.sensors.items()}
+        return {name: kind for name, kind in kinds.items() if kind}
+
     def chain(self) -> SerialChain:
         """Return the arm's kinematic chain."""
         ends = self.robot.base_link, self.robot.tip_link
@@ -266,6 +284,8 @@ class Workcell(msgspec.Struct, forbid_unknown_fields=True):
         """Return a checksum of everything that a plan depends on."""
         plain = msgspec.to_builtins(msgspec.structs.replace(self, file=''))
         del plain['confirm']
+        for sensor in plain['sensors'].values():
+            del sensor['kind']
         return hashlib.sha256(msgspec.json.encode(plain)).hexdigest()
 
     def model(self) -> ArmModel:

@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Literal
 
 import numpy as np
 
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.transforms import apply
-from remaster_ros.types import BoolArray, FloatArray, IntArray, Measurements
+from remaster_ros.types import BoolArray, FloatArray, IntArray, Measurements, SensorKind
 
 GRAVITY = (0.0, 0.0, -9.81)
 # A joint that moved less than this stays on the flank of its gears that it was on. One that slides
@@ -41,6 +42,8 @@ class Context:
     joint_offsets: FloatArray  # As fitted, rad, m of joints that slide, (k,)
     markers: FloatArray  # As fitted, in the tool frame, m, (markers, 3)
     T_R_N: FloatArray  # As fitted, (sensors, 4, 4)
+    # Of the sensors; '' where it is unknown, () where it is of none
+    sensor_kinds: tuple[Literal['', SensorKind], ...] = field(default=(), kw_only=True)
     timed: bool = field(default=True, kw_only=True)  # False where the rows' times only order them
 
     def __len__(self) -> int:
@@ -215,6 +218,7 @@ class Context:
             self,
             rows,
             timed=self.timed,
+            sensor_kinds=self.sensor_kinds,
         )
 
     def blocks(self, rows: int = BLOCK_ROWS) -> Iterator[tuple[slice, Context]]:
@@ -228,6 +232,15 @@ class Context:
         for start in range(0, len(self), rows):
             where = slice(start, min(start + rows, len(self)))
             yield where, self.at(np.arange(where.start, where.stop))
+
+    def sensors(self, *without: SensorKind) -> list[tuple[int, str]]:
+        """Return index and name of the sensors whose kind is none of these."""
+        kinds = self.sensor_kinds or ('',) * len(self.sensor_names)
+        return [
+            (index, name)
+            for index, (name, kind) in enumerate(zip(self.sensor_names, kinds, strict=True))
+            if kind not in without
+        ]
 
     def seen_by(self, sensor: int) -> BoolArray:
         """Return which rows a sensor measured, (n,)."""

@@ -15,7 +15,7 @@ from remaster_ros.types import FloatArray
 
 def cells(context: Context) -> Iterator[Cell]:
     """Each sensor's frame shifts steadily, or shifts and turns."""
-    for index, name in enumerate(context.sensor_names):
+    for index, name in context.sensors('controller'):
         mine = context.seen_by(index) & context.to_fit
         # The registration is that of the middle of the readings.
         middle = float(context.elapsed_s[mine].mean()) if mine.any() else 0.0

@@ -24,8 +24,8 @@ VARIANTS = (
 
 
 def cells(context: Context) -> Iterator[Cell]:
-    """Each sensor: radial about its z axis, in metres or in field angle, or about its origin."""
-    for index, name in enumerate(context.sensor_names):
+    """Each sensor that may have lenses: radial about its z axis, or about its origin."""
+    for index, name in context.sensors('tracker', 'controller'):
         for variant, form, unit, axes in VARIANTS:
             kind = variant.replace(' ', '_')
             rarity = SPHERE_RARITY if variant == 'radial sphere' else 1
@@ -74,7 +74,9 @@ EFFECT = Effect(
     plausible=(1e-5, 1e-1),
     sentence='{subject} distorts towards the edge of its view (lens calibration).',
     separate_by='poses towards the edges of the sensor view, or the sensor moved and turned',
-    remedy='Calibrate the lenses of the sensor again, and measure in the middle of its view.',
+    remedy='Calibrate the lenses of the sensor again, and measure in the middle of its view. '
+    'If it has none (a laser tracker, points that the controller computed), state its kind in '
+    'session.yaml and search again.',
     size=up_to('{subject} errs'),
     cells=cells,
 )

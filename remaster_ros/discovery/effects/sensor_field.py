@@ -35,7 +35,7 @@ JITTER = 1e-6
 
 def cells(context: Context) -> Iterator[Cell]:
     """Each sensor, with a long and with a short length, and along the line of sight."""
-    for index, name in enumerate(context.sensor_names):
+    for index, name in context.sensors('controller'):
         mine = context.seen_by(index)
         poses = len(np.unique(context.measurements.pose[mine]))
         count = min(MOST_CENTERS, int(poses / POSES_PER_CENTER))

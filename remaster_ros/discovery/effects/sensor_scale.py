@@ -16,12 +16,16 @@ from remaster_ros.types import FloatArray
 def cells(context: Context) -> Iterator[Cell]:
     """Each sensor: one scale, one along its z axis (depth), or one per axis."""
     x, y, z = np.eye(3)
-    for index, name in enumerate(context.sensor_names):
+    with_lens = context.sensors('tracker', 'controller')
+    for index, name in context.sensors('controller'):
         for variant, directions, parameters in (
             ('', [x + y + z], [f'scale_{name}']),
             ('depth', [z], [f'scale_z_{name}']),
             ('by axis', [x, y, z], [f'scale_{axis}_{name}' for axis in 'xyz']),
         ):
+            # Each direction of a tracker has the same measure: the wavelength of its laser.
+            if variant and (index, name) not in with_lens:
+                continue
             yield EFFECT.cell(
                 partial(_stretched, sensor=index, directions=directions),
                 parameters,

@@ -35,7 +35,7 @@ RARITY = 3
 
 def cells(context: Context) -> Iterator[Cell]:
     """Each sensor, with a long, a middling and a short memory."""
-    for index, name in enumerate(context.sensor_names):
+    for index, name in context.sensors('controller'):
         mine = context.seen_by(index)
         if np.sum(mine) < FEWEST_READINGS:
             continue

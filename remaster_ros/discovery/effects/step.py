@@ -60,9 +60,9 @@ def between(context: Context, low: float, high: float) -> Iterator[Cell]:
 
 def _in(context: Context, gaps: FloatArray) -> Iterator[Cell]:
     """Zero-offsets; markers; sensors, which shift or also turn; the base where several see it."""
-    sensors: list[tuple[int, ...]] = [(index,) for index in range(len(context.sensor_names))]
+    sensors: list[tuple[int, ...]] = [(index,) for index, _ in context.sensors('controller')]
     if len(sensors) > 1:
-        sensors.append(tuple(range(len(sensors))))
+        sensors.append(tuple(index for (index,) in sensors))
     places = context.joints + len(context.marker_names) + 2 * len(sensors)
     for gap in gaps:
         moment = float(gap.mean())

@@ -284,12 +284,15 @@ def _frames(context: Context) -> Iterator[Cell]:
             unit='m',
             subject=marker,
         )
-    for index, sensor in enumerate(context.sensor_names):
+    with_lens = context.sensors('tracker', 'controller')
+    for index, sensor in context.sensors('controller'):
         axes = [f'{sensor}_{axis}' for axis in 'xyz']
         for form in _sensor_forms(context, index):
             columns = partial(_shifted, turn=partial(_sensor_turn, sensor=index), form=form)
             yield _cell('sensor_frame', form, axes, 'm', columns, subject=sensor)
         for name, power, unit in (('constant', 0, 'm'), ('quadratic', 2, '1/m')):
+            if power and (index, sensor) not in with_lens:
+                continue
             yield EFFECT.cell(
                 partial(_line_of_sight, sensor=index, power=power),
                 [f'range_{name}_{sensor}'],

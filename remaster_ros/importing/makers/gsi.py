@@ -48,6 +48,7 @@ def read(text: str) -> Named | None:
     left = len(lines) - len(rows)
     return Named(
         kind="points in Leica's GSI, mm",
+        instrument='tracker',
         names=('name', *(f'{axis} [mm]' for axis in 'XYZ')),
         rows=tuple(rows),
         lines=tuple(at),

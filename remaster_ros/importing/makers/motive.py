@@ -152,6 +152,7 @@ def read(text: str) -> Named | None:
     )
     return Named(
         kind=f'a take of Motive ({version}){", " if unit else ""}{unit}',
+        instrument='camera',
         names=tuple(names),
         notes=notes,
         rows=tuple(table),

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from remaster_ros.errors import InputError
+from remaster_ros.types import SensorKind
 
 SHOWN = 60
 NUMBER = re.compile(r'[+-]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][+-]?\d+)?', re.ASCII)
@@ -40,6 +41,8 @@ class Named:
     coupling: Mapping[str, tuple[str, Literal[1, -1]]] = field(default_factory=dict)
     # Of the controller; '' where it is not known.
     maker: str = ''
+    # Kind of the instrument that measured the points; '' where it is not known.
+    instrument: Literal['', SensorKind] = ''
     # What was left out of the file, a sentence each.
     notes: tuple[str, ...] = ()
     has_header: bool = True  # The names stand in the file

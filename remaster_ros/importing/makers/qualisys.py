@@ -83,6 +83,7 @@ def read(text: str) -> Named | None:
         at_lines.append(number)
     return Named(
         kind=f'a capture of Qualisys ({"6D" if bodies else "3D"})',
+        instrument='camera',
         names=tuple(labels),
         rows=tuple(rows),
         lines=tuple(at_lines),

@@ -91,6 +91,7 @@ def read(text: str) -> Named | None:
         notes += ('angles left out, as it is not written how they turn: export quaternions',)
     return Named(
         kind=f'a capture of Vicon ({chosen}), {rate[0].strip()} frames per second',
+        instrument='camera',
         names=tuple(labels),
         rows=tuple(table),
         lines=tuple(at),

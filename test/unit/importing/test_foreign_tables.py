@@ -155,3 +155,21 @@ def test_json_has_the_columns_and_the_hint(arm, imported, tmp_path):
     (out, _), session = imported(arm.urdf, path, '--json', '--unchecked')
     assert json.loads(out)['session'] is not None
     np.testing.assert_allclose(session.measurements.q, reversed_, atol=1e-8)
+
+
+@pytest.mark.parametrize(
+    ('options', 'kinds'),
+    [
+        ((), {}),
+        (('--sensor', 'camera'), {'camera': 'camera'}),
+        (('--sensor', 'leica_at960'), {'leica_at960': 'tracker'}),
+        (('--sensor', 'tracker', '--sensor-kind', 'controller'), {'tracker': 'controller'}),
+        (('--sensor-kind', 'tracker'), {'sensor': 'tracker'}),
+    ],
+)
+def test_what_measured_is_known_by_its_name_or_is_said(arm, imported, tmp_path, options, kinds):
+    """A lens is looked for only where there may be one."""
+    header = ['A1', 'A2', 'A3', 'A4', 'A5', 'A6', 'X', 'Y', 'Z']
+    own = write(tmp_path, 'own.csv', text(header, [*np.rad2deg(arm.q).T, *(1e3 * arm.points).T]))
+    _, session = imported(arm.urdf, own, *options)
+    assert session.sensor_kinds == kinds
