@@ -207,7 +207,7 @@ def import_table(
     """
     from remaster_ros.importing import in_python
     from remaster_ros.importing.assemble import SessionOptions
-    from remaster_ros.importing.columns import Told
+    from remaster_ros.importing.columns import ColumnChoice
     from remaster_ros.importing.rows import TableOptions
     from remaster_ros.session.robot_description import read_arm
 
@@ -215,7 +215,7 @@ def import_table(
         TableOptions(
             angles=angles,
             length=length,
-            told=Told(tuple(joints), tuple(points), time, names),
+            chosen=ColumnChoice(tuple(joints), tuple(points), time, names),
             join=join,
             clock_offset_s=clock_offset_s,
             pulses_per_degree=tuple(pulses_per_degree),

@@ -18,7 +18,7 @@ from remaster_ros.cli.options import names, number
 from remaster_ros.compensation.compensator import ROUNDING_RAD, Compensator, Correction
 from remaster_ros.compensation.file import read_compensation
 from remaster_ros.errors import InputError
-from remaster_ros.importing.columns import Columns, Told, find_columns
+from remaster_ros.importing.columns import ColumnChoice, Columns, find_columns
 from remaster_ros.importing.text_table import TextTable, read_table
 from remaster_ros.importing.units import ANGLES
 from remaster_ros.importing.values import joint_values, numbers, times
@@ -79,7 +79,7 @@ def run(args: argparse.Namespace) -> int:
     table = read_table(args.table)
     chain = compensation.model.chain
     sliding = np.flatnonzero(chain.slides).tolist()
-    columns = find_columns(table, chain.joint_names, Told(joints=args.joints), sliding)
+    columns = find_columns(table, chain.joint_names, ColumnChoice(joints=args.joints), sliding)
     if len(columns.joints) != len(chain):
         raise InputError(
             f'{args.table}: {len(columns.joints)} columns are joint angles, but the arm of '
@@ -122,7 +122,7 @@ def _shown(chain: SerialChain, joint: int, value: float, digits: int = 2) -> str
 
 def _temperature(table: TextTable, columns: Columns, stated: float | None) -> FloatArray | None:
     """Return the temperature of each row, degrees Celsius; None if unknown."""
-    column = columns.one('temperature')
+    column = columns.first_of_kind('temperature')
     if stated is not None:
         return np.full(len(table.rows), stated)
     return None if column is None else numbers(table, (column,))[:, 0]

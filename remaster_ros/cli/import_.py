@@ -19,17 +19,17 @@ from remaster_ros.cli.options import add_description, names, number, xacro_argum
 from remaster_ros.errors import InputError, InsufficientDataError, MistakeFoundError
 from remaster_ros.importing.assemble import (
     SessionOptions,
-    as_counted,
     assemble,
     refuse_outside_limits,
+    with_controller_coupling,
     without_whole_turns,
 )
 from remaster_ros.importing.bags import is_bag, read_bag
-from remaster_ros.importing.columns import Told
+from remaster_ros.importing.columns import ColumnChoice
 from remaster_ros.importing.rows import RawRows, TableOptions, from_tool, read_rows
 from remaster_ros.importing.sense import Sense, check_sense
-from remaster_ros.importing.sessions import Stretch, arrangement_of, mended
-from remaster_ros.importing.turns import oriented
+from remaster_ros.importing.sessions import Stretch, arrangement_of, corrected_session
+from remaster_ros.importing.turns import with_orientation
 from remaster_ros.importing.units import ANGLES, LENGTHS
 from remaster_ros.kinematics.pad_angles import pad_in_words
 from remaster_ros.kinematics.serial_chain import SerialChain
@@ -318,10 +318,10 @@ def run(args: argparse.Namespace) -> int:
     with progress_bar(args.quiet or args.json) as progress:
         progress('reading', 0.0)
         options = _session_options(args, cell)
-        rows = oriented(_read(args, urdf, chain).in_order(), chain, options)
+        rows = with_orientation(_read(args, urdf, chain).in_order(), chain, options)
         if args.on_tool:
             rows = from_tool(rows)
-        options, counted = as_counted(rows, chain, options)
+        options, counted = with_controller_coupling(rows, chain, options)
         notes = f'imported from {", ".join(path.name for path in args.files)}'
         rng = np.random.default_rng(args.seed)
         session, how = assemble(rows, urdf, chain, options, rng, notes)
@@ -333,7 +333,7 @@ def run(args: argparse.Namespace) -> int:
             exchange=args.exchange_markers,
             turn=args.turn_tool,
         )
-        session = mended(session, arrangement)
+        session = corrected_session(session, arrangement)
         session = replace(session, accuracy_option=args.accuracy_option)
         sense = check_sense(session, rows, progress, args.never_mastered)
     session, turned = without_whole_turns(session, chain)
@@ -390,7 +390,7 @@ def _mend(args: argparse.Namespace) -> int:
     )
     with progress_bar(args.quiet or args.json) as progress:
         progress('trying', 0.0)
-        session = mended(session, arrangement)
+        session = corrected_session(session, arrangement)
         if args.accuracy_option:
             session = replace(session, accuracy_option=args.accuracy_option)
         if not args.unchecked:
@@ -436,7 +436,7 @@ def _read(args: argparse.Namespace, urdf: str, chain: SerialChain) -> RawRows:
             encoding=args.encoding,
             angles=args.angles,
             length=args.length,
-            told=Told(args.joints, args.points, args.time, args.names),
+            chosen=ColumnChoice(args.joints, args.points, args.time, args.names),
             join=args.join,
             within_s=args.within,
             clock_offset_s=args.clock_offset,

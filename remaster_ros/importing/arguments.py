@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the options of ``remaster import`` are called in Python, in sentences and as remedies."""
+"""Names of the options of ``remaster import`` as arguments of functions, in messages."""
 
 from __future__ import annotations
 
@@ -29,19 +29,19 @@ _NAMES = {
 _LISTS = ('--joints', '--points', '--reverse', '--sheet', '--pulses-per-degree')
 _MAPPINGS = ('--couple', '--offset')
 _OPTION = re.compile(r'--[a-z]+(?:-[a-z]+)*')
-# What stands behind an option in a sentence as its value.
+# An option with its value in a sentence.
 _VALUE = re.compile(
     r'(--join|--angles|--length|--time) (name|time|order|deg|rad|gon|mm|cm|m|none)\b'
 )
-# Of a function that joins data frames.
+# Remedy for a function that joins data frames.
 _BY_ORDER = 'take the index off both (reset_index(drop=True))'
 _LEFT_OUT = '; to write it as it is, add --unchecked'
 
 
 def in_python(sentence: str, arguments: Collection[str]) -> str:
-    """Return a sentence that names options with the arguments of a function in their place.
+    """Sentence with arguments of a function in place of options of the command.
 
-    What the function has no argument for is that of the command.
+    `arguments` are those that the function has; other options are written as the command's.
     """
     if 'join' not in arguments:
         sentence = sentence.replace('say --join order', _BY_ORDER)
@@ -58,7 +58,7 @@ def in_python(sentence: str, arguments: Collection[str]) -> str:
 
 
 def remedy(options: str, arguments: Collection[str]) -> str:
-    """Return options with their values, as `sense` proposes them, as arguments; '' of none."""
+    """Options proposed by `sense`, with their values, as arguments of a function; '' if none."""
     words = shlex.split(options)
     found: dict[str, list[str]] = {}
     for word in words:

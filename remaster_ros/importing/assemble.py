@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From rows to a session: poses by equal goals, a fair choice of what is held out, one order."""
+"""Session from rows: poses by equal tool poses, held-out poses, configurations in one order."""
 
 from __future__ import annotations
 
@@ -32,11 +32,11 @@ from remaster_ros.types import (
     Session,
 )
 
-# Tool poses that are equal but for the rounding of the robot's report and for the difference
-# between its controller's kinematics and the nominal ones.
+# Tool poses closer than this are one pose: it covers the rounding of the robot's report and the
+# difference between its controller's kinematics and the nominal ones.
 SAME_POSE_M = 2e-3
 SAME_POSE_RAD = 5e-3
-# One of so many poses, in the order measured, is held out.
+# One of this number of poses, in the order measured, is held out.
 HOLD_OUT_ONE_OF = 4
 # Fewer poses are all needed for the fit.
 FEWEST_POSES = 12
@@ -58,22 +58,22 @@ _WORDS_OF_KINDS: dict[SensorKind, re.Pattern[str]] = {
 
 @dataclass(frozen=True)
 class SessionOptions:
-    """What the user said of the session."""
+    """Options of the command that concern the session."""
 
-    # Corrections of the joints by column, in this order: another joint that is added, with its
-    # sign; signs that are reversed; angles added, degrees
+    # Corrections by joint column, applied in this order: coupled joint with its sign; columns
+    # whose sign is reversed; angles added, degrees
     couple: tuple[tuple[str, tuple[str, Literal[1, -1]]], ...] = ()
     reverse: tuple[str, ...] = ()
     add_deg: tuple[tuple[str, float], ...] = ()
     sensor: str = 'sensor'
     marker: str = 'marker'
-    # Where the marker is in the tool frame, m; None where nothing is known
+    # Position of the marker in the tool frame, m; None if unknown
     marker_m: tuple[float, float, float] | None = None
     marker_std_m: float | None = None
-    # Share of the poses that is held out where the table names none
+    # Share of the poses that is held out if the table states no split
     hold_out: float = 1.0 / HOLD_OUT_ONE_OF
-    visited_in_order: bool = False  # Each row's configuration was reached from that before
-    on_tool: bool = False  # The sensor is, and measures the pose of what stands
+    visited_in_order: bool = False  # Each configuration was reached from the previous row's
+    on_tool: bool = False  # The sensor is on the tool and measures the pose of a fixed target
     sensor_kind: Literal['', SensorKind] = ''
 
     @classmethod
@@ -84,7 +84,7 @@ class SessionOptions:
         offset_deg: Mapping[str, float] | None,
         sensor_kind: Literal['', SensorKind] = '',
     ) -> SessionOptions:
-        """Return corrections of the joints as Python's functions take them."""
+        """Options with the joint corrections in the form of the Python functions' arguments."""
         added: dict[str, tuple[str, Literal[1, -1]]] = {
             name: (other.lstrip('+-'), -1 if other[:1] == '-' else 1)
             for name, other in (couple or {}).items()
@@ -98,9 +98,10 @@ class SessionOptions:
 
 
 def controller_of(rows: RawRows, chain: SerialChain, options: SessionOptions) -> Controller | None:
-    """Return how the controller writes the joints, by the table's columns and what was told.
+    """How the controller counts the joints, by the table's columns and the user's corrections.
 
-    None where that is known to be as the URDF has them, as in a bag without corrections.
+    None if it counts them as the URDF does, as in a bag without corrections. Raises InputError if
+    corrections are given for an arm with a prismatic joint.
     """
     told = options.couple or options.reverse or options.add_deg
     if chain.slides.any():
@@ -120,14 +121,14 @@ def controller_of(rows: RawRows, chain: SerialChain, options: SessionOptions) ->
     names = [own if name.isdigit() else name for name, own in zip(names, chain.joint_names)]
     pads = [PadJoint(name, unit) for name in names]
     for name, (other, sign) in options.couple:
-        added = chain.joint_names[_joint(other, rows, chain, '--couple')]
-        i = _joint(name, rows, chain, '--couple')
+        added = chain.joint_names[_joint_index(other, rows, chain, '--couple')]
+        i = _joint_index(name, rows, chain, '--couple')
         pads[i] = replace(pads[i], coupling={**pads[i].coupling, added: sign})
     for name in options.reverse:
-        i = _joint(name, rows, chain, '--reverse')
+        i = _joint_index(name, rows, chain, '--reverse')
         pads[i] = replace(pads[i], sign=1 if pads[i].sign < 0 else -1)
     for name, angle in options.add_deg:
-        i = _joint(name, rows, chain, '--offset')
+        i = _joint_index(name, rows, chain, '--offset')
         pads[i] = replace(pads[i], zero_deg=pads[i].zero_deg + angle)
     joints = dict(zip(chain.joint_names, pads, strict=True))
     if joint := coupled_in_circle({name: pad.coupling for name, pad in joints.items()}):
@@ -137,7 +138,11 @@ def controller_of(rows: RawRows, chain: SerialChain, options: SessionOptions) ->
     return Controller(joints, rows.maker)
 
 
-def _joint(name: str, rows: RawRows, chain: SerialChain, option: str) -> int:
+def _joint_index(name: str, rows: RawRows, chain: SerialChain, option: str) -> int:
+    """Index of a joint by the name of its column or in the URDF.
+
+    Raises InputError if there is none.
+    """
     for names in (rows.joint_columns, chain.joint_names):
         folded = [known.casefold() for known in names]
         matching = [i for i, known in enumerate(folded) if known == name.casefold()]
@@ -158,7 +163,7 @@ def assemble(
     rng: np.random.Generator,
     notes: str,
 ) -> tuple[Session, list[str]]:
-    """Return the session, and how poses were found and held out, a sentence each.
+    """Session from rows, and sentences on how poses were found and held out.
 
     Raises
     ------
@@ -172,8 +177,8 @@ def assemble(
     pose, how_pose = _poses(rows, chain, q)
     configuration = _configurations(rows, pose, q)
     validation, how_split = _splits(rows, pose, options.hold_out, rng)
-    sensor, sensors = _numbered(rows.labels.get('sensor', [options.sensor] * n))
-    marker, markers = _numbered(rows.labels.get('marker', [options.marker] * n))
+    sensor, sensors = _indices_of_names(rows.labels.get('sensor', [options.sensor] * n))
+    marker, markers = _indices_of_names(rows.labels.get('marker', [options.marker] * n))
     from_q = pad.to_urdf(rows.from_q)
     effort = rows.effort
     if effort is not None:
@@ -182,7 +187,7 @@ def assemble(
         turned = pad.to_urdf(shown)
         effort = np.linalg.solve(turned[1:] - turned[0], effort.T).T
     if options.visited_in_order:
-        from_q = _visited(configuration, q)
+        from_q = _previous_configuration(configuration, q)
     measurements = Measurements(
         observation=np.arange(n),
         pose=pose,
@@ -219,7 +224,7 @@ def assemble(
         settle_s=None,
         timed=rows.stamp_s is not None,
         exit_status='complete',
-        created=_date(rows),
+        created=_measurement_date(rows),
         notes=notes,
         controller=controller,
         sensor_kinds=_kinds(sensors, rows, options),
@@ -244,12 +249,15 @@ def _kinds(
     return kinds
 
 
-def as_counted(
+def with_controller_coupling(
     rows: RawRows, chain: SerialChain, options: SessionOptions
 ) -> tuple[SessionOptions, list[str]]:
-    """Return the options with what the file's controller couples, and the sentence on it.
+    """Options with the joint coupling of the file's controller, and the sentence on it.
 
-    A description may have the coupling already: then the points fit without it.
+    If it fits.
+
+    The URDF may contain the coupling already: the options stay as they are if the points then fit
+    better without it.
     """
     coupling = tuple(rows.coupling.items())
     if options.couple or not coupling or chain.slides.any():
@@ -267,7 +275,10 @@ def as_counted(
 
 
 def without_whole_turns(session: Session, chain: SerialChain) -> tuple[Session, str]:
-    """Return the session with its angles within the limits, and which were turned, '' for none."""
+    """Session with angles shifted by whole turns into the limits.
+
+    And the sentence on it ('' if none).
+    """
     m = session.measurements
     q = chain.within_turns(m.q)
     if np.array_equal(q, m.q):
@@ -283,20 +294,17 @@ def without_whole_turns(session: Session, chain: SerialChain) -> tuple[Session, 
     )
 
 
-def _date(rows: RawRows) -> str:
-    """Return when the first row was measured, ISO 8601; '' where the times are not since 1970."""
+def _measurement_date(rows: RawRows) -> str:
+    """Date of the first row, ISO 8601; '' if the times do not count from 1970."""
     if rows.stamp_s is None or rows.stamp_s[0] < FIRST_DATE_S:
         return ''
     return datetime.fromtimestamp(float(rows.stamp_s[0])).isoformat(timespec='seconds')
 
 
 def refuse_outside_limits(rows: RawRows, chain: SerialChain, q: FloatArray) -> None:
-    """Refuse joint angles outside the URDF's limits, naming the row of the table.
+    """Raise InputError, naming the row of the table.
 
-    Raises
-    ------
-    InputError
-        One line for the first such row.
+    If a joint angle is outside the URDF's limits.
     """
     allowed = chain.limit_tolerance
     outside = (q < chain.lower - allowed) | (q > chain.upper + allowed)
@@ -304,14 +312,14 @@ def refuse_outside_limits(rows: RawRows, chain: SerialChain, q: FloatArray) -> N
         count = int(outside[:, joint].sum())
         if chain.slides[joint]:
             raise InputError(
-                f'{rows.where[row]}, column {rows.joint_columns[joint]}: '
+                f'{rows.source[row]}, column {rows.joint_columns[joint]}: '
                 f'{1e3 * q[row, joint]:.2f} mm is outside the limits of '
                 f'{chain.joint_names[joint]} ({1e3 * chain.lower[joint]:.1f} to '
                 f'{1e3 * chain.upper[joint]:.1f} mm), as {count} of {len(q)} rows are; are its '
                 'unit (in the header, such as [mm]) and the URDF right?'
             )
         raise InputError(
-            f'{rows.where[row]}, column {rows.joint_columns[joint]}: '
+            f'{rows.source[row]}, column {rows.joint_columns[joint]}: '
             f'{np.degrees(q[row, joint]):.3f} degrees is outside the limits of '
             f'{chain.joint_names[joint]} ({np.degrees(chain.lower[joint]):.1f} to '
             f'{np.degrees(chain.upper[joint]):.1f} degrees), as {count} of {len(q)} rows are; are '
@@ -320,9 +328,9 @@ def refuse_outside_limits(rows: RawRows, chain: SerialChain, q: FloatArray) -> N
 
 
 def _poses(rows: RawRows, chain: SerialChain, q: FloatArray) -> tuple[IntArray, str]:
-    """Return the pose of each row, (n,), and how it was found."""
+    """Pose index of each row, (n,), and a sentence on how poses were found."""
     if 'pose' in rows.labels:
-        pose, names = _numbered(rows.labels['pose'])
+        pose, names = _indices_of_names(rows.labels['pose'])
         return pose, f'{counted(len(names), "pose")}, as the table numbers them'
     T = chain.forward(q)
     # A rotation by a small angle a moves the columns of its matrix by a * sqrt(2) in all.
@@ -349,9 +357,9 @@ def _frames(
     marker: IntArray,
     configuration: IntArray,
 ) -> IntArray | None:
-    """Return the frame of each row, (n,): different markers that a sensor had at one moment.
+    """Frame index of each row, (n,): rows of one frame are markers seen by a sensor at one moment.
 
-    -1 for a row by itself; None where all are, or the times are not known.
+    -1 for a row that is alone in its frame; None if all are, or if times are unknown.
     """
     if moment is None:
         return None
@@ -363,7 +371,7 @@ def _frames(
 
 
 def _configurations(rows: RawRows, pose: IntArray, q: FloatArray) -> IntArray:
-    """Return the configuration of each row: as labelled, else equal joints and no move between."""
+    """Configuration index of each row: by label, else runs of equal joints and pose."""
     if 'configuration' in rows.labels:
         labels = list(zip(pose.tolist(), rows.labels['configuration'], strict=True))
         index: dict[tuple[int, str], int] = {}
@@ -375,30 +383,30 @@ def _configurations(rows: RawRows, pose: IntArray, q: FloatArray) -> IntArray:
     for names in seen:
         if names is not None:
             again &= np.array(names[1:]) == np.array(names[:-1])
-    # The same marker by the same sensor again is another visit, or another shot of it.
+    # A second row of one marker and sensor is another visit, or another shot.
     return np.concatenate(([0], np.cumsum(moved | again)))
 
 
 def _splits(
     rows: RawRows, pose: IntArray, share: float, rng: np.random.Generator
 ) -> tuple[BoolArray, str]:
-    """Return which rows are held out, (n,), and how they were chosen."""
+    """Mask of the held-out rows, (n,), and a sentence on how they were chosen."""
     if 'split' in rows.labels:
         given = [_SPLITS.get(text.strip().lower(), -1) for text in rows.labels['split']]
         for row, split in enumerate(given):
             if split < 0:
                 raise InputError(
-                    f'{rows.where[row]}, column split: {rows.labels["split"][row]!r} is neither '
+                    f'{rows.source[row]}, column split: {rows.labels["split"][row]!r} is neither '
                     'optimization nor validation; correct it'
                 )
         splits = np.array(given)
-        for one in np.unique(pose):
-            mine = np.flatnonzero(pose == one)
-            if len(np.unique(splits[mine])) > 1:
-                other = mine[splits[mine] != splits[mine[0]]][0]
+        for pose_index in np.unique(pose):
+            pose_rows = np.flatnonzero(pose == pose_index)
+            if len(np.unique(splits[pose_rows])) > 1:
+                other = pose_rows[splits[pose_rows] != splits[pose_rows[0]]][0]
                 raise InputError(
-                    f'{rows.where[other]}: another split than {rows.where[mine[0]]}, which has '
-                    'the same pose; give a pose one split'
+                    f'{rows.source[other]}: another split than {rows.source[pose_rows[0]]}, which '
+                    'has the same pose; give a pose one split'
                 )
         return splits == 1, f'{counted(int(splits.sum()), "row")} held out, as the table has them'
     poses, first = np.unique(pose, return_index=True)
@@ -411,16 +419,16 @@ def _splits(
         )
     # One of each run of poses: the held-out ones meet all of the session, and so does any drift.
     runs = np.array_split(order, max(1, round(share * len(order))))
-    held = [rng.choice(run) for run in runs]
+    held_out = [rng.choice(run) for run in runs]
     sizes = sorted({len(run) for run in runs})
-    return np.isin(pose, held), (
-        f'{len(held)} of {len(order)} poses held out: one, drawn at random, of every '
+    return np.isin(pose, held_out), (
+        f'{len(held_out)} of {len(order)} poses held out: one, drawn at random, of every '
         f'{" or ".join(map(str, sizes))} in the order measured'
     )
 
 
-def _visited(configuration: IntArray, q: FloatArray) -> FloatArray:
-    """Return where the arm came from: the configuration before, (n, k)."""
+def _previous_configuration(configuration: IntArray, q: FloatArray) -> FloatArray:
+    """Joints of the configuration before, (n, k); NaN for the first."""
     from_q = np.full_like(q, np.nan)
     first = np.flatnonzero(np.diff(configuration, prepend=configuration[0]) != 0)
     for start, end in zip(first, [*first[1:], len(q)]):
@@ -428,7 +436,7 @@ def _visited(configuration: IntArray, q: FloatArray) -> FloatArray:
     return from_q
 
 
-def _numbered(names: Sequence[str]) -> tuple[IntArray, list[str]]:
-    """Return the index of each name in the order of their first, and the names."""
+def _indices_of_names(names: Sequence[str]) -> tuple[IntArray, list[str]]:
+    """Index of each name in the order of first occurrence, (n,), and the different names."""
     index: dict[str, int] = {}
     return np.array([index.setdefault(name, len(index)) for name in names]), list(index)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rows from a ROS bag: joint states, and the points measured while the arm stood still."""
+"""Rows from a ROS bag: joint states, and points measured while the arm stood still."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from remaster_ros.session.observations import LENGTH_TOLERANCE
 from remaster_ros.types import FARTHEST_M, FloatArray
 
 JOINT_STATE = 'sensor_msgs/msg/JointState'
-# What holds a point or a pose, the likeliest first, and where in the message it is.
+# Message types with one point or pose, the likeliest first, and the field that has it.
 PLACES = {
     'geometry_msgs/msg/PointStamped': 'point',
     'geometry_msgs/msg/PoseStamped': 'pose',
@@ -40,20 +40,20 @@ PLACES = {
     'geometry_msgs/msg/PoseWithCovarianceStamped': 'pose.pose',
     'nav_msgs/msg/Odometry': 'pose.pose',
 }
-# Of messages with several places, the likeliest first: the field with them.
+# Message types with several places, the likeliest first, and the field that lists them.
 SEVERAL = {
     'mocap4r2_msgs/msg/RigidBodies': 'rigidbodies',
     'mocap4r2_msgs/msg/Markers': 'markers',
     'tf2_msgs/msg/TFMessage': 'transforms',
 }
 _KINDS = (*PLACES, *SEVERAL)
-# Hundreds of turns; an arm has some at most.
+# Largest plausible joint angle, rad: hundreds of turns, of which an arm has a few at most.
 LARGEST_RAD = 1e4
 SUFFIXES = ('.mcap', '.db3', '.bag')
 
 
 def is_bag(path: Path) -> bool:
-    """Return whether a path is a bag: a file of one, or a folder that holds one."""
+    """Whether a path is a bag: a file of one, or a folder that holds one."""
     if path.is_dir():
         return (path / 'metadata.yaml').exists() or any(
             any(path.glob(f'*{suffix}')) for suffix in SUFFIXES
@@ -63,20 +63,20 @@ def is_bag(path: Path) -> bool:
 
 @dataclass(eq=False)
 class _Topic:
-    """Stamps and values of one topic."""
+    """Stamps and values of the messages of one topic."""
 
     stamps: list[float] = field(default_factory=list)
     values: list[Any] = field(default_factory=list)
 
     def stream(self, scale: float = 1.0) -> Stream:
-        """Return them in the order of their stamps, the first three columns times a scale."""
+        """Values in the order of their stamps, the first three columns times a scale."""
         values = np.array(self.values, dtype=float)
         values[:, :3] *= scale
         return Stream.of(np.array(self.stamps), values)
 
 
 def _place(message: Any, where: str) -> tuple[float, ...]:
-    """Return x, y and z, and of a pose its quaternion x, y, z, w; NaN where that is none."""
+    """Position x, y, z and, for a pose, quaternion x, y, z, w; NaN if its length is not 1."""
     for name in where.split('.'):
         message = getattr(message, name)
     place = getattr(message, 'position', getattr(message, 'translation', message))
@@ -91,7 +91,7 @@ def _place(message: Any, where: str) -> tuple[float, ...]:
 
 
 def _places(topic: str, kind: str, message: Any) -> Iterator[tuple[str, Any, tuple[float, ...]]]:
-    """Give the name, the header and the place, as `_place`, of each place in a message."""
+    """Yield name, header and place, as `_place`, of each place in a message."""
     if kind in PLACES:
         yield topic, message.header, _place(message, PLACES[kind])
         return
@@ -114,18 +114,18 @@ def read_bag(
     clock_offset_s: float | None = None,
     links: Container[str] = (),
 ) -> RawRows:
-    """Read a bag; each topic of points is a sensor, or what a message of several names.
+    """Read a bag; each topic of points, or each name in a message of several, is a sensor.
 
     Parameters
     ----------
     joint_topics, point_topics
-        As told; () for all that fit.
+        Topics that the user named; () for all that fit.
     length
-        Unit of the points where it is not the metre of ROS.
+        Unit of the points if it is not the metre of ROS; '' for the metre.
     clock_offset_s
-        What is added to the stamps of the points to have the joints'; None to find it.
+        Offset added to the stamps of the points to have those of the joints; None to find it.
     links
-        Of the robot: where these are the robot believes, and no sensor has measured.
+        Links of the robot, whose transforms the robot computes and no sensor measures.
 
     Raises
     ------
@@ -194,9 +194,9 @@ def read_bag(
 def _require_sensible(
     path: Path, joints: _Topic, points: Mapping[str, _Topic], scale: float
 ) -> None:
-    """Refuse angles and points without sense, before anything is computed of them.
+    """Raise InputError for angles or points too large to be real, before anything is computed.
 
-    A NaN for what was not seen is none of them.
+    NaN, for a point that was not seen, is allowed.
     """
     angles = np.array(joints.values, dtype=float)
     if np.any(np.abs(angles) > LARGEST_RAD):
@@ -214,11 +214,15 @@ def _require_sensible(
 
 
 def _stamp(header: Any, log_s: float) -> float:
+    """Stamp of a header, s; the time of recording if the header has none."""
     return float(header.stamp.sec + 1e-9 * header.stamp.nanosec or log_s)
 
 
 def _messages(path: Path, seen: dict[str, str]) -> Iterator[tuple[str, str, Any, float]]:
-    """Give the joint states and points of a bag of any kind; `seen` gets its topics."""
+    """Yield topic, type, message and time, s, of joint states and points.
+
+    Fill `seen` with topics.
+    """
     # Imported here: it takes a quarter of a second, which tables need not wait for.
     from rosbags.highlevel import AnyReader
 
@@ -251,12 +255,14 @@ def _messages(path: Path, seen: dict[str, str]) -> Iterator[tuple[str, str, Any,
 
 
 def _topics(seen: dict[str, str]) -> str:
+    """Topics with their types as text; 'no topics' if there are none."""
     return ', '.join(f'{topic} ({kind})' for topic, kind in sorted(seen.items())) or 'no topics'
 
 
 def _joint_topic(
     path: Path, joints: dict[str, _Topic], seen: dict[str, str], chain: SerialChain
 ) -> str:
+    """The only topic with the robot's joints. Raises InputError for none or several."""
     named = [topic for topic in joints if topic.endswith('joint_states')] or list(joints)
     if len(named) == 1:
         return named[0]
@@ -271,7 +277,7 @@ def _joint_topic(
 
 
 class _Rows:
-    """Rows as they are found; `joints` are the stream of `joint_topic`, rad."""
+    """Rows of the standstills in a bag; `joints` is the stream of `joint_topic`, rad."""
 
     def __init__(
         self,
@@ -289,7 +295,7 @@ class _Rows:
         self._matched: list[str] = []
 
     def add(self, topic: str, stream: Stream) -> None:
-        """Take the mean of the points of each standstill."""
+        """Add the mean point of each standstill in the stream of one topic."""
         still = self._still
         if not len(still) or not len(stream.stamps):
             return
@@ -318,7 +324,7 @@ class _Rows:
             self._rows.append((j, topic, place, std, len(kept), turn))
 
     def raw(self, topics: Sequence[str], length: str, seen: dict[str, str]) -> RawRows:
-        """Return the rows."""
+        """All rows, sorted by standstill. Raises InputError if no point was measured at one."""
         path, chain, joint_topic = self._path, self._chain, self._joint_topic
         if not self._rows:
             raise InputError(
@@ -342,7 +348,7 @@ class _Rows:
         unsteady = f'{self._unsteady} standstills with a marker that was not still were left out'
         dropped = f'{self._dropped} points far from all others of their standstill were left out'
         return RawRows(
-            where=tuple(f'{path}, {end:.3f} s' for end in ends),
+            source=tuple(f'{path}, {end:.3f} s' for end in ends),
             joint_columns=chain.joint_names,
             q=q,
             from_q=np.full((len(q), len(chain)), np.nan),

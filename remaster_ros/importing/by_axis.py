@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reports that have a row for each of X, Y and Z, as inspection programs write them: made wide."""
+"""Reports with a row for each of X, Y and Z, as inspection programs write them, made wide."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from remaster_ros.errors import InputError
 
 _AXES = ('X', 'Y', 'Z')
 _NAMED = re.compile(r'(.+?)[ ._:/-]+([XYZxyz])')
-# Of the rows so many are of X, Y and Z: others are diameters and distances.
+# Least share of rows that are X, Y or Z; the others are diameters and distances.
 _SHARE = 0.5
 _FEWEST_POINTS = 3
 _SEEN = 100
-# Of characters: a name, a separator and a letter are no longer; of more separators in a row the
-# expression above would try every beginning.
+# Characters of a cell with name, separator and axis. In a longer run of separators the expression
+# above would try every beginning.
 _LONGEST = 200
 
 Rows = list[tuple[str, ...]]
@@ -24,12 +24,12 @@ Rows = list[tuple[str, ...]]
 def wide(
     names: Sequence[str], rows: Rows, lines: Sequence[int], is_number: Callable[[str], bool]
 ) -> tuple[list[str], Rows, list[int]] | None:
-    """Return names, rows and lines of a table with a row a point; None where it is no such report.
+    """Names, rows and lines of a table with a row for each point; None for other tables.
 
     Raises
     ------
     InputError
-        A point without one of the three, with its line.
+        A point without one of its axes, with its line.
     """
     if len(rows) < _FEWEST_POINTS * len(_AXES):
         return None
@@ -80,7 +80,10 @@ def wide(
 
 
 def _axes(rows: Rows) -> tuple[list[str], int, list[str] | None] | None:
-    """Return the axis of each row, '' for others, in which column it is, and names if there."""
+    """Axis of each row ('' if none), index of its column.
+
+    And names of points if that column has them.
+    """
     for column, cells in enumerate(zip(*rows)):
         axes = [cell.upper() if cell.upper() in _AXES else '' for cell in cells]
         if {*_AXES} <= {*axes} and sum(map(bool, axes)) > _SHARE * len(rows):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Bags of robot_calibration: a message a pose, with its joint states and the points of sensors."""
+"""Bags of robot_calibration: a message for each pose, with joint states and points of sensors."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from remaster_ros.errors import InputError
-from remaster_ros.importing.rows import RawRows, moving
+from remaster_ros.importing.rows import RawRows, moving_markers
 from remaster_ros.importing.units import LENGTHS
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.types import FARTHEST_M, FloatArray
@@ -26,11 +26,11 @@ def rows_of(
     sensors: Sequence[str] = (),
     length: str = '',
 ) -> RawRows:
-    """Return a row for each point of each message, which are given with their times, s.
+    """Rows of messages of robot_calibration, given as pairs of time, s, and message.
 
-    The points of a sensor are markers by their place in its list, as a finder lists the corners
-    of a board. What stands still is where the arm's own model has them, and is left out.
-    `sensors` are the names of those that are used; () for all.
+    The markers of a sensor are the places in its list of points, as a finder lists the corners of
+    a board. Points that stand still come from the arm's own model and are left out. `sensors` are
+    the names of the sensors to use; () for all.
 
     Raises
     ------
@@ -66,14 +66,14 @@ def rows_of(
     for at, key in enumerate(chosen):
         for i, place in places[key].items():
             raw[at, i] = place
-    moved = moving(raw) if len(chosen) else np.zeros(0, bool)
+    moved = moving_markers(raw) if len(chosen) else np.zeros(0, bool)
     used = [key for key, is_moved in zip(chosen, moved) if is_moved]
     if not used:
         raise InputError(
             f'{path}: no observation with points that move; it has sensors '
             f'{", ".join(sorted(known)) or "without points"}'
         )
-    left = sorted(known - {sensor for sensor, _ in used})
+    still_sensors = sorted(known - {sensor for sensor, _ in used})
     points = raw[moved]
     row, marker = np.nonzero(np.isfinite(points[:, :, 0]).T)
     position = points[marker, row] * LENGTHS[length or 'm']
@@ -89,7 +89,7 @@ def rows_of(
         labels['marker'] = [f'{used[i][0]}_{used[i][1]}' for i in marker]
     n = len(row)
     return RawRows(
-        where=tuple(f'{path}, message {i + 1}' for i in row),
+        source=tuple(f'{path}, message {i + 1}' for i in row),
         joint_columns=chain.joint_names,
         q=q[row],
         from_q=np.full((n, len(chain)), np.nan),
@@ -104,7 +104,9 @@ def rows_of(
             **{f'features of {name}': f'points, {length or "m"}' for name in names},
         },
         description=(f'{path}: {len(messages)} messages of robot_calibration, a pose each',),
-        warnings=tuple(f'{path}: {name} left out: its points stand still' for name in left),
+        warnings=tuple(
+            f'{path}: {name} left out: its points stand still' for name in still_sensors
+        ),
         length_unit=length or 'm',
         reading=row if len(used) > len(names) else None,
     )

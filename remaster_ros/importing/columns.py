@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the columns of a table are (joints, a point, time, …), by their headers or as told."""
+"""Meaning of the columns of a table (joints, point, time, …), by header or by choice."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from remaster_ros.importing.units import ANGLES, LENGTHS, PULSES, other_unit, sp
 AXES = ('x', 'y', 'z')
 _TOKEN = re.compile(r'[^\W\d_]+|\d+|#')
 _CAMEL = re.compile(r'(?<=[a-z])(?=[A-Z])|(?<=[XYZ])(?=[A-Z][a-z])')
-# Words for the coordinates of surveyors: east, north and up are right-handed, as X, Y and Z.
+# Surveyors' words for coordinates: east, north and up are right-handed, like X, Y and Z.
 _AXIS_WORDS = {
     **dict.fromkeys(('rechtswert', 'easting', 'east', 'e', 'ost', 'ostwert'), 'x'),
     **dict.fromkeys(('hochwert', 'northing', 'north', 'n', 'nord', 'nordwert'), 'y'),
     **dict.fromkeys(('höhe', 'hoehe', 'height', 'elevation', 'elev', 'h'), 'z'),
 }
 # Words of headers, in the languages of the programs and pendants seen so far.
-# Which height, and in which system: words that X and Y are without.
+# Words that a surveyed height has in addition, and X and Y do not have.
 _SURVEYED = {'ortho', 'orthometric', 'ellipsoidal', 'ell', 'local', 'grid'}
 _JOINT_WORDS = {
     *('a', 'j', 'q', 'ax', 'th', 'theta', 'θ', 'jt', 'jnt', 'axis', 'joint', 'joints'),
@@ -40,7 +40,7 @@ _OTHER_JOINTS = {
     *('velocity', 'vel', 'qd', 'speed', 'current', 'torque', 'effort', 'moment', 'tau', 'temp'),
     *('temperature', 'acceleration', 'error', 'err', 'offset', 'std', 'sigma', 'min', 'max'),
 }
-# Words of torques that were measured at all joints, in N m, and what else stands beside them.
+# Words of measured joint torques, N m, and words that may accompany them.
 _TORQUES = {'torque', 'torques', 'tau', 'effort', 'efforts', 'moment'}
 _OF_TORQUES = {'nm', 'motor', 'j'}
 # What pendants call the joints, base to tip, as words of a header: UR in five languages, Yaskawa.
@@ -58,7 +58,7 @@ _PENDANTS = tuple(
     )
 )
 _SPREAD = {'std', 'stdev', 'stddev', 'sigma', 'sd', 'uncertainty', 'rms'}
-# Of an expanded uncertainty, U(95), which is no standard deviation.
+# Words of an expanded uncertainty, U(95), which is no standard deviation.
 _EXPANDED = {'u', '95'}
 _TOOL = {
     *(
@@ -75,7 +75,7 @@ _TOOL = {
         *'rwvaf',
     ),
 }
-# Of columns that are no place that was measured.
+# Words of columns that are not measured positions.
 _NOT_MEASURED = {
     *('nominal', 'nom', 'command', 'desired', 'soll', 'nennwert', 'sollwert', 'cad', 'planned'),
     *('theo', 'théorique', 'theoretical', 'teorico', 'teórico', 'nominale', 'expected', 'prog'),
@@ -103,7 +103,7 @@ _WORDS = {
     'temperature': {'temperature', 'temp', 'temperatur', 'ambient'},
     'samples': {'samples', 'shots', 'messungen'},
 }
-# Whose clock it is.
+# Words for the owner of a clock: `ros time`, `controller time`.
 _CLOCKS = {
     *('pc', 'ros', 'robot', 'system', 'sys', 'wall', 'host', 'log', 'unix', 'utc', 'local'),
     *('controller', 'msg', 'message', 'header', 'recv', 'receive', 'capture', 'measurement'),
@@ -113,35 +113,35 @@ _KINDS = {word: kind for kind, words in _WORDS.items() for word in words}
 
 @dataclass
 class Columns:
-    """Which column of a table is what; indices from 0, None and empty where there is none."""
+    """Meaning of each column of a table, by index from 0; None and empty if there is none."""
 
     # Base to tip.
     joints: tuple[int, ...] = ()
     from_joints: tuple[int, ...] = ()
-    # Measured torques of the joints, N m; () where there are none.
+    # Measured torques of the joints, N m; () if there are none.
     efforts: tuple[int, ...] = ()
-    # Marker ('' where there is one without a name) -> X, Y and Z, their standard deviations, and
-    # the quaternion x, y, z, w where it was measured.
+    # Marker ('' for a single one without a name) -> columns X, Y and Z, their standard deviations,
+    # and the quaternion x, y, z, w if it was measured.
     points: dict[str, tuple[int, ...]] = field(default_factory=dict)
     stds: dict[str, tuple[int, ...]] = field(default_factory=dict)
     orientations: dict[str, tuple[int, ...]] = field(default_factory=dict)
-    # Columns of an orientation that do not tell how it turns: three angles, or a quaternion
-    # without letters.
-    turned: tuple[int, ...] = ()
+    # Columns of an orientation without a stated convention: three angles, or a quaternion whose
+    # components have no letters.
+    ambiguous_orientation: tuple[int, ...] = ()
     # Kind (``name``, ``time``, ``pose``, …) -> columns.
     others: dict[str, list[int]] = field(default_factory=lambda: defaultdict(list))
     # Column -> unit of its header.
     units: dict[int, str] = field(default_factory=dict)
-    # Column -> how it was taken for what it is: ``header``, ``told`` or ``place``.
-    why: dict[int, str] = field(default_factory=dict)
+    # Column -> where its meaning comes from: ``header``, ``told`` (by the user) or ``place``.
+    origin: dict[int, str] = field(default_factory=dict)
 
     @property
     def point(self) -> tuple[int, ...]:
-        """X, Y and Z of all markers, one marker after the other."""
+        """Columns X, Y and Z of all markers, one marker after the other."""
         return tuple(flat.from_iterable(self.points.values()))
 
-    def one(self, kind: str) -> int | None:
-        """Return the first column of a kind."""
+    def first_of_kind(self, kind: str) -> int | None:
+        """The first column of a kind such as ``time``; None if there is none."""
         return next(iter(self.others.get(kind, ())), None)
 
 
@@ -149,8 +149,8 @@ Table = tuple[TextTable, Columns]
 
 
 @dataclass(frozen=True)
-class Told:
-    """What the user said of the columns, by name or by number from 1; '' and () where nothing."""
+class ColumnChoice:
+    """Columns that the user chose, by name or by number from 1; '' and () if not chosen."""
 
     joints: tuple[str, ...] = ()
     points: tuple[str, ...] = ()
@@ -161,38 +161,40 @@ class Told:
 def find_columns(
     table: TextTable,
     joint_names: Sequence[str],
-    told: Told = Told(),
+    chosen: ColumnChoice = ColumnChoice(),
     sliding: Collection[int] = (),
 ) -> Columns:
-    """Find out what the columns of a table are.
+    """Assign a meaning to each column of a table.
 
     Parameters
     ----------
     joint_names
-        Of the robot; a header that holds one of them is that joint's.
+        Joints of the robot; a header that contains one of them is that joint's column.
+    chosen
+        Columns that the user chose.
     sliding
-        Indices of those whose columns hold lengths.
+        Indices of prismatic joints, whose columns hold lengths.
 
     Raises
     ------
     InputError
-        Several columns could be the same, or a told one is not there; with what to say.
+        Several columns could have one meaning, or a chosen column is absent; with the remedy.
     """
     found = Columns()
     headers = [_Header.of(name) for name in table.names]
     found.units = {i: header.unit for i, header in enumerate(headers) if header.unit}
-    found.joints = _told_columns(table, told.joints, '--joints', found)
-    found.points = _told_points(table, headers, told.points, found)
-    for kind, name in (('time', told.time), ('name', told.names)):
+    found.joints = _chosen_columns(table, chosen.joints, '--joints', found)
+    found.points = _chosen_points(table, headers, chosen.points, found)
+    for kind, name in (('time', chosen.time), ('name', chosen.names)):
         if name and name != 'none':
-            found.others[kind] += _told_columns(table, (name,), f'--{kind}', found)
+            found.others[kind] += _chosen_columns(table, (name,), f'--{kind}', found)
     if not table.has_header:
-        return _by_place(table, found, len(joint_names))
-    taken = set(found.why)
+        return _columns_by_place(table, found, len(joint_names))
+    taken = set(found.origin)
     if not found.joints:
-        found.joints = _joints(table, headers, joint_names, sliding, taken, found)
+        found.joints = _joint_columns(table, headers, joint_names, sliding, taken, found)
     if not found.points:
-        found.points = _points(table, headers, taken, found)
+        found.points = _point_columns(table, headers, taken, found)
     for i in (*found.joints, *found.point):
         unit = other_unit(table.names[i])
         if unit and not (i in found.joints and unit.lower() in PULSES):
@@ -201,32 +203,33 @@ def find_columns(
                 f'{", ".join(ANGLES if i in found.joints else LENGTHS)} is expected; convert the '
                 'column'
             )
-    _orientations(headers, taken, found)
+    _find_orientation(headers, taken, found)
     for i, header in enumerate(headers):
         if i in taken:
             continue
         kind = header.kind()
-        if kind and not (kind in ('time', 'date', 'clock') and told.time):
+        if kind and not (kind in ('time', 'date', 'clock') and chosen.time):
             found.others[kind].append(i)
-            found.why[i] = 'header'
+            found.origin[i] = 'header'
     return found
 
 
 @dataclass(frozen=True)
 class _Header:
-    """A header as words, and its unit."""
+    """Words of a header in lower case, and its unit."""
 
     words: tuple[str, ...]
     unit: str
 
     @classmethod
     def of(cls, text: str) -> _Header:
+        """Parse a header."""
         name, unit = split_unit(text)
         words = _TOKEN.findall(_CAMEL.sub(' ', name))
         return cls(tuple(word.lower() for word in words), unit)
 
     def kind(self) -> str:
-        """Return the kind of column beside joints and points; '' where it is none."""
+        """Kind of a column other than joints and points, such as ``time``; '' if it has none."""
         words = [word for word in self.words if word not in ('s', 'c', 'ns', 'ms', 'air', 'nsec')]
         joined = ''.join(words)
         if joined in _KINDS:
@@ -236,7 +239,10 @@ class _Header:
 
 
 def _first_kind(words: Sequence[str]) -> str:
-    """Return the kind of `point name`, `time stamp`, `no of samples`; '' of anything else."""
+    """Kind of a header of several words such as `point name`, `time stamp`, `no of samples`.
+
+    '' if unknown.
+    """
     kinds = [_KINDS.get(word, '') for word in words]
     if len(words) == 2 and kinds[0] in ('name', 'time') and kinds[1] in ('name', 'time'):
         return kinds[0]
@@ -247,10 +253,10 @@ def _first_kind(words: Sequence[str]) -> str:
     return 'temperature' if 'temperature' in kinds and len(words) <= 2 else ''
 
 
-def _told_columns(
+def _chosen_columns(
     table: TextTable, names: Sequence[str], option: str, found: Columns
 ) -> tuple[int, ...]:
-    """Return told columns; none where this table has not all of them."""
+    """Indices of the columns that the user chose; () if this table does not have all of them."""
     columns = []
     index = {name.casefold(): i for i, name in enumerate(table.names)}
     for i, name in enumerate(table.names):
@@ -266,11 +272,11 @@ def _told_columns(
         return ()
     if len(set(columns)) < len(columns):
         raise InputError(f'{table.path}: {option} names a column twice')
-    found.why.update(dict.fromkeys(columns, 'told'))
+    found.origin.update(dict.fromkeys(columns, 'told'))
     return tuple(columns)
 
 
-def _joints(
+def _joint_columns(
     table: TextTable,
     headers: Sequence[_Header],
     joint_names: Sequence[str],
@@ -278,7 +284,10 @@ def _joints(
     taken: set[int],
     found: Columns,
 ) -> tuple[int, ...]:
-    """Return the columns of the joints, base to tip; those they came from go into `found`."""
+    """Columns of the joints, base to tip.
+
+    Columns of the previous joints go into `found.from_joints`.
+    """
     complete: dict[tuple[str, ...], tuple[int, ...]] = {}
     schemes = [tuple(tuple(_Header.of(name).words) for name in joint_names)]
     schemes += [names for names in _PENDANTS if len(names) == len(joint_names)]
@@ -287,7 +296,7 @@ def _joints(
         for i, header in enumerate(headers):
             if i in taken:
                 continue
-            number, stem = _joint_of(header.words, named)
+            number, stem = _joint_number(header.words, named)
             slides = number is not None and number - 1 in sliding
             if header.unit and header.unit not in (LENGTHS if slides else ANGLES):
                 continue
@@ -311,7 +320,7 @@ def _joints(
     came_from = [stem for stem in complete if 'from' in stem]
     if came_from:
         found.from_joints = complete[came_from[0]]
-        _take(found, found.from_joints, taken)
+        _claim(found, found.from_joints, taken)
     torques = [
         columns
         for stem, columns in complete.items()
@@ -321,31 +330,34 @@ def _joints(
     ]
     if len(torques) == 1:
         found.efforts = torques[0]
-        _take(found, found.efforts, taken)
+        _claim(found, found.efforts, taken)
     usable = [stem for stem in complete if not _OTHER_JOINTS & set(stem) and stem not in came_from]
     known = [stem for stem in usable if set(stem) <= _JOINT_WORDS | _REPORTED | {*'*=#'}]
     best = [stem for stem in known if '=' in stem or _REPORTED & set(stem)] or known or usable
     sets = [complete[stem] for stem in best]
     sets = [columns for columns in sets if len(columns) == len(joint_names)] or sets
-    chosen = _only_one(table, sets, 'the joint angles', 'name them, base to tip, with --joints')
-    _take(found, chosen, taken)
+    chosen = _single_set(table, sets, 'the joint angles', 'name them, base to tip, with --joints')
+    _claim(found, chosen, taken)
     return chosen
 
 
-def _only_one(
+def _single_set(
     table: TextTable, sets: Sequence[tuple[int, ...]], what: str, remedy: str
 ) -> tuple[int, ...]:
-    """Return the only set of columns; () where there is none, an `InputError` for several."""
+    """The only set of columns; () if there is none. Raises InputError if there are several."""
     if len(sets) > 1:
         listed = '; '.join(', '.join(table.names[i] for i in columns) for columns in sets[:4])
         raise InputError(f'{table.path}: these could all be {what}: {listed}; {remedy}')
     return sets[0] if sets else ()
 
 
-def _joint_of(
+def _joint_number(
     words: tuple[str, ...], named: Sequence[tuple[str, ...]]
 ) -> tuple[int | None, tuple[str, ...]]:
-    """Return the number of the joint that a header names, and the words around it."""
+    """Number (from 1) of the joint that a header names, None if it names none.
+
+    And the other words.
+    """
     for i, name in sorted(enumerate(named), key=lambda pair: -len(pair[1])):
         for short in (name, name[:-1] if name[-1:] == ('joint',) else name):
             for start in range(len(words) - len(short) + 1):
@@ -363,49 +375,54 @@ def _joint_of(
     return int(words[at]), (*words[:at], '*', *words[at + 1 :])
 
 
-def _told_points(
+def _chosen_points(
     table: TextTable, headers: Sequence[_Header], names: Sequence[str], found: Columns
 ) -> dict[str, tuple[int, ...]]:
-    """Return the told points, by the markers' names or by three columns each."""
+    """Columns by marker that the user chose, by marker names or by three columns each."""
     groups = {name: table.groups[name] for name in table.groups} or {
-        _label(table, columns): columns for columns in _groups(headers, set()).values()
+        _marker_label(table, columns): columns for columns in _xyz_groups(headers, set()).values()
     }
     folded = {name.casefold(): name for name in groups}
     if names and all(name.casefold() in folded for name in names):
-        told = {folded[name.casefold()]: groups[folded[name.casefold()]] for name in names}
-        found.why.update(dict.fromkeys(flat.from_iterable(told.values()), 'told'))
-        found.orientations = {name: table.turns[name] for name in told if name in table.turns}
-        return told
-    columns = _told_columns(table, names, '--points', found)
+        chosen = {folded[name.casefold()]: groups[folded[name.casefold()]] for name in names}
+        found.origin.update(dict.fromkeys(flat.from_iterable(chosen.values()), 'told'))
+        found.orientations = {name: table.turns[name] for name in chosen if name in table.turns}
+        return chosen
+    columns = _chosen_columns(table, names, '--points', found)
     if len(columns) % 3:
         raise InputError(
             f'{table.path}: --points names {len(columns)} columns; name X, Y and Z of each marker'
         )
-    return _markers(table, [columns[i : i + 3] for i in range(0, len(columns), 3)])
+    return _columns_by_marker(table, [columns[i : i + 3] for i in range(0, len(columns), 3)])
 
 
-def _markers(table: TextTable, sets: Sequence[tuple[int, ...]]) -> dict[str, tuple[int, ...]]:
-    """Return marker -> columns; one alone has no name of its own."""
+def _columns_by_marker(
+    table: TextTable, sets: Sequence[tuple[int, ...]]
+) -> dict[str, tuple[int, ...]]:
+    """Columns X, Y, Z by marker; the name of a single marker is ''."""
     if len(sets) < 2:
         return dict.fromkeys([''] * len(sets), sets[0]) if sets else {}
-    labels = [_label(table, columns) for columns in sets]
+    labels = [_marker_label(table, columns) for columns in sets]
     if len(set(labels)) < len(labels):
         labels = [f'marker_{i}' for i in range(1, len(sets) + 1)]
     return dict(zip(labels, sets, strict=True))
 
 
-def _label(table: TextTable, columns: Sequence[int]) -> str:
-    """Return the name of a marker: what the header of its X has beside the axis."""
+def _marker_label(table: TextTable, columns: Sequence[int]) -> str:
+    """Name of a marker: the header of its X column without the axis."""
     name = split_unit(table.names[columns[0]])[0]
-    rest = re.sub(r'(?<![^\W\d_])(?:[Pp]os(?:ition)?|[Pp])?[_ .-]?[xX](?![^\W\d_])', '', name)
-    rest = rest.strip(' _-./:')
-    return f'marker_{rest}' if rest.isdigit() or not rest else rest
+    stem = re.sub(r'(?<![^\W\d_])(?:[Pp]os(?:ition)?|[Pp])?[_ .-]?[xX](?![^\W\d_])', '', name)
+    stem = stem.strip(' _-./:')
+    return f'marker_{stem}' if stem.isdigit() or not stem else stem
 
 
-def _groups(
+def _xyz_groups(
     headers: Sequence[_Header], taken: set[int], fewest: int = 3
 ) -> dict[tuple[str, ...], tuple[int, ...]]:
-    """Return words around the axis -> columns X, Y and Z, where so many of them are there."""
+    """Columns X, Y and Z by the words around the axis.
+
+    If at least `fewest` of the three are there.
+    """
     groups: dict[tuple[str, ...], dict[str, int]] = defaultdict(dict)
     for i, header in enumerate(headers):
         if i in taken or (header.unit and header.unit not in LENGTHS):
@@ -422,19 +439,19 @@ def _groups(
     }
 
 
-def _points(
+def _point_columns(
     table: TextTable, headers: Sequence[_Header], taken: set[int], found: Columns
 ) -> dict[str, tuple[int, ...]]:
-    """Return the columns X, Y, Z of each marker; standard deviations go into `found`."""
+    """Columns X, Y, Z by marker; columns of standard deviations go into `found.stds`."""
     if table.groups:
         chosen = {name: table.groups[name] for name in table.points or table.groups}
         found.orientations = {name: table.turns[name] for name in chosen if name in table.turns}
         for columns in (*chosen.values(), *found.orientations.values()):
-            _take(found, columns, taken)
+            _claim(found, columns, taken)
         return chosen
-    complete = _groups(headers, taken)
+    complete = _xyz_groups(headers, taken)
     spreads = [stem for stem in complete if _SPREAD & set(stem) or 's' in stem]
-    lettered = _lettered(complete)
+    lettered = _lettered_stems(complete)
     usable = [stem for stem in complete if stem not in spreads and not _NOT_MEASURED & set(stem)]
     usable = [stem for stem in usable if not set(stem) >= _EXPANDED]
     best = [stem for stem in usable if stem in lettered or not _TOOL & set(stem)] or usable
@@ -442,7 +459,7 @@ def _points(
     sets = [complete[stem] for stem in best]
     partial = [
         columns
-        for stem, columns in _groups(headers, taken, 1).items()
+        for stem, columns in _xyz_groups(headers, taken, 1).items()
         if _REPORTED & set(stem) and len(columns) < len(AXES)
     ]
     if best and partial and not any(_REPORTED & set(stem) for stem in best):
@@ -454,20 +471,20 @@ def _points(
     # letters from A on.
     unlike = {tuple(word for word in stem if not word.isdigit()) for stem in best}
     if len(unlike) > 1 and not {*best} <= lettered:
-        _only_one(table, sets, 'the measured points', _NAME_POINTS)
-    markers = _markers(table, sets)
-    _take(found, tuple(flat.from_iterable(sets)), taken)
+        _single_set(table, sets, 'the measured points', _NAME_POINTS)
+    markers = _columns_by_marker(table, sets)
+    _claim(found, tuple(flat.from_iterable(sets)), taken)
     for stem in spreads:
         around = tuple(word for word in stem if word not in {*_SPREAD, 's'})
         for marker, own in zip(markers, best, strict=True):
             if len(best) == 1 or around == own:
                 found.stds.setdefault(marker, complete[stem])
-                _take(found, complete[stem], taken)
+                _claim(found, complete[stem], taken)
     return markers
 
 
-def _lettered(stems: Iterable[tuple[str, ...]]) -> set[tuple[str, ...]]:
-    """Return the words that differ in one letter alone, which is A, B and so on."""
+def _lettered_stems(stems: Iterable[tuple[str, ...]]) -> set[tuple[str, ...]]:
+    """Word groups that differ only in one letter, which runs A, B and so on."""
     alike: dict[tuple[str, ...], dict[str, tuple[str, ...]]] = defaultdict(dict)
     for stem in stems:
         for i, word in enumerate(stem):
@@ -486,12 +503,12 @@ _NAME_POINTS = (
 )
 
 
-def _orientations(headers: Sequence[_Header], taken: set[int], found: Columns) -> None:
-    """Find the orientations that were measured beside the points of one marker."""
+def _find_orientation(headers: Sequence[_Header], taken: set[int], found: Columns) -> None:
+    """Find the columns of an orientation measured with the points of a single marker."""
     groups: dict[tuple[str, ...], dict[str, int]] = defaultdict(dict)
     for i, header in enumerate(headers):
         if i not in taken and header.unit in ('', *ANGLES):
-            rest, axis = _turn_of(header.words)
+            rest, axis = _orientation_component(header.words)
             if axis:
                 groups[rest].setdefault(axis, i)
     if len(found.points) != 1:
@@ -504,26 +521,30 @@ def _orientations(headers: Sequence[_Header], taken: set[int], found: Columns) -
         if {*columns} == {*names}
     ]
     if len(complete) > 1:
-        # A log has the robot's own beside that of the point.
-        complete = [columns for columns in complete if _is_beside(headers, found, columns)]
+        # A log may also have the orientation that the robot reports of its tool.
+        complete = [
+            columns for columns in complete if _has_words_of_point(headers, found, columns)
+        ]
     if len(complete) == 1:
-        _take(found, complete[0], taken)
+        _claim(found, complete[0], taken)
         if {*'xyzw'} in map(set, groups.values()):
             found.orientations[marker] = complete[0]
         else:
-            found.turned = complete[0]
+            found.ambiguous_orientation = complete[0]
 
 
-def _is_beside(headers: Sequence[_Header], found: Columns, columns: Sequence[int]) -> bool:
-    """Return whether an orientation has the words of the point's columns beside the axis."""
+def _has_words_of_point(
+    headers: Sequence[_Header], found: Columns, columns: Sequence[int]
+) -> bool:
+    """Whether the header of an orientation has the same words as the header of the point."""
     stems = [
         tuple(word for word in _with_axis(headers[i].words) if word not in (*AXES, *_PLACES))
         for i in found.point[:1]
     ]
-    return stems == [_turn_of(headers[columns[0]].words)[0]]
+    return stems == [_orientation_component(headers[columns[0]].words)[0]]
 
 
-# Words for the place in a pose.
+# Words for the position in a pose.
 _PLACES = {'position', 'translation', 'pos', 'point', 't'}
 _TURNED = {
     *('quaternion', 'quat', 'orientation', 'rotation', 'rot', 'q', 'rotvec', 'rvec', 'euler'),
@@ -538,47 +559,51 @@ _ANGLES = (
 _AS_AXIS = {'i': 'x', 'j': 'y', 'k': 'z', 'r': 'w'}
 
 
-def _turn_of(words: tuple[str, ...]) -> tuple[tuple[str, ...], str]:
-    """Return the words around the name of an angle, or of a number of a quaternion, and that."""
+def _orientation_component(words: tuple[str, ...]) -> tuple[tuple[str, ...], str]:
+    """Words around an angle or quaternion component in a header, and its name.
+
+    ((), '') if none.
+    """
     turned = {*words} & _TURNED
     for at, word in enumerate(words):
-        rest = tuple(w for w in (*words[:at], *words[at + 1 :]) if w not in _TURNED)
+        others = tuple(w for w in (*words[:at], *words[at + 1 :]) if w not in _TURNED)
         if any(word in names for names in _ANGLES[:3]):
-            return rest, word
+            return others, word
         if axis := re.fullmatch(r'(?:q|quat|orientation|rot|r)_?([xyz])|(?:q|quat)_?w', word):
-            return rest, axis[1] or 'w'
+            return others, axis[1] or 'w'
         if axis := re.fullmatch(r'q([ijkr])', word):
-            return rest, _AS_AXIS[axis[1]]
+            return others, _AS_AXIS[axis[1]]
         if turned and re.fullmatch(r'[xyzw]|[0-4]', word):
-            return rest, word
+            return others, word
         if len(words) == 1 and word in 'abcwpr':
-            return rest, word
+            return others, word
     return (), ''
 
 
 def _with_axis(words: Sequence[str]) -> tuple[str, ...]:
-    """Return words with `px`, `posx`, `sy` or `dz` taken apart."""
+    """Words with `px`, `posx`, `sy` or `dz` split into prefix and axis."""
     words = [_AXIS_WORDS.get(word, word) for word in words if word not in _SURVEYED]
-    apart = (
+    split = (
         (word[:-1], word[-1]) if re.fullmatch(r'(?:p|pos|s|d|r|t|v)[xyz]', word) else (word,)
         for word in words
     )
-    return tuple(flat.from_iterable(apart))
+    return tuple(flat.from_iterable(split))
 
 
-def _take(found: Columns, columns: Sequence[int], taken: set[int]) -> None:
+def _claim(found: Columns, columns: Sequence[int], taken: set[int]) -> None:
+    """Mark columns as used, with their meaning known from the header."""
     taken.update(columns)
-    found.why.update(dict.fromkeys(columns, 'header'))
+    found.origin.update(dict.fromkeys(columns, 'header'))
 
 
-def _by_place(table: TextTable, found: Columns, joints: int) -> Columns:
-    """Take columns without a header by their place: a name, then joints, then X, Y, Z."""
+def _columns_by_place(table: TextTable, found: Columns, joints: int) -> Columns:
+    """Assign columns without a header by their place: a name, then joints, then X, Y, Z."""
     if table.groups and not found.points:
         found.points, found.orientations = {**table.groups}, {**table.turns}
         for columns in (*found.points.values(), *found.orientations.values()):
-            found.why.update(dict.fromkeys(columns, 'place'))
-    free = [i for i in range(len(table.names)) if i not in found.why]
-    numeric = [i for i in free if _numeric(table, i)]
+            found.origin.update(dict.fromkeys(columns, 'place'))
+    free = [i for i in range(len(table.names)) if i not in found.origin]
+    numeric = [i for i in free if _is_numeric(table, i)]
     texts = sorted({*free}.difference(numeric))
     wanted = (0 if found.joints else joints, 0 if found.points else 3)
     first = numeric[:1] if _counts_up(table, numeric) else []
@@ -595,7 +620,7 @@ def _by_place(table: TextTable, found: Columns, joints: int) -> Columns:
                     found.points = {'': tuple(places[need_joints:])}
                 if texts or lead:
                     found.others['name'] += [*texts[:1], *lead]
-                found.why.update(dict.fromkeys([*texts[:1], *lead, *places], 'place'))
+                found.origin.update(dict.fromkeys([*texts[:1], *lead, *places], 'place'))
                 return found
     if found.joints or found.points:
         return found
@@ -607,14 +632,15 @@ def _by_place(table: TextTable, found: Columns, joints: int) -> Columns:
 
 
 def _counts_up(table: TextTable, numeric: Sequence[int]) -> bool:
+    """Whether the first numeric column holds different whole numbers, as row numbers do."""
     if not numeric:
         return False
     cells = [row[numeric[0]] for row in table.rows]
     return all(cell.isdigit() for cell in cells) and len(set(cells)) == len(cells)
 
 
-def _numeric(table: TextTable, column: int) -> bool:
-    """Return whether a column has numbers, and no other text but for missing ones."""
+def _is_numeric(table: TextTable, column: int) -> bool:
+    """Whether a column has numbers, and no other text than marks for missing values."""
     try:
         values = [table.number(row, column) for row in range(len(table.rows))]
     except InputError:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Data frames (pandas, or anything with its columns, index and itertuples) as text tables."""
+"""Data frames (pandas, or objects with its columns, index and itertuples) as text tables."""
 
 from __future__ import annotations
 
@@ -11,22 +11,23 @@ from pathlib import Path
 from typing import Any
 
 from remaster_ros.errors import InputError
-from remaster_ros.importing.makers.named import some
+from remaster_ros.importing.makers.named import first_names
 from remaster_ros.importing.text_table import TextTable, table_of_text
 
-# A column with this name is that of rows (`columns` has the word).
+# Name of a column that counts rows; `columns` knows the word.
 _INDEX = 'index'
 
 
 def is_frame(given: Any) -> bool:
-    """Return whether an object is a data frame, as pandas has them."""
+    """Whether an object is a data frame with the interface of pandas."""
     return all(hasattr(given, name) for name in ('columns', 'index', 'itertuples'))
 
 
 def tables_of(frames: Sequence[Any], names: Sequence[str]) -> list[TextTable]:
-    """Return frames as the tables that files with the same content are; `names` for messages.
+    """Data frames as text tables; `names` are for messages.
 
-    The index is a column, unless it counts the rows of all frames from 0 on.
+    The index becomes a column, unless it counts the rows of all frames from 0 on. Raises
+    InputError if an index is twice in frames to be joined.
     """
     plain = all(_counts(frame) for frame in frames)
     for frame, name in zip(frames, names):
@@ -38,11 +39,12 @@ def tables_of(frames: Sequence[Any], names: Sequence[str]) -> list[TextTable]:
 
 
 def _counts(frame: Any) -> bool:
-    """Return whether the index counts the rows from 0 on."""
+    """Whether the index of a frame counts the rows from 0 on."""
     return [*frame.index] == [*range(len(frame.index))]
 
 
 def _table_of(frame: Any, name: str, with_index: bool) -> TextTable:
+    """Text table of a data frame, with its index as a column if `with_index`."""
     header = [' '.join(map(str, c)) if isinstance(c, tuple) else str(c) for c in frame.columns]
     # A frame of an array has counted columns: no names.
     named = header != [*map(str, range(len(header)))]
@@ -60,7 +62,7 @@ def _table_of(frame: Any, name: str, with_index: bool) -> TextTable:
     writer.writerows([header] * named + rows)
     table = table_of_text(text.getvalue(), Path(name))
     empty = [str(i) for i, row in enumerate(rows) if not any(row)]
-    note = f'{name}, row{"s" * (len(empty) > 1)} {some(empty)}: no value, left out'
+    note = f'{name}, row{"s" * (len(empty) > 1)} {first_names(empty)}: no value, left out'
     return replace(
         table,
         counted='row',
@@ -71,7 +73,7 @@ def _table_of(frame: Any, name: str, with_index: bool) -> TextTable:
 
 
 def _cell(value: Any) -> str:
-    """Return a value as a file has it: as many digits as it needs, ISO 8601, nothing for NaN."""
+    """A value as text: full precision, ISO 8601 for times, '' for NaN and None."""
     if value is None or value != value:
         return ''
     text = value.isoformat() if hasattr(value, 'isoformat') else str(value)

@@ -16,17 +16,17 @@ from remaster_ros.errors import InputError, InsufficientDataError
 from remaster_ros.importing.arguments import in_python, remedy
 from remaster_ros.importing.assemble import (
     SessionOptions,
-    as_counted,
     assemble,
     refuse_outside_limits,
+    with_controller_coupling,
     without_whole_turns,
 )
 from remaster_ros.importing.frames import is_frame, tables_of
-from remaster_ros.importing.makers.named import some
+from remaster_ros.importing.makers.named import first_names
 from remaster_ros.importing.rows import RawRows, TableOptions, read_rows
 from remaster_ros.importing.sense import check_sense
 from remaster_ros.importing.text_table import TextTable
-from remaster_ros.importing.turns import oriented
+from remaster_ros.importing.turns import with_orientation
 from remaster_ros.importing.units import ANGLES, LENGTHS
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.types import FloatArray, Session
@@ -36,7 +36,10 @@ log = logging.getLogger('remaster_ros')
 
 @dataclass(frozen=True)
 class Choices:
-    """What was said to a function, and the names of its arguments, for messages."""
+    """Options given to a function of the public face, and the names of its arguments.
+
+    For messages.
+    """
 
     table: TableOptions
     corrections: SessionOptions
@@ -48,23 +51,23 @@ class Choices:
 def of_arrays(
     joints: Any, points: Any, robot: tuple[str, SerialChain], choices: Choices
 ) -> Session:
-    """Return the session of joints and points, row by row; see `session_from`."""
+    """Session from arrays of joints and points, row by row; see `session_from`."""
     urdf, chain = robot
     if is_frame(joints) and is_frame(points):
-        with _naming(choices.arguments):
+        with _with_argument_names(choices.arguments):
             tables = tables_of((joints, points), ('joints', 'points'))
         return of_tables(tables, robot, choices)
     options = choices.table
-    q = _numbers(joints, 'joints', chain.joint_names) * ANGLES[options.angles or 'rad']
-    position = _numbers(points, 'points', ('x', 'y', 'z')) * LENGTHS[options.length or 'm']
+    q = _number_array(joints, 'joints', chain.joint_names) * ANGLES[options.angles or 'rad']
+    position = _number_array(points, 'points', ('x', 'y', 'z')) * LENGTHS[options.length or 'm']
     if len(q) != len(position):
         raise InputError(f'joints have {len(q)} rows, points {len(position)}; give a point each')
     known = np.isfinite(q).all(axis=1) & np.isfinite(position).all(axis=1)
     at = np.flatnonzero(known)
-    lost = [str(row) for row in np.flatnonzero(~known)]
+    dropped = [str(row) for row in np.flatnonzero(~known)]
     n = len(at)
     rows = RawRows(
-        where=tuple(f'row {i}' for i in at),
+        source=tuple(f'row {i}' for i in at),
         joint_columns=chain.joint_names,
         q=q[at],
         from_q=np.full((n, len(chain)), np.nan),
@@ -76,17 +79,17 @@ def of_arrays(
         samples=np.full(n, -1.0),
         columns={},
         description=(),
-        warnings=(f'row{"s" * (len(lost) > 1)} {some(lost)}: not a number, left out',)
-        * bool(lost),
+        warnings=(f'row{"s" * (len(dropped) > 1)} {first_names(dropped)}: not a number, left out',)
+        * bool(dropped),
     )
-    return _made(rows, urdf, chain, choices, 'from arrays')
+    return _checked_session(rows, urdf, chain, choices, 'from arrays')
 
 
 def of_files(files: Sequence[Any], robot: tuple[str, SerialChain], choices: Choices) -> Session:
-    """Return the session of files, or of data frames; see `import_table`."""
+    """Session from files or data frames; see `import_table`."""
     frames = [file for file in files if is_frame(file)]
     names = ['frame'] if len(frames) == 1 else [f'frame {i + 1}' for i in range(len(frames))]
-    with _naming(choices.arguments):
+    with _with_argument_names(choices.arguments):
         read = iter(tables_of(frames, names))
     return of_tables(
         [next(read) if is_frame(file) else Path(file) for file in files], robot, choices
@@ -96,19 +99,19 @@ def of_files(files: Sequence[Any], robot: tuple[str, SerialChain], choices: Choi
 def of_tables(
     files: Sequence[Path | TextTable], robot: tuple[str, SerialChain], choices: Choices
 ) -> Session:
-    """Return the session of one table or of two that are joined, some of which were read."""
+    """Session from one table, or from a table of joints and one of points that are joined."""
     urdf, chain = robot
-    with _naming(choices.arguments):
+    with _with_argument_names(choices.arguments):
         rows = read_rows(files, chain, choices.table).in_order()
-        rows = oriented(rows, chain, choices.corrections)
+        rows = with_orientation(rows, chain, choices.corrections)
     named = [file.path if isinstance(file, TextTable) else file for file in files]
     notes = f'imported from {", ".join(path.name for path in named)}'
-    return _made(rows, urdf, chain, choices, notes)
+    return _checked_session(rows, urdf, chain, choices, notes)
 
 
 @contextlib.contextmanager
-def _naming(arguments: Collection[str]) -> Iterator[None]:
-    """Let errors name these arguments of a function in place of options of the command."""
+def _with_argument_names(arguments: Collection[str]) -> Iterator[None]:
+    """Replace options of the command in errors by the arguments of the function."""
     try:
         yield
     except (InputError, InsufficientDataError) as error:
@@ -119,9 +122,12 @@ def _naming(arguments: Collection[str]) -> Iterator[None]:
         raise kind(words) from None
 
 
-def _made(rows: RawRows, urdf: str, chain: SerialChain, choices: Choices, notes: str) -> Session:
-    with _naming(choices.arguments):
-        options, _ = as_counted(rows, chain, choices.corrections)
+def _checked_session(
+    rows: RawRows, urdf: str, chain: SerialChain, choices: Choices, notes: str
+) -> Session:
+    """Session of rows that fit the robot. Raises InsufficientDataError, with a remedy, if not."""
+    with _with_argument_names(choices.arguments):
+        options, _ = with_controller_coupling(rows, chain, choices.corrections)
         rng = np.random.default_rng(choices.seed)
         session, _ = assemble(rows, urdf, chain, options, rng, notes)
         sense = check_sense(session, rows, lambda *_: None, choices.never_mastered)
@@ -136,8 +142,8 @@ def _made(rows: RawRows, urdf: str, chain: SerialChain, choices: Choices, notes:
     return session
 
 
-def _numbers(given: Any, what: str, names: Sequence[str]) -> FloatArray:
-    """Return an array (n, len(names)); of a data frame or a dict the columns of these names."""
+def _number_array(given: Any, what: str, names: Sequence[str]) -> FloatArray:
+    """Array (n, len(names)) of an array, or of the named columns of a data frame or dict."""
     columns = getattr(given, 'columns', None)
     if columns is None and isinstance(given, dict):
         columns = given.keys()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Poses that a table writes as 4×4 matrices, sixteen columns each: a point and a quaternion."""
+"""Poses in a table as 4×4 matrices, sixteen columns each, replaced by point and quaternion."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ _COUNTED = re.compile(r'(.*?)[\[(_ ]*(\d{1,2})[\])]?')
 
 
 def with_poses(table: TextTable) -> TextTable:
-    """Return a table with X, Y, Z and quaternion of each 4×4 matrix in place of its columns.
+    """Table with X, Y, Z and quaternion in place of the sixteen columns of each 4×4 matrix.
 
     Sixteen columns that are no rigid motion stay as they are.
     """
     names, rows = list(table.names), [list(row) for row in table.rows]
     dropped: set[int] = set()
     poses: dict[str, list[int]] = {}
-    found = _groups(table) if table.has_header else _in_a_row(table)
+    found = _matrices_by_name(table) if table.has_header else _matrices_by_place(table)
     for stem, places in found.items():
         numbers = _numbers(table, places)
         T = None if numbers is None else rigid(numbers)
@@ -39,7 +39,7 @@ def with_poses(table: TextTable) -> TextTable:
         of = stem or 'pose'
         # Where they stood: seven columns in place of sixteen.
         labels = [f'{of} {axis}' for axis in 'xyz'] + [f'{of} q{axis}' for axis in 'xyzw']
-        values = np.column_stack((T[:, :3, 3], [quaternion_xyzw(one[:3, :3]) for one in T]))
+        values = np.column_stack((T[:, :3, 3], [quaternion_xyzw(matrix[:3, :3]) for matrix in T]))
         for column, label, cells in zip(places, labels, values.T):
             names[column] = label
             for row, value in zip(rows, cells):
@@ -60,8 +60,8 @@ def with_poses(table: TextTable) -> TextTable:
     )
 
 
-def _groups(table: TextTable) -> Mapping[str, list[int]]:
-    """Return the sixteen columns of each matrix, in the order of their numbers, by their name."""
+def _matrices_by_name(table: TextTable) -> Mapping[str, list[int]]:
+    """Sixteen columns of each matrix, row by row or as counted, by the matrix's name."""
     found: dict[str, list[int]] = {}
     for pattern, counts in ((_ROW_AND_COLUMN, SIZE), (_COUNTED, COUNT)):
         by_stem: dict[str, dict[tuple[int, ...], int]] = defaultdict(dict)
@@ -79,15 +79,17 @@ def _groups(table: TextTable) -> Mapping[str, list[int]]:
     return found
 
 
-def _in_a_row(table: TextTable) -> Mapping[str, list[int]]:
-    """Return the sixteen columns of each matrix of a table without names."""
+def _matrices_by_place(table: TextTable) -> Mapping[str, list[int]]:
+    """Sixteen adjacent columns of each matrix in a table without names, by a number."""
     found: dict[str, list[int]] = {}
     first = 0
     while first + COUNT <= len(table.names):
         columns = [*range(first, first + COUNT)]
         # The first row tells where there can be none.
-        one = _numbers(table.select([0]), columns)
-        numbers = None if one is None or rigid(one) is None else _numbers(table, columns)
+        first_row = _numbers(table.select([0]), columns)
+        numbers = (
+            None if first_row is None or rigid(first_row) is None else _numbers(table, columns)
+        )
         if numbers is not None and rigid(numbers) is not None:
             found[f'pose {len(found) + 1}'] = columns
             first += COUNT
@@ -97,7 +99,7 @@ def _in_a_row(table: TextTable) -> Mapping[str, list[int]]:
 
 
 def _numbers(table: TextTable, columns: list[int]) -> FloatArray | None:
-    """Return the numbers of columns, (n, 16); None where one is missing or is none."""
+    """Numbers of columns, (n, 16); None if one is missing or no number."""
     try:
         cells = [[table.number(row, i) for i in columns] for row in range(len(table.rows))]
     except InputError:

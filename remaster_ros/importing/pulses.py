@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Joints in pulses of the motors, as controllers of Yaskawa save them: to degrees."""
+"""Conversion of joints in motor pulses, as Yaskawa's controllers save them, to degrees."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ from remaster_ros.importing.text_table import TextTable
 from remaster_ros.importing.units import PULSES, other_unit
 from remaster_ros.importing.values import numbers
 
-# Whole numbers beyond ten turns, in degrees, are no angles of an arm.
+# Whole numbers above this, ten turns in degrees, are pulses and no angles.
 _LARGEST_DEG = 3600.0
 _UNIT = re.compile(rf'\s*[\[(]?\b(?:{"|".join(PULSES)})\b[\])]?\s*$', re.IGNORECASE)
 
 
 def in_degrees(joints: Table, per_degree: tuple[float, ...], angles: str) -> tuple[Table, str]:
-    """Return joints in pulses as joints in degrees, and the sentence on it; '' of others.
+    """Table of joints in degrees, and a sentence on the conversion ('' if they are no pulses).
 
-    `per_degree` are the pulses of a degree, base to tip; () where they were not told.
+    `per_degree` are the pulses of a degree for each joint, base to tip; () if not given.
 
     Raises
     ------
     InputError
-        The joints are in pulses, and how many make a degree was not told.
+        The joints are in pulses, and `per_degree` is not given.
     """
     table, columns = joints
-    own = [table.names[i] for i in columns.joints]
-    stated = [name for name in own if other_unit(name).lower() in PULSES]
+    headers = [table.names[i] for i in columns.joints]
+    stated = [name for name in headers if other_unit(name).lower() in PULSES]
     if not per_degree:
         if stated or _look_like_pulses(table, columns, angles):
             largest = np.abs(numbers(table, columns.joints, optional=True))
@@ -39,16 +39,18 @@ def in_degrees(joints: Table, per_degree: tuple[float, ...], angles: str) -> tup
                 'by their header' if stated else f'whole numbers, up to {np.nanmax(largest):.0f}'
             )
             raise InputError(
-                f'{table.path}: {own[0]} … {own[-1]} are pulses of the motors ({seen}), which '
+                f'{table.path}: {headers[0]} … {headers[-1]} are pulses of the motors ({seen}), '
+                'which '
                 'tell no angles without the pulses of a degree; state them, base to tip, with '
                 '--pulses-per-degree N,N,… (the pulses that the pendant shows at a known angle, '
                 'by that angle), or give a table in degrees'
             )
         return joints, ''
-    if len(per_degree) != len(own):
+    if len(per_degree) != len(headers):
         raise InputError(
-            f'--pulses-per-degree: {len(per_degree)} numbers, and {len(own)} joints ({own[0]} … '
-            f'{own[-1]}); give one for each, base to tip'
+            f'--pulses-per-degree: {len(per_degree)} numbers, and {len(headers)} joints '
+            f'({headers[0]} … '
+            f'{headers[-1]}); give one for each, base to tip'
         )
     both = dict(zip(columns.joints, per_degree))
     both |= dict(zip(columns.from_joints, per_degree))
@@ -62,11 +64,12 @@ def in_degrees(joints: Table, per_degree: tuple[float, ...], angles: str) -> tup
                 row[column] = repr(float(angle)).replace('.', table.decimal)
     table = replace(table, names=tuple(names), rows=tuple(map(tuple, cells)))
     units = {**columns.units, **dict.fromkeys(both, 'deg')}
-    listed = ', '.join(f'{name} {count:g}' for name, count in zip(own, per_degree))
+    listed = ', '.join(f'{name} {count:g}' for name, count in zip(headers, per_degree))
     return (table, replace(columns, units=units)), f'pulses a degree, as told: {listed}'
 
 
 def _look_like_pulses(table: TextTable, columns: Columns, angles: str) -> bool:
+    """Whether joints without a unit are whole numbers too large for angles."""
     if angles or any(columns.units.get(i) for i in columns.joints):
         return False
     values = numbers(table, columns.joints, optional=True)

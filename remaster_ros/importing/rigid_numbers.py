@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Sixteen numbers that are a pose: a 4×4 matrix, row by row or column by column."""
+"""Poses from sixteen numbers: 4×4 matrices, row by row or column by column."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from remaster_ros.types import FloatArray
 
 SIZE = 4
 COUNT = SIZE * SIZE
-# Of a rotation written with three digits.
+# Tolerance of a rotation matrix that is written with three digits.
 _ROUNDING = 2e-3
 
 
 def rigid(numbers: FloatArray) -> FloatArray | None:
-    """Return rigid motions (n, 4, 4) of their numbers (n, 16); None where they are none.
+    """Rigid motions (n, 4, 4) from sixteen numbers each, (n, 16); None if they are none.
 
-    The row 0 0 0 1 tells how the numbers stand; libfranka writes columns.
+    The place of the row 0 0 0 1 decides between rows and columns, which libfranka writes.
     """
     T = numbers.reshape(-1, SIZE, SIZE)
     for each in (T, T.swapaxes(1, 2)):

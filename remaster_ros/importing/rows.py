@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From tables to rows of joints and points in SI, each with the line it came from."""
+"""Rows of joint angles and points in SI, from one table or from two that are joined."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from typing import Any, Literal, cast
 import numpy as np
 
 from remaster_ros.errors import InputError
-from remaster_ros.importing.columns import AXES, Columns, Table, Told, find_columns
+from remaster_ros.importing.columns import AXES, ColumnChoice, Columns, Table, find_columns
 from remaster_ros.importing.makers import kuka
-from remaster_ros.importing.makers.named import some
+from remaster_ros.importing.makers.named import first_names
 from remaster_ros.importing.pose_matrices import with_poses
 from remaster_ros.importing.pulses import in_degrees
 from remaster_ros.importing.standstills import stopped
@@ -46,18 +46,16 @@ from remaster_ros.session.files import read_limited
 from remaster_ros.session.observations import LENGTH_TOLERANCE
 from remaster_ros.types import AngleUnit, BoolArray, FloatArray, IntArray, SensorKind
 
-# Which row of the joints belongs to which row of the points: by name, by time or by order.
-
-
-How = Literal['', 'name', 'time', 'order']
+# Criterion by which rows of joints and rows of points are paired; '' for the first that works.
+JoinCriterion = Literal['', 'name', 'time', 'order']
 # A joint that turns by more between the reports before and after a point was moving, in the
 # units of the table: degrees; in radians a thousandth.
 _STILL_DEG = 0.05
-# Between the parts of a name: SpatialAnalyzer's collection::group::point, and paths.
+# Separators between the parts of a name: SpatialAnalyzer's collection::group::point, and paths.
 _PATH = re.compile(r'::|[/\\|]')
-# From this level of comparing names on it takes so many of them, and the other table has at most
-# so many times as many.
-_OWN_PART, _LAST_WORD, _FEWEST_NAMES, _MOST_TIMES = 3, 4, 4, 3
+# Levels of `_comparison_keys`. From the first on, at least `_FEWEST_NAMES` names have to match.
+# One table has at most `_MOST_TIMES` as many names as the other.
+_DISTINCT_PART, _LAST_WORD, _FEWEST_NAMES, _MOST_TIMES = 3, 4, 4, 3
 _WORDS = re.compile(r'[\s_.-]+')
 # A number with a decimal sign is measured, no name.
 _MEASURED = re.compile(r'[+-]?\d*[.,]\d+(?:[eE][+-]?\d+)?')
@@ -66,32 +64,35 @@ _BRACKETS = re.compile(r'[\[\](){}_\s-]')
 
 @dataclass(frozen=True, eq=False)
 class Pairs:
-    """The pairs found."""
+    """Pairs of rows of a table of points and a table of joints."""
 
-    # Rows of the two tables, (n,) each.
+    # Row indices in the two tables, (n,) each.
     points: IntArray
     joints: IntArray
-    # By what they were paired, for people.
-    how: str
-    # What was left out and why, a sentence each.
+    # Criterion of the pairing in words, such as "by time".
+    criterion: str
+    # Rows that were left out, with the reason, a sentence each.
     left_out: tuple[str, ...] = ()
 
 
 def join(
     points: Table,
     joints: Table,
-    how: How = '',
+    how: JoinCriterion = '',
     within_s: float = 1.0,
 ) -> Pairs:
-    """Pair the rows of two tables, where something tells which belong together."""
+    """Pair the rows of two tables by name, time or order.
+
+    Raises InputError if nothing pairs them.
+    """
     if how in ('', 'name'):
-        pairs = _by_name(points, joints, by_header=how == '')
+        pairs = _pairs_by_name(points, joints, by_header=how == '')
         if pairs is not None:
             return pairs
     if how in ('', 'time'):
-        pairs = _by_time(points, joints, within_s)
+        pairs = _pairs_by_time(points, joints, within_s)
         if pairs is None and not how:
-            pairs = _by_name(points, joints, by_header=False)
+            pairs = _pairs_by_name(points, joints, by_header=False)
         if pairs is not None:
             return pairs
     a, b = points[0], joints[0]
@@ -121,33 +122,39 @@ def join(
 def common_names(
     points: Table, joints: Table, by_header: bool = True
 ) -> tuple[int, int, list[str], list[str]] | None:
-    """Return the columns by whose names most rows belong together, and the names as compared.
+    """The pair of columns whose names match in most rows, and the names in comparable form.
 
-    `P01`, `p1` and `P1 ` are the same; where no names are, then the last parts (`A::KR6::P1` and
-    `P1`), then those without brackets and underscores (`P[1]`), then what is not the same in all
-    names of a table (`KR6_P1` and `Pose 1`), then the last words (`KR6_P1` and `P1`); in these two
-    one table has all names of the other. If not `by_header`, any column may have the names.
+    Names are compared at rising levels until some match: `P01`, `p1` and `P1 ` are equal; then the
+    last parts (`A::KR6::P1` and `P1`), then names without brackets and underscores (`P[1]`), then
+    without the beginning and end that all names of a table share (`KR6_P1` and `Pose 1`), then the
+    last words (`KR6_P1` and `P1`). At the last two levels one table must contain all names of the
+    other. If not `by_header`, any unused column may hold the names. None if no level matches.
     """
     named = [(i, j) for i in points[1].others['name'] for j in joints[1].others['name']]
     for level in range(_LAST_WORD + 1):
-        found = _matching(points, joints, level, named, level < _OWN_PART)
+        found = _best_name_columns(points, joints, level, named, level < _DISTINCT_PART)
         if found is not None:
             return found
     if by_header:
         return None
-    pairs = [(i, j) for i in _spare(*points) for j in _spare(*joints)]
+    pairs = [
+        (i, j) for i in _possible_name_columns(*points) for j in _possible_name_columns(*joints)
+    ]
     for level in range(_LAST_WORD + 1):
-        found = _matching(points, joints, level, pairs, False)
+        found = _best_name_columns(points, joints, level, pairs, False)
         if found is not None:
             return found
     return None
 
 
-def _spare(table: TextTable, columns: Columns) -> list[int]:
+def _possible_name_columns(table: TextTable, columns: Columns) -> list[int]:
     """Return columns that may be names: of no other use, no two rows alike."""
     used = {*columns.joints, *columns.from_joints, *columns.point}
     used |= {
-        i for kind, own in columns.others.items() if kind not in ('name', 'pose') for i in own
+        i
+        for kind, kind_columns in columns.others.items()
+        if kind not in ('name', 'pose')
+        for i in kind_columns
     }
     return [
         i
@@ -158,16 +165,17 @@ def _spare(table: TextTable, columns: Columns) -> list[int]:
     ]
 
 
-def _matching(
+def _best_name_columns(
     points: Table, joints: Table, level: int, columns: Iterable[tuple[int, int]], sure: bool
 ) -> tuple[int, int, list[str], list[str]] | None:
-    """Return the columns of which most names belong together, at this level of comparing them.
+    """The pair of columns with most names in common at one level of `_comparison_keys`.
 
-    Where that is not `sure` by the header, one table has all names of the other.
+    If not `sure` (the header does not call them names), one table must contain all names of the
+    other. None if no pair matches.
     """
     best: tuple[int, int, int, list[str], list[str]] | None = None
     for i, j in columns:
-        a, b = _keys(points[0], i, level), _keys(joints[0], j, level)
+        a, b = _comparison_keys(points[0], i, level), _comparison_keys(joints[0], j, level)
         common = len(set(a) & set(b))
         fewer, more = sorted((len(set(a)), len(set(b))))
         # A log counts all of its rows: such numbers are no names of points.
@@ -180,29 +188,40 @@ def _matching(
     return best and best[1:]
 
 
-def _by_name(points: Table, joints: Table, *, by_header: bool) -> Pairs | None:
+def _pairs_by_name(points: Table, joints: Table, *, by_header: bool) -> Pairs | None:
+    """Pairs of rows with equal names; None if the tables share none.
+
+    Raises InputError if a name is twice.
+    """
     best = common_names(points, joints, by_header)
     if best is None:
         return None
     i, j, a, b = best
-    several = points[1].one('sensor') is not None or points[1].one('marker') is not None
+    has_several_readings = (
+        points[1].first_of_kind('sensor') is not None
+        or points[1].first_of_kind('marker') is not None
+    )
     for keys, (table, _), column in ((a, points, i), (b, joints, j)):
         count = Counter(keys)
-        twice = [row for row, key in enumerate(keys) if count[key] > 1 and key in set(a) & set(b)]
-        if twice and not (several and table is points[0]):
+        repeated = [
+            row for row, key in enumerate(keys) if count[key] > 1 and key in set(a) & set(b)
+        ]
+        if repeated and not (has_several_readings and table is points[0]):
             raise table.fault(
-                twice[1],
+                repeated[1],
                 column,
-                f'is also on {table.counted} {table.lines[twice[0]]}; keep one, or say --join '
+                f'is also on {table.counted} {table.lines[repeated[0]]}; keep one, or say --join '
                 'order',
             )
     at = {key: row for row, key in enumerate(b)}
     rows = np.array([row for row, key in enumerate(a) if key in at], dtype=np.int64)
     left_out = []
     for (table, _), column, keys, other in ((points, i, a, set(b)), (joints, j, b, set(a))):
-        alone = [table.rows[row][column] for row, key in enumerate(keys) if key not in other]
-        if alone:
-            left_out.append(f'{table.path}: {some(alone)}: not in the other table, left out')
+        unmatched = [table.rows[row][column] for row, key in enumerate(keys) if key not in other]
+        if unmatched:
+            left_out.append(
+                f'{table.path}: {first_names(unmatched)}: not in the other table, left out'
+            )
     return Pairs(
         rows,
         np.array([at[a[row]] for row in rows], dtype=np.int64),
@@ -211,20 +230,20 @@ def _by_name(points: Table, joints: Table, *, by_header: bool) -> Pairs | None:
     )
 
 
-def _keys(table: TextTable, column: int, level: int) -> list[str]:
-    """Return names as they are compared.
+def _comparison_keys(table: TextTable, column: int, level: int) -> list[str]:
+    """Names of a column in the form in which they are compared at a level.
 
-    0 whole, 1 their last parts, 2 those without brackets, 3 without what all of them begin and end
-    with, 4 their last words.
+    0: whole; 1: last part of a path; 2: without brackets; 3: without the beginning and end that
+    all names share; 4: last word. All lower case, numbers without leading zeros.
     """
     names = [row[column] for row in table.rows]
     if level > 0:
         names = [_PATH.split(name.strip())[-1] for name in names]
     if level == _LAST_WORD:
         names = [_WORDS.split(name.strip())[-1] for name in names]
-    elif level == _OWN_PART:
-        begin = _common([name.casefold() for name in names])
-        end = _common([name[begin:][::-1].casefold() for name in names])
+    elif level == _DISTINCT_PART:
+        begin = _common_prefix_length([name.casefold() for name in names])
+        end = _common_prefix_length([name[begin:][::-1].casefold() for name in names])
         names = [name[begin : len(name) - end] for name in names]
     elif level > 1:
         names = [_BRACKETS.sub('', name) for name in names]
@@ -234,15 +253,18 @@ def _keys(table: TextTable, column: int, level: int) -> list[str]:
     ]
 
 
-def _common(names: Sequence[str]) -> int:
-    """Return with how many letters all names begin, without the digits of a number."""
+def _common_prefix_length(names: Sequence[str]) -> int:
+    """Number of letters with which all names begin, not counting trailing digits."""
     first, last = min(names), max(names)
     same = itertools.takewhile(lambda pair: pair[0] == pair[1], zip(first, last))
     return len(''.join(letter for letter, _ in same).rstrip(string.digits))
 
 
-def _by_time(points: Table, joints: Table, within_s: float) -> Pairs | None:
-    """Pair each point with the joints reported next to it, where the arm stood still."""
+def _pairs_by_time(points: Table, joints: Table, within_s: float) -> Pairs | None:
+    """Pairs of each point with the joints reported nearest in time.
+
+    None if a table has no times.
+    """
     when, reported = times(*points), times(*joints)
     if when is None or reported is None:
         return None
@@ -250,7 +272,7 @@ def _by_time(points: Table, joints: Table, within_s: float) -> Pairs | None:
     reported = reported[order]
     days = np.round((np.median(reported) - np.median(when)) / DAY_S)
     if days and any(np.all(np.abs(t - WITHOUT_DATE_S) < 2.0 * DAY_S) for t in (when, reported)):
-        # One of the two has no dates.
+        # One of the two tables has times of day without dates.
         when = when + days * DAY_S
     after = np.searchsorted(reported, when)
     before = np.clip(after - 1, 0, len(reported) - 1)
@@ -286,7 +308,7 @@ def _by_time(points: Table, joints: Table, within_s: float) -> Pairs | None:
 
 
 def _span(times_s: FloatArray) -> str:
-    """Return the first and the last time, as dates where they are such."""
+    """First and last time as text: dates, or seconds if the times have no date."""
     ends = times_s.min(), times_s.max()
     if ends[0] < WITHOUT_DATE_S:
         return f'{ends[0]:.1f} to {ends[1]:.1f} s'
@@ -296,58 +318,59 @@ def _span(times_s: FloatArray) -> str:
 def _refuse_equal_times(
     joints: Table, reported: FloatArray, order: IntArray, q: FloatArray, used: IntArray
 ) -> None:
-    """Refuse joints that a point needs and that have the time of others.
+    """Raise InputError if a row of joints that a point needs has the time of another row.
 
-    ``reported``: s, rising; ``order``: their rows in the table; ``used``: which are needed.
+    ``reported``: times of the joints, s, rising; ``order``: their row in the table; ``used``:
+    indices into ``reported`` of the rows that are needed.
     """
     table, columns = joints
     for at in np.unique(used):
         for other in (at - 1, at + 1):
             if not 0 <= other < len(reported) or reported[other] != reported[at]:
                 continue
-            one, two = sorted((order[at], order[other]))
-            if np.any(q[one] != q[two]):
+            earlier, later = sorted((order[at], order[other]))
+            if np.any(q[earlier] != q[later]):
                 column = next(
                     c for kind in ('time', 'clock', 'date') for c in columns.others[kind]
                 )
                 raise table.fault(
-                    int(two),
+                    int(later),
                     column,
-                    f'is the time of {table.counted} {table.lines[one]} as well, and the joints '
-                    'are others; give times with seconds, or say --join order',
+                    f'is the time of {table.counted} {table.lines[earlier]} as well, and the '
+                    'joints are others; give times with seconds, or say --join order',
                 )
 
 
-# A marker that moves by less than this share of what others move is not on the arm: one on the
-# first link would, by less than a fiftieth of the arm's reach about its axis.
+# A marker whose extent is less than this share of the largest one is not on the arm. A marker on
+# the first link would move so little only within a fiftieth of the arm's reach from its axis.
 STATIC = 0.02
-# Of fewer configurations any two may well have one time.
+# With fewer configurations two equal times may be a coincidence.
 _FEWEST_ALIKE = 4
 _OTHERS = ('pose', 'configuration', 'split', 'sensor', 'marker')
 
 
 @dataclass(frozen=True)
 class TableOptions:
-    """What the user said of the tables; '' and () where nothing."""
+    """Options of the command that concern the tables; '', () and None if not given."""
 
     separator: str = ''
     decimal: str = ''
     encoding: str = ''
     angles: str = ''
     length: str = ''
-    told: Told = field(default_factory=Told)
-    join: How = ''
+    chosen: ColumnChoice = field(default_factory=ColumnChoice)
+    join: JoinCriterion = ''
     within_s: float = 1.0
     clock_offset_s: float | None = None
-    pulses_per_degree: tuple[float, ...] = ()  # Base to tip; () for joints in angles
-    sheets: tuple[str, ...] = ()  # Of a workbook; () for all with numbers
+    pulses_per_degree: tuple[float, ...] = ()  # Base to tip; () if the joints are angles
+    sheets: tuple[str, ...] = ()  # Names of workbook sheets; () for all with numbers
 
 
 @dataclass(frozen=True, eq=False)
 class RawRows:
-    """Rows of joints and points in the order measured."""
+    """Rows of joint angles and points in SI, in the order measured."""
 
-    where: tuple[str, ...]  # File and line of each row, for messages, n texts
+    source: tuple[str, ...]  # File and line of each row, for messages, n texts
     joint_columns: tuple[str, ...]  # Names of the k joint columns
     # rad and m, (n, k) and (n, 3); NaN where unknown
     q: FloatArray
@@ -360,33 +383,34 @@ class RawRows:
     # (n,); NaN and -1 where unknown
     temperature_c: FloatArray
     samples: FloatArray
-    columns: dict[str, str]  # Column -> what it was taken for, for people
+    columns: dict[str, str]  # Column -> its meaning in words
     description: tuple[str, ...]  # How the files were read and joined, a line each
     warnings: tuple[str, ...]  # A sentence each
-    # Marker -> columns of X, Y and Z, where there are such
+    # Marker -> names of its columns X, Y and Z; empty for a bag
     points: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
-    length_unit: str = 'm'  # In which the points are
-    # In which the table has the joints; None where they are those of the URDF, as in a bag
+    length_unit: str = 'm'  # Unit of the points in the file
+    # Unit of the joints in the table; None if they are those of the URDF in SI, as in a bag
     angle_unit: AngleUnit | None = None
-    # Which rows were measured at once, (n,); None where each was measured by itself
+    # Index of the reading of each row, (n,): rows of one reading were measured at the same time.
+    # None if each row is a reading of its own
     reading: IntArray | None = None
-    # Quaternion x, y, z, w of the marker in the sensor's frame, (n, 4), NaN where unknown; None
-    # where none was measured
+    # Quaternion x, y, z, w of the marker in the sensor's frame, (n, 4), NaN if unknown; None if
+    # no orientation was measured
     orientation: FloatArray | None = None
-    # Columns of one that do not tell how it turns, (n, 3) or (n, 4), their unit, '' where none is
-    # stated, and their names
-    turned: FloatArray | None = None
-    turned_unit: str = ''
-    turned_columns: str = ''
-    # Joint column -> (another one, 1 or -1), as the controller of this file counts
+    # Orientation whose convention (Euler order, quaternion order) the columns do not state, (n, 3)
+    # or (n, 4), with its unit ('' if not stated) and column names
+    ambiguous_orientation: FloatArray | None = None
+    ambiguous_unit: str = ''
+    ambiguous_columns: str = ''
+    # Joint column -> (coupled joint column, 1 or -1), as the controller of this file counts
     coupling: Mapping[str, tuple[str, Literal[1, -1]]] = field(default_factory=dict)
-    maker: str = ''  # Of the controller; '' where it is not known
-    # Kind of the instrument that measured the points; '' where it is not known
+    maker: str = ''  # Manufacturer of the controller; '' if unknown
+    # Kind of the instrument that measured the points; '' if unknown
     instrument: Literal['', SensorKind] = ''
-    effort: FloatArray | None = None  # Measured torques, N m, (n, k); None where there are none
+    effort: FloatArray | None = None  # Measured torques, N m, (n, k); None if not measured
 
     def in_order(self) -> RawRows:
-        """Return the rows in the order of their times."""
+        """Rows sorted by their times, with a warning if that changed the order."""
         if self.stamp_s is None:
             return self
         order = np.argsort(self.stamp_s, kind='stable')
@@ -400,7 +424,7 @@ class RawRows:
         return replace(
             self,
             **picked,
-            where=tuple(self.where[i] for i in order),
+            source=tuple(self.source[i] for i in order),
             labels={kind: [names[i] for i in order] for kind, names in self.labels.items()},
             warnings=(*self.warnings, 'the rows were put in the order of their times'),
         )
@@ -409,7 +433,7 @@ class RawRows:
 def read_rows(
     files: Sequence[Path | TextTable], chain: SerialChain, options: TableOptions
 ) -> RawRows:
-    """Read one table with joints and points, or one with each; some may have been read before.
+    """Read one table with joints and points, or one table of each, from files or tables in memory.
 
     Raises
     ------
@@ -438,7 +462,7 @@ def read_rows(
         )
     ]
     tables = [
-        _visited(table, programs[table.path]) if table.path in programs else table
+        _in_move_order(table, programs[table.path]) if table.path in programs else table
         for table in tables
     ]
     sliding = np.flatnonzero(chain.slides).tolist()
@@ -446,9 +470,9 @@ def read_rows(
     def with_columns(tables: list[TextTable]) -> list[Table]:
         found, problems = [], []
         for table in tables:
-            told = _of_table(options.told, table, tables)
+            chosen = _choice_for_table(options.chosen, table, tables)
             try:
-                found.append((table, find_columns(table, chain.joint_names, told, sliding)))
+                found.append((table, find_columns(table, chain.joint_names, chosen, sliding)))
             except InputError as error:
                 # A workbook has sheets for other things.
                 if not table.part:
@@ -458,27 +482,27 @@ def read_rows(
             raise problems[0]
         return found
 
-    if not (options.told.joints or options.told.points):
-        # Numbers that were told are those of the file.
+    if not (options.chosen.joints or options.chosen.points):
+        # Column numbers that the user gave count the columns of the file as it is.
         tables = [table if table.has_header else with_poses(table) for table in tables]
     found = with_columns(tables)
-    if not any(columns.points for _, columns in found) and not options.told.points:
+    if not any(columns.points for _, columns in found) and not options.chosen.points:
         tables = [with_poses(table) for table in tables]
         found = with_columns(tables)
-    _refuse_untold(found, options.told)
+    _refuse_absent_columns(found, options.chosen)
     whole = [pair for pair in found if pair[1].points and pair[1].joints]
     if len(whole) == 1 and all(table.part for table, _ in found):
         # Beside it a workbook has sums, and an archive other arrays.
         found = whole
-    with_points = _told_first([pair for pair in found if pair[1].points], 'points')
-    with_joints = _told_first([pair for pair in found if pair[1].joints], 'joints')
+    with_points = _prefer_chosen([pair for pair in found if pair[1].points], 'points')
+    with_joints = _prefer_chosen([pair for pair in found if pair[1].joints], 'joints')
     # A log of joints may have where the robot believes its tool to be.
     alone = [pair for pair in with_points if not pair[1].joints]
-    points = _only(
+    points = _single_table(
         alone if len(alone) == 1 else with_points, tables, 'a measured point (X, Y, Z)', '--points'
     )
     # Where the points' table repeats the joints, those of the other table were meant.
-    joints = _only(
+    joints = _single_table(
         [pair for pair in with_joints if pair is not points] or with_joints,
         tables,
         'the joint angles',
@@ -490,7 +514,7 @@ def read_rows(
         for table in tables
         if table.part and table not in (points[0], joints[0])
     ]
-    joints, idle = _without_idle(joints, len(chain))
+    joints, idle = _without_unused_axes(joints, len(chain))
     if idle:
         warnings.append(f'{joints[0].path}: {", ".join(idle)} left out: 0 in every row')
     if len(joints[1].joints) != len(chain):
@@ -514,11 +538,11 @@ def read_rows(
             warnings.append(f'{table.path}: {unused} left out, the points are in {points[0].path}')
     stamp = None
     in_order = options.join == 'order'
-    told = options.join in ('name', 'time') or options.told.time == 'none'
+    chosen = options.join in ('name', 'time') or options.chosen.time == 'none'
     still = None
     # A clock that was told is that of two streams.
     if options.clock_offset_s is not None or (
-        not told and (in_order or joints is points or not common_names(points, joints))
+        not chosen and (in_order or joints is points or not common_names(points, joints))
     ):
         still = stopped(
             points, joints, chain, options.angles, options.length, options.clock_offset_s, in_order
@@ -528,19 +552,21 @@ def read_rows(
         description += still.description
         warnings += still.warnings
     else:
-        points, joints, left = _complete(points, joints)
+        points, joints, left = _without_incomplete_rows(points, joints)
         warnings += left
     if still is None and joints[0] is not points[0]:
         pairs = join(points, joints, options.join, options.within_s)
-        description.append(f'{len(pairs.points)} rows joined {pairs.how}')
+        description.append(f'{len(pairs.points)} rows joined {pairs.criterion}')
         warnings += pairs.left_out
         points = points[0].select(pairs.points), points[1]
         joints = joints[0].select(pairs.joints), joints[1]
-    return _values(points, joints, chain, options, stamp, tuple(description), tuple(warnings))
+    return _raw_rows(points, joints, chain, options, stamp, tuple(description), tuple(warnings))
 
 
-def _without_idle(joints: Table, count: int) -> tuple[Table, list[str]]:
-    """Return joints without axes behind so many that are 0 throughout, and the names of these.
+def _without_unused_axes(joints: Table, count: int) -> tuple[Table, list[str]]:
+    """Table of joints without axes beyond the first `count` that are 0 throughout.
+
+    And their names.
 
     A controller that has seven axes writes 0 for the seventh of an arm with six.
     """
@@ -552,10 +578,13 @@ def _without_idle(joints: Table, count: int) -> tuple[Table, list[str]]:
     return (table, kept), [table.names[i] for i in beyond]
 
 
-def _complete(points: Table, joints: Table) -> tuple[Table, Table, tuple[str, ...]]:
-    """Return tables without rows that have no joints or no point, and sentences on these."""
+def _without_incomplete_rows(points: Table, joints: Table) -> tuple[Table, Table, tuple[str, ...]]:
+    """Points and joints without rows that lack joints or a point.
+
+    And a sentence on what is left out.
+    """
     same = points[0] is joints[0]
-    kept, left = {}, []
+    kept, notes = {}, []
     for what, (table, _), places in (
         ('no joints', joints, joints[1].joints),
         ('no point', points, points[1].point),
@@ -565,22 +594,22 @@ def _complete(points: Table, joints: Table) -> tuple[Table, Table, tuple[str, ..
         known = np.array([not lost(is_missing(row[i]) for i in places) for row in table.rows])
         kept[what] = known
         if not known.all() and known.any():
-            left.append(f'{table.at_rows(np.flatnonzero(~known).tolist())}: {what}, left out')
+            notes.append(f'{table.at_rows(np.flatnonzero(~known).tolist())}: {what}, left out')
         if not known.any():
             kept[what] = np.ones(len(table.rows), bool)
     if same:
         both = kept['no joints'] & kept['no point']
         table = points[0].select(np.flatnonzero(both).tolist())
-        return (table, points[1]), (table, joints[1]), tuple(left)
+        return (table, points[1]), (table, joints[1]), tuple(notes)
     tables = [
         (table.select(np.flatnonzero(kept[what]).tolist()), columns)
         for what, (table, columns) in (('no point', points), ('no joints', joints))
     ]
-    return tables[0], tables[1], tuple(left)
+    return tables[0], tables[1], tuple(notes)
 
 
-def _visited(data: TextTable, program: Path) -> TextTable:
-    """Return the positions of a KUKA program's data in the order of its moves."""
+def _in_move_order(data: TextTable, program: Path) -> TextTable:
+    """Positions of a KUKA data file (.dat) in the order of the moves of its program (.src)."""
     text, _ = decode(read_limited(program, TABLE_LIMIT, 'name the program'), program, '')
     named = [row[0] for row in data.rows] if data.names[0] == 'name' else []
     order = kuka.moves(text)
@@ -594,7 +623,7 @@ def _visited(data: TextTable, program: Path) -> TextTable:
     return replace(data.select(kept), notes=notes)
 
 
-def _values(
+def _raw_rows(
     points: Table,
     joints: Table,
     chain: SerialChain,
@@ -603,6 +632,7 @@ def _values(
     description: tuple[str, ...],
     warnings: tuple[str, ...],
 ) -> RawRows:
+    """Rows in SI from a table of points and a table of joints that belong together row by row."""
     table, columns = points
     q, units, scale = joint_values(*joints, chain, options.angles)
     angle = next((unit for unit, _ in units if unit in ANGLES), None)
@@ -618,7 +648,7 @@ def _values(
     refuse_far(table, columns, length)
     names = list(columns.points)
     if several:
-        moved, left = _moved(raw, names, table)
+        moved, left = _markers_on_arm(raw, names, table)
         warnings += left
         row, marker = row[moved[marker]], marker[moved[marker]]
     n, k = q.shape
@@ -632,22 +662,22 @@ def _values(
             std[i] = numbers(table, columns.stds[name], optional=True) * LENGTHS[length]
         if name in columns.orientations:
             turns[i] = numbers(table, columns.orientations[name], optional=True)
-            _refuse_no_turn(table, columns.orientations[name], turns[i])
+            _refuse_non_unit_quaternions(table, columns.orientations[name], turns[i])
     effort = None
     # Of a stream the torques are those of one moment, and no mean over a standstill.
     if joints[1].efforts and stamp is None:
         effort = numbers(joints[0], joints[1].efforts, optional=True)
-    if stamp is None and options.told.time != 'none':
+    if stamp is None and options.chosen.time != 'none':
         stamp = times(*points)
         if stamp is None and joints[0] is not table:
             stamp = times(*joints)
-    if stamp is not None and (equal := _all_the_same(stamp, q)):
+    if stamp is not None and (equal := _shared_time_note(stamp, q)):
         stamp = None
         warnings += (equal,)
     given = {}
     for kind in _OTHERS:
         for one, found in (points, joints):
-            column = found.one(kind)
+            column = found.first_of_kind(kind)
             if column is not None and kind not in given:
                 given[kind] = [one.rows[i][column] for i in row]
     if several:
@@ -657,7 +687,7 @@ def _values(
     for one, found in both:
         prefix = f'{one.path.name}: ' if len(both) > 1 else ''
         is_joints, is_points = found is joints[1], found is columns
-        meaning = _meanings(
+        meaning = _column_meanings(
             found if is_joints else replace(found, joints=(), from_joints=(), efforts=()),
             chain,
             tuple(f'{unit} ({how})' for unit, how in units),
@@ -667,7 +697,7 @@ def _values(
             f'{prefix}{name}': meaning.get(i, 'not used') for i, name in enumerate(one.names)
         }
     return RawRows(
-        where=tuple(table.at(int(i)) for i in row),
+        source=tuple(table.at(int(i)) for i in row),
         joint_columns=tuple(joints[0].names[i] for i in joints[1].joints),
         q=q[row],
         from_q=from_q[row],
@@ -675,8 +705,8 @@ def _values(
         std=std[marker, row],
         stamp_s=None if stamp is None else stamp[row],
         labels=given,
-        temperature_c=_optional(points, 'temperature')[row],
-        samples=np.nan_to_num(_optional(points, 'samples')[row], nan=-1.0),
+        temperature_c=_optional_column(points, 'temperature')[row],
+        samples=np.nan_to_num(_optional_column(points, 'samples')[row], nan=-1.0),
         columns=meanings,
         description=description,
         warnings=warnings,
@@ -685,12 +715,16 @@ def _values(
         angle_unit=cast(AngleUnit | None, angle),
         reading=row if several else None,
         orientation=turns[marker, row] if columns.orientations else None,
-        turned=numbers(table, columns.turned, optional=True)[row] if columns.turned else None,
-        turned_unit=columns.units.get(columns.turned[0], '') if columns.turned else '',
-        turned_columns=', '.join(
+        ambiguous_orientation=numbers(table, columns.ambiguous_orientation, optional=True)[row]
+        if columns.ambiguous_orientation
+        else None,
+        ambiguous_unit=columns.units.get(columns.ambiguous_orientation[0], '')
+        if columns.ambiguous_orientation
+        else '',
+        ambiguous_columns=', '.join(
             table.names[i]
             for i in (
-                *columns.turned,
+                *columns.ambiguous_orientation,
                 *itertools.chain.from_iterable(columns.orientations.values()),
             )
         ),
@@ -703,21 +737,26 @@ def _values(
 
 
 def _refuse_part_of_a_point(table: TextTable, columns: Columns, raw: FloatArray) -> None:
-    """Refuse points of which X, Y or Z alone is missing."""
-    for own, points in zip(columns.points.values(), raw):
+    """Raise InputError if only some of X, Y and Z of a point are missing.
+
+    Or if no point is left.
+    """
+    for marker_columns, points in zip(columns.points.values(), raw):
         empty = np.isnan(points)
         for row in np.flatnonzero(empty.any(axis=1) & ~empty.all(axis=1))[:1]:
             raise table.fault(
                 int(row),
-                own[int(np.argmax(empty[row]))],
+                marker_columns[int(np.argmax(empty[row]))],
                 'is empty, and the others of its point are not; complete it or empty all three',
             )
     if len(raw) > 1 and np.isnan(raw).all():
         raise InputError(f'{table.path}: it has no point that was measured')
 
 
-def _refuse_no_turn(table: TextTable, columns: Sequence[int], turns: FloatArray) -> None:
-    """Refuse quaternions that are none."""
+def _refuse_non_unit_quaternions(
+    table: TextTable, columns: Sequence[int], turns: FloatArray
+) -> None:
+    """Raise InputError for the first quaternion, (n, 4), whose length is not 1."""
     off = np.abs(np.linalg.norm(turns, axis=1) - 1.0) > LENGTH_TOLERANCE
     for row in np.flatnonzero(off)[:1]:
         raise table.fault(
@@ -728,31 +767,43 @@ def _refuse_no_turn(table: TextTable, columns: Sequence[int], turns: FloatArray)
         )
 
 
-def moving(raw: FloatArray) -> BoolArray:
-    """Return which markers (markers, n, 3) move as the arm does; NaN where one was not seen."""
+def moving_markers(raw: FloatArray) -> BoolArray:
+    """Mask of the markers (markers, n, 3) that move with the arm.
+
+    NaN for readings that are missing.
+    """
     seen = np.isfinite(raw[:, :, 0])
     extent = np.array(
-        [np.ptp(own[at], axis=0).max() if at.any() else 0.0 for own, at in zip(raw, seen)]
+        [
+            np.ptp(marker_points[at], axis=0).max() if at.any() else 0.0
+            for marker_points, at in zip(raw, seen)
+        ]
     )
     return np.asarray(extent > STATIC * extent.max(initial=0.0))
 
 
-def _moved(
+def _markers_on_arm(
     raw: FloatArray, names: Sequence[str], table: TextTable
 ) -> tuple[BoolArray, tuple[str, ...]]:
-    """Return which markers move with the arm, (markers,), and the sentences on the others."""
-    moved = moving(raw)
+    """Mask of the markers that move with the arm, (markers,).
+
+    And a sentence on each other marker.
+    """
+    moved = moving_markers(raw)
     return moved, tuple(
         f'{table.path}: {name} stays in its place, so it is not on the arm; left out'
-        if np.isfinite(own[:, 0]).any()
+        if np.isfinite(marker_points[:, 0]).any()
         else f'{table.path}: {name} was never seen; left out'
-        for name, is_moved, own in zip(names, moved, raw)
+        for name, is_moved, marker_points in zip(names, moved, raw)
         if not is_moved
     )
 
 
-def _all_the_same(stamp: FloatArray, q: FloatArray) -> str:
-    """Return that most configurations have one and the same time, which is none; '' else."""
+def _shared_time_note(stamp: FloatArray, q: FloatArray) -> str:
+    """Sentence that most configurations share one time, which is then unusable.
+
+    '' if they do not.
+    """
     configurations = np.unique(np.column_stack((q, stamp)), axis=0)
     if len(configurations) < _FEWEST_ALIKE:
         return ''
@@ -765,21 +816,25 @@ def _all_the_same(stamp: FloatArray, q: FloatArray) -> str:
     )
 
 
-def _optional(points: Table, kind: str) -> FloatArray:
-    column = points[1].one(kind)
+def _optional_column(points: Table, kind: str) -> FloatArray:
+    """Numbers of the first column of a kind, (n,); NaN if empty or if there is no such column."""
+    column = points[1].first_of_kind(kind)
     if column is None:
         return np.full(len(points[0].rows), np.nan)
     return numbers(points[0], (column,), optional=True)[:, 0]
 
 
-def _meanings(
+def _column_meanings(
     columns: Columns, chain: SerialChain, units: Sequence[str], length: str
 ) -> dict[int, str]:
-    """Return what each column was taken for, by its index; of points only with a `length`."""
+    """Meaning of each column in words, by column index.
+
+    Columns of points only if `length` is given.
+    """
 
     def how(i: int) -> str:
         place = {'place': ', by its place', 'told': ', as told'}
-        return place.get(columns.why.get(i, ''), '')
+        return place.get(columns.origin.get(i, ''), '')
 
     found: dict[int, str] = {}
     for kind, joints in (('', columns.joints), ('coming from, ', columns.from_joints)):
@@ -797,7 +852,7 @@ def _meanings(
             found.setdefault(i, f'standard deviation of {axis} of {of}, {length}')
         for letter, i in zip('xyzw', turned):
             found.setdefault(i, f'{letter} of the quaternion of {of}{how(i)}')
-    for i in columns.turned if length else ():
+    for i in columns.ambiguous_orientation if length else ():
         found.setdefault(i, f'orientation of the marker{how(i)}')
     for kind, places in columns.others.items():
         for i in places:
@@ -805,51 +860,56 @@ def _meanings(
     return found
 
 
-def _of_table(told: Told, table: TextTable, tables: Sequence[TextTable]) -> Told:
-    """Return what was told of one table: numbers are of a table that has no names."""
-    own = _of_file(told, table.path, [one.path for one in tables])
+def _choice_for_table(
+    chosen: ColumnChoice, table: TextTable, tables: Sequence[TextTable]
+) -> ColumnChoice:
+    """Chosen columns that concern one table: numbers count only for a table without names."""
+    of_table = _choice_for_file(chosen, table.path, [one.path for one in tables])
     if not table.has_header or all(one.has_header for one in tables):
-        return own
+        return of_table
     points, joints = (
         () if names and all(map(str.isdigit, names)) else names
-        for names in (own.points, own.joints)
+        for names in (of_table.points, of_table.joints)
     )
-    return replace(own, points=points, joints=joints)
+    return replace(of_table, points=points, joints=joints)
 
 
-def _of_file(told: Told, path: Path, paths: Sequence[Path]) -> Told:
-    """Return what was told of one file: `joints.txt:1-6` is of that file alone."""
-    own: dict[str, tuple[str, ...]] = {}
-    for kind, names in (('joints', told.joints), ('points', told.points)):
+def _choice_for_file(chosen: ColumnChoice, path: Path, paths: Sequence[Path]) -> ColumnChoice:
+    """Chosen columns that concern one file: `joints.txt:1-6` is for that file alone."""
+    of_file: dict[str, tuple[str, ...]] = {}
+    for kind, names in (('joints', chosen.joints), ('points', chosen.points)):
         for other in paths:
             for name in (str(other), other.name):
                 if names and names[0].startswith(f'{name}:'):
-                    rest = (names[0][len(name) + 1 :], *names[1:])
-                    names = rest if other == path else ()
-        own[kind] = tuple(one for name in names for one in _range(name))
-    return replace(told, joints=own['joints'], points=own['points'])
+                    names_of_file = (names[0][len(name) + 1 :], *names[1:])
+                    names = names_of_file if other == path else ()
+        of_file[kind] = tuple(one for name in names for one in _expanded_range(name))
+    return replace(chosen, joints=of_file['joints'], points=of_file['points'])
 
 
-def _range(name: str) -> list[str]:
+def _expanded_range(name: str) -> list[str]:
+    """Column numbers of a range such as `1-6`; the name itself if it is no range."""
     ends = re.fullmatch(r'(\d+)-(\d+)', name)
     if ends is None or not int(ends[1]) <= int(ends[2]) <= MOST_COLUMNS:
         return [name]
     return [str(i) for i in range(int(ends[1]), int(ends[2]) + 1)]
 
 
-def _told_first(found: list[Table], kind: str) -> list[Table]:
-    """Return the tables in which columns of a kind were told, or all where none were."""
-    told = [
+def _prefer_chosen(found: list[Table], kind: str) -> list[Table]:
+    """Tables in which the user chose columns of a kind; all tables if none were chosen."""
+    chosen = [
         pair
         for pair in found
         if 'told'
-        in (pair[1].why.get(i) for i in (pair[1].joints if kind == 'joints' else pair[1].point))
+        in (pair[1].origin.get(i) for i in (pair[1].joints if kind == 'joints' else pair[1].point))
     ]
-    return told or found
+    return chosen or found
 
 
-def _only(found: list[Table], tables: Sequence[TextTable], what: str, option: str) -> Table:
-    """Return the one table that has something."""
+def _single_table(
+    found: list[Table], tables: Sequence[TextTable], what: str, option: str
+) -> Table:
+    """The only table of a list. Raises InputError if the list has none or several."""
     if len(found) == 1:
         return found[0]
     names = ' and '.join(str(table.path) for table in tables)
@@ -862,28 +922,29 @@ def _only(found: list[Table], tables: Sequence[TextTable], what: str, option: st
     raise InputError(f'{names}: both have {what}; give one of them, or name columns with {option}')
 
 
-def _refuse_untold(found: list[Table], told: Told) -> None:
-    """Refuse columns that were told and are in no table."""
+def _refuse_absent_columns(found: list[Table], chosen: ColumnChoice) -> None:
+    """Raise InputError if a column that the user chose is in no table."""
     for option, names, attribute in (
-        ('--joints', told.joints, 'joints'),
-        ('--points', told.points, 'point'),
+        ('--joints', chosen.joints, 'joints'),
+        ('--points', chosen.points, 'point'),
     ):
         if names and not any(
-            getattr(columns, attribute) and columns.why[getattr(columns, attribute)[0]] == 'told'
+            getattr(columns, attribute)
+            and columns.origin[getattr(columns, attribute)[0]] == 'told'
             for _, columns in found
         ):
             has = '; '.join(f'{table.path} has {", ".join(table.names)}' for table, _ in found)
             known = {name.casefold() for table, _ in found for name in table.names}
             absent = next((name for name in names if name.casefold() not in known), names[0])
             raise InputError(f'{option}: there is no column {absent!r}; {has}')
-    for option, name in (('--time', told.time), ('--names', told.names)):
-        if name not in ('', 'none') and not any('told' in c.why.values() for _, c in found):
+    for option, name in (('--time', chosen.time), ('--names', chosen.names)):
+        if name not in ('', 'none') and not any('told' in c.origin.values() for _, c in found):
             has = '; '.join(f'{table.path} has {", ".join(table.names)}' for table, _ in found)
             raise InputError(f'{option}: there is no column {name!r}; {has}')
 
 
 def from_tool(rows: RawRows) -> RawRows:
-    """Return rows of a sensor on the tool as those of the sensor, in the frame of what it sees.
+    """Rows of a sensor on the tool, converted to the frame of the target that it sees.
 
     Raises
     ------

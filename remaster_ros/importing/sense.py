@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether a table makes sense for the robot, and if not, which change makes it: one sentence."""
+"""Whether a table is consistent with the robot and, if not, which change makes it so."""
 
 from __future__ import annotations
 
@@ -35,33 +35,32 @@ from remaster_ros.importing.units import split_unit
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.types import FloatArray, Session
 
-# Angles that agree so well are one configuration, measured again: a pendant's last digits.
+# Joint angles closer than this, rad, are one configuration: the last digits of a pendant.
 SAME_JOINTS_RAD = 1e-3
-# Points that agree so well with the nominal arm are computed from its joints, m.
+# Points closer than this to the nominal arm, m, are computed from its joints, not measured.
 COMPUTED_M = 2e-5
-# Good rows of an LBR iiwa, which bends under its weight, were up to 3 mm off. Three times that is
-# a choice: no arm was measured that bends so far, and errors below it are left to `fit`.
+# Rows below this distance from the fit, m, are not reported as outliers. Good rows of an LBR
+# iiwa, which bends under its weight, were up to 3 mm off; three times that is a choice.
 BENT_M = 0.01
-# Zeros further off, rad, are of another zero position, by quarters of a turn: a mistake.
+# Zero-offsets above this, rad, are not errors of mastering but another zero position.
 _LARGEST_UNMASTERED = np.pi / 4.0
-# Option with which zeros that are off by less are written, and all else is still checked.
+# Option that accepts offsets below that limit, with all other checks.
 NEVER_MASTERED = '--never-mastered'
-# Rows that a sentence names.
+# Number of rows that a sentence names.
 SHOWN_ROWS = 5
 
 
 @dataclass(frozen=True)
 class Sense:
-    """What trying the table against the robot has shown."""
+    """Result of trying the table against the robot."""
 
-    fits: bool  # As it is
-    sentence: str  # What was found
-    options: str = ''  # What to add to the command so that it fits; '' where nothing helps
-    error_m: float | None = None  # Median distance from the fit, m; None of too few rows
-    # Rows of the table that do not fit, with their distances, m, the farthest first, and what to
-    # do about them where the rest fits; '' where there is nothing
+    fits: bool  # Whether the table fits the robot without a change
+    sentence: str  # The finding, for people
+    options: str = ''  # Options of the command with which the table fits; '' if none helps
+    error_m: float | None = None  # Median distance from the fit, m; None if there are too few rows
+    # Rows of the table that do not fit, with their distances, m, the farthest first
     rows_off: tuple[tuple[str, float], ...] = ()
-    warning: str = ''
+    warning: str = ''  # Sentence on these rows with the remedy; '' if the table does not fit
 
 
 def check_sense(
@@ -70,16 +69,18 @@ def check_sense(
     progress: Callable[[str, float], None],
     never_mastered: bool = False,
 ) -> Sense:
-    """Fit the table as it is and, where that is gross, as it might be meant.
+    """Fit the table to the robot and, if the error is gross, look for the mistake in it.
 
     Parameters
     ----------
     session
-        As it would be written.
+        Session of the table as it stands.
     rows
-        For the names of the columns.
+        Rows of the table, for the names of the columns.
+    progress
+        Called with the step and the fraction done.
     never_mastered
-        Zero-offsets may be larger than a mastered robot has.
+        Whether zero-offsets may be larger than those of a mastered robot.
     """
     # The marker is left free: one that is firm at a wrong place would bend the fit.
     part = replace(session, marker_std_m=UNKNOWN_MARKER_STD_M)
@@ -92,37 +93,41 @@ def check_sense(
         off = find_rows_off(part, MOST_ROWS)
     except InsufficientDataError as error:
         return Sense(False, f'too little to try it against the robot: {error}')
-    without = shown_mm(as_given.error_m)
-    if not session.on_tool and _is_of_the_robot(part, chain):
+    error_text = shown_mm(as_given.error_m)
+    if not session.on_tool and _is_computed_from_joints(part, chain):
         return Sense(
             False,
             'the points are where the robot itself believes its tool to be, none that was '
             'measured; name the columns of the measured point with --points',
             error_m=as_given.error_m,
         )
-    beside = _beside(session, off, rows)
-    too_many = off.too_many and bool(beside)
+    outlying = _outlying_rows(session, off, rows)
+    too_many = off.too_many and bool(outlying)
     allowed = max(DISPLACED * session.marker_std_m, MARKER_SHIFT_M)
     if not as_given.gross and not too_many and as_given.marker_shift_m < allowed:
         return Sense(
             True,
-            f'the robot fits to {without} (median), with zero-offsets of up to '
-            f'{_largest(as_given.joint_offsets, chain)}',
+            f'the robot fits to {error_text} (median), with zero-offsets of up to '
+            f'{_largest_offsets_text(as_given.joint_offsets, chain)}',
             error_m=as_given.error_m,
-            rows_off=beside,
-            warning=_to_correct(beside, rows),
+            rows_off=outlying,
+            warning=_outlier_warning(outlying, rows),
         )
     if as_given.gross and len(part.measurements) < FEWEST_ROWS:
         return Sense(
             False,
-            f'the data fit to {without} only, and {len(part.measurements)} rows are too few to '
+            f'the data fit to {error_text} only, and {len(part.measurements)} rows are too few to '
             f'look for the reason (from {FEWEST_ROWS} on); check units, signs and order of the '
             'joints, and the URDF',
             error_m=as_given.error_m,
         )
     progress('trying', 0.3)
-    if as_given.gross and len(part.markers) > 1 and (apart := _by_marker(part, rows, without)):
-        return replace(apart, error_m=as_given.error_m)
+    if (
+        as_given.gross
+        and len(part.markers) > 1
+        and (by_marker := _single_markers_fit(part, rows, error_text))
+    ):
+        return replace(by_marker, error_m=as_given.error_m)
     mistakes = find_mistakes(session)
     if mistakes.fitting:
         sentence, options = in_a_sentence(mistakes, session, columns_of(rows, chain))
@@ -131,10 +136,10 @@ def check_sense(
     largest = np.abs(as_given.joint_offsets / as_given.per_radian).max()
     unmastered = as_given.left_m <= UNCALIBRATED_ERROR_M and largest < _LARGEST_UNMASTERED
     if as_given.gross and unmastered and not too_many and as_given.marker_shift_m < allowed:
-        found = _not_mastered(as_given, without, chain, never_mastered)
-        return replace(found, rows_off=beside, warning=_to_correct(beside, rows))
+        found = _unmastered(as_given, error_text, chain, never_mastered)
+        return replace(found, rows_off=outlying, warning=_outlier_warning(outlying, rows))
     if too_many and as_given.error_m <= UNCALIBRATED_ERROR_M:
-        return _many_off(as_given, beside, rows)
+        return _too_many_outliers(as_given, outlying, rows)
     if not as_given.gross:
         return Sense(
             False,
@@ -144,13 +149,13 @@ def check_sense(
             error_m=as_given.error_m,
         )
     measured = session.measurements.orientation is not None and not session.on_tool
-    return _nothing_found(as_given, without, chain, measured)
+    return _nothing_found(as_given, error_text, chain, measured)
 
 
-def _is_of_the_robot(session: Session, chain: SerialChain) -> bool:
-    """Return whether the points are computed from the joints, by the nominal arm in its base.
+def _is_computed_from_joints(session: Session, chain: SerialChain) -> bool:
+    """Whether the points are computed from the joints by the nominal arm, in its base frame.
 
-    No sensor sees an arm without an error, and none has the frame of its base that well.
+    No sensor measures an arm to `COMPUTED_M`, and none knows the base frame that well.
     """
     m = session.measurements
     for marker in range(len(session.markers)):
@@ -163,8 +168,8 @@ def _is_of_the_robot(session: Session, chain: SerialChain) -> bool:
     return True
 
 
-def _largest(offsets: FloatArray, chain: SerialChain) -> str:
-    """Return the largest angle, and the largest length where a joint slides, of offsets (k,)."""
+def _largest_offsets_text(offsets: FloatArray, chain: SerialChain) -> str:
+    """Largest angle and, for prismatic joints, largest length of offsets (k,), as text."""
     sizes, slides = np.abs(offsets), chain.slides
     parts = []
     if not slides.all():
@@ -175,7 +180,7 @@ def _largest(offsets: FloatArray, chain: SerialChain) -> str:
 
 
 def _too_few(session: Session, joints: int) -> str:
-    """Return that there are fewer configurations than unknowns can be found from; '' otherwise."""
+    """Sentence that the configurations are fewer than the unknowns need; '' if they are enough."""
     m = session.measurements.select(~session.measurements.is_validation)
     sensors, markers = len(np.unique(m.sensor)), len(np.unique(m.marker))
     # A configuration that is measured again tells of the noise alone.
@@ -199,8 +204,8 @@ def _too_few(session: Session, joints: int) -> str:
     )
 
 
-def _by_marker(session: Session, rows: RawRows, without: str) -> Sense | None:
-    """Return which markers fit where they are looked at one at a time; None where none does."""
+def _single_markers_fit(session: Session, rows: RawRows, error_text: str) -> Sense | None:
+    """Finding that some markers fit when each is taken by itself; None if no marker fits."""
     m = session.measurements
     fitting: dict[str, float] = {}
     for i, name in enumerate(session.markers):
@@ -213,7 +218,7 @@ def _by_marker(session: Session, rows: RawRows, without: str) -> Sense | None:
     if not fitting:
         return None
     others = [name for name in session.markers if name not in fitting]
-    alone = ', '.join(fitting)
+    fitting_names = ', '.join(fitting)
     if others:
         why = f'without {", ".join(others)}; is that on the tool?'
     else:
@@ -222,60 +227,65 @@ def _by_marker(session: Session, rows: RawRows, without: str) -> Sense | None:
     points = rows.points.get(name, ())
     return Sense(
         False,
-        f'all markers together fit to {without} only, {alone} to '
+        f'all markers together fit to {error_text} only, {fitting_names} to '
         f'{shown_mm(max(fitting.values()))} {why}',
         f'--points {",".join(points)}' if points else '',
     )
 
 
-def _beside(session: Session, off: RowsOff, rows: RawRows) -> tuple[tuple[str, float], ...]:
-    """Return the rows that do not fit, the farthest first, with their distances, m."""
+def _outlying_rows(session: Session, off: RowsOff, rows: RawRows) -> tuple[tuple[str, float], ...]:
+    """Rows of the table that do not fit, with their distances, m, the farthest first."""
     found = np.flatnonzero(off.off & (off.error_m > BENT_M))
     order = found[np.argsort(-off.error_m[found], kind='stable')]
     # Rows were left out where points were moved to other joints.
     line = session.measurements.observation
-    return tuple((rows.where[line[row]], float(off.error_m[row])) for row in order)
+    return tuple((rows.source[line[row]], float(off.error_m[row])) for row in order)
 
 
-def _to_correct(beside: Sequence[tuple[str, float]], rows: RawRows) -> str:
-    """Return the warning on rows that do not fit; '' where all do."""
-    return f'{_few_words(beside, rows)}; correct these rows or remove them' if beside else ''
+def _outlier_warning(outlying: Sequence[tuple[str, float]], rows: RawRows) -> str:
+    """Warning about rows that do not fit, with the remedy; '' if there are none."""
+    return (
+        f'{_outliers_text(outlying, rows)}; correct these rows or remove them' if outlying else ''
+    )
 
 
-def _few_words(beside: Sequence[tuple[str, float]], rows: RawRows) -> str:
-    """Return how many rows do not fit, how far they are off, and the first of them."""
+def _outliers_text(outlying: Sequence[tuple[str, float]], rows: RawRows) -> str:
+    """Number of rows that do not fit, their distances, and the first of them, as text."""
     shown = [
-        f'{where.rpartition("/")[2]} ({shown_mm(error)})' for where, error in beside[:SHOWN_ROWS]
+        f'{where.rpartition("/")[2]} ({shown_mm(error)})' for where, error in outlying[:SHOWN_ROWS]
     ]
-    more = f' and {len(beside) - SHOWN_ROWS} more' if len(beside) > SHOWN_ROWS else ''
-    errors = [error for _, error in beside]
+    more = f' and {len(outlying) - SHOWN_ROWS} more' if len(outlying) > SHOWN_ROWS else ''
+    errors = [error for _, error in outlying]
     least, far = shown_mm(min(errors)), shown_mm(max(errors))
     far = far if least == far else f'{least} to {far}'
-    verb = 'does' if len(beside) == 1 else 'do'
+    verb = 'does' if len(outlying) == 1 else 'do'
     return (
-        f'{len(beside)} of {len(rows.where)} rows {verb} not fit, {far} off: '
+        f'{len(outlying)} of {len(rows.source)} rows {verb} not fit, {far} off: '
         f'{", ".join(shown)}{more}'
     )
 
 
-def _many_off(given: Fitted, beside: tuple[tuple[str, float], ...], rows: RawRows) -> Sense:
-    """Return that more rows are off than a fit would leave out."""
+def _too_many_outliers(
+    given: Fitted, outlying: tuple[tuple[str, float], ...], rows: RawRows
+) -> Sense:
+    """Finding that more rows are off than a fit would leave out."""
     return Sense(
         False,
-        f'half of the rows fit to {shown_mm(given.error_m)}, but {_few_words(beside, rows)}; that '
+        f'half of the rows fit to {shown_mm(given.error_m)}, but '
+        f'{_outliers_text(outlying, rows)}; that '
         'is more than a fit leaves out: check whether each point stands beside its own joints, '
         'whether one marker was measured throughout and stayed in its place, and correct these '
         'rows or remove them',
         error_m=given.error_m,
-        rows_off=beside,
+        rows_off=outlying,
     )
 
 
 ON_TOOL = '; poses that a camera on the tool has of a board that stands need --on-tool'
 
 
-def _not_mastered(given: Fitted, without: str, chain: SerialChain, never_mastered: bool) -> Sense:
-    """Return that zeros are further off than those of a mastered robot, and what to do."""
+def _unmastered(given: Fitted, error_text: str, chain: SerialChain, never_mastered: bool) -> Sense:
+    """Finding that zero-offsets are larger than those of a mastered robot, with the remedy."""
     far = np.flatnonzero(np.abs(given.joint_offsets) > LARGEST_OFFSET * given.per_radian)
     listed = ' and '.join(
         f'{chain.joint_names[i]} off by {chain.shown_offset(i, given.joint_offsets[i], 1)}'
@@ -283,7 +293,7 @@ def _not_mastered(given: Fitted, without: str, chain: SerialChain, never_mastere
     )
     several = len(far) > 1
     found = (
-        f'the data fit to {without} with the zero{"s" * several} of {listed}, more than a '
+        f'the data fit to {error_text} with the zero{"s" * several} of {listed}, more than a '
         'mastered robot has'
     )
     if never_mastered:
@@ -300,21 +310,22 @@ def _not_mastered(given: Fitted, without: str, chain: SerialChain, never_mastere
     )
 
 
-def _nothing_found(given: Fitted, without: str, chain: SerialChain, oriented: bool) -> Sense:
+def _nothing_found(given: Fitted, error_text: str, chain: SerialChain, oriented: bool) -> Sense:
+    """Finding that the table does not fit and no known mistake explains it."""
     equal = np.abs(given.joint_offsets) / given.per_radian
     worst = int(np.argmax(equal))
     if chain.slides.any():
         off = f', joint {worst + 1} by {chain.shown_offset(worst, given.joint_offsets[worst], 1)}'
         return Sense(
             False,
-            f'the data fit to {without} only, with zero-offsets{off}; check units, signs and '
+            f'the data fit to {error_text} only, with zero-offsets{off}; check units, signs and '
             'order of the joints (where a joint slides other mistakes are not looked for), that '
             'the URDF is that of this arm, and that each point stands beside its own joints',
             error_m=given.error_m,
         )
     return Sense(
         False,
-        f'the data fit to {without} only, and it is none of these, which were tried: {TRIED}; '
+        f'the data fit to {error_text} only, and it is none of these, which were tried: {TRIED}; '
         'check that the URDF is that of this arm, that each point stands beside its own joints, '
         'and that one marker was measured throughout'
         f'{ON_TOOL if oriented else ""}',
@@ -323,13 +334,14 @@ def _nothing_found(given: Fitted, without: str, chain: SerialChain, oriented: bo
 
 
 def columns_of(rows: RawRows, chain: SerialChain) -> Columns:
-    """Return how the table names what it holds, and in which units that was taken to be."""
+    """Names of the columns of joints and points, and their units, for sentences on mistakes."""
     joints = tuple(split_unit(column)[0] for column in rows.joint_columns)
     return Columns(
         joints=joints,
         # A column without a name is called as the robot's joint.
         shown=tuple(
-            own if name.isdigit() else name for name, own in zip(joints, chain.joint_names)
+            joint_name if name.isdigit() else name
+            for name, joint_name in zip(joints, chain.joint_names)
         ),
         points=next(iter(rows.points.values()), ('X', 'Y', 'Z')),
         length_unit=rows.length_unit,

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A session that was written with a mistake in it, without the mistake: as import is told."""
+"""Correction of a mistake in a session that was written already, by the options of import."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ QUARTER_DEG = 90.0
 
 @dataclass(frozen=True)
 class Stretch:
-    """What is moved, and between which observations, the latter excluded; None where to an end."""
+    """A change of a range of observations; `until` is excluded, None is the first or the end."""
 
     what: str
     since: int | None = None
@@ -43,29 +43,29 @@ def arrangement_of(
     turn: tuple[str, float] = ('', 0.0),
     tip_link: str = '',
 ) -> Arrangement:
-    """Return the arrangement of a session that was told.
+    """Arrangement of a session by the user's corrections.
 
     Parameters
     ----------
     order
-        Joint whose column each joint, base to tip, is to take; () for as they are.
+        Joint whose column each joint, base to tip, takes; () for no change.
     couple, reverse, add_deg
-        As of `assemble.SessionOptions`.
+        Corrections of joints as in `assemble.SessionOptions`.
     angle_scale, length_scale
-        What angles and points are multiplied by.
+        Factors of the angles and of the points.
     mirrored
-        True where X and Y of the points are exchanged.
+        Whether X and Y of the points are exchanged.
     shift, exchange
-        Rows that each point is moved on by, and two markers whose labels are exchanged.
+        Rows by which each point is moved on, and two markers whose labels are exchanged.
     turn
-        Axis, and degrees by which the markers' places are turned about it; '' for not at all.
+        Axis, and degrees by which the markers are turned about it; '' for no turn.
     tip_link
-        Tool frame; '' for as it is.
+        Tool frame; '' for no change.
 
     Raises
     ------
     InputError
-        Names that the session has not, or angles that are no quarters of a turn.
+        Names that the session does not have, or angles that are no multiple of 90 degrees.
     """
     k = len(joint_names)
     if order and len(order) != k:
@@ -98,8 +98,8 @@ def arrangement_of(
         coupled=coupled,
         mirrored=mirrored,
         length_scale=length_scale,
-        shift=0 if shift is None else -_rows(shift.what),
-        exchanged=() if exchange is None else _markers(exchange.what, session),
+        shift=0 if shift is None else -_row_shift(shift.what),
+        exchanged=() if exchange is None else _marker_pair(exchange.what, session),
         since=stretch.since,
         until=stretch.until,
         turned=('xyz'.index(axis) if axis else 0, _quarters(angle, '--turn-tool')),
@@ -107,8 +107,8 @@ def arrangement_of(
     )
 
 
-def mended(session: Session, arrangement: Arrangement) -> Session:
-    """Return a whole session, its references among it, without a mistake."""
+def corrected_session(session: Session, arrangement: Arrangement) -> Session:
+    """Session with a correction applied to all its rows, reference visits included."""
     if arrangement == Arrangement.given(len(arrangement.order)):
         return session
     whole = arranged(replace(session, measurements=all_rows(session)), arrangement)
@@ -126,7 +126,7 @@ def mended(session: Session, arrangement: Arrangement) -> Session:
 def _controller(
     session: Session, arrangement: Arrangement, joint_names: Sequence[str]
 ) -> Controller | None:
-    """Return how the pad writes the joints, now that their columns are understood otherwise."""
+    """How the controller counts the joints after their columns were rearranged."""
     plain = Arrangement.given(len(joint_names))
     of_joints = (arrangement.order, arrangement.signs, arrangement.quarters, arrangement.coupled)
     if of_joints == (plain.order, plain.signs, plain.quarters, plain.coupled):
@@ -149,15 +149,16 @@ def _controller(
     if arrangement.coupled:
         second, third = (joint_names[arrangement.order[i]] for i in (1, 2))
         other = known.get(second, PadJoint(second))
-        own = known.get(third, PadJoint(third))
-        if own.coupling or other.coupling or other.zero_deg:
+        pad_of_third = known.get(third, PadJoint(third))
+        if pad_of_third.coupling or other.coupling or other.zero_deg:
             raise InputError('--couple: the joints of this session are coupled or moved already')
-        share = cast(Literal[1, -1], arrangement.coupled * own.sign * other.sign)
+        share = cast(Literal[1, -1], arrangement.coupled * pad_of_third.sign * other.sign)
         pads[joint_names[2]] = replace(pads[joint_names[2]], coupling={joint_names[1]: share})
     return Controller(pads, '' if session.controller is None else session.controller.maker)
 
 
-def _rows(text: str) -> int:
+def _row_shift(text: str) -> int:
+    """Number of rows to shift by, 1 or -1. Raises InputError for other text."""
     try:
         rows = int(text)
     except ValueError:
@@ -169,7 +170,8 @@ def _rows(text: str) -> int:
     return rows
 
 
-def _markers(text: str, session: Session) -> tuple[int, ...]:
+def _marker_pair(text: str, session: Session) -> tuple[int, ...]:
+    """Indices of two markers of a text such as ``sir,smr``."""
     names = text.split(',')
     if len(names) != 2:
         raise InputError(f'--exchange-markers: {text!r} is not two markers, such as sir,smr')
@@ -177,6 +179,7 @@ def _markers(text: str, session: Session) -> tuple[int, ...]:
 
 
 def _index(name: str, names: Sequence[str], option: str) -> int:
+    """Index of a name. Raises InputError, with the option, if it is unknown."""
     if name not in names:
         raise InputError(
             f'{option}: there is no {name!r}; there are {", ".join(names)}'
@@ -186,6 +189,7 @@ def _index(name: str, names: Sequence[str], option: str) -> int:
 
 
 def _quarters(angle: float, option: str) -> int:
+    """Number of quarter turns in an angle, degrees. Raises InputError if it is no multiple."""
     quarters = angle / QUARTER_DEG
     if not np.isclose(quarters, round(quarters)):
         raise InputError(

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Streams: where one stood still, which clock is that of another, a table of standstills.
+"""Standstills of streams, the offset between their clocks, and tables of one row a standstill.
 
-A log of joints and a camera's take have each their own clock. Both stand still where the arm does:
-the offset of the clocks is that by which most begins and ends of standstills fall together. Where
-the visits are alike in length several offsets do that as well; then the robot decides: paired
-rightly, its modelled points differ from the measured ones by little.
+A log of joints and a camera's take have a clock each. Both stand still when the arm does: the
+offset of the clocks is the one by which most begins and ends of standstills coincide. If the
+visits are equally long, several offsets do; then the robot decides: with the right pairs its
+modelled points differ little from the measured ones.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ _ALIKE = 0.9
 
 
 def refuse_sliding(chain: SerialChain, path: Path) -> None:
-    """Refuse an arm with a joint that slides: its standstills are judged by angles."""
+    """Raise InputError for an arm with a prismatic joint: standstills are judged by angles."""
     for joint in np.flatnonzero(chain.slides)[:1]:
         raise InputError(
             f"{path}: it is a stream, and joint '{chain.joint_names[joint]}' slides; standstills "
@@ -68,7 +68,7 @@ def refuse_sliding(chain: SerialChain, path: Path) -> None:
 
 @dataclass(frozen=True, eq=False)
 class Stream:
-    """What was reported at which time."""
+    """Values reported over time."""
 
     # s, rising, (n,).
     stamps: FloatArray
@@ -77,7 +77,7 @@ class Stream:
 
     @classmethod
     def of(cls, stamps: FloatArray, values: FloatArray) -> Stream:
-        """Return the finite values in the order of their stamps."""
+        """Stream of the finite values in the order of their stamps."""
         finite = np.flatnonzero(np.isfinite(values).all(axis=1) & np.isfinite(stamps))
         order = finite[np.argsort(stamps[finite], kind='stable')]
         return cls(stamps[order], values[order])
@@ -85,7 +85,7 @@ class Stream:
 
 @dataclass(frozen=True, eq=False)
 class Standstills:
-    """When a stream stood still, and where."""
+    """Begin, end and mean value of each standstill of a stream."""
 
     # s, (n,); equal for single shots.
     begin: FloatArray
@@ -98,23 +98,23 @@ class Standstills:
     closed: BoolArray
 
     def __len__(self) -> int:
-        """Return how many there are."""
+        """Number of standstills."""
         return len(self.begin)
 
     @property
     def shots(self) -> bool:
-        """Whether these are moments, not times."""
+        """Whether all are single measurements at one moment."""
         return bool(np.all(self.begin == self.end))
 
     @classmethod
     def of_shots(cls, stamps: FloatArray, values: FloatArray) -> Standstills:
-        """Return single shots of an instrument, each taken while the arm stood still."""
+        """Single measurements of an instrument, each taken while the arm stood still."""
         none = np.zeros(len(stamps), bool)
         return cls(stamps, stamps, values, none, none)
 
 
 def is_stream(stamps: FloatArray) -> bool:
-    """Return whether rows follow each other faster than an arm can stop and be measured."""
+    """Whether rows follow each other faster than an arm can stop and be measured."""
     if len(stamps) <= _FEWEST_ROWS:
         return False
     # Times that are all the same are none.
@@ -122,14 +122,17 @@ def is_stream(stamps: FloatArray) -> bool:
 
 
 def joint_standstills(stream: Stream, fewest: int = 1) -> Standstills:
-    """Return when no joint, rad, moved for longer than an arm may swing, `fewest` reports."""
+    """Standstills of joints, rad: longer than the arm may swing.
+
+    With at least `fewest` reports.
+    """
     rules = SettleRules()
     noise = min(_RANGE_STDS * _quietest(stream), 5.0 * rules.still_tolerance)
     return _standstills(stream, max(rules.still_tolerance, noise), fewest)
 
 
 def point_standstills(stream: Stream) -> Standstills:
-    """Return when a marker stood still, in whatever unit it is; none where it never did."""
+    """Standstills of a marker, in any unit; empty if it never stood still."""
     # A frame that jumps is no motion.
     values = _median_of_five(stream.values)
     smooth = Stream(stream.stamps, values)
@@ -141,6 +144,7 @@ def point_standstills(stream: Stream) -> Standstills:
 
 
 def _median_of_five(values: FloatArray) -> FloatArray:
+    """Running median over five values, (n, m)."""
     if len(values) < FEWEST_SAMPLES:
         return values
     padded = np.pad(values, ((2, 2), (0, 0)), mode='edge')
@@ -149,7 +153,7 @@ def _median_of_five(values: FloatArray) -> FloatArray:
 
 
 def _quietest(stream: Stream) -> float:
-    """Return the standard deviation of a stream where it is quietest, of its noisiest column."""
+    """Standard deviation in the quietest part of a stream, of its noisiest column."""
     step = float(np.median(np.diff(stream.stamps))) if len(stream.stamps) > 1 else SWING_S
     size = max(FEWEST_SAMPLES, round(SWING_S / max(step, 1e-4)))
     blocks = len(stream.values) // size
@@ -160,6 +164,7 @@ def _quietest(stream: Stream) -> float:
 
 
 def _standstills(stream: Stream, tolerance: float, fewest: int) -> Standstills:
+    """Runs in which all values stay within `tolerance`, of at least `fewest` values."""
     stamps, values = stream.stamps, stream.values
     step = float(np.median(np.diff(stamps))) if len(stamps) > 1 else 0.0
     gap = max(SettleRules().max_gap_s, _FEWEST_ROWS * step)
@@ -190,7 +195,7 @@ def _standstills(stream: Stream, tolerance: float, fewest: int) -> Standstills:
 
 @dataclass(frozen=True, eq=False)
 class Matching:
-    """Which standstills of points are which of the joints."""
+    """Pairs of standstills of points and of joints."""
 
     # Indices, (n,) each.
     points: IntArray
@@ -203,7 +208,10 @@ class Matching:
     error: float | None = None
 
     def in_words(self, points: Standstills, joints: Standstills, names: tuple[str, str]) -> str:
-        """Return how well they match, for people; `names` of points and joints."""
+        """Sentence on the number of pairs and the clock offset.
+
+        `names` are those of points and joints.
+        """
         what = 'points' if points.shots else 'standstills'
         text = (
             f'{len(self.points)} of {len(points)} {what} of {names[0]} match '
@@ -219,7 +227,7 @@ class Matching:
 
 
 def point_visits(stream: Stream) -> Standstills:
-    """Return the standstills of a stream of points, or the shots of an instrument."""
+    """Standstills of a stream of points, or the single measurements of an instrument."""
     if is_stream(stream.stamps):
         return point_standstills(stream)
     return Standstills.of_shots(stream.stamps, stream.values)
@@ -234,12 +242,13 @@ def match(
 ) -> Matching:
     """Pair the standstills of points with those of the joints, rad.
 
-    `names` are those of points and joints, for messages; `offset_s` is as told, None to find it.
-    An `InputError` where nothing stood still, no offset joins them, or several do as well.
+    `names` are those of points and joints, for messages; `offset_s` is the clock offset, None to
+    find it. Raises InputError if nothing stood still, no offset joins them, or several do equally
+    well.
     """
 
     def error_of(i: IntArray, j: IntArray) -> float:
-        """Return what the robot leaves of pairs, as a share of the points' extent."""
+        """Residual of the robot for pairs, as a share of the points' extent."""
         return float(linear_fit(chain, joints.mean[j][None], points.mean[i])[0][0])
 
     for name, standstills in zip(names, (points, joints)):
@@ -305,7 +314,7 @@ def _matching(
     offset: float,
     error_of: Callable[[IntArray, IntArray], float],
 ) -> Matching:
-    """Return the pairs that overlap with an offset of the clocks, s."""
+    """Pairs of standstills that overlap with a clock offset, s, with the refined offset."""
     begin, end = points.begin + offset, points.end + offset
     before = np.searchsorted(joints.end, begin)
     after = np.searchsorted(joints.begin, end, side='right')
@@ -347,12 +356,13 @@ def _judged(
     apart: float | None,
     error_of: Callable[[IntArray, IntArray], float],
 ) -> Matching:
+    """Matching of pairs with the residual of the robot, if there are enough pairs."""
     error = error_of(i, j) if len(i) >= _FEWEST_FOR_ROBOT else None
     return Matching(i, j, offset, apart, error)
 
 
 def _offsets(points: Standstills, joints: Standstills) -> list[float]:
-    """Return offsets of the clocks that bring many standstills together, the likeliest first."""
+    """Clock offsets, s, that bring many standstills together, the likeliest first."""
     if points.shots:
         return _offsets_of_shots(points.begin, joints)
     differences = [
@@ -374,7 +384,7 @@ def _offsets(points: Standstills, joints: Standstills) -> list[float]:
 
 
 def _offsets_of_shots(shots: FloatArray, joints: Standstills) -> list[float]:
-    """Return offsets with which most shots fall into standstills, the middle of each range."""
+    """Clock offsets, s, with which most shots fall into standstills: the middle of each range."""
     starts = (joints.begin[None] - shots[:, None]).ravel()
     stops = (joints.end[None] - shots[:, None]).ravel()
     at = np.concatenate((starts, stops))
@@ -390,18 +400,20 @@ def _offsets_of_shots(shots: FloatArray, joints: Standstills) -> list[float]:
 
 
 def mean_of(rows: FloatArray) -> FloatArray:
-    """Return the mean of rows (n, m), (m,): of equal ones to the last digit.
+    """Mean of rows (n, m), (m,), which is exact for equal rows.
 
-    A sum of many is rounded: of what stood still it would not be what each of them says.
+    The plain mean of equal numbers is rounded and may differ from them in the last digit.
     """
     return np.asarray(rows[0] + (rows - rows[0]).mean(axis=0))
 
 
 def reading_of(points: FloatArray) -> tuple[FloatArray, FloatArray, IntArray] | None:
-    """Return mean and standard deviation of a marker at a standstill, and which points are of it.
+    """Mean (3,) and standard deviation (3,) of a marker at a standstill.
 
-    Of points in m, (n, 3), at least one: (3,), (3,) and indices; NaN for the std of a shot. None
-    where the marker was not still.
+    And indices of the points used.
+
+    `points` are in m, (n, 3), at least one. The deviation is NaN for a single shot. None if the
+    marker was not still.
     """
     if len(points) < FEWEST_SAMPLES:
         # Shots of an instrument: the last one is the one that was kept.
@@ -417,7 +429,7 @@ def reading_of(points: FloatArray) -> tuple[FloatArray, FloatArray, IntArray] | 
 
 
 def between(stream: Stream, begin: float, end: float) -> slice:
-    """Return the values of a stream from where the arm no longer swings."""
+    """Slice of a stream from the moment the arm no longer swings after `begin` to `end`."""
     first, last = np.searchsorted(stream.stamps, (begin + SWING_S, end))
     return slice(int(first), int(last))
 
@@ -431,7 +443,7 @@ FEWEST_REPORTS = 3
 
 @dataclass(frozen=True, eq=False)
 class Stopped:
-    """Two tables, a row a standstill, that belong together row by row."""
+    """Tables of points and joints, one row a standstill, that belong together row by row."""
 
     points: Table
     joints: Table
@@ -451,10 +463,10 @@ def stopped(
     clock_offset_s: float | None = None,
     in_order: bool = False,
 ) -> Stopped | None:
-    """Return tables of which one is a stream of joints, a row a standstill; None for others.
+    """Tables with one row a standstill if the joints are a stream; None if they are not.
 
-    `in_order`: points belong to standstills by their order, as told. An `InputError` for a stream
-    that never stands still, or standstills that do not match.
+    `in_order`: pair points with standstills by their order, as the user said. Raises InputError
+    for a stream that never stands still, or standstills that do not match.
     """
     reported = times(*joints)
     if reported is None or not is_stream(reported):
@@ -541,7 +553,7 @@ def _by_order(
     names: tuple[str, str],
     told: bool,
 ) -> Stopped:
-    """Return points without times beside as many standstills, where the robot agrees or `told`."""
+    """Pair points without times with equally many standstills, if the robot agrees or `told`."""
     raw = numbers(points[0], points[1].point, optional=True)
     rows = np.flatnonzero(np.isfinite(raw).any(axis=1))
     if len(rows) != len(still):
@@ -576,7 +588,7 @@ def _by_order(
 def _unpaired(
     points: Table, kept: IntArray, when: FloatArray, span: FloatArray, offset: float | None
 ) -> tuple[str, ...]:
-    """Return which shots belong to no standstill; `span` is that of the joints' record, s."""
+    """Sentences on shots that belong to no standstill; `span` is the time of the joints, s."""
     lost = np.setdiff1d(np.flatnonzero(np.isfinite(when)), kept)
     clock = when[lost] + (offset or 0.0)
     inside = (clock >= span[0]) & (clock <= span[-1])
@@ -591,16 +603,18 @@ def _unpaired(
 
 
 def _lost(count: int, kept: IntArray, name: str) -> tuple[str, ...]:
+    """Sentence on the standstills without a point; () if there are none."""
     lost = count - len(np.unique(kept))
     return (f'{lost} standstills of {name} without a point were left out',) * bool(lost)
 
 
 def _extent(values: FloatArray) -> float:
+    """Longest side of the box around points."""
     return float(np.ptp(values, axis=0).max()) if len(values) else 0.0
 
 
 def _rows_of(stamps: FloatArray, when: FloatArray) -> IntArray:
-    """Return the row of each stamp; equal ones are different rows."""
+    """Row index of each stamp; equal stamps are different rows."""
     order = np.argsort(when, kind='stable')
     sorted_when = when[order]
     taken: dict[float, int] = {}
@@ -619,7 +633,7 @@ def _scale(
     windows: FloatArray,
     still: Standstills,
 ) -> float:
-    """Return the unit of the points, m."""
+    """Scale of the points to m, from their unit."""
     parts = [stream.values[between(stream, *window)] for window in windows]
     seen = [j for j, part in enumerate(parts) if len(part)]
     if not seen:
@@ -632,7 +646,10 @@ def _scale(
 def _means(
     points: Table, when: FloatArray, windows: FloatArray, scale: float
 ) -> tuple[IntArray, Table, int]:
-    """Return the standstills with a point, their table, and how many readings were unsteady."""
+    """Standstills with a point, the table of their mean points.
+
+    And the number of unsteady readings.
+    """
     table, columns = points
     spread = {
         name: tuple(range(len(table.names) + 3 * i, len(table.names) + 3 * i + 3))
@@ -685,14 +702,16 @@ def _means(
                 rows=tuple(rows),
                 lines=tuple(lines),
             ),
-            replace(columns, stds=spread, others=defaultdict(list, others), turned=()),
+            replace(
+                columns, stds=spread, others=defaultdict(list, others), ambiguous_orientation=()
+            ),
         ),
         unsteady,
     )
 
 
 def _mean_turn(turns: FloatArray) -> FloatArray:
-    """Return the mean of quaternions that are near each other, (4,)."""
+    """Mean of quaternions that are near each other, (4,)."""
     mean = (turns * np.where(turns @ turns[0] < 0.0, -1.0, 1.0)[:, None]).mean(axis=0)
     return np.asarray(mean / np.linalg.norm(mean))
 
@@ -700,7 +719,7 @@ def _mean_turn(turns: FloatArray) -> FloatArray:
 def _at_rest(
     joints: Table, still: Standstills, at: IntArray, reported: FloatArray, unit: float
 ) -> Table:
-    """Return the joints' table with a row for each of these standstills, the mean of it."""
+    """Table of joints with one row, the mean, for each of the standstills `at`."""
     table, columns = joints
     rows, lines = [], []
     order = np.argsort(reported, kind='stable')
@@ -715,4 +734,5 @@ def _at_rest(
 
 
 def _text(value: float, decimal: str) -> str:
+    """A number as text with a decimal sign."""
     return repr(float(value)).replace('.', decimal)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A text table of any program: its encoding, separator and decimal sign, and its cells by line."""
+"""Text tables of any program: encoding, separator, decimal sign, and cells by line."""
 
 from __future__ import annotations
 
@@ -18,23 +18,23 @@ import numpy as np
 from remaster_ros.errors import InputError
 from remaster_ros.importing import by_axis
 from remaster_ros.importing.makers import READERS, UNPACKERS
-from remaster_ros.importing.makers.named import Named, some
+from remaster_ros.importing.makers.named import NamedColumns, first_names
 from remaster_ros.importing.units import bare, is_unit, split_unit
 from remaster_ros.session.files import cpu_limited, read_limited
 from remaster_ros.types import IntArray
 
 TABLE_LIMIT = 256 * 1024**2
-# Processor time for reading a file, s, and for each MiB of it: five times what the slowest of
-# plain tables takes (test_reading_time).
+# Limit of processor time for reading a file, s, and for each MiB of it: five times that of the
+# slowest plain table (test_reading_time).
 CPU_S, CPU_S_PER_MIB = 30.0, 5.0
 # An export of Motive with five skeletons and 300 markers has 4,000 columns; the longest name seen
 # (a path of SpatialAnalyzer) has 200 characters.
 MOST_COLUMNS, LONGEST_NAME = 5_000, 1_000
-# In this order where several explain a table equally well; blanks come last.
+# Separators in order of preference if several explain a table equally well; blanks come last.
 SEPARATORS = {';': 'semicolons', '\t': 'tabs', ',': 'commas', '|': 'bars', ' ': 'blanks'}
-# From so many lines the separator is found.
+# Number of lines from which the separator is found.
 SEEN_LINES = 2000
-# In place of the encoding of a table that was no text: of a workbook, of arrays.
+# Stands for the encoding of a table that was no text file: a workbook, an array.
 CELLS = 'cells'
 _COMMENT = re.compile(r'\s*(?:#|//|%|!|\*)\s*')
 _PLAIN = re.compile(r'[+-]?(?:\d+(?:[.,]\d*)?|[.,]\d+)(?:[eE][+-]?\d+)?', re.ASCII)
@@ -42,12 +42,13 @@ _PLAIN = re.compile(r'[+-]?(?:\d+(?:[.,]\d*)?|[.,]\d+)(?:[eE][+-]?\d+)?', re.ASC
 _THOUSANDS = re.compile(r'[+-]?\d{1,3}(?:([.,])\d{3})(?:\1\d{3})*[.,]\d+', re.ASCII)
 # A number whose unit stands in its cell, as spreadsheets show one.
 _WITH_UNIT = re.compile(r'([+-]?\d[\d.,]*(?:[eE][+-]?\d+)?)\s*(°|º|deg|rad|gon|µm|μm|mm|cm|m|in)')
-# What programs write in a field without a value.
+# Marks that programs write in a field without a value.
 _MISSING = {
     *('nan', 'none', 'null', 'nil', 'na', 'n/a', 'n.a.', '#n/a', '#na', '#nv', '<na>', 'nat'),
     *('-', '--', '---', '–', '—', '?'),
 }
-# Groups of three digits apart by blanks or apostrophes, and what shows that a column has none.
+# Groups of three digits separated by blanks or apostrophes; a number that shows that a column
+# does not have such groups.
 _GROUPED = re.compile("[+-]?\\d{1,3}(?:[ \u00a0\u2009\u202f'’]\\d{3})+(?:[.,]\\d+)?", re.ASCII)
 _BETWEEN_GROUPS = re.compile("[ \u00a0\u2009\u202f'’]")
 _UNGROUPED = re.compile(r'[+-]?\d{4,}(?:[.,]\d*)?', re.ASCII)
@@ -64,7 +65,7 @@ _NEVER = re.compile(r'(?!)')
 _BLANKS = re.compile(r'\s+(?![\[(])')
 # A row of the table has the joints of the smallest arm at least.
 _FEWEST_NUMBERS = 2
-# A later separator is right where it gives so many times as many numbers: titles give some.
+# A later separator is preferred if it gives this factor more numbers: titles give some.
 _MORE = 1.25
 # Words that name a line which sums up those above it.
 _SUMS = {
@@ -84,21 +85,21 @@ _SHOWN = 40
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class TextTable(Named):
-    """A table as text."""
+class TextTable(NamedColumns):
+    """Cells of a table as text, with the line of each row in the file."""
 
     path: Path  # The file, for messages
-    # What it was found, or told, to be written with
+    # Character encoding of the file, such as ``UTF-8``; `CELLS` if it was no text file
     encoding: str
     part: str = ''  # Sheet of a workbook that has several tables
     counted: str = 'line'  # What `lines` counts, for messages
-    # Of a data frame whose index counts them, with those left out; 0 of others
+    # Rows of a data frame whose index counts from 0, dropped rows included; 0 for other tables
     rows_in_order: int = 0
     separator: str = ''
     preamble: str = ''  # Title and comment lines
 
     def describe(self) -> str:
-        """Return how it is written, in a few words."""
+        """Number of rows, separator, decimal sign and encoding, in a few words."""
         if self.kind:
             return f'{self.path}: {len(self.rows)} rows of {self.kind}'
         if self.encoding == CELLS:
@@ -111,22 +112,22 @@ class TextTable(Named):
         )
 
     def at(self, row: int) -> str:
-        """Return the file and the line of a row."""
+        """File and line of a row, counted from 0."""
         return f'{self.path}, {self.counted} {self.lines[row]}'
 
     def at_rows(self, rows: Iterable[int]) -> str:
-        """Return the file and the lines of rows, the first five of them."""
+        """File and lines of rows, of which the first five are listed."""
         lines = [str(self.lines[row]) for row in rows]
-        return f'{self.path}, {self.counted}{"s" * (len(lines) > 1)} {some(lines)}'
+        return f'{self.path}, {self.counted}{"s" * (len(lines) > 1)} {first_names(lines)}'
 
     def fault(self, row: int, column: int, problem: str) -> InputError:
-        """Return the error of one cell, both counted from 0."""
+        """InputError on one cell, with file, line, column and content; both indices from 0."""
         cell = self.rows[row][column]
         shown = repr(cell if len(cell) <= 40 else cell[:40] + '…')
         return InputError(f'{self.at(row)}, column {self.names[column]}: {shown} {problem}')
 
     def number(self, row: int, column: int) -> float | None:
-        """Return a cell as a number; None where it is empty."""
+        """Number in a cell; None if it is empty. Raises InputError if it is other text."""
         cell = self.rows[row][column]
         value = parse_number(cell, self.decimal) if cell else None
         if value is None and not is_missing(cell):
@@ -134,7 +135,7 @@ class TextTable(Named):
         return value
 
     def select(self, rows: Iterable[int]) -> TextTable:
-        """Return some of the rows."""
+        """Table with some of the rows."""
         kept = list(rows)
         return replace(
             self,
@@ -144,12 +145,12 @@ class TextTable(Named):
 
 
 def is_missing(cell: str) -> bool:
-    """Return whether a cell says that there is no value."""
+    """Whether a cell is empty or a mark for a missing value."""
     return not cell or cell.lower() in _MISSING
 
 
 def parse_number(cell: str, decimal: str) -> float | None:
-    """Return the finite number of a cell; None where there is none."""
+    """Finite number of a cell; None if the cell is no number."""
     other = '.' if decimal == ',' else ','
     if _THOUSANDS.fullmatch(cell) and cell.count(decimal) == 1 and _last_sign(cell) == decimal:
         cell = cell.replace(other, '')
@@ -162,12 +163,13 @@ def parse_number(cell: str, decimal: str) -> float | None:
 def read_table(
     path: Path, separator: str = '', decimal: str = '', encoding: str = ''
 ) -> TextTable:
-    """Read a file with one table; what is not told is found.
+    """Read a file with one table; separator, decimal sign and encoding are found if not given.
 
     Raises
     ------
     InputError
-        One line naming file, line and remedy: no text, no numbers, or rows of unequal length.
+        One line naming file, line and remedy: no text, no numbers, rows of unequal length, or
+        several tables.
     """
     tables = read_tables(path, separator, decimal, encoding)
     if len(tables) > 1:
@@ -177,7 +179,7 @@ def read_table(
 
 
 def table_of_text(text: str, path: Path) -> TextTable:
-    """Return the table of a text with tabs, which was no file; `path` is its name in messages."""
+    """Table of a tab-separated text in memory; `path` is its name in messages."""
     return _table(text, path, '\t', '.', CELLS)
 
 
@@ -188,13 +190,14 @@ def read_tables(
     encoding: str = '',
     sheets: Sequence[str] = (),
 ) -> list[TextTable]:
-    """Read the tables of a file: those of a workbook's sheets, else one; as `read_table`.
+    """Read the tables of a file: one of each sheet of a workbook, else one.
 
-    `sheets` are the names of those that are read; () for all that hold numbers.
+    `sheets` are the names of the sheets to read; () for all with numbers. Raises InputError as
+    `read_table`, and if reading exceeds its limit of processor time.
     """
     data = read_limited(path, TABLE_LIMIT, 'name the table')
     if data.startswith(b'\x1f\x8b'):
-        data = _unpacked(data, path)
+        data = _decompressed(data, path)
     limit_s = CPU_S + CPU_S_PER_MIB * len(data) / 1024**2
     refusal = (
         f'{path}: not read after {limit_s:.0f} s of processor time, many times what a file of its '
@@ -207,15 +210,18 @@ def read_tables(
             except InputError as error:
                 raise InputError(f'{path}: {error}') from None
             if parts is not None:
-                return _of_parts(parts, path, decimal, sheets)
+                return _tables_of_sheets(parts, path, decimal, sheets)
         text, encoding = decode(data, path, encoding)
         return [_table(text, path, separator, decimal, encoding)]
 
 
-def _of_parts(
+def _tables_of_sheets(
     parts: Mapping[str, str], path: Path, decimal: str, sheets: Sequence[str]
 ) -> list[TextTable]:
-    """Return the tables of a workbook's sheets, or of arrays, that hold rows of numbers."""
+    """Tables of the sheets of a workbook, or of the arrays of an archive.
+
+    That hold rows of numbers.
+    """
     folded = {name.casefold(): name for name in parts}
     for name in sheets:
         if name.casefold() not in folded:
@@ -246,7 +252,10 @@ def _of_parts(
 def _table(
     text: str, path: Path, separator: str, decimal: str, encoding: str, part: str = ''
 ) -> TextTable:
-    """Return the table of a text; as `read_table`. `part` is the sheet of a workbook."""
+    """Table of a text, by the makers' readers or as plain text.
+
+    `part` is the sheet of a workbook.
+    """
     for read in READERS:
         try:
             found = read(text)
@@ -268,7 +277,7 @@ def _table(
         # Names of points may begin as comments do.
         comment, plain = _NEVER, [line for _, line in lines]
     separator = separator or _find_separator(plain[:SEEN_LINES])
-    split = _without_lists(
+    split = _with_lists_as_columns(
         [(number, line, _split(line, separator, path, number)) for number, line in lines]
     )
     width, first, usual = _first_row(split, path, comment)
@@ -277,7 +286,7 @@ def _table(
     header, preamble, named = _header(split[:first], width, separator, path)
     written = [cells for _, _, cells in split[:named]]
     rows: list[tuple[str, ...]] = []
-    at, left = [], []
+    at, dropped = [], []
     # Titles may hold numbers; below the names, and where there are none, that is a damaged row.
     above = [entry for entry in split[named:first] if not comment.match(entry[1])]
     damaged = [
@@ -297,7 +306,7 @@ def _table(
             cells = cells[:-1]
         numbered = not (named or rows) and _are_counted(cells)
         if numbered or _is_no_row(cells, usual, width):
-            left.append(f'{number} ({line.strip()[:_SHOWN]})')
+            dropped.append(f'{number} ({line.strip()[:_SHOWN]})')
             continue
         if len(cells) != width:
             raise InputError(
@@ -309,7 +318,7 @@ def _table(
     while width > 1 and not any(row[width - 1] for row in rows):
         width -= 1
     rows = [row[:width] for row in rows]
-    rows, header = _without_units(_without_groups(rows), header)
+    rows, header = _without_units(_without_thousands_separators(rows), header)
     names = tuple(header[:width]) if header else tuple(map(str, range(1, width + 1)))
     try:
         report = by_axis.wide(names, rows, at, lambda cell: _is_number(cell) or not cell)
@@ -337,14 +346,14 @@ def _table(
         lines=tuple(at),
         preamble=preamble,
         has_header=bool(header),
-        notes=(f'{path}, line{"s" * (len(left) > 1)} {some(left)}: no row, left out',)
-        * bool(left),
+        notes=(f'{path}, line{"s" * (len(dropped) > 1)} {first_names(dropped)}: no row, left out',)
+        * bool(dropped),
     )
     return _bounded(found_table)
 
 
 def _bounded(table: TextTable) -> TextTable:
-    """Return the table; InputError if it has more columns, or longer names, than any table has."""
+    """The table. Raises InputError if it has too many columns, or a name that is too long."""
     if len(table.names) > MOST_COLUMNS:
         raise _too_wide(table.path, min(table.lines, default=1), len(table.names))
     for name in table.names:
@@ -363,8 +372,11 @@ def _too_wide(path: Path, line: int, width: int) -> InputError:
     )
 
 
-def _unpacked(data: bytes, path: Path) -> bytes:
-    """Return what gzip packed, as PolyScope packs its programs."""
+def _decompressed(data: bytes, path: Path) -> bytes:
+    """Content of gzip data, as of PolyScope's programs.
+
+    Raises InputError if damaged or too large.
+    """
     try:
         with gzip.GzipFile(fileobj=io.BytesIO(data)) as packed:
             unpacked = packed.read(TABLE_LIMIT + 1)
@@ -376,10 +388,11 @@ def _unpacked(data: bytes, path: Path) -> bytes:
 
 
 def decode(data: bytes, path: Path, encoding: str = '') -> tuple[str, str]:
-    """Return the text of a file, and the name of its encoding.
+    """Text of a file, and the name of its encoding.
 
-    A byte order mark decides, then zeros between Latin letters (UTF-16), then whether it is valid
-    UTF-8; else it is Windows' Latin alphabet, which gives each byte a letter.
+    A byte order mark decides, then zeros between Latin letters (UTF-16), then whether the bytes
+    are valid UTF-8; else the encoding is Windows' Latin alphabet, which has a letter for almost
+    each byte. Raises InputError if the result contains null characters.
     """
     even, odd = data[:64:2], data[1:64:2]
     if encoding:
@@ -408,6 +421,7 @@ def decode(data: bytes, path: Path, encoding: str = '') -> tuple[str, str]:
 
 
 def _split(line: str, separator: str, path: Path, number: int) -> list[str]:
+    """Cells of a line. Raises InputError if its quotes are not balanced."""
     if separator == ' ':
         return _BLANKS.split(line.strip())
     try:
@@ -418,22 +432,23 @@ def _split(line: str, separator: str, path: Path, number: int) -> list[str]:
 
 
 def _is_ornament(line: str) -> bool:
+    """Whether a line is the rule below the header of a table in Markdown or ASCII."""
     return ('--' in line or '==' in line) and bool(_ORNAMENT.fullmatch(line))
 
 
-def _listed(cell: str) -> list[str]:
-    """Return the numbers of a list in a cell, as `[0.1, -1.5]`; [] where it is none."""
+def _list_in_cell(cell: str) -> list[str]:
+    """Numbers of a list in a cell such as `[0.1, -1.5]`; [] if the cell is no list."""
     found = _LIST.fullmatch(cell) if len(cell) <= _LONGEST_LIST * _LONGEST_NUMBER else None
     cells = re.split(r'\s*[,;]\s*|\s+', found[1].strip()) if found else []
     return cells if 1 < len(cells) <= _LONGEST_LIST and all(map(_PLAIN.fullmatch, cells)) else []
 
 
-def _without_lists(
+def _with_lists_as_columns(
     split: list[tuple[int, str, list[str]]],
 ) -> list[tuple[int, str, list[str]]]:
-    """Return the cells with each list in as many columns as it has numbers, with their names."""
-    first = next((cells for *_, cells in split[:SEEN_LINES] if any(map(_listed, cells))), [])
-    widths = [len(_listed(cell)) for cell in first]
+    """Lines with each list in a cell split into a column for each number."""
+    first = next((cells for *_, cells in split[:SEEN_LINES] if any(map(_list_in_cell, cells))), [])
+    widths = [len(_list_in_cell(cell)) for cell in first]
     if not first:
         return split
     wide = []
@@ -441,24 +456,24 @@ def _without_lists(
         parts: list[str] = []
         for i, cell in enumerate(cells):
             width = widths[i] if len(cells) == len(widths) else 0
-            if width and not _listed(cell) and not is_missing(cell):
-                # Of a name.
+            if width and not _list_in_cell(cell) and not is_missing(cell):
+                # The name of a column of lists.
                 parts += [
                     f'{cell} {one}' for one in ('xyz' if width == 3 else range(1, width + 1))
                 ]
             elif width and is_missing(cell):
                 parts += width * ['']
             else:
-                parts += _listed(cell) or [cell]
+                parts += _list_in_cell(cell) or [cell]
         wide.append((number, line, parts))
     return wide
 
 
-def _without_groups(rows: list[tuple[str, ...]]) -> list[tuple[str, ...]]:
-    """Return cells without what is between thousands, in columns that have it everywhere."""
+def _without_thousands_separators(rows: list[tuple[str, ...]]) -> list[tuple[str, ...]]:
+    """Cells without the blanks or apostrophes between groups of three digits."""
     columns = [*zip(*rows)]
     for i, column in enumerate(columns):
-        # At once, as logs are large.
+        # One search over the whole column, as logs are large.
         if not _BETWEEN_GROUPS.search('\n'.join(column)):
             continue
         grouped = {cell for cell in column if _GROUPED.fullmatch(cell)}
@@ -471,7 +486,7 @@ def _without_groups(rows: list[tuple[str, ...]]) -> list[tuple[str, ...]]:
 def _without_units(
     rows: list[tuple[str, ...]], header: list[str]
 ) -> tuple[list[tuple[str, ...]], list[str]]:
-    """Return cells without the unit that all cells of a column have; it goes into its name."""
+    """Cells without the unit that all cells of a column have, and the header with that unit."""
     header = list(header)
     columns = [*zip(*rows)]
     for i, column in enumerate(columns):
@@ -490,7 +505,7 @@ def _without_units(
 
 
 def _find_separator(lines: Sequence[str]) -> str:
-    """Return the separator between which most cells of most rows are numbers."""
+    """Separator that splits most rows into most cells with numbers."""
     best, most = ' ', 0
     for separator in SEPARATORS:
         split = []
@@ -500,11 +515,11 @@ def _find_separator(lines: Sequence[str]) -> str:
             except InputError:
                 continue
         widths = Counter(
-            len(cells) for cells in split if sum(map(_count, cells)) >= _FEWEST_NUMBERS
+            len(cells) for cells in split if sum(map(_count_numbers, cells)) >= _FEWEST_NUMBERS
         )
         width = widths.most_common(1)[0][0] if widths else 0
         count = sum(
-            sum(map(_count, cells)) for cells in split if len(cells) == width and width > 1
+            sum(map(_count_numbers, cells)) for cells in split if len(cells) == width and width > 1
         )
         if count > _MORE * most:
             best, most = separator, count
@@ -512,6 +527,7 @@ def _find_separator(lines: Sequence[str]) -> str:
 
 
 def _is_number(cell: str) -> bool:
+    """Whether a cell is a number, also with thousands separators or a unit."""
     # Many cells of a wide table are empty.
     return bool(
         cell
@@ -519,20 +535,21 @@ def _is_number(cell: str) -> bool:
     )
 
 
-def _count(cell: str) -> int:
-    """Return how many numbers a cell has."""
-    return int(_is_number(cell)) or len(_listed(cell))
+def _count_numbers(cell: str) -> int:
+    """Number of numbers in a cell, which may be a list."""
+    return int(_is_number(cell)) or len(_list_in_cell(cell))
 
 
 def _is_row(cells: Sequence[str]) -> bool:
+    """Whether a line has at least two cells with numbers."""
     return sum(map(_is_number, cells)) >= _FEWEST_NUMBERS
 
 
 def _is_no_row(cells: Sequence[str], usual: IntArray, width: int) -> bool:
-    """Return whether a line below the names sums up others, or is text between them or behind.
+    """Whether a line below the header is a sum, a page title or a remark, not a damaged row.
 
-    `usual` are the columns that have numbers in most rows. What is left of a row that was cut off
-    has some of them.
+    `usual` are the columns that have numbers in most rows, in which a row that was cut off still
+    has some numbers.
     """
     if not len(usual):
         return False
@@ -552,9 +569,11 @@ def _is_no_row(cells: Sequence[str], usual: IntArray, width: int) -> bool:
 def _first_row(
     split: list[tuple[int, str, list[str]]], path: Path, comment: re.Pattern[str]
 ) -> tuple[int, int, IntArray]:
-    """Return the number of columns, the index of the first line that is a row, and its numbers.
+    """Number of columns, index of the first line that is a row.
 
-    The third are the columns that have numbers in most rows.
+    And columns that usually have numbers.
+
+    Raises InputError if no line has two numbers.
     """
     rows = [
         (i, cells)
@@ -579,9 +598,9 @@ def _first_row(
 def _header(
     above: list[tuple[int, str, list[str]]], width: int, separator: str, path: Path
 ) -> tuple[list[str], str, int]:
-    """Return the names of the columns, empty where there are none, and the lines above them.
+    """Names of the columns ([] if there are none), title lines above, and number of lines to skip.
 
-    The third is how many lines there are down to the names, 0 where there are none.
+    The number is 0 if there are no names. `above` are the lines before the first row.
     """
     names: list[str] = []
     over: list[str] = []
@@ -611,18 +630,18 @@ def _header(
                 f'{path}, line {number}: {wrong!r}, where a unit is expected, as beside it'
             )
         else:
-            names, named, over = _below(over or names, cells), at, []
+            names, named, over = _with_group_names(over or names, cells), at, []
     return names, '\n'.join(preamble), named
 
 
 def _are_counted(cells: Sequence[str]) -> bool:
-    """Return whether cells are the numbers of their columns from 0 on, as programs name them."""
+    """Whether names are only the numbers of their columns from 0 on, as programs write them."""
     given = [cell for cell in cells[:1] if cell] + [*cells[1:]]
     return len(given) >= _FEWEST_NUMBERS and given == [str(i) for i in range(len(given))]
 
 
-def _below(over: Sequence[str], names: list[str]) -> list[str]:
-    """Return names that are unlike, by what stands above the first of each group of them."""
+def _with_group_names(over: Sequence[str], names: list[str]) -> list[str]:
+    """Names with the group above them in front, for names that occur more than once."""
     group, groups = '', []
     for cell in (*over, *[''] * (len(names) - len(over))):
         group = cell or group
@@ -635,7 +654,7 @@ def _below(over: Sequence[str], names: list[str]) -> list[str]:
 
 
 def _find_decimal(rows: Sequence[Sequence[str]]) -> str:
-    """Return the decimal sign: the last sign of the numbers that have one."""
+    """Decimal sign: the last sign, point or comma, of most numbers that have one."""
     signs: Counter[str] = Counter()
     for cells in rows:
         for cell in cells:
@@ -645,5 +664,5 @@ def _find_decimal(rows: Sequence[Sequence[str]]) -> str:
 
 
 def _last_sign(cell: str) -> str:
-    """Return the last point or comma of a number; '' where it has none."""
+    """The last point or comma of a number; '' if it has none."""
     return next((letter for letter in reversed(cell) if letter in '.,'), '')

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Orientations whose columns do not say how they turn: the one that turns as the arm did.
+"""Convention of orientations whose columns do not state it: the one that turns as the arm did.
 
-Euler angles have 24 orders, a quaternion two; a rotation vector looks like angles. From one row to
-another the tool turned as the measured body did, but for how that stands on the tool, and the
-sensor in the room. The points tell the latter as well. Only the right way to read the columns
-agrees with both.
+Euler angles have 24 orders, a quaternion two, and a rotation vector looks like angles. Between two
+rows the tool turned as the measured body did, up to the constant orientation of the body on the
+tool and of the sensor in the room. The points give the orientation of the sensor as well. Only the
+right convention agrees with both.
 """
 
 from __future__ import annotations
@@ -24,75 +24,87 @@ from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.transforms import inverse_poses
 from remaster_ros.types import FloatArray
 
-# Orientations that agree so well with the nominal arm are computed from its joints, rad; rounded
-# to a hundredth of a degree they do.
-OWN_RAD = 2e-4
-# Zero-offsets of some degrees turn the tool by so much, rad; others that agree so well beside the
-# best one leave it open.
+# Orientations closer than this to the nominal arm, rad, are computed from its joints. It covers
+# a rounding to a hundredth of a degree.
+COMPUTED_RAD = 2e-4
+# Largest difference from the arm, rad: zero-offsets of some degrees turn the tool by so much.
+# Another convention within the second value, rad, of the best one leaves the choice open.
 AGREE_RAD, OTHER_RAD = 0.1, 0.02
-# A robot whose joints are right leaves so much of the points' extent.
+# Largest residual, as a share of the points' extent, of a robot whose joints are right.
 FITS = 0.03
-# Largest difference of how the sensor stands, by the points and by the orientations, rad.
+# Largest difference of the sensor's orientation by the points and by the orientations, rad.
 SENSOR_RAD = 0.2
-# Of fewer rows nothing is told.
+# Fewer rows do not decide between conventions.
 FEWEST_ROWS = 8
 # At half a turn a rotation vector may as well be its opposite, rad.
 _HALF_TURN_RAD = 2.9
 _REFERENCES = 5
 
 
-def oriented(rows: RawRows, chain: SerialChain, options: SessionOptions) -> RawRows:
-    """Return rows with what their columns of an orientation mean, or without it, and say so."""
-    if rows.turned is None and rows.orientation is None:
+def with_orientation(rows: RawRows, chain: SerialChain, options: SessionOptions) -> RawRows:
+    """Rows with quaternions of their orientation columns, or without them.
+
+    And a warning that says so.
+
+    The convention is the one that agrees with the arm. Orientations are dropped if they are
+    computed by the robot, disagree with the arm, or fit in several conventions.
+    """
+    if rows.ambiguous_orientation is None and rows.orientation is None:
         return rows
-    ways = [options]
+    options_tried = [options]
     if rows.coupling and not chain.slides.any():
-        ways.append(replace(options, couple=(*options.couple, *rows.coupling.items())))
+        options_tried.append(replace(options, couple=(*options.couple, *rows.coupling.items())))
     joints = [
         PadAngles.of(controller_of(rows, chain, one), chain.joint_names).to_urdf(rows.q)
-        for one in ways
+        for one in options_tried
     ]
     arms = [chain.forward(q) for q in joints]
-    if rows.turned is None:
+    if rows.ambiguous_orientation is None:
         assert rows.orientation is not None
         several = any(len({*rows.labels.get(what, [''])}) > 1 for what in ('marker', 'sensor'))
         if options.on_tool or several:
             return rows
-        anyhow = _apart(rows, rows.orientation, arms, False, anyhow=True)
-        if anyhow < OWN_RAD:
-            return _without(rows, _OF_THE_ROBOT)
-        if anyhow < AGREE_RAD < _apart(rows, rows.orientation, arms, False):
-            return _without(rows, 'are in another frame than the points')
-        # Where the joints are wrong they tell nothing: those are seen to afterwards.
+        by_joints = _orientation_error(rows, rows.orientation, arms, False, ignore_points=True)
+        if by_joints < COMPUTED_RAD:
+            return _without_orientation(rows, _OF_THE_ROBOT)
+        if by_joints < AGREE_RAD < _orientation_error(rows, rows.orientation, arms, False):
+            return _without_orientation(rows, 'are in another frame than the points')
+        # If the joints are wrong, the arm cannot judge orientations; `sense` finds that later.
         known = np.isfinite(rows.orientation).all(axis=1)
         fits = linear_fit(chain, np.array(joints), rows.position)[0].min() < FITS
-        if anyhow > AGREE_RAD and known.sum() >= FEWEST_ROWS and fits:
-            return _without(rows, 'turn otherwise than the arm')
+        if by_joints > AGREE_RAD and known.sum() >= FEWEST_ROWS and fits:
+            return _without_orientation(rows, 'turn otherwise than the arm')
         return rows
     found = [
-        (_apart(rows, xyzw, arms, options.on_tool), words, xyzw)
-        for words, xyzw in _readings(rows.turned, rows.turned_unit)
+        (_orientation_error(rows, xyzw, arms, options.on_tool), words, xyzw)
+        for words, xyzw in _conventions(rows.ambiguous_orientation, rows.ambiguous_unit)
     ]
     if not found:
-        return _without(rows, 'are no quaternions')
+        return _without_orientation(rows, 'are no quaternions')
     found.sort(key=lambda one: one[0])
     error, words, xyzw = found[0]
     others = [
         other for apart, _, other in found[1:] if apart < max(2.0 * error, error + OTHER_RAD)
     ]
-    if min(_apart(rows, one, arms, options.on_tool, anyhow=True) for *_, one in found) < OWN_RAD:
-        return _without(rows, _OF_THE_ROBOT)
+    if (
+        min(
+            _orientation_error(rows, one, arms, options.on_tool, ignore_points=True)
+            for *_, one in found
+        )
+        < COMPUTED_RAD
+    ):
+        return _without_orientation(rows, _OF_THE_ROBOT)
     if error > AGREE_RAD:
-        return _without(rows, 'turn otherwise than the arm, however they are read')
-    if any(_different(xyzw, other) for other in others):
-        return _without(rows, 'can be read in several ways, which fit the arm alike')
+        return _without_orientation(rows, 'turn otherwise than the arm, however they are read')
+    if any(_differ(xyzw, other) for other in others):
+        return _without_orientation(rows, 'can be read in several ways, which fit the arm alike')
     return replace(
         rows,
         orientation=xyzw,
-        turned=None,
+        ambiguous_orientation=None,
         warnings=(
             *rows.warnings,
-            f'{rows.turned_columns}: read as {words}, which turns as the arm did to '
+            f'{rows.ambiguous_columns}: read as {words}, which turns as the arm did to '
             f'{np.degrees(error):.2f} degrees',
         ),
     )
@@ -101,13 +113,19 @@ def oriented(rows: RawRows, chain: SerialChain, options: SessionOptions) -> RawR
 _OF_THE_ROBOT = 'are how the robot itself believes its tool to be turned, not measured'
 
 
-def _without(rows: RawRows, why: str) -> RawRows:
-    note = f'{rows.turned_columns or "the orientations"} {why}; left out'
-    return replace(rows, orientation=None, turned=None, warnings=(*rows.warnings, note))
+def _without_orientation(rows: RawRows, why: str) -> RawRows:
+    """Rows without orientations, and the warning why."""
+    note = f'{rows.ambiguous_columns or "the orientations"} {why}; left out'
+    return replace(
+        rows, orientation=None, ambiguous_orientation=None, warnings=(*rows.warnings, note)
+    )
 
 
-def _readings(values: FloatArray, unit: str) -> Iterator[tuple[str, FloatArray]]:
-    """Give the ways to read columns (n, 3) or (n, 4), in words, and their quaternions (n, 4)."""
+def _conventions(values: FloatArray, unit: str) -> Iterator[tuple[str, FloatArray]]:
+    """Yield each convention in words and the quaternions (n, 4) of columns (n, 3) or (n.
+
+    4) in it.
+    """
     known = np.isfinite(values).all(axis=1)
     if values.shape[1] == len('xyzw'):
         lengths = np.linalg.norm(values[known], axis=1)
@@ -139,13 +157,18 @@ def _readings(values: FloatArray, unit: str) -> Iterator[tuple[str, FloatArray]]
             yield words, xyzw
 
 
-def _apart(
-    rows: RawRows, xyzw: FloatArray, arms: list[FloatArray], on_tool: bool, anyhow: bool = False
+def _orientation_error(
+    rows: RawRows,
+    xyzw: FloatArray,
+    arms: list[FloatArray],
+    on_tool: bool,
+    ignore_points: bool = False,
 ) -> float:
-    """Return by how much measured turns differ from those of the arm, rad (median).
+    """Median difference of measured orientations from those of the arm, rad.
 
-    The arm's tool poses are (n, 4, 4) each. If not `anyhow`, it is inf where the sensor stands
-    otherwise than the points say.
+    `arms` are the tool poses, (n, 4, 4), for each way to count the joints; the best one counts. If
+    not `ignore_points`, it is inf if the sensor's orientation disagrees with the points; also inf
+    if there are too few rows.
     """
     known = np.flatnonzero(np.isfinite(xyzw).all(axis=1))
     if len(known) < FEWEST_ROWS:
@@ -157,7 +180,7 @@ def _apart(
     errors = []
     for T in arms:
         arm = Rotation.from_matrix(T[known, :3, :3])
-        by_points = _sensor_turn(position, T[known])
+        by_points = _sensor_rotation(position, T[known])
         for first in range(min(_REFERENCES, len(known))):
             a = (measured * measured[first].inv()).as_rotvec()
             b = (arm * arm[first].inv()).as_rotvec()
@@ -166,15 +189,15 @@ def _apart(
             if used.sum() < FEWEST_ROWS - 2:
                 continue
             sensor = Rotation.align_vectors(a[used], b[used])[0]
-            if anyhow or (sensor.inv() * by_points).magnitude() < SENSOR_RAD:
+            if ignore_points or (sensor.inv() * by_points).magnitude() < SENSOR_RAD:
                 errors.append(np.median(np.linalg.norm(a - sensor.apply(b), axis=1)[used]))
     return float(min(errors, default=np.inf))
 
 
-def _sensor_turn(position: FloatArray, T: FloatArray) -> Rotation:
-    """Return how the base is turned in the sensor's frame, by the points of one marker.
+def _sensor_rotation(position: FloatArray, T: FloatArray) -> Rotation:
+    """Rotation of the base in the sensor's frame, from the points (n, 3) of one marker.
 
-    B p + e - R m = t is linear in the 15 numbers of B, e and m; B is the inverse turn.
+    B p + e - R m = t is linear in the 15 numbers of B, e and m; B is the inverse rotation.
     """
     n = len(T)
     A = np.zeros((3 * n, 15))
@@ -187,8 +210,8 @@ def _sensor_turn(position: FloatArray, T: FloatArray) -> Rotation:
     return Rotation.from_matrix(u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt)
 
 
-def _different(xyzw: FloatArray, other: FloatArray) -> bool:
-    """Return whether two readings are of different orientations."""
+def _differ(xyzw: FloatArray, other: FloatArray) -> bool:
+    """Whether two arrays of quaternions (n, 4) are different orientations."""
     known = np.isfinite(xyzw).all(axis=1)
     between = Rotation.from_quat(xyzw[known]).inv() * Rotation.from_quat(other[known])
     return bool(np.median(between.magnitude()) > OTHER_RAD / 4.0)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Units as tables write them, and what they are in SI."""
+"""Units as tables write them, and their values in SI."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ TIMES = {'s': 1.0, 'ms': 1e-3, 'us': 1e-6, 'ns': 1e-9, 'min': 60.0, 'h': 3600.0}
 TEMPERATURES = {'degc': 1.0, 'k': 1.0}
 SI = {**ANGLES, **LENGTHS, **TIMES, **TEMPERATURES}
 
-# German grad are degrees; who means the other one writes gon.
+# German "grad" are degrees; hundredths of a right angle are written "gon".
 _WORDS = {
     word: unit
     for unit, words in {
@@ -34,16 +34,16 @@ _WORDS = {
 _IN_BRACKETS = re.compile(r'\s*[\[(]\s*([^\])]+?)\s*[\])]\s*$')
 _AFTER_SLASH = re.compile(r'\s*(?:/|,| in )\s*([^\s/,]+)\s*$')
 _AT_END = re.compile(r'[ _.-]([^ _.-]+)$')
-# At the end of a name these mean something else: `A1_min`.
+# Units that mean something else at the end of a name: `A1_min`.
 _ONLY_IN_BRACKETS = ('min', 'h', 'k')
 # One letter at the end of a name is no unit: `point_s`, `J_m`; but x_m is one.
 _COORDINATE_IN_M = re.compile(r'(?:^|.*[ _.-])[xyz]_m$', re.IGNORECASE)
 _MM_AT_ONCE = re.compile(r'[xyz]mm', re.IGNORECASE)
 
 
-# Of the motors; `pulses` makes angles of them.
+# Units of motor pulses, which the module `pulses` converts to angles.
 PULSES = ('pulses', 'pulse', 'puls', 'counts', 'count', 'ticks', 'inc')
-# What tables are written in as well, and nothing here converts.
+# Units that tables have and nothing here converts.
 _OTHERS = {
     *('mrad', 'arcmin', 'arcsec', 'rev', 'turns', *PULSES),
     *('ft', 'feet', 'foot', 'yd', 'mil', 'mils', 'thou', 'dm', 'km', 'nm', 'px', 'pixel'),
@@ -51,30 +51,30 @@ _OTHERS = {
 
 
 def other_unit(header: str) -> str:
-    """Return the unit at the end of a header that nothing converts; '' where there is none."""
+    """Unit at the end of a header that nothing converts; '' if there is none."""
     found = _IN_BRACKETS.search(header) or _AT_END.search(header)
     return found[1] if found and found[1].lower() in _OTHERS else ''
 
 
 def unit_of(text: str) -> str:
-    """Return the unit that a text stands for, as `SI` has it; '' where it stands for none."""
+    """Unit in a text, as a key of `SI`; '' if the text is no known unit."""
     word = bare(text).lower()
     word = _WORDS.get(word, word)
     return word if word in SI else ''
 
 
 def is_unit(text: str) -> bool:
-    """Return whether a cell below a header can be a unit."""
+    """Whether a cell below a header can be a unit, or a mark for no unit."""
     return bool(unit_of(text)) or bare(text).strip('-–—') in ('', '1')
 
 
 def bare(text: str) -> str:
-    """Return a unit without the brackets around it."""
+    """A unit without the brackets around it."""
     return text.strip().strip('[]()').strip()
 
 
 def split_unit(header: str) -> tuple[str, str]:
-    """Return the name of a column without its unit, and the unit, '' where it has none."""
+    """Name of a column without its unit, and the unit ('' if it has none)."""
     found = _IN_BRACKETS.search(header) or _AFTER_SLASH.search(header)
     if found and unit_of(found[1]):
         return header[: found.start()].strip(), unit_of(found[1])

@@ -22,7 +22,7 @@ _UNIT_LINE = re.compile(
     r'(?:units?|einheit(?:en)?|unidad(?:es)?|unités?|unità)\s*(?:are|is)?\s*[:=]?\s*([A-Za-zµ"°]+)',
     re.IGNORECASE,
 )
-# A time since 1970 that is larger is in ms, us or ns.
+# Times since 1970 above these values are in ns, us or ms.
 _EPOCHS = ((1e17, 'ns'), (1e14, 'us'), (1e11, 'ms'))
 # Days since 1900, as spreadsheets count: of 1995 to 2119. As seconds of some clock they would be a
 # session of less than half a minute.
@@ -33,7 +33,7 @@ WITHOUT_DATE_S = 946_684_800.0
 # A date and a time without signs between them.
 _COMPACT = re.compile(r'(?:19|20)\d\d[01]\d[0-3]\d[0-2]\d[0-5]\d[0-5]\d')
 _CLOCK = re.compile(r'(\d\d?)\.(\d\d)\.\d\d')
-# Numbers that are no date.
+# Numbers that `dateutil` would take for a date.
 _SHORT = re.compile(r'[^:]?\d*(?:[.,\s-]+\d*)?')
 # Two numbers of a date and the sign between them; dates that begin with the year are not meant.
 _DATE = re.compile(r'\D*(\d\d?)([./-])(\d\d?)\2\d\d(?:\d\d)?(?!\d)')
@@ -74,12 +74,15 @@ _MONTHS = {
     }.items()
     for word in words.split()
 }
-# More than one turn each way: no arm reports that in radians.
+# Largest angle, rad, that an arm reports: a little more than one turn each way.
 _LARGEST_RAD = 2.1 * np.pi
 
 
 def numbers(table: TextTable, columns: tuple[int, ...], optional: bool = False) -> FloatArray:
-    """Return columns of numbers, (n, len(columns)); NaN where optional and empty."""
+    """Columns of numbers, (n, len(columns)); NaN if `optional` and empty.
+
+    Raises InputError for an empty cell if not `optional`, and for text that is no number.
+    """
     values = np.full((len(table.rows), len(columns)), np.nan)
     for row in range(len(table.rows)):
         for i, column in enumerate(columns):
@@ -92,11 +95,14 @@ def numbers(table: TextTable, columns: tuple[int, ...], optional: bool = False) 
     return values
 
 
-def angle_unit(table: TextTable, columns: Columns, told: str) -> tuple[str, str]:
-    """Return the unit of the joint angles, and how it is known: told, header or guessed."""
+def angle_unit(table: TextTable, columns: Columns, stated_unit: str) -> tuple[str, str]:
+    """Unit of the joint angles, and how it is known: 'told', 'header' or 'guessed'.
+
+    `stated_unit` is the user's, '' if none. Raises InputError if the headers have several units.
+    """
     units = {columns.units.get(i, '') for i in columns.joints} - {''}
-    if told:
-        return told, 'told'
+    if stated_unit:
+        return stated_unit, 'told'
     if len(units) > 1:
         raise InputError(
             f'{table.path}: the joints have several units in the header '
@@ -109,17 +115,17 @@ def angle_unit(table: TextTable, columns: Columns, told: str) -> tuple[str, str]
 
 
 def joint_values(
-    table: TextTable, columns: Columns, chain: SerialChain, told: str
+    table: TextTable, columns: Columns, chain: SerialChain, stated_unit: str
 ) -> tuple[FloatArray, tuple[tuple[str, str], ...], FloatArray]:
-    """Return the joints' positions, (n, k), rad or m, with unit and source of each, k, and scale.
+    """Joint positions, (n, k), rad or m; unit and source of each joint, k; and scale to SI, (k,).
 
-    The unit of the angles is `told` or found. That of a joint that slides is in its header. Else
-    it is m where all values are within the joint's limits then, and mm where they are within them
-    as that.
+    The unit of the angles is `stated_unit`, else that of the header, else guessed. The unit of a
+    prismatic joint is in its header; else m if all values in m are within the joint's limits, else
+    mm if they are within the limits in mm. Raises InputError if neither fits.
     """
     values = numbers(table, columns.joints)
     turning = tuple(i for i, slides in zip(columns.joints, chain.slides) if not slides)
-    angle = angle_unit(table, replace(columns, joints=turning), told)
+    angle = angle_unit(table, replace(columns, joints=turning), stated_unit)
     units = []
     for joint, column in enumerate(columns.joints):
         if not chain.slides[joint]:
@@ -156,16 +162,16 @@ def joint_values(
 
 
 def length_unit(
-    table: TextTable, columns: Columns, told: str, points: FloatArray, modelled: FloatArray
+    table: TextTable, columns: Columns, stated_unit: str, points: FloatArray, modelled: FloatArray
 ) -> tuple[str, str]:
-    """Return the unit of the points, and how it is known.
+    """Unit of the points, and how it is known: 'told', 'header' or 'guessed'.
 
-    The points are as written, (n, 3). Where nothing states the unit, it is the one in which they
-    lie as far apart as those `modelled` of the robot, m, (n, 3).
+    `points` are the points as written, (n, 3). If nothing states the unit, it is the one in which
+    their spread is nearest to that of the points `modelled` of the robot, m, (n, 3).
     """
     units = {columns.units.get(i, '') for i in columns.point} - {''}
-    if told:
-        return told, 'told'
+    if stated_unit:
+        return stated_unit, 'told'
     if len(units) > 1:
         raise InputError(
             f'{table.path}: X, Y and Z have several units in the header '
@@ -184,7 +190,7 @@ def length_unit(
 
 
 def refuse_far(table: TextTable, columns: Columns, unit: str) -> None:
-    """Refuse points beyond any sensor."""
+    """Raise InputError for the first point that is beyond the range of any sensor."""
     far = np.abs(numbers(table, columns.point, optional=True)) * LENGTHS[unit] > FARTHEST_M
     for row, i in np.argwhere(far)[:1]:
         raise table.fault(
@@ -196,13 +202,13 @@ def refuse_far(table: TextTable, columns: Columns, unit: str) -> None:
 
 
 def times(table: TextTable, columns: Columns) -> FloatArray | None:
-    """Return the times of the rows, s, (n,); None where the table has none.
+    """Times of the rows, s, (n,); None if the table has none.
 
-    Numbers, ISO 8601, or a date and a time as programs write them (dates with points have the day
-    first), in one column or in two.
+    A time is a number, ISO 8601, or a date and a time as programs write them (dates with points
+    have the day first), in one column or in two. Raises InputError for text that is no time.
     """
-    column = columns.one('time')
-    clock, date = columns.one('clock'), columns.one('date')
+    column = columns.first_of_kind('time')
+    clock, date = columns.first_of_kind('clock'), columns.first_of_kind('date')
     if column is None:
         column = clock if clock is not None else date
     if column is None or not any(row[column] for row in table.rows):
@@ -234,6 +240,7 @@ def times(table: TextTable, columns: Columns) -> FloatArray | None:
 
 
 def _time(text: str, decimal: str, day_first: bool) -> float | None:
+    """Time of a cell, s; None if the cell is no time."""
     if len(text) > _LONGEST_TIME:
         return None
     number = parse_number(text, decimal)
@@ -266,7 +273,7 @@ def _time(text: str, decimal: str, day_first: bool) -> float | None:
 
 
 def _in_english(text: str) -> str:
-    """Return a time with English months, without days of the week, and with colons."""
+    """A time with English names of months, without days of the week, and with colons."""
     text = _WORD.sub(lambda word: _MONTHS.get(word[1].casefold(), word[0]), text)
     text = re.sub(r'[年月]', '-', text).replace('日', ' ').replace('_', ' ')
     text = re.sub(r'([AaPp])\. ?([Mm])\.', r'\1\2', text)
@@ -275,13 +282,13 @@ def _in_english(text: str) -> str:
 
 
 def _are_clocks(texts: Sequence[str]) -> bool:
-    """Return whether times of day are written with points: there are months up to 12 only."""
+    """Whether times of day are written with points: a second number above 12 is no month."""
     found = [_CLOCK.fullmatch(text) for text in texts]
     return all(found) and any(not 0 < int(match[2]) <= _MOST_MONTHS for match in found if match)
 
 
 def _is_day_first(texts: Sequence[str]) -> bool:
-    """Return whether dates have the day before the month: all of a column are written so."""
+    """Whether dates have the day before the month, judged from the whole column."""
     found = [match for match in map(_DATE.match, texts) if match]
     first, second = [int(match[1]) for match in found], [int(match[3]) for match in found]
     if any(match[2] == '.' for match in found) or max(first, default=0) > _MOST_MONTHS:

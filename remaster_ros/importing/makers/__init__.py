@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files of one maker's own form, read into named columns: one file a maker, one function each."""
+"""Readers of makers' own file formats into named columns: one file a maker."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ from remaster_ros.importing.makers import (
     workbook,
     yaml_text,
 )
-from remaster_ros.importing.makers.named import Named
+from remaster_ros.importing.makers.named import NamedColumns
 
-# Each returns None where a text is not of its kind.
-READERS: tuple[Callable[[str], Named | None], ...] = (
+# Each reader returns None for a text of another format.
+READERS: tuple[Callable[[str], NamedColumns | None], ...] = (
     json_text.read,
     motive.read,
     vicon.read,
@@ -58,6 +58,5 @@ READERS: tuple[Callable[[str], Named | None], ...] = (
     yaml_text.read,
 )
 
-# Of bytes that are no text: the tables in it as text, by their names; None where a file is not of
-# this kind.
+# Readers of binary files: tables as text by their names; None for a file of another format.
 UNPACKERS: tuple[Callable[[bytes], dict[str, str] | None], ...] = (workbook.read, numpy_file.read)

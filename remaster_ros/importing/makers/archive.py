@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Zip archives that workbooks and arrays of NumPy are: what a damaged one raises, in one line."""
+"""Errors of damaged zip archives (workbooks, NumPy arrays) as one line."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from contextlib import contextmanager
 
 from remaster_ros.errors import InputError
 
-# Of damaged directories `zipfile` raises what places and lengths without sense lead to.
+# Exceptions that `zipfile` raises for damaged or locked archives.
 _DAMAGED = (
     zipfile.BadZipFile,
     zlib.error,
@@ -30,8 +30,8 @@ _DAMAGED = (
 
 
 @contextmanager
-def damage_said() -> Iterator[None]:
-    """Raise an InputError in place of what a damaged or locked archive raises."""
+def damage_as_input_error() -> Iterator[None]:
+    """Raise InputError in place of the exceptions for a damaged or locked archive."""
     try:
         yield
     except _DAMAGED:

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import re
 
-from remaster_ros.importing.makers.named import Named, unexpected
+from remaster_ros.importing.makers.named import NamedColumns, unexpected
 
 _LINE = re.compile(
     r'\s*"?(?:(?P<name>[^\s;,\t].*?)"?[\s.,;:_-]+"?)?(?P<axis>[XYZ])"?(?:\s*[;:=,\t]\s*|\s+)'
@@ -14,12 +14,12 @@ _LINE = re.compile(
 )
 _AXES = 'XYZ'
 _SEEN = 60
-# A name, an axis and a number are no longer; what is repeated for longer takes ever more ways.
+# Longest line with a name, an axis and a number; matching longer lines takes exponential time.
 _LONGEST = 200
 
 
-def read(text: str) -> Named | None:
-    """Return the points of such a report; None for anything else."""
+def read(text: str) -> NamedColumns | None:
+    """Points of a report with one number a line; None for other text."""
     lines = [(i, line) for i, line in enumerate(text.splitlines(), 1) if line.strip()]
     seen = [match['axis'] for _, line in lines[:_SEEN] if (match := _match(line))]
     if len(seen) < 2 * len(_AXES) or 2 * len(seen) <= len(lines[:_SEEN]):
@@ -31,7 +31,7 @@ def read(text: str) -> Named | None:
     for number, line in lines:
         match = _match(line)
         if match is None:
-            # Of a point in the middle nothing else may stand there.
+            # Between the axes of a point no other line may stand.
             if values or len(re.findall(r'\d+(?:[.,]\d+)?', line)) > 1:
                 raise unexpected(number, line, f'{_AXES[len(values)]} and its number')
             above = line.strip(' \t;,"')
@@ -50,7 +50,7 @@ def read(text: str) -> Named | None:
         raise unexpected(*lines[-1], f'{_AXES[len(values)]} below it')
     named = len({*names}) > 1
     decimal = ',' if any(',' in cell for row in rows for cell in row) else '.'
-    return Named(
+    return NamedColumns(
         kind='points with a line for each axis',
         names=(*['name'] * named, *_AXES),
         rows=tuple((*[name] * named, *row) for name, row in zip(names, rows, strict=True)),

@@ -6,7 +6,7 @@ from __future__ import annotations
 import re
 
 from remaster_ros.errors import InputError
-from remaster_ros.importing.makers.named import NUMBER, Named, axes_in_order, unexpected
+from remaster_ros.importing.makers.named import NUMBER, NamedColumns, axes_in_order, unexpected
 
 _CALL = re.compile(r'\bposj\s*\(')
 _LIST = re.compile(r'\bposj\s*\(\s*\[?([^()\[\]]*)\]?\s*\)')
@@ -18,8 +18,8 @@ _RELATIVE = re.compile(r'\bDR_MV_MOD_REL\b|\bmod\s*=\s*1\b')
 _EXPECTED = 'posj(…) with an angle in degrees for each joint, once a line,'
 
 
-def read(text: str) -> Named | None:
-    """Return the positions of joints of a program in DRL; None for anything else."""
+def read(text: str) -> NamedColumns | None:
+    """Joint positions of a program in DRL; None for other text."""
     if not _CALL.search(text):
         return None
     found: list[tuple[int, str, dict[str, str]]] = []

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """FANUC's texts: positions at the end of a program (.ls), and position registers (posreg.va).
 
-FANUC counts J3 from the horizontal: what the axis itself turns is J3 + J2.
+FANUC counts J3 from the horizontal: the axis itself turns by J3 + J2.
 """
 
 from __future__ import annotations
@@ -9,14 +9,14 @@ from __future__ import annotations
 import re
 
 from remaster_ros.errors import InputError
-from remaster_ros.importing.makers.named import NUMBER, Named, axes_in_order, unexpected
+from remaster_ros.importing.makers.named import NUMBER, NamedColumns, axes_in_order, unexpected
 
 _OPEN = re.compile(r'\s*(PR?\[\d+)(?:\s*:\s*"[^"]*")?\]\s*\{\s*')
 _INCREMENT = re.compile(r'\s*\d+:\s*[JLC]\s+PR?\[.*\bINC\b', re.IGNORECASE)
 _CLOSE = re.compile(r'\s*\}\s*;?\s*')
 _GROUP = re.compile(r'\s*GP(\d+)\s*:')
 _IGNORED = re.compile(r"\s*(?:U[FT]\s*:\s*\w+|CONFIG\s*:\s*'[^']*')\s*,?\s*")
-# What was never taught is shown so.
+# Mark of a position that was never taught.
 _UNTAUGHT = r'\*{2,}'
 _JOINT = re.compile(
     rf'\s*(J\d|E(?:XT)?\d)\s*[=:]\s*({NUMBER.pattern}|{_UNTAUGHT})\s+(deg|mm)\s*,?\s*'
@@ -29,8 +29,8 @@ _REGISTER = re.compile(r"\s*\[(\d+),(\d+)\]\s*=\s*'[^']*'\s*(.*?)\s*")
 _OF_GROUP = re.compile(r'\s*(?:Group\s*:\s*(\d+))?\s*(?:Config\s*:\s*([^:=]*))?\s*')
 
 
-def read(text: str) -> Named | None:
-    """Return the joint positions of a program of FANUC's; None for anything else."""
+def read(text: str) -> NamedColumns | None:
+    """Joint positions of a FANUC program or of position registers; None for other text."""
     if re.search(r'\$POSREG\b.*\bARRAY\b', text):
         return _registers(text)
     if not re.search(r'^[ \t]*/PROG\b|^[ \t]*PR?\[\d+[^\n]*\]\s*\{', text, re.MULTILINE):
@@ -89,8 +89,8 @@ def read(text: str) -> Named | None:
     return _positions('positions of a FANUC program', found, places, untaught, bool(others))
 
 
-def _registers(text: str) -> Named:
-    """Return the position registers of `posreg.va` that are in joints, of the first group."""
+def _registers(text: str) -> NamedColumns:
+    """Position registers of `posreg.va` in joints, of the first motion group."""
     found: list[tuple[int, str, dict[str, str]]] = []
     places, untaught, others = set[int](), set[int](), False
     values: dict[str, str] | None = None
@@ -98,12 +98,12 @@ def _registers(text: str) -> Named:
     for number, line in enumerate(text.splitlines(), 1):
         code = re.sub(r'</?[A-Za-z!][^<>]*>', '', line)
         if register := _REGISTER.fullmatch(code):
-            rest = register[3]
+            value = register[3]
             values, opened = {}, number
-            if rest.lower() == 'uninitialized':
+            if value.lower() == 'uninitialized':
                 values = None
                 continue
-            if not _OF_GROUP.fullmatch(rest):
+            if not _OF_GROUP.fullmatch(value):
                 raise unexpected(number, line, "[1,1] = '…' Group: 1")
             if register[1] != '1':
                 others, values = True, {}
@@ -130,8 +130,8 @@ def _registers(text: str) -> Named:
                 at = of.end()
             else:
                 raise unexpected(number, line, 'J1 = … deg and so on')
-    left = places | untaught
-    found = [entry for entry in found if entry[0] not in left]
+    excluded = places | untaught
+    found = [entry for entry in found if entry[0] not in excluded]
     for number, name, values in found:
         if not values:
             raise InputError(f'line {number}: {name} has no axes, J1 = … deg is expected')
@@ -148,7 +148,8 @@ def _positions(
     places: int,
     untaught: int,
     others: bool,
-) -> Named:
+) -> NamedColumns:
+    """Columns of joint positions, with notes on what was left out."""
     notes = (f'{places} Cartesian positions were left out',) * bool(places)
     notes += (f'{untaught} positions that were never taught were left out',) * bool(untaught)
     notes += ('the axes of other motion groups were left out',) * others

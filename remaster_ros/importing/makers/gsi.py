@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Leica's GSI, as total stations export it: words of a fixed width, point by point.
+"""Leica's GSI, as total stations export it: words of a fixed width, a line for each point.
 
-A word has two digits of what it is (11: the point's name, 81 to 83: east, north, height), four of
+A word has two digits for its kind (11: name of the point, 81 to 83: east, north, height), four of
 information, of which the last is the unit, a sign, and 8 or 16 digits or letters.
 """
 
@@ -10,7 +10,7 @@ from __future__ import annotations
 import re
 
 from remaster_ros.errors import InputError
-from remaster_ros.importing.makers.named import Named, unexpected
+from remaster_ros.importing.makers.named import NamedColumns, unexpected
 
 _WORD = re.compile(r'(\d\d)([\d.]{4})([+-])([^\s+]{16}|[^\s+]{8})(?=\s|$)')
 _LINE = re.compile(rf'\*?(?:{_WORD.pattern}\s*)+')
@@ -19,8 +19,8 @@ _NAME, _AXES = '11', ('81', '82', '83')
 _DIGITS = {'0': 0, '6': 1, '8': 2}
 
 
-def read(text: str) -> Named | None:
-    """Return the points of a file in GSI; None for anything else."""
+def read(text: str) -> NamedColumns | None:
+    """Points of a file in GSI; None for other text."""
     lines = [(i, line.strip()) for i, line in enumerate(text.splitlines(), 1) if line.strip()]
     if not lines or not _LINE.fullmatch(lines[0][1]):
         return None
@@ -45,12 +45,12 @@ def read(text: str) -> Named | None:
             'line 1: there are no coordinates in it (words 81, 82 and 83); angles and distances '
             'are no points: export coordinates'
         )
-    left = len(lines) - len(rows)
-    return Named(
+    skipped_lines = len(lines) - len(rows)
+    return NamedColumns(
         kind="points in Leica's GSI, mm",
         instrument='tracker',
         names=('name', *(f'{axis} [mm]' for axis in 'XYZ')),
         rows=tuple(rows),
         lines=tuple(at),
-        notes=(f'{left} lines without coordinates were left out',) * bool(left),
+        notes=(f'{skipped_lines} lines without coordinates were left out',) * bool(skipped_lines),
     )

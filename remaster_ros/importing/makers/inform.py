@@ -6,7 +6,7 @@ from __future__ import annotations
 import re
 
 from remaster_ros.errors import InputError
-from remaster_ros.importing.makers.named import NUMBER, Named, axes_in_order, unexpected
+from remaster_ros.importing.makers.named import NUMBER, NamedColumns, axes_in_order, unexpected
 
 _JOB = re.compile(r'\s*/JOB\b')
 _TYPE = re.compile(r'\s*///POSTYPE\s+(\w+)')
@@ -18,8 +18,8 @@ _REMEDY = (
 )
 
 
-def read(text: str) -> Named | None:
-    """Return the positions of a job that are of joints; None for anything else."""
+def read(text: str) -> NamedColumns | None:
+    """Joint positions of a Yaskawa job; None for other text."""
     if _JOB.match(text) is None:
         return None
     found: list[tuple[int, str, dict[str, str]]] = []

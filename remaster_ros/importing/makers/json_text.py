@@ -13,13 +13,13 @@ from typing import Any
 
 from remaster_ros.errors import InputError
 from remaster_ros.importing.makers import records
-from remaster_ros.importing.makers.named import Named, unexpected
+from remaster_ros.importing.makers.named import NamedColumns, unexpected
 
 _START = re.compile(r'\s*(?:\{\s*"|\[\s*[\[{])')
 
 
-def read(text: str) -> Named | None:
-    """Return the records of JSON or of JSON lines; None for anything else."""
+def read(text: str) -> NamedColumns | None:
+    """Records of JSON or of JSON lines; None for other text."""
     if not _START.match(text):
         return None
     try:
@@ -38,7 +38,7 @@ def read(text: str) -> Named | None:
 
 
 class _Decoder(json.JSONDecoder):
-    """Decode to records that have their lines; numbers stay as they are written."""
+    """JSON decoder that keeps numbers as text, and the line of each object and array."""
 
     def __init__(self, text: str) -> None:
         super().__init__(parse_float=str, parse_int=str, parse_constant=str)
@@ -49,7 +49,10 @@ class _Decoder(json.JSONDecoder):
         self.scan_once = json.scanner.py_make_scanner(self)  # type: ignore[attr-defined]
 
     def whole(self) -> Any:
-        """Return the value, or the values one behind the other; None where it is no JSON."""
+        """The value of the text, or a list of several values in sequence.
+
+        None if it is not JSON.
+        """
         values = records.Items()
         at = 0
         blank = re.compile(r'[\s,]*')

@@ -6,7 +6,7 @@ from __future__ import annotations
 import re
 
 from remaster_ros.errors import InputError
-from remaster_ros.importing.makers.named import NUMBER, Named, axes_in_order, unexpected
+from remaster_ros.importing.makers.named import NUMBER, NamedColumns, axes_in_order, unexpected
 
 _SECTION = re.compile(r'\s*\.(\w+)')
 _NAME = r'#[A-Za-z][\w.]*(?:\[\s*\d+\s*\])?'
@@ -17,8 +17,8 @@ _SIX = re.compile(r'(?:[-+.\d]+[\s,]+){5}[-+.\d]')
 _EXPECTED = '#name and an angle for each joint'
 
 
-def read(text: str) -> Named | None:
-    """Return the joint displacements of a text in AS; None for anything else."""
+def read(text: str) -> NamedColumns | None:
+    """Joint displacements of a text in AS; None for other text."""
     if not (
         re.search(r'^[ \t]*\.JOINTS', text, re.MULTILINE | re.IGNORECASE) or _CALL.search(text)
     ):

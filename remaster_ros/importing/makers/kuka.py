@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""KUKA's own texts: axis positions of a .dat or .src file, and of $AXIS_ACT as it is shown."""
+"""KUKA's texts: axis positions of a .dat or .src file, and printed values of $AXIS_ACT."""
 
 from __future__ import annotations
 
 import re
 
 from remaster_ros.errors import InputError
-from remaster_ros.importing.makers.named import NUMBER, Named, axes_in_order, unexpected
+from remaster_ros.importing.makers.named import NUMBER, NamedColumns, axes_in_order, unexpected
 
 _AGGREGATE = re.compile(r'\{([^{}]*)\}')
 _AXES = re.compile(r'\b(?:E6)?AXIS\b|\$AXIS_ACT', re.IGNORECASE)
@@ -26,8 +26,8 @@ _LONGEST_NAME = 200
 _EXPECTED = '{E6AXIS: A1 …, A2 …} with a number for each axis'
 
 
-def read(text: str) -> Named | None:
-    """Return the axis positions in a text of KUKA's; None for anything else."""
+def read(text: str) -> NamedColumns | None:
+    """Axis positions in a text of KUKA's; None for other text."""
     if not (re.search(r'\{[^{}]*\b[Aa]1\s+[-+.\d]', text) or _PROGRAM.match(text)):
         return None
     found: list[tuple[int, str, dict[str, str]]] = []
@@ -66,22 +66,23 @@ def read(text: str) -> Named | None:
 
 
 def moves(text: str) -> tuple[str, ...]:
-    """Return the points that the moves of a program name, in their order; some more than once."""
+    """Names of the points to which the moves of a program go, in order, with repetitions."""
     codes = (line.partition(';')[0] for line in text.splitlines())
     return tuple(_point(found[1]) for found in map(_MOVE.match, codes) if found)
 
 
 def _point(name: str) -> str:
-    """Return what a point is called whose data is called so: P1 of XP1."""
+    """Name of a point from the name of its data: P1 for XP1."""
     return name[1:] if name.upper().startswith('X') and len(name) > 1 else name
 
 
 def _position(
     number: int, line: str, before: str, aggregate: re.Match[str]
 ) -> tuple[str, dict[str, str]]:
-    """Return the name of a position, '' where it has none, and its axes.
+    """Name of a position ('' if it has none) and its axes.
 
-    ``before``: the text between the position before and this one.
+    ``before``: text between the previous position and this one. Raises InputError for text that is
+    no axis position.
     """
     values: dict[str, str] = {}
     for part in aggregate[1].split(','):

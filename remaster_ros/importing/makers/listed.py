@@ -1,52 +1,52 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Logs in which each line has the joints in brackets, as programs print a list: `P1: [0, 1]`."""
+"""Logs in which each line has the joints as a list in brackets: `P1: [0, 1]`."""
 
 from __future__ import annotations
 
 import re
 
-from remaster_ros.importing.makers.named import NUMBER, Named, leading, unexpected
+from remaster_ros.importing.makers.named import NUMBER, NamedColumns, leading_column, unexpected
 
-# In square brackets or braces, or in round ones alone; behind them arguments of a call, or the
-# external axes of RAPID. Each has one way to match: a line of a large log that is none of them is
-# told at once.
+# A list in square brackets or braces, or in round ones alone; behind it arguments of a call, or
+# the external axes of RAPID. Each alternative matches in one way only, so that other lines of a
+# large log are rejected quickly.
 _LINE = re.compile(
     r'(?:(?P<before>(?:[^\[\]{}]|\[\d+\])*)(?:\[{1,2}\(?|\{)(?P<list>[^\[\](){}]*)\)?'
     r'(?:\]\s*,\s*\[(?P<external>[^\[\]]*)\]\]|(?:\]{1,2}|\})(?:,\s*[\w.=]+\s*)*\)?)'
     r'|(?P<head>[^\[\](){}]*)\({1,2}(?P<row>[^\[\](){}]*)\){1,2})\s*(?:[,;]\s*)?'
 )
-# Text between the lists has fewer numbers.
+# Lines of text between the lists have at most this many numbers.
 _ANY_NUMBER = re.compile(r'\d+(?:\.\d*)?')
-_MOST_BESIDE = 2
-# A call with the list, and what calls are named that take places.
+_MOST_IN_TEXT = 2
+# A call with the list, and names of calls that take Cartesian poses.
 _CALLED = re.compile(r'([A-Za-z_]\w*)\s*\(\s*[\[(]?\s*[-+.\d]')
 _PLACES = re.compile(r'lin|pose|cart|tcp|move_?[lcp]\b|frame|trans', re.IGNORECASE)
 _RAPID = ('jointtarget', 'moveabsj')
 _UNUSED = 9e9
 _BETWEEN = re.compile(r'\s*[,;]\s*|\s+')
-# What a name is set apart by, and what it is set before.
-_APART = ' \t:;,="\'('
+# Characters around a name that are no part of it.
+_DELIMITERS = ' \t:;,="\'('
 _FEWEST, _MOST = 2, 12
 
 
-def read(text: str) -> Named | None:
-    """Return the lists of a log, with their names or times; None for anything else."""
+def read(text: str) -> NamedColumns | None:
+    """Lists of a log, with their names or times; None for other text."""
     lines = [(i, line) for i, line in enumerate(text.splitlines(), 1) if line.strip()]
     # Titles and keys have no numbers.
     head = next((i for i, (_, line) in enumerate(lines) if re.search(r'\d', line)), len(lines))
     first = [_LINE.fullmatch(line) for _, line in lines[head : head + 2]]
     if not first or not all(first) or any(word in text.lower() for word in _RAPID):
         return None
-    if head and re.search(r'[,;\t]', (first[0] and _parts(first[0])[0]) or ''):
+    if head and re.search(r'[,;\t]', (first[0] and _label_and_list(first[0])[0]) or ''):
         # The names of columns.
         return None
     rows: list[list[str]] = []
-    before: list[str] = []
+    labels: list[str] = []
     numbers_of: list[int] = []
-    beside, call, rapid = 0, '', False
+    text_lines, call, rapid = 0, '', False
     for number, line in lines[head:]:
         match = _LINE.fullmatch(line)
-        words, numbers = ('', '') if match is None else _parts(match)
+        words, numbers = ('', '') if match is None else _label_and_list(match)
         cells = _BETWEEN.split(numbers) if numbers else []
         listed = bool(cells) and all(map(NUMBER.fullmatch, cells))
         if not rows and (
@@ -55,10 +55,10 @@ def read(text: str) -> Named | None:
             or (match and match['external'] and not words)
         ):
             return None
-        if rows and len(_ANY_NUMBER.findall(line)) <= _MOST_BESIDE:
-            beside += 1
+        if rows and len(_ANY_NUMBER.findall(line)) <= _MOST_IN_TEXT:
+            text_lines += 1
             continue
-        if not listed or (rows and len(cells) != len(rows[0])) or not _is_unused(match):
+        if not listed or (rows and len(cells) != len(rows[0])) or not _has_no_external_axes(match):
             raise unexpected(
                 number, line, f'a list of {len((rows or [cells])[0])} numbers in brackets'
             )
@@ -70,31 +70,31 @@ def read(text: str) -> Named | None:
         rapid = bool(match and match['external'])
         call = call or (called[1] if called else '')
         rows.append(cells)
-        before.append(words)
+        labels.append(words)
         numbers_of.append(number)
-    lead, before = leading(before)
+    lead, labels = leading_column(labels)
     # External axes are of RAPID, which counts in degrees.
     joints = [f'J{i}{" [deg]" * rapid}' for i in range(1, len(rows[0]) + 1)]
     is_point = len(rows[0]) == len('XYZ')
-    return Named(
+    return NamedColumns(
         kind='lists of points' if is_point else 'lists of joints',
         names=(*lead, *('XYZ' if is_point else joints)),
         rows=tuple(
-            (*([words] if lead else []), *cells) for words, cells in zip(before, rows, strict=True)
+            (*([words] if lead else []), *cells) for words, cells in zip(labels, rows, strict=True)
         ),
         lines=tuple(numbers_of),
-        notes=(f'{beside} lines without a list were left out',) * bool(beside),
+        notes=(f'{text_lines} lines without a list were left out',) * bool(text_lines),
     )
 
 
-def _parts(line: re.Match[str]) -> tuple[str, str]:
-    """Return what stands before a list, and what is in it."""
+def _label_and_list(line: re.Match[str]) -> tuple[str, str]:
+    """Text before the list of a line, and text within it."""
     before = line['before'] or line['head'] or ''
-    return before.strip(_APART), (line['list'] or line['row'] or '').strip()
+    return before.strip(_DELIMITERS), (line['list'] or line['row'] or '').strip()
 
 
-def _is_unused(line: re.Match[str] | None) -> bool:
-    """Return whether the external axes of a line are none, or at 0."""
+def _has_no_external_axes(line: re.Match[str] | None) -> bool:
+    """Whether the external axes of a line are absent, unused or at 0."""
     external = (line and line['external']) or '0'
     cells = [cell.strip() for cell in external.split(',')]
     return all(

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""OptiTrack Motive's export of a take: rigid bodies and markers, a line a frame.
+"""OptiTrack Motive's export of a take: rigid bodies and markers, a line for each frame.
 
-Above the frames stand a line about the take and one line each for type, name, ID, in newer
-versions the parent, the quantity and the axis; they are recognised by words, not by their number.
+Above the frames are a line about the take and a line each for type, name, ID, in newer versions
+the parent, the quantity and the axis; they are recognised by words, not by their number.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from remaster_ros.importing.makers.named import Named, unexpected
+from remaster_ros.importing.makers.named import NamedColumns, unexpected
 from remaster_ros.importing.units import LENGTHS
 from remaster_ros.types import BoolArray, FloatArray, IntArray
 
@@ -33,20 +33,22 @@ _HEADLESS = re.compile(
 )
 _NUMBER = re.compile(r'[+-]?\d+(?:[.,]\d+)?(?:[eE][+-]?\d+)?', re.ASCII)
 _MOST_HEAD_LINES = 12
-# A marker that moves by less than this share of what others move is not on the arm.
+# A marker whose extent is less than this share of the largest one is not on the arm.
 _STATIC = 0.02
-# Markers are further apart, m; a piece that begins later than that, s, may be of any marker.
+# Smallest distance of two markers, m. A piece of a track that begins later than this after the
+# previous one, s, may belong to any marker.
 _SAME_M, _LOST_S = 0.01, 0.5
-# What a tool carries, the likeliest kind first: the points of a body are of one solution.
+# Kinds of assets on a tool, the likeliest first: the points of a body share one solution.
 _KINDS = ('Rigid Body', 'Marker', 'Rigid Body Marker')
 
 
 def _likeliness(kind: str) -> int:
+    """Rank of a kind of asset, 0 for the likeliest."""
     return _KINDS.index(kind) if kind in _KINDS else len(_KINDS)
 
 
-def read(text: str) -> Named | None:
-    """Return the columns of a take; None for anything else."""
+def read(text: str) -> NamedColumns | None:
+    """Columns of a take; None for other text. Raises InputError for a damaged one."""
     start = _START.match(text) or _HEADLESS.match(text)
     if start is None and _HEADLESS.match(text.partition('\n')[2]):
         raise unexpected(1, text.partition('\n')[0], 'Format Version')
@@ -128,7 +130,7 @@ def read(text: str) -> Named | None:
         for (number, line), cells in zip(lines[at + 1 :], table):
             if not all(_NUMBER.fullmatch(cell) for cell in cells if cell):
                 raise unexpected(number, line, 'a number in each cell that is not empty')
-        tracks, left = _tracks(groups, table, commas, unit)
+        tracks, dropped_pieces = _moving_tracks(groups, table, commas, unit)
         if not tracks:
             raise unexpected(
                 *lines[at],
@@ -145,12 +147,12 @@ def read(text: str) -> Named | None:
         pieces = sum(len(track.labels) for track in tracks)
         if pieces > len(tracks):
             notes = (f'{pieces} pieces of markers without a label are of {len(tracks)}',)
-        if left:
-            notes += (f'{left} pieces of markers without a label were left out',)
+        if dropped_pieces:
+            notes += (f'{dropped_pieces} pieces of markers without a label were left out',)
     version = (
         f'format {take.get("Format Version", "?").strip()}' if take else 'without its first line'
     )
-    return Named(
+    return NamedColumns(
         kind=f'a take of Motive ({version}){", " if unit else ""}{unit}',
         instrument='camera',
         names=tuple(names),
@@ -166,7 +168,10 @@ def read(text: str) -> Named | None:
 
 @dataclass(eq=False)
 class _Track:
-    """Pieces of one marker: where it is, NaN where unseen, and of which piece, -1 for none."""
+    """Pieces of one marker.
+
+    `places` is NaN, (n, 3), and `of`, the index of the piece, -1 if the marker was not seen.
+    """
 
     labels: list[str]
     places: FloatArray
@@ -177,44 +182,52 @@ class _Track:
         return self.of >= 0
 
     def extent(self) -> float:
-        """Return the longest side of the box around it."""
+        """Longest side of the box around the positions."""
         return float(np.ptp(self.places[self.seen], axis=0).max())
 
-    def apart(self, places: FloatArray, time_s: FloatArray) -> float:
-        """Return how far a piece is from where this one is or would be, inf if it is too late."""
+    def distance(self, places: FloatArray, time_s: FloatArray) -> float:
+        """Distance of a piece from this marker's seen or predicted position.
+
+        Inf if too long after it.
+        """
         seen = np.isfinite(places[:, 0])
         both = seen & self.seen
         if both.any():
-            apart = np.linalg.norm((places - self.places)[both], axis=1)
-            return float(np.quantile(apart, 0.5, method='lower'))
+            distance = np.linalg.norm((places - self.places)[both], axis=1)
+            return float(np.quantile(distance, 0.5, method='lower'))
         first = int(np.argmax(seen))
-        own = np.flatnonzero(self.seen[:first])
-        if not len(own) or time_s[first] - time_s[own[-1]] > _LOST_S:
+        seen_before = np.flatnonzero(self.seen[:first])
+        if not len(seen_before) or time_s[first] - time_s[seen_before[-1]] > _LOST_S:
             return np.inf
         way = 0.0
-        if len(own) > 1:
-            step = np.linalg.norm(self.places[own[-1]] - self.places[own[-2]])
-            way = float(step) * (first - own[-1]) / (own[-1] - own[-2])
-        return max(0.0, float(np.linalg.norm(places[first] - self.places[own[-1]])) - 2.0 * way)
+        if len(seen_before) > 1:
+            step = np.linalg.norm(self.places[seen_before[-1]] - self.places[seen_before[-2]])
+            way = float(step) * (first - seen_before[-1]) / (seen_before[-1] - seen_before[-2])
+        return max(
+            0.0, float(np.linalg.norm(places[first] - self.places[seen_before[-1]])) - 2.0 * way
+        )
 
     def add(self, label: str, places: FloatArray) -> None:
-        """Take a piece where nothing was seen before."""
+        """Add a piece in the frames in which the marker was not seen."""
         fresh = np.isfinite(places[:, 0]) & ~self.seen
         self.places[fresh] = places[fresh]
         self.of[fresh] = len(self.labels)
         self.labels.append(label)
 
 
-def _tracks(
+def _moving_tracks(
     groups: Mapping[str, tuple[int, ...]],
     table: Sequence[tuple[str, ...]],
     commas: bool,
     unit: str,
 ) -> tuple[list[_Track], int]:
-    """Return the markers that move, of their pieces, and how many pieces are left out.
+    """Tracks of the markers that move, joined from their pieces.
 
-    Motive gives a marker that it lost another number. A piece belongs to what was last seen, or is
-    seen, in the same place. None where several remain and none of them is there most of the time.
+    And the number of pieces left out.
+
+    Motive gives a marker that it lost a new number. A piece belongs to the marker that was last
+    seen, or is seen, in the same place. Empty if several markers remain and none is seen most of
+    the time.
     """
 
     def column(i: int) -> FloatArray:
@@ -228,23 +241,25 @@ def _tracks(
     same = _SAME_M / LENGTHS[unit or 'm']
     for label in sorted(pieces, key=lambda name: int(np.argmax(np.isfinite(pieces[name][:, 0])))):
         own = pieces[label]
-        apart = [track.apart(own, time_s) for track in tracks]
-        if not apart or min(apart) > same:
+        distance = [track.distance(own, time_s) for track in tracks]
+        if not distance or min(distance) > same:
             none = np.full(len(table), -1)
             tracks.append(_Track([], np.full(own.shape, np.nan), none))
-            apart.append(0.0)
-        tracks[int(np.argmin(apart))].add(label, own)
+            distance.append(0.0)
+        tracks[int(np.argmin(distance))].add(label, own)
     # What stays in its place is not on the arm.
     largest = max(track.extent() for track in tracks) if tracks else 0.0
-    moving = [track for track in tracks if track.extent() > _STATIC * largest]
-    seen = np.sum([track.seen for track in moving], axis=0)
-    if len(moving) > 1 and seen.max() == 1:
+    moving_markers = [track for track in tracks if track.extent() > _STATIC * largest]
+    seen = np.sum([track.seen for track in moving_markers], axis=0)
+    if len(moving_markers) > 1 and seen.max() == 1:
         # Never two of them: one, which was lost for longer.
-        for track in moving[1:]:
+        for track in moving_markers[1:]:
             for i, label in enumerate(track.labels):
                 of_piece = np.where((track.of == i)[:, None], track.places, np.nan)
-                moving[0].add(label, of_piece)
-        moving = moving[:1]
-    elif len(moving) > 1:
-        moving = [track for track in moving if 2 * track.seen.sum() > (seen > 0).sum()]
-    return moving, len(pieces) - sum(len(track.labels) for track in moving)
+                moving_markers[0].add(label, of_piece)
+        moving_markers = moving_markers[:1]
+    elif len(moving_markers) > 1:
+        moving_markers = [
+            track for track in moving_markers if 2 * track.seen.sum() > (seen > 0).sum()
+        ]
+    return moving_markers, len(pieces) - sum(len(track.labels) for track in moving_markers)

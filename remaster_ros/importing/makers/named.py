@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a maker's own file has: named columns, and what is known of how its controller counts."""
+"""Named columns of a file, and how its controller counts the joints."""
 
 from __future__ import annotations
 
@@ -14,62 +14,63 @@ from remaster_ros.types import SensorKind
 SHOWN = 60
 NUMBER = re.compile(r'[+-]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][+-]?\d+)?', re.ASCII)
 _TIME = re.compile(r'\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d(?:[.,]\d+)?|\d{5,}\.\d+')
-# An arm that this program calibrates has more than one joint, and no controller has more axes.
+# An arm to calibrate has at least two joints, and no controller has more than a hundred axes.
 _FEWEST_AXES, _MOST_AXES = 2, 100
 
 
 @dataclass(frozen=True, eq=False)
-class Named:
-    """Named columns of a text."""
+class NamedColumns:
+    """Named columns of a text, with the line of each row."""
 
-    # What the file is, for people, where it is no plain table.
+    # Format of the file in words; '' for a plain table.
     kind: str
-    # Of the columns, with their units in brackets; numbers from 1 on where there is no header.
+    # Names of the columns, with units in brackets; numbers from 1 on if there is no header.
     names: tuple[str, ...]
     # Cells as text, and the line of each row in the file.
     rows: tuple[tuple[str, ...], ...]
     lines: tuple[int, ...]
-    # Sign of the numbers.
+    # Decimal sign of the numbers.
     decimal: str = '.'
-    # Marker -> columns X, Y and Z, where the file itself names its markers, and -> columns of its
-    # quaternion x, y, z, w.
+    # Marker -> columns X, Y and Z, if the file itself names its markers; and marker -> columns of
+    # its quaternion x, y, z, w.
     groups: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
     turns: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
-    # The markers that are taken where nothing is told; () for all of them.
+    # Markers that are used unless the user names others; () for all.
     points: tuple[str, ...] = ()
-    # Joint column -> (another one, 1 or -1) that the controller does not count with it.
+    # Joint column -> (another joint column, 1 or -1) that has to be added to it: the controller
+    # counts the two joints as coupled.
     coupling: Mapping[str, tuple[str, Literal[1, -1]]] = field(default_factory=dict)
-    # Of the controller; '' where it is not known.
+    # Manufacturer of the controller; '' if unknown.
     maker: str = ''
-    # Kind of the instrument that measured the points; '' where it is not known.
+    # Kind of the instrument that measured the points; '' if unknown.
     instrument: Literal['', SensorKind] = ''
-    # What was left out of the file, a sentence each.
+    # Parts of the file that were left out, a sentence each.
     notes: tuple[str, ...] = ()
     has_header: bool = True  # The names stand in the file
 
 
 def unexpected(number: int, line: str, expected: str) -> InputError:
-    """Return the error of a line that is not what it should be."""
+    """InputError on a line, with its number, its content and what is expected there."""
     text = line.strip()
     shown = text if len(text) <= SHOWN else f'{text[:SHOWN]}…'
     return InputError(f'line {number}: {shown!r}, where {expected} is expected')
 
 
-def some(names: Sequence[str]) -> str:
-    """Return the first five names, and how many more there are."""
+def first_names(names: Sequence[str]) -> str:
+    """The first five names, and the number of others."""
     more = f' and {len(names) - 5} more' if len(names) > 5 else ''
     return f'{", ".join(names[:5])}{more}'
 
 
-def leading(before: list[str]) -> tuple[list[str], list[str]]:
-    """Return the name of what stands before the numbers of each line, and its cells; [] of none.
+def leading_column(labels: list[str]) -> tuple[list[str], list[str]]:
+    """Name and cells of the column of texts `labels` the numbers of each line; [] if it is none.
 
-    They are times, or names where most are unlike.
+    It is a time if all texts have one, a name if most of them are different.
     """
-    stamps = [_TIME.search(words) for words in before]
+    stamps = [_TIME.search(words) for words in labels]
     if all(stamps):
         return ['time'], [stamp[0].replace(',', '.') for stamp in stamps if stamp]
-    return ['name'] * (2 * len({*before}) > len(before) and any(before)), before
+    return ['name'] * (2 * len({*labels}) > len(labels) and any(labels)), labels
 
 
 def axes_in_order(
@@ -80,11 +81,12 @@ def axes_in_order(
     coupling: Mapping[str, tuple[str, Literal[1, -1]]] | None = None,
     notes: tuple[str, ...] = (),
     unit: str = 'deg',
-) -> Named:
-    """Return positions as columns: their names where any has one, then the axes in order.
+) -> NamedColumns:
+    """Joint positions as columns: their names, if any has one, then the axes in order.
 
-    Each position is `found` as its line, name ('' for none) and axes, such as ``A1``. `letters`
-    are those of the arm's axes, then of external axes, which are left out where they stay at 0.
+    Each position in `found` is its line, name ('' for none) and axes such as ``A1``. `letters` are
+    that of the arm's axes, then those of external axes, which are left out if they stay at 0.
+    Raises InputError if a position lacks an axis.
     """
     every = {axis for _, _, values in found for axis in values}
     if len(every) > _MOST_AXES:
@@ -101,7 +103,7 @@ def axes_in_order(
     moved = {axis for *_, values in found for axis, cell in values.items() if float(cell)}
     axes = arm + [axis for axis in axes if axis[0] != letters[0] and axis in moved]
     named = any(name for _, name, _ in found)
-    return Named(
+    return NamedColumns(
         kind=kind,
         names=(*['name'] * named, *(f'{axis} [{unit}]' for axis in arm), *axes[len(arm) :]),
         rows=tuple(

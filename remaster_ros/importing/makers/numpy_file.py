@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Arrays that NumPy has saved (.npy, .npz): those with a row for each configuration, as text."""
+"""Arrays that NumPy has saved (.npy, .npz), with a row for each configuration, as text."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from remaster_ros.errors import InputError
-from remaster_ros.importing.makers.archive import damage_said
+from remaster_ros.importing.makers.archive import damage_as_input_error
 
 _FEWEST_ROWS = 2
-# Of numbers in an array, unpacked.
+# Largest number of values in an unpacked array.
 _LIMIT = 64 * 1024**2
 
 
 def read(data: bytes) -> dict[str, str] | None:
-    """Return the arrays of a file as text with tabs; None for anything else.
+    """Arrays of a file as tab-separated text; None for other files.
 
     Arrays with equally many rows are columns of one text, by the name of the first.
     """
@@ -32,7 +32,7 @@ def read(data: bytes) -> dict[str, str] | None:
     if not data.startswith(b'PK\x03\x04'):
         return None
     arrays: dict[str, NDArray[Any]] = {}
-    with damage_said(), zipfile.ZipFile(io.BytesIO(data)) as parts:
+    with damage_as_input_error(), zipfile.ZipFile(io.BytesIO(data)) as parts:
         for info in parts.infolist():
             if info.filename.endswith('.npy'):
                 if info.file_size > 8 * _LIMIT:
@@ -56,6 +56,7 @@ def read(data: bytes) -> dict[str, str] | None:
 
 
 def _loaded(data: bytes, where: str) -> NDArray[Any]:
+    """Array of bytes in NumPy's format. Raises InputError if they are damaged."""
     try:
         array = np.load(io.BytesIO(data), allow_pickle=False)
     except Exception as error:
@@ -69,7 +70,7 @@ def _loaded(data: bytes, where: str) -> NDArray[Any]:
 
 
 def _columns(array: NDArray[Any], name: str, where: str) -> tuple[list[str], list[list[str]]]:
-    """Return names and columns of an array as text: a matrix has its numbers row by row."""
+    """Names and columns of an array as text; a matrix becomes its numbers row by row."""
     if array.dtype.names:
         fields = [_columns(array[own], own, where) for own in array.dtype.names]
         return [one for header, _ in fields for one in header], [
@@ -88,13 +89,14 @@ def _columns(array: NDArray[Any], name: str, where: str) -> tuple[list[str], lis
 
 
 def _labels(name: str, width: int) -> list[str]:
-    """Return names of the columns of an array: an axis each of three, else a number."""
+    """Names of the columns of an array: x, y, z for three, else numbers."""
     if width == 1:
         return [name]
     return [f'{name} {one}' for one in ('xyz' if width == 3 else range(1, width + 1))]
 
 
 def _as_text(header: list[str], columns: list[list[str]]) -> str:
+    """Tab-separated text of columns, below a header if there is one."""
     rows = [header] if header else []
     rows += [list(row) for row in zip(*columns)]
     clean = (' '.join(cell.split()) for row in rows for cell in row)

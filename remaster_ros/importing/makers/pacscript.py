@@ -6,7 +6,7 @@ from __future__ import annotations
 import re
 
 from remaster_ros.errors import InputError
-from remaster_ros.importing.makers.named import NUMBER, Named, axes_in_order, unexpected
+from remaster_ros.importing.makers.named import NUMBER, NamedColumns, axes_in_order, unexpected
 
 # `J(…)` in PacScript, `(…)` in PAC; a line may begin with its number or `Let`.
 _POSITION = re.compile(
@@ -20,8 +20,8 @@ _LISTED = re.compile(r'([JPT]?)[ \t]*\(?(?:[ \t]*[-+]?[\d.]+[ \t]*,){4}', re.IGN
 _FEWEST, _MOST = 3, 8
 
 
-def read(text: str) -> Named | None:
-    """Return the joint positions of a program of Denso's; None for anything else."""
+def read(text: str) -> NamedColumns | None:
+    """Joint positions of a program of Denso's; None for other text."""
     if not re.search(
         r'^[^\S\n]*(?:let\s+)?J\[\s*\w+\s*\]\s*=\s*J?\s*\(', text, re.MULTILINE | re.I
     ):
@@ -59,7 +59,7 @@ def read(text: str) -> Named | None:
 
 
 def _is_cut(code: str, line: str) -> bool:
-    """Return whether a comment begins within a position, as a lost or foreign letter makes it."""
+    """Whether a comment begins within a position, because a letter is lost or foreign."""
     return code != line and (
         any(code.count(a) != code.count(b) for a, b in ('[]', '()'))
         or bool(

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Qualisys' exports of a capture (QTM, .tsv): markers (3D) or rigid bodies (6D), a line a frame.
 
-Above the frames stand lines with a key each. Lengths are in mm; what was not seen is 0 0 0.
+Above the frames are lines with a key each. Lengths are in mm; 0 0 0 stands for a point that was
+not seen.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ import re
 
 import numpy as np
 
-from remaster_ros.importing.makers.named import NUMBER, Named, unexpected
+from remaster_ros.importing.makers.named import NUMBER, NamedColumns, unexpected
 from remaster_ros.kinematics.transforms import quaternion_xyzw
 
 _START = re.compile(r'\s*NO_OF_FRAMES\t')
@@ -20,8 +21,8 @@ _AXES = ('X', 'Y', 'Z')
 _BODY = (*_AXES, 'Roll', 'Pitch', 'Yaw', 'Residual', *(f'Rot[{i}]' for i in range(9)))
 
 
-def read(text: str) -> Named | None:
-    """Return the columns of a capture; None for anything else."""
+def read(text: str) -> NamedColumns | None:
+    """Columns of a capture; None for other text."""
     if _START.match(text) is None:
         return None
     head: dict[str, list[str]] = {}
@@ -78,10 +79,10 @@ def read(text: str) -> Named | None:
         before = float(time)
         row = [time]
         for start in range(2 * timed, width, each):
-            row += _seen(number, line, cells[start : start + each])
+            row += _position_cells(number, line, cells[start : start + each])
         rows.append(tuple(row))
         at_lines.append(number)
-    return Named(
+    return NamedColumns(
         kind=f'a capture of Qualisys ({"6D" if bodies else "3D"})',
         instrument='camera',
         names=tuple(labels),
@@ -92,8 +93,8 @@ def read(text: str) -> Named | None:
     )
 
 
-def _seen(number: int, line: str, cells: list[str]) -> list[str]:
-    """Return place, and quaternion of a body, of one marker or body; empty where it was lost."""
+def _position_cells(number: int, line: str, cells: list[str]) -> list[str]:
+    """Position, and quaternion for a body, of one marker or body; empty cells if it was lost."""
     size = 3 if len(cells) == len(_AXES) else 7
     given = [cell for cell in cells if cell]
     if not given or all(float(cell) == 0.0 for cell in cells[:3] if cell):

@@ -6,7 +6,7 @@ from __future__ import annotations
 import re
 
 from remaster_ros.errors import InputError
-from remaster_ros.importing.makers.named import NUMBER, Named, axes_in_order, unexpected
+from remaster_ros.importing.makers.named import NUMBER, NamedColumns, axes_in_order, unexpected
 
 _MODULE = re.compile(
     r'^[ \t]*MODULE[ \t]+\w+|\brobtarget[ \t]+\w+[ \t]*:=', re.IGNORECASE | re.MULTILINE
@@ -36,8 +36,8 @@ _UNUSED = 9e9
 _EXPECTED = '[[…,…],[…]] with a number for each axis'
 
 
-def read(text: str) -> Named | None:
-    """Return the joint targets of a module; None for anything else."""
+def read(text: str) -> NamedColumns | None:
+    """Joint targets of a module, or of a log; None for other text."""
     lower = text.lower()
     # Looking for words is much faster than for patterns, and logs are large.
     known = any(word in lower for word in ('jointtarget', 'moveabsj', 'robtarget', 'module')) and (
@@ -96,7 +96,7 @@ def read(text: str) -> Named | None:
 
 
 def _statements(text: str) -> list[tuple[int, str]]:
-    """Return the statements without comments, and the line on which each begins."""
+    """Statements without comments, with the line on which each begins."""
     statements: list[tuple[int, str]] = []
     parts: list[str] = []
     start = 0
@@ -120,6 +120,7 @@ def _statements(text: str) -> list[tuple[int, str]]:
 
 
 def _axes(number: int, statement: str, value: re.Match[str]) -> dict[str, str]:
+    """Axes of a joint target; unused external axes are left out."""
     axes = {}
     for letter, group in (('J', value[1]), ('E', value[2])):
         for i, cell in enumerate((group or '').split(',') if group else (), 1):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Nested data (JSON, YAML) as named columns: a row for each of the records in it."""
+"""Nested data (JSON, YAML) as named columns: a row for each record."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from typing import Any
 import numpy as np
 
 from remaster_ros.errors import InputError
-from remaster_ros.importing.makers.named import NUMBER, Named, unexpected
+from remaster_ros.importing.makers.named import NUMBER, NamedColumns, unexpected
 from remaster_ros.importing.rigid_numbers import COUNT, rigid
 from remaster_ros.kinematics.transforms import quaternion_xyzw
 
 _FEWEST_RECORDS = 2
-# A log of an arm has fewer numbers in a record; what is longer is a cloud of points or an image.
+# A record of an arm has fewer numbers; a longer one is a cloud of points or an image.
 _MOST_CELLS = 500
 _DEEPEST = 20
-# Of joints, in a message or a file that has them once.
+# Keys of a list of joint names, in a message or once in a file.
 _JOINT_NAMES = ('name', 'names', 'joint_names', 'jointNames', 'joints')
 _OF_A_POSE = ('x', 'y', 'z', 'qx', 'qy', 'qz', 'qw')
 _EMPTY = ('null', '~', 'none', 'nan', '.nan')
@@ -40,9 +40,9 @@ class Items(list[Any]):
 Record = tuple[int, dict[str, str]]
 
 
-def read(kind: str, data: Any) -> Named | None:
-    """Return the rows of nested data, whose scalars are text; None where it has no records."""
-    found, names, left = _records(data, ())
+def read(kind: str, data: Any) -> NamedColumns | None:
+    """Rows of nested data, whose scalars are text; None if it has no records."""
+    found, names, dropped_keys = _records(data, ())
     if len(found) < _FEWEST_RECORDS:
         return None
     rows = [(line, dict(_cells('', record, names, 0, line))) for line, record in found]
@@ -62,20 +62,21 @@ def read(kind: str, data: Any) -> Named | None:
             given = ', '.join([*cells][:6])
             raise unexpected(line, given, f'{absent} as well, null where it was not measured,')
     single = all(key.isdigit() for key in usual)
-    return Named(
+    return NamedColumns(
         kind=kind,
         names=tuple(key or '1' for key in usual),
         rows=tuple(tuple(cells.get(key, '') for key in usual) for _, cells in rows),
         lines=tuple(line for line, _ in rows),
         has_header=not single,
-        notes=(f'{", ".join(left[:5])} left out: not of each record',) * bool(left),
+        notes=(f'{", ".join(dropped_keys[:5])} left out: not of each record',)
+        * bool(dropped_keys),
     )
 
 
 def _records(
     data: Any, names: Sequence[str]
 ) -> tuple[list[tuple[int, Any]], Sequence[str], list[str]]:
-    """Return the records in the data with their lines, names of joints, and keys left out."""
+    """Records in nested data with their lines, names of joints, and keys that are left out."""
     if isinstance(data, Items):
         if _are_records(data):
             return [(one.line or data.line, one) for one in data], names, []
@@ -96,7 +97,7 @@ def _records(
     else:
         key = ''
     mappings = data and all(isinstance(one, Mapping) for one in data.values())
-    if mappings and (found := _of_keys(data)):
+    if mappings and (found := _records_by_key(data)):
         return found, names, []
     columns = {
         name: value
@@ -108,23 +109,24 @@ def _records(
         count = Counter(len(value) for value in columns.values())
         size = max(count, key=lambda n: (count[n] > 1, _weight(columns, n), n))
         chosen = {name: value for name, value in columns.items() if len(value) == size}
-        left = [name for name in data if name not in chosen and name != key]
+        dropped_keys = [name for name in data if name not in chosen and name != key]
         if (
             len(chosen) == 1
             and _are_records(only := next(iter(chosen.values())))
             and all(isinstance(one, Mapping) for one in only)
         ):
-            return [(one.line, one) for one in only], names, left
+            return [(one.line, one) for one in only], names, dropped_keys
         rows = [Mapping(zip(chosen, values)) for values in zip(*chosen.values())]
         for i, row in enumerate(rows):
             lines = [getattr(value[i], 'line', 0) for value in chosen.values()]
             row.line = max(lines) or next(iter(chosen.values())).line
-        return [(row.line, row) for row in rows], names, left
+        return [(row.line, row) for row in rows], names, dropped_keys
     deeper = [value for value in data.values() if isinstance(value, Mapping)]
     return _records(deeper[0], names) if len(deeper) == 1 else ([], names, [])
 
 
 def _weight(columns: dict[str, Items], size: int) -> int:
+    """Number of cells in one record of columns that have `size` values."""
     return sum(
         len(value[0]) if isinstance(value[0], (Items, Mapping)) else 1
         for value in columns.values()
@@ -133,11 +135,13 @@ def _weight(columns: dict[str, Items], size: int) -> int:
 
 
 def _are_records(data: Items) -> bool:
+    """Whether a list holds at least two records of one kind."""
     kinds = {type(one) for one in data}
     return len(data) >= _FEWEST_RECORDS and kinds in ({Mapping}, {Items})
 
 
 def _named(header: Sequence[str], row: Items) -> Mapping:
+    """Record of a row with the names of a header."""
     if len(row) != len(header):
         raise unexpected(row.line, str([*row]), f'{len(header)} values')
     found = Mapping(zip(header, row))
@@ -145,8 +149,8 @@ def _named(header: Sequence[str], row: Items) -> Mapping:
     return found
 
 
-def _of_keys(data: Mapping) -> list[tuple[int, Any]]:
-    """Return records of a frame that is written by column, key, row or by row, key, column."""
+def _records_by_key(data: Mapping) -> list[tuple[int, Any]]:
+    """Records of a data frame written by column and key, row and key, or row and column."""
     inner = [tuple(one) for one in data.values()]
     if len({*inner}) != 1 or any(
         isinstance(cell, (Items, Mapping)) for one in data.values() for cell in one.values()
@@ -166,6 +170,7 @@ def _of_keys(data: Mapping) -> list[tuple[int, Any]]:
 
 
 def _with_name(key: str, record: Mapping) -> Mapping:
+    """Record with its key as the name."""
     found = Mapping({'name': key, **record})
     found.line = record.line
     return found
@@ -174,7 +179,7 @@ def _with_name(key: str, record: Mapping) -> Mapping:
 def _cells(
     name: str, value: Any, names: Sequence[str], depth: int, line: int
 ) -> Iterator[tuple[str, str]]:
-    """Give the column and the text of each scalar of a record."""
+    """Yield column and text of each scalar of a record."""
     if depth > _DEEPEST:
         raise InputError(f'line {line}: more than {_DEEPEST} levels of brackets')
     if isinstance(value, Mapping):
@@ -203,6 +208,10 @@ def _cells(
 def _of_mapping(
     name: str, value: Mapping, names: Sequence[str], depth: int, line: int
 ) -> Iterator[tuple[str, str]]:
+    """Yield column and text of each scalar of a mapping.
+
+    A list of joint names labels the others.
+    """
     for whole, part in _SECONDS:
         if {*value} == {whole, part} and all(str(one).isdigit() for one in value.values()):
             yield f'{name} [s]', f'{value[whole]}.{value[part]:0>9}'
@@ -217,14 +226,14 @@ def _of_mapping(
         ),
         '',
     )
-    own = [str(one) for one in value[keyed]] if keyed else names
+    joint_names = [str(one) for one in value[keyed]] if keyed else names
     for key, one in value.items():
         if key != keyed:
-            yield from _cells(f'{name} {key}'.strip(), one, own, depth + 1, line)
+            yield from _cells(f'{name} {key}'.strip(), one, joint_names, depth + 1, line)
 
 
 def _pose(cells: Sequence[Any]) -> list[float]:
-    """Return place and quaternion of sixteen numbers that are a pose; [] where they are none."""
+    """Position and quaternion of sixteen numbers that are a pose; [] if they are none."""
     if not all(NUMBER.fullmatch(str(one)) for one in cells):
         return []
     T = rigid(np.array(cells, float))
@@ -232,6 +241,7 @@ def _pose(cells: Sequence[Any]) -> list[float]:
 
 
 def _flat(value: Items) -> Iterator[Any]:
+    """Yield the scalars of nested lists."""
     for one in value:
         if isinstance(one, Items):
             yield from _flat(one)

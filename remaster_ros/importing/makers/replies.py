@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Logs of replies of a controller, with times: `[10:00:05] 0,{1.0,…},GetAngle();`.
+"""Logs of a controller's replies, with times: `[10:00:05] 0,{1.0,…},GetAngle();`.
 
-The replies of one call have the joints. Those of others are text, or places of the tool.
+The replies of one call have the joints. Replies of other calls are text, or poses of the tool.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from collections import defaultdict
 
-from remaster_ros.importing.makers.named import NUMBER, Named, some, unexpected
+from remaster_ros.importing.makers.named import NUMBER, NamedColumns, first_names, unexpected
 
 _TIME = re.compile(
     r'\s*+[\[(<]?\s*+'
@@ -29,8 +29,8 @@ _SEEN = 50
 _DIGITS = re.compile(r'\d+(?:\.\d+)?')
 
 
-def read(text: str) -> Named | None:
-    """Return the joints of the replies, with their times; None for anything else."""
+def read(text: str) -> NamedColumns | None:
+    """Joints of the replies, with their times; None for other text."""
     lines = [(i, line) for i, line in enumerate(text.splitlines(), 1) if line.strip()]
     seen = [line for _, line in lines[:_SEEN]]
     timed = [line[match.end() :] for line in seen if (match := _TIME.match(line))]
@@ -42,7 +42,7 @@ def read(text: str) -> Named | None:
         # A log of lists.
         return None
     found: dict[str, list[tuple[int, str, list[str]]]] = defaultdict(list)
-    beside: list[str] = []
+    other_lines: list[str] = []
     failed: list[str] = []
     for number, line in lines:
         time = _TIME.match(line)
@@ -52,7 +52,9 @@ def read(text: str) -> Named | None:
         if reply is None or not time or len(cells) < _FEWEST:
             if len(_DIGITS.findall(rest)) >= _FEWEST:
                 raise unexpected(number, line, 'a time and a list of numbers in brackets')
-            (failed if reply and reply['state'] not in (None, '0') else beside).append(str(number))
+            (failed if reply and reply['state'] not in (None, '0') else other_lines).append(
+                str(number)
+            )
             continue
         if not all(map(NUMBER.fullmatch, cells)) or len(cells) > _MOST:
             raise unexpected(number, line, 'numbers alone in the brackets')
@@ -74,11 +76,11 @@ def read(text: str) -> Named | None:
     notes = [f'replies of {", ".join(sorted(set(found) - {call}))} left out'] * (len(found) > 1)
     if failed:
         notes.append(
-            f'line{"s" * (len(failed) > 1)} {some(failed)}: replies of an error, left out'
+            f'line{"s" * (len(failed) > 1)} {first_names(failed)}: replies of an error, left out'
         )
-    if beside:
-        notes.append(f'{len(beside)} lines without a list were left out')
-    return Named(
+    if other_lines:
+        notes.append(f'{len(other_lines)} lines without a list were left out')
+    return NamedColumns(
         kind=f'replies{" of " * bool(call)}{call}',
         names=('time', *(f'J{i}' for i in range(1, len(rows[0][2]) + 1))),
         rows=tuple((time.replace(',', '.'), *cells) for _, time, cells in rows),
@@ -88,7 +90,7 @@ def read(text: str) -> Named | None:
 
 
 def _call(reply: re.Match[str]) -> str:
-    """Return what was called: the word behind the list, else the last one before it."""
+    """Name of the call: the word behind the list, else the last word before it."""
     behind = _WORD.findall(reply['after'])
     before = _WORD.findall(reply['before'])
     return behind[0] if behind else before[-1] if before else ''

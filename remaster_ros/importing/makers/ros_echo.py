@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What ``rostopic echo -p`` and ``ros2 topic echo --csv`` print of joint states.
+"""Joint states and points as printed by ``rostopic echo -p`` and ``ros2 topic echo --csv``.
 
 ROS 1 has the names of the joints in cells of their own (``field.name0``); ROS 2 has no header: a
 second, a nanosecond, the frame, the names, then positions, velocities and efforts.
@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import re
 
-from remaster_ros.importing.makers.named import NUMBER, Named, unexpected
+from remaster_ros.importing.makers.named import NUMBER, NamedColumns, unexpected
 
 _FIELD = re.compile(r'field\.(name|position)\[?(\d+)\]?')
 
 
-def read(text: str) -> Named | None:
-    """Return the joints of a printed topic; None for anything else."""
+def read(text: str) -> NamedColumns | None:
+    """Joints or points of a printed topic; None for other text."""
     lines = [(i, line) for i, line in enumerate(text.splitlines(), 1) if line.strip()]
     if not lines:
         return None
@@ -23,11 +23,12 @@ def read(text: str) -> Named | None:
     if any(_FIELD.fullmatch(cell) for cell in head):
         return _with_header(head, lines[1:])
     if _names(head):
-        return _without(lines)
+        return _without_header(lines)
     return _places(lines) if _is_place(head) else None
 
 
-def _with_header(head: list[str], lines: list[tuple[int, str]]) -> Named | None:
+def _with_header(head: list[str], lines: list[tuple[int, str]]) -> NamedColumns | None:
+    """Joints as ROS 1 prints them; None if names and positions do not match."""
     columns = {cell: i for i, cell in enumerate(head)}
     names, positions = dict[str, int](), dict[str, int]()
     for cell, i in columns.items():
@@ -45,16 +46,16 @@ def _with_header(head: list[str], lines: list[tuple[int, str]]) -> Named | None:
     rows = []
     for number, line in lines:
         cells = [cell.strip() for cell in line.split(',')]
-        own = [cells[i] for i in names.values()] if len(cells) == len(head) else []
-        first = first or own
-        if not own or own != first:
+        line_names = [cells[i] for i in names.values()] if len(cells) == len(head) else []
+        first = first or line_names
+        if not line_names or line_names != first:
             raise unexpected(number, line, f'{len(head)} cells with the same names of joints')
         rows.append((cells[time], *(cells[positions[i]] for i in names)))
     return _named(first, rows, lines, 'ns')
 
 
 def _names(cells: list[str]) -> list[str]:
-    """Return the joints' names of a line of ``ros2 topic echo --csv``; [] of other lines."""
+    """Joint names in a line of ``ros2 topic echo --csv``; [] for other lines."""
     if len(cells) < 5 or not _stamp(cells):
         return []
     names = []
@@ -65,7 +66,8 @@ def _names(cells: list[str]) -> list[str]:
     return names if len(names) > 1 and len(cells) >= 3 + 2 * len(names) and all(names) else []
 
 
-def _without(lines: list[tuple[int, str]]) -> Named:
+def _without_header(lines: list[tuple[int, str]]) -> NamedColumns:
+    """Joints as ROS 2 prints them. Raises InputError if the names change."""
     first = _names([cell.strip() for cell in lines[0][1].split(',')])
     rows = []
     for number, line in lines:
@@ -78,14 +80,14 @@ def _without(lines: list[tuple[int, str]]) -> Named:
 
 
 def _stamp(cells: list[str]) -> str:
-    """Return the time of a line that begins with second and nanosecond; '' of other lines."""
+    """Time of a line that begins with second and nanosecond; '' for other lines."""
     if not (cells[0].isdigit() and cells[1].isdigit() and int(cells[1]) < 1e9):
         return ''
     return f'{cells[0]}.{int(cells[1]):09d}'
 
 
 def _is_place(cells: list[str]) -> bool:
-    """Return whether a line is a point or pose: second, nanosecond, frame, 3 or 7 numbers."""
+    """Whether a line is a point or pose: second, nanosecond, frame, 3 or 7 numbers."""
     return (
         len(cells) - 3 in (len('xyz'), len('xyz') + len('xyzw'))
         and bool(_stamp(cells))
@@ -94,8 +96,8 @@ def _is_place(cells: list[str]) -> bool:
     )
 
 
-def _places(lines: list[tuple[int, str]]) -> Named:
-    """Return the points of ``ros2 topic echo --csv``, with orientations where it has them."""
+def _places(lines: list[tuple[int, str]]) -> NamedColumns:
+    """Points of ``ros2 topic echo --csv``, with orientations if present."""
     rows = []
     width = len(lines[0][1].split(','))
     for number, line in lines:
@@ -104,7 +106,7 @@ def _places(lines: list[tuple[int, str]]) -> Named:
             raise unexpected(number, line, f'second, nanosecond, frame and {width - 3} numbers')
         rows.append((_stamp(cells), *cells[3:]))
     axes = [*(f'{axis} [m]' for axis in 'xyz'), *(f'q{axis}' for axis in 'xyzw')]
-    return Named(
+    return NamedColumns(
         kind='points as ROS prints them',
         names=('time [s]', *axes[: width - 3]),
         rows=tuple(rows),
@@ -114,8 +116,9 @@ def _places(lines: list[tuple[int, str]]) -> Named:
 
 def _named(
     joints: list[str], rows: list[tuple[str, ...]], lines: list[tuple[int, str]], unit: str
-) -> Named:
-    return Named(
+) -> NamedColumns:
+    """Columns of joint states; `unit` is that of the time."""
+    return NamedColumns(
         kind='joint states as ROS prints them',
         names=(f'time [{unit}]', *(f'{joint} position' for joint in joints)),
         rows=tuple(rows),

@@ -7,17 +7,17 @@ import re
 from bisect import bisect_right
 from collections import Counter
 
-from remaster_ros.importing.makers.named import NUMBER, Named, axes_in_order, unexpected
+from remaster_ros.importing.makers.named import NUMBER, NamedColumns, axes_in_order, unexpected
 
 _TAG = re.compile(r'<[^<>]*>')
 _ATTRIBUTE = re.compile(r'([\w:]+)\s*=\s*"([^"]*)"')
-# Attributes beside the joints.
+# Attributes other than the joints.
 _KNOWN = ('name', 'key', 'size', 'access', 'public', 'type', 'xsi:type')
 _JOINT = re.compile(r'j\d+')
 
 
-def read(text: str) -> Named | None:
-    """Return the joints of a data file of VAL 3; None for anything else."""
+def read(text: str) -> NamedColumns | None:
+    """Joints of a data file of VAL 3; None for other text."""
     if not re.search(r'<[^<>]*\bj\d\s*=\s*"', text):
         return None
     found: list[tuple[int, str, dict[str, str]]] = []

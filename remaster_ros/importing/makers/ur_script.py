@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Joint positions of a program of UR's: those of movej, waypoints called …_q, and of a .urp."""
+"""Joint positions of UR programs: of movej, of waypoints named …_q, and of a .urp file."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import math
 import re
 
 from remaster_ros.errors import InputError
-from remaster_ros.importing.makers.named import NUMBER, Named, axes_in_order, unexpected
+from remaster_ros.importing.makers.named import NUMBER, NamedColumns, axes_in_order, unexpected
 
 _MOVE = re.compile(r'\b(?:movej|servoj)\s*\(\s*')
 _LIST = re.compile(r'\[([^\[\]]*)\]')
@@ -16,14 +16,14 @@ _ASSIGNED = re.compile(r'\s*(?:global\s+|local\s+)?([A-Za-z]\w*)\s*=\s*')
 _SEVERAL = re.compile(rf'{_ASSIGNED.pattern}\[\s*((?:\[[^\[\]]*\]\s*(?:,\s*)?)+)\]\s*')
 _LISTED = re.compile(rf'{_ASSIGNED.pattern}\[')
 _DEGREES = re.compile(rf'd2r\(\s*({NUMBER.pattern})\s*\)')
-# Six numbers in a list, and what takes such beside movej.
+# Six numbers in a list, and calls other than movej that take such lists.
 _SIX = re.compile(r'(?<!p)\[\s*(?:[-+.\deE]+\s*,\s*){5}')
 _OTHERS = re.compile(r'\b(?:speed[jl]|set_\w+|force_mode|inverse_\w+|textmsg|get_\w+)\s*\(')
 _EXPECTED = 'a list of the joints in rad, [0.1, -1.5, …],'
 
 
-def read(text: str) -> Named | None:
-    """Return the joint positions of a program in URScript; None for anything else."""
+def read(text: str) -> NamedColumns | None:
+    """Joint positions of a program in URScript; None for other text."""
     if re.search(r'<JointAngles\b', text):
         return _waypoints(text)
     if not re.search(
@@ -86,7 +86,7 @@ def read(text: str) -> Named | None:
 
 
 def _whole_lists(text: str) -> list[tuple[int, str]]:
-    """Return the lines without comments, those of one list together, and where each begins."""
+    """Lines without comments, a list of several lines as one, with the line where each begins."""
     lines: list[tuple[int, list[str]]] = []
     opened = 0
     for number, line in enumerate(text.splitlines(), 1):
@@ -103,8 +103,8 @@ _WAYPOINT = re.compile(r'<Waypoint\b[^<>]*\bname="([^"<>]*)"|<JointAngles\b([^<>
 _ANGLES = re.compile(r'\s*angles="([^"<>]*)"\s*/?\s*')
 
 
-def _waypoints(text: str) -> Named:
-    """Return the waypoints of a program as PolyScope saves it (.urp), which is XML."""
+def _waypoints(text: str) -> NamedColumns:
+    """Waypoints of a program that PolyScope saved (.urp), which is XML."""
     found = []
     name = ''
     for number, line in enumerate(text.splitlines(), 1):
@@ -124,6 +124,7 @@ def _waypoints(text: str) -> Named:
 
 
 def _joints(number: int, line: str, listed: str) -> dict[str, str]:
+    """Joint angles of a list, rad, as text; d2r(…) is converted."""
     values = {}
     for i, cell in enumerate(listed.split(','), 1):
         degrees = _DEGREES.fullmatch(cell.strip())

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Vicon's export of a capture (Nexus, Tracker): markers, or objects, a line a frame.
+"""Vicon's export of a capture (Nexus, Tracker): markers, or objects, a line for each frame.
 
-Each section has its name, the frames per second, the names of what it follows, the axes, the units
-and then the frames. There is no time in it.
+Each section has its title, the frames per second, the names of the objects, the axes, the units
+and then the frames. It has no times.
 """
 
 from __future__ import annotations
@@ -10,9 +10,9 @@ from __future__ import annotations
 import csv
 import re
 
-from remaster_ros.importing.makers.named import NUMBER, Named, unexpected
+from remaster_ros.importing.makers.named import NUMBER, NamedColumns, unexpected
 
-# What a tool carries, the likeliest first.
+# Sections that describe a tool, the likeliest first.
 _SECTIONS = ('Objects', 'Segments', 'Global Angles', 'Trajectories', 'Markers')
 _START = re.compile(r'\s*"?([A-Z][A-Za-z ]+?)"?[,;\t]*\s*')
 _AXES = {**{f'T{axis}': axis for axis in 'XYZ'}, **{axis: axis for axis in 'XYZ'}}
@@ -20,8 +20,8 @@ _TURNS = {f'R{axis}': axis.lower() for axis in 'XYZW'}
 _HEAD_LINES = 5
 
 
-def read(text: str) -> Named | None:
-    """Return the columns of a capture; None for anything else."""
+def read(text: str) -> NamedColumns | None:
+    """Columns of a capture; None for other text."""
     if not re.search(r'^"?Frame"?[,;\t]"?Sub Frame"?[,;\t]', text, re.MULTILINE):
         return None
     lines = [(i, line) for i, line in enumerate(text.splitlines(), 1)]
@@ -89,7 +89,7 @@ def read(text: str) -> Named | None:
     )
     if other_turns:
         notes += ('angles left out, as it is not written how they turn: export quaternions',)
-    return Named(
+    return NamedColumns(
         kind=f'a capture of Vicon ({chosen}), {rate[0].strip()} frames per second',
         instrument='camera',
         names=tuple(labels),
@@ -103,7 +103,7 @@ def read(text: str) -> Named | None:
 
 
 def _name(text: str) -> str:
-    """Return the name of an object without what it is measured as, and once."""
+    """Name of an object without the kind of its measurement, and without its repetition."""
     text = re.sub(r'^Global Angle (?:\(.*?\) )?', '', text)
-    subject, sign, own = text.partition(':')
-    return own if sign and own == subject else text
+    subject, sign, object_name = text.partition(':')
+    return object_name if sign and object_name == subject else text

@@ -12,20 +12,21 @@ from datetime import datetime, timedelta
 from xml.etree import ElementTree
 
 from remaster_ros.errors import InputError
-from remaster_ros.importing.makers.archive import damage_said
+from remaster_ros.importing.makers.archive import damage_as_input_error
 
-# Of an unpacked part, as of a text table.
+# Largest size of an unpacked part, bytes, as of a text table.
 _LIMIT = 256 * 1024**2
-# Of a sheet of Excel.
+# Size of a sheet in Excel.
 _MOST_ROWS, _MOST_COLUMNS = 1_048_576, 16_384
 _CELL = re.compile(r'([A-Z]{1,3})([1-9]\d{0,6})')
 # Number formats of dates and times that have no text of their own (ECMA-376, 18.8.30).
 _DATE_FORMATS = {*range(14, 23), *range(27, 37), *range(45, 48), *range(50, 59)}
-# What stands in a format beside the letters of a date: text in quotes, colours, conditions.
+# Parts of a number format that are no letters of a date: quoted text, colours, conditions.
 _NOT_LETTERS = re.compile(r'"[^"]*"|\\.|_.|\*.|\[(?!h|m|s)[^\]]*\]', re.IGNORECASE)
 # Serial days count from here, for which 1900 counts as a leap year.
 _EPOCH, _EPOCH_1904 = datetime(1899, 12, 30), datetime(1904, 1, 1)
-# Spreadsheets show 15 digits; a number that needs two or more less was written so.
+# Spreadsheets show 15 digits. A number whose 15 digits are at least three characters shorter than
+# its stored text was entered in that form.
 _DIGITS, _FEWER = 15, 3
 _COMMA = re.compile(r'[+-]?\d+,\d+')
 _THOUSANDS = re.compile(r'[+-]?[1-9]\d{0,2},\d{3}')
@@ -34,16 +35,17 @@ Grid = dict[int, dict[int, str]]
 
 
 def read(data: bytes) -> dict[str, str] | None:
-    """Return the visible sheets of a workbook, name -> text with tabs; None for anything else."""
+    """Visible sheets of a workbook, name -> tab-separated text; None for other files."""
     if data.startswith(b'\xd0\xcf\x11\xe0'):
         raise InputError('this is a workbook of an old form (.xls); save it as .xlsx or as CSV')
     if not data.startswith(b'PK\x03\x04'):
         return None
-    with damage_said(), zipfile.ZipFile(io.BytesIO(data)) as parts:
+    with damage_as_input_error(), zipfile.ZipFile(io.BytesIO(data)) as parts:
         return _sheets(parts)
 
 
 def _sheets(parts: zipfile.ZipFile) -> dict[str, str] | None:
+    """Visible sheets of a zip archive; None if it holds arrays of NumPy."""
     names = {*parts.namelist()}
     if 'xl/workbook.xml' not in names:
         if any(name.endswith('.npy') for name in names):
@@ -77,6 +79,7 @@ def _sheets(parts: zipfile.ZipFile) -> dict[str, str] | None:
 
 
 def _parsed(parts: zipfile.ZipFile, name: str) -> ElementTree.Element:
+    """XML of a part. Raises InputError if it is damaged, too large or declares entities."""
     with parts.open(name) as part:
         content = part.read(_LIMIT + 1)
     if len(content) > _LIMIT:
@@ -91,16 +94,17 @@ def _parsed(parts: zipfile.ZipFile, name: str) -> ElementTree.Element:
 
 
 def _each(element: ElementTree.Element, name: str) -> Iterator[ElementTree.Element]:
-    """Give the elements of a name, whatever its namespace: strict workbooks have another one."""
+    """Elements of a name in any namespace: strict workbooks have another one."""
     return (one for one in element.iter() if _name(one) == name)
 
 
 def _name(element: ElementTree.Element) -> str:
+    """Name of an element without its namespace."""
     return str(element.tag).rpartition('}')[2]
 
 
 def _text_of(element: ElementTree.Element) -> str:
-    """Return the text of a cell or string, without how to pronounce it."""
+    """Text of a cell or string, without phonetic hints."""
     texts = []
     for one in element:
         if _name(one) == 't':
@@ -111,8 +115,8 @@ def _text_of(element: ElementTree.Element) -> str:
 
 
 def _date_styles(styles: ElementTree.Element) -> list[bool]:
-    """Return for each style of a cell whether it shows a date or a time."""
-    own = {
+    """Whether each cell style shows a date or a time."""
+    custom_formats = {
         one.get('numFmtId'): bool(
             re.search('[ymdhs]', _NOT_LETTERS.sub('', one.get('formatCode', '')), re.IGNORECASE)
         )
@@ -120,13 +124,13 @@ def _date_styles(styles: ElementTree.Element) -> list[bool]:
     }
     of_cells = next(_each(styles, 'cellXfs'), ())
     ids = [style.get('numFmtId', '0') for style in of_cells]
-    return [own.get(i, i.isdigit() and int(i) in _DATE_FORMATS) for i in ids]
+    return [custom_formats.get(i, i.isdigit() and int(i) in _DATE_FORMATS) for i in ids]
 
 
 def _grid(
     sheet: ElementTree.Element, shared: list[str], dates: list[bool], since_1904: bool
 ) -> Grid:
-    """Return the cells of a sheet by row and column, counted from 1."""
+    """Cells of a sheet by row and column, counted from 1."""
     grid: Grid = {}
     row_at = 0
     texts: set[tuple[int, int]] = set()
@@ -162,10 +166,11 @@ def _grid(
                 grid.setdefault(row_at, {})[column] = text
                 if kind in ('s', 'inlineStr', 'str'):
                     texts.add((row_at, column))
-    return _with_points(grid, texts)
+    return _with_decimal_points(grid, texts)
 
 
 def _column(letters: str) -> int:
+    """Number of a column from its letters, from 1."""
     number = 0
     for letter in letters:
         number = 26 * number + ord(letter) - ord('A') + 1
@@ -173,7 +178,7 @@ def _column(letters: str) -> int:
 
 
 def _number(value: str, is_date: bool, since_1904: bool) -> str:
-    """Return a number as a sheet shows it: a date as ISO 8601, digits without those of binary."""
+    """A number as a sheet shows it: a date as ISO 8601, digits without binary rounding."""
     try:
         number = float(value)
     except ValueError:
@@ -189,8 +194,8 @@ def _number(value: str, is_date: bool, since_1904: bool) -> str:
     return short if len(short) <= len(value) - _FEWER else value
 
 
-def _with_points(grid: Grid, texts: set[tuple[int, int]]) -> Grid:
-    """Return the grid with points in place of the decimal commas of numbers that are text."""
+def _with_decimal_points(grid: Grid, texts: set[tuple[int, int]]) -> Grid:
+    """Grid with points in place of decimal commas in numbers that are stored as text."""
     found = [(r, c) for r, c in texts if _COMMA.fullmatch(grid[r][c])]
     if any(not _THOUSANDS.fullmatch(grid[r][c]) for r, c in found):
         for r, c in found:
@@ -199,7 +204,7 @@ def _with_points(grid: Grid, texts: set[tuple[int, int]]) -> Grid:
 
 
 def _as_text(grid: Grid) -> str:
-    """Return a line for each row of the sheet; columns without anything are left out."""
+    """Tab-separated line for each row of the sheet, without empty columns."""
     columns = sorted({column for row in grid.values() for column in row})
     text = io.StringIO()
     writer = csv.writer(text, delimiter='\t', lineterminator='\n')

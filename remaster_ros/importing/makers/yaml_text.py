@@ -10,19 +10,19 @@ import yaml
 
 from remaster_ros.errors import InputError
 from remaster_ros.importing.makers import records
-from remaster_ros.importing.makers.named import Named, unexpected
+from remaster_ros.importing.makers.named import NamedColumns, unexpected
 
 _START = re.compile(
     r'(?:[^\S\n]*(?:#[^\n]*)?\n|%YAML[^\n]*\n|---[^\n]*\n)*(?:- ?|[A-Za-z_]\w*:(?:\s|$))'
 )
-# A line of nested data: an item, a document, or a key with blanks before it.
+# A line of nested data: an item, a document, or an indented key.
 _NESTED = re.compile(r'[ ]*-(?:\s.*)?|---.*|[ ]+[A-Za-z_]\w*:(?:\s.*)?|[A-Za-z_]\w*:\s*')
 _LOADER = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
 _SEEN, _SHARE = 50, 0.7
 
 
-def read(text: str) -> Named | None:
-    """Return the records of YAML; None for anything else."""
+def read(text: str) -> NamedColumns | None:
+    """Records of YAML; None for other text."""
     if not _START.match(text):
         return None
     lines = [line for line in text.splitlines() if line.strip()]
@@ -57,7 +57,10 @@ def read(text: str) -> Named | None:
 
 
 def _plain(node: yaml.Node | None, budget: list[int], depth: int) -> Any:
-    """Return a node as text, items or a mapping, each with its line."""
+    """Node as text, Items or Mapping, each with its line.
+
+    `budget` has the number of nodes that may still be expanded: aliases of aliases multiply.
+    """
     budget[0] -= 1
     if budget[0] < 0:
         # An alias stands for what is elsewhere, and aliases of aliases multiply.

@@ -68,8 +68,8 @@ def test_rows_without_names_or_times_are_joined_by_order_only_where_told(chain, 
 def test_a_stream_of_joints_is_joined_by_time_where_the_arm_stood_still(chain, tmp_path):
     time = np.arange(0.0, 30.0, 0.1)
     stop = (time // 10).astype(int)
-    moving = time % 10 > 8.0
-    q = Q[stop] + np.where(moving, 0.2 * (time % 10 - 8.0), 0.0)[:, None]
+    moving_markers = time % 10 > 8.0
+    q = Q[stop] + np.where(moving_markers, 0.2 * (time % 10 - 8.0), 0.0)[:, None]
     q_file = joints(tmp_path, [f'r{i}' for i in range(300)], q, time=time)
     when = np.array([4.03, 19.03, 25.03])
     p_file = points(tmp_path, ['a', 'b', 'c'], XYZ, time=when)
@@ -83,8 +83,8 @@ def test_a_stream_of_joints_is_joined_by_time_where_the_arm_stood_still(chain, t
         read_rows([late, q_file], chain, TableOptions(join='time'))
     with pytest.raises(InputError, match=r'several offsets of the clocks .* with --clock-offset'):
         read_rows([late, q_file], chain, TableOptions())
-    told = TableOptions(angles='rad', length='m', clock_offset_s=-1000.0)
-    np.testing.assert_allclose(read_rows([late, q_file], chain, told).stamp_s, when[[0, 2]])
+    chosen = TableOptions(angles='rad', length='m', clock_offset_s=-1000.0)
+    np.testing.assert_allclose(read_rows([late, q_file], chain, chosen).stamp_s, when[[0, 2]])
 
 
 def test_rows_stand_in_the_order_of_their_times(chain, tmp_path):
@@ -92,7 +92,7 @@ def test_rows_stand_in_the_order_of_their_times(chain, tmp_path):
     path = write(tmp_path, 't.csv', text(header, [*Q.T, *XYZ.T, [3.0, 1.0, 2.0]]))
     rows = read_rows([path], chain, TableOptions(angles='rad', length='m')).in_order()
     np.testing.assert_allclose(rows.q, Q[[1, 2, 0]])
-    assert rows.where[0] == f'{path}, line 3'
+    assert rows.source[0] == f'{path}, line 3'
     assert rows.warnings == ('the rows were put in the order of their times',)
 
 
@@ -229,7 +229,7 @@ def test_what_a_pad_counts_otherwise_is_proposed_and_undone(do, joint, share, sa
 
 
 @pytest.mark.parametrize(
-    ('header', 'told', 'said', 'option'),
+    ('header', 'chosen', 'said', 'option'),
     [
         (HEADER, ('--length', 'in'), 'the points in mm', '--length mm'),
         (HEADER, ('--angles', 'rad'), '', '--angles deg'),
@@ -241,9 +241,9 @@ def test_what_a_pad_counts_otherwise_is_proposed_and_undone(do, joint, share, sa
         ),
     ],
 )
-def test_units_and_columns_that_were_stated_wrongly_are_proposed(do, header, told, said, option):
+def test_units_and_columns_that_were_stated_wrongly_are_proposed(do, header, chosen, said, option):
     arm, run = do
-    error = run(header, columns(arm), *told)
+    error = run(header, columns(arm), *chosen)
     assert said in error
     assert f'add {option};' in error
 

@@ -157,8 +157,8 @@ def test_points_go_before_poses_and_one_of_several_is_asked_for(chain, tmp_path)
     several = written(tmp_path / 'several', poses(POSE, ('/tcp_pose', '/vrpn/tool')))
     with pytest.raises(InputError, match='poses on /tcp_pose, /vrpn/tool; name those of the se'):
         read_bag(several, chain)
-    told = read_bag(several, chain, point_topics=('/vrpn/tool',))
-    assert told.labels['sensor'] == ['vrpn'] * 3
+    chosen = read_bag(several, chain, point_topics=('/vrpn/tool',))
+    assert chosen.labels['sensor'] == ['vrpn'] * 3
 
 
 def test_the_command_makes_a_session_of_it(bag, session, imported):

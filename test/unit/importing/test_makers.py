@@ -12,7 +12,7 @@ from foreign.tables import measured, text, write
 from rigs.command_line import remaster
 
 from remaster_ros.errors import InputError
-from remaster_ros.importing.columns import Told, find_columns
+from remaster_ros.importing.columns import ColumnChoice, find_columns
 from remaster_ros.importing.makers import READERS
 from remaster_ros.importing.rows import TableOptions, read_rows
 from remaster_ros.importing.text_table import read_table
@@ -44,7 +44,7 @@ def test_joints_and_names_are_those_that_were_written(kind, tmp_path):
     got = np.rad2deg(numbers(table, found.joints) * ANGLES[unit])
     np.testing.assert_allclose(got, q, atol=1e-6)
     if KINDS[kind].named:
-        assert [row[found.one('name')] for row in table.rows] == names
+        assert [row[found.first_of_kind('name')] for row in table.rows] == names
 
 
 def test_the_coupling_of_fanuc_and_the_names_are_kept(tmp_path, imported):
@@ -143,8 +143,8 @@ def test_columns_are_told_of_one_of_two_files_without_header(tmp_path):
     arm = measured(rows=8)
     joints = write(tmp_path, 'joints.txt', text([], [*np.rad2deg(arm.q).T, *np.zeros((3, 8))]))
     points = write(tmp_path, 'points.txt', text([], [*arm.points.T, *np.zeros((4, 8))]))
-    told = Told(joints=('joints.txt:1-6',), points=('points.txt:1-3',))
-    options = TableOptions(told=told, join='order', length='m')
+    chosen = ColumnChoice(joints=('joints.txt:1-6',), points=('points.txt:1-3',))
+    options = TableOptions(chosen=chosen, join='order', length='m')
     rows = read_rows([points, joints], arm.chain, options)
     np.testing.assert_allclose(rows.q, arm.q, atol=1e-7)
     np.testing.assert_allclose(rows.position, arm.points, atol=1e-6)
@@ -199,7 +199,7 @@ def mutated(rng, content, one_line, comment):
 def rows_of(table, named):
     """Return the cells of names and joints, counted."""
     found = find_columns(table, JOINTS)
-    columns = (*[found.one('name')] * named, *found.joints)
+    columns = (*[found.first_of_kind('name')] * named, *found.joints)
     return Counter(tuple(row[i] for i in columns) for row in table.rows)
 
 
@@ -276,13 +276,13 @@ def test_the_accuracy_option_of_a_kuka_is_asked_for_and_kept(tmp_path, imported)
     program = write(tmp_path, 'calib.src', KINDS['kuka_src'].write(names, np.rad2deg(arm.q)))
     points = write(tmp_path, 'points.csv', text(['Name', 'X', 'Y', 'Z'], [names, *arm.points.T]))
     args = [arm.urdf, program, points, '--length', 'm', '--join', 'order', '--unchecked']
-    for told, option in (((), ''), (('--accuracy-option', 'active'), 'active')):
-        (out, _), session = imported(*args, *told)
-        assert ('--accuracy-option' in out) == (not told)
+    for chosen, option in (((), ''), (('--accuracy-option', 'active'), 'active')):
+        (out, _), session = imported(*args, *chosen)
+        assert ('--accuracy-option' in out) == (not chosen)
         assert session.accuracy_option == option
     # Of a session it can be said afterwards.
-    told = ['--accuracy-option', 'inactive', '--unchecked', '--quiet']
-    remaster('import', tmp_path / 'session1', '--out', tmp_path / 'c', *told)
+    chosen = ['--accuracy-option', 'inactive', '--unchecked', '--quiet']
+    remaster('import', tmp_path / 'session1', '--out', tmp_path / 'c', *chosen)
     assert read_session(tmp_path / 'c').accuracy_option == 'inactive'
 
 

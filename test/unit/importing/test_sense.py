@@ -108,7 +108,7 @@ def test_configurations_measured_again_count_once(table):
 
 
 @pytest.mark.parametrize(
-    ('spoil', 'told', 'points'),
+    ('spoil', 'chosen', 'points'),
     [
         (lambda q: q * [1, 1, -1, 1, -1, 1], ['--reverse', 'A3'], ('X', 'Y', 'Z')),
         pytest.param(
@@ -125,16 +125,16 @@ def test_configurations_measured_again_count_once(table):
         ),
     ],
 )
-def test_a_proposal_is_one_that_the_program_accepts_and_that_helps(table, spoil, told, points):
+def test_a_proposal_is_one_that_the_program_accepts_and_that_helps(table, spoil, chosen, points):
     """Whatever is proposed beside what was told already: added to the command, it is done."""
     imported = table()
     imported.q = spoil(imported.q)
     if points[0].startswith('Py'):
         imported.points = imported.points[:, [1, 0, 2]]
         points = ('Px [mm]', 'Py [mm]', 'Pz [mm]')
-    _, error, _ = imported.run(*told, points=points, status=1)
+    _, error, _ = imported.run(*chosen, points=points, status=1)
     proposed = error.split('to write it so, add ')[1].split('; to write it as')[0]
-    found, _, session = imported.run(*told, *shlex.split(proposed), points=points)
+    found, _, session = imported.run(*chosen, *shlex.split(proposed), points=points)
     assert found['fits'], proposed
     np.testing.assert_allclose(session.measurements.q, imported.arm.q, atol=1e-6, err_msg=proposed)
 

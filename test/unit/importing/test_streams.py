@@ -10,7 +10,7 @@ from foreign.streams import arm_of, capture_of, log_of, run_of, seen, take_of
 from foreign.tables import text, write
 
 from remaster_ros.errors import InputError
-from remaster_ros.importing.columns import Told
+from remaster_ros.importing.columns import ColumnChoice
 from remaster_ros.importing.rows import TableOptions, read_rows
 
 UNIX_S = 1_772_715_731.344
@@ -67,7 +67,7 @@ def test_a_take_and_a_log_of_another_clock(
 def test_a_point_of_a_take_is_taken_by_its_name(arm, run, tmp_path):
     take, log = take_of(run), log_of(run, 5.0)
     rows = rows_of(tmp_path, arm, take, log)
-    named = rows_of(tmp_path, arm, take, log, told=Told(points=('tool:Marker1',)))
+    named = rows_of(tmp_path, arm, take, log, chosen=ColumnChoice(points=('tool:Marker1',)))
     np.testing.assert_allclose(named.position - rows.position, 1e-3, atol=1e-6)
 
 
@@ -163,8 +163,8 @@ def test_where_several_offsets_do_and_no_robot_decides_it_is_asked_for(arm, tmp_
     paths = [write(tmp_path, 'take.csv', take), write(tmp_path, 'log.csv', log)]
     with pytest.raises(InputError, match=r'several offsets of the clocks \(.*--clock-offset'):
         read_rows(paths, other, TableOptions())
-    told = read_rows(paths, other, TableOptions(clock_offset_s=100.0 + begins))
-    assert_stops(told, arm, slice(4, -4))
+    chosen = read_rows(paths, other, TableOptions(clock_offset_s=100.0 + begins))
+    assert_stops(chosen, arm, slice(4, -4))
 
 
 @pytest.mark.parametrize('offset', [0.02, 0.1, 0.4, -0.6])
@@ -203,8 +203,8 @@ def test_shots_at_times_of_their_own_are_paired_by_order_where_the_robot_agrees(
     assert_stops(rows, arm)
 
 
-@pytest.mark.parametrize('told', ['', 'order'])
-def test_points_without_times_belong_to_the_standstills_by_order(told, arm, run, tmp_path):
+@pytest.mark.parametrize('chosen', ['', 'order'])
+def test_points_without_times_belong_to_the_standstills_by_order(chosen, arm, run, tmp_path):
     points = seen(run, 0.5 * (run.begin + run.end), 2, 3e-5)
     names = [f'M{i}' for i in range(len(points))]
     log = log_of(run, 5.0)
@@ -212,12 +212,12 @@ def test_points_without_times_belong_to_the_standstills_by_order(told, arm, run,
     def table(points):
         return text(['name', 'X', 'Y', 'Z'], [names[: len(points)], *points.T])
 
-    rows = rows_of(tmp_path, arm, table(points), log, join=told)
+    rows = rows_of(tmp_path, arm, table(points), log, join=chosen)
     assert_stops(rows, arm)
     assert rows.stamp_s is not None
     with pytest.raises(InputError, match=r'23 points, and 24 standstills in log.csv; only'):
-        rows_of(tmp_path, arm, table(points[1:]), log, join=told)
-    if not told:
+        rows_of(tmp_path, arm, table(points[1:]), log, join=chosen)
+    if not chosen:
         with pytest.raises(InputError, match=r'take.csv has no times, and by their order'):
             rows_of(tmp_path, arm, table(points[::-1]), log)
 

@@ -11,7 +11,7 @@ from foreign.streams import arm_of, log_of, run_of, take_of
 from foreign.tables import measured, text, write
 
 from remaster_ros.errors import InputError
-from remaster_ros.importing.columns import Told
+from remaster_ros.importing.columns import ColumnChoice
 from remaster_ros.importing.makers import motive
 from remaster_ros.importing.rows import TableOptions, read_rows
 
@@ -187,8 +187,8 @@ def test_names_whose_last_words_are_those_of_the_other(arm, tmp_path):
 
 def test_numbers_of_columns_are_of_the_table_without_names(arm, tmp_path):
     content = text([], [POINTS, *millimetres(arm), *3 * [[0.011] * COUNT]])
-    told = Told(points=('2', '3', '4'))
-    assert_rows(rows_of(arm, tmp_path, content, joints_table(arm), told=told), arm)
+    chosen = ColumnChoice(points=('2', '3', '4'))
+    assert_rows(rows_of(arm, tmp_path, content, joints_table(arm), chosen=chosen), arm)
 
 
 def test_numbers_of_a_log_are_no_names_of_points(arm, tmp_path):
@@ -254,8 +254,8 @@ def test_expanded_uncertainties_and_columns_that_a_program_counted(arm, tmp_path
     assert any('line 1 (0,1,2,3,4,5): no row' in line for line in rows.warnings)
     # With the number of each row beside them.
     joints = text(['', *map(str, range(6))], [range(COUNT), *degrees(arm)])
-    told = Told(joints=('2', '3', '4', '5', '6', '7'))
-    assert_rows(rows_of(arm, tmp_path, shots, joints, told=told, join='order'), arm)
+    chosen = ColumnChoice(joints=('2', '3', '4', '5', '6', '7'))
+    assert_rows(rows_of(arm, tmp_path, shots, joints, chosen=chosen, join='order'), arm)
 
 
 def test_surveyors_letters(arm, tmp_path):
@@ -707,7 +707,7 @@ def test_names_in_two_lines(arm, tmp_path):
     header = ['Point', *AXES, *2 * 'XYZ', '']
     beside = [column + 10.0 for column in millimetres(arm)]
     table = text(header[:-1], [POINTS, *degrees(arm), *millimetres(arm), *beside], ';')
-    rows = rows_of(arm, tmp_path, over + table, told=Told(points=('Ball 1',)))
+    rows = rows_of(arm, tmp_path, over + table, chosen=ColumnChoice(points=('Ball 1',)))
     assert_rows(rows, arm)
     both = rows_of(arm, tmp_path, over + table)
     assert {*both.labels['marker']} == {'Ball 1', 'Ball 2'}

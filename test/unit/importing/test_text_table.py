@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from remaster_ros.errors import InputError
-from remaster_ros.importing.columns import Told, find_columns
+from remaster_ros.importing.columns import ColumnChoice, find_columns
 from remaster_ros.importing.rows import TableOptions, read_rows
 from remaster_ros.importing.text_table import decode, parse_number, read_table
 from remaster_ros.importing.values import numbers, times
@@ -56,7 +56,7 @@ def test_what_was_written_is_read(
     columns = find_columns(table, JOINTS)
     values = numbers(table, (*columns.joints, *columns.point))
     np.testing.assert_array_equal(values, np.array(rows))
-    assert [row[columns.one('name')] for row in table.rows] == names
+    assert [row[columns.first_of_kind('name')] for row in table.rows] == names
 
 
 @pytest.mark.parametrize(
@@ -119,10 +119,10 @@ def test_what_could_be_several_columns_is_asked_for(tmp_path):
     path = write(tmp_path, 't.csv', text(names, [[0.5, 1.5]] * len(names), ';'))
     with pytest.raises(InputError, match=r'A1, A2; J1, J2; name them, base to tip, with --joints'):
         find_columns(read_table(path), JOINTS)
-    told = Told(joints=('J2', 'J1'))
+    chosen = ColumnChoice(joints=('J2', 'J1'))
     with pytest.raises(InputError, match=r'LT_X, LT_Y, LT_Z; IR_X, IR_Y, IR_Z; .*--points'):
-        find_columns(read_table(path), JOINTS, told)
-    found = find_columns(read_table(path), JOINTS, Told(('J2', 'J1'), ('8', '9', '10')))
+        find_columns(read_table(path), JOINTS, chosen)
+    found = find_columns(read_table(path), JOINTS, ColumnChoice(('J2', 'J1'), ('8', '9', '10')))
     assert (found.joints, found.point) == ((3, 2), (7, 8, 9))
 
 
