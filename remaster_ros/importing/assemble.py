@@ -252,9 +252,7 @@ def _kinds(
 def with_controller_coupling(
     rows: RawRows, chain: SerialChain, options: SessionOptions
 ) -> tuple[SessionOptions, list[str]]:
-    """Options with the joint coupling of the file's controller, and the sentence on it.
-
-    If it fits.
+    """Options with the joint coupling of the file's controller if it fits, and a sentence on it.
 
     The URDF may contain the coupling already: the options stay as they are if the points then fit
     better without it.
@@ -277,7 +275,7 @@ def with_controller_coupling(
 def without_whole_turns(session: Session, chain: SerialChain) -> tuple[Session, str]:
     """Session with angles shifted by whole turns into the limits.
 
-    And the sentence on it ('' if none).
+    Last result: a sentence on the shifts, '' if there are none.
     """
     m = session.measurements
     q = chain.within_turns(m.q)
@@ -302,10 +300,7 @@ def _measurement_date(rows: RawRows) -> str:
 
 
 def refuse_outside_limits(rows: RawRows, chain: SerialChain, q: FloatArray) -> None:
-    """Raise InputError, naming the row of the table.
-
-    If a joint angle is outside the URDF's limits.
-    """
+    """Raise InputError for the first row with a joint angle outside the URDF's limits."""
     allowed = chain.limit_tolerance
     outside = (q < chain.lower - allowed) | (q > chain.upper + allowed)
     for row, joint in np.argwhere(outside)[:1]:

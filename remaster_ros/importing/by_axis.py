@@ -80,9 +80,10 @@ def wide(
 
 
 def _axes(rows: Rows) -> tuple[list[str], int, list[str] | None] | None:
-    """Axis of each row ('' if none), index of its column.
+    """Axis of each row ('' if none), and index of the column with the axes.
 
-    And names of points if that column has them.
+    Last result: names of the points, if that column has them. None if the table has no such
+    column.
     """
     for column, cells in enumerate(zip(*rows)):
         axes = [cell.upper() if cell.upper() in _AXES else '' for cell in cells]

@@ -239,9 +239,9 @@ class _Header:
 
 
 def _first_kind(words: Sequence[str]) -> str:
-    """Kind of a header of several words such as `point name`, `time stamp`, `no of samples`.
+    """Kind of a header of several words, '' if unknown.
 
-    '' if unknown.
+    Examples are `point name`, `time stamp` and `no of samples`.
     """
     kinds = [_KINDS.get(word, '') for word in words]
     if len(words) == 2 and kinds[0] in ('name', 'time') and kinds[1] in ('name', 'time'):
@@ -354,9 +354,9 @@ def _single_set(
 def _joint_number(
     words: tuple[str, ...], named: Sequence[tuple[str, ...]]
 ) -> tuple[int | None, tuple[str, ...]]:
-    """Number (from 1) of the joint that a header names, None if it names none.
+    """Number of the joint, from 1, that a header names, and the other words.
 
-    And the other words.
+    None and () if it names no joint.
     """
     for i, name in sorted(enumerate(named), key=lambda pair: -len(pair[1])):
         for short in (name, name[:-1] if name[-1:] == ('joint',) else name):
@@ -421,7 +421,7 @@ def _xyz_groups(
 ) -> dict[tuple[str, ...], tuple[int, ...]]:
     """Columns X, Y and Z by the words around the axis.
 
-    If at least `fewest` of the three are there.
+    Groups with fewer than `fewest` of the three are left out.
     """
     groups: dict[tuple[str, ...], dict[str, int]] = defaultdict(dict)
     for i, header in enumerate(headers):
@@ -562,7 +562,7 @@ _AS_AXIS = {'i': 'x', 'j': 'y', 'k': 'z', 'r': 'w'}
 def _orientation_component(words: tuple[str, ...]) -> tuple[tuple[str, ...], str]:
     """Words around an angle or quaternion component in a header, and its name.
 
-    ((), '') if none.
+    () and '' if the header names none.
     """
     turned = {*words} & _TURNED
     for at, word in enumerate(words):

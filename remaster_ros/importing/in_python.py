@@ -36,10 +36,7 @@ log = logging.getLogger('remaster_ros')
 
 @dataclass(frozen=True)
 class Choices:
-    """Options given to a function of the public face, and the names of its arguments.
-
-    For messages.
-    """
+    """Options given to a Python function, and the names of its arguments."""
 
     table: TableOptions
     corrections: SessionOptions

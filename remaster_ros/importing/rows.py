@@ -566,9 +566,8 @@ def read_rows(
 def _without_unused_axes(joints: Table, count: int) -> tuple[Table, list[str]]:
     """Table of joints without axes beyond the first `count` that are 0 throughout.
 
-    And their names.
-
-    A controller that has seven axes writes 0 for the seventh of an arm with six.
+    A controller that has seven axes writes 0 for the seventh of an arm with six. Last result: the
+    names of the axes left out.
     """
     table, columns = joints
     beyond = columns.joints[count:]
@@ -581,7 +580,7 @@ def _without_unused_axes(joints: Table, count: int) -> tuple[Table, list[str]]:
 def _without_incomplete_rows(points: Table, joints: Table) -> tuple[Table, Table, tuple[str, ...]]:
     """Points and joints without rows that lack joints or a point.
 
-    And a sentence on what is left out.
+    Last result: a sentence on what is left out.
     """
     same = points[0] is joints[0]
     kept, notes = {}, []
@@ -737,10 +736,7 @@ def _raw_rows(
 
 
 def _refuse_part_of_a_point(table: TextTable, columns: Columns, raw: FloatArray) -> None:
-    """Raise InputError if only some of X, Y and Z of a point are missing.
-
-    Or if no point is left.
-    """
+    """Raise InputError for a point of which X, Y or Z is missing, or if no point is left."""
     for marker_columns, points in zip(columns.points.values(), raw):
         empty = np.isnan(points)
         for row in np.flatnonzero(empty.any(axis=1) & ~empty.all(axis=1))[:1]:
@@ -768,10 +764,7 @@ def _refuse_non_unit_quaternions(
 
 
 def moving_markers(raw: FloatArray) -> BoolArray:
-    """Mask of the markers (markers, n, 3) that move with the arm.
-
-    NaN for readings that are missing.
-    """
+    """Mask of the markers in (markers, n, 3), NaN for missing readings, that move with the arm."""
     seen = np.isfinite(raw[:, :, 0])
     extent = np.array(
         [
@@ -787,7 +780,7 @@ def _markers_on_arm(
 ) -> tuple[BoolArray, tuple[str, ...]]:
     """Mask of the markers that move with the arm, (markers,).
 
-    And a sentence on each other marker.
+    Last result: a sentence on each other marker.
     """
     moved = moving_markers(raw)
     return moved, tuple(
@@ -800,10 +793,7 @@ def _markers_on_arm(
 
 
 def _shared_time_note(stamp: FloatArray, q: FloatArray) -> str:
-    """Sentence that most configurations share one time, which is then unusable.
-
-    '' if they do not.
-    """
+    """Sentence that most configurations share one time, which is unusable then; '' if not."""
     configurations = np.unique(np.column_stack((q, stamp)), axis=0)
     if len(configurations) < _FEWEST_ALIKE:
         return ''

@@ -122,9 +122,9 @@ def is_stream(stamps: FloatArray) -> bool:
 
 
 def joint_standstills(stream: Stream, fewest: int = 1) -> Standstills:
-    """Standstills of joints, rad: longer than the arm may swing.
+    """Standstills of joints, rad, that are longer than the arm may swing.
 
-    With at least `fewest` reports.
+    Each has at least `fewest` reports.
     """
     rules = SettleRules()
     noise = min(_RANGE_STDS * _quietest(stream), 5.0 * rules.still_tolerance)
@@ -410,7 +410,7 @@ def mean_of(rows: FloatArray) -> FloatArray:
 def reading_of(points: FloatArray) -> tuple[FloatArray, FloatArray, IntArray] | None:
     """Mean (3,) and standard deviation (3,) of a marker at a standstill.
 
-    And indices of the points used.
+    Last result: indices of the points used.
 
     `points` are in m, (n, 3), at least one. The deviation is NaN for a single shot. None if the
     marker was not still.
@@ -646,9 +646,9 @@ def _scale(
 def _means(
     points: Table, when: FloatArray, windows: FloatArray, scale: float
 ) -> tuple[IntArray, Table, int]:
-    """Standstills with a point, the table of their mean points.
+    """Indices of the standstills with a point, and the table of their mean points.
 
-    And the number of unsteady readings.
+    Last result: the number of readings left out because the marker was not still.
     """
     table, columns = points
     spread = {

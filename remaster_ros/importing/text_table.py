@@ -218,10 +218,7 @@ def read_tables(
 def _tables_of_sheets(
     parts: Mapping[str, str], path: Path, decimal: str, sheets: Sequence[str]
 ) -> list[TextTable]:
-    """Tables of the sheets of a workbook, or of the arrays of an archive.
-
-    That hold rows of numbers.
-    """
+    """Tables with rows of numbers, of the sheets of a workbook or the arrays of an archive."""
     folded = {name.casefold(): name for name in parts}
     for name in sheets:
         if name.casefold() not in folded:
@@ -569,9 +566,7 @@ def _is_no_row(cells: Sequence[str], usual: IntArray, width: int) -> bool:
 def _first_row(
     split: list[tuple[int, str, list[str]]], path: Path, comment: re.Pattern[str]
 ) -> tuple[int, int, IntArray]:
-    """Number of columns, index of the first line that is a row.
-
-    And columns that usually have numbers.
+    """Number of columns, index of the first row, and the columns that have numbers in most rows.
 
     Raises InputError if no line has two numbers.
     """

@@ -42,12 +42,10 @@ _REFERENCES = 5
 
 
 def with_orientation(rows: RawRows, chain: SerialChain, options: SessionOptions) -> RawRows:
-    """Rows with quaternions of their orientation columns, or without them.
+    """Rows with quaternions of their orientation columns, or without orientations.
 
-    And a warning that says so.
-
-    The convention is the one that agrees with the arm. Orientations are dropped if they are
-    computed by the robot, disagree with the arm, or fit in several conventions.
+    The convention is the one that agrees with the arm. Orientations are dropped, with a warning,
+    if they are computed by the robot, disagree with the arm, or fit in several conventions.
     """
     if rows.ambiguous_orientation is None and rows.orientation is None:
         return rows
@@ -122,9 +120,9 @@ def _without_orientation(rows: RawRows, why: str) -> RawRows:
 
 
 def _conventions(values: FloatArray, unit: str) -> Iterator[tuple[str, FloatArray]]:
-    """Yield each convention in words and the quaternions (n, 4) of columns (n, 3) or (n.
+    """Yield conventions in which columns (n, 3) or (n, 4) can be read.
 
-    4) in it.
+    Each is its name in words and the quaternions, (n, 4).
     """
     known = np.isfinite(values).all(axis=1)
     if values.shape[1] == len('xyzw'):

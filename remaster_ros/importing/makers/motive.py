@@ -188,7 +188,7 @@ class _Track:
     def distance(self, places: FloatArray, time_s: FloatArray) -> float:
         """Distance of a piece from this marker's seen or predicted position.
 
-        Inf if too long after it.
+        Infinite if the piece begins too long after the marker was lost.
         """
         seen = np.isfinite(places[:, 0])
         both = seen & self.seen
@@ -223,11 +223,9 @@ def _moving_tracks(
 ) -> tuple[list[_Track], int]:
     """Tracks of the markers that move, joined from their pieces.
 
-    And the number of pieces left out.
-
     Motive gives a marker that it lost a new number. A piece belongs to the marker that was last
     seen, or is seen, in the same place. Empty if several markers remain and none is seen most of
-    the time.
+    the time. Last result: the number of pieces left out.
     """
 
     def column(i: int) -> FloatArray:

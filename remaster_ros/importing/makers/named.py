@@ -63,7 +63,7 @@ def first_names(names: Sequence[str]) -> str:
 
 
 def leading_column(labels: list[str]) -> tuple[list[str], list[str]]:
-    """Name and cells of the column of texts `labels` the numbers of each line; [] if it is none.
+    """Name and cells of a column of the texts before the numbers of each line; [] if it is none.
 
     It is a time if all texts have one, a name if most of them are different.
     """

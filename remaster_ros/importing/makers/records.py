@@ -210,7 +210,7 @@ def _of_mapping(
 ) -> Iterator[tuple[str, str]]:
     """Yield column and text of each scalar of a mapping.
 
-    A list of joint names labels the others.
+    A list of joint names in it labels the lists of numbers.
     """
     for whole, part in _SECONDS:
         if {*value} == {whole, part} and all(str(one).isdigit() for one in value.values()):
