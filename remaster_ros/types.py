@@ -87,6 +87,9 @@ class Observation:
         Whether a correction was on; None where unknown.
     effort
         Measured joint torques, N m, (k,), NaN where unknown; None where none is known.
+    velocity, acceleration
+        Of the joints when the marker was measured, rad/s and rad/s², (k,); None of an arm that
+        stood still.
     """
 
     observation: int
@@ -107,6 +110,8 @@ class Observation:
     wanted: FloatArray | None = None
     correction: bool | None = None
     effort: FloatArray | None = None
+    velocity: FloatArray | None = None
+    acceleration: FloatArray | None = None
 
 
 @dataclass(frozen=True)
@@ -193,6 +198,9 @@ class Measurements:
     correction
         1 where a correction was on, 0 where it was off, (n,); -1 where unknown. None where the
         file has no such column.
+    velocity, acceleration
+        Of the joints when the markers were measured, rad/s and rad/s², (n, k); NaN where the arm
+        stood still. None of a session whose arm always stood still.
     """
 
     observation: IntArray
@@ -214,6 +222,8 @@ class Measurements:
     orientation: FloatArray | None = None
     wanted: FloatArray | None = None
     correction: IntArray | None = None
+    velocity: FloatArray | None = None
+    acceleration: FloatArray | None = None
 
     def __len__(self) -> int:
         """Return the number of observations."""
@@ -381,6 +391,8 @@ class Session:
         Of the file that the rows were read from; '' where they were not read, or are a part of it.
     disagreements
         What the sessions that it was made of disagree in, a sentence each.
+    clock_offset_s
+        Sensor name -> what was added to its stamps to have those of the joint states, s.
     """
 
     urdf: str
@@ -409,6 +421,12 @@ class Session:
     accuracy_option: AccuracyOption = ''
     disagreements: tuple[str, ...] = ()
     sensor_kinds: Mapping[str, SensorKind] = field(default_factory=dict)
+    clock_offset_s: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def is_moving(self) -> bool:
+        """Whether markers were measured while the arm moved."""
+        return self.measurements.velocity is not None
 
     @property
     def urdf_sha256(self) -> str:
@@ -467,6 +485,8 @@ class Session:
             ([f'orientation_{axis}' for axis in 'xyzw'], m.orientation),
             ([f'effort{i}_{unit}' for i, _, unit in joints], m.effort),
             ([f'wanted{i}_{unit}' for i, unit, _ in joints], m.wanted),
+            ([f'velocity{i}_{unit}_s' for i, unit, _ in joints], m.velocity),
+            ([f'acceleration{i}_{unit}_s2' for i, unit, _ in joints], m.acceleration),
         ):
             if values is not None and not np.isnan(values).all():
                 found |= dict(zip(names, values.T, strict=True))

@@ -47,8 +47,12 @@ def solution_pairs(measurements: Measurements, rng: np.random.Generator) -> IntA
     """Return the rows i < j seen by the same sensor on the same marker at the same pose, (m, 2).
 
     The sums of eq. 17 of Van Wyk et al.; rows of one configuration are the same solution and make
-    no pair. Of more than 200,000 pairs as many are drawn at random.
+    no pair, nor do those of an arm that moved. Of more than 200,000 pairs as many are drawn at
+    random.
     """
+    if measurements.velocity is not None:
+        # Rows of a moving arm's segment are no solutions of one pose.
+        return np.zeros((0, 2), np.int64)
     key = (measurements.pose, measurements.marker, measurements.sensor)
     order = np.lexsort((np.arange(len(measurements)), *key))
     changes = np.any([np.diff(column[order]) != 0 for column in key], axis=0)
@@ -154,7 +158,9 @@ def _measured(
     else:
         relative = unavailable(
             ('before', 'after'),
-            'no pose has two joint solutions seen by the same sensor on the same marker',
+            'the arm moved: no pose is reached by two joint solutions'
+            if measurements.velocity is not None
+            else 'no pose has two joint solutions seen by the same sensor on the same marker',
         )
     absolute = {
         side: summary(np.linalg.norm((measurements.position - points)[chosen], axis=1))

@@ -59,7 +59,7 @@ _QUARTER = np.pi / 2.0
 # What belongs to the joints of a row and not to its point.
 _OF_JOINTS = (
     *('pose', 'configuration', 'is_validation', 'is_reference'),
-    *('q', 'from_q', 'effort', 'wanted', 'correction'),
+    *('q', 'from_q', 'effort', 'wanted', 'correction', 'velocity', 'acceleration'),
 )
 # Of angles that are degrees taken for radians, and the other way round.
 _SCALES = (1.0, np.pi / 180.0, 180.0 / np.pi)
@@ -125,6 +125,12 @@ class Arrangement:
             turned[:, 2] += self.coupled * turned[:, 1]
         return turned * np.array(self.signs) + _QUARTER * np.array(self.quarters)
 
+    def rates(self, columns: FloatArray | None, scale: float = 1.0) -> FloatArray | None:
+        """Return what has a sign and no zero, (n, k), times a scale; None for None."""
+        if columns is None:
+            return None
+        return scale * columns[:, list(self.order)] * np.array(self.signs)
+
     def points(self, points: FloatArray) -> FloatArray:
         """Return the points, m, (n, 3), of the table's."""
         return (points[:, [1, 0, 2]] if self.mirrored else points) * self.length_scale
@@ -164,9 +170,9 @@ def arranged(session: Session, arrangement: Arrangement) -> Session:
         m,
         q=arrangement.joints(m.q),
         from_q=arrangement.joints(m.from_q),
-        effort=None
-        if m.effort is None
-        else m.effort[:, list(arrangement.order)] * np.array(arrangement.signs),
+        effort=arrangement.rates(m.effort),
+        velocity=arrangement.rates(m.velocity, arrangement.angle_scale),
+        acceleration=arrangement.rates(m.acceleration, arrangement.angle_scale),
         wanted=None if m.wanted is None else arrangement.joints(m.wanted),
         position=arrangement.points(m.position),
     )

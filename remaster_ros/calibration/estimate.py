@@ -19,6 +19,7 @@ from remaster_ros.calibration.model import Model
 from remaster_ros.calibration.moved_since import moved_since
 from remaster_ros.calibration.noise import NoiseModel
 from remaster_ros.calibration.outliers import find_outliers
+from remaster_ros.calibration.path_noise import PathNoise
 from remaster_ros.calibration.posterior import Posterior
 from remaster_ros.calibration.priors import (
     Prior,
@@ -68,6 +69,7 @@ class Problem:
     marker_std_m: FloatArray
     fitted: IntArray  # Indices of the optimization rows
     priors: Priors  # What is known beforehand of offsets and registrations
+    path_noise: PathNoise | None = None  # Of errors along a path; None where there are none
 
     @classmethod
     def of(cls, session: Session, priors: Priors | None = None) -> Problem:
@@ -192,6 +194,7 @@ class Problem:
                 for index, name in enumerate(self.sensor_names)
                 if name in self.session.on_tool
             ),
+            path_noise=self.path_noise,
         )
 
 
@@ -279,7 +282,7 @@ def _estimated(problem: Problem, model: Model, z: FloatArray, start: Start | Non
         # From the mode of the rows kept before: only the first search has far to go.
         near = z if found is None else found[1].z
         # Of a reading, position and orientation are kept or neither.
-        kept = model.rows(measurements, np.setdiff1d(rows.source, rows.source[~keep]))
+        kept = model.rows_of_path(measurements, np.setdiff1d(rows.source, rows.source[~keep]))
         found = keep, find_mode(Posterior.of(model, kept, priors, free, near))
         return found[1]
 

@@ -66,6 +66,7 @@ class Extension:
     step_std: float = np.inf
     # Where to begin the search for the mode; None where that is to be found, too
     start: Start | None = None
+    of_motion: bool = False  # What every fit of a moving session has (`dynamics`): no causes
 
     def turns(self, theta: FloatArray, rows: IntArray) -> dict[int, FloatArray]:
         """Return the angles that theta (..., m) adds in n rows: joint -> rad, (..., n)."""

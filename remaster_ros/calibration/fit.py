@@ -11,6 +11,7 @@ from typing import Literal
 import numpy as np
 
 from remaster_ros.calibration.convergence import MINIMUM_DRAWS
+from remaster_ros.calibration.dynamics import estimate_moving
 from remaster_ros.calibration.estimate import Estimate, Problem, estimate
 from remaster_ros.calibration.extension import Extension
 from remaster_ros.calibration.mistakes import sound_estimate
@@ -104,6 +105,11 @@ def fit_session(
     started = clock() if clock is not None else np.nan
     problem = Problem.of(session, priors)
     slides = list(compress(problem.chain.joint_names, problem.chain.slides))
+    if session.is_moving and sampler == 'paper':
+        raise InputError(
+            "the paper's model has no dynamics, and this session was measured while the arm "
+            'moved; fit with the fast sampler'
+        )
     if slides and sampler == 'paper':
         raise InputError(
             f"joint '{slides[0]}' slides, which the paper sampler does not take; fit with the "
@@ -122,7 +128,8 @@ def fit_session(
         if extension is not None:
             found = estimate(problem, extension)
         elif found is None:
-            found = sound_estimate(session, priors)
+            fitted = estimate_moving if session.is_moving else estimate
+            found = sound_estimate(session, priors, fitted)
         sampled = _fast(found, chains, draws, precision, rng, report)
         if unmodelled is not None:
             sampled = replace(sampled, unmodelled=unmodelled)

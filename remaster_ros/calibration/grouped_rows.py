@@ -17,6 +17,7 @@ import numpy as np
 from scipy.sparse import csr_array
 from scipy.spatial.transform import Rotation
 
+from remaster_ros.calibration.path_noise import Decorrelation, PathNoise
 from remaster_ros.kinematics.transforms import apply
 from remaster_ros.types import BoolArray, FloatArray, IntArray, Measurements
 
@@ -58,6 +59,8 @@ class Rows:
     # Where the position of a row was measured, in the base coordinates of the reference, m, (n,
     # 3); None where that is ``target``
     place: FloatArray | None = None
+    # Of each sensor whose errors are correlated along the path; () where none are
+    decorrelation: tuple[Decorrelation, ...] = ()
 
     @classmethod
     def of(cls, measurements: Measurements, rows: IntArray, reference: FloatArray) -> Rows:
@@ -156,6 +159,42 @@ class Rows:
             place=place,
         )
 
+    def along_path(self, noise: PathNoise | None) -> Rows:
+        """Return these rows with errors that are correlated along the path; as are without."""
+        if noise is None:
+            return self
+        found = []
+        for sensor, span in self.of_points.spans:
+            first, last = np.searchsorted(self.frame_start, (span.start, span.stop)).tolist()
+            found.append(
+                Decorrelation.of(
+                    noise,
+                    sensor,
+                    self.source,
+                    self.marker,
+                    self.frame_start,
+                    self.frame_size,
+                    slice(first, last),
+                )
+            )
+        return replace(self, decorrelation=tuple(found))
+
+    def decorrelated(self, values: FloatArray) -> FloatArray:
+        """Return vectors (n, 3, ...) of which errors along the path are independent."""
+        if not self.decorrelation:
+            return values
+        flat = values.reshape(len(self), -1)
+        size = self.frame_size[:, None].astype(flat.dtype)
+        means = self.frame_sum(flat) / size
+        apart = flat - np.repeat(means, self.frame_size, axis=0)
+        for one in self.decorrelation:
+            for frames, factor, markers in one.runs:
+                means[frames] = factor.astype(flat.dtype) @ means[frames]
+                for rows, own in markers:
+                    apart[rows] = own.astype(flat.dtype) @ apart[rows]
+        apart += np.repeat(means, self.frame_size, axis=0)
+        return apart.reshape(values.shape)
+
     def __len__(self) -> int:
         """Return the number of rows."""
         return len(self.source)
@@ -219,12 +258,15 @@ class Rows:
         )
 
     def picked(self, rows: slice | IntArray) -> Rows:
-        """Return the columns of some rows; how they are grouped is left to the caller."""
+        """Return the columns of some rows; how they are grouped is left to the caller.
+
+        Some rows by themselves are not decorrelated.
+        """
         names = ('source', 'q', 'marker', 'target', 'frame', 'body', 'lever', 'place')
         columns: dict[str, Any] = {
             name: value[rows] for name in names if (value := getattr(self, name)) is not None
         }
-        return replace(self, **columns)
+        return replace(self, decorrelation=(), **columns)
 
     @property
     def group_of_row(self) -> IntArray:

@@ -175,7 +175,7 @@ def held_out_tests(
     kept = measurements.is_validation & ~np.isin(measurements.observation, gross)
     if not kept.any() or np.all(posterior.noise(mode.eta).sigma < LEAST_NOISE_M):
         return ()
-    held_out = posterior.model.rows(measurements, np.flatnonzero(kept)).of_points
+    held_out = posterior.model.rows_of_path(measurements, np.flatnonzero(kept)).of_points
     fitted = _contrasts(mode, measurements, spread_poses(posterior.rows))
     others = _contrasts(mode, measurements, spread_poses(held_out))
     return tuple(

@@ -10,7 +10,7 @@ session without it is estimated as any session is.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from itertools import combinations, product
 from shlex import quote
@@ -125,8 +125,14 @@ def is_gross(found: Estimate) -> bool:
 
 
 @one_thread
-def sound_estimate(session: Session, priors: Priors | None = None) -> Estimate:
+def sound_estimate(
+    session: Session,
+    priors: Priors | None = None,
+    fitted: Callable[[Problem], Estimate] = estimate,
+) -> Estimate:
     """Estimate a session; where it does not fit its robot, name the mistake without which it does.
+
+    ``fitted``: how it is estimated.
 
     Raises
     ------
@@ -136,7 +142,7 @@ def sound_estimate(session: Session, priors: Priors | None = None) -> Estimate:
         It does not fit, and none of the mistakes that were tried mends it.
     """
     try:
-        found = estimate(Problem.of(session, priors))
+        found = fitted(Problem.of(session, priors))
     except MisfitError as error:
         refused = error
     else:

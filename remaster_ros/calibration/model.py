@@ -49,6 +49,7 @@ import numpy as np
 
 from remaster_ros.calibration.extension import Extension
 from remaster_ros.calibration.grouped_rows import Bodies, Rows
+from remaster_ros.calibration.path_noise import PathNoise
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.transforms import (
     apply,
@@ -80,11 +81,17 @@ class Model:
     body_reference: FloatArray = field(default_factory=lambda: np.zeros((0, 3, 3)))
     # Sensors on the tool, whose readings are those of the sensor in front of what it sees
     on_tool: tuple[int, ...] = ()
+    path_noise: PathNoise | None = None  # Of errors along a path; None of an arm that stood still
 
     @property
     def joints(self) -> int:
         """Number of joints k."""
         return len(self.chain)
+
+    @property
+    def has_causes(self) -> bool:
+        """Whether it has further parameters that are causes of error, not of motion."""
+        return self.extension is not None and not self.extension.of_motion
 
     @property
     def core(self) -> int:
@@ -129,6 +136,10 @@ class Model:
     def rows(self, measurements: Measurements, rows: IntArray) -> Rows:
         """Return given rows sorted, with the orientations that are fitted."""
         return Rows.with_turns(measurements, rows, self.reference, self.bodies, self.on_tool)
+
+    def rows_of_path(self, measurements: Measurements, rows: IntArray) -> Rows:
+        """Return given rows of the session as `rows`, errors correlated along its path."""
+        return self.rows(measurements, rows).along_path(self.path_noise)
 
     def registration(self, sensor: int) -> slice:
         """Return where the correction of a sensor lies in the vector."""

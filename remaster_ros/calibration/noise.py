@@ -285,7 +285,7 @@ class NoiseModel:
         """Return the sum of squares in each error group, m², of errors (..., n, 3)."""
         if self.frames is not None:
             errors = np.einsum('nij,...nj->...ni', self.frames, errors)
-        values = np.moveaxis(errors, (-2, -1), (0, 1))
+        values = self.rows.decorrelated(np.moveaxis(errors, (-2, -1), (0, 1)))
         sums = np.zeros((*errors.shape[:-2], len(self.error_groups)))
         for index, part in self._parts(self.rows, values, 0):
             sums[..., index] = np.einsum('ni...,ni...->...', part, part)
@@ -325,13 +325,16 @@ class NoiseModel:
             coordinates of `Rows.target`; called with some thousand rows at a time, so that memory
             does not grow with their number.
         """
-        for first, last in self.rows.blocks(GRAM_ROWS):
+        # Rows that are correlated along the path are taken whole.
+        most = len(self.rows) + 1 if self.rows.decorrelation else GRAM_ROWS
+        for first, last in self.rows.blocks(most):
             rows = self.rows.of_groups(first, last)
             start = int(self.rows.group_start[first])
             where = slice(start, start + len(rows))
             values = features(rows, where)
             if self.frames is not None:
                 values = self.frames[where] @ values
+            values = rows.decorrelated(values)
             for index, part in self._parts(rows, values, first):
                 yield index, part.reshape(-1, values.shape[2])
 
@@ -389,6 +392,7 @@ class NoiseModel:
         flat = values.reshape(len(rows), 3, -1)
         if self.frames is not None:
             flat = self.frames.astype(kind) @ flat
+        flat = rows.decorrelated(flat)
         sigma, pose_sigma, frame_sigma = self._of_groups(noise)
         size, count = rows.mean_frame_size[:, None], rows.group_frames[:, None]
         inner = np.sqrt(sigma**2 + size * frame_sigma**2)

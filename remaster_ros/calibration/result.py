@@ -453,7 +453,7 @@ def build_result(
         parameters=len(sampled.moved) - 3 * len(model.bodies),
     )
     structure, widening, tell = None, np.ones(model.joints), None
-    if sampled.mode is not None and model.extension is None:
+    if sampled.mode is not None and not model.has_causes:
         gross = np.concatenate([np.zeros(0, np.int64), *(check.gross for check in noise_checks)])
         of_points = sampled.mode.of_points
         held_out = held_out_tests(of_points, measurements, gross)

@@ -13,6 +13,7 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
+from remaster_ros.calibration.dynamics import estimate_moving, moving_words
 from remaster_ros.calibration.mistakes import sound_estimate
 from remaster_ros.cli.console import progress_bar, show, tell
 from remaster_ros.cli.options import add_description, names, number, xacro_arguments
@@ -24,8 +25,9 @@ from remaster_ros.importing.assemble import (
     with_controller_coupling,
     without_whole_turns,
 )
-from remaster_ros.importing.bags import is_bag, read_bag
+from remaster_ros.importing.bags import is_bag, read_bag, read_streams
 from remaster_ros.importing.columns import ColumnChoice
+from remaster_ros.importing.moving import MovingOptions, moving_session
 from remaster_ros.importing.rows import RawRows, TableOptions, from_tool, read_rows
 from remaster_ros.importing.sense import Sense, check_sense
 from remaster_ros.importing.sessions import Stretch, arrangement_of, corrected_session
@@ -74,6 +76,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='of a xacro file given with --urdf, such as ur_type:=ur5e; may be repeated',
     )
     parser.add_argument('--json', action='store_true', help='print one JSON object')
+    parser.add_argument(
+        '--moving',
+        action='store_true',
+        help='of a bag: rows of 0.1 s while the arm moves, in place of its standstills',
+    )
     table = parser.add_argument_group('what the columns are, where it was not found')
     table.add_argument(
         '--joints',
@@ -315,6 +322,8 @@ def run(args: argparse.Namespace) -> int:
     else:
         urdf, base = cell.urdf_text, args.base_link or cell.robot.base_link
         chain = SerialChain.from_urdf(urdf, base, args.tip_link or cell.robot.tip_link)
+    if args.moving:
+        return _import_moving(args, cell, urdf, chain)
     with progress_bar(args.quiet or args.json) as progress:
         progress('reading', 0.0)
         options = _session_options(args, cell)
@@ -403,6 +412,78 @@ def _mend(args: argparse.Namespace) -> int:
                 ) from None
     write_session(args.out, without_whole_turns(session, chain)[0])
     content = {'session': str(args.out), 'columns': {}, 'warnings': [], 'hint': ''}
+    tell(args, content, _written(args.out))
+    return 0
+
+
+def _import_moving(
+    args: argparse.Namespace, cell: Workcell | None, urdf: str, chain: SerialChain
+) -> int:
+    """Write the session of a bag whose arm moved; errors as of `run`."""
+    if len(args.files) > 1 or not is_bag(args.files[0]):
+        raise InputError(
+            f'{args.files[-1]}: --moving takes one bag, with joint states and frames as recorded'
+        )
+    for option, given in (
+        ('--couple', args.couple),
+        ('--reverse', args.reverse),
+        ('--offset', args.offset),
+        ('--shift-points', args.shift_points),
+        ('--exchange-markers', args.exchange_markers),
+        ('--turn-tool', args.turn_tool[0]),
+        ('--on-tool', args.on_tool),
+    ):
+        if given:
+            raise InputError(f'{option} is not for --moving: import the standstills with it')
+    path = args.files[0]
+    topics, places, std = {}, {}, args.marker_std_mm
+    if cell is not None:
+        topics = {
+            f'/{topic.lstrip("/")}': (name, marker)
+            for name, sensor in cell.sensors.items()
+            for marker, topic in sensor.topics.items()
+        }
+        places = {name: np.array(place) for name, place in cell.markers.items()}
+        std = 1e3 * cell.marker_std_m if std is None else std
+    with progress_bar(args.quiet or args.json) as progress:
+        progress('reading', 0.0)
+        links = parse_urdf(urdf).links
+        joints, streams, columns = read_streams(
+            path, chain, args.joints, args.points, args.length, links, topics
+        )
+        if args.marker_mm is not None:
+            if len(streams) > 1:
+                raise InputError('--marker-mm is for one marker; give several by --cell')
+            places = {streams[0].marker: 1e-3 * np.array(args.marker_mm)}
+        progress('finding the clocks', 0.3)
+        options = MovingOptions(
+            places=places,
+            marker_std_m=None if std is None else 1e-3 * std,
+            clock_offset_s=args.clock_offset,
+            hold_out=args.hold_out,
+            notes=f'imported from {path.name}, moving',
+            accuracy_option=args.accuracy_option,
+        )
+        rng = np.random.default_rng(args.seed)
+        session, how = moving_session(str(path), joints, streams, chain, urdf, options, rng)
+        session, turned = without_whole_turns(session, chain)
+        fits = ''
+        if not args.unchecked:
+            progress('trying', 0.8)
+            try:
+                found = sound_estimate(session, fitted=estimate_moving)
+            except InsufficientDataError as error:
+                raise InsufficientDataError(
+                    f'{error}; nothing was written; to write it as it is, add --unchecked'
+                ) from None
+            fits = moving_words(found)
+    width = max(map(len, columns))
+    lines = [f'  {column:{width}s}  {meaning}' for column, meaning in columns.items()]
+    lines += [*how, *filter(None, (turned, fits))]
+    show(args.quiet or args.json, '\n'.join((f'{path}: the arm moving', *lines)))
+    write_session(args.out, session)
+    content = {'session': str(args.out), 'columns': columns, 'warnings': [], 'hint': ''}
+    content |= {'clock_offset_s': session.clock_offset_s}
     tell(args, content, _written(args.out))
     return 0
 

@@ -7,12 +7,14 @@ from collections import defaultdict
 from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
 from remaster_ros.errors import InputError
 from remaster_ros.importing.calibration_data import CALIBRATION_DATA, rows_of
+from remaster_ros.importing.moving import MarkerStream
 from remaster_ros.importing.rows import STATIC, RawRows
 from remaster_ros.importing.standstills import (
     SWING_S,
@@ -133,62 +135,146 @@ def read_bag(
         No such topics, no standstill with a point in it, or a damaged bag.
     """
     refuse_sliding(chain, path)
-    joints: dict[str, _Topic] = defaultdict(_Topic)
-    found: dict[str, dict[str, _Topic]] = {kind: defaultdict(_Topic) for kind in _KINDS}
-    calibration: list[tuple[float, Any]] = []
-    seen: dict[str, str] = {}
-    of: dict[str, str] = {}
-    for topic, kind, message, log_s in _messages(path, seen):
-        if kind == CALIBRATION_DATA:
-            calibration.append((log_s, message))
-        elif kind == JOINT_STATE:
-            if joint_topics and topic not in joint_topics:
-                continue
-            position = dict(zip(message.name, message.position))
-            if all(name in position for name in chain.joint_names):
-                joints[topic].stamps.append(_stamp(message.header, log_s))
-                joints[topic].values.append([position[name] for name in chain.joint_names])
-        else:
-            for name, header, place in _places(topic, kind, message):
-                if point_topics and not {topic, name} & {*point_topics}:
+    bag = _Bag.of(path, chain, joint_topics, point_topics, length, links)
+    if isinstance(bag, RawRows):
+        return bag
+    rows = _Rows(path, chain, bag.joints.stream(), bag.joint_topic, clock_offset_s)
+    for topic, own in sorted(bag.points.items()):
+        rows.add(topic, own.stream(bag.scale))
+    return rows.raw(sorted(bag.points), length or 'm', bag.unused)
+
+
+def read_streams(
+    path: Path,
+    chain: SerialChain,
+    joint_topics: Sequence[str] = (),
+    point_topics: Sequence[str] = (),
+    length: str = '',
+    links: Container[str] = (),
+    names: Mapping[str, tuple[str, str]] = MappingProxyType({}),
+) -> tuple[Stream, list[MarkerStream], dict[str, str]]:
+    """Read the joint states and marker positions of a bag, as they were recorded.
+
+    Topics whose first parts are the same, and the names in messages of several, are markers of one
+    sensor.
+
+    Parameters
+    ----------
+    joint_topics, point_topics, length, links
+        As of `read_bag`.
+    names
+        Topic -> sensor and marker, if they are known.
+
+    Returns
+    -------
+    Stream, list of MarkerStream, dict
+        Joint positions, rad, (n, k); positions of each marker, m; column or topic -> meaning.
+
+    Raises
+    ------
+    InputError
+        No such topics, a bag of single measurements, or a damaged bag.
+    """
+    bag = _Bag.of(path, chain, joint_topics, point_topics, length, links)
+    if isinstance(bag, RawRows):
+        raise InputError(
+            f'{path}: holds measurements of standstills ({CALIBRATION_DATA}), none of a moving '
+            'arm; import it without --moving'
+        )
+    found, taken = [], set()
+    columns = {bag.joint_topic: f'joint angles ({", ".join(chain.joint_names)}), rad'}
+    for name, own in sorted(bag.points.items()):
+        topic = bag.topic_of[name]
+        parts = [part for part in topic.strip('/').split('/') if part]
+        own_name = name.rpartition('/')[2] if name != topic else '_'.join(parts[1:])
+        sensor, marker = names.get(name, (parts[0], own_name or 'marker'))
+        if marker in taken:
+            marker = f'{sensor}_{marker}'
+        taken.add(marker)
+        columns[name] = f'marker {marker} of sensor {sensor}, {length or "m"}'
+        stamps, values = np.array(own.stamps), np.array(own.values, dtype=float)[:, :3]
+        found.append(MarkerStream(sensor, marker, Stream.of(stamps, bag.scale * values)))
+    columns |= {topic: 'not used' for topic in bag.unused if topic not in columns}
+    return bag.joints.stream(), found, columns
+
+
+@dataclass(frozen=True, eq=False)
+class _Bag:
+    """Joint states and points of a bag."""
+
+    joint_topic: str
+    joints: _Topic
+    points: Mapping[str, _Topic]  # By topic, or by name in messages of several
+    topic_of: Mapping[str, str]  # Of each of these
+    unused: dict[str, str]  # Topic -> type of the message, of topics without points
+    scale: float  # Unit of the points, m
+
+    @classmethod
+    def of(
+        cls,
+        path: Path,
+        chain: SerialChain,
+        joint_topics: Sequence[str],
+        point_topics: Sequence[str],
+        length: str,
+        links: Container[str],
+    ) -> _Bag | RawRows:
+        """Read a bag; return rows if it holds measurements of robot_calibration."""
+        joints: dict[str, _Topic] = defaultdict(_Topic)
+        found: dict[str, dict[str, _Topic]] = {kind: defaultdict(_Topic) for kind in _KINDS}
+        calibration: list[tuple[float, Any]] = []
+        seen: dict[str, str] = {}
+        of: dict[str, str] = {}
+        for topic, kind, message, log_s in _messages(path, seen):
+            if kind == CALIBRATION_DATA:
+                calibration.append((log_s, message))
+            elif kind == JOINT_STATE:
+                if joint_topics and topic not in joint_topics:
                     continue
-                if name not in links:
-                    found[kind][name].stamps.append(_stamp(header, log_s))
-                    found[kind][name].values.append(place)
-                    of[name] = topic
-    if calibration:
-        return rows_of(path, calibration, chain, point_topics, length)
-    joint_topic = _joint_topic(path, joints, seen, chain)
-    kind = next((kind for kind in _KINDS if found[kind]), '')
-    if not kind:
-        raise InputError(
-            f'{path}: no geometry_msgs/PointStamped or PoseStamped, and no transform of a frame '
-            f'that is no link of the robot; it has {_topics(seen)}'
-        )
-    points = found[kind]
-    scale = LENGTHS[length or 'm']
-    _require_sensible(path, joints[joint_topic], points, scale)
-    if kind in SEVERAL and not point_topics:
-        # Frames of a camera and of the room stand still.
-        extent = {
-            name: np.ptp(np.array(one.values)[:, :3], axis=0).max() for name, one in points.items()
-        }
-        points = {
-            name: one
-            for name, one in points.items()
-            if extent[name] > STATIC * max(extent.values())
-        } or points
-    if len(points) > 1 and not point_topics and kind != next(iter(PLACES)):
-        # One of them may well be where the robot believes its tool to be.
-        raise InputError(
-            f'{path}: poses on {", ".join(sorted(points))}; name those of the sensor with --points'
-        )
-    rows = _Rows(path, chain, joints[joint_topic].stream(), joint_topic, clock_offset_s)
-    for topic, own in sorted(points.items()):
-        rows.add(topic, own.stream(scale))
-    used = {of[name] for name in points}
-    seen = {topic: what for topic, what in seen.items() if topic not in used}
-    return rows.raw(sorted(points), length or 'm', seen)
+                position = dict(zip(message.name, message.position))
+                if all(name in position for name in chain.joint_names):
+                    joints[topic].stamps.append(_stamp(message.header, log_s))
+                    joints[topic].values.append([position[name] for name in chain.joint_names])
+            else:
+                for name, header, place in _places(topic, kind, message):
+                    if point_topics and not {topic, name} & {*point_topics}:
+                        continue
+                    if name not in links:
+                        found[kind][name].stamps.append(_stamp(header, log_s))
+                        found[kind][name].values.append(place)
+                        of[name] = topic
+        if calibration:
+            return rows_of(path, calibration, chain, point_topics, length)
+        joint_topic = _joint_topic(path, joints, seen, chain)
+        kind = next((kind for kind in _KINDS if found[kind]), '')
+        if not kind:
+            raise InputError(
+                f'{path}: no geometry_msgs/PointStamped or PoseStamped, and no transform of a '
+                f'frame that is no link of the robot; it has {_topics(seen)}'
+            )
+        points = found[kind]
+        scale = LENGTHS[length or 'm']
+        _require_sensible(path, joints[joint_topic], points, scale)
+        if kind in SEVERAL and not point_topics:
+            # Frames of a camera and of the room stand still.
+            extent = {
+                name: np.ptp(np.array(one.values)[:, :3], axis=0).max()
+                for name, one in points.items()
+            }
+            points = {
+                name: one
+                for name, one in points.items()
+                if extent[name] > STATIC * max(extent.values())
+            } or points
+        if len(points) > 1 and not point_topics and kind != next(iter(PLACES)):
+            # One of them may well be where the robot believes its tool to be.
+            raise InputError(
+                f'{path}: poses on {", ".join(sorted(points))}; name those of the sensor with '
+                '--points'
+            )
+        used = {of[name] for name in points}
+        unused = {topic: what for topic, what in seen.items() if topic not in used}
+        return cls(joint_topic, joints[joint_topic], points, of, unused, scale)
 
 
 def _require_sensible(

@@ -41,7 +41,9 @@ from remaster_ros.types import (
 
 log = logging.getLogger('remaster_ros')
 
-OPTIONAL = ('frame', 'orientation', 'effort', 'wanted', 'correction')
+MOVING = ('velocity', 'acceleration')
+"""Fields of an observation whose columns sessions of a moving arm have, and no others."""
+OPTIONAL = ('frame', 'orientation', 'effort', 'wanted', 'correction', *MOVING)
 """Fields of an observation whose columns are optional."""
 OMITTABLE = ('from_q', 'std', 'samples', 'temperature_c')
 """Fields whose columns are always written, but are optional in files of other programs."""
@@ -174,11 +176,12 @@ def split_line(line: str, path: Path, number: int) -> list[str]:
 
 
 def column_names(
-    joints: int, slides: Sequence[bool] | BoolArray | None = None
+    joints: int, slides: Sequence[bool] | BoolArray | None = None, moving: bool = False
 ) -> dict[str, list[str]]:
     """Return the columns of each field of `Observation`, in the order written.
 
-    ``slides``: whether each joint is prismatic, (k,): its positions are in m, its efforts in N.
+    ``slides``: whether each joint is prismatic, (k,): its positions are in m, its efforts in N;
+    ``moving``: with the `MOVING` fields.
     """
     lengths = [False] * joints if slides is None else list(slides)
 
@@ -189,7 +192,7 @@ def column_names(
         ]
 
     single = ('observation', 'pose', 'configuration', 'split', 'stamp_s', 'sensor', 'marker')
-    return {
+    columns = {
         **{name: [name] for name in single},
         'q': of_joints('q'),
         'from_q': of_joints('from_q'),
@@ -201,6 +204,10 @@ def column_names(
         'wanted': of_joints('wanted'),
         'correction': ['correction'],
     }
+    if moving:
+        columns['velocity'] = of_joints('velocity', 'rad_s', 'm_s')
+        columns['acceleration'] = of_joints('acceleration', 'rad_s2', 'm_s2')
+    return columns
 
 
 class RowFormat:
@@ -208,7 +215,7 @@ class RowFormat:
 
     ``sensors``, ``markers``: names in the order of session.yaml; ``optional``: the `OPTIONAL`
     fields of lines to be written; ``within_limits``: refuse joint angles outside the robot's
-    limits.
+    limits; ``moving``: the columns of `MOVING` are there.
     """
 
     def __init__(
@@ -219,11 +226,12 @@ class RowFormat:
         markers: Sequence[str],
         optional: Collection[str] = (),
         within_limits: bool = True,
+        moving: bool = False,
     ) -> None:
         self._path, self._chain = path, chain
         self._sensors, self._markers = sensors, markers
         self._within_limits = within_limits
-        self._columns = column_names(len(chain), chain.slides)
+        self._columns = column_names(len(chain), chain.slides, moving)
         self._absent = [name for name in OPTIONAL if name not in optional]
         self._written = [
             name
@@ -231,6 +239,7 @@ class RowFormat:
             if field not in self._absent
             for name in names
         ]
+        self._moving = moving
 
     @property
     def header(self) -> str:
@@ -259,6 +268,8 @@ class RowFormat:
             'effort': _numbers(o.effort, joints),
             'wanted': _numbers(o.wanted, joints),
             'correction': ['' if o.correction is None else STATES[o.correction]],
+            'velocity': _numbers(o.velocity, joints),
+            'acceleration': _numbers(o.acceleration, joints),
         }
         for field in self._absent:
             del cells[field]
@@ -327,6 +338,9 @@ class RowFormat:
         def given(field: str) -> bool:
             return columns[field][0] in table.cells
 
+        def of_motion(field: str) -> FloatArray | None:
+            return table.whole_or_empty(columns[field]) if self._moving else None
+
         split = table.choices('split', SPLITS, f'is none of {", ".join(SPLITS)}; correct it')
         is_reference = split == SPLITS.index('reference')
         states = ('', *STATES)
@@ -357,6 +371,8 @@ class RowFormat:
             - 1
             if given('correction')
             else None,
+            velocity=of_motion('velocity'),
+            acceleration=of_motion('acceleration'),
         )
         if measurements.orientation is not None:
             length = np.linalg.norm(measurements.orientation, axis=1, keepdims=True)
@@ -437,6 +453,7 @@ def observations_of(
         *(m.q, m.position, rows(m.from_q), rows(m.std), counts(m.samples)),
         (None if value != value else value for value in m.temperature_c.tolist()),
         *(counts(m.frame), rows(m.orientation), rows(m.wanted), corrections, rows(m.effort)),
+        *(rows(m.velocity), rows(m.acceleration)),
     )
 
 
@@ -483,21 +500,24 @@ def _check_names(names: list[str], columns: Mapping[str, list[str]], path: Path)
             f'{where}: of the columns {", ".join(axes)} only {", ".join(turned)} are '
             'there; give all or none'
         )
-    for field in ('q', 'from_q', 'effort', 'wanted'):
+    for field in ('q', 'from_q', 'effort', 'wanted', *MOVING):
+        if field not in columns:
+            continue
         wanted = columns[field]
-        prefix, suffix = wanted[0].split('1')
-        pattern = re.compile(f'{prefix}[0-9]+_(rad|m|nm|n)')
+        prefix, suffix = wanted[0].split('1', 1)
+        pattern = re.compile(f'({prefix}[0-9]+)_(rad|m|nm|n)(_s2?)?')
         found = [name for name in names if pattern.fullmatch(name)]
-        by_number = {name.rpartition('_')[0]: name for name in wanted}
+        by_number = {pattern.sub(r'\1', name): name for name in wanted}
         for name in found:
-            right = by_number.get(name.rpartition('_')[0], name)
+            right = by_number.get(pattern.sub(r'\1', name), name)
             if name != right:
+                slides = pattern.sub(r'\2', right) in ('m', 'n')
                 raise InputError(
                     f'{where}: column {name}: joint {right[len(prefix) :].partition("_")[0]} of '
-                    f'the URDF {"slides" if right.endswith(("_m", "_n")) else "turns"}, so its '
+                    f'the URDF {"slides" if slides else "turns"}, so its '
                     f'column is {right}; write it so, in that unit, or correct the URDF'
                 )
-        if set(found) != set(wanted) and (found or field == 'q'):
+        if set(found) != set(wanted) and (found or field in ('q', *MOVING)):
             raise InputError(
                 f'{where}: {len(found)} columns {prefix}…{suffix} for the {len(wanted)} joints '
                 f'of the robot between its base_link and tip_link; give {wanted[0]} to '

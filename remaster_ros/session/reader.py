@@ -92,7 +92,10 @@ def _read(folder: Path, sums: dict[str, str], within_limits: bool) -> Session:
     data = read_limited(rows_path, OBSERVATIONS_LIMIT, 'a session folder holds observations.csv')
     check_data(sums, rows_path, data)
     names = tuple(header.sensors), tuple(header.markers)
-    measurements = RowFormat(rows_path, chain, *names, within_limits=within_limits).parse(data)
+    row_format = RowFormat(
+        rows_path, chain, *names, within_limits=within_limits, moving=header.is_moving
+    )
+    measurements = row_format.parse(data)
     on_tool = [i for i, name in enumerate(header.sensors) if name in header.on_tool]
     measurements = inverted_readings(measurements, on_tool, str(rows_path))
     references = None
@@ -141,7 +144,9 @@ def write_session(folder: str | os.PathLike[str], session: Session) -> None:
     names = session.sensor_names, session.marker_names
     on_tool = [i for i, name in enumerate(session.sensors) if name in session.on_tool]
     measured = inverted_readings(all_rows(session), on_tool, 'session to be written')
-    row_format = RowFormat(folder / ROWS, chain, *names, optional_of(measured))
+    row_format = RowFormat(
+        folder / ROWS, chain, *names, optional_of(measured), moving=session.is_moving
+    )
     rows = row_format.text(measured).encode()
     row_format.parse(rows)
     with undone_on_failure():

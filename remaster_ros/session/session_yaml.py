@@ -31,6 +31,8 @@ from remaster_ros.types import (
 )
 
 FORMAT = 'remaster-session/1'
+# Of an arm that moved while it was measured. A program that knows no dynamics refuses it.
+FORMAT_MOVING = 'remaster-session/1.1'
 ExitStatus = Literal['complete', 'stopped', 'aborted']
 MARKER_STD = Bounds(0.0, 0.4, 'm', remedy='; 0.3 where nothing is known of their places')
 ZERO = Bounds(-360.0, 360.0, 'degrees')
@@ -93,8 +95,14 @@ class SessionHeader(msgspec.Struct):
     controller: Controller | None = None
     correction: Correction | None = None
     accuracy_option: AccuracyOption = ''
+    clock_offset_s: dict[str, float] = {}
     # Keys unknown to this version, nested as in the file.
     extra: dict[str, Any] = {}
+
+    @property
+    def is_moving(self) -> bool:
+        """Whether markers were measured while the arm moved."""
+        return self.format == FORMAT_MOVING
 
     @property
     def on_tool(self) -> frozenset[str]:
@@ -140,6 +148,7 @@ class SessionHeader(msgspec.Struct):
             correction=self.correction,
             accuracy_option=self.accuracy_option,
             references=references,
+            clock_offset_s=self.clock_offset_s,
         )
 
 
@@ -152,8 +161,8 @@ def parse_header(data: bytes, path: Path) -> SessionHeader:
         content = load_yaml(decode_text(data, path))
     except YamlError as error:
         raise InputError(f'{path}: {error}') from None
-    if not isinstance(content, dict) or content.get('format') != FORMAT:
-        found = content.get('format') if isinstance(content, dict) else None
+    found = content.get('format') if isinstance(content, dict) else None
+    if not isinstance(content, dict) or found not in (FORMAT, FORMAT_MOVING):
         raise InputError(
             f"{path}: key 'format' is {str(found)[:60]!r}, not {FORMAT!r}; "
             'this version reads no other format'
@@ -169,7 +178,7 @@ def parse_header(data: bytes, path: Path) -> SessionHeader:
 def write_header(session: Session, urdf_name: str, exit_status: str) -> str:
     """Return the text of session.yaml; raise InputError if the session breaks the format."""
     content: dict[str, Any] = {
-        'format': FORMAT,
+        'format': FORMAT_MOVING if session.is_moving else FORMAT,
         'robot': {
             'urdf': urdf_name,
             'base_link': session.base_link,
@@ -198,6 +207,7 @@ def write_header(session: Session, urdf_name: str, exit_status: str) -> str:
         'controller': session.controller,
         'correction': session.correction,
         'accuracy_option': session.accuracy_option,
+        'clock_offset_s': session.clock_offset_s,
     }
     header = _checked(to_plain(content), 'session to be written: ')
     given = {key: value for key, value in to_plain(header).items() if value not in ('', {}, None)}
@@ -279,6 +289,10 @@ def _problem(header: SessionHeader) -> str:
             return f'base_prior.{sensor}: no such sensor ({known}); correct the name'
         if problem := base.problem(f'base_prior.{sensor}'):
             return problem
+    for sensor in header.clock_offset_s:
+        if sensor not in header.sensors:
+            known = ', '.join(header.sensors)
+            return f'clock_offset_s.{sensor}: no such sensor ({known}); correct the name'
     if header.controller is not None and (problem := _controller_problem(header.controller)):
         return problem
     if header.created:

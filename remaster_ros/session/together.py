@@ -91,6 +91,10 @@ def together(sessions: Sequence[tuple[str, Session]]) -> tuple[Session, list[str
                 **{names[one]: kind for one, kind in session.sensor_kinds.items()},
             },
             on_tool=joined.on_tool | {names[one] for one in session.on_tool},
+            clock_offset_s={
+                **joined.clock_offset_s,
+                **{names[one]: offset for one, offset in session.clock_offset_s.items()},
+            },
             oriented=joined.oriented | {names[one] for one in session.oriented},
             # The less is known of any marker, the less is said of each.
             marker_std_m=max(joined.marker_std_m, session.marker_std_m),

@@ -1,0 +1,300 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What motion adds to the errors of an arm: parameters that every fit of a moving session has.
+
+With q̇ and q̈ of a row, J_j the derivative of the marker by joint j, and t its time::
+
+    clock of a sensor   Σ_j J_j q̇_j c,  Σ_j J_j q̇_j (t - mean of t) d
+    lag of a joint      J_j q̇_j l_j: its reports are late by l_j more than those of all joints
+    wind-up             J_j f_j w_j: friction, f with the sign of the speed, after a reversal
+                        within some travel (`friction_share`), of which two are tried
+    inertia             J_j τ_j s_j, τ the torque of the links' inertia (`moving_links`)
+    tool                - a_x m_x along each axis of the tool, a the marker's acceleration: a mode
+                        far above what the motion excites, m = 1 / (2 π f)²
+
+Sizes of real machines as Gaussian priors about 0. A lag that all joints have is one of the clock:
+the mean of the lags, each weighted with the square of the speed that its joint gives the markers,
+is 0. Offsets are then stated with what motion leaves unknown of them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from remaster_ros.calibration.estimate import Estimate, Problem, estimate
+from remaster_ros.calibration.extension import Extension, Start, Term
+from remaster_ros.calibration.path_noise import PathNoise, path_noise
+from remaster_ros.kinematics.moving_links import MovingLinks
+from remaster_ros.kinematics.serial_chain import SerialChain
+from remaster_ros.kinematics.transforms import apply
+from remaster_ros.types import FloatArray, IntArray, Measurements
+
+# Time whose frames a row is the mean of, s: a dozen of a camera of 120 Hz, within which sensor and
+# arm err alike.
+ROW_S = 0.1
+# Travels of a joint in which its friction turns round, rad: of gears, which slip at once, and of
+# seals and grease.
+TRAVELS_RAD = (1e-4, 1e-3)
+# Parts of a row in which friction is followed.
+PARTS = 8
+# Rows that are farther apart are no neighbours, s.
+LONGEST_GAP_S = 1.6 * ROW_S
+# Standard deviations of the priors. A clock is found to less than a millisecond when a recording
+# is imported; crystals differ by parts in 1e5.
+CLOCK_STD_S, DRIFT_STD = 5e-3, 1e-4
+# Reports of one controller are of times that differ by less than a few of its cycles, s.
+LAG_STD_S = 3e-3
+# Their weighted mean is 0 by definition, s.
+MEAN_LAG_STD_S = 1e-6
+# Play and wind-up of friction, some hundredths of a degree, rad.
+WINDUP_STD_RAD = 5e-4
+# Gearboxes of 3 kN m/rad and stiffer, rad/(N m).
+SOFTNESS_STD = 3e-4
+# Frames of a sensor that show correlations.
+FEWEST_FRAMES = 40
+# A tool's mode of 7 Hz and above, s².
+MODE_STD_S2 = 5e-4
+
+
+@dataclass(frozen=True, eq=False)
+class MotionColumns:
+    """Functions of a row's motion, n rows and k joints; 0 where the arm stood still."""
+
+    chain: SerialChain
+    q: FloatArray  # With zero-offsets, rad, (n, k)
+    velocity: FloatArray  # rad/s
+    acceleration: FloatArray  # rad/s²
+    seconds: FloatArray  # Times of the rows, s, (n,)
+
+    @classmethod
+    def of(cls, chain: SerialChain, m: Measurements, offsets: FloatArray) -> MotionColumns:
+        """Return those of measurements that have velocities."""
+        assert m.velocity is not None
+        assert m.acceleration is not None
+        rates = np.nan_to_num(m.velocity), np.nan_to_num(m.acceleration)
+        return cls(chain, m.q + offsets, *rates, m.stamp_s)
+
+    @cached_property
+    def links(self) -> MovingLinks:
+        """Motion of the links."""
+        return MovingLinks.of(self.chain, self.q, self.velocity, self.acceleration)
+
+    def jacobian(self, places: FloatArray) -> FloatArray:
+        """Return the derivative of markers at places of the tool by the joints, (n, 3, k)."""
+        return self.chain.position_jacobian(self.q, places)
+
+    @cached_property
+    def friction(self) -> tuple[FloatArray, FloatArray]:
+        """Share of each joint's friction, -1 to 1, if it turns round soon, and late less soon."""
+        soon, late = (
+            friction_share(self.seconds, self.q, self.velocity, self.acceleration, travel)
+            for travel in (np.outer(TRAVELS_RAD, self.chain.per_radian))
+        )
+        return soon, late - soon
+
+    @cached_property
+    def inertial_torque(self) -> FloatArray:
+        """Torque of the links' inertia about each joint, N m, (n, k)."""
+        return self.links.inertial_torque()
+
+    def swing(self, places: FloatArray) -> FloatArray:
+        """Return what a mode along each axis of the tool displaces, m per s², (n, 3, 3).
+
+        ``places``: of the markers in the tool frame, m, (n, 3).
+        """
+        tool = self.links.frames[:, -1] @ self.chain.T_fixed[-1]
+        moved = self.links.point_acceleration(apply(tool, places))
+        along = np.einsum('nia,ni->na', tool[:, :3, :3], moved)
+        return np.asarray(-tool[:, :3, :3] * along[:, None, :])
+
+
+def friction_share(
+    seconds: FloatArray,
+    q: FloatArray,
+    velocity: FloatArray,
+    acceleration: FloatArray,
+    travel: FloatArray,
+) -> FloatArray:
+    """Return the share of its full torque that friction has, the mean over each row, (n, k).
+
+    Friction that slips turns round within a travel, (k,), of the joint after each reversal: of
+    Dahl's model (1968, Aerospace Corp. TOR-0158) the share approaches the sign of the speed
+    exponentially. It is followed along rows that are neighbours in time, and begins at that sign.
+    """
+    moments, first, which = np.unique(seconds, return_index=True, return_inverse=True)
+    q, velocity, acceleration = q[first], velocity[first], acceleration[first]
+    gap = np.diff(moments, prepend=-np.inf)
+    # Times within a row; its speed changes steadily.
+    part = ROW_S * ((np.arange(PARTS) + 0.5) / PARTS - 0.5)
+    shares = np.zeros_like(q)
+    share, last = np.sign(velocity[0]), q[0]
+    for i in range(len(moments)):
+        if gap[i] > LONGEST_GAP_S:
+            share = np.sign(velocity[i] + acceleration[i] * part[0])
+            last = q[i] + velocity[i] * part[0]
+        total = np.zeros_like(share)
+        path = q[i] + np.outer(part, velocity[i]) + 0.5 * np.outer(part**2, acceleration[i])
+        for place in path:
+            step = place - last
+            side = np.sign(step)
+            share = side + (share - side) * np.exp(-np.abs(step) / travel)
+            total += share
+            last = place
+        shares[i] = total / PARTS
+    shares[~np.any(velocity != 0.0, axis=1)] = 0.0
+    return shares[which.reshape(-1)]
+
+
+def dynamic_extension(
+    chain: SerialChain, m: Measurements, sensor_names: tuple[str, ...], markers: FloatArray
+) -> Extension:
+    """Return the parameters of motion for all rows of the measurements.
+
+    ``markers``: nominal places in the tool frame, m, (markers, 3).
+    """
+    k = len(chain)
+    columns = MotionColumns.of(chain, m, np.zeros(k))
+    names: list[str] = []
+    units: list[str] = []
+    std: list[float] = []
+    terms: list[Term] = []
+
+    def named(name: str, unit: str, size: float) -> slice:
+        names.append(name)
+        units.append(unit)
+        std.append(size)
+        return slice(len(names) - 1, len(names))
+
+    seconds = m.stamp_s - m.stamp_s.mean()
+    for sensor, name in enumerate(sensor_names):
+        mine: IntArray = (m.sensor == sensor).astype(np.int64)
+        for what, unit, size, factor in (
+            ('clock', 's', CLOCK_STD_S, mine),
+            ('clock_drift', 's/s', DRIFT_STD, mine * seconds),
+        ):
+            where = named(f'{what}_{name}', unit, size)
+            terms += [
+                Term(where, joint, (columns.velocity[:, joint] * factor)[:, None])
+                for joint in range(k)
+            ]
+    lags = []
+    for joint in range(k):
+        per = float(chain.per_radian[joint])
+        own = chain.units[joint]
+        lags.append(len(names))
+        terms.append(
+            Term(
+                named(f'lag_{joint + 1}', 's', LAG_STD_S),
+                joint,
+                columns.velocity[:, joint, None],
+            )
+        )
+        for name, friction in zip(('windup', 'late_windup'), columns.friction, strict=True):
+            where = named(f'{name}_{joint + 1}', own, WINDUP_STD_RAD * per)
+            terms.append(Term(where, joint, friction[:, joint, None]))
+        if chain.has_inertials:
+            where = named(
+                f'inertia_{joint + 1}',
+                f'{own}/{chain.torque_units[joint]}',
+                SOFTNESS_STD * per**2,
+            )
+            terms.append(Term(where, joint, columns.inertial_torque[:, joint, None]))
+    swing = columns.swing(markers[m.marker])
+    for axis, letter in enumerate('xyz'):
+        where = named(f'tool_mode_{letter}', 's²', MODE_STD_S2)
+        terms.append(Term(where, None, swing[:, :, axis, None]))
+    precision = np.diag(np.array(std) ** -2.0)
+    power = np.mean(
+        (columns.jacobian(markers[m.marker]) * columns.velocity[:, None, :]) ** 2, (0, 1)
+    )
+    weight = power / power.sum()
+    precision[np.ix_(lags, lags)] += np.outer(weight, weight) / MEAN_LAG_STD_S**2
+    return Extension(
+        tuple(names),
+        tuple(units),
+        tuple(terms),
+        np.zeros((len(m), 3)),
+        np.zeros(len(names)),
+        precision,
+        of_motion=True,
+    )
+
+
+def estimate_moving(problem: Problem) -> Estimate:
+    """Find the mode with the parameters of motion, under noise that is correlated along the path.
+
+    Errors as of `estimate`.
+    """
+    extension = dynamic_extension(
+        problem.chain, problem.measurements, problem.sensor_names, problem.markers
+    )
+    found = estimate(problem, extension)
+    noise = noise_along_path(found)
+    if noise is None:
+        return found
+    model, x = found.model, found.model.natural(found.mode.z)
+    gross = np.array([row for row, _ in found.left_out], dtype=np.int64)
+    start = Start(model.offsets(x), model.T_R_N(x), model.markers(x), gross)
+    return estimate(replace(problem, path_noise=noise), replace(extension, start=start))
+
+
+def noise_along_path(found: Estimate) -> PathNoise | None:
+    """Return the correlations of a fit's errors along the path; None of too few frames."""
+    posterior, model, mode = found.posterior, found.model, found.mode
+    rows, free = posterior.rows.of_points, posterior.free
+    errors = rows.target - model.predict(mode.z, rows)
+    columns = model.jacobian(mode.z, rows)[:, :, free]
+    prior = mode.linearisation.prior[: len(free), : len(free)]
+    noise: PathNoise | None = None
+    for sensor, span in rows.spans:
+        first, last = np.searchsorted(rows.frame_start, (span.start, span.stop)).tolist()
+        if last - first < FEWEST_FRAMES:
+            continue
+        frame = np.repeat(np.arange(last - first), rows.frame_size[first:last])
+        variance = float(np.mean(errors[span] ** 2) * np.mean(rows.frame_size[first:last]))
+        noise = path_noise(
+            found.problem.chain,
+            found.problem.measurements,
+            sensor,
+            (rows.source[span], frame, rows.marker[span]),
+            errors[span],
+            columns[span],
+            prior * variance,
+            noise,
+            len(model.sensor_names),
+        )
+    return noise
+
+
+def moving_words(found: Estimate) -> str:
+    """Return the errors that are left, and what is found of the clocks, a sentence."""
+    posterior = found.posterior
+    errors = posterior.rows.target - found.model.predict(found.mode.z, posterior.rows)
+    length = 1e3 * float(np.median(np.linalg.norm(errors[: posterior.rows.points], axis=1)))
+    clocks = [
+        f'the stamps of {name} are {late_words(*late)}' for name, late in clocks_of(found).items()
+    ]
+    return f'the moving robot fits to {length:.2f} mm (median); {"; ".join(clocks)}'
+
+
+def clocks_of(found: Estimate) -> dict[str, tuple[float, float]]:
+    """Return how late the stamps of each sensor are beside the joints', and its std, s."""
+    extension, model = found.model.extension, found.model
+    assert extension is not None
+    theta, free = model.theta(found.mode.z), found.posterior.free
+    variance = dict(zip(free.tolist(), np.diag(found.mode.covariance), strict=False))
+    clocks = {}
+    for name in model.sensor_names:
+        index = extension.names.index(f'clock_{name}')
+        taken = found.problem.session.clock_offset_s.get(name, 0.0)
+        std = float(np.sqrt(variance.get(model.core + index, 0.0)))
+        clocks[name] = (-(taken + float(theta[index])), std)
+    return clocks
+
+
+def late_words(late_s: float, std_s: float) -> str:
+    """Return how late stamps are with the standard deviation, as text."""
+    what = 'late' if late_s >= 0.0 else 'early'
+    return f'{1e3 * abs(late_s):.2f} ± {1e3 * std_s:.2f} ms {what}'

@@ -1,0 +1,319 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Errors along a path: a Gaussian process over the tool's pose, common to a sensor's markers.
+
+What a sensor errs by at one place it errs by a tenth of a second later, too, and when the arm
+comes by again. The errors of frames a and b of a sensor are correlated by::
+
+    (1 - s) [a = b] + s M(d),    d² = |p_a - p_b|² / l_m² + angle(a, b)² / l_rad²
+
+with M of Matérn's family, of order 1/2, 3/2, 5/2 or without end (Stein 1999, Interpolation of
+Spatial Data), p and angle of the nominal tool. The order, the share s of the process and its two
+lengths maximise the restricted likelihood (REML, Patterson and Thompson 1971, Biometrika 58) of
+the frames' means about a fit; the deviations of single markers from them have a share and lengths
+of their own, in the same proportion.
+
+The rows are then decorrelated: the means of the frames, and the deviations of each marker, are
+multiplied by the inverse of the Cholesky factor of these correlations. All else of the noise is as
+in `noise`, on rows that are independent. That the lengths and shares are estimated is not counted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+import scipy
+from scipy.linalg import cho_factor, solve_triangular
+
+from remaster_ros.kinematics.serial_chain import SerialChain
+from remaster_ros.types import FloatArray, IntArray, Measurements
+
+# Lengths at which the search begins, and how far it goes.
+START_M, START_RAD = 0.1, 0.5
+RANGE_M, RANGE_RAD = (0.01, 1.0), (0.05, 5.0)
+# Standard deviation of their logarithms about it, of a weak prior.
+LOG_LENGTH_STD = 1.0
+# Orders of Matérn's family; without end it is the squared exponential.
+ORDERS = (0.5, 1.5, 2.5, np.inf)
+# Of the share of the process.
+RANGE_SHARE = (1e-3, 0.9995)
+# Frames of a run: a matrix of so many is factored in a tenth of a second. Runs count as
+# independent.
+MOST_FRAMES = 1_200
+
+
+@dataclass(frozen=True, eq=False)
+class PathNoise:
+    """Correlations of all rows of a session."""
+
+    # Nominal tool, of every row: position, m, (n, 3), and turn, a matrix, (n, 9)
+    position: FloatArray
+    turn: FloatArray
+    # Of each sensor, (sensors,)
+    share: FloatArray  # Of the process in the errors of the frames' means
+    marker_share: FloatArray  # In the deviations of markers from them
+    length_m: FloatArray
+    length_rad: FloatArray
+    marker_scale: FloatArray  # How many times these lengths are those of the deviations
+    order: IntArray  # Of Matérn's family, an index into `ORDERS`
+
+    def of_frames(self, sensor: int, rows: IntArray) -> FloatArray:
+        """Return the correlations of frames, each by one of its rows, (f, f)."""
+        return self._correlations(sensor, rows, float(self.share[sensor]), 1.0)
+
+    def of_markers(self, sensor: int, rows: IntArray) -> FloatArray:
+        """Return those of the deviations of one marker in some rows, (r, r)."""
+        share, scale = float(self.marker_share[sensor]), float(self.marker_scale[sensor])
+        return self._correlations(sensor, rows, share, scale)
+
+    def _correlations(self, sensor: int, rows: IntArray, share: float, scale: float) -> FloatArray:
+        lengths = float(self.length_m[sensor]), float(self.length_rad[sensor])
+        d = _distance(self.position[rows], self.turn[rows], *lengths)
+        return _correlations(d / scale, share, int(self.order[sensor]))
+
+
+@dataclass(frozen=True, eq=False)
+class Decorrelation:
+    """Triangular matrices that decorrelate the rows of one sensor, run by run.
+
+    ``frames``: frames of each run, ``means``: its matrix (f, f); ``markers``: rows and matrix of
+    each marker's deviations in the run.
+    """
+
+    runs: tuple[tuple[slice, FloatArray, tuple[tuple[IntArray, FloatArray], ...]], ...]
+
+    @classmethod
+    def of(
+        cls,
+        noise: PathNoise,
+        sensor: int,
+        source: IntArray,
+        marker: IntArray,
+        frame_start: IntArray,
+        frame_size: IntArray,
+        frames: slice,
+    ) -> Decorrelation:
+        """Factor the correlations of a sensor's frames.
+
+        ``source``, ``marker``: of all rows, (n,); ``frame_start``, ``frame_size``: of all frames;
+        ``frames``: those of the sensor.
+        """
+        runs = []
+        parts = -(-(frames.stop - frames.start) // MOST_FRAMES)
+        for part in np.array_split(np.arange(frames.start, frames.stop), parts):
+            first, last = int(part[0]), int(part[-1]) + 1
+            at = source[frame_start[first:last]]
+            means = _inverse_factor(noise.of_frames(sensor, at))
+            stop = int(frame_start[last - 1] + frame_size[last - 1])
+            rows = np.arange(int(frame_start[first]), stop)
+            own = []
+            if noise.marker_share[sensor] > RANGE_SHARE[0]:
+                for one in np.unique(marker[rows]):
+                    mine = rows[marker[rows] == one]
+                    own.append((mine, _inverse_factor(noise.of_markers(sensor, source[mine]))))
+            runs.append((slice(first, last), means, tuple(own)))
+        return cls(tuple(runs))
+
+
+def path_noise(
+    chain: SerialChain,
+    m: Measurements,
+    sensor: int,
+    rows: tuple[IntArray, IntArray, IntArray],
+    errors: FloatArray,
+    columns: FloatArray,
+    prior: FloatArray,
+    before: PathNoise | None,
+    sensors: int,
+) -> PathNoise:
+    """Return the noise with that of one sensor estimated from a fit.
+
+    Parameters
+    ----------
+    chain, m
+        The nominal arm, and all rows of the session.
+    sensor, sensors
+        Which of how many.
+    rows
+        Of the sensor, sorted by frames: index in the measurements, (n,), number of the frame from
+        0 on, (n,), marker, (n,).
+    errors, columns
+        Of these rows, m, (n, 3), and the derivative by the fit's parameters, (n, 3, p).
+    prior
+        Precision of these times the variance of a frame's mean, (p, p).
+    before
+        With the sensors before.
+    """
+    source, frame, marker = rows
+    if before is None:
+        T = chain.forward(m.q)
+        unit = np.zeros(sensors)
+        before = PathNoise(
+            T[:, :3, 3],
+            T[:, :3, :3].reshape(-1, 9),
+            unit.copy(),
+            unit.copy(),
+            unit + START_M,
+            unit + START_RAD,
+            unit + 1.0,
+            unit.astype(np.int64),
+        )
+    size = np.bincount(frame)
+    first = np.flatnonzero(np.diff(frame, prepend=-1))
+    weight = np.sqrt(size)[:, None]
+    mean = np.add.reduceat(errors, first, axis=0) / size[:, None]
+    left = np.concatenate((columns, errors[..., None]), axis=2)
+    joined = np.add.reduceat(left, first, axis=0) / weight[..., None]
+    # Long recordings: the lengths of a part of them are those of all.
+    some = slice(0, MOST_FRAMES)
+    joined, at = joined[some], source[first][some]
+    position, turn = before.position[at], before.turn[at]
+    f, p = len(joined), prior.shape[0]
+    flat = joined.reshape(f, -1)
+
+    def cost(logs: FloatArray, order: int) -> float:
+        """Return minus the log restricted likelihood, the variance profiled out."""
+        share, length_m, length_rad = _natural(logs)
+        d = _distance(position, turn, length_m, length_rad)
+        factor = np.linalg.cholesky(_correlations(d, share, order))
+        white = solve_triangular(factor, flat, lower=True, check_finite=False)
+        white = white.reshape(f * 3, p + 1)
+        gram = white.T @ white
+        inner = gram[:p, :p] + prior
+        unit = 1.0 / np.sqrt(np.maximum(np.diag(inner), np.finfo(float).tiny))
+        root = cho_factor(inner * np.outer(unit, unit) + 1e-10 * np.eye(p), lower=True)
+        pull = solve_triangular(root[0], unit * gram[:p, p], lower=True)
+        rest = max(float(gram[p, p] - pull @ pull), 1e-300)
+        logdet = 3.0 * np.sum(np.log(np.diag(factor)))
+        logdet += np.sum(np.log(np.diag(root[0])) - np.log(unit))
+        # A weak prior on the lengths: a path may not show them.
+        weak = 0.5 * (logs[1] ** 2 + logs[2] ** 2) / LOG_LENGTH_STD**2
+        return float(logdet + 0.5 * (3 * f - p) * np.log(rest) + weak)
+
+    start = np.array([4.0, 0.0, 0.0])
+    tries = [
+        (*_minimised(partial(cost, order=order), start), order) for order in range(len(ORDERS))
+    ]
+    _, best, order = min(tries, key=lambda one: one[0])
+    share, length_m, length_rad = _natural(best)
+    own, scale = _of_markers(
+        errors - mean[frame],
+        frame,
+        marker,
+        f,
+        _distance(position, turn, length_m, length_rad),
+        order,
+    )
+    values = {
+        'share': share,
+        'marker_share': own,
+        'length_m': length_m,
+        'length_rad': length_rad,
+        'marker_scale': scale,
+        'order': order,
+    }
+    arrays = {name: getattr(before, name).copy() for name in values}
+    for name, value in values.items():
+        arrays[name][sensor] = value
+    return PathNoise(before.position, before.turn, **arrays)
+
+
+def _minimised(cost: Callable[[FloatArray], float], start: FloatArray) -> tuple[float, FloatArray]:
+    """Return the least cost near a start, and where it is."""
+    simplex = start + np.concatenate((np.zeros((1, len(start))), 0.7 * np.eye(len(start))))
+    found = scipy.optimize.minimize(
+        cost,
+        start,
+        method='Nelder-Mead',
+        options={'xatol': 0.1, 'fatol': 0.1, 'maxfev': 60, 'initial_simplex': simplex},
+    )
+    return float(found.fun), np.asarray(found.x)
+
+
+def _natural(logs: FloatArray) -> tuple[float, float, float]:
+    share = float(np.clip(1.0 / (1.0 + np.exp(-logs[0])), *RANGE_SHARE))
+    length_m = float(np.clip(START_M * np.exp(logs[1]), *RANGE_M))
+    length_rad = float(np.clip(START_RAD * np.exp(logs[2]), *RANGE_RAD))
+    return share, length_m, length_rad
+
+
+def _of_markers(
+    apart: FloatArray,
+    frame: IntArray,
+    marker: IntArray,
+    frames: int,
+    distance: FloatArray,
+    order: int,
+) -> tuple[float, float]:
+    """Return share and scale of the process in the deviations of single markers, by likelihood.
+
+    ``apart``: m, (n, 3), of the rows of the first ``frames`` frames and others; ``distance``:
+    between these frames, (f, f).
+    """
+    series: dict[bytes, tuple[IntArray, list[FloatArray]]] = {}
+    for one in np.unique(marker):
+        mine = (marker == one) & (frame < frames)
+        if mine.sum() > frames // 2:
+            at = frame[mine]
+            series.setdefault(at.tobytes(), (at, []))[1].append(apart[mine])
+    if len(np.unique(marker)) < 2 or not series:
+        return 0.0, 1.0
+
+    def cost(logs: FloatArray) -> float:
+        share, scale = _natural_of_markers(logs)
+        squares = logdet = count = 0.0
+        whole = _correlations(distance / scale, share, order)
+        for at, several in series.values():
+            values = np.concatenate(several, axis=1)
+            factor = np.linalg.cholesky(whole[np.ix_(at, at)])
+            white = solve_triangular(factor, values, lower=True, check_finite=False)
+            squares += float(np.sum(white**2))
+            logdet += values.shape[1] * float(np.sum(np.log(np.diag(factor))))
+            count += values.size
+        weak = 0.5 * (logs[1] / LOG_LENGTH_STD) ** 2
+        return logdet + 0.5 * count * float(np.log(max(squares, 1e-300))) + weak
+
+    # A process at the edge of what is seen is begun from either side.
+    tries = [_minimised(cost, np.array([logit, 0.0])) for logit in (-4.0, 1.0)]
+    return _natural_of_markers(min(tries, key=lambda one: one[0])[1])
+
+
+def _natural_of_markers(logs: FloatArray) -> tuple[float, float]:
+    share = float(np.clip(1.0 / (1.0 + np.exp(-logs[0])), *RANGE_SHARE))
+    return share, float(np.clip(np.exp(logs[1]), 0.1, 10.0))
+
+
+def _distance(
+    position: FloatArray, turn: FloatArray, length_m: float, length_rad: float
+) -> FloatArray:
+    """Return the distances of poses in lengths of the process, (f, f)."""
+    # A rotation by a small angle moves the columns of its matrix by sqrt(2) times it in all.
+    place = np.concatenate((position / length_m, turn / (np.sqrt(2.0) * length_rad)), axis=1)
+    square = np.sum(place**2, axis=1)
+    apart = square[:, None] + square - 2.0 * place @ place.T
+    return np.sqrt(np.maximum(apart, 0.0))
+
+
+def _correlations(distance: FloatArray, share: float, order: int) -> FloatArray:
+    """Return correlations by distances in lengths of the process, (f, f)."""
+    d = np.sqrt(2.0 * min(ORDERS[order], 2.5)) * distance
+    if ORDERS[order] == np.inf:
+        process = np.exp(-0.5 * distance**2)
+    elif ORDERS[order] == 0.5:
+        process = np.exp(-d)
+    elif ORDERS[order] == 1.5:
+        process = (1.0 + d) * np.exp(-d)
+    else:
+        process = (1.0 + d + d**2 / 3.0) * np.exp(-d)
+    result = share * process
+    result[np.diag_indices(len(result))] = 1.0
+    return np.asarray(result)
+
+
+def _inverse_factor(correlations: FloatArray) -> FloatArray:
+    factor = np.linalg.cholesky(correlations)
+    return np.asarray(
+        solve_triangular(factor, np.eye(len(factor)), lower=True, check_finite=False)
+    )

@@ -1,0 +1,136 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Joint positions, velocities and accelerations at any time, from a stream of joint states.
+
+Smoothing splines (cubic: Reinsch 1967, Numer. Math. 10) of each stretch without a gap, as smooth
+as leaves residuals of the size of the reports' noise: of encoders, their resolution, and stamps.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.interpolate import BSpline, make_smoothing_spline
+
+from remaster_ros.errors import InputError
+from remaster_ros.importing.standstills import Stream
+from remaster_ros.types import BoolArray, FloatArray
+
+# Joint states at a lower rate do not tell accelerations: an arm changes its speed within 0.1 s.
+LEAST_RATE_HZ = 40.0
+# Reports that are farther apart are of two stretches, s; or so many usual steps.
+LONGEST_GAP_S, LONGEST_GAP_STEPS = 0.1, 5.0
+# Shorter stretches tell no acceleration, s.
+SHORTEST_S = 0.5
+# Of a spline by a smoothing time h its equivalent kernel (Silverman 1984, Ann. Stat. 12) averages
+# over some 3 h. An arm's speed changes more slowly than this, s.
+LONGEST_SMOOTHING_S = 0.04
+# Smoothing times that are tried, in proportion.
+SMOOTHING_STEP = 1.4
+# Reports by which the smoothing is chosen.
+MOST_TRIED = 3_000
+# Scores of smoothing times that count as alike, in proportion.
+ALIKE = 1.03
+
+
+@dataclass(frozen=True, eq=False)
+class JointMotion:
+    """Splines of k joints in stretches of time, in order."""
+
+    begin: FloatArray  # Of each stretch, s, (stretches,)
+    end: FloatArray
+    splines: tuple[tuple[BSpline, ...], ...]  # Of each stretch, one for each joint
+    noise: FloatArray  # Standard deviation of a report about its spline, rad, (k,)
+    rate_hz: float  # Of the reports, the median
+
+    @classmethod
+    def of(cls, joints: Stream, where: str) -> JointMotion:
+        """Fit splines to joint states, rad; `where` is for messages.
+
+        Raises InputError if the reports are too rare, or never last long enough.
+        """
+        stamps, values = _increasing(joints)
+        if len(stamps) < 2:
+            raise InputError(f'{where}: no joint states with times that increase')
+        step = float(np.median(np.diff(stamps)))
+        if step * LEAST_RATE_HZ > 1.0:
+            raise InputError(
+                f'{where}: joint states at {1.0 / step:.0f} Hz; at least {LEAST_RATE_HZ:.0f} Hz '
+                'are needed to measure while the arm moves: have the controller report more '
+                'often, or import the standstills, without --moving'
+            )
+        gap = max(LONGEST_GAP_S, LONGEST_GAP_STEPS * step)
+        edges = np.flatnonzero(np.diff(stamps) > gap) + 1
+        stretches = [
+            part
+            for part in np.split(np.arange(len(stamps)), edges)
+            if stamps[part[-1]] - stamps[part[0]] >= SHORTEST_S
+        ]
+        if not stretches:
+            raise InputError(
+                f'{where}: the joint states are interrupted every {SHORTEST_S:g} s or sooner'
+            )
+        chosen = [_smoothing(stamps, column, step) for column in values.T]
+        splines = tuple(
+            tuple(
+                make_smoothing_spline(stamps[part], column[part], lam=time_s**4 / step)
+                for column, (time_s, _) in zip(values.T, chosen, strict=True)
+            )
+            for part in stretches
+        )
+        return cls(
+            np.array([stamps[part[0]] for part in stretches]),
+            np.array([stamps[part[-1]] for part in stretches]),
+            splines,
+            np.array([noise for _, noise in chosen]),
+            1.0 / step,
+        )
+
+    def stretch(self, times: FloatArray) -> FloatArray:
+        """Return the stretch that each time is in, (n,); -1 for none."""
+        index = np.searchsorted(self.begin, times, side='right') - 1
+        inside = (index >= 0) & (times <= self.end[np.maximum(index, 0)])
+        return np.where(inside, index, -1)
+
+    def at(self, times: FloatArray, derivative: int = 0) -> FloatArray:
+        """Return joint positions, or their derivatives by time, (n, k); NaN outside."""
+        stretch = self.stretch(times)
+        result = np.full((len(times), len(self.noise)), np.nan)
+        for index, splines in enumerate(self.splines):
+            mine = stretch == index
+            if mine.any():
+                result[mine] = np.stack([s(times[mine], derivative) for s in splines], axis=1)
+        return result
+
+
+def _increasing(joints: Stream) -> tuple[FloatArray, FloatArray]:
+    """Return the reports whose stamps increase: the first of equal ones."""
+    kept: BoolArray = np.diff(joints.stamps, prepend=-np.inf) > 1e-6
+    return joints.stamps[kept], joints.values[kept]
+
+
+def _smoothing(stamps: FloatArray, values: FloatArray, step: float) -> tuple[float, float]:
+    """Return the smoothing time of a joint, s, and the standard deviation of its reports, rad.
+
+    The longest one whose residuals are as small as of any, once what a report moves its own spline
+    by is taken off (generalised cross-validation, Craven & Wahba 1979, Numer. Math. 31): the rest
+    is noise. By the part of the record in which the joint moves most.
+    """
+    moved = np.abs(np.diff(values, prepend=values[0]))
+    middle = int(np.argmax(np.convolve(moved, np.ones(min(MOST_TRIED, len(moved))), 'same')))
+    first = max(0, min(middle - MOST_TRIED // 2, len(values) - MOST_TRIED))
+    times, places = stamps[first : first + MOST_TRIED], values[first : first + MOST_TRIED]
+    tried = []
+    time_s = 0.5 * step
+    while time_s <= LONGEST_SMOOTHING_S:
+        spline = make_smoothing_spline(times, places, lam=time_s**4 / step)
+        # The middle of the equivalent kernel, times the step.
+        own = min(0.9, step / (2.0 * np.sqrt(2.0) * time_s))
+        square = float(np.mean((places - spline(times))[10:-10] ** 2))
+        tried.append((square / (1.0 - own) ** 2, time_s, np.sqrt(square / (1.0 - own))))
+        time_s *= SMOOTHING_STEP
+    least = min(score for score, _, _ in tried)
+    _, time_s, noise = max(
+        (one for one in tried if one[0] <= ALIKE * max(least, 1e-20)), key=lambda one: one[1]
+    )
+    return time_s, float(noise)

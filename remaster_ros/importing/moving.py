@@ -1,0 +1,542 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A session of an arm that moved while it was measured: rows of 0.1 s, in segments of 0.5 s.
+
+A row is a configuration on the path: joint positions, velocities and accelerations at the middle
+of its frames, by splines of the joint states, and where the marker was then: the mean of what the
+frames are off the robot's own prediction for each of their times, which the bend of the path
+within the row does not move. A segment stands where other sessions have a pose: its rows share an
+error of the sensor and of the arm.
+
+*Clocks.* The marker's stamps and those of the joint states are of two computers, tens of
+milliseconds apart. In that time an arm moves by a centimetre, which no tangent follows: the offset
+is found here, by Gauss-Newton steps of robust fits with the offset as one more parameter, from
+where the speeds of marker and tool are most alike; what it is off by is an effect of `discover`
+and a parameter of `fit` like others.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from remaster_ros.calibration.dynamics import ROW_S
+from remaster_ros.calibration.estimate import Problem
+from remaster_ros.calibration.gauge_words import counted
+from remaster_ros.calibration.grouped_rows import Rows
+from remaster_ros.calibration.initial_guess import CAUCHY_WIDTH, closest_start, robust_spread
+from remaster_ros.calibration.mistakes import UNKNOWN_MARKER_STD_M
+from remaster_ros.calibration.priors import prior_rows
+from remaster_ros.errors import InputError
+from remaster_ros.importing.joint_motion import JointMotion
+from remaster_ros.importing.standstills import Stream
+from remaster_ros.kinematics.serial_chain import SerialChain
+from remaster_ros.kinematics.transforms import apply, inverse
+from remaster_ros.types import (
+    AccuracyOption,
+    BoolArray,
+    FloatArray,
+    IntArray,
+    Measurements,
+    Session,
+)
+
+BLOCK_S = ROW_S
+# Rows of a segment: an arm at 0.25 m/s goes on by 0.1 m in 0.5 s, the reach of errors that depend
+# on where it is.
+SEGMENT_ROWS = 5
+# A sensor with fewer frames in a second measures single points.
+LEAST_FRAMES_HZ = 10.0
+# A row with fewer frames than this share of the usual number is left out.
+LEAST_FRAMES = 0.5
+# An arm whose joints are all slower than this stands still, rad/s.
+STILL_RAD_S = 0.02
+# Fewer rows of a sensor are no motion to measure by: 6 s.
+FEWEST_ROWS = 60
+# Offsets of the clocks that are looked at by the speeds, s; steps and smoothing of these, s.
+FARTHEST_CLOCK_S, SPEED_STEP_S, SPEED_SMOOTHING_S = 3.0, 0.005, 0.05
+# Correlation of the speeds of marker and tool below which these tell nothing of the clocks.
+LEAST_ALIKE = 0.5
+# The offset of the clocks is found when steps are shorter, s.
+CLOCK_SETTLED_S = 2e-5
+MOST_CLOCK_STEPS = 12
+# A longer step may lead to where the tangent no longer holds, s.
+LONGEST_CLOCK_STEP_S = 0.05
+# Rows of a robust fit that looks for the clocks.
+MOST_FITTED = 1_500
+# A frame so many robust standard deviations off the others of its row is of another marker.
+GROSS = 8.0
+
+
+@dataclass(frozen=True, eq=False)
+class MarkerStream:
+    """Positions of one marker by one sensor, m, in the sensor's frame and by its stamps."""
+
+    sensor: str
+    marker: str
+    stream: Stream
+
+
+@dataclass(frozen=True)
+class MovingOptions:
+    """What is said of the session."""
+
+    # Marker -> nominal position in the tool frame, m; others are unknown
+    places: Mapping[str, FloatArray] = field(default_factory=dict)
+    marker_std_m: float | None = None  # None: 0.5 mm if all positions are known, else 0.3 m
+    # Added to the stamps of all sensors to have those of the joint states, s; None to find it
+    clock_offset_s: float | None = None
+    hold_out: float = 0.25  # Share of the segments
+    notes: str = ''
+    accuracy_option: AccuracyOption = ''
+
+
+class _Guess(NamedTuple):
+    """A robust fit: where the sensors should see the markers."""
+
+    joint_offsets: FloatArray  # rad, (k,)
+    markers: FloatArray  # In T, m, (markers, 3)
+    T_N_R: FloatArray  # (sensors, 4, 4)
+
+
+@dataclass(frozen=True, eq=False)
+class _Frames:
+    """Frames of one sensor: f stamps, m markers."""
+
+    stamps: FloatArray  # s, rising, (f,)
+    positions: FloatArray  # m, NaN of a marker that was not seen, (f, m, 3)
+    markers: IntArray  # Indices of the m markers
+
+    @classmethod
+    def of(cls, streams: Sequence[MarkerStream], markers: Sequence[str]) -> _Frames:
+        """Join the streams of a sensor by their stamps."""
+        stamps = np.unique(np.concatenate([one.stream.stamps for one in streams]))
+        positions = np.full((len(stamps), len(streams), 3), np.nan)
+        for index, one in enumerate(streams):
+            positions[np.searchsorted(stamps, one.stream.stamps), index] = one.stream.values
+        return cls(stamps, positions, np.array([markers.index(one.marker) for one in streams]))
+
+
+@dataclass(frozen=True, eq=False)
+class _Block:
+    """Rows of one sensor, a block of time each: b blocks, m markers."""
+
+    number: IntArray  # Of the block in the whole record, rising, (b,)
+    times: FloatArray  # By the joints' clock, s, (b,)
+    q: FloatArray  # And its derivatives at those times, (b, k)
+    velocity: FloatArray
+    acceleration: FloatArray
+    position: FloatArray  # NaN where too few frames saw the marker, (b, m, 3)
+    std: FloatArray
+    samples: IntArray  # (b, m)
+
+
+class _Recording:
+    """Joint motion and frames, from which rows are made for any offset of the clocks."""
+
+    def __init__(
+        self,
+        where: str,
+        motion: JointMotion,
+        frames: Mapping[str, _Frames],
+        markers: Sequence[str],
+        chain: SerialChain,
+        urdf: str,
+        options: MovingOptions,
+    ) -> None:
+        self.where, self.motion, self.frames = where, motion, frames
+        self.markers, self.chain, self.urdf, self.options = markers, chain, urdf, options
+        self.dropped = 0
+
+    def blocks(self, sensor: int, clock_s: float, guess: _Guess | None) -> _Block:
+        """Return the rows of a sensor whose stamps are moved by an offset."""
+        frames, motion = self.frames[list(self.frames)[sensor]], self.motion
+        times = frames.stamps + clock_s
+        inside = motion.stretch(times) >= 0
+        times, positions = times[inside], frames.positions[inside]
+        number = np.floor((times - motion.begin[0]) / BLOCK_S).astype(np.int64)
+        # A block that has the end of a stretch in it is two.
+        new = (np.diff(number) != 0) | (np.diff(motion.stretch(times)) != 0)
+        first = np.concatenate(([0], np.flatnonzero(new) + 1)) if len(times) else np.zeros(0, int)
+        count = np.diff(np.append(first, len(times)))
+        usual = BLOCK_S / np.median(np.diff(frames.stamps))
+        middle = np.add.reduceat(times, first) / count if len(times) else times
+        velocity = motion.at(middle, 1)
+        kept = (count >= LEAST_FRAMES * usual) & (np.abs(velocity).max(axis=1) > STILL_RAD_S)
+        block = np.repeat(np.arange(len(first)), count)
+        used = kept[block]
+        block = (np.cumsum(kept) - 1)[block[used]]
+        times, positions = times[used], positions[used]
+        middle, velocity = middle[kept], velocity[kept]
+        q = motion.at(middle)
+        at_frames = np.zeros_like(positions)
+        at_middle = np.zeros((len(middle), positions.shape[1], 3))
+        if guess is not None:
+            at_frames = self._seen(motion.at(times), frames.markers, sensor, guess)
+            at_middle = self._seen(q, frames.markers, sensor, guess)
+        left = positions - at_frames
+        mean, std, samples = _means(left, block, len(middle))
+        if guess is not None:
+            length = np.linalg.norm(left - mean[block], axis=2)
+            far = length > GROSS * max(float(np.nanmedian(length)), 1e-6)
+            self.dropped += int(np.sum(far))
+            mean, std, samples = _means(np.where(far[..., None], np.nan, left), block, len(middle))
+        few = samples < max(1.0, LEAST_FRAMES * usual)
+        mean[few], std[few] = np.nan, np.nan
+        return _Block(
+            number[first[kept]],
+            middle,
+            q,
+            velocity,
+            motion.at(middle, 2),
+            at_middle + mean,
+            std,
+            samples,
+        )
+
+    def _seen(self, q: FloatArray, markers: IntArray, sensor: int, guess: _Guess) -> FloatArray:
+        """Return where a sensor should see markers, m, (n, m, 3)."""
+        points = self.chain.positions(
+            q[:, None, :], guess.markers[markers], guess.joint_offsets[None, None, :]
+        )
+        return apply(guess.T_N_R[sensor], points)
+
+    def session(
+        self, clocks_s: FloatArray, guess: _Guess | None, rng: np.random.Generator | None = None
+    ) -> Session:
+        """Return the session with the sensors' stamps moved by offsets, (sensors,).
+
+        With a generator some segments are held out.
+        """
+        self.dropped = 0
+        names = list(self.frames)
+        blocks = [self.blocks(i, float(clock), guess) for i, clock in enumerate(clocks_s)]
+        number = np.unique(np.concatenate([one.number for one in blocks]))
+        segment = _segments(number)
+        parts, configurations = [], 0
+        for sensor, (name, one) in enumerate(zip(names, blocks, strict=True)):
+            rows, columns = np.nonzero(np.isfinite(one.position[..., 0]))
+            if len(np.unique(rows)) < FEWEST_ROWS:
+                raise InputError(
+                    f'{self.where}: {name} saw the arm move for '
+                    f'{BLOCK_S * len(np.unique(rows)):.1f} s; at least '
+                    f'{BLOCK_S * FEWEST_ROWS:.0f} s are needed, and some 30 for good '
+                    'zero-offsets; are the clocks of both the same (--clock-offset)?'
+                )
+            n, k = len(rows), len(self.chain)
+            parts.append(
+                Measurements(
+                    observation=np.zeros(n, np.int64),
+                    pose=segment[np.searchsorted(number, one.number)][rows],
+                    configuration=configurations + rows,
+                    is_validation=np.zeros(n, bool),
+                    stamp_s=one.times[rows],
+                    sensor=np.full(n, sensor),
+                    marker=self.frames[name].markers[columns],
+                    q=one.q[rows],
+                    from_q=np.full((n, k), np.nan),
+                    position=one.position[rows, columns],
+                    std=one.std[rows, columns],
+                    samples=one.samples[rows, columns],
+                    temperature_c=np.full(n, np.nan),
+                    frame=rows,
+                    velocity=one.velocity[rows],
+                    acceleration=one.acceleration[rows],
+                )
+            )
+            configurations += len(one.times)
+        joined = _joined(parts)
+        if rng is not None:
+            joined = replace(joined, is_validation=self._held_out(joined.pose, rng))
+        return self._session(joined, dict(zip(names, clocks_s.tolist(), strict=True)))
+
+    def _held_out(self, pose: IntArray, rng: np.random.Generator) -> BoolArray:
+        segments = np.unique(pose)
+        if not self.options.hold_out:
+            return np.zeros(len(pose), bool)
+        runs = np.array_split(segments, max(1, round(self.options.hold_out * len(segments))))
+        return np.isin(pose, [rng.choice(run) for run in runs])
+
+    def _session(self, measurements: Measurements, clock_offset_s: dict[str, float]) -> Session:
+        options = self.options
+        known = all(name in options.places for name in self.markers)
+        std = 0.5e-3 if known else UNKNOWN_MARKER_STD_M
+        of_sensor = {
+            name: [self.markers[i] for i in frames.markers] for name, frames in self.frames.items()
+        }
+        return Session(
+            urdf=self.urdf,
+            base_link=self.chain.base_link,
+            tip_link=self.chain.tip_link,
+            markers={name: options.places.get(name, np.zeros(3)) for name in self.markers},
+            sensors={name: markers[0] for name, markers in of_sensor.items()},
+            further_markers={
+                name: tuple(markers[1:]) for name, markers in of_sensor.items() if markers[1:]
+            },
+            measurements=measurements,
+            marker_std_m=std if options.marker_std_m is None else options.marker_std_m,
+            settle_s=None,
+            exit_status='complete',
+            notes=options.notes,
+            accuracy_option=options.accuracy_option,
+            clock_offset_s=clock_offset_s,
+        )
+
+
+def moving_session(
+    where: str,
+    joints: Stream,
+    streams: Sequence[MarkerStream],
+    chain: SerialChain,
+    urdf: str,
+    options: MovingOptions,
+    rng: np.random.Generator,
+) -> tuple[Session, list[str]]:
+    """Return the session of each continuous motion in a recording, and how it was made.
+
+    Parameters
+    ----------
+    where
+        Names the recording in messages.
+    joints
+        Joint positions, rad, (n, k), by their stamps.
+    streams
+        What the sensors measured, at least one.
+    chain, urdf
+        The nominal arm.
+    options
+        What the user said.
+    rng
+        Chooses the segments that are held out.
+
+    Returns
+    -------
+    Session, list of str
+        A sentence each: rates and noise, clocks, rows and segments, what was left out.
+
+    Raises
+    ------
+    InputError
+        Joint states that are too rare, a sensor that saw hardly any motion, or an arm with a joint
+        that slides.
+    """
+    for joint in np.flatnonzero(chain.slides)[:1]:
+        raise InputError(
+            f"{where}: joint '{chain.joint_names[joint]}' slides; moving rows are made for arms "
+            'whose joints all turn: import the standstills, without --moving'
+        )
+    motion = JointMotion.of(joints, where)
+    shots = {one.sensor for one in streams if _rate_hz(one.stream) < LEAST_FRAMES_HZ}
+    streams = [one for one in streams if one.sensor not in shots]
+    if not streams:
+        raise InputError(
+            f'{where}: {", ".join(sorted(shots))} measured single points, fewer than '
+            f'{LEAST_FRAMES_HZ:.0f} in a second, and while the arm moves nothing is measured by '
+            'one point; import the standstills, without --moving'
+        )
+    markers = list(dict.fromkeys(one.marker for one in streams))
+    frames = {
+        sensor: _Frames.of([one for one in streams if one.sensor == sensor], markers)
+        for sensor in dict.fromkeys(one.sensor for one in streams)
+    }
+    recording = _Recording(where, motion, frames, markers, chain, urdf, options)
+    found = options.clock_offset_s is None
+    clocks_s = np.array(
+        [
+            _clock_by_speeds(motion, own, chain, options, markers) if found else 0.0
+            for own in frames.values()
+        ]
+    ) + (options.clock_offset_s or 0.0)
+    guess: _Guess | None = None
+    for _ in range(MOST_CLOCK_STEPS if found else 2):
+        session = recording.session(clocks_s, guess)
+        guess, steps_s = _robust_fit(session)
+        if found:
+            clocks_s = clocks_s + np.clip(steps_s, -LONGEST_CLOCK_STEP_S, LONGEST_CLOCK_STEP_S)
+            if np.all(np.abs(steps_s) < CLOCK_SETTLED_S):
+                break
+    session = recording.session(clocks_s, guess, rng)
+    m = session.measurements
+    assert m.velocity is not None
+    noise = np.degrees(motion.noise)
+    how = [
+        f'joint states at {motion.rate_hz:.0f} Hz, their noise {noise.min():.5f} to '
+        f'{noise.max():.5f} degrees',
+        *(f'{name} measured single points, which are left out' for name in sorted(shots)),
+        *(
+            f'{counted(len(np.unique(m.configuration[m.sensor == i])), "row")} of {BLOCK_S:g} s '
+            f'by {name}, whose stamps are {_late(-clock)}' + ('' if found else ', as told')
+            for i, (name, clock) in enumerate(zip(frames, clocks_s))
+        ),
+        f'{counted(len(np.unique(m.pose)), "segment")} of about {BLOCK_S * SEGMENT_ROWS:g} s, '
+        f'{len(np.unique(m.pose[m.is_validation]))} of them held out; the arm moves at up to '
+        f'{np.degrees(np.abs(m.velocity).max()):.0f} degrees/s',
+    ]
+    if recording.dropped:
+        how.append(f'{recording.dropped} points far from all others of their row were left out')
+    return session, how
+
+
+def _rate_hz(stream: Stream) -> float:
+    """Return how many values a stream usually has in a second; 0 of fewer than two."""
+    steps = np.diff(stream.stamps)
+    steps = steps[steps > 0.0]
+    return float(1.0 / np.median(steps)) if len(steps) else 0.0
+
+
+def _late(seconds: float) -> str:
+    """Return how late stamps are, in words."""
+    return f'{1e3 * abs(seconds):.2f} ms {"late" if seconds >= 0.0 else "early"}'
+
+
+def _segments(number: IntArray) -> IntArray:
+    """Return the segment of each block, by the numbers of the blocks (b,), rising."""
+    runs = np.split(np.arange(len(number)), np.flatnonzero(np.diff(number) > 1) + 1)
+    segment, count = np.zeros(len(number), np.int64), 0
+    for run in runs:
+        for part in np.array_split(run, max(1, round(len(run) / SEGMENT_ROWS))):
+            segment[part] = count
+            count += 1
+    return segment
+
+
+def _means(
+    values: FloatArray, block: IntArray, blocks: int
+) -> tuple[FloatArray, FloatArray, IntArray]:
+    """Return mean and standard deviation of each block, (b, m, 3), and samples, (b, m).
+
+    Of values (f, m, 3), NaN where none, in blocks (f,).
+    """
+    seen = np.isfinite(values[..., 0])
+    first = np.searchsorted(block, np.arange(blocks))
+
+    def total(part: FloatArray) -> FloatArray:
+        return np.add.reduceat(part, first, axis=0) if blocks else part[:0]
+
+    samples = total(seen.astype(float))
+    with np.errstate(invalid='ignore', divide='ignore'):
+        mean = total(np.where(seen[..., None], values, 0.0)) / samples[..., None]
+        apart = np.where(seen[..., None], values - mean[block], 0.0)
+        std = np.sqrt(total(apart**2) / (samples[..., None] - 1.0))
+    return mean, np.where(samples[..., None] > 1, std, np.nan), samples.astype(np.int64)
+
+
+def _joined(parts: Sequence[Measurements]) -> Measurements:
+    """Return the rows of all sensors in the order of time, numbered."""
+    columns = {
+        name: None
+        if getattr(parts[0], name) is None
+        else np.concatenate([getattr(part, name) for part in parts])
+        for name in vars(parts[0])
+    }
+    whole = Measurements(**columns)  # type: ignore[arg-type]
+    order = np.lexsort((whole.marker, whole.sensor, whole.stamp_s))
+    return replace(whole.select(order), observation=np.arange(len(whole)))
+
+
+def _clock_by_speeds(
+    motion: JointMotion,
+    frames: _Frames,
+    chain: SerialChain,
+    options: MovingOptions,
+    markers: Sequence[str],
+) -> float:
+    """Return the offset of the clocks with which speeds of marker and tool are most alike, s.
+
+    0 where they never are.
+    """
+    grid = np.arange(motion.begin[0], motion.end[-1], SPEED_STEP_S)
+    name = markers[frames.markers[0]]
+    place = options.places.get(name, np.zeros(3))
+    with np.errstate(invalid='ignore'):
+        points = chain.positions(np.nan_to_num(motion.at(grid)), place)
+    modelled = np.linalg.norm(np.diff(points, axis=0), axis=1) / SPEED_STEP_S
+    modelled[~np.isfinite(motion.at(grid[1:])[:, 0])] = 0.0
+    modelled = np.minimum(modelled, 10.0)
+    own = frames.positions[:, 0]
+    seen = np.isfinite(own[:, 0])
+    if seen.sum() < FEWEST_ROWS:
+        return 0.0
+    stamps = frames.stamps[seen]
+    times = np.arange(stamps[0], stamps[-1], SPEED_STEP_S)
+    path = np.stack([np.interp(times, stamps, column) for column in own[seen].T], axis=1)
+    width = max(1, round(2.0 * SPEED_SMOOTHING_S / SPEED_STEP_S))
+    measured = np.linalg.norm(path[width:] - path[:-width], axis=1) / (width * SPEED_STEP_S)
+    kernel = np.ones(width) / width
+    modelled = np.convolve(modelled, kernel, 'same')
+    middle = times[: len(measured)] + 0.5 * width * SPEED_STEP_S
+    alike = []
+    offsets = np.arange(-FARTHEST_CLOCK_S, FARTHEST_CLOCK_S, SPEED_STEP_S)
+    for offset in offsets:
+        at = np.interp(middle + offset, grid[1:], modelled, left=np.nan, right=np.nan)
+        both = np.isfinite(at)
+        if both.sum() < 0.5 * len(at) or not (np.std(at[both]) and np.std(measured[both])):
+            alike.append(-1.0)
+            continue
+        alike.append(float(np.corrcoef(at[both], measured[both])[0, 1]))
+    best = int(np.argmax(alike))
+    return float(offsets[best]) if alike[best] > LEAST_ALIKE else 0.0
+
+
+def _robust_fit(session: Session) -> tuple[_Guess, FloatArray]:
+    """Return a robust fit of a session, and how far each sensor's clock is off beside it, s."""
+    problem = Problem.of(session)
+    measurements, rows = problem.measurements, problem.fitted
+    chosen = rows[np.linspace(0, len(rows) - 1, min(len(rows), MOST_FITTED)).astype(np.int64)]
+    empty = problem.empty_model()
+    # Offsets of degrees move no clock, and the first search has far to go.
+    priors = problem.marker_priors(empty) + problem.plausibility(
+        empty, np.arange(len(problem.chain))
+    )
+    model, z = closest_start(
+        empty,
+        measurements,
+        chosen,
+        problem.markers,
+        float(np.max(problem.marker_std_m)),
+        priors,
+    )
+    found = Rows.of(measurements, chosen, model.reference)
+    errors = found.target - model.predict(z, found)
+    jacobian = model.jacobian(z, found)
+    by_joints = jacobian[:, :, : model.joints].copy()
+    # The outer two joints' columns are zero in these coordinates.
+    pose = model.inner_pose(z, found)
+    correction = model.corrections(z)
+    clocks = np.zeros((len(found), 3, len(model.sensor_names)))
+    assert measurements.velocity is not None
+    for sensor, span in found.spans:
+        by_joints[span] = correction[sensor, :3, :3] @ pose.by_joints[span]
+        velocity = measurements.velocity[found.source[span]]
+        clocks[span, :, sensor] = np.einsum('nik,nk->ni', by_joints[span], velocity)
+    free = np.setdiff1d(np.arange(model.size), (0, model.joints - 1))
+    design = np.concatenate((jacobian[:, :, free], clocks), axis=2)
+    spread = robust_spread(errors, found)
+    scale = np.concatenate(
+        [np.full(span.stop - span.start, one) for one, (_, span) in zip(spread, found.spans)]
+    )
+    residual, by_z = prior_rows(model, priors, z)
+    pull = np.concatenate((by_z[:, free], np.zeros((len(by_z), len(model.sensor_names)))), axis=1)
+    left, solution = errors, np.zeros(design.shape[2])
+    for _ in range(10):
+        width = CAUCHY_WIDTH * scale
+        root = 1.0 / np.sqrt(1.0 + np.sum(left**2, axis=1) / width**2) / scale
+        matrix = np.concatenate(
+            ((design * root[:, None, None]).reshape(-1, design.shape[2]), pull)
+        )
+        right = np.concatenate(((errors * root[:, None]).ravel(), -residual))
+        unit = np.maximum(np.linalg.norm(matrix, axis=0), 1e-300)
+        solution = np.linalg.lstsq(matrix / unit, right, rcond=1e-12)[0] / unit
+        left = errors - design @ solution
+        spread = robust_spread(left, found)
+        scale = np.concatenate(
+            [np.full(span.stop - span.start, one) for one, (_, span) in zip(spread, found.spans)]
+        )
+    moved = z.copy()
+    moved[free] += solution[: len(free)]
+    # Far from the right clock the step of the rest goes too far.
+    x = model.natural(moved if np.all(np.abs(solution[len(free) :]) < 5e-3) else z)
+    guess = _Guess(model.offsets(x), model.markers(x), inverse(model.T_R_N(x)))
+    return guess, solution[len(free) :]

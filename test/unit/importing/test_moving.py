@@ -1,0 +1,188 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Rows of a moving arm from recordings in a world with dynamics of its own."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from worlds.moving_bags import CELL, CHAIN, imported, recorded, write_bag
+from worlds.moving_world import Dynamics, Errors, without_dynamics
+
+from remaster_ros.calibration.dynamics import clocks_of, estimate_moving
+from remaster_ros.calibration.estimate import Problem, estimate
+from remaster_ros.calibration.fit import fit_session
+from remaster_ros.calibration.mistakes import UNKNOWN_MARKER_STD_M
+from remaster_ros.cli.main import main
+from remaster_ros.errors import InputError
+from remaster_ros.importing.joint_motion import JointMotion
+from remaster_ros.importing.standstills import Stream
+from remaster_ros.kinematics.serial_chain import SerialChain
+from remaster_ros.session.reader import read_session, write_session
+from remaster_ros.types import Session
+
+SEED = 7
+QUIET = Errors(white_m=2e-5, field_m=0.0)
+
+
+@pytest.fixture(scope='module')
+def recording():
+    print(f'moving world, seed {SEED}')
+    return recorded(SEED, seconds=15.0)
+
+
+@pytest.fixture(scope='module')
+def session(recording) -> Session:
+    return imported(*recording)[0]
+
+
+def inner(found):
+    """Return offsets and stds of the joints that are neither first nor last, rad."""
+    model, free = found.model, found.posterior.free
+    std = np.sqrt(np.diag(found.mode.covariance))
+    of = {int(index): value for index, value in zip(free, std, strict=False)}
+    joints = range(1, model.joints - 1)
+    return model.offsets(model.natural(found.mode.z))[1:-1], np.array([of[j] for j in joints])
+
+
+def test_splines_have_the_motion():
+    """Positions to the noise, speeds and accelerations to what that makes of them."""
+    rng = np.random.default_rng(0)
+    t = np.sort(np.arange(0.0, 10.0, 0.008) + rng.normal(0.0, 5e-5, 1250))
+    q = np.stack((np.sin(t), 0.5 * np.cos(2.0 * t)), axis=1)
+    motion = JointMotion.of(Stream.of(t, q + rng.normal(0.0, 1e-5, q.shape)), 'x')
+    at = np.linspace(0.5, 9.5, 200)
+    for derivative, expected, tolerance in (
+        (0, np.stack((np.sin(at), 0.5 * np.cos(2 * at)), axis=1), 1e-5),
+        (1, np.stack((np.cos(at), -np.sin(2 * at)), axis=1), 4e-4),
+        (2, np.stack((-np.sin(at), -2.0 * np.cos(2 * at)), axis=1), 2e-2),
+    ):
+        assert np.sqrt(np.mean((motion.at(at, derivative) - expected) ** 2)) < tolerance
+    assert np.all((motion.noise > 5e-6) & (motion.noise < 6e-5))
+    assert np.isnan(motion.at(np.array([-1.0, 11.0]))).all()
+
+
+def test_rows_segments_and_frames(session):
+    m = session.measurements
+    assert session.is_moving
+    assert m.velocity is not None
+    rows = np.unique(m.configuration, return_index=True)[1]
+    assert np.all(np.bincount(m.configuration) == 4)
+    assert np.median(np.diff(m.stamp_s[rows])) == pytest.approx(0.1, abs=0.01)
+    assert np.all(np.abs(m.velocity).max(axis=1) > 0.02)
+    sizes = np.bincount(m.pose[rows])
+    assert np.all((sizes >= 3) & (sizes <= 7))
+    held_out = np.unique(m.pose[m.is_validation])
+    assert len(held_out) == round(0.25 * len(sizes))
+    assert np.all(np.isin(m.samples, range(6, 14)))
+
+
+def test_a_session_is_written_and_read_to_the_last_digit(session, tmp_path):
+    write_session(tmp_path / 's', session)
+    again = read_session(tmp_path / 's')
+    assert again.clock_offset_s == session.clock_offset_s
+    for name, value in vars(session.measurements).items():
+        np.testing.assert_array_equal(getattr(again.measurements, name), value, err_msg=name)
+    header = (tmp_path / 's' / 'session.yaml').read_text(encoding='utf-8')
+    assert header.startswith('format: remaster-session/1.1\n')
+    (tmp_path / 's' / 'session.yaml').write_text(header.replace('/1.1', '/1'), encoding='utf-8')
+    # Columns of a later format are not known to this one.
+    assert not read_session(tmp_path / 's').is_moving
+    still = replace(session.measurements, velocity=None, acceleration=None)
+    write_session(tmp_path / 't', replace(session, measurements=still, clock_offset_s={}))
+    header = (tmp_path / 't' / 'session.yaml').read_text(encoding='utf-8')
+    assert header.startswith('format: remaster-session/1\n')
+    (tmp_path / 't' / 'session.yaml').write_text(header.replace('/1', '/1.1'), encoding='utf-8')
+    with pytest.raises(InputError, match='velocity'):
+        read_session(tmp_path / 't')
+
+
+@pytest.mark.parametrize('clock_s', [-0.7, 0.02, 1.9])
+def test_the_offset_of_the_clocks_is_found(clock_s):
+    world, recording = recorded(3, seconds=12.0, dynamics=without_dynamics(Dynamics(clock_s=0.0)))
+    moved = replace(recording, frame_stamps=recording.frame_stamps - clock_s)
+    session, how = imported(world, moved, places={})
+    assert session.marker_std_m == UNKNOWN_MARKER_STD_M
+    # Its standard deviation is 0.2 ms: the error of the sensor follows the motion.
+    assert session.clock_offset_s['bar'] == pytest.approx(clock_s, abs=1e-3)
+    assert any('early' in line if clock_s > 0 else 'late' in line for line in how)
+    told, _ = imported(world, moved, clock_offset_s=clock_s)
+    assert told.clock_offset_s['bar'] == clock_s
+
+
+def test_the_bend_of_a_path_moves_no_row():
+    """An arm at the speeds of its maker: 0.1 s bends by a millimetre, rows are right to 0.02."""
+    dynamics = replace(without_dynamics(Dynamics(clock_s=0.0)), jitter_s=0.0)
+    world, recording = recorded(4, seconds=12.0, tool_speed=None, dynamics=dynamics, errors=QUIET)
+    session, _ = imported(world, recording)
+    found = estimate_moving(Problem.of(session))
+    assert np.all(np.abs(inner(found)[0] - world.joint_offsets[1:-1]) < np.radians(5e-3))
+    rows = found.posterior.rows
+    errors = rows.target - found.model.predict(found.mode.z, rows)
+    assert np.sqrt(np.mean(errors**2)) < 2e-5
+
+
+def test_offsets_with_honest_intervals_from_motion(session, recording):
+    """One of the campaign's sessions, of half the length; beside it the fit without dynamics."""
+    world, recording = recording
+    found = estimate_moving(Problem.of(session))
+    offsets, std = inner(found)
+    z = (offsets - world.joint_offsets[1:-1]) / std
+    # Five normal numbers are longer than this in 1 of 1,000 worlds.
+    assert np.sum(z**2) < 20.5
+    naive, naive_std = inner(estimate(Problem.of(session)))
+    z = (naive - world.joint_offsets[1:-1]) / naive_std
+    assert np.sum(z**2) > 20.5
+    late_s, std_s = clocks_of(found)['bar']
+    assert abs(-late_s - recording.delay_s) < 4.0 * std_s < 4e-3
+
+
+def test_fit_has_the_dynamics_and_the_paper_sampler_refuses(session):
+    result = fit_session(session, rng=np.random.default_rng(0))
+    assert {'clock_bar', 'lag_2', 'windup_3', 'inertia_2', 'tool_mode_x'} <= {*result.theta_names}
+    assert result.accuracy['optimization']['relative']['before'] is None
+    with pytest.raises(InputError, match='no dynamics'):
+        fit_session(session, rng=np.random.default_rng(0), sampler='paper')
+
+
+@pytest.mark.parametrize('kind', ['point', 'pose'])
+def test_a_bag_becomes_a_session(kind, recording, tmp_path, capsys):
+    world, recording = recording
+    write_bag(tmp_path / 'bag', world, recording, kind)
+    (tmp_path / 'arm.urdf').write_text(CELL.urdf_text, encoding='utf-8')
+    command = ['import', '--moving', str(tmp_path / 'bag'), '--out', str(tmp_path / 's')]
+    command += ['--urdf', str(tmp_path / 'arm.urdf'), '--tip-link', 'tool']
+    if kind == 'pose':
+        topics = ','.join(f'/bar/ball_{i}/pose' for i in range(1, 5))
+        assert main(command) == 2
+        command += ['--points', topics]
+    assert main(command) == 0
+    assert 'the stamps of bar are ' in capsys.readouterr().out
+    session = read_session(tmp_path / 's')
+    assert list(session.sensors) == ['bar']
+    assert len(session.markers) == 4
+    assert session.clock_offset_s['bar'] == pytest.approx(recording.delay_s, abs=2e-3)
+
+
+def test_what_cannot_be_measured_in_motion_is_refused(recording, tmp_path, capsys):
+    world, recording = recording
+    some = slice(None, None, 10)
+    rare = replace(
+        recording, joint_stamps=recording.joint_stamps[some], joints=recording.joints[some]
+    )
+    with pytest.raises(InputError, match='joint states at 25 Hz; at least 40 Hz'):
+        imported(world, rare)
+    single = replace(
+        recording,
+        frame_stamps=recording.frame_stamps[::60],
+        points=recording.points[::60],
+    )
+    with pytest.raises(InputError, match='single points'):
+        imported(world, single)
+    still = replace(recording, joints=np.broadcast_to(recording.joints[0], recording.joints.shape))
+    with pytest.raises(InputError, match=r'saw the arm move for 0\.0 s'):
+        imported(world, still, clock_offset_s=0.0)
+    (tmp_path / 'table.csv').write_text('a,b\n1,2\n', encoding='utf-8')
+    command = ['import', '--moving', str(tmp_path / 'table.csv'), '--cell', 'demo']
+    assert main([*command, '--out', str(tmp_path / 's')]) == 2
+    assert '--moving takes one bag' in capsys.readouterr().err
+    assert isinstance(CHAIN, SerialChain)
