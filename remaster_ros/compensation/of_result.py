@@ -360,7 +360,11 @@ def placed(cell: Cell, chain: SerialChain) -> Iterator[tuple[Slot, FloatArray]]:
 
     Each place with the matrix from the cell's m parameters to its coefficients.
     """
-    if cell.model_change is not None:
+    if cell.changes is not None:
+        # The arm is as it was after the change.
+        if not cell.ends:
+            yield from placed(cell.changes, chain)
+    elif cell.model_change is not None:
         change = cell.model_change
         yield Slot('geometry', change.joint), np.concatenate((change.shifts, change.turns), 1).T
     elif cell.place == 'joint_angle':

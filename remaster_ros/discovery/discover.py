@@ -22,6 +22,7 @@ from remaster_ros.calibration.outliers import find_outliers
 from remaster_ros.calibration.result import FitResult
 from remaster_ros.calibration.sampling import Progress, silent
 from remaster_ros.discovery.effects.base import Cell
+from remaster_ros.discovery.effects.moments import changed
 from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.discovery.evidence import solve
 from remaster_ros.discovery.explain import FoundEffect, describe
@@ -187,6 +188,7 @@ def discover_session(
         if name not in untestable and not effect.moves_the_fit
         for cell in effect.cells(residuals.context)
     ]
+    cells += changed(residuals.context, [(cell, EFFECTS[cell.name].changes) for cell in cells])
 
     def walked(data: Residuals, start: Walk | None) -> Walk:
         first = None if start is None else start.models[0]

@@ -215,6 +215,8 @@ def grouped(cells: Sequence[Cell]) -> list[tuple[Cell, ...]]:
         cause_per = EFFECTS[cell.name].cause_per
         if cause_per != 'effect':
             key += (str(cell.joints), cell.label if cause_per == 'variant' else '')
+        if cell.changes is not None:
+            key += (f'{cell.moment} {cell.ends}',)
         groups.setdefault(key, []).append(cell)
     return [tuple(group) for group in groups.values()]
 
@@ -256,7 +258,7 @@ def _described(walk: Walk, group: tuple[Cell, ...], share: float) -> FoundEffect
         cause=in_words(group, data.part) + _also_called(alike),
         size_m=size_of(data, solution, group),
         share=share,
-        remedy=EFFECTS[first.name].remedy_of(first),
+        remedy=EFFECTS[first.name].remedy_of(first) if first.changes is None else CHANGED,
         title=titled(first, _joints(group)),
         in_robot_model=all(cell.model_change is not None for cell in group),
         of_measurement=first.of_measurement,
@@ -328,6 +330,13 @@ def _same(data: Residuals, cell: Cell, other: Cell) -> bool:
     return bool(cosines.min() > SAME)
 
 
+CHANGED = (
+    'Find what was changed at that moment: a payload put on or taken off, a setting of the '
+    'controller, something that came loose. Measure before and after it in sessions of their own.'
+)
+"""What to do about a cause that begins or changes in mid-session."""
+
+
 def size_of(data: Residuals, solution: Solution, group: Sequence[Cell]) -> float:
     """Return the RMS of a cause's displacement after absorption by the offsets model, m."""
     wheres = dict(zip(solution.cells, solution.slices(), strict=True))
@@ -378,6 +387,10 @@ def in_words(group: Sequence[Cell], context: Context) -> str:
         when=_when(first, context),
     )
     sentence = sentence[:1].upper() + sentence[1:]
+    if first.changes is not None:
+        when = _when(first, context).removesuffix(',')
+        changed = 'It ended' if first.ends else 'It began, or changed by so much,'
+        sentence += f' {changed} {when}.'
     if not context.has_gravity and first.place == 'joint_angle' and 'angle' in first.driver:
         sentence += (
             ' It may be gravity that bends the arm: without link masses in the URDF '

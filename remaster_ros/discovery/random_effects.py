@@ -140,7 +140,12 @@ def kinds(data: Residuals, cells: Sequence[Cell], apart: Sequence[Cell] = ()) ->
     members: dict[str, list[Cell]] = {}
     for cell in sorted(cells, key=lambda cell: -cell.size):
         effect = EFFECTS[cell.name]
-        if effect.many or not effect.in_family(cell) or taken & set(cell.parameters):
+        if (
+            effect.many
+            or cell.changes is not None
+            or not effect.in_family(cell)
+            or taken & set(cell.parameters)
+        ):
             continue
         if (cell.name, cell.joints, cell.subject) not in taken_places:
             members.setdefault(cell.name, []).append(cell)

@@ -24,6 +24,7 @@ from scipy.special import log_expit, logsumexp
 from remaster_ros.calibration.noise import Noise
 from remaster_ros.discovery.effects.base import Cell
 from remaster_ros.discovery.effects.context import Context
+from remaster_ros.discovery.effects.moments import changed_at, gaps
 from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.discovery.effects.sensor_wander import EFFECT as SENSOR_WANDER
 from remaster_ros.discovery.evidence import System
@@ -66,22 +67,33 @@ NAMED = float(np.log(len(EFFECTS) / 0.05))
 # Models that are evaluated in the end at most, the log posterior below the best at which none is,
 # and the share below which none is kept.
 MOST_MODELS, NEGLIGIBLE, LEAST_SHARE = 24, 7.0, 1e-3
+# Gaps about a moment at which something came in which other changes are tried, too: a fourth of
+# those between two moments at which changes are, in a session of a hundred configurations.
+NEAREST = 4
 # Exchanges of each block of the best model that are looked at.
 MOST_EXCHANGED = 8
 
 
-Identity = tuple[str, tuple[int, ...], str, str, str]
-"""What makes a cause: name, joints, place, driver and subject."""
+Identity = tuple[str, tuple[int, ...], str, str, str, str]
+"""What makes a cause: name, joints, place, driver, subject, and if it begins or ends."""
 
 
 def identity(cell: Cell) -> Identity:
     """Return which cause a candidate is, at whatever moment, order or axis."""
-    return cell.name, cell.joints, cell.place, cell.driver, cell.subject
+    change = '' if cell.changes is None else 'ends' if cell.ends else 'begins'
+    return cell.name, cell.joints, cell.place, cell.driver, cell.subject, change
 
 
 def at_other_moments(cell: Cell, context: Context, low: float, high: float) -> list[Cell]:
     """Return what happened in the place of a cell in the gaps between two moments, s."""
-    between = EFFECTS[cell.name].between
+    between, changes = EFFECTS[cell.name].between, EFFECTS[cell.name].changes
+    if cell.changes is not None and changes is not None:
+        found = [
+            one
+            for gap in gaps(context, low, high)
+            for one in changed_at(cell.changes, changes, gap)
+        ]
+        return [one for one in found if one.ends == cell.ends]
     if not cell.happened or between is None:
         return []
     return [
@@ -301,6 +313,8 @@ class Walk:
         self.families = background(data, cells)
         # The same with a variance for each free form: one smoothness for all may fit none of them.
         self.by_form = by_form(data, self.families)
+        # What may change in mid-session.
+        self._changing = [*{c.changes.key: c.changes for c in cells if c.changes}.values()]
         of_background = {member.key for one in self.families for member in one.members}
         singles = [cell for cell in cells if cell.penalty is None or cell.key not in of_background]
         tried = {cell.key for cell in singles}
@@ -328,19 +342,27 @@ class Walk:
             for index, first in enumerate((self.bare, self.empty)):
                 self.chains.append(self._chain(first, hot=index > 0))
                 progress(0.5 * (index + 1))
-        if self._dated():
+        if self._refined():
             best = max((chain.best for chain in self.chains), key=lambda one: one.value)
             self.chains.append(self._chain(best, hot=False))
         self._weigh()
 
-    def _dated(self) -> bool:
-        """Add candidates at moments near those of the best model; return whether there are any."""
+    def _refined(self) -> bool:
+        """Add candidates near those of the best model; return whether there are any.
+
+        At other moments, and of what has a place that no parameter is.
+        """
         best = max((chain.best for chain in self.chains), key=lambda one: one.value)
         context, tried = self.data.part, [block.cell for block in self.pool.blocks]
         added = False
         for position, (block, _) in enumerate(best.model):
             cell = self.pool.blocks[block].cell
             if not cell.happened:
+                finer = EFFECTS[cell.name].finer
+                nearby = [] if finer is None else [*finer(context, cell)]
+                nearby = [one for one in nearby if one.key not in self.pool.place]
+                self.pool.extend(candidates(self.data, nearby))
+                added = added or bool(nearby)
                 continue
             moments = np.unique([one.moment for one in tried if one.name == cell.name])
             low = np.max(moments[moments < cell.moment], initial=-np.inf)
@@ -355,18 +377,58 @@ class Walk:
             surface = Surface(self.pool, best.noise, best.std)
             rest = State.of(surface, best.model[:position] + best.model[position + 1 :])
             near = [block, *range(first, len(self.pool.blocks))]
-            gain = rest.gains[near].max(axis=1)
-            at = np.array([self.pool.blocks[i].cell.moment for i in near])
-            weight = np.exp(gain - gain.max())
-            middle = at[np.argmax(gain)]
-            spread = float(np.sqrt(np.average((at - middle) ** 2, weights=weight)))
+            spread = self._spread_of_moments(rest, cell)
             for i in near:
                 one = self.pool.blocks[i]
                 self.pool.blocks[i] = replace(one, cell=replace(one.cell, moment_std=spread))
             self._known.clear()
             self._wholes.clear()
             added = added or len(near) > 1
-        return added
+        happened = [
+            one for block, _ in best.model if (one := self.pool.blocks[block].cell).happened
+        ]
+        near_these = {
+            one.key: one
+            for cell in happened
+            for one in self._changes_near(cell.moment)
+            if one.key not in self.pool.place
+        }
+        self.pool.extend(candidates(self.data, [*near_these.values()]))
+        return added or bool(near_these)
+
+    def _spread_of_moments(self, rest: State, cell: Cell) -> float:
+        """Return the standard deviation of the moment of a cause beside a model, s.
+
+        Over all moments that were tried, each for the time that is nearest to it.
+        """
+        same = [
+            (one.cell.moment, rest.gains[index].max())
+            for index, one in enumerate(self.pool.blocks)
+            if identity(one.cell) == identity(cell) and one.cell.variant == cell.variant
+        ]
+        at, gain = np.array(sorted(same)).T
+        weight = np.exp(gain - gain.max())
+        if len(at) > 1:
+            weight = weight * np.maximum(np.gradient(at), 0.0)
+        middle = at[np.argmax(gain)]
+        return float(np.sqrt(np.average((at - middle) ** 2, weights=weight)))
+
+    def _changes_near(self, moment: float) -> list[Cell]:
+        """Return the changes of all causes in the gaps nearest to a moment.
+
+        What comes at one moment looks like several steps there; the moments that are tried of each
+        change lie further apart than those of steps.
+        """
+        context = self.data.part
+        found = gaps(context)
+        nearest = found[np.argsort(np.abs(found.mean(axis=1) - moment))[:NEAREST]]
+        return [
+            one
+            for cell in self._changing
+            if (changes := EFFECTS[cell.name].changes) is not None
+            for gap in nearest
+            for one in changed_at(cell, changes, gap)
+        ]
 
     def _again(self, start: Evaluated) -> Evaluated:
         """Return the model of an earlier walk on these rows."""

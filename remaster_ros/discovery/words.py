@@ -80,7 +80,7 @@ def titled(cell: Cell, joints: Sequence[int]) -> str:
     """
     kind = KIND_OF_SUBJECT.get(cell.place, '')
     joint = joint_words(joints[:1]) if joints else ''
-    if cell.happened:
+    if cell.happened and cell.changes is None:
         words = {
             'joint_angle': f'{joint} slipped',
             'marker': f'{the(kind, cell.subject)} moved',
@@ -95,6 +95,9 @@ def titled(cell: Cell, joints: Sequence[int]) -> str:
         words = called(cell.name, joints)
         if cell.subject.lower() not in ('', kind):
             words += f' of {cell.subject}'
+    if cell.changes is not None:
+        minutes = f'{cell.moment / 60.0:.1f} min'
+        words += f', until {minutes}' if cell.ends else f', from {minutes} on'
     return words[:1].upper() + words[1:]
 
 

@@ -621,7 +621,7 @@ def causes(discovery: Discovery) -> Figure:
         cell
         for group in discovery.groups
         for cell in group
-        if cell.place == 'joint_angle' or cell.happened
+        if cell.place == 'joint_angle' or (cell.happened and cell.changes is None)
     ]
     constant = [
         effect
@@ -716,9 +716,13 @@ def _cause(ax: Axes, discovery: Discovery, cell: Cell) -> None:
     whole = len(data.context) <= MOST_DRAWN
     context = data.context if whole else data.part
     left = data.unexplained(solution) if whole else data.left(solution)
-    fitted = np.ones(len(context), dtype=bool)
+    # A change is drawn where it is there.
+    there = np.ones(len(context), dtype=bool)
+    if cell.changes is not None:
+        there = (context.elapsed_s > cell.moment) != cell.ends
+    fitted = there.copy()
     if whole:
-        fitted = np.isin(np.arange(len(context)), data.rows.source)
+        fitted &= np.isin(np.arange(len(context)), data.rows.source)
     one, unit = (1e-3, 'mm') if context.slides(cell.joints[0]) else (ARC_MINUTE, 'arc minutes')
     parameters = _estimate(discovery, cell) / one
     index = {name: i for i, name in enumerate(discovery.fit.theta_names)}
@@ -743,16 +747,17 @@ def _cause(ax: Axes, discovery: Discovery, cell: Cell) -> None:
     points = (values[far] @ parameters + angle)[shown]
     if cell.driver.startswith('approach'):
         band = 2.0 * (values @ draws.T).std(axis=1)
-        _sides(ax, x, effect, band, (x[far][shown], points))
+        _sides(ax, x[there], effect[there], band[there], (x[far][shown], points))
     else:
-        at, line = np.sort(x), effect[np.argsort(x)]
+        order = np.flatnonzero(there)[np.argsort(x[there])]
+        at, line = x[order], effect[order]
         if cell.curve is not None:
             # Everywhere, so that the band opens where nothing was measured; the line is not there.
             x, at = cell.curve.in_turn(x), cell.curve.grid()
             values = cell.curve.columns(at)
             line = np.where(cell.curve.seen(at, NEAR), values @ mean, np.nan)
         else:
-            values = values[np.argsort(x)]
+            values = values[order]
             # No straight line where nothing was measured.
             widest = WIDE_GAP if cell.form == 'sin/cos' else EMPTY
             gap = np.diff(at, prepend=at[0]) > widest * np.ptp(at)
@@ -771,13 +776,18 @@ def _cause(ax: Axes, discovery: Discovery, cell: Cell) -> None:
         low, high = middle - spread, middle + spread
         ax.fill_between(around / per_shown, low, high, color=AFTER, alpha=0.25, linewidth=0)
         # What jumps has no slope between two readings.
-        drawn = 'default' if not cell.happened else 'steps-mid'
+        jumps = cell.happened and cell.changes is None
+        drawn = 'steps-mid' if jumps else 'default'
         ax.plot(at / per_shown, line, color=AFTER, linewidth=1.3, drawstyle=drawn)
     limit = np.quantile(np.abs(points), 0.99)
     ax.set_ylim(-1.2 * limit, 1.2 * limit)
     ax.set_xlabel(label)
     ax.set_ylabel(unit)
-    name = 'slip' if cell.happened else cell.name.replace('_', ' ')
+    slipped = cell.happened and cell.changes is None
+    name = 'slip' if slipped else cell.name.replace('_', ' ')
+    if cell.changes is not None:
+        minutes = f'{cell.moment / 60.0:.1f} min'
+        name += f', until {minutes}' if cell.ends else f', from {minutes} on'
     ax.set_title(f'joint {cell.joints[0]}: {name}')
 
 

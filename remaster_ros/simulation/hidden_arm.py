@@ -134,6 +134,18 @@ class ChainArm:
         moment = np.sum(self._chain.masses[:, None] * centers, axis=1)
         return np.cross(moment, np.array(GRAVITY))
 
+    def carried_moment(self, q: FloatArray) -> FloatArray:
+        """Gravity's moment on what each joint carries about its origin, in R, N m, (n, k, 3)."""
+        chain = self._chain
+        frames = chain.frames(q)
+        centers = apply(frames, chain.centers_of_mass)
+        moments = np.zeros((len(q), len(chain), 3))
+        for j in range(len(chain)):
+            arms = centers[:, j:] - frames[:, j, :3, 3][:, None]
+            total = np.einsum('l,nlx->nx', chain.masses[j:], arms)
+            moments[:, j] = np.cross(total, np.array(GRAVITY))
+        return moments
+
     def segments(self) -> FloatArray:
         """From each joint to the next one, the last to the tool, m, (k + 1, 3)."""
         return self._chain.T_fixed[:, :3, 3]

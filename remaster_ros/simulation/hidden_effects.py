@@ -45,6 +45,9 @@ class Circumstances:
     # Gravity's torque about each joint, or force along it, (n, k), and about the base, N m, (n, 3)
     torque: FloatArray
     base_moment: FloatArray
+    # Gravity's moment on what each joint carries, about its origin, in the frame before its turn,
+    # N m, (n, k, 3)
+    carried_moment: FloatArray
     segments: FloatArray  # From each joint to the next, in the frame between, m, (k + 1, 3)
     axes: FloatArray  # Axis of each joint in its own frame, (k, 3)
     tool: FloatArray  # Rotation of the tool, (n, 3, 3)
@@ -65,13 +68,14 @@ class Deviation:
     marker: FloatArray  # Added to each marker (c of them) in the tool frame, m, (n, c, 3)
     # What each sensor (s of them) adds to a point p = (x, y, z) that it measures, in its frame N:
     # beside, m, (n, s, 3); turn × p, rad, (n, s, 3); scale p, (n, s, 3); radial (x² + y²) (x, y,
-    # 0), 1/m², (n, s, 1); along the line of sight a + b |p|² + c |p|³, in m, 1/m, 1/m², (n, s, 3);
-    # and z u² half where u = (x, y)/z along half is positive, (n, s, 2): the rays of one half of
-    # its view bend
+    # 0) about a center, 1/m², (n, s, 1), and m, (n, s, 2); along the line of sight a + b |p|² +
+    # c |p|³, in m, 1/m, 1/m², (n, s, 3); and z u² half where u = (x, y)/z along half is positive,
+    # (n, s, 2): the rays of one half of its view bend
     beside: FloatArray
     turn: FloatArray
     scale: FloatArray
     radial: FloatArray
+    center: FloatArray
     along: FloatArray
     half: FloatArray
 
@@ -82,7 +86,7 @@ class Deviation:
         """Return an arm and sensors as drawn."""
         s = len(sensors)
         shapes = ((k,), (k + 1, 3), (k, 3), (3,), (len(markers), 3))
-        per_sensor = ((s, 3), (s, 3), (s, 3), (s, 1), (s, 3), (s, 2))
+        per_sensor = ((s, 3), (s, 3), (s, 3), (s, 1), (s, 2), (s, 3), (s, 2))
         return cls(sensors, markers, *(np.zeros((n, *shape)) for shape in (*shapes, *per_sensor)))
 
     def map(self, change: Callable[..., FloatArray], *others: Deviation) -> Deviation:
@@ -98,6 +102,7 @@ class Deviation:
         """Return what a sensor makes of points p in its frame N, m, (n, 3)."""
         s = self.sensors.index(sensor)
         across = points * (1.0, 1.0, 0.0)
+        across[:, :2] -= self.center[:, s]
         square = np.sum(across**2, axis=1, keepdims=True)
         distance = np.linalg.norm(points, axis=1, keepdims=True)
         powers = distance ** np.array([0.0, 2.0, 3.0])
@@ -519,6 +524,35 @@ def base_compliance(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
     d.base[:, :2] += e.values[0] * c.base_moment[:, :2]
 
 
+@_named(
+    'link_rotation',
+    'gravity_moment',
+    lambda kind, context: HiddenEffect(
+        kind, (int(context.rng.integers(2, context.joints)),), np.array([5e-5])
+    ),
+    Part('lateral_compliance_{j}'),
+)
+def lateral_compliance(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
+    """Joint j tips by so much per moment of weight across its axis, rad/(N m)."""
+    j = e.joints[0] - 1
+    across = np.eye(3) - np.outer(c.axes[j], c.axes[j])
+    d.tilt[:, j] += e.values[0] * c.carried_moment[:, j] @ across
+
+
+def _draw_rocking(kind: str, context: DrawContext) -> HiddenEffect:
+    angle = context.rng.uniform(0.0, np.pi)
+    axis = np.array([np.cos(angle), np.sin(angle), 0.0])
+    moment = np.quantile(context.circumstances.base_moment @ axis, context.rng.uniform(0.25, 0.75))
+    return HiddenEffect(kind, (), np.array([2e-3]), {'axis': axis, 'moment': float(moment)})
+
+
+@_named('base_rotation', 'gravity_moment', _draw_rocking, Part('base_tipping'))
+def base_tipping(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
+    """The base rocks by so much, rad, where the moment about an axis exceeds a value."""
+    leans = c.base_moment @ e.detail['axis'] > e.detail['moment']
+    d.base += e.values[0] * np.where(leans, 0.5, -0.5)[:, None] * e.detail['axis']
+
+
 @_named('sensor_frame', 'time', of_sensor(1e-6, 3), *_along_axes('drift_{axis}_{{sensor}}'))
 def registration_drift(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
     """What the sensor measures wanders with this velocity, m/s, in its own frame."""
@@ -630,6 +664,37 @@ def spherical_distortion(e: HiddenEffect, d: Deviation, c: Circumstances) -> Non
 def one_sided_lens(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
     """δp = z u² k, u = (x, y)/z along k = values where that is positive, else nothing."""
     d.half[:, d.sensors.index(e.detail['sensor'])] += e.values
+
+
+def _draw_off_centre(kind: str, context: DrawContext) -> HiddenEffect:
+    effect = of_sensor(0.2)(kind, context)
+    return replace(effect, detail={**effect.detail, 'center': 0.3 * context.direction(2)})
+
+
+@_unnamed('sensor_frame', 'position', _draw_off_centre, answers=('sensor_distortion',))
+def off_centre_lens(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
+    """δp = k |p − c|² (p − c) across the axis z, c not on it."""
+    s = d.sensors.index(e.detail['sensor'])
+    d.radial[:, s] += e.values[0]
+    d.center[:, s] += e.detail['center']
+
+
+def _draw_lagging(kind: str, context: DrawContext) -> HiddenEffect:
+    lag = float(context.rng.uniform(900.0, 4500.0))
+    return HiddenEffect(kind, (), np.array([2e-4]), {'lag_s': lag})
+
+
+@_unnamed('link_translation', 'temperature', _draw_lagging, answers=('thermal_growth',))
+def lagging_growth(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
+    """Every segment grows by α of its length per K of a temperature that follows, 1/K."""
+    # The thermometer's temperature is a line between two configurations.
+    tau, slow = e.detail['lag_s'], np.zeros(len(c.time_s))
+    for i in range(1, len(slow)):
+        dt = c.time_s[i] - c.time_s[i - 1]
+        rate = (c.warming_k[i] - c.warming_k[i - 1]) / max(dt, 1e-9)
+        steady = c.warming_k[i - 1] - rate * tau
+        slow[i] = steady + rate * dt + (slow[i - 1] - steady) * np.exp(-dt / tau)
+    d.shift += e.values[0] * slow[:, None, None] * c.segments
 
 
 KINDS = NAMED | UNNAMED

@@ -57,6 +57,9 @@ class Arm(Protocol):
     def base_moment(self, q: FloatArray) -> FloatArray:
         """Moment of the moving links' weight about the base's origin, N m, (n, 3)."""
 
+    def carried_moment(self, q: FloatArray) -> FloatArray:
+        """Gravity's moment on what each joint carries about its origin, in R, N m, (n, k, 3)."""
+
     def segments(self) -> FloatArray:
         """From each joint to the next one, the last to the tool, m, (k + 1, 3).
 
@@ -97,6 +100,7 @@ def circumstances(arm: Arm, visited: Round, joint_offsets: FloatArray) -> Circum
         warming_k=visited.warming_k,
         torque=arm.gravity_torque(q),
         base_moment=arm.base_moment(q),
+        carried_moment=np.einsum('nkji,nkj->nki', state.before, arm.carried_moment(q)),
         segments=arm.segments(),
         axes=np.einsum('kji,kj->ki', state.after[0], state.axis[0]),
         tool=state.tool,

@@ -80,6 +80,18 @@ class PinocchioArm:
         centers = np.array([pin.centerOfMass(self.model, self._data, angles) for angles in q])
         return np.cross(centers, mass * GRAVITY)
 
+    def carried_moment(self, q: FloatArray) -> FloatArray:
+        """Gravity's moment on what each joint carries about its origin, in R, N m, (n, k, 3)."""
+        moments = np.zeros((len(q), self.joints, 3))
+        for i, angles in enumerate(q):
+            # Of the subtree of each joint, its centre in the joint's own frame.
+            pin.centerOfMass(self.model, self._data, angles, True)
+            for j in range(self.joints):
+                turn = self._data.oMi[j + 1].rotation
+                arm = turn @ self._data.com[j + 1]
+                moments[i, j] = np.cross(self._data.mass[j + 1] * arm, GRAVITY)
+        return moments
+
     def segments(self) -> FloatArray:
         """From each joint's origin to the next one's, the last to the tool's, m, (k + 1, 3).
 

@@ -122,6 +122,9 @@ class _Elsewhere(PartOfContext):
     def approach(self) -> FloatArray:
         return Context.approach.func(self)  # type: ignore[attr-defined, no-any-return]
 
+    def lagging_warming(self, lag_s: float) -> FloatArray:
+        return Context.lagging_warming(self, lag_s)
+
     @cached_property
     def elapsed_s(self) -> FloatArray:
         return self.measurements.stamp_s - self.whole.measurements.stamp_s.min()

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
-from typing import Any, Literal, get_args
+from typing import Any, Literal, Protocol, get_args
 
 import numpy as np
 
@@ -106,6 +106,10 @@ class Cell:
     # does not go below, in ``unit``; 0 for none
     least: float = 0.0
     slide: bool = False  # It is about the place of a joint that slides
+    # The cell of which it is a change at its moment, which begins then or ends then; None for what
+    # is there in all of the session
+    changes: Cell | None = None
+    ends: bool = False
 
     @property
     def size(self) -> int:
@@ -120,6 +124,8 @@ class Cell:
     @property
     def of_measurement(self) -> bool:
         """Whether it lies in how the arm was measured and not in the arm."""
+        if self.changes is not None:
+            return self.changes.of_measurement
         if self.happened:
             return self.place != 'joint_angle'
         return self.place == 'sensor_frame' or (
@@ -150,7 +156,16 @@ class Cell:
     def label(self) -> str:
         """Subject, variant and moment in one."""
         moment = '' if np.isnan(self.moment) else f'{self.moment:.3f} s'
+        moment = f'until {moment}' if self.ends else moment
         return ' '.join(part for part in (self.subject, self.variant, moment) if part)
+
+
+class Changes(Protocol):
+    """Columns of a cell that is there only after some moment in a gap (2,), s, or before it."""
+
+    def __call__(self, context: Context, cell: Cell, gap: FloatArray, ends: bool) -> Design:
+        """Return the columns."""
+        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -203,6 +218,10 @@ class Effect:
     # For what happened at one moment: its cells in all gaps between rows that reach between two
     # moments, s since the first row
     between: Callable[[Context, float, float], Iterable[Cell]] | None = None
+    # For what has a place or size that no parameter is: its cells near one of them
+    finer: Callable[[Context, Cell], Iterable[Cell]] | None = None
+    # Columns of a change of its cells at a moment; None for what is the same in all of a session
+    changes: Changes | None = None
 
     def cell(
         self, columns: Callable[[Context], Design], parameters: Iterable[str], **more: Any

@@ -9,6 +9,7 @@ import numpy as np
 
 from remaster_ros.discovery.effects.base import Cell, Design, Effect, needs_gravity, turned
 from remaster_ros.discovery.effects.context import Context
+from remaster_ros.discovery.effects.moments import switched
 from remaster_ros.discovery.effects.sizes import angle, largest
 from remaster_ros.types import FloatArray
 
@@ -56,5 +57,6 @@ EFFECT = Effect(
     'bearings and first links give way, no bolt changes that, and it can only be corrected.',
     size=_tips,
     cells=cells,
+    changes=switched,
     needs=needs_gravity,
 )

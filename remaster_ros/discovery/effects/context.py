@@ -169,6 +169,25 @@ class Context:
         first = given[known][np.argmin(self.measurements.stamp_s[known])]
         return np.where(known, given - first, 0.0)
 
+    def lagging_warming(self, lag_s: float) -> FloatArray:
+        """Return `warming` through a first-order lag, from the first row on, K, (n,)."""
+        if lag_s not in self._lagging:
+            order = np.argsort(self.elapsed_s, kind='stable')
+            known = order[np.isfinite(self.measurements.temperature_c[order])]
+            time = self.elapsed_s[order]
+            warm = np.interp(time, self.elapsed_s[known], self.warming[known])
+            share = -np.expm1(-np.diff(time) / lag_s)
+            slow = np.zeros(len(order))
+            for i, part in enumerate(share.tolist()):
+                slow[i + 1] = slow[i] + part * (0.5 * (warm[i] + warm[i + 1]) - slow[i])
+            self._lagging[lag_s] = np.empty(len(order))
+            self._lagging[lag_s][order] = slow
+        return self._lagging[lag_s]
+
+    @cached_property
+    def _lagging(self) -> dict[float, FloatArray]:
+        return {}
+
     @cached_property
     def has_temperature(self) -> bool:
         """Whether the temperature is known and varies."""
@@ -325,6 +344,10 @@ class PartOfContext(Context):
     def warming(self) -> FloatArray:
         """Temperature above the first known one of the whole, K, (n,)."""
         return self.whole.warming[self.rows]
+
+    def lagging_warming(self, lag_s: float) -> FloatArray:
+        """As of the whole, K, (n,)."""
+        return self.whole.lagging_warming(lag_s)[self.rows]
 
     @cached_property
     def has_temperature(self) -> bool:

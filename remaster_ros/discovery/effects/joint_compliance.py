@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 from remaster_ros.discovery.effects.base import Cell, Effect, needs_gravity
 from remaster_ros.discovery.effects.context import Context
+from remaster_ros.discovery.effects.moments import switched
 from remaster_ros.discovery.effects.sizes import largest, of_joint
 from remaster_ros.types import FloatArray
 
@@ -48,5 +49,6 @@ EFFECT = Effect(
     'what is left by the force, and state the payload.',
     size=_turned,
     cells=cells,
+    changes=switched,
     needs=needs_gravity,
 )

@@ -32,7 +32,11 @@ def cells(context: Context) -> Iterator[Cell]:
 
 
 def _crept(context: Context, sensor: int, middle: float, turning: bool) -> Design:
-    amount = ((context.elapsed_s - middle) * context.seen_by(sensor))[:, None]
+    return _columns(context, sensor, context.elapsed_s - middle, turning)
+
+
+def _columns(context: Context, sensor: int, passed_s: FloatArray, turning: bool) -> Design:
+    amount = (passed_s * context.seen_by(sensor))[:, None]
     axes = [context.sensor_turn[:, :, axis] for axis in range(3)]
     shifts = [amount * axis for axis in axes]
     if turning:
@@ -40,6 +44,14 @@ def _crept(context: Context, sensor: int, middle: float, turning: bool) -> Desig
         arms = context.points - context.centers[sensor]
         shifts += [amount * np.cross(axis, arms) for axis in axes]
     return displaced(*shifts)
+
+
+def _began(context: Context, cell: Cell, gap: FloatArray, ends: bool) -> Design:
+    """Return a drift that begins, or becomes faster, at a moment, or ends then."""
+    since_s = context.elapsed_s - gap.mean()
+    since_s = np.minimum(since_s, 0.0) if ends else np.maximum(since_s, 0.0)
+    sensor = context.sensor_names.index(cell.subject)
+    return _columns(context, sensor, since_s, cell.size > 3)
 
 
 def _moved_by(context: Context, cell: Cell, draws: FloatArray) -> str:
@@ -63,5 +75,6 @@ EFFECT = Effect(
     'measuring.',
     size=_moved_by,
     cells=cells,
+    changes=_began,
     needs=needs_time,
 )

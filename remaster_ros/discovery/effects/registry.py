@@ -20,6 +20,8 @@ MODULES = (
     'marker_offset',
     'thermal_growth',
     'base_compliance',
+    'lateral_compliance',
+    'base_tipping',
     'registration_drift',
     'sensor_scale',
     'sensor_distortion',

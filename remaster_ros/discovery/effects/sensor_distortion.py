@@ -9,22 +9,25 @@ import numpy as np
 
 from remaster_ros.discovery.effects.base import Cell, Design, Effect, displaced
 from remaster_ros.discovery.effects.context import Context
+from remaster_ros.discovery.effects.moments import switched
 from remaster_ros.discovery.effects.sizes import up_to
 from remaster_ros.types import FloatArray
 
 # No lens distorts lengths about the sensor's origin, and in most rooms it resembles a scale.
 SPHERE_RARITY = 20
-# Name, form, unit, and axes where it has a parameter for each.
+# Name, form, unit, and axes where it has a parameter for each. About another centre c a lens errs
+# by k r² (p − c) − 2 k (c · p) p to first order in c (Brown's decentring): its x and y are −k c.
 VARIANTS = (
     ('radial', 'radial', '1/m^2', ''),
     ('radial angle', 'radial', 'm/m', ''),
     ('radial sphere', 'radial', '1/m^2', ''),
+    ('radial off centre', 'radial', '1/m^2', 'kxy'),
     ('quadratic', 'quadratic', '1/m', 'xyz'),
 )
 
 
 def cells(context: Context) -> Iterator[Cell]:
-    """Each sensor that may have lenses: radial about its z axis, or about its origin."""
+    """Each sensor that may have lenses: radial about its z axis, another one, or its origin."""
     for index, name in context.sensors('tracker', 'controller'):
         for variant, form, unit, axes in VARIANTS:
             kind = variant.replace(' ', '_')
@@ -58,6 +61,11 @@ def distortions(p: FloatArray, variant: str) -> list[FloatArray]:
         return [square * across]
     if variant == 'radial angle':
         return [square / np.maximum(p[:, 2:] ** 2, 1e-2) * across]
+    if variant == 'radial off centre':
+        decentred = [
+            square * axis + 2.0 * across[:, [i]] * across for i, axis in enumerate(np.eye(3)[:2])
+        ]
+        return [square * across, *decentred]
     if variant == 'radial sphere':
         return [np.sum(p**2, axis=1)[:, None] * p]
     return [square * axis for axis in np.eye(3)]
@@ -79,4 +87,5 @@ EFFECT = Effect(
     'session.yaml and search again.',
     size=up_to('{subject} errs'),
     cells=cells,
+    changes=switched,
 )

@@ -9,6 +9,7 @@ import numpy as np
 
 from remaster_ros.discovery.effects.base import Cell, Design, Effect, displaced
 from remaster_ros.discovery.effects.context import Context
+from remaster_ros.discovery.effects.moments import switched
 from remaster_ros.discovery.effects.sizes import number
 from remaster_ros.types import FloatArray
 
@@ -71,4 +72,5 @@ EFFECT = Effect(
     remedy='Calibrate the sensor again, with a length standard of certified length.',
     size=_long,
     cells=cells,
+    changes=switched,
 )

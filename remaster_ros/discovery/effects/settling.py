@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 from remaster_ros.discovery.effects.base import Cell, Effect, needs_approach
 from remaster_ros.discovery.effects.context import Context
+from remaster_ros.discovery.effects.moments import switched
 from remaster_ros.discovery.effects.sizes import largest, of_joint, span_of
 from remaster_ros.types import FloatArray
 
@@ -45,5 +46,6 @@ EFFECT = Effect(
     'exact; check the integral gain of the servo.',
     size=_short,
     cells=cells,
+    changes=switched,
     needs=needs_approach,
 )

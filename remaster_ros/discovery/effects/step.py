@@ -1,9 +1,7 @@
 """Step: something slipped or was bumped at one moment and stayed there.
 
-A moment lies midway in the gap between two successive configurations. The search tries moments
-spread over the session, and then all of them near the best (`Effect.between`), in the gaps of the
-rows worked on. Nothing tells when in such a gap it was: a row held out there is predicted by the
-mean over the gap.
+The search tries moments spread over the session, and then all of them near the best
+(`Effect.between`), in the gaps of the rows worked on (`moments`).
 """
 
 from __future__ import annotations
@@ -22,49 +20,30 @@ from remaster_ros.discovery.effects.base import (
     needs_time,
 )
 from remaster_ros.discovery.effects.context import Context
+from remaster_ros.discovery.effects.moments import after, gaps, spread
 from remaster_ros.discovery.effects.sizes import along_mean, angle, length, of_joint
 from remaster_ros.types import FloatArray
 
 MOMENTS = 40
-# Of the configurations, before and after a step: fewer do not tell it from gross errors.
-LEAST_SHARE = 0.04
-
-
-def _gaps(context: Context) -> FloatArray:
-    """Return start and end of gaps between configurations, s since the first row, (m, 2)."""
-    _, row = np.unique(context.measurements.configuration, return_inverse=True)
-    first, last = np.full(row.max() + 1, np.inf), np.full(row.max() + 1, -np.inf)
-    np.minimum.at(first, row, context.elapsed_s)
-    np.maximum.at(last, row, context.elapsed_s)
-    order = np.argsort(first)
-    first, last = first[order], np.maximum.accumulate(last[order])
-    apart = first[1:] > last[:-1]
-    edge = max(2, int(LEAST_SHARE * len(first)))
-    inside = (np.arange(1, len(first)) >= edge) & (np.arange(1, len(first)) <= len(first) - edge)
-    return np.column_stack([last[:-1], first[1:]])[apart & inside]
 
 
 def cells(context: Context) -> Iterator[Cell]:
     """Every place, at moments spread evenly over the configurations."""
-    gaps = _gaps(context)
-    if len(gaps):
-        chosen = np.linspace(0, len(gaps) - 1, min(MOMENTS, len(gaps)))
-        yield from _in(context, gaps[chosen.round().astype(int)])
+    yield from _in(context, spread(gaps(context), MOMENTS))
 
 
 def between(context: Context, low: float, high: float) -> Iterator[Cell]:
     """Every place, in every gap that reaches between two moments."""
-    gaps = _gaps(context)
-    yield from _in(context, gaps[(gaps[:, 1] > low) & (gaps[:, 0] < high)])
+    yield from _in(context, gaps(context, low, high))
 
 
-def _in(context: Context, gaps: FloatArray) -> Iterator[Cell]:
+def _in(context: Context, chosen: FloatArray) -> Iterator[Cell]:
     """Zero-offsets; markers; sensors, which shift or also turn; the base where several see it."""
     sensors: list[tuple[int, ...]] = [(index,) for index, _ in context.sensors('controller')]
     if len(sensors) > 1:
         sensors.append(tuple(index for (index,) in sensors))
     places = context.joints + len(context.marker_names) + 2 * len(sensors)
-    for gap in gaps:
+    for gap in chosen:
         moment = float(gap.mean())
         at = partial(EFFECT.cell, moment=moment, drawn_from=MOMENTS * places)
         for joint in range(1, context.joints + 1):
@@ -103,26 +82,19 @@ def _in(context: Context, gaps: FloatArray) -> Iterator[Cell]:
                 )
 
 
-def _after(context: Context, gap: FloatArray) -> FloatArray:
-    """Return how probably each row is after what happened at some moment in a gap, (n, 1)."""
-    start, end = gap
-    share: FloatArray = np.clip((context.elapsed_s - start) / (end - start), 0.0, 1.0)
-    return share[:, None]
-
-
 def _slipped(context: Context, joint: int, gap: FloatArray) -> Design:
-    return Design(joint - 1, _after(context, gap))
+    return Design(joint - 1, after(context, gap))
 
 
 def _marker_moved(context: Context, marker: int, gap: FloatArray) -> Design:
-    mine = _after(context, gap) * (context.marker == marker)[:, None]
+    mine = after(context, gap) * (context.marker == marker)[:, None]
     return displaced(*along_axes(mine, context.tool[:, :3, :3]))
 
 
 def _sensor_moved(
     context: Context, sensors: tuple[int, ...], gap: FloatArray, turning: bool
 ) -> Design:
-    mine = _after(context, gap) * np.isin(context.sensor, sensors)[:, None]
+    mine = after(context, gap) * np.isin(context.sensor, sensors)[:, None]
     # Along the axes of the sensor, or of the base where all of them are concerned.
     turn = context.sensor_turn if len(sensors) == 1 else np.eye(3)[None]
     shifts = along_axes(mine, turn)

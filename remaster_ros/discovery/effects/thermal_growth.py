@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
 
 from remaster_ros.discovery.effects.base import NO_TIMES, Cell, Design, Effect, displaced
 from remaster_ros.discovery.effects.context import Context
-from remaster_ros.discovery.effects.drivers import Driver, driver_named, slow_drivers
+from remaster_ros.discovery.effects.drivers import TEMPERATURE, Driver, driver_named, slow_drivers
 from remaster_ros.discovery.effects.sizes import along_mean, length
 from remaster_ros.types import FloatArray
 
@@ -17,6 +18,9 @@ from remaster_ros.types import FloatArray
 LARGEST_PER_S = 1e-6
 # Growth with time is rarer by so much where the temperature is recorded.
 BESIDE_TEMPERATURE = 50
+# Time constants with which the arm may follow a thermometer that warms up before it, s: of a small
+# joint housing to those of a large casting.
+LAGS_S = (600.0, 1800.0, 5400.0)
 
 
 def cells(context: Context) -> Iterator[Cell]:
@@ -39,6 +43,23 @@ def cells(context: Context) -> Iterator[Cell]:
                 drawn_from=(4 * len(parts) if joints else 2)
                 * (BESIDE_TEMPERATURE if beside else 1),
             )
+
+    if context.has_temperature and context.has_time:
+        for lag in LAGS_S:
+            yield EFFECT.cell(
+                partial(_grown, driver=lagging(lag), joints=arm),
+                [f'growth_lag_{lag:.0f}'],
+                driver='temperature',
+                form='lagging',
+                sign=1,
+                variant=f'lag of {lag / 60.0:.0f} min',
+                drawn_from=2 * len(LAGS_S),
+            )
+
+
+def lagging(lag_s: float) -> Driver:
+    """Return the temperature of what follows the thermometer with a time constant, s."""
+    return replace(TEMPERATURE, value=lambda context: context.lagging_warming(lag_s))
 
 
 def _grown(context: Context, driver: Driver, joints: tuple[int, ...]) -> Design:

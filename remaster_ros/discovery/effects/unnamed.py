@@ -200,16 +200,8 @@ def _rotated(context: Context, turn: Feature, about: Feature, form: _Form) -> De
     return turned(context, along_axes(form.features(context), turn(context)), about(context))
 
 
-def _bending(context: Context, link: int) -> Design:
-    """Bearings give way to gravity's moment across the joint's own axis."""
-    moment = context.gravity_moment[:, link - 1]
-    own = context.link_rotation(link) @ context.chain.axes[link - 1]
-    lateral = moment - np.sum(moment * own, axis=1)[:, None] * own
-    return turned(context, [lateral], context.joint_origin(link))
-
-
 def _links(context: Context) -> Iterator[Cell]:
-    """Links that shift or turn: by gravity's moment, over time, by temperature."""
+    """Links that shift or turn over time or by temperature."""
     slow = [form for driver in slow_drivers(context) for form in _forms(context, driver, 'linear')]
     for link in context.links():
         turn = partial(Context.link_rotation, joint=link)
@@ -220,16 +212,6 @@ def _links(context: Context) -> Iterator[Cell]:
             yield _cell('link_translation', form, axes, 'm', shift, (link,))
             rotation = partial(_rotated, turn=turn, about=about, form=form)
             yield _cell('link_rotation', form, turns, 'rad', rotation, (link,))
-        if context.has_gravity:
-            yield EFFECT.cell(
-                partial(_bending, link=link),
-                [f'lateral_compliance_{link}'],
-                joints=(link,),
-                place='link_rotation',
-                driver='gravity_moment',
-                form='linear',
-                unit='rad/(N m)',
-            )
 
 
 def _base_turn(context: Context) -> FloatArray:

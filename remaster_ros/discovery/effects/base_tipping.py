@@ -1,0 +1,97 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Base tipping: a foot that does not bear lets the base rock from one place to another."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from remaster_ros.discovery.effects.base import Cell, Design, Effect, needs_gravity, turned
+from remaster_ros.discovery.effects.context import Context
+from remaster_ros.discovery.effects.sizes import angle
+from remaster_ros.types import FloatArray
+
+# Horizontal axes about which the base may rock, over half a turn.
+AXES = 12
+# Shares of the configurations in which the base lies on one side.
+SHARES = (0.15, 0.25, 0.35, 0.5, 0.65, 0.75, 0.85)
+# Finer: so many axes and shares about the best, each a fourth as far apart.
+FINER = np.arange(-4, 5) / 4.0
+
+
+def cells(context: Context) -> Iterator[Cell]:
+    """About each axis, where the moment of the arm's weight exceeds each of some values."""
+    for degrees in np.arange(AXES) * (180.0 / AXES):
+        for share in SHARES:
+            yield _cell(context, float(degrees), share)
+
+
+def _cell(context: Context, degrees: float, share: float) -> Cell:
+    level = float(np.quantile(context.base_moment[context.to_fit] @ _axis(degrees), share))
+    return EFFECT.cell(
+        Rocking(degrees, level),
+        ['base_tipping'],
+        variant=f'{degrees:.2f}° from x, at {level:.1f} N m'.replace('-', '−'),
+        drawn_from=AXES * len(SHARES),
+    )
+
+
+def finer(context: Context, cell: Cell) -> Iterator[Cell]:
+    """Give cells about axes and moments near those of another."""
+    best = cell.columns
+    assert isinstance(best, Rocking)
+    share = float(np.mean(context.base_moment[context.to_fit] @ best.axis <= best.level))
+    for turn in FINER * (180.0 / AXES):
+        for shift in FINER * 0.1:
+            if 0.05 < share + shift < 0.95:
+                yield _cell(context, best.degrees + float(turn), share + float(shift))
+
+
+def _axis(degrees: float) -> FloatArray:
+    return np.array([np.cos(np.radians(degrees)), np.sin(np.radians(degrees)), 0.0])
+
+
+@dataclass(frozen=True)
+class Rocking:
+    """Columns of a base that rocks about an axis of R, where the moment about it has a value."""
+
+    degrees: float  # Of the horizontal axis, from x of R
+    level: float  # N m
+
+    @property
+    def axis(self) -> FloatArray:
+        """The axis, (3,)."""
+        return _axis(self.degrees)
+
+    def __call__(self, context: Context) -> Design:
+        """Return the turn by a radian between the two places, half of it to each side."""
+        side = np.where(context.base_moment @ self.axis > self.level, 0.5, -0.5)
+        return turned(context, [side[:, None] * self.axis], np.zeros(3))
+
+
+def _rocks(context: Context, cell: Cell, draws: FloatArray) -> str:
+    return f'the base rocks by {angle(draws[:, 0])} about an axis {cell.variant}'
+
+
+EFFECT = Effect(
+    name='base_tipping',
+    place='base_rotation',
+    driver='gravity_moment',
+    form='step',
+    equation='δp = ± ½ θ n × p, + where the moment of the weight about n exceeds M₀',
+    source='Nordin & Gutman 2002, Automatica 38 (play between two contacts)',
+    unit='rad',
+    plausible=(1e-6, 1e-2),
+    sign=1,
+    sentence='The base rocks as the arm reaches over (a foot does not bear, or loose bolts).',
+    separate_by='a dial gauge at the foot while the arm reaches from one side to the other',
+    remedy='Hold a dial gauge between the ground and each foot of the stand while the arm reaches '
+    'from one side to the other; level the feet, tighten the bolts, and measure again.',
+    size=_rocks,
+    cells=cells,
+    needs=needs_gravity,
+    in_family=lambda cell: False,
+    finer=finer,
+)

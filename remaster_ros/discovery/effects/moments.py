@@ -1,0 +1,92 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Moments at which something begins or changes in mid-session.
+
+A moment lies midway in the gap between two successive configurations. Nothing tells when in such
+a gap it was: a row held out there is predicted by the mean over the gap.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+
+from remaster_ros.discovery.effects.base import Cell, Changes, Design
+from remaster_ros.discovery.effects.context import Context
+from remaster_ros.types import FloatArray
+
+# Of the configurations, before and after a moment: fewer do not tell it from gross errors.
+LEAST_SHARE = 0.04
+# Moments at which each effect may change that are tried; those near the best follow.
+MOMENTS_OF_CHANGE = 12
+# An effect changes in mid-session in one of so many sessions in which it is there.
+RARITY_OF_CHANGE = 3
+
+
+def gaps(context: Context, low: float = -np.inf, high: float = np.inf) -> FloatArray:
+    """Return start and end of gaps between configurations, s since the first row, (m, 2).
+
+    ``low, high``: of those that reach between two moments, s.
+    """
+    _, row = np.unique(context.measurements.configuration, return_inverse=True)
+    first, last = np.full(row.max() + 1, np.inf), np.full(row.max() + 1, -np.inf)
+    np.minimum.at(first, row, context.elapsed_s)
+    np.maximum.at(last, row, context.elapsed_s)
+    order = np.argsort(first)
+    first, last = first[order], np.maximum.accumulate(last[order])
+    apart = first[1:] > last[:-1]
+    edge = max(2, int(LEAST_SHARE * len(first)))
+    inside = (np.arange(1, len(first)) >= edge) & (np.arange(1, len(first)) <= len(first) - edge)
+    found = np.column_stack([last[:-1], first[1:]])[apart & inside]
+    return found[(found[:, 1] > low) & (found[:, 0] < high)]
+
+
+def spread(found: FloatArray, count: int) -> FloatArray:
+    """Return at most so many of some gaps (m, 2), spread evenly over them."""
+    if len(found) == 0:
+        return found
+    chosen = np.linspace(0, len(found) - 1, min(count, len(found)))
+    return found[chosen.round().astype(int)]
+
+
+def after(context: Context, gap: FloatArray) -> FloatArray:
+    """Return how probably each row is after what happened at some moment in a gap, (n, 1)."""
+    start, end = gap
+    share: FloatArray = np.clip((context.elapsed_s - start) / (end - start), 0.0, 1.0)
+    return share[:, None]
+
+
+def switched(context: Context, cell: Cell, gap: FloatArray, ends: bool) -> Design:
+    """Return the columns of a cell from a moment on, or up to it, and nothing else."""
+    design = cell.columns(context)
+    share = 1.0 - after(context, gap) if ends else after(context, gap)
+    values = design.values * (share if design.values.ndim == 2 else share[:, None])
+    return Design(design.at, values)
+
+
+def changed_at(cell: Cell, changes: Changes, gap: FloatArray) -> Iterator[Cell]:
+    """Give a cell that begins, or becomes more or less, in a gap (2,), and one that ends then."""
+    begins = replace(
+        cell,
+        parameters=tuple(f'{name}_change' for name in cell.parameters),
+        columns=partial(changes, cell=cell, gap=gap, ends=False),
+        drawn_from=cell.drawn_from * MOMENTS_OF_CHANGE * RARITY_OF_CHANGE,
+        sign=0,
+        moment=float(gap.mean()),
+        changes=cell,
+        model_change=None,
+    )
+    yield begins
+    columns = partial(changes, cell=cell, gap=gap, ends=True)
+    yield replace(begins, columns=columns, sign=cell.sign, ends=True)
+
+
+def changed(context: Context, cells: Iterable[tuple[Cell, Changes | None]]) -> Iterator[Cell]:
+    """Give the changes of cells at moments spread over the session, each with how it changes."""
+    moments = spread(gaps(context), MOMENTS_OF_CHANGE) if context.has_time else np.zeros((0, 2))
+    for cell, changes in cells:
+        if changes is not None and cell.penalty is None:
+            for gap in moments:
+                yield from changed_at(cell, changes, gap)
