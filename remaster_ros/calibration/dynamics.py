@@ -76,6 +76,18 @@ class MotionColumns:
         rates = np.nan_to_num(m.velocity), np.nan_to_num(m.acceleration)
         return cls(chain, m.q + offsets, *rates, m.stamp_s)
 
+    def at(self, rows: IntArray) -> MotionColumns:
+        """Return the same of some rows, by their indices in this one."""
+        return _PartOfMotion(
+            self.chain,
+            self.q[rows],
+            self.velocity[rows],
+            self.acceleration[rows],
+            self.seconds[rows],
+            self,
+            rows,
+        )
+
     @cached_property
     def links(self) -> MovingLinks:
         """Motion of the links."""
@@ -108,6 +120,20 @@ class MotionColumns:
         moved = self.links.point_acceleration(apply(tool, places))
         along = np.einsum('nia,ni->na', tool[:, :3, :3], moved)
         return np.asarray(-tool[:, :3, :3] * along[:, None, :])
+
+
+@dataclass(frozen=True, eq=False)
+class _PartOfMotion(MotionColumns):
+    """Some rows, whose friction comes from the path of all."""
+
+    whole: MotionColumns
+    rows: IntArray
+
+    @cached_property
+    def friction(self) -> tuple[FloatArray, FloatArray]:
+        """As of the whole."""
+        soon, late = self.whole.friction
+        return soon[self.rows], late[self.rows]
 
 
 def friction_share(
@@ -240,6 +266,14 @@ def estimate_moving(problem: Problem) -> Estimate:
     return estimate(replace(problem, path_noise=noise), replace(extension, start=start))
 
 
+def estimate_beside(moving: Estimate, problem: Problem) -> Estimate:
+    """Return the estimate without parameters of motion, under the noise that remains with them.
+
+    What motion adds is left in its errors. ``moving``: of `estimate_moving`.
+    """
+    return estimate(replace(problem, path_noise=moving.problem.path_noise))
+
+
 def noise_along_path(found: Estimate) -> PathNoise | None:
     """Return the correlations of a fit's errors along the path; None of too few frames."""
     posterior, model, mode = found.posterior, found.model, found.mode
@@ -280,9 +314,13 @@ def moving_words(found: Estimate) -> str:
 
 
 def clocks_of(found: Estimate) -> dict[str, tuple[float, float]]:
-    """Return how late the stamps of each sensor are beside the joints', and its std, s."""
+    """Return how late the stamps of each sensor are beside the joints', and its std, s.
+
+    {} of a fit without parameters of motion.
+    """
     extension, model = found.model.extension, found.model
-    assert extension is not None
+    if extension is None or not extension.of_motion:
+        return {}
     theta, free = model.theta(found.mode.z), found.posterior.free
     variance = dict(zip(free.tolist(), np.diag(found.mode.covariance), strict=False))
     clocks = {}

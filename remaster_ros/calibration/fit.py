@@ -78,7 +78,7 @@ def fit_session(
         each, (size, c): the posterior is widened by them. Not in paper mode.
     found
         The session's estimate, where it has been made with the same priors and without further
-        effects.
+        effects. With these its noise along a path is taken over.
 
     Raises
     ------
@@ -126,6 +126,8 @@ def fit_session(
     else:
         # With further effects the same model has been fitted to the same rows before.
         if extension is not None:
+            if found is not None:
+                problem = replace(problem, path_noise=found.problem.path_noise)
             found = estimate(problem, extension)
         elif found is None:
             fitted = estimate_moving if session.is_moving else estimate

@@ -13,8 +13,9 @@ the frames' means about a fit; the deviations of single markers from them have a
 of their own, in the same proportion.
 
 The rows are then decorrelated: the means of the frames, and the deviations of each marker, are
-multiplied by the inverse of the Cholesky factor of these correlations. All else of the noise is as
-in `noise`, on rows that are independent. That the lengths and shares are estimated is not counted.
+multiplied by the inverse of the Cholesky factor of these correlations, and by the share of the
+standard deviation that is scatter about their mean. All else of the noise is as in `noise`, on
+rows that are independent. That the lengths and shares are estimated is not counted.
 """
 
 from __future__ import annotations
@@ -313,7 +314,15 @@ def _correlations(distance: FloatArray, share: float, order: int) -> FloatArray:
 
 
 def _inverse_factor(correlations: FloatArray) -> FloatArray:
+    """Return what decorrelates errors, in proportion to their scatter about their mean.
+
+    The mean of a slow process over a path is no scatter: a registration takes it up.
+    """
     factor = np.linalg.cholesky(correlations)
-    return np.asarray(
-        solve_triangular(factor, np.eye(len(factor)), lower=True, check_finite=False)
-    )
+    inverse = solve_triangular(factor, np.eye(len(factor)), lower=True, check_finite=False)
+    return np.asarray(np.sqrt(1.0 - scatterless(correlations)) * inverse)
+
+
+def scatterless(correlations: FloatArray) -> float:
+    """Return the share of the variance that all errors have in common."""
+    return min(float(np.mean(correlations)), 0.999)

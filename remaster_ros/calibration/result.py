@@ -14,6 +14,7 @@ from scipy.linalg import cho_factor, cho_solve
 
 from remaster_ros.calibration.comparison import Comparison, compared, predicted_rows
 from remaster_ros.calibration.convergence import SamplerInfo
+from remaster_ros.calibration.dynamics import clocks_of
 from remaster_ros.calibration.estimate import Estimate, Problem
 from remaster_ros.calibration.gauge_words import the
 from remaster_ros.calibration.identifiability import Gauge, GaugeDirection, known_offsets
@@ -284,6 +285,11 @@ class FitResult:
     def comparison(self) -> Comparison:
         """The same fit with all offsets held at zero beside this one."""
         return self.compare()
+
+    @property
+    def clocks(self) -> Mapping[str, tuple[float, float]]:
+        """How late each sensor's stamps are beside the joints', and std, s; {} if none moved."""
+        return {} if self.found is None else clocks_of(self.found)
 
     @property
     def T_R_N_before(self) -> Mapping[str, FloatArray]:

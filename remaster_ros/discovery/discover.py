@@ -9,12 +9,13 @@ and refuse a model that predicts them worse than the offsets do.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Literal
 
 import numpy as np
 
+from remaster_ros.calibration.dynamics import clocks_of, estimate_beside, estimate_moving
 from remaster_ros.calibration.estimate import Estimate, Problem, estimate
 from remaster_ros.calibration.fit import fit_session
 from remaster_ros.calibration.mistakes import sound_estimate
@@ -23,7 +24,7 @@ from remaster_ros.calibration.result import FitResult
 from remaster_ros.calibration.sampling import Progress, silent
 from remaster_ros.discovery.effects.base import Cell
 from remaster_ros.discovery.effects.moments import changed
-from remaster_ros.discovery.effects.registry import EFFECTS
+from remaster_ros.discovery.effects.registry import EFFECTS, effects_of
 from remaster_ros.discovery.evidence import solve
 from remaster_ros.discovery.explain import FoundEffect, describe
 from remaster_ros.discovery.gain import (
@@ -97,6 +98,9 @@ class Discovery:
         its sensor, m, (n, 3).
     unexplained
         Structure that no cause explains.
+    clocks
+        Of a moving session: how late each sensor's stamps are beside the joints', and std, s. They
+        were taken out before the search.
     alone
         The sampled fit whose zero-offsets are right where nothing else of the arm is corrected:
         with errors of the measurement taken out where they are certain, and no other.
@@ -128,6 +132,7 @@ class Discovery:
     geometry: GeometryModel | None
     thinning: Thinning | None = None
     unexplained: tuple[Unexplained, ...] = ()
+    clocks: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
     @property
     def loads_geometry(self) -> bool:
@@ -177,14 +182,21 @@ def discover_session(
     report('offsets', 0.0)
     # What causes do to orientations is not modelled.
     session = session.positions_alone()
-    before = sound_estimate(session)
+    moving = sound_estimate(session, fitted=estimate_moving) if session.is_moving else None
+    if moving is None:
+        before = sound_estimate(session)
+    else:
+        before = sound_estimate(session, fitted=partial(estimate_beside, moving))
     found, residuals, pool = _to_search(session, before, rng)
+    effects_tried = effects_of(session.is_moving)
     untestable = {
-        name: why for name, effect in EFFECTS.items() if (why := effect.needs(residuals.context))
+        name: why
+        for name, effect in effects_tried.items()
+        if (why := effect.needs(residuals.context))
     }
     cells = [
         cell
-        for name, effect in EFFECTS.items()
+        for name, effect in effects_tried.items()
         if name not in untestable and not effect.moves_the_fit
         for cell in effect.cells(residuals.context)
     ]
@@ -297,6 +309,7 @@ def discover_session(
         geometry=geometry,
         thinning=thinning,
         unexplained=unexplained,
+        clocks={} if moving is None else clocks_of(moving),
     )
     if result.loads_geometry:
         return result
@@ -313,7 +326,8 @@ def _to_search(
     moved = moved_markers(found, residuals, bare.noise, ()) if bare is not None else ()
     if moved:
         # A marker that is pulled to where it is not leaves errors for other causes to explain.
-        found = estimate(Problem.of(session, loosened(session, moved)))
+        problem = Problem.of(session, loosened(session, moved))
+        found = estimate(replace(problem, path_noise=before.problem.path_noise))
         residuals = Residuals.of(found)
     pool = draw_rows(found.problem.measurements, found.problem.fitted, rng)
     if len(pool) < len(found.problem.fitted):
@@ -353,6 +367,7 @@ def _sampled(
         precision=PRECISION,
         extension=extension_of(data, solution, found) if solution.cells else None,
         unmodelled=np.concatenate(moves, axis=1),
+        found=found,
         progress=lambda _, share: report('sampling the extended model', share),
     )
     return fit, gain_of(before, data, solution, fit, rng), if_drawn

@@ -21,6 +21,7 @@ from remaster_ros.calibration.grouped_rows import Rows
 from remaster_ros.calibration.laplace import Mode
 from remaster_ros.calibration.noise import Noise, NoiseModel
 from remaster_ros.calibration.outliers import robust_noise
+from remaster_ros.calibration.path_noise import PathNoise
 from remaster_ros.calibration.priors import STEP_STD
 from remaster_ros.discovery import packed
 from remaster_ros.discovery.effects.base import Cell
@@ -70,6 +71,7 @@ class Residuals:
     reference: FloatArray  # T_R_N of every sensor that `errors` are relative to, (sensors, 4, 4)
     noise_model: NoiseModel  # Which errors of the rows have which variance
     noise: Noise  # A robust first estimate
+    path_noise: PathNoise | None = None  # Of errors along a path
 
     @classmethod
     def of(cls, found: Estimate) -> Residuals:
@@ -104,6 +106,7 @@ class Residuals:
             full_jacobian[block.source] = model.natural_jacobian(x, block)
 
         rows = Rows.of(problem.measurements, found.kept, model.reference)
+        rows = rows.along_path(problem.path_noise)
         combinations = _orthonormal(full_jacobian[rows.source])
         full_base = full_jacobian @ combinations
         step_precision = np.zeros(model.size)
@@ -126,6 +129,7 @@ class Residuals:
             model.reference,
             noise_model,
             noise_model.of_sensors(*noise),
+            problem.path_noise,
         )
 
     def holding(self, parameters: IntArray) -> Residuals:
@@ -148,6 +152,7 @@ class Residuals:
     def only(self, source: IntArray) -> Residuals:
         """Return the same on other rows of the session."""
         rows = Rows.of(self.context.measurements, np.sort(source), self.reference)
+        rows = rows.along_path(self.path_noise)
         return replace(
             self,
             rows=rows,

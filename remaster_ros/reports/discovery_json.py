@@ -43,6 +43,7 @@ from remaster_ros.planning.rival_causes import FoundCause
 from remaster_ros.reports import schemas
 from remaster_ros.reports.fit_json import (
     DISCOVERY_FILE,
+    clocks_content,
     correction_text,
     estimates,
     model_text,
@@ -119,6 +120,8 @@ def discovery_content(
     }
     if discovery.thinning is not None:
         content['rows_searched'] = discovery.thinning
+    if discovery.clocks:
+        content['clocks'] = clocks_content(discovery.clocks)
     if decided:
         content['decided'] = [
             {

@@ -372,6 +372,8 @@ def fit_content(result: FitResult) -> schemas.Fit:
                 row[f'model_std_{row["unit"]}'] = std
     if result.orientations is not None:
         content['orientation'] = _orientation(result, result.orientations)
+    if result.clocks:
+        content['clocks'] = clocks_content(result.clocks)
     if (geometry := geometry_of(result)) is not None:
         content['geometry'] = _geometry(result, geometry)
         wider = of_joints(result.chain, **uncertainty(result)._asdict())
@@ -380,6 +382,13 @@ def fit_content(result: FitResult) -> schemas.Fit:
                 row[f'std_if_exactly_drawn_{row["unit"]}'] = row[f'std_{row["unit"]}']
                 row |= off_drawing
     return schemas.checked(content, schemas.Fit)
+
+
+def clocks_content(clocks: Mapping[str, tuple[float, float]]) -> dict[str, Any]:
+    """Return how late the stamps of sensors are, s, as files have it."""
+    return {
+        name: {'late_ms': 1e3 * late, 'std_ms': 1e3 * std} for name, (late, std) in clocks.items()
+    }
 
 
 def table_rows(**columns: Iterable[Any]) -> list[dict[str, Any]]:

@@ -327,6 +327,13 @@ class FittedGeometry(Struct):
     imitations: list[Imitation]
 
 
+class Clock(Struct):
+    """How late a sensor's stamps are beside those of the joint states."""
+
+    late_ms: float
+    std_ms: float
+
+
 class Fit(Struct):
     """fit.json.
 
@@ -352,6 +359,7 @@ class Fit(Struct):
     intervals: Literal['model', 'robust'] | UnsetType = UNSET
     geometry: FittedGeometry | UnsetType = UNSET
     orientation: Orientation | UnsetType = UNSET
+    clocks: dict[str, Clock] | UnsetType = UNSET
     judgement: Judgement | UnsetType = UNSET
 
 
@@ -590,6 +598,7 @@ class Discovered(Struct):
     predicted_regions95: PredictedRegions | UnsetType = UNSET
     loadable: list[Loadable] | UnsetType = UNSET
     rows_searched: Thinning | UnsetType = UNSET
+    clocks: dict[str, Clock] | UnsetType = UNSET
     confirmation: Confirmed | UnsetType = UNSET
     decided: list[Decided] | UnsetType = UNSET
     judgement: Judgement | UnsetType = UNSET

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Literal
 
 import msgspec
 import numpy as np
-from msgspec import UNSET, Struct
+from msgspec import UNSET, Struct, UnsetType
 
+from remaster_ros.calibration.dynamics import late_words
 from remaster_ros.calibration.gauge_words import counted, in_a_line, listed
 from remaster_ros.calibration.measured_again import MeasuredAgain
 from remaster_ros.calibration.noise_check import SPOILT, NoiseCheck
@@ -28,6 +29,7 @@ from remaster_ros.discovery.words import (
 )
 from remaster_ros.reports.rows_csv import lengths_mm
 from remaster_ros.reports.schemas import (
+    Clock,
     Confirmed,
     Discovered,
     Effect,
@@ -667,6 +669,7 @@ def fit_lines(fit: Fit) -> list[str]:
             if turned.get('after'):
                 before, after = turned['before']['mean_deg'], turned['after']['mean_deg']
                 lines.append(f'… orientation: {before:.4f} deg before, {after:.4f} deg after')
+    lines += clock_lines(fit.clocks)
     lines += [fit.judgement.headline, *fit.judgement.points]
     if isinstance(fit.geometry, Struct) and (moved := fit.geometry.imitations):
         lines.append(as_drawn(fit.geometry, [max(moved, key=lambda one: one.as_angle)]))
@@ -678,6 +681,18 @@ def fit_lines(fit: Fit) -> list[str]:
         rows = ', '.join(str(row.observation) for row in fit.left_out)
         lines.append(f'left out as gross errors: observation {rows}')
     return lines
+
+
+def clock_lines(clocks: dict[str, Clock] | UnsetType) -> list[str]:
+    """Return how late the stamps of each sensor are, and what to do, a line each."""
+    if not isinstance(clocks, dict):
+        return []
+    return [
+        f"{name}'s stamps are {late_words(1e-3 * clock.late_ms, 1e-3 * clock.std_ms)} beside "
+        'those of the joint states; taken out here. To do: synchronise the clocks (PTP), or state '
+        'it to what joins their data (import --clock-offset)'
+        for name, clock in clocks.items()
+    ]
 
 
 def _offset(row: JointOffset) -> str:
@@ -708,7 +723,7 @@ def _to_load(rows: Sequence[Loadable], effects: Sequence[Effect] = ()) -> list[s
 def discovery_lines(found: Discovered) -> list[str]:
     """Return verdict, causes, what can be loaded, and the coverage of held-out rows in lines."""
     assert isinstance(found.judgement, Judgement)
-    lines = [f'verdict: {found.verdict}', found.judgement.headline]
+    lines = [f'verdict: {found.verdict}', found.judgement.headline, *clock_lines(found.clocks)]
     for effect in found.effects:
         lines.append(f'{effect.title}: {size_words(effect)}. {effect.cause}')
         if effect.remedy:

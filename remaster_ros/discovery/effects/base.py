@@ -305,6 +305,11 @@ def needs_approach(context: Context) -> str:
     return '' if context.has_approach else 'where the arm came from (from_q) is not recorded'
 
 
+def needs_motion(context: Context) -> str:
+    """Return why effects of motion cannot be tested; '' where they can."""
+    return '' if context.has_motion else 'the arm stood still at every reading'
+
+
 def needs_time(context: Context) -> str:
     """Return why drift cannot be tested; '' where it can."""
     if context.has_time:

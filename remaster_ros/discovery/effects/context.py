@@ -9,6 +9,7 @@ from typing import Literal
 
 import numpy as np
 
+from remaster_ros.calibration.dynamics import MotionColumns
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.transforms import apply
 from remaster_ros.types import BoolArray, FloatArray, IntArray, Measurements, SensorKind
@@ -141,6 +142,21 @@ class Context:
         """Whether it is recorded where the arm came from."""
         known = np.all(np.isfinite(self.measurements.from_q), axis=1)
         return bool(len(known) and np.mean(known) >= KNOWN_SHARE)
+
+    @property
+    def has_motion(self) -> bool:
+        """Whether the arm moved while it was measured."""
+        return self.measurements.velocity is not None
+
+    @cached_property
+    def motion(self) -> MotionColumns:
+        """Functions of the rows' motion, of a session that `has_motion`."""
+        return MotionColumns.of(self.chain, self.measurements, self.joint_offsets)
+
+    @cached_property
+    def marker_velocity(self) -> FloatArray:
+        """Velocity of the marker in R, m/s, (n, 3)."""
+        return np.einsum('nik,nk->ni', self.jacobian, self.motion.velocity)
 
     @cached_property
     def elapsed_s(self) -> FloatArray:
@@ -324,6 +340,11 @@ class PartOfContext(Context):
     def has_approach(self) -> bool:
         """As of the whole."""
         return self.whole.has_approach
+
+    @cached_property
+    def motion(self) -> MotionColumns:
+        """As of the whole."""
+        return self.whole.motion.at(self.rows)
 
     @cached_property
     def elapsed_s(self) -> FloatArray:

@@ -33,9 +33,33 @@ MODULES = (
 """Modules of this package, each of which has an ``EFFECT``; in the order they are tried."""
 
 
+OF_MOTION = (
+    'clock_offset',
+    'clock_drift',
+    'joint_lag',
+    'friction_windup',
+    'inertial_deflection',
+    'tool_mode',
+)
+"""Modules of effects that only an arm shows that moves; they are tried on no other session."""
+
+
 def _effect(module: str) -> Effect:
     effect: Effect = import_module(f'{__package__}.{module}').EFFECT
     return effect
 
 
-EFFECTS = {effect.name: effect for effect in map(_effect, MODULES)}
+class _Effects(dict[str, Effect]):
+    """Effects of every session by name; those of motion are found by name, and not listed."""
+
+    def __missing__(self, name: str) -> Effect:
+        return MOTION[name]
+
+
+MOTION = {effect.name: effect for effect in map(_effect, OF_MOTION)}
+EFFECTS = _Effects((effect.name, effect) for effect in map(_effect, MODULES))
+
+
+def effects_of(moving: bool) -> dict[str, Effect]:
+    """Return the effects that are tried on a session."""
+    return {**EFFECTS, **MOTION} if moving else {**EFFECTS}

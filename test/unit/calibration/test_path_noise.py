@@ -7,7 +7,7 @@ import pytest
 from remaster_ros.calibration.dynamics import friction_share
 from remaster_ros.calibration.grouped_rows import Rows
 from remaster_ros.calibration.noise import Noise, NoiseModel
-from remaster_ros.calibration.path_noise import ORDERS, PathNoise
+from remaster_ros.calibration.path_noise import ORDERS, PathNoise, scatterless
 from remaster_ros.types import Measurements
 
 FRAMES, MARKERS = 60, 3
@@ -58,7 +58,9 @@ def test_correlated_errors_become_independent(rows, order):
     covariance = 0.25 * member @ of_frames @ member.T + np.kron(of_markers, apart)
     along = rows.along_path(noise)
     white = along.decorrelated(np.repeat(np.eye(len(rows))[:, None, :], 3, axis=1))[:, 0, :]
-    expected = 0.25 * member @ member.T + np.kron(np.eye(FRAMES), apart)
+    scatter = 1.0 - scatterless(of_frames), 1.0 - scatterless(of_markers)
+    expected = 0.25 * scatter[0] * member @ member.T
+    expected += scatter[1] * np.kron(np.eye(FRAMES), apart)
     np.testing.assert_allclose(white @ covariance @ white.T, expected, atol=1e-9)
 
 

@@ -1,0 +1,167 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Sessions of 30 s of motion: are offsets, clock and their intervals right?
+
+Worlds of test/worlds/moving_world.py: pinocchio, with dynamics and an error field of its own. In
+each a recording is imported as of a bag and fitted, with the dynamics and, beside it, without.
+
+    python benchmarks/bench_moving.py --sessions 60
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import common
+import numpy as np
+from worlds.moving_bags import imported, recorded
+from worlds.moving_world import Dynamics, Errors
+
+from remaster_ros.calibration.dynamics import clocks_of, estimate_moving
+from remaster_ros.calibration.estimate import Estimate, Problem, estimate
+from remaster_ros.calibration.fit import fit_session
+from remaster_ros.discovery.discover import discover_session
+from remaster_ros.errors import InsufficientDataError
+from remaster_ros.reports.sentences import verdict
+from remaster_ros.types import FloatArray, Session
+
+COLOURS = {'good': 'green', 'caution': 'amber', 'bad': 'red'}
+# Of an interval of 95 %, in standard deviations.
+WITHIN = 1.96
+
+
+@dataclass(frozen=True)
+class World:
+    """Worlds of one kind."""
+
+    name: str
+    scale: float  # Of the dynamics
+    tool_speed: float | None  # m/s
+    own_field_m: float = 0.0  # Error field of each marker by itself
+
+    def session(self, seed: int) -> tuple[Session, FloatArray, float]:
+        """Return a session, the true offsets, and the delay of the sensor's stamps, s."""
+        world, recording = recorded(
+            seed,
+            tool_speed=self.tool_speed,
+            dynamics=Dynamics(scale=self.scale),
+            errors=Errors(own_field_m=self.own_field_m),
+        )
+        session, _ = imported(world, recording, seed)
+        return session, world.joint_offsets, recording.delay_s
+
+
+WORLDS = (
+    World('0.25 m/s, dynamics × 1', 1.0, 0.25),
+    World('0.25 m/s, dynamics × 3', 3.0, 0.25),
+    World('no limit at the tool, × 1', 1.0, None),
+    World('no limit at the tool, × 3', 3.0, None),
+)
+OF_EACH_MARKER = World('0.25 m/s, × 1, and 0.05 mm of each marker', 1.0, 0.25, 5e-5)
+
+
+def inner(found: Estimate) -> tuple[FloatArray, FloatArray]:
+    """Return offsets and standard deviations of joints 2 to k - 1, rad."""
+    model, free = found.model, found.posterior.free
+    std = dict(zip(free.tolist(), np.sqrt(np.diag(found.mode.covariance)), strict=False))
+    x = model.natural(found.mode.z)
+    return model.offsets(x)[1:-1], np.array([std[j] for j in range(1, model.joints - 1)])
+
+
+def row(world: World, seeds: range) -> Iterator[object]:
+    """Give the cells of a line of the table."""
+    errors, stds, clocks, clock_stds, cpu = [], [], [], [], []
+    naive_errors, naive_stds = [], []
+    for seed in seeds:
+        session, truth, delay_s = world.session(seed)
+        begun = time.process_time()
+        problem = Problem.of(session)
+        found = estimate_moving(problem)
+        cpu.append(time.process_time() - begun)
+        offsets, std = inner(found)
+        errors.append(offsets - truth[1:-1])
+        stds.append(std)
+        late_s, late_std = clocks_of(found)['bar']
+        clocks.append(-late_s - delay_s)
+        clock_stds.append(late_std)
+        offsets, std = inner(estimate(problem))
+        naive_errors.append(offsets - truth[1:-1])
+        naive_stds.append(std)
+    e, s = np.array(errors), np.array(stds)
+    z, naive = e / s, np.array(naive_errors) / np.array(naive_stds)
+    yield from (world.name, len(seeds))
+    yield from (f'{np.degrees(_rms(e)):.4f}', f'{np.degrees(_rms(s)):.4f}')
+    yield from (f'{_rms(z):.2f}', f'{100.0 * np.mean(np.abs(z) < WITHIN):.0f} %')
+    yield f'{1e3 * _rms(np.array(clocks)):.3f} ({1e3 * _rms(np.array(clock_stds)):.3f})'
+    yield f'{_rms(np.array(clocks) / np.array(clock_stds)):.2f}'
+    yield f'{np.degrees(_rms(np.array(naive_errors))):.4f}'
+    yield f'{_rms(naive):.1f}'
+    yield f'{np.mean(cpu):.2f}'
+
+
+def _rms(values: FloatArray) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def verdicts(count: int) -> str:
+    """Return the colours of fits of sessions whose velocities were taken away, and CPU times."""
+    colours: dict[str, int] = {}
+    fits, discoveries = [], []
+    for seed in range(count):
+        world = WORLDS[seed % len(WORLDS)]
+        session, _, _ = world.session(seed)
+        begun = time.process_time()
+        fit_session(session, rng=np.random.default_rng(0))
+        fits.append(time.process_time() - begun)
+        if seed < 2:
+            begun = time.process_time()
+            discover_session(session, rng=np.random.default_rng(0))
+            discoveries.append(time.process_time() - begun)
+        still = replace(session.measurements, velocity=None, acceleration=None)
+        try:
+            naive = fit_session(replace(session, measurements=still), rng=np.random.default_rng(0))
+            colour = COLOURS[verdict(naive).mood]
+        except InsufficientDataError:
+            colour = 'refused'
+        colours[colour] = colours.get(colour, 0) + 1
+    listed = ', '.join(f'{name} {number}' for name, number in colours.items())
+    return (
+        f'Fits of {count} of these sessions without their velocities: {listed}. CPU of '
+        f'`fit_session` {np.mean(fits):.1f} s (at most {max(fits):.1f}), of `discover_session` '
+        f'{", ".join(f"{one:.1f}" for one in discoveries)} s.'
+    )
+
+
+def main() -> None:
+    """Print the tables."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument('--sessions', type=int, default=12, help='of all worlds together')
+    parser.add_argument('--verdicts', type=int, default=4, help='sessions whose fits are judged')
+    args = parser.parse_args()
+    print(common.machine())
+    each = args.sessions // len(WORLDS)
+    header = (
+        'world',
+        'sessions',
+        'RMS error, deg',
+        'stated std',
+        'RMS z',
+        'in 95 %',
+        'clock error (std), ms',
+        'its z',
+        'without dynamics, deg',
+        'its z',
+        'CPU, s',
+    )
+    seeds = [range(1000 * i, 1000 * i + each) for i in range(len(WORLDS))]
+    rows = [[*row(world, own)] for world, own in zip(WORLDS, seeds, strict=True)]
+    rows.append([*row(OF_EACH_MARKER, range(9000, 9000 + max(1, each // 3)))])
+    print(common.table(header, rows))
+    print(f'seeds {", ".join(f"{one.start} to {one.stop - 1}" for one in seeds)}')
+    print(verdicts(args.verdicts))
+
+
+if __name__ == '__main__':
+    main()

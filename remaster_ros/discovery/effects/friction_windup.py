@@ -1,0 +1,45 @@
+"""Wind-up by friction: a joint lags behind its encoder by an angle with the sign of its speed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from remaster_ros.discovery.effects.base import Cell, Effect, needs_motion
+from remaster_ros.discovery.effects.context import Context
+from remaster_ros.discovery.effects.sizes import of_joint
+from remaster_ros.types import FloatArray
+
+
+def cells(context: Context) -> Iterator[Cell]:
+    """One cell per joint: δq_j = w_j f_j, f_j with the sign of q̇_j, with memory."""
+    return EFFECT.at_joints(
+        context,
+        context.turning,
+        lambda context, joint: [part[:, joint - 1] for part in context.motion.friction],
+        ['windup_{joint}', 'late_windup_{joint}'],
+        drawn_from=context.joints,
+    )
+
+
+def _wound(context: Context, cell: Cell, draws: FloatArray) -> str:
+    joint = cell.joints[0]
+    return f'joint {joint} is {of_joint(context, joint, 2.0 * draws[:, 0])} apart, way by way'
+
+
+EFFECT = Effect(
+    name='friction_windup',
+    place='joint_angle',
+    driver='sign_of_velocity',
+    form='step',
+    equation='δq_j = w_j f_j, δ df_j/dq_j = 1 − f_j sign(q̇_j) for travels δ of 1e-4 and 1e-3 rad',
+    source='Dahl 1968, Aerospace Corp. TOR-0158; Taghirad & Bélanger 1998 (harmonic drives)',
+    unit='rad',
+    plausible=(1e-6, 5e-4),
+    sentence='Friction winds {subject} up: where it is depends on which way it moves.',
+    separate_by='the same path there and back',
+    remedy='Have the friction of the gearbox checked (grease, preload); where it must be exact, '
+    'come from the same side.',
+    size=_wound,
+    cells=cells,
+    needs=needs_motion,
+)

@@ -1,0 +1,48 @@
+"""Inertial deflection: a joint gives way to the inertia of what it carries."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from remaster_ros.discovery.effects.base import Cell, Effect, needs_gravity, needs_motion
+from remaster_ros.discovery.effects.context import Context
+from remaster_ros.discovery.effects.sizes import largest, of_joint
+from remaster_ros.types import FloatArray
+
+
+def cells(context: Context) -> Iterator[Cell]:
+    """One cell per joint: δq_j = s_j τ_j."""
+    return EFFECT.at_joints(
+        context,
+        context.turning,
+        lambda context, joint: [context.motion.inertial_torque[:, joint - 1]],
+        ['inertia_{joint}'],
+        drawn_from=context.joints,
+    )
+
+
+def _gave_way(context: Context, cell: Cell, draws: FloatArray) -> str:
+    joint = cell.joints[0]
+    torque = largest(context.motion.inertial_torque[:, joint - 1])
+    moved = of_joint(context, joint, draws[:, 0] * torque)
+    return f'joint {joint} gives way by {moved} under {torque:.0f} N m of inertia'
+
+
+EFFECT = Effect(
+    name='inertial_deflection',
+    place='joint_angle',
+    driver='inertial_torque',
+    form='linear',
+    equation="δq_j = s_j τ_j(q, q̇, q̈), τ by the links' inertia forces −m a",
+    source='Luh, Walker & Paul 1980, J. Dyn. Sys. Meas. Control 102; Spong 1987, ibid. 109',
+    unit='rad/(N m)',
+    plausible=(1e-6, 3e-4),
+    sign=1,
+    sentence='Acceleration bends {subject} (soft gearbox or bearing).',
+    separate_by='the same path at two speeds: the deflection grows with their square',
+    remedy='Accelerate less where it must be exact, and have gearbox and bearing checked for '
+    'play; where the weight carried bends the joint too, correct that by its torque.',
+    size=_gave_way,
+    cells=cells,
+    needs=lambda context: needs_motion(context) or needs_gravity(context),
+)

@@ -1,0 +1,48 @@
+"""Mode of the tool: the tool swings behind its acceleration."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from remaster_ros.discovery.effects.base import Cell, Design, Effect, displaced, needs_motion
+from remaster_ros.discovery.effects.context import Context
+from remaster_ros.discovery.effects.sizes import number
+from remaster_ros.types import FloatArray
+
+
+def cells(context: Context) -> Iterator[Cell]:
+    """The tool as a whole: δp = -R diag(m) R' a, one m for each axis of the tool."""
+    yield EFFECT.cell(_swung, [f'tool_mode_{axis}' for axis in 'xyz'])
+
+
+def _swung(context: Context) -> Design:
+    swing = context.motion.swing(context.markers[context.marker])
+    return displaced(*(swing[:, :, axis] for axis in range(3)))
+
+
+def _frequency(context: Context, cell: Cell, draws: FloatArray) -> str:
+    axis = int(np.argmax(draws.mean(axis=0)))
+    softest = np.maximum(draws[:, axis], 1e-7)
+    hertz = 1.0 / (2.0 * np.pi * np.sqrt(softest))
+    shown = number(float(hertz.mean()), float(hertz.std()), ' Hz')
+    return f'along {"xyz"[axis]} of the tool it swings at {shown}'
+
+
+EFFECT = Effect(
+    name='tool_mode',
+    place='marker',
+    driver='acceleration',
+    form='linear',
+    equation="δp = −R_T diag(m) R_T' a, m = 1/(2πf)², far below the mode's frequency f",
+    source='Inman 2014, Engineering Vibration: base excitation below resonance',
+    unit='s²',
+    plausible=(1e-6, 5e-4),
+    sentence='The tool swings behind its acceleration (a soft tool or mount).',
+    separate_by='the same path at two speeds, and markers on the flange beside those of the tool',
+    remedy='Stiffen the tool or its mount, or accelerate less where it must be exact.',
+    size=_frequency,
+    cells=cells,
+    needs=needs_motion,
+)
