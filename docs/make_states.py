@@ -14,6 +14,7 @@ BEGIN, END = '<!-- states: written by make docs -->', '<!-- end of states -->'
 LEAVES = {
     'CheckPath': 'check',
     'Drive': '**a move**',
+    'Renew': '**its next piece**',
     'Stop': '**a stop**',
     'Settled': 'settled',
     'Failed': 'failed',

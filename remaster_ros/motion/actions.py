@@ -40,6 +40,16 @@ class Drive:
     solution: int
     admitted: Admitted
     wall_s: float
+    begins_s: float = 0.0  # The stamp of the trajectory, robot time, s; 0 for at once
+
+
+@dataclass(frozen=True)
+class Renew:
+    """Publish the next piece of the move under way, at once: it was decided at `wall_s`."""
+
+    admitted: Admitted
+    wall_s: float
+    begins_s: float  # As of a `Drive`
 
 
 @dataclass(frozen=True)
@@ -78,7 +88,7 @@ class Halted:
     reason: str
 
 
-Action = CheckPath | Drive | Stop | Settled | Failed | Halted
+Action = CheckPath | Drive | Renew | Stop | Settled | Failed | Halted
 
 
 @dataclass(frozen=True)
@@ -101,6 +111,10 @@ class SupervisorRules:
     # After a longer interruption only a person goes on, unless the robot's safety circuit was
     # known to be released all the time (wall time)
     resume_alone_s: float = 5.0
+    # The controller has a move in pieces that are over after so long (robot time); 0 for whole
+    # moves
+    horizon_s: float = 0.0
+    keeps_stamps: bool = True  # Whether the controller keeps the stamps of trajectories
 
     @property
     def units(self) -> JointUnits:

@@ -25,6 +25,7 @@ from remaster_ros.motion.actions import (
     Failed,
     Halted,
     PathAnswer,
+    Renew,
     Stop,
     SupervisorRules,
 )
@@ -59,6 +60,13 @@ DOUBT_S = 0.5
 REFUSED_IN_A_ROW = 12
 """The arm is halted if so many configurations could not be commanded and none between them was
 reached: planner and bridge then have different models of the arm."""
+MISSED_IN_A_ROW = 3
+"""The arm is halted if the next piece of a move came too late so often, and no configuration was
+reached between: else it would stop and go on without end."""
+TOO_SLOW = (
+    'the next piece of a move came too late {count} times in a row ({why}): see what holds up the '
+    'host of the bridge, or joint_states on their way to it, for {held_s:.1f} s'
+)
 BEGINS = {PROBE: Event.PROBE, WAY_OUT: Event.LEAVE}
 """What a move is by its number; the others lead to a configuration."""
 
@@ -86,6 +94,10 @@ class ArmSupervisor:
     ----------
     halted
         Why the arm stays where it is until a person clears the halt; ''.
+    missed
+        How often the next piece of a move came too late, so that the arm stopped on its way.
+    why_missed
+        Why it did last; '' before that.
     """
 
     def __init__(
@@ -106,7 +118,12 @@ class ArmSupervisor:
         # Whether it may be elsewhere than reported, until a probe has led it there to its end.
         self._unsure = end is None
         self._wall = -np.inf
-        self._failures = self._refusals = 0
+        self._keeps_stamps = rules.keeps_stamps
+        self.missed = self._failures = self._refusals = 0
+        # Why the next piece of the move was not sent when it was due; ''.
+        self._why_not = self.why_missed = ''
+        # Since a configuration was reached, or a person has gone on.
+        self._missed_in_a_row = 0
         self._seen: Seen | None = None
         self._doubted_wall: float | None = None
         # What else came on joint_states, and when (wall time, s).
@@ -121,7 +138,7 @@ class ArmSupervisor:
         /remaster/collect.
         """
         if self._interlocks.planner(state, run, wall_s):
-            self._failures = self._refusals = 0
+            self._failures = self._refusals = self._missed_in_a_row = 0
             # A person may have moved the arm meanwhile.
             self._queue.found(Finding.DOUBT)
         return self.tick(wall_s)
@@ -299,13 +316,16 @@ class ArmSupervisor:
         """Process since when a bridge before this one has been gone, s of wall time."""
         self._interlocks.interrupted(since_wall_s)
 
-    def not_sent(self, command: Drive | Stop, wall_s: float) -> list[Action]:
+    def not_sent(self, command: Drive | Renew | Stop, wall_s: float) -> list[Action]:
         """Process that a command was not published, as this process was paused since its decision.
 
         A move is decided again after all that arrived meanwhile is processed. An arm that was to
         be stopped goes on, and where it is now is not known.
         """
         self._motion.take_back()
+        if isinstance(command, Renew):
+            # The piece before it ends in a stop, if none comes in time.
+            return []
         if isinstance(command, Drive):
             return self._step(Event.MOVE_NOT_SENT)
         late_s = wall_s - command.wall_s
@@ -331,7 +351,9 @@ class ArmSupervisor:
         if silent and self._engaged:
             return self._halt('; '.join(filter(None, (silent, self.trouble))))
         blocked = self.blocked(wall_s)
-        return self._stop(blocked, wall_s) if blocked else self._go_on(wall_s)
+        if blocked:
+            return self._stop(blocked, wall_s)
+        return self._go_on_moving(wall_s) or self._go_on(wall_s)
 
     # What is reported
 
@@ -355,6 +377,15 @@ class ArmSupervisor:
     def end(self) -> FloatArray | None:
         """Where the last command led, (k,); None before it is sure that the arm is there."""
         return None if self._unsure else self._motion.led.end
+
+    @property
+    def next_end(self) -> FloatArray | None:
+        """Where the next piece of the move under way ends, (k,); None where there is none."""
+        return self._motion.next_end
+
+    def use_stamps(self, *, kept: bool) -> None:
+        """Send moves from now on as of `SupervisorRules.keeps_stamps`."""
+        self._keeps_stamps = kept
 
     @property
     def busy(self) -> bool:
@@ -386,8 +417,8 @@ class ArmSupervisor:
 
     @property
     def _engaged(self) -> bool:
-        """Whether a collection is running: what is wrong with the robot then halts it."""
-        return self._interlocks.collecting or self.busy
+        """Whether a collection or a stop is under way: trouble with the robot then halts it."""
+        return self._interlocks.collecting or self.busy or self.state is Arm.BRAKES
 
     def _gap(self, report: JointReport) -> str:
         """Return that a collection's arm was not observed for too long; ''.
@@ -404,6 +435,34 @@ class ArmSupervisor:
             return ''
         return f'the robot was not observed for {gap_s / self._rate:.1f} s'
 
+    # Inside: the rest of a move
+
+    def _go_on_moving(self, wall_s: float) -> list[Action]:
+        """Give the controller the next piece of a move that is followed."""
+        seen = self._seen
+        if seen is None or self.state not in (Arm.LEAVES, Arm.MOVES):
+            return []
+        due = self._motion.due(seen, wall_s)
+        if due == 'missed':
+            # The arm is about to stop by itself; whoever may sends it on from where it stands.
+            self._motion.end_piece(seen, wall_s, self._rate)
+            self.missed += 1
+            self._missed_in_a_row += 1
+            self.why_missed = self._why_not or 'the host of the bridge is held up'
+            self._interlocks.stopped_on_its_way(wall_s)
+            return self._step(Event.MISSED)
+        if due == 'renew':
+            unseen = self._motion.unseen(seen, wall_s, self._rate)
+            self._why_not = self._motion.lost(seen, wall_s) or unseen
+        if due != 'renew' or self._why_not:
+            return []
+        try:
+            return self._step(Event.RENEW, self._motion.renew(seen, wall_s))
+        except MotionRefusedError as error:
+            # What it has ends in a stop.
+            self._why_not = str(error)
+            return []
+
     # Inside: the next configuration
 
     def _go_on(self, wall_s: float) -> list[Action]:
@@ -411,6 +470,12 @@ class ArmSupervisor:
         seen, queue = self._seen, self._queue
         if seen is None or self.state is not Arm.STANDS or not seen.stands(wall_s):
             return []
+        if self._missed_in_a_row >= MISSED_IN_A_ROW:
+            why = TOO_SLOW.format(
+                count=self._missed_in_a_row, why=self.why_missed, held_s=self._motion.patience_s
+            )
+            self._missed_in_a_row = 0
+            return self._halt(why)
         elsewhere = self._motion.led.elsewhere(seen.q)
         if elsewhere:
             self._motion.led.ask(seen.q)
@@ -433,6 +498,8 @@ class ArmSupervisor:
         return actions
 
     def _drive(self, solution: int, path: FreePath, seen: Seen, wall_s: float) -> list[Action]:
+        # A stamp that is not of the controller's clock would lead the arm to another time.
+        self._motion.keeps_stamps = self._keeps_stamps and self.reports.is_on_time
         doubtful = None
         if solution == PROBE:
             doubtful = np.logical_or(seen.frozen(), self._unsure)
@@ -444,6 +511,7 @@ class ArmSupervisor:
         except MotionRefusedError as error:
             return self._give_up(solution, str(error), wall_s)
         self._interlocks.note_moved()
+        self._why_not = ''
         return self._step(BEGINS.get(solution, Event.MOVE), drive)
 
     def _give_up(self, solution: int, reason: str, wall_s: float) -> list[Action]:
@@ -475,7 +543,7 @@ class ArmSupervisor:
                 self._unsure = False
             return self._step(Event.ENDED)
         if outcome == 'settled' and visit is not None:
-            self._failures = self._refusals = 0
+            self._failures = self._refusals = self._missed_in_a_row = 0
             return self._step(Event.SETTLED, visit.settled_at(seen))
         return self._fail(visit.solution, why) if outcome == 'failed' and visit is not None else []
 
@@ -530,7 +598,7 @@ class ArmSupervisor:
         if then is not None and tuple(map(type, actions)) == then.actions:
             self._motion.enter(then.state)
             return list(actions)
-        if any(isinstance(action, Drive | Stop) for action in actions):
+        if any(isinstance(action, Drive | Renew | Stop) for action in actions):
             self._motion.take_back()
         self.halted = self.halted or f'a fault of this program: "{event}" while the arm {state}'
         self._motion.enter(Arm.HALTED)

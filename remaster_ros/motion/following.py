@@ -36,6 +36,12 @@ SLOWED_RAD = 5e-3
 """Only where its path leads on by so much in this time, rad."""
 SLOWED_SHARE = 0.5
 """An arm that has gone less than this share of it is being stopped."""
+STANDS_SHARE = 0.2
+"""And one that has gone less than this share of what it is behind its path stands: an arm that may
+lag so far (`SupervisorRules.lag_s`) has gone more."""
+JUST_S = 0.02
+"""A report is of just now that is no older, s of wall time: a piece of a move is sent for an arm
+that is seen to move, not for one that was seen to a moment ago."""
 LAG_CHANGES_S = 0.1
 """By so much the lag of an arm that follows may have changed in this time, s."""
 VARIES_S = 1.0
@@ -101,15 +107,15 @@ class Following:
 
     ``trajectory``: where it was sent; ``sent, sent_wall``: when, robot time and wall time, s;
     ``rules``: how far it may lag and how long a command may take to be seen.
-    Attributes: ``reacted``: whether the arm has left its start, or goes too short a way for that
-    to be seen.
+    Attributes: ``sent``: when it was, robot time, s; ``reacted``: whether the arm has left its
+    start, or goes too short a way for that to be seen.
     """
 
     def __init__(
         self, trajectory: Trajectory, sent: float, sent_wall: float, rules: SupervisorRules
     ) -> None:
         self.trajectory, self._rules = trajectory, rules
-        self._sent, self._sent_wall = sent, sent_wall
+        self.sent, self._sent_wall = sent, sent_wall
         self.reacted = False
         self._lag_s = 0.0
         # The last moments: time since it was sent (s), where the arm was, its lag (s).
@@ -120,7 +126,12 @@ class Following:
 
     def elapsed_s(self, time: float) -> float:
         """Return the time since it was sent at a robot time, s."""
-        return time - self._sent
+        return time - self.sent
+
+    def set_back(self, by_s: float) -> None:
+        """Process that the next line begins later by `by_s`, s; the arm stands before it."""
+        self.sent += by_s
+        self._trail = deque((t - by_s, q, lag - by_s) for t, q, lag in self._trail)
 
     def update(self, seen: Seen, rate: float) -> str:
         """Process a report; return how the arm has been off its path for too long, ''."""
@@ -148,6 +159,31 @@ class Following:
             return 'the arm is not seen to move yet'
         return self._astray or (STOPPED_ON_ITS_WAY if self._is_slowed() else '')
 
+    def unseen(self, seen: Seen, wall_s: float, rate: float) -> str:
+        """Return why no report of just now shows that the arm goes on along its path; ''.
+
+        For a stop it is enough to know where the arm may be (`lost`). What leads it on is for one
+        that moves: a controller may join it to an arm that has been stopped since by a jump.
+        """
+        if wall_s - seen.wall > JUST_S or not self._trail:
+            return 'joint_states do not come'
+        (before, q_before, lag_before), (now, q, lag) = self._trail[0], self._trail[-1]
+        passed_s = now - before
+        # A robot of a clock that runs faster leaves out as many more of its reports.
+        longest_s = SLOWED_LONGEST_S + LATENCY_S * (max(rate, 1.0) - 1.0)
+        if not SLOWED_S - JITTER_S <= passed_s <= longest_s:
+            return f'joint_states come {passed_s:.2f} s apart'
+        largest = self._rules.units.largest
+        behind = largest(self.trajectory.at(now)[0] - q)
+        if behind <= ON_PATH_RAD:
+            return ''
+        # A moment ago it went on, and now it does not.
+        last, _, lag_last = next(one for one in reversed(self._trail) if now - one[0] >= JUST_S)
+        moments = (passed_s, lag_before), (now - last, lag_last)
+        grows = any(lag - then > SLOWED_SHARE * since_s for since_s, then in moments)
+        stands = largest(q - q_before) < STANDS_SHARE * behind
+        return 'the arm is not seen to go on' if grows or stands else ''
+
     def window(self, seen: Seen, wall_s: float, rate: float) -> tuple[float, float]:
         """Return between which times on the trajectory the arm is now, s.
 
@@ -161,7 +197,8 @@ class Following:
         # In a rest the lag is what the arm still has to the end of the line.
         index, since_s = self.trajectory.line_at(reported)
         rested_s = max(since_s - self.trajectory.lines[index].duration_s, 0.0)
-        return reported - rested_s - self._lag_s - jitter, elapsed + seen.late_s + jitter
+        low_s = reported - rested_s - self._lag_s - jitter
+        return low_s, elapsed + seen.late_s + jitter
 
     def has_ended(self, seen: Seen, wall_s: float, rate: float) -> bool:
         """Whether the arm is at the end of the trajectory, or will be without any command."""

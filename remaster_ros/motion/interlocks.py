@@ -115,6 +115,21 @@ class Interlocks:
         self._held_since_wall, self._released = since_wall_s, False
         self.say(Word.HINDERED)
 
+    def stopped_on_its_way(self, wall_s: float) -> None:
+        """Process that the arm comes to rest on its way by itself, and for no reason that is here.
+
+        As after any interruption: where nothing shows who stops the arm meanwhile, a person goes
+        on.
+        """
+        if self.consent is Consent.GIVEN:
+            self._held_since_wall, self._released = wall_s, self._is_released
+            self.say(Word.HINDERED)
+
+    @property
+    def _is_released(self) -> bool:
+        """Whether the robot itself reports that nobody stops it."""
+        return self.was_right('safety') and not self.reason('safety_link')
+
     def revoke(self, why: str) -> None:
         """Process that a person has changed what consent was given for."""
         self._must_collect = why
@@ -129,7 +144,7 @@ class Interlocks:
 
         Where the robot itself reported all the time that nobody has stopped it, none is needed.
         """
-        released = self.was_right('safety') and not self.reason('safety_link')
+        released = self._is_released
         reason = self._hindrance(wall_s)
         if self.consent is Consent.GIVEN and reason and self._moved:
             self._held_since_wall, self._released = wall_s, released
@@ -138,7 +153,9 @@ class Interlocks:
             return
         self._released &= released
         lasted_s = wall_s - self._held_since_wall
-        if self.run and not self._released and lasted_s > self._resume_alone_s:
+        # With 0 none is short enough, also one that is looked at twice at the same time.
+        too_long = lasted_s > self._resume_alone_s or not self._resume_alone_s
+        if self.run and not self._released and too_long:
             self._must_collect = (
                 'the collection was interrupted'
                 f'{f" for more than {self._resume_alone_s:g} s" if self._resume_alone_s else ""}'

@@ -33,6 +33,9 @@ LATE_WALL_S = 0.1
 FAST, LATE_FAST_WALL_S = 5.0, 0.5
 """A clock that runs so many times as fast is a simulation's: no person stands beside the arm, and
 the machine, busy with the simulation, may delay by so much, s of wall time."""
+SAME_CLOCK_S = 0.1
+"""Stamps that usually come so soon, s of wall time, are of the node's own clock. Others are of
+another host's, or late from the start, which is not to be told from that."""
 DRIFT = 2e-4
 """Two clocks may run apart by so many seconds a second."""
 SHORTEN = 0.05
@@ -138,6 +141,14 @@ class JointReports:
         self._delays: list[tuple[float, float]] = []
         self._delay: float | None = None
         self.late_s = 0.0
+
+    @property
+    def is_on_time(self) -> bool:
+        """Whether stamps are known to be of the node's clock, and to come at once."""
+        if self._delay is None:
+            return False
+        # A clock that runs fast is published in steps.
+        return abs(self._delay) <= SAME_CLOCK_S * max(self.clock.rate, 1.0)
 
     def believes(self, report: JointReport) -> bool:
         """Return whether a report is believed; `trouble` is the reason where it is not."""

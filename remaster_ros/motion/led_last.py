@@ -21,8 +21,9 @@ class LedLast:
     """The memory of it, of the bridge and of the compensator alike.
 
     ``names, units``: of the joints; ``tolerance_rad``: an arm that is no further off is there;
-    ``end``: where it was led before this process was started, rad or m, (k,); None where that is
-    not known; ``confirms``: the service by which a person confirms the report.
+    ``end``: where it was led before this process was started, rad or m, (k,), or between which
+    places, (n, k); None where that is not known; ``confirms``: the service by which a person
+    confirms the report.
     Attributes: ``end``: where the last command led, (k,); None where that is not known.
     """
 
@@ -37,7 +38,7 @@ class LedLast:
         self._names, self._units, self._tolerance_rad = names, units, tolerance_rad
         self._confirms = confirms
         # Where the arm is, rad or m, (k,); several where it was held somewhere between them.
-        self._places: tuple[FloatArray, ...] = () if end is None else (end,)
+        self._places: tuple[FloatArray, ...] = () if end is None else tuple(np.atleast_2d(end))
         self._before: tuple[FloatArray, ...] = self._places
         # Where it is reported, which a person was asked to compare with the robot's display.
         self._asked: FloatArray | None = None

@@ -20,6 +20,7 @@ import numpy as np
 from remaster_ros.errors import RemasterError
 from remaster_ros.motion.limits import LONGEST_S, MotionLimits
 from remaster_ros.motion.path_check import FreePath, PointSpeeds
+from remaster_ros.motion.pieces import AHEAD_S, Piece, in_steps, piece_of, step_of
 from remaster_ros.motion.stopping import STOP_S, stop_on_line
 from remaster_ros.motion.trajectory import (
     HEADROOM,
@@ -83,6 +84,8 @@ class Admitted:
     trajectory: Trajectory | None = None
     # Whether the controller is given no velocities, and draws straight lines
     is_straight: bool = False
+    # Which part of `trajectory` the waypoints are; None where they are no part of one
+    piece: Piece | None = None
 
 
 class MotionGate:
@@ -105,11 +108,13 @@ class MotionGate:
 
     def __init__(self, limits: MotionLimits, speeds: PointSpeeds | None = None) -> None:
         self.limits, self._speeds = limits, speeds
-        self._under_way: tuple[Trajectory, MotionLimits] | None = None
+        self._under_way: tuple[Trajectory, MotionLimits, FreePath] | None = None
         self.refused = 0
 
-    def admit(self, path: FreePath, q: FloatArray) -> Admitted:
-        """Return a move along a path that was found free.
+    def admit(
+        self, path: FreePath, q: FloatArray, horizon_s: float = 0.0, *, keeps_stamps: bool = True
+    ) -> Admitted:
+        """Return a move along a path that was found free, with its first piece.
 
         Parameters
         ----------
@@ -117,6 +122,10 @@ class MotionGate:
             The path.
         q
             Where the arm stands, rad or m, (k,).
+        horizon_s
+            As of `pieces.piece_of`; 0 for all of the move at once.
+        keeps_stamps
+            Whether the controller does; else the pieces are steps.
 
         Raises
         ------
@@ -130,13 +139,68 @@ class MotionGate:
                 text = limits.units.in_radians(off, 4)
                 raise StartMovedError(f'the arm stands {text} from the start of the path')
             trajectory = plan_trajectory(limits, path.points, path.peaks_m)
-            waypoints = trajectory.waypoints()
-            self._check(waypoints, q, path, limits)
+            stands = Waypoint(0.0, q, np.zeros_like(q))
+            # All of the way first: an arm is not sent where it could not go on.
+            if horizon_s and not keeps_stamps:
+                trajectory = in_steps(trajectory, horizon_s)
+            waypoints, piece = trajectory.waypoints(), None
+            self._check(waypoints, stands, path, limits)
+            if horizon_s and not keeps_stamps:
+                piece = step_of(trajectory, 0)
+                waypoints = piece.waypoints
+            elif horizon_s:
+                piece = piece_of(trajectory, 0.0, horizon_s)
+                waypoints = piece.waypoints
+                # With a stamp it may come sooner or later than it begins.
+                for time_s in (-AHEAD_S, 0.0, AHEAD_S):
+                    self._check(waypoints, replace(stands, time_s=time_s), path, limits)
         except MotionRefusedError:
             self.refused += 1
             raise
-        self._under_way = trajectory, limits
-        return Admitted(waypoints, trajectory)
+        self._under_way = trajectory, limits, path
+        return Admitted(waypoints, trajectory, piece=piece)
+
+    def renew(self, sent_s: float, horizon_s: float) -> Admitted:
+        """Return the piece that replaces the one under way.
+
+        ``sent_s``: the time since the start of the move, s; ``horizon_s``: as of `admit`.
+        Raises MotionRefusedError: as of `admit`; LookupError: no move is under way.
+        """
+        if self._under_way is None:
+            raise LookupError('no move is under way')
+        trajectory, limits, path = self._under_way
+        piece = piece_of(trajectory, sent_s, horizon_s)
+        first, *rest = piece.waypoints
+        try:
+            if not rest:
+                raise MotionRefusedError('nothing is left of the move')
+            self._check(rest, first, path, limits)
+        except MotionRefusedError:
+            self.refused += 1
+            raise
+        return Admitted(piece.waypoints, trajectory, piece=piece)
+
+    def step(self, index: int, q: FloatArray) -> Admitted:
+        """Return the step of this number of the move under way, which begins at once.
+
+        ``q``: where the arm stands, rad or m, (k,). The waypoints have times from its beginning.
+        Raises MotionRefusedError: as of `admit`; LookupError: no move is under way.
+        """
+        if self._under_way is None:
+            raise LookupError('no move is under way')
+        trajectory, limits, path = self._under_way
+        piece, start_s = step_of(trajectory, index), trajectory.starts_s[index]
+        sent = tuple(replace(p, time_s=p.time_s - start_s) for p in piece.waypoints)
+        off = trajectory.lines[index].start - q
+        try:
+            if not limits.units.largest(off) <= START_RAD:
+                text = limits.units.in_radians(off, 4)
+                raise StartMovedError(f'the arm stands {text} from the start of the step')
+            self._check(sent, Waypoint(0.0, q, np.zeros_like(q)), path, limits)
+        except MotionRefusedError:
+            self.refused += 1
+            raise
+        return Admitted(sent, trajectory, piece=piece)
 
     def admit_probe(self, path: FreePath, q: FloatArray, doubtful: BoolArray) -> Admitted:
         """Return a move of next to nothing that is harmless where the arm is not as reported.
@@ -171,7 +235,7 @@ class MotionGate:
         trajectory = Trajectory((Line(start, end, 1.0 / (time_s - RAMP_S)),))
         waypoints = (Waypoint(time_s, end, np.zeros_like(end)),)
         try:
-            self._check(waypoints, q, path, limits)
+            self._check(waypoints, Waypoint(0.0, q, np.zeros_like(q)), path, limits)
         except MotionRefusedError:
             self.refused += 1
             raise
@@ -193,7 +257,7 @@ class MotionGate:
         """
         if self._under_way is None:
             raise LookupError('no move is under way')
-        trajectory, limits = self._under_way
+        trajectory, limits, _ = self._under_way
         index, since_s = trajectory.line_at(high_s)
         low_since_s = max(low_s - trajectory.starts_s[index], 0.0)
         line = trajectory.lines[index]
@@ -204,13 +268,17 @@ class MotionGate:
         return Admitted((stop,))
 
     def _check(
-        self, waypoints: Sequence[Waypoint], q: FloatArray, path: FreePath, limits: MotionLimits
+        self,
+        waypoints: Sequence[Waypoint],
+        start: Waypoint,
+        path: FreePath,
+        limits: MotionLimits,
     ) -> None:
-        """Look at each cubic from the present state on."""
-        units = limits.units
+        """Look at each cubic from a state on; the last one must end at rest."""
+        units, q = limits.units, start.q
         low = np.minimum(limits.lower + limits.margins, q)
         high = np.maximum(limits.upper - limits.margins, q)
-        points = [Waypoint(0.0, q, np.zeros_like(q)), *waypoints]
+        points = [start, *waypoints]
         if np.any(points[-1].velocity != 0.0):
             raise MotionRefusedError('the move does not end at rest')
         for before, after in pairwise(points):

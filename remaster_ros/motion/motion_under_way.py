@@ -8,7 +8,7 @@ from typing import Literal
 
 import numpy as np
 
-from remaster_ros.motion.actions import Drive, Settled, Stop, SupervisorRules
+from remaster_ros.motion.actions import Drive, Renew, Settled, Stop, SupervisorRules
 from remaster_ros.motion.following import (
     ASTRAY_S,
     ON_PATH_RAD,
@@ -19,11 +19,19 @@ from remaster_ros.motion.following import (
 )
 from remaster_ros.motion.joint_units import JointUnits
 from remaster_ros.motion.led_last import LedLast
-from remaster_ros.motion.motion_gate import MotionGate
+from remaster_ros.motion.motion_gate import START_RAD, MotionGate
 from remaster_ros.motion.path_check import FreePath
+from remaster_ros.motion.pieces import (
+    AHEAD_S,
+    GUARD_S,
+    JOINED_S,
+    RENEWED_S,
+    STEP_REST_S,
+    Piece,
+)
 from remaster_ros.motion.settling import SettleDetector
 from remaster_ros.motion.states import HAS_STOP, HAS_VISIT, Arm
-from remaster_ros.motion.trajectory import Trajectory
+from remaster_ros.motion.trajectory import RAMP_S, Trajectory
 from remaster_ros.types import BoolArray, FloatArray
 
 PROBE_WAIT_S = 0.5
@@ -84,6 +92,11 @@ class Visit:
             return 'failed', 'did not come to rest at its target in time'
         return UNDER_WAY
 
+    def set_back(self, by_s: float) -> None:
+        """Process that the rest of the move begins later, s."""
+        self.following.set_back(by_s)
+        self.deadline += by_s
+
     def settled_at(self, seen: Seen) -> Settled:
         """Return the action that reports the arm as settled, by the report that completed it."""
         still_since = self.detector.still_since
@@ -137,6 +150,15 @@ class Braking:
         return UNDER_WAY
 
 
+def _led_now(seen: Seen, wall_s: float) -> float:
+    """Return robot time now, s, for what is sent in pieces.
+
+    A simulated clock that runs faster than the wall's waits for each report to be taken
+    (`simulated_clock.LEADS`): it is not ahead of the last one by what its rate would have.
+    """
+    return seen.now(wall_s, 1.0)
+
+
 STOPPED_S = 1.0
 """After the end of a stop the arm stands within so much time, s; the lag comes on top."""
 OTHER_PLACES = 2.0
@@ -165,6 +187,15 @@ class MotionUnderWay:
         self._stood_off = -np.inf
         self.visit: Visit | None = None
         self.braking: Braking | None = None
+        # What the controller has of the move, and when it was sent, s since the move's start.
+        # How moves are sent from now on, and how the one under way is.
+        self.horizon_s, self.keeps_stamps = rules.horizon_s, rules.keeps_stamps
+        self._horizon_s, self._keeps_stamps = 0.0, True
+        self._piece: Piece | None = None
+        self._piece_sent_s = 0.0
+        self._piece_before: tuple[Piece | None, float] = None, 0.0
+        # By how much the last command has set the rest of the move back, s.
+        self._set_back_s = 0.0
 
     def enter(self, state: Arm) -> None:
         """Be in this state from now on; what does not belong to it is over."""
@@ -202,18 +233,87 @@ class MotionUnderWay:
         Raises MotionRefusedError: as of `MotionGate.admit`; nothing is under way then.
         """
         if doubtful is None:
-            admitted = self.gate.admit(path, seen.q)
+            admitted = self.gate.admit(
+                path, seen.q, self.horizon_s, keeps_stamps=self.keeps_stamps
+            )
         else:
             admitted = self.gate.admit_probe(path, seen.q, doubtful)
         trajectory, rules = admitted.trajectory, self.rules
         assert trajectory is not None
         time = seen.now(wall_s, rate)
+        self._horizon_s, self._keeps_stamps = self.horizon_s, self.keeps_stamps
+        piece = admitted.piece
+        has_stamp = self._keeps_stamps and piece is not None and not piece.is_last
+        if has_stamp:
+            # Where the last report came late more time has passed than it tells.
+            time = _led_now(seen, wall_s) + seen.late_s + AHEAD_S
         deadline = time + trajectory.duration_s + rules.settle.settle_s + rules.arrive_timeout_s
         detector = SettleDetector(trajectory.end, rules.settle)
         following = Following(trajectory, time, wall_s, rules)
         self.visit = Visit(solution, following, detector, rules, seen.stamp, deadline)
-        self.led.lead_to(trajectory.end)
-        return Drive(solution, admitted, wall_s)
+        self._take(admitted.piece, 0.0)
+        self.led.lead_to(admitted.waypoints[-1].q)
+        return Drive(solution, admitted, wall_s, time if has_stamp else 0.0)
+
+    @property
+    def next_end(self) -> FloatArray | None:
+        """Where the next piece of the move ends, rad or m, (k,); None without a move."""
+        return None if self.visit is None or self._piece is None else self._piece.next_end
+
+    @property
+    def patience_s(self) -> float:
+        """How much later than due the next piece of a move may come, s of robot time."""
+        if not self._keeps_stamps:
+            return STEP_REST_S
+        return self._horizon_s - RAMP_S - GUARD_S - RENEWED_S
+
+    def due(self, seen: Seen, wall_s: float) -> Literal['', 'renew', 'missed']:
+        """Return whether the next piece of the move is due, or comes too late."""
+        piece, visit = self._piece, self.visit
+        if piece is None or visit is None or piece.is_last:
+            return ''
+        elapsed_s = visit.following.elapsed_s(_led_now(seen, wall_s))
+        if not self._keeps_stamps:
+            if elapsed_s > piece.cut_s:
+                return 'missed'
+            off = self.rules.units.largest(seen.q - piece.end)
+            is_there = elapsed_s > piece.end_s and off <= START_RAD
+            return 'renew' if is_there and seen.stands(wall_s) else ''
+        if elapsed_s > piece.cut_s - GUARD_S:
+            return 'missed'
+        return 'renew' if elapsed_s >= max(self._piece_sent_s + RENEWED_S, JOINED_S) else ''
+
+    def renew(self, seen: Seen, wall_s: float) -> Renew:
+        """Return the next piece of the move; errors as of `MotionGate.renew`."""
+        assert self.visit is not None
+        assert self._piece is not None
+        following = self.visit.following
+        sent_s = following.elapsed_s(_led_now(seen, wall_s))
+        begins_s, by_s = following.sent, 0.0
+        if self._keeps_stamps:
+            admitted = self.gate.renew(sent_s, self._horizon_s)
+        else:
+            # The rest before it ends now.
+            index, begins_s = self.visit.trajectory.starts_s.index(self._piece.cut_s), 0.0
+            admitted = self.gate.step(index, seen.q)
+            by_s, sent_s = sent_s - self._piece.cut_s, self._piece.cut_s
+            self.visit.set_back(by_s)
+        self._take(admitted.piece, sent_s, by_s)
+        self.led.lead_to(admitted.waypoints[-1].q)
+        return Renew(admitted, wall_s, begins_s)
+
+    def _take(self, piece: Piece | None, sent_s: float, set_back_s: float = 0.0) -> None:
+        self._piece_before = self._piece, self._piece_sent_s
+        self._set_back_s = set_back_s
+        self._piece, self._piece_sent_s = piece, sent_s
+
+    def end_piece(self, seen: Seen, wall_s: float, rate: float) -> None:
+        """Let the piece under way end in its stop; it is under way in the state that follows."""
+        assert self.visit is not None
+        assert self._piece is not None
+        begins = self.visit.following.sent + self._piece.cut_s
+        over = self.visit.following.sent + self._piece.end_s + allowed_lag_s(self.rules, rate)
+        self._brake(self._piece.end, max(begins, seen.now(wall_s, rate)), over, rate)
 
     def judge(self, seen: Seen, rate: float, *, recorder_waits: bool) -> Outcome:
         """Return what becomes of the move or the stop by a report; see `Visit` and `Braking`."""
@@ -233,6 +333,14 @@ class MotionUnderWay:
         assert self.visit is not None
         return self.visit.following.lost(seen, wall_s)
 
+    def unseen(self, seen: Seen, wall_s: float, rate: float) -> str:
+        """Return why a moving arm is not seen to go on along its path just now; ''."""
+        assert self.visit is not None
+        if not self._keeps_stamps:
+            # It stands where its next step begins.
+            return ''
+        return self.visit.following.unseen(seen, wall_s, rate)
+
     def stop(self, reason: str, seen: Seen, wall_s: float, rate: float) -> Stop | None:
         """Return the stop of a moving arm that is not `lost`, along the rest of its line.
 
@@ -243,16 +351,29 @@ class MotionUnderWay:
         following = self.visit.following
         if following.has_ended(seen, wall_s, rate):
             return None
-        admitted = self.gate.stop(*following.window(seen, wall_s, rate))
+        low_s, high_s = following.window(seen, wall_s, rate)
+        if self._piece is not None:
+            # Behind that it is on the stop of its piece.
+            high_s = min(high_s, self._piece.cut_s)
+        admitted = self.gate.stop(min(low_s, high_s), high_s)
         (stop,) = admitted.waypoints
         begins = seen.now(wall_s, rate) + allowed_lag_s(self.rules, rate)
-        over, patience_s = begins + stop.time_s, ASTRAY_S * max(rate, 1.0)
-        deadline = over + max(STOPPED_S, patience_s)
-        units = self.rules.units
-        self.braking = Braking(stop.q, begins, over, deadline, self.near, patience_s, units)
+        self._brake(stop.q, begins, begins + stop.time_s, rate)
+        self._set_back_s = 0.0
         self.led.lead_to(stop.q)
         return Stop(admitted, reason, wall_s)
+
+    def _brake(self, end: FloatArray, begins: float, over: float, rate: float) -> None:
+        """Begin to look at a stop that leads to `end`, (k,), between two robot times, s."""
+        patience_s = ASTRAY_S * max(rate, 1.0)
+        deadline = over + max(STOPPED_S, patience_s)
+        units = self.rules.units
+        self.braking = Braking(end, begins, over, deadline, self.near, patience_s, units)
 
     def take_back(self) -> None:
         """Process that the last command was not sent."""
         self.led.take_back()
+        self._piece, self._piece_sent_s = self._piece_before
+        if self.visit is not None and self._set_back_s:
+            self.visit.set_back(-self._set_back_s)
+        self._set_back_s = 0.0

@@ -14,7 +14,16 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import TypeVar
 
-from remaster_ros.motion.actions import Action, CheckPath, Drive, Failed, Halted, Settled, Stop
+from remaster_ros.motion.actions import (
+    Action,
+    CheckPath,
+    Drive,
+    Failed,
+    Halted,
+    Renew,
+    Settled,
+    Stop,
+)
 
 
 class Arm(StrEnum):
@@ -43,6 +52,8 @@ class Event(StrEnum):
     PROBE = 'the probe is next'
     LEAVE = 'the way out is next'
     MOVE = 'its way is free'
+    RENEW = 'the next piece of the move is due'
+    MISSED = 'the next piece of the move comes too late'
     REFUSED = 'no way, or the gate refuses it'
     SETTLED = 'settled at its target'
     FAILED = 'not at its target, or no answer, in time'
@@ -86,6 +97,9 @@ def _commanded(state: Arm) -> dict[Event, Then]:
         Event.HALT_BRAKING: Then(Arm.HALTS, (Stop, Halted)),
         Event.ASTRAY: Then(Arm.HALTED, (Halted,)),
         Event.MOVE_NOT_SENT: Then(Arm.STANDS),
+        Event.RENEW: Then(state, (Renew,)),
+        # Its piece ends in a stop by itself.
+        Event.MISSED: Then(Arm.BRAKES),
     }
 
 

@@ -135,13 +135,14 @@ class Trajectory:
     """Lines one after the other, with a rest between them."""
 
     lines: tuple[Line, ...]
+    rest_s: float = REST_S  # Between two lines
 
     @cached_property
     def starts_s(self) -> tuple[float, ...]:
         """When each line begins, s."""
         times = [0.0]
         for line in self.lines[:-1]:
-            times.append(times[-1] + line.duration_s + REST_S)
+            times.append(times[-1] + line.duration_s + self.rest_s)
         return tuple(times)
 
     @property

@@ -22,8 +22,9 @@ import numpy as np
 from action_msgs.msg import GoalInfo, GoalStatus, GoalStatusArray
 from action_msgs.srv import CancelGoal
 from rclpy.action import ActionClient
+from rclpy.duration import Duration
 from rclpy.node import Node
-from rclpy.qos import qos_profile_action_status_default
+from rclpy.qos import QoSProfile, qos_profile_action_status_default
 from rclpy.task import Future
 from trajectory_msgs.msg import JointTrajectory
 
@@ -52,6 +53,13 @@ CODES = {
 UNDER_WAY = (GoalStatus.STATUS_ACCEPTED, GoalStatus.STATUS_EXECUTING, GoalStatus.STATUS_CANCELING)
 OVER = (CancelGoal.Response.ERROR_UNKNOWN_GOAL_ID, CancelGoal.Response.ERROR_GOAL_TERMINATED)
 """Answers to the cancelling of a goal that is over."""
+LATEST = 3
+"""So many goals of a move may be under way: the newest, one that it replaces, one that is late."""
+EXPIRES_S = 0.4
+"""A command that has not come to the controller's host for so long is not sent again, s: after a
+cable was out it would lead an arm that has stopped since, by a jump to where it would be. The stop
+of the piece before one that is sent when it is due begins later than that (`motion.pieces`)."""
+STATE_TYPE = 'control_msgs/msg/JointTrajectoryControllerState'
 LAST_ANSWER_WALL_S = 0.5
 """A bridge that ends waits so long for the answer to its last stop, s: much longer than a request
 and its answer take on one computer, and no one who ends it notices."""
@@ -100,13 +108,46 @@ class ForeignGoals:
         return f'another client has sent a goal to {self._action}: end that client'
 
 
-class TopicLink:
-    """Publish the commands on the controller's topic."""
+class ControllerStates:
+    """Whether the controller publishes its state as joint_trajectory_controller does.
+
+    Of that one, and of what is derived from it, it is known what becomes of a trajectory's stamp.
+    """
 
     def __init__(self, node: Node) -> None:
+        place = node.resolve_topic_name(COMMANDS).rpartition('/')[0]
+        self._node, self._topic = node, f'{place}/controller_state'
+
+    def is_there(self) -> bool:
+        """Return whether it does now; its type is known without the package of its message."""
+        if not self._node.count_publishers(self._topic):
+            return False
+        found = self._node.get_publishers_info_by_topic(self._topic)
+        return any(info.topic_type == STATE_TYPE for info in found)
+
+
+def _expiring(profile: QoSProfile) -> QoSProfile:
+    """Return a profile whose messages are given up after `EXPIRES_S`."""
+    return QoSProfile(
+        depth=profile.depth,
+        reliability=profile.reliability,
+        liveliness=profile.liveliness,
+        liveliness_lease_duration=profile.liveliness_lease_duration,
+        lifespan=Duration(seconds=EXPIRES_S),
+    )
+
+
+class TopicLink:
+    """Publish the commands on the controller's topic.
+
+    ``simulated``: in a simulation that waits for its nodes no command is late.
+    """
+
+    def __init__(self, node: Node, *, simulated: bool = False) -> None:
         self._node = node
         self._topic = node.resolve_topic_name(COMMANDS)
-        self._publisher = node.create_publisher(JointTrajectory, COMMANDS, LEASED)
+        profile = LEASED if simulated else _expiring(LEASED)
+        self._publisher = node.create_publisher(JointTrajectory, COMMANDS, profile)
         self.missing = f'no controller listens to {self._topic}'
 
     def matched(self) -> bool:
@@ -125,8 +166,8 @@ class TopicLink:
         """Return who else commands the controller, ''; publishers are counted elsewhere."""
         return ''
 
-    def send(self, message: JointTrajectory, *, stop: bool = False) -> None:
-        """Send a trajectory that the motion gate has admitted."""
+    def send(self, message: JointTrajectory, kind: str) -> None:
+        """Send a trajectory that the motion gate has admitted: a move, a renewal or a stop."""
         self._publisher.publish(message)
 
     def cancel(self) -> None:
@@ -204,18 +245,23 @@ class ActionLink:
             'some 20 s)'
         )
 
-    def send(self, message: JointTrajectory, *, stop: bool = False) -> None:
+    def send(self, message: JointTrajectory, kind: str) -> None:
         """Send a trajectory that the motion gate has admitted, in place of the one under way."""
         names, rules = message.joint_names, self._rules
         # rad or m, as the positions.
         end = np.full(len(names), rules.settle.arrive_tolerance) * rules.units.per_radian
-        if stop:
+        if kind == 'stop':
             # No target: where on its line the arm comes to rest is enough.
             end = path_tolerance(np.zeros(len(names)), rules)
         else:
-            self._goals.clear()
+            speeds = np.max(np.abs([point.velocities for point in message.points]), axis=0)
+            if kind == 'move':
+                self._goals.clear()
+                self._speeds = np.zeros(len(names))
             # A stop begins with the speeds of its move.
-            self._speeds = np.max(np.abs([point.velocities for point in message.points]), axis=0)
+            self._speeds = np.maximum(self._speeds, speeds)
+            # Those that were replaced are over, and only the last ones may not have been yet.
+            del self._goals[:-LATEST]
         goal = self._action_type.Goal(
             trajectory=message,
             path_tolerance=self._tolerances(names, path_tolerance(self._speeds, rules)),

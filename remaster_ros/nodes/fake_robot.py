@@ -25,7 +25,7 @@ from remaster_ros.collection.message_fields import seconds
 from remaster_ros.nodes.messages import stamp_of
 from remaster_ros.nodes.parameters import declare, parameter
 from remaster_ros.nodes.running import RemasterNode, run
-from remaster_ros.nodes.simulated_clock import TAKEN, TAKEN_EVERY_S
+from remaster_ros.nodes.simulated_clock import LEADS, TAKEN, TAKEN_EVERY_S
 from remaster_ros.session.workcell import read_cell
 from remaster_ros.simulation.arm_motion import ServoPoint
 from remaster_ros.simulation.robot import FakeArm
@@ -122,8 +122,9 @@ class FakeRobotNode(RemasterNode):
             wait_s = max(left_s / self.world.rate, POLL_WALL_S)
 
     def _on_taken(self, message: Header) -> None:
-        if message.frame_id.isdecimal():
-            self._pace.took(int(message.frame_id), seconds(message.stamp))
+        pid, _, what = message.frame_id.partition(' ')
+        if pid.isdecimal():
+            self._pace.took(int(pid), seconds(message.stamp), leads=what == LEADS)
 
     def _publish_state(self) -> None:
         if self.arm.reports_stop != self._reported_stop:

@@ -45,6 +45,7 @@ from remaster_ros.motion.actions import (
     Failed,
     Halted,
     PathAnswer,
+    Renew,
     Settled,
     Stop,
     SupervisorRules,
@@ -57,11 +58,13 @@ from remaster_ros.motion.motion_gate import PROBE_S, Admitted, MotionGate
 from remaster_ros.motion.move_queue import PROBE
 from remaster_ros.motion.path_check import PointSpeeds
 from remaster_ros.motion.path_search import PathSearch
+from remaster_ros.motion.pieces import HORIZON_S, LEAST_HORIZON_S
 from remaster_ros.motion.settling import SettleRules
 from remaster_ros.nodes.background import Background
 from remaster_ros.nodes.controller_link import (
     COMMANDS,
     ActionLink,
+    ControllerStates,
     ForeignGoals,
     TopicLink,
     control_messages,
@@ -96,7 +99,7 @@ MATCHED_WALL_S = 0.5
 """So much later than ours the controller's side of a DDS match may come."""
 NO_TOPIC = 'none'
 """What `emergency_stop_topic` is where the robot has no such topic."""
-LATE_WALL_S = {Stop: 0.1, Drive: 0.5}
+LATE_WALL_S = {Stop: 0.1, Renew: 0.1, Drive: 0.5}
 """A command that was decided longer ago is not published any more, s of wall time.
 
 A stop is for where the arm is on its way. A move begins where it stands: a busy machine may take
@@ -202,6 +205,22 @@ class Parameters(SimulationParameters):
         '…/follow_joint_trajectory (needs control_msgs)',
         choices=('topic', 'action'),
     )
+    horizon_s: float = parameter(
+        HORIZON_S,
+        'the controller has no more of a move than what is over so soon, and is given the rest '
+        'while the bridge lives; 0 for whole moves, which go on if the bridge fails',
+        unit='s',
+        low=LEAST_HORIZON_S,
+        high=HORIZON_S,
+        off=0.0,
+    )
+    trajectory_stamps: str = parameter(
+        'auto',
+        'whether the controller keeps the stamps of trajectories, so that a move in pieces goes '
+        'on evenly; else a long line is gone in steps from rest to rest; auto: if it has the '
+        'topic …/controller_state, as joint_trajectory_controller has',
+        choices=('auto', 'kept', 'ignored'),
+    )
     emergency_stop_topic: str = parameter(
         '',
         "std_msgs/Bool, true while the robot's own safety stops it; none where there is none: "
@@ -228,6 +247,7 @@ class Parameters(SimulationParameters):
             stall_s=self.stall_s,
             reaction_s=self.reaction_s,
             lag_s=self.lag_s,
+            horizon_s=self.horizon_s,
             # Nothing shows an emergency stop of an arm that rests or waits, or its release.
             resume_alone_s=self.resume_alone_s if self.safety_topic else 0.0,
         )
@@ -375,7 +395,7 @@ class RobotBridge(RemasterNode):
             JointReports(robot.lower, robot.upper, robot.velocity_limits, units),
             self.p.rules(units),
             self._halt_file.read(),
-            None if last is None else last.end,
+            None if last is None else last.places,
         )
         self._keeps_end, self._kept_end = is_kept, self.supervisor.end
         self._search = PathSearch(model, speeds)
@@ -384,7 +404,7 @@ class RobotBridge(RemasterNode):
         # The last announcement as it came: its stamp, and what is wanted, rad or m, (m, k).
         self._announced: tuple[str, FloatArray] = ('', np.empty((0, len(self.chain))))
         self.steady_s = SteadyTime(self, self.p.simulated_clock_rate)
-        self._taken = ReportsTaken(self, self.p.simulated_clock_rate)
+        self._taken = ReportsTaken(self, self.p.simulated_clock_rate, leads=True)
         if last is not None:
             self.supervisor.interrupted(self.steady_s() - last.age_s)
         self._settled_wall = self.steady_s()
@@ -395,7 +415,10 @@ class RobotBridge(RemasterNode):
         if by_action:
             control_messages()
         self._foreign = ForeignGoals(self)
+        self._states_of_controller = ControllerStates(self)
         self._closing = False
+        # How often the next piece of a move came too late, as it was told last.
+        self._missed = 0
         # Made when this bridge is known to be the only one of its name.
         self._controller: TopicLink | ActionLink | None = None
         # Since when a controller listens; a command before that would be lost.
@@ -596,6 +619,7 @@ class RobotBridge(RemasterNode):
         rivals = self._states.rival() or next(filter(None, others), '')
         if self._controller is not None:
             rivals = rivals or self._controller.rival()
+        self.supervisor.use_stamps(kept=self._keeps_stamps())
         for name, trouble in (
             ('rivals', rivals),
             ('model', self._model_trouble(now)),
@@ -604,6 +628,12 @@ class RobotBridge(RemasterNode):
             ('safety_link', self._emergency.trouble()),
         ):
             self._do(self.supervisor.observe(name, trouble, now))
+
+    def _keeps_stamps(self) -> bool:
+        """Whether the controller is known to keep the stamps of trajectories."""
+        if self.p.trajectory_stamps != 'auto':
+            return self.p.trajectory_stamps == 'kept'
+        return self._states_of_controller.is_there()
 
     def _controller_trouble(self, now: float) -> str:
         """Return why a command would be lost; ''."""
@@ -614,7 +644,7 @@ class RobotBridge(RemasterNode):
                 rules = self.supervisor.rules
                 self._controller = ActionLink(self, rules, self._foreign, self._on_given_up)
             else:
-                self._controller = TopicLink(self)
+                self._controller = TopicLink(self, simulated=bool(self.p.simulated_clock_rate))
         if not self._controller.listens():
             self._listened_wall = None
         elif self._listened_wall is None:
@@ -634,21 +664,21 @@ class RobotBridge(RemasterNode):
         stops = any(isinstance(action, Stop) for action in actions)
         for action in actions:
             match action:
-                case Drive() if self._closing:
+                case Drive() | Renew() if self._closing:
                     pass
                 case CheckPath():
                     self._paths.submit(
                         partial(self._search.find, action), partial(self._on_path, action.number)
                     )
-                case Drive() | Stop() if (
-                    self.steady_s() - action.wall_s > LATE_WALL_S[type(action)]
-                ):
+                case Drive() | Renew() | Stop() if self._is_late(action):
                     # Paused in between (SIGSTOP, a host that swaps): the arm is elsewhere now, or
                     # must not move any more.
                     self._do(self.supervisor.not_sent(action, self.steady_s()))
                 case Drive():
                     self._send(action)
                     self._on_commanded(action)
+                case Renew():
+                    self._send(action)
                 case Stop(_, reason):
                     self._send(action)
                     self.counts['stopped'] += 1
@@ -671,15 +701,26 @@ class RobotBridge(RemasterNode):
                     self.status.event(events.ArmHalted(stamp=self._pose_stamp, reason=reason))
                     self.status.publish()
                     self.get_logger().error(f'halted: {reason}')
+        self._tell_missed()
         self._keep_end()
+
+    def _tell_missed(self) -> None:
+        """Say that the arm stops on its way, as the next piece of its move came too late."""
+        if self.supervisor.missed == self._missed:
+            return
+        self._missed = self.supervisor.missed
+        reason = f'the next piece of its move came too late: {self.supervisor.why_missed}'
+        self.counts['stopped'] += 1
+        self.status.event(events.ArmStopped(stamp=self._pose_stamp, reason=reason))
+        self.get_logger().warning(f'the arm stops: {reason}')
 
     def _keep_end(self) -> None:
         """Write down where the last command leads, for a bridge after this one."""
-        end = self.supervisor.end
+        end, following = self.supervisor.end, self.supervisor.next_end
         if not self._keeps_end or end is None or end is self._kept_end:
             return
         self._kept_end = end
-        write = partial(self._command_file.write, end, time.time_ns())
+        write = partial(self._command_file.write, end, time.time_ns(), following)
         self._disk.submit(write, self._on_end_written)
 
     def _on_end_written(self, result: object) -> None:
@@ -688,19 +729,33 @@ class RobotBridge(RemasterNode):
                 f'{self._command_file.path}: where the arm was led last is not kept ({result})'
             )
 
-    def _send(self, command: Drive | Stop) -> None:
+    def _is_late(self, command: Drive | Renew | Stop) -> bool:
+        """Whether a command was decided so long ago that it is not published any more."""
+        limit_s = LATE_WALL_S[type(command)]
+        if isinstance(command, Drive) and command.begins_s:
+            # It begins at a time, and not when it comes.
+            limit_s = LATE_WALL_S[Renew]
+        return self.steady_s() - command.wall_s > limit_s
+
+    def _send(self, command: Drive | Renew | Stop) -> None:
         """Publish a command; the supervisor is told where that fails."""
         try:
-            self._publish(command.admitted, stop=isinstance(command, Stop))
+            kind = {Stop: 'stop', Renew: 'renewal', Drive: 'move'}[type(command)]
+            begins_s = 0.0 if isinstance(command, Stop) else command.begins_s
+            self._publish(command.admitted, kind, begins_s)
         except Exception:
             self._do(self.supervisor.not_sent(command, self.steady_s()))
             raise
 
-    def _publish(self, admitted: Admitted, *, stop: bool = False) -> None:
+    def _publish(self, admitted: Admitted, kind: str = 'move', begins_s: float = 0.0) -> None:
         """Publish what the gate has admitted; nothing else is ever published to a controller."""
         # A stop is a trajectory too: an empty one is refused by some versions of
         # joint_trajectory_controller, and the arm goes on.
         message = JointTrajectory(joint_names=list(self.chain.joint_names))
+        if begins_s:
+            # That of the robot's own clock, which its reports have: all pieces of a move are one
+            # function of its time, and none is joined to where the arm is reported.
+            message.header.stamp = stamp_of(begins_s)
         message.points = [
             JointTrajectoryPoint(
                 positions=point.q.tolist(),
@@ -710,7 +765,7 @@ class RobotBridge(RemasterNode):
             for point in admitted.waypoints
         ]
         assert self._controller is not None
-        self._controller.send(message, stop=stop)
+        self._controller.send(message, kind)
 
     def _on_commanded(self, drive: Drive) -> None:
         solution, duration_s = drive.solution, drive.admitted.waypoints[-1].time_s
@@ -768,6 +823,7 @@ class RobotBridge(RemasterNode):
             **self.counts,
             **{f'joints_refused_{reason}': count for reason, count in sorted(refused.items())},
             'moves_refused': supervisor.gate.refused,
+            'moves_cut_short': supervisor.missed,
         }
         age_s = supervisor.report_age_s(now)
         state = events.BridgeState(

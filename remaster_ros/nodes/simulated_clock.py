@@ -25,6 +25,9 @@ TAKEN = 'remaster/joint_states_taken'
 TAKEN_EVERY_S = 0.1
 """Reports are confirmed no more often than this, s of their stamps, or where these stand of wall
 time."""
+LEADS = 'leads'
+"""Behind the process id of who leads the arm: no report is left out there, and time waits for
+each."""
 SILENT_WALL_S = 5.0
 """A clock that is not published for so long has ended, and watchdogs follow the wall's, s.
 
@@ -94,10 +97,12 @@ class ReportsTaken:
     """Publishes, in a simulation, until when a node has taken what came.
 
     ``simulated``: `simulated_clock_rate`, or whether the clock is simulated; else nothing is
-    published.
+    published; ``leads``: whether the node leads the arm.
     """
 
-    def __init__(self, node: RemasterNode, simulated: float) -> None:
+    def __init__(self, node: RemasterNode, simulated: float, *, leads: bool = False) -> None:
+        self._every_s = 0.0 if leads else TAKEN_EVERY_S
+        self._name = f'{os.getpid()} {LEADS}' if leads else str(os.getpid())
         self._publisher = node.create_publisher(Header, TAKEN, 10) if simulated else None
         # Stamps of what was confirmed and of what was taken last, and when that was confirmed.
         self._confirmed_s = self._taken_s = -TAKEN_EVERY_S
@@ -109,9 +114,11 @@ class ReportsTaken:
             return
         stamp_s, wall = seconds(stamp), time.monotonic()
         # A robot that sends one report again and again has published something all the same.
-        again = stamp_s == self._taken_s and wall - self._confirmed_wall >= TAKEN_EVERY_S
+        is_same = stamp_s == self._taken_s
+        again = is_same and wall - self._confirmed_wall >= TAKEN_EVERY_S
         self._taken_s = stamp_s
-        if not again and abs(stamp_s - self._confirmed_s) < TAKEN_EVERY_S:
+        is_soon = is_same or abs(stamp_s - self._confirmed_s) < self._every_s
+        if is_soon and not again:
             return
         self._confirmed_s, self._confirmed_wall = stamp_s, wall
-        self._publisher.publish(Header(stamp=stamp, frame_id=str(os.getpid())))
+        self._publisher.publish(Header(stamp=stamp, frame_id=self._name))

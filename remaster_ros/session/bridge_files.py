@@ -76,6 +76,7 @@ class _Kept(msgspec.Struct):
     joints: list[str]
     end: list[float]
     sent_ns: int
+    next: list[float] | None = None  # Where the piece of the move behind it would end
 
 
 @dataclass(frozen=True)
@@ -86,6 +87,14 @@ class LastCommand:
     end: FloatArray | None
     # Time since it was sent, s; infinite if unknown.
     age_s: float
+    # End of the next piece of its move, rad, (k,): that may have been sent, too.
+    next_end: FloatArray | None = None
+
+    @property
+    def places(self) -> FloatArray | None:
+        """Places between which the arm was led, rad, (n, k); None if unknown."""
+        ends = [end for end in (self.end, self.next_end) if end is not None]
+        return None if self.end is None else np.array(ends)
 
 
 class LastCommandFile:
@@ -112,13 +121,28 @@ class LastCommandFile:
             return LastCommand(None, np.inf)
         # If the clock was set back, the age is unknown.
         age_s = (now_ns - kept.sent_ns) / 1e9 if now_ns >= kept.sent_ns else np.inf
-        end = np.array(kept.end)
-        known = kept.joints == self._joints and end.shape == (len(self._joints),)
-        return LastCommand(end if known and np.isfinite(end).all() else None, age_s)
+        names = kept.joints == self._joints
+        end, following = (
+            np.array(one) if names and one and _is_place(one, len(self._joints)) else None
+            for one in (kept.end, kept.next)
+        )
+        return LastCommand(end, age_s, following)
 
-    def write(self, end: FloatArray, sent_ns: int) -> None:
+    def write(self, end: FloatArray, sent_ns: int, next_end: FloatArray | None = None) -> None:
         """Store the end of a command; raise RemasterError if the file cannot be written."""
         make_folder(self.path.parent)
         write_atomically(
-            self.path, msgspec.json.encode(_Kept(self._joints, end.tolist(), sent_ns))
+            self.path,
+            msgspec.json.encode(
+                _Kept(
+                    self._joints,
+                    end.tolist(),
+                    sent_ns,
+                    None if next_end is None else next_end.tolist(),
+                )
+            ),
         )
+
+
+def _is_place(values: Sequence[float], joints: int) -> bool:
+    return len(values) == joints and bool(np.isfinite(values).all())

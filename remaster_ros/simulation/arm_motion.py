@@ -56,6 +56,34 @@ def spline(
     return np.array([start, start_velocity, c2, c3])
 
 
+def from_now(
+    now_s: float, begins_s: float | None, points: Sequence[ServoPoint]
+) -> tuple[list[ServoPoint], tuple[FloatArray, FloatArray] | None]:
+    """Return what is left of a trajectory with a stamp, and where its reference is now.
+
+    As joint_trajectory_controller does: points whose time has passed are behind it, and it goes on
+    between the two around now. Without such a point it joins the first one to where the arm is.
+
+    ``begins_s``: the stamp, s; None for at once; ``points``: at times from there.
+    """
+    since_s = 0.0 if begins_s is None else now_s - begins_s
+    left = [
+        ServoPoint(point.time_s - since_s, point.q, point.velocity)
+        for point in points
+        if point.time_s > since_s
+    ]
+    behind = [point for point in points if point.time_s <= since_s]
+    if not behind or not left:
+        return left, None
+    last, ahead = behind[-1], points[len(behind)]
+    rest = np.zeros_like(last.q)
+    start = rest if last.velocity is None else last.velocity
+    piece = spline(last.q, start, ahead.q, ahead.velocity, ahead.time_s - last.time_s)
+    powers = (since_s - last.time_s) ** np.arange(len(piece))
+    slope = piece[1:] * np.arange(1, len(piece))[:, None]
+    return left, (powers @ piece, powers[: len(slope)] @ slope)
+
+
 def _steady_response(reference: FloatArray) -> FloatArray:
     """Polynomial particular solution of the servo equation for a polynomial reference."""
     w, z = NATURAL_FREQUENCY, DAMPING
@@ -111,17 +139,25 @@ class Motion:
         q = np.asarray(q, float)
         self._responses = [_Response.of(start_s, q[None], q, np.zeros_like(q))]
 
-    def follow(self, start_s: float, waypoints: Sequence[ServoPoint]) -> None:
+    def follow(
+        self,
+        start_s: float,
+        waypoints: Sequence[ServoPoint],
+        reference_now: tuple[FloatArray, FloatArray] | None = None,
+    ) -> None:
         """From `start_s` on follow a trajectory; replaces what is under way.
 
-        The last waypoint is held. One piece of response is kept for each piece of the reference.
+        ``reference_now``: where it leads at `start_s`, and how fast, (k,) each; None where it
+        begins where the arm is. The last waypoint is held. One piece of response is kept for each
+        piece of the reference.
         """
         # A later trajectory replaces what of the former has not happened yet.
         self._responses = [r for r in self._responses if r.start_s <= start_s] or [
             self._responses[0]
         ]
         x, v = self.at(start_s)
-        reference, velocity, begin_s = x, v, 0.0
+        reference, velocity = (x, v) if reference_now is None else reference_now
+        begin_s = 0.0
         for waypoint in waypoints:
             # Differences of times from the start: in world time those of a message may vanish.
             duration_s = waypoint.time_s - begin_s

@@ -12,7 +12,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from remaster_ros.simulation.arm_motion import ServoPoint
+from remaster_ros.simulation.arm_motion import ServoPoint, from_now
 from remaster_ros.simulation.faults import Numbers, is_out
 from remaster_ros.simulation.world import World
 from remaster_ros.types import FloatArray
@@ -42,6 +42,8 @@ class FakeArm:
         self._last: tuple[float, list[str], FloatArray, FloatArray] | None = None
         self._reports = 0
         self._wrapped_once = False
+        # Of the last trajectory: its stamp, s, and how far beside it the arm comes, rad, (k,).
+        self._begun_s, self._stray = 0.0, np.zeros(len(self.names))
 
     def command(
         self, names: Sequence[str], points: Sequence[ServoPoint], start_s: float = 0.0
@@ -68,7 +70,10 @@ class FakeArm:
         columns = [list(names).index(name) for name in self.names]
         # The arm does not come back to quite the same place twice.
         per_radian = self.world.chain.per_radian
-        stray = self._rng.normal(0.0, REPEATABILITY_RAD, len(columns)) * per_radian
+        if not start_s or start_s != self._begun_s:
+            self._stray = self._rng.normal(0.0, REPEATABILITY_RAD, len(columns)) * per_radian
+        # The same all the way of one move, which may come in parts.
+        stray, self._begun_s = self._stray, start_s
         # Faults: beside the target, or slowly.
         slow, beside = faults.get('slow', 1.0), faults.get('elsewhere', 0.0) * per_radian
         waypoints = [
@@ -79,9 +84,9 @@ class FakeArm:
             )
             for point in points
         ]
-        begin = max(start_s, now)
+        begin = start_s or now
         self._commanded = begin + waypoints[-1].time_s, points[-1].q[columns]
-        self.world.begin_motion(begin, waypoints)
+        self.world.begin_motion(now, *from_now(now, begin, waypoints))
         return None
 
     def _refuse(
@@ -93,7 +98,9 @@ class FakeArm:
             return f'incoming joints do not match: unknown {unknown}, missing {missing}'
         if not points:
             return 'the trajectory is empty'
-        times = [0.0, *(point.time_s for point in points)]
+        times = [point.time_s for point in points]
+        if times[0] < 0.0 or (times[0] == 0.0 and not start_s):
+            return 'time_from_start does not increase'
         if any(later <= earlier for earlier, later in pairwise(times)):
             return 'time_from_start does not increase'
         for point in points:

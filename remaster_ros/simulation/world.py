@@ -131,10 +131,19 @@ class World:
 
     # Motion
 
-    def begin_motion(self, start_s: float, waypoints: Sequence[ServoPoint]) -> None:
-        """Send the arm along waypoints (reported joint positions); all processes read of it."""
+    def begin_motion(
+        self,
+        start_s: float,
+        waypoints: Sequence[ServoPoint],
+        reference: tuple[FloatArray, FloatArray] | None = None,
+    ) -> None:
+        """Send the arm along waypoints (reported joint positions); all processes read of it.
+
+        ``reference``: as of `Motion.follow`.
+        """
+        now = None if reference is None else [one.tolist() for one in reference]
         with (self.folder / MOTION_FILE).open('a') as file:
-            file.write(json.dumps([start_s, to_plain(list(waypoints))]) + '\n')
+            file.write(json.dumps([start_s, to_plain(list(waypoints)), now]) + '\n')
 
     @property
     def has_moved(self) -> bool:
@@ -149,11 +158,12 @@ class World:
         while line := self._lines.readline():
             self._torn += line
             if self._torn.endswith('\n'):
-                (start_s, points), self._torn = json.loads(self._torn), ''
+                (start_s, points, now), self._torn = json.loads(self._torn), ''
                 waypoints = from_plain(points, list[ServoPoint])
                 end_s, end = start_s + waypoints[-1].time_s, waypoints[-1].q
                 self._wrong.move(start_s, self._motion.at(start_s)[0], end_s, end)
-                self._motion.follow(start_s, waypoints)
+                reference = None if now is None else (np.array(now[0]), np.array(now[1]))
+                self._motion.follow(start_s, waypoints, reference)
 
     def reported(self, t: float) -> tuple[FloatArray, FloatArray]:
         """Joint positions (rad or m) and velocities (per s) as the encoders have them, (k,)."""

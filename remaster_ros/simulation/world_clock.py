@@ -38,6 +38,12 @@ AHEAD_S, AHEAD_WALL_S = 0.15, 0.05
 """World time may be ahead of a participant by so much, s, and by so much wall time at its rate:
 half of what the bridge allows an arm to lag (0.35 s and 0.1 s of wall time), since a command takes
 a while to get to the arm."""
+LEAD_AHEAD_S = 0.1
+"""World time is ahead of a report that who leads the arm has not taken by no more than this, s,
+however fast it runs: a move begins so long after it was decided (`motion.pieces.AHEAD_S`), and the
+next piece of a move comes before the stop of the piece under way."""
+LEAD_PATIENCE_WALL_S = 20.0
+"""Who leads the arm and gives no sign for so long is waited for as others are, s of wall time."""
 PATIENCE_WALL_S = 120.0
 """A process that runs and does nothing for so long is not waited for any more, s of wall time."""
 LOOK_WALL_S = 0.1
@@ -71,6 +77,8 @@ class Pace:
         # stamps of a robot that is out of order may go back.
         self._reports: deque[tuple[float, float]] = deque(maxlen=10_000)
         self._took: dict[int, _Participant] = {}
+        # Which of them lead the arm.
+        self._leads: set[int] = set()
         self._fakes: dict[int, _Participant] = {}
 
     def published(self, stamp_s: float) -> None:
@@ -78,10 +86,11 @@ class Pace:
         with self._lock:
             self._reports.append((stamp_s, self._clock.now()))
 
-    def took(self, pid: int, stamp_s: float) -> None:
+    def took(self, pid: int, stamp_s: float, *, leads: bool = False) -> None:
         """Note that a process has taken all reports up to the one with this stamp.
 
-        A stamp of no report is a time of the World, until which it has done all.
+        A stamp of no report is a time of the World, until which it has done all. One that leads
+        the arm confirms each report, behind the command that it has sent by it.
         """
         with self._lock:
             now = self._clock.now()
@@ -90,6 +99,8 @@ class Pace:
             if pid in self._took:
                 known.append(self._took[pid].done_s)
             self._took[pid] = _Participant(max(known), time.monotonic())
+            if leads:
+                self._leads.add(pid)
 
     def go_on(self, most_s: float = math.inf) -> None:
         """Let world time run as far as it may, and not past `most_s`."""
@@ -100,20 +111,26 @@ class Pace:
                 self._fakes[pid] = _Participant(done_s, wall)
         with self._lock:
             taken_s = min(_waited_for(self._took, wall), default=math.inf)
+            leads = {pid: self._took[pid] for pid in self._leads}
+            led_s = min(_waited_for(leads, wall, LEAD_PATIENCE_WALL_S), default=math.inf)
             taken_s += self._confirmed_every_s
-            while self._reports and self._reports[0][1] <= taken_s:
+            while self._reports and self._reports[0][1] <= min(taken_s, led_s):
                 self._reports.popleft()
-            since = [published_s for _, published_s in list(self._reports)[:1]]
+            reports = [published_s for _, published_s in self._reports]
+        since = [one for one in reports if one > taken_s][:1]
         since += _waited_for(self._fakes, wall)
-        self._clock.hold(min(min([now, *since]) + self._ahead_s, most_s))
+        untaken = [one + LEAD_AHEAD_S for one in reports if one > led_s][:1]
+        self._clock.hold(min([*untaken, min([now, *since]) + self._ahead_s, most_s]))
 
 
-def _waited_for(participants: dict[int, _Participant], wall: float) -> Iterable[float]:
+def _waited_for(
+    participants: dict[int, _Participant], wall: float, patience_s: float = PATIENCE_WALL_S
+) -> Iterable[float]:
     """Yield until when each process that is waited for has done what was due, s."""
     for pid, p in participants.items():
         if wall - p.looked_wall > LOOK_WALL_S:
             p.runs, p.looked_wall = is_running(pid), wall
-        if p.runs and wall - p.came_wall <= PATIENCE_WALL_S:
+        if p.runs and wall - p.came_wall <= patience_s:
             yield p.done_s
 
 

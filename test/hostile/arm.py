@@ -45,6 +45,9 @@ class Command:
         The arm was in emergency stop.
     foreign
         It came from another node than the bridge.
+    begins_s
+        Its stamp on the arm's monotonic clock, s; None for at once. Points whose time has passed
+        when it arrives are behind it: it goes on between those around that time.
     """
 
     arrival_s: float
@@ -57,19 +60,29 @@ class Command:
     obeyed: bool = True
     emergency: bool = False
     foreign: bool = False
+    begins_s: float | None = None
+
+    @property
+    def zero_s(self) -> float:
+        """From when its times count, s."""
+        return self.arrival_s if self.begins_s is None else self.begins_s
 
     @property
     def end_s(self) -> float:
         """When it is over, s."""
-        return self.arrival_s + float(self.times_s[-1])
+        return self.zero_s + float(self.times_s[-1])
 
     def spline(self) -> Spline:
         """Return what the controller makes of it."""
-        n, k = self.q.shape
-        edges = np.concatenate([[0.0], self.times_s])
-        q = np.vstack([self.start_q, self.q])
-        v = None if self.v is None else np.vstack([self.start_v, self.v])
-        a = None if self.a is None or v is None else np.vstack([np.zeros(k), self.a])
+        k = self.q.shape[1]
+        since_s = self.arrival_s - self.zero_s
+        if self.times_s[0] > since_s:
+            edges = np.concatenate([[since_s], self.times_s])
+            q = np.vstack([self.start_q, self.q])
+            v = None if self.v is None else np.vstack([self.start_v, self.v])
+            a = None if self.a is None or v is None else np.vstack([np.zeros(k), self.a])
+        else:
+            edges, q, v, a = self.times_s, self.q, self.v, self.a
         pieces = [
             _piece(
                 edges[i + 1] - edges[i],
@@ -78,9 +91,9 @@ class Command:
                 None if v is None else (v[i], v[i + 1]),
                 None if a is None else (a[i], a[i + 1]),
             )
-            for i in range(n)
+            for i in range(len(q) - 1)
         ]
-        return Spline(self.arrival_s, edges, pieces, q[-1])
+        return Spline(self.zero_s, edges, pieces, q[-1])
 
 
 def _piece(
@@ -138,7 +151,7 @@ class Spline:
 
     def at(self, time_s: float) -> tuple[FloatArray, FloatArray]:
         """Position and velocity at a time, (k,) each."""
-        s = max(time_s - self.begin_s, 0.0)
+        s = max(time_s - self.begin_s, float(self.edges_s[0]))
         index = int(np.searchsorted(self.edges_s, s, side='right')) - 1
         if index >= len(self.pieces):
             return self.end, np.zeros_like(self.end)
@@ -175,12 +188,15 @@ class HostileArm:
         It is where the controller commands it; else a servo lags a little behind.
     open_loop
         Trajectories begin at the former reference, not at the measured state.
+    keeps_stamps
+        The controller keeps the stamps of trajectories; else it begins each at once.
     """
 
     q: FloatArray
     begin_s: float
     exact: bool = False
     open_loop: bool = False
+    keeps_stamps: bool = True
     commands: list[Command] = field(default_factory=list)
     lock: threading.RLock = field(default_factory=threading.RLock)
 
@@ -220,6 +236,7 @@ class HostileArm:
         a: FloatArray | None = None,
         lost: bool = False,
         foreign: bool = False,
+        begins_s: float | None = None,
     ) -> Command:
         """Obey a trajectory, unless it was lost or the arm is in emergency stop."""
         with self.lock:
@@ -228,8 +245,21 @@ class HostileArm:
             if self.open_loop:
                 start_q, start_v = self._reference.at(now_s)
             obeyed = not (lost or self.emergency or not np.all(np.isfinite(q)))
+            begins_s = begins_s if self.keeps_stamps else None
+            # What is over when it comes is refused, as joint_trajectory_controller does.
+            obeyed = obeyed and (begins_s is None or begins_s + times_s[-1] > now_s)
             command = Command(
-                now_s, times_s, q, v, a, start_q, start_v, obeyed, self.emergency, foreign
+                now_s,
+                times_s,
+                q,
+                v,
+                a,
+                start_q,
+                start_v,
+                obeyed,
+                self.emergency,
+                foreign,
+                begins_s,
             )
             self.commands.append(command)
             if obeyed:
@@ -251,6 +281,12 @@ class HostileArm:
             self.advance(now_s)
             self._reference = _at_rest(self.q, now_s)
             self.v, self.emergency = np.zeros_like(self.q), False
+
+    def ends_in(self, now_s: float) -> float:
+        """Return how long the last command that it obeyed goes on, s."""
+        with self.lock:
+            obeyed = [command for command in self.commands if command.obeyed]
+        return obeyed[-1].end_s - now_s if obeyed else 0.0
 
     def speed(self) -> float:
         """Speed of the fastest joint now, rad/s."""

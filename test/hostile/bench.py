@@ -307,7 +307,7 @@ class Bench(BridgeProcess):
         """Put the arm somewhere else; only while no bridge runs."""
         with self.arm.lock:
             old = self.arm
-            self.arm = HostileArm(q, time.monotonic(), old.exact, old.open_loop)
+            self.arm = HostileArm(q, time.monotonic(), old.exact, old.open_loop, old.keeps_stamps)
             self.arm.commands = old.commands
         self._led_to(q)
 
@@ -428,6 +428,9 @@ class Bench(BridgeProcess):
         if q is None or not len(q):
             return
         lost = withheld or self.rng.random() < self.lines.command_loss
+        stamp = message.header.stamp
+        # On the robot's clock, as that of joint_states.
+        begins_s = stamp.sec + 1e-9 * stamp.nanosec - time.time() - self.calm.clock_s
         self.arm.take(
             time.monotonic(),
             np.array(times),
@@ -436,6 +439,7 @@ class Bench(BridgeProcess):
             rows('accelerations'),
             lost,
             foreign=foreign or message.header.frame_id == INTRUDER,
+            begins_s=time.monotonic() + begins_s if stamp.sec else None,
         )
 
     def _on_status(self, array: DiagnosticArray) -> None:

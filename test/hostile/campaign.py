@@ -19,6 +19,7 @@ from hostile.bench import Bench
 from hostile.injections import (
     a_little_late,
     another_robots_joints,
+    bridge_killed,
     clock_set_back,
     command_doubled,
     commands_late,
@@ -40,6 +41,7 @@ from hostile.injections import (
     foreign_states,
     frozen_states,
     gripper_beside,
+    hostile_values,
     killed_while_halted,
     late_from_the_start,
     late_states,
@@ -63,6 +65,7 @@ from hostile.injections import (
     silence,
     somewhat_late,
     stopped_stamps,
+    stopped_while_it_rests,
     wrapped,
     wrapped_once,
 )
@@ -98,7 +101,8 @@ INJECTIONS = (
     *(Injection(act, 'go on') for act in (a_little_late, command_doubled, pose_taken_back)),
     Injection(pauses, 'go on', 3.0),
     # Where the move before it was long, a person goes on after it.
-    Injection(process_killed, 'any', 0.5),
+    *(Injection(act, 'any', 0.5) for act in (process_killed, bridge_killed)),
+    Injection(hostile_values, 'any'),
     *(Injection(act, 'halt', 1.5) for act in (emergency, emergency_driver_silent)),
     *(Injection(act, 'halt') for act in (emergency_released, emergency_while_measuring)),
     *(Injection(act, 'halt') for act in (emergency_while_paused, process_paused_emergency)),
@@ -121,6 +125,7 @@ WITH_TOPIC = (
 """Where the bridge has an emergency_stop_topic."""
 WITHOUT_TOPIC = (
     Injection(emergency_in_a_wait, 'any', 2.0, topic=False),
+    Injection(stopped_while_it_rests, 'any', 2.0, topic=False),
     Injection(emergency_while_braking, 'halt', 3.0, topic=False),
 )
 """And where it has none."""
@@ -227,6 +232,9 @@ class Campaign:
             stamp_noise_s=float(rng.choice([0.0, 0.0, 2e-4])),
             exact=bool(rng.random() < 0.3),
             open_loop=bool(rng.random() < 0.3),
+            # A controller that keeps the stamps of trajectories, or one that begins at once.
+            keeps_stamps=(kept := bool(rng.random() < 0.5)),
+            trajectory_stamps='kept' if kept else 'ignored',
             **({'emergency_stop_topic': EMERGENCY} if topic else {}),
         )
         bench.emergency_shown = False if topic else None
@@ -288,6 +296,9 @@ class Campaign:
         bench, since = scene.bench, time.monotonic()
         kind.act(scene)
         outcome.expected, outcome.alone = scene.expected or kind.expected, scene.alone
+        outcome.after_kill_s = scene.after_kill_s
+        ended = bench.process is None or bench.process.poll() is not None
+        outcome.ended = ended
         shown_from = since if scene.note != 'restarted' else time.monotonic() - 0.5
         if outcome.expected == 'halt':
             bench.until(lambda: bench.seen.halted(shown_from), HALT_WITHIN_S)

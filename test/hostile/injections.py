@@ -16,10 +16,13 @@ from hostile.bench import Bench
 from hostile.lines import COMMANDS, INTRUDER, RELIABLE
 from hostile.scene import ANSWER_S, HOME, SPREAD, Scene
 from sensor_msgs.msg import JointState
+from std_msgs.msg import String
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from remaster_ros.types import FloatArray
 
+STANDS_RAD_S = 1e-3
+"""An arm that is no faster stands."""
 MOST_OFF_RAD = 2e-3
 """`arrive_tolerance` of the bridge: an arm that is no further from its end has arrived."""
 
@@ -251,6 +254,59 @@ def process_killed(s: Scene) -> None:
     s.wait(0.0, 0.6)
     restart(s.bench)
     s.bench.send(s.solutions)
+
+
+def bridge_killed(s: Scene) -> None:
+    """Nobody sends a stop any more: what the controller has ends by itself."""
+    killed = time.monotonic()
+    s.bench.kill()
+    s.bench.until(lambda: s.bench.arm.speed() < STANDS_RAD_S, 20.0)
+    s.after_kill_s = time.monotonic() - killed
+    s.note = f'{s.after_kill_s:.2f} s'
+    restart(s.bench)
+    s.bench.send(s.solutions)
+
+
+def hostile_values(s: Scene) -> None:
+    """Messages without sense on every topic of the bridge, and parameters of the wrong kind."""
+    node, made = s.bench.intruder, []
+    topics = [
+        ('/remaster/joint_waypoints', JointTrajectory),
+        ('/remaster/events', String),
+        ('/robot_description', String),
+        ('/joint_states', JointState),
+    ]
+    try:
+        for topic, kind in topics:
+            made.append(node.create_publisher(kind, topic, RELIABLE))
+        s.bench.until(lambda: all(one.get_subscription_count() for one in made), 2.0)
+        for publisher, (_, kind) in zip(made, topics):
+            texts = (String(data=''), String(data='x' * 2**20), String(data='{"version": 1e300'))
+            odd = texts if kind is String else (kind(),)
+            for message in odd:
+                publisher.publish(message)
+            publisher.publish(b'\x00\x01\x00\x00' + b'\xff' * 64)
+        for value in (1e-300, float('nan'), -1.0):
+            s.bench.set_parameter('cartesian_speed_limit_m_s', value)
+        s.maybe_pause(0.5)
+    finally:
+        for publisher in made:
+            node.destroy_publisher(publisher)
+
+
+def stopped_while_it_rests(s: Scene) -> None:
+    """An emergency stop of an arm that waits, released within seconds; no topic shows it."""
+    bench = s.bench
+    bench.waiting_for = 'mocap'
+    bench.until(lambda: bench.arm.speed() < STANDS_RAD_S, 5.0)
+    s.wait(0.2, 0.5)
+    bench.arm.stop_by_brakes(time.monotonic())
+    s.wait(0.3, 1.0)
+    bench.arm.release(time.monotonic())
+    back = time.monotonic()
+    bench.waiting_for = ''
+    s.wait(1.5, 2.0)
+    s.alone = len(bench.commands_since(back))
 
 
 def killed_while_halted(s: Scene) -> None:

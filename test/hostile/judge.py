@@ -8,7 +8,7 @@ interpolation of `hostile.arm`, and nothing of the code that makes the commands.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -140,7 +140,7 @@ class Judgement:
     Attributes
     ----------
     kind
-        ``move``, ``stop`` or ``probe``.
+        ``move``, ``piece`` (the rest of a move), ``stop`` or ``probe``.
     at_s
         Monotonic time of arrival.
     way_rad
@@ -158,7 +158,11 @@ class Judgement:
     outside_rad
         How far outside the joint limits; infinite for what is no number.
     off_path_rad, back_rad, beyond_rad
-        Of a stop: distance from the admitted path, way back along it, way beyond its end.
+        Of a stop: distance from the admitted path, way back along it, way beyond its end; of a
+        piece, the first two.
+    jump_rad
+        Of a piece: how far it begins from where the controller has led the arm, or from where the
+        arm is: the nearer of the two.
     lowest_m
         Lowest point of the arm on the way, m.
     """
@@ -177,6 +181,7 @@ class Judgement:
     back_rad: float = 0.0
     beyond_rad: float = 0.0
     lowest_m: float = np.inf
+    jump_rad: float = 0.0
 
     def wrong(self, rules: Rules) -> list[str]:
         """Return what must not have been commanded, in words."""
@@ -187,11 +192,11 @@ class Judgement:
             out.append(f'joint speed {self.speed_ratio:.2f} of what is allowed')
         if self.cartesian_m_s > rules.cartesian_m_s * (1.0 + SPEED_TOLERANCE):
             out.append(f'{self.cartesian_m_s:.3f} m/s')
-        if self.kind == 'move' and self.acceleration_ratio > 1.0 + SPEED_TOLERANCE:
+        if self.kind in ('move', 'piece') and self.acceleration_ratio > 1.0 + SPEED_TOLERANCE:
             out.append(f'acceleration {self.acceleration_ratio:.2f} of what is allowed')
         if self.lowest_m < 0.0:
             out.append(f'through the floor: {self.lowest_m:.3f} m')
-        for what in ('off_path', 'back', 'beyond'):
+        for what in ('off_path', 'back', 'beyond', 'jump'):
             value = getattr(self, f'{what}_rad')
             if value > ON_PATH_RAD:
                 out.append(f'stop {what.replace("_", " ")} by {np.rad2deg(value):.2f} deg')
@@ -229,7 +234,17 @@ class Judge:
         # A stop ends a move before its time; what follows the stop's own end is a move again.
         under_way = self._last is not None and command.arrival_s < self._last.end_s
         admitted = self._move
-        if admitted is not None and (under_way or not running):
+        further = {}
+        if admitted is not None and under_way and len(command.times_s) > 1:
+            kind = 'piece'
+            assert self._last is not None
+            here, _ = command.spline().at(command.arrival_s)
+            led, _ = self._last.spline().at(command.arrival_s)
+            off = (here - led, here - command.start_q)
+            further = {'jump_rad': float(min(np.max(np.abs(one)) for one in off))}
+            admitted = extended(admitted, command)
+            further |= {k: v for k, v in along(admitted, q).items() if k != 'beyond_rad'}
+        elif admitted is not None and (under_way or not running):
             kind = 'stop'
         elif way < PROBE_RAD:
             kind = 'probe'
@@ -254,12 +269,21 @@ class Judge:
             acceleration_ratio=np.nan if bound is None else float(np.max(np.abs(a) / bound)),
             outside_rad=outside_rad if outside_rad > max(allowed, 0.0) + 1e-4 else 0.0,
             lowest_m=min((body.lowest(row) for row in q[moving]), default=np.inf),
-            **(along(admitted, q) if kind == 'stop' and admitted is not None else {}),
+            **(along(admitted, q) if kind == 'stop' and admitted is not None else further),
         )
         self._last = command
         if kind != 'stop':
-            self._move = command
+            self._move = admitted if kind == 'piece' else command
         return judged
+
+
+def extended(admitted: Command, piece: Command) -> Command:
+    """Return a move with what a piece adds to it, from when that came."""
+    times = admitted.zero_s + admitted.times_s
+    passed, ahead = times <= piece.arrival_s, piece.zero_s + piece.times_s > piece.arrival_s
+    q = np.vstack([admitted.q[passed], piece.q[ahead]])
+    times = np.concatenate([times[passed], (piece.zero_s + piece.times_s)[ahead]])
+    return replace(admitted, q=q, v=None, a=None, times_s=times - admitted.zero_s)
 
 
 def along(admitted: Command, q: FloatArray) -> dict[str, float]:

@@ -10,6 +10,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from hostile.judge import Judgement, Rules, percentiles
 
+AFTER_KILL_S = 2.0
+"""An arm stands so long after its bridge was killed, s."""
 STALLED_S = 0.15
 """The test's own process did not run for so long: joint states came late by it, s."""
 
@@ -36,6 +38,10 @@ class Outcome:
         Where the bridge was to go on: it did, and the arm arrived.
     latencies
         From a request to stop to the stop, s.
+    after_kill_s
+        How long the arm went on after its bridge was killed.
+    ended
+        The bridge's process has ended, and was not killed.
     arm_share
         Largest joint speed of the arm itself over what is allowed.
     gap_s
@@ -53,6 +59,8 @@ class Outcome:
     settled: bool = True
     latencies: list[float] = field(default_factory=list)
     arm_share: float = 0.0
+    after_kill_s: float = 0.0
+    ended: bool = False
     gap_s: float = 0.0
 
     def wrong(self, rules: Rules) -> list[str]:
@@ -62,6 +70,10 @@ class Outcome:
             out.append(f'{self.alone} commands without a person after a wait')
         if self.late_commands:
             out.append(f'{self.late_commands} commands to an arm that has been stopped')
+        if self.ended:
+            out.append('the node has ended')
+        if self.after_kill_s > AFTER_KILL_S + self.gap_s:
+            out.append(f'{self.after_kill_s:.2f} s of motion after the bridge was killed')
         if not self.moved:
             return [*out, 'the arm did not move before anything was wrong']
         if self.expected == 'halt' and not self.halted:

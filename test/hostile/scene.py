@@ -56,7 +56,7 @@ def bench_of(
     **options: object,
 ) -> Bench:
     """Return a bench of the demo cell; options are `Bench`'s and the bridge's parameters."""
-    known = {'rate', 'clock_s', 'stamp_noise_s', 'exact', 'open_loop'}
+    known = {'rate', 'clock_s', 'stamp_noise_s', 'exact', 'open_loop', 'keeps_stamps'}
     parameters = {'cell': 'demo', 'speed_share': rules.speed_share, **FAST}
     parameters['emergency_stop_topic'] = 'none'
     parameters |= {key: value for key, value in options.items() if key not in known}
@@ -122,6 +122,8 @@ class Scene:
         Times from a request to stop to the stop's arrival, s; infinite where none came.
     note
         The figures of this injection, in words.
+    after_kill_s
+        How long the arm went on after its bridge was killed, s.
     """
 
     bench: Bench
@@ -134,6 +136,7 @@ class Scene:
     note: str = ''
     expected: str = ''
     alone: int = 0
+    after_kill_s: float = 0.0
 
     def wait(self, low_s: float, high_s: float) -> float:
         """Let a random time pass; returns it, s."""

@@ -300,8 +300,10 @@ def test_a_speed_that_is_changed_holds_at_once(bridge):
     wait(bench, lambda: bench.arm.speed() < 1e-3)
     stopped = time.monotonic()
     wait(bench, lambda: moves(bench, stopped))
-    _, speeds, _ = moves(bench, stopped)[0].spline().sample()
-    assert np.all(np.abs(speeds) <= 0.05 * CHAIN.velocity_limits * 1.001)
+    # The move comes in pieces: the stop, and then none that is faster, to the same place.
+    wait(bench, lambda: np.allclose(moves(bench, stopped)[-1].q[-1], target))
+    for piece in moves(bench, stopped):
+        _, speeds, _ = piece.spline().sample()
+        assert np.all(np.abs(speeds) <= 0.05 * CHAIN.velocity_limits * 1.001)
     assert bench.arm.fastest(stopped, CHAIN.velocity_limits) < 0.06
-    np.testing.assert_allclose(moves(bench, stopped)[0].q[-1], target)
-    assert len(bench.commands_since(changed)) == 2
+    assert len(bench.commands_since(changed)) == 1 + len(moves(bench, stopped))

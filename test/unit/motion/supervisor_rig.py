@@ -12,6 +12,7 @@ from remaster_ros.motion.actions import (
     Drive,
     Halted,
     PathAnswer,
+    Renew,
     Settled,
     Stop,
     SupervisorRules,
@@ -102,7 +103,7 @@ class Rig:
                 answer = self._answered(action)
                 if answer is not None:
                     self.do(self.supervisor.path_found(action.number, answer, self.wall))
-            elif isinstance(action, Drive | Stop):
+            elif isinstance(action, Drive | Renew | Stop):
                 points = self.obey(
                     tuple(
                         dataclasses.replace(p, q=p.q / self.unit, velocity=p.velocity / self.unit)
@@ -112,7 +113,7 @@ class Rig:
                 if isinstance(action, Stop) and self.stop_s:
                     self.on_its_way = self.t + self.stop_s, points
                 else:
-                    self._command(points)
+                    self._command(points, getattr(action, 'begins_s', 0.0) or None)
 
     def _answered(self, request):
         """Ask for a path in radians, and give it in the units of the supervisor."""
@@ -129,12 +130,13 @@ class Rig:
         }
         return dataclasses.replace(answer, **paths)
 
-    def _command(self, points):
+    def _command(self, points, begins_s=None):
         if not points:
             return
         q, velocity = self.arm.at(self.t)
         self.commands.append((self.t, q, velocity, points))
-        self.arm.follow(self.t, [servo.ServoPoint(p.time_s, p.q, p.velocity) for p in points])
+        servo_points = [servo.ServoPoint(p.time_s, p.q, p.velocity) for p in points]
+        self.arm.follow(self.t, *servo.from_now(self.t, begins_s, servo_points))
 
     def cubics(self):
         """What the controller makes of each command, from where the arm really is."""

@@ -2,6 +2,7 @@
 """The tables of the supervisor's states: what they allow, that all of it happens, and the page."""
 
 import copy
+import dataclasses
 import sys
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from test_supervisor_way_out import in_contact
 
 from remaster_ros.motion import arm_supervisor
 from remaster_ros.motion.actions import CheckPath, Drive, Halted, PathAnswer, Stop
+from remaster_ros.motion.pieces import HORIZON_S
 from remaster_ros.motion.states import ARM, CONSENT, PLACE, Arm, Consent, Event, Place, Word, after
 
 DOCS = Path(__file__).parents[3] / 'docs'
@@ -205,6 +207,14 @@ def goes_on_after_its_stop(rig):
     rig.run(5.0)
 
 
+def is_away_for_a_while(rig):
+    """The process stands still while the next piece would be due."""
+    rig.alive.discard('bridge')
+    rig.run(1.1)
+    rig.alive.add('bridge')
+    rig.run(3.0)
+
+
 REACHED = {
     Arm.STANDS: (lambda rig: rig, [emergency, given_up, another, pause, refused]),
     Arm.ASKS: (asks, [emergency, given_up, another, pause]),
@@ -260,6 +270,19 @@ def test_every_row_of_the_table_happens_and_nothing_else(rows, rig):
             assert rig.supervisor.state is state, cause
             cause(rig)
             assert 'a fault of this program' not in rig.supervisor.halted, (state, cause)
+    for state, reach in ((Arm.MOVES, moves), (Arm.LEAVES, leaves)):
+        for cause in (goes_on, is_away_for_a_while):
+            rig = copy.deepcopy(begun)
+            rig.supervisor._motion.horizon_s = HORIZON_S
+            limits = rig.supervisor.gate.limits
+            if state is Arm.MOVES:
+                # A long way, so that it has pieces; that out of a contact is slow anyway.
+                slow = dataclasses.replace(limits, velocity=limits.velocity / 3.0)
+                rig.do(rig.supervisor.use_limits(slow, rig.wall))
+            rig = reach(rig)
+            assert rig.supervisor.state is state
+            cause(rig)
+            assert 'a fault of this program' not in rig.supervisor.halted
     rig = copy.deepcopy(begun)
     never_settles(rig)
     rig = measures(copy.deepcopy(begun))

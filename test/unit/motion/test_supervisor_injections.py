@@ -1,24 +1,30 @@
 # SPDX-License-Identifier: Apache-2.0
 """Whatever happens: nothing is commanded outside limits, speeds, accelerations; none after a halt.
 
-320 runs of six seconds with one to four injections each, at random moments. Each command is judged
-as two kinds of controller would carry it out: from where the arm really is and moves (closed
-loop), and from the reference of the command before (open loop).
+320 runs of six seconds with one to four injections each, at random moments, of whole moves and of
+moves in pieces. Each command is judged as two kinds of controller would carry it out: from where
+the arm really is and moves (closed loop), and from the reference of the command before (open
+loop). A piece with a stamp is one function of time with the piece before it, for both.
 """
 
 import copy
+import dataclasses
 from collections import Counter
 
 import numpy as np
 import pytest
-from supervisor_rig import LIMITS, SPEED, Rig
+from supervisor_rig import LIMITS, RULES, SPEED, Rig
 
 from remaster_ros.motion.actions import Drive, Halted, Stop
 from remaster_ros.motion.motion_gate import Cubic
+from remaster_ros.motion.pieces import HORIZON_S
 from remaster_ros.motion.trajectory import Waypoint
 from remaster_ros.simulation import arm_motion as servo
 
 SECONDS, DT = 6.0, 0.05
+JUMP_RAD = 0.1
+"""How far a piece with a stamp may begin from where an open-loop controller has led the arm, rad:
+where the two pieces before it were lost, for an arm that goes 1.5 rad/s."""
 SERVO = 0.02
 """A servo overshoots: share by which the speed of an arm may exceed what it is told."""
 
@@ -26,10 +32,10 @@ SERVO = 0.02
 class Judged(Rig):
     """Keeps the reference of an open-loop controller, and judges every command."""
 
-    def __init__(self):
+    def __init__(self, rules):
         self.reference = []
         self.worst = Counter()
-        super().__init__()
+        super().__init__(rules)
 
     def _reference_at(self, t):
         q, velocity = self.arm.at(t) if not self.reference else (None, None)
@@ -44,22 +50,30 @@ class Judged(Rig):
         self.arm = servo.Motion(self.t, self.arm.at(self.t)[0])
         self.reference = []
 
-    def _command(self, points):
+    def _command(self, points, begins_s=None):
         if points:
             assert not self.supervisor.halted or self.halting, 'commanded while halted'
             for point in points:
                 assert LIMITS.outside(np.round(point.q, 9)) == ''
             begins = {'open': self._reference_at(self.t), 'closed': self.arm.at(self.t)}
+            now_s = 0.0 if begins_s is None else self.t - begins_s
+            behind = [point for point in points if point.time_s <= now_s]
+            ahead = points[len(behind) :]
             for kind, (q, velocity) in begins.items():
-                before, start, reference = Waypoint(0.0, q, velocity), self.t, []
-                for point in points:
+                before, start, reference = Waypoint(now_s, q, velocity), self.t - now_s, []
+                if behind:
+                    before = behind[-1]
+                    here = Cubic.between(before, ahead[0]).at(now_s - before.time_s)
+                    jump = float(np.max(np.abs(here - q)))
+                    self.worst[f'jump {kind}'] = max(self.worst[f'jump {kind}'], jump)
+                for point in ahead:
                     cubic = Cubic.between(before, point)
                     reference.append((start + before.time_s, cubic))
                     self._judge(kind, cubic)
                     before = point
                 if kind == 'open':
                     self.reference = reference
-        super()._command(points)
+        super()._command(points, begins_s)
 
     def _judge(self, kind, cubic):
         low, high = cubic.range()
@@ -151,9 +165,14 @@ def injections(rng):
 
 
 @pytest.mark.parametrize('runs', [100, pytest.param(320, marks=pytest.mark.qualify)])
-def test_nothing_dangerous_is_commanded_in_random_runs(runs):
+@pytest.mark.parametrize(
+    'pieces',
+    [{}, {'horizon_s': HORIZON_S}, {'horizon_s': HORIZON_S, 'keeps_stamps': False}],
+    ids=['whole', 'stamps', 'none'],
+)
+def test_nothing_dangerous_is_commanded_in_random_runs(pieces, runs):
     rng = np.random.default_rng(2026)
-    begun, counts, worst = Judged(), Counter(), Counter()
+    begun, counts, worst = Judged(dataclasses.replace(RULES, **pieces)), Counter(), Counter()
     for _ in range(runs):
         rig = copy.deepcopy(begun)
         rig.rng = np.random.default_rng(rng.integers(2**32))
@@ -203,3 +222,4 @@ def test_nothing_dangerous_is_commanded_in_random_runs(runs):
     assert worst['speed closed'] <= 1.0 + SERVO
     assert worst['hard open'] <= 1.001
     assert worst['hard closed'] <= 1.0 + SERVO
+    assert worst['jump open'] <= JUMP_RAD

@@ -47,6 +47,8 @@ FAST = {
     'speed_share': 1.0,
     'cartesian_speed_limit_m_s': 0.5,
     'emergency_stop_topic': 'robot/released',
+    # Whole moves: each is one command. What comes in pieces has tests of its own.
+    'horizon_s': 0.0,
 }
 """Parameters of a bridge whose decisions come soon."""
 PATIENCE_S = 30.0
@@ -106,8 +108,8 @@ class CountedBridge(robot_bridge.RobotBridge):
         super()._on_waypoints(message)
         self.taken['ways'] += 1
 
-    def _publish(self, admitted, **how):
-        super()._publish(admitted, **how)
+    def _publish(self, *how):
+        super()._publish(*how)
         self.published += 1
 
     def _summary(self):
@@ -471,7 +473,8 @@ class Rig:
         assert all(not len(p.accelerations) and not len(p.effort) for p in message.points)
         q = np.array([p.positions for p in message.points])
         v = np.array([p.velocities for p in message.points])
-        self.commands.append(self.arm.take(self.wall, times, q, v))
+        begins_s = seconds(message.header.stamp) or None
+        self.commands.append(self.arm.take(self.wall, times, q, v, begins_s=begins_s))
 
     def _on_status(self, array):
         for item in array.status:

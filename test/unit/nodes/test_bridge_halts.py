@@ -17,7 +17,7 @@ from std_msgs.msg import Bool
 from trajectory_msgs.msg import JointTrajectory
 
 from remaster_ros.collection.events import HaltCleared, PlannerState, RecorderState
-from remaster_ros.motion.actions import Drive, Stop
+from remaster_ros.motion.actions import Drive, Renew, Stop
 from remaster_ros.nodes import robot_bridge
 from remaster_ros.nodes.status import LEASED
 
@@ -215,8 +215,8 @@ def paused_in(r, monkeypatch, name, pause_s=1.88):
     gate = r.bridge.supervisor.gate
     make = getattr(gate, name)
 
-    def pause(*args):
-        admitted = make(*args)
+    def pause(*args, **options):
+        admitted = make(*args, **options)
         monkeypatch.setattr(gate, name, make)
         r.wall += pause_s
         return admitted
@@ -244,7 +244,7 @@ def test_a_stop_is_not_published_after_a_pause_of_the_process(rig, monkeypatch, 
 
 @pytest.mark.parametrize(('limit_s', 'pause_s'), [(0.1, 0.09), (0.125, 0.125)])
 def test_a_stop_that_is_hardly_late_is_published(rig, monkeypatch, limit_s, pause_s):
-    assert {Stop: 0.1, Drive: 0.5} == robot_bridge.LATE_WALL_S
+    assert {Stop: 0.1, Renew: 0.1, Drive: 0.5} == robot_bridge.LATE_WALL_S
     monkeypatch.setitem(robot_bridge.LATE_WALL_S, Stop, limit_s)
     r = rig()
     r.go(AWAY, speed=0.2)
@@ -405,9 +405,9 @@ def test_every_rule_is_asked_at_the_time_it_is(rig):
             if not callable(value) or name.startswith('_'):
                 return value
 
-            def call(*args):
+            def call(*args, **how):
                 seen.setdefault(name, []).append(args)
-                return value(*args)
+                return value(*args, **how)
 
             return call
 

@@ -43,6 +43,7 @@ def test_the_summary(rig):
         'joints_trouble': '',
         'correction': '',
         'moves_refused': '0',
+        'moves_cut_short': '0',
         'pose': named,
         'run': 'token',
         'qos_trouble': '',

@@ -33,6 +33,8 @@ RANGES = {
     'lag_s': (0.35, 0.05, 2.0, 's'),
     'command_interface': ('topic', None, None, ''),
     'emergency_stop_topic': ('', None, None, ''),
+    'horizon_s': (1.6, 1.4, 1.6, 's'),
+    'trajectory_stamps': ('auto', None, None, ''),
 }
 """What an arm is left to: whoever changes one of them has to change it here as well."""
 
@@ -66,10 +68,18 @@ def test_every_rule_comes_from_its_own_parameter():
         lag_s=1.25,
         # Without it nothing goes on by itself.
         emergency_stop_topic='robot/stops',
+        horizon_s=1.5,
     )
     units = JointUnits((False, True))
     assert parameters.rules(units) == SupervisorRules(
-        SettleRules(1.5, 0.01, 0.001, units=units), 11.0, 12.0, 13.0, 14.0, 15.0, 1.25
+        SettleRules(1.5, 0.01, 0.001, units=units),
+        11.0,
+        12.0,
+        13.0,
+        14.0,
+        15.0,
+        1.25,
+        horizon_s=1.5,
     )
 
 

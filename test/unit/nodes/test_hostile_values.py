@@ -413,7 +413,7 @@ def test_a_command_that_cannot_be_published_is_none(rig):
     r = rig()
     before = len(r.commands)
 
-    def full(admitted, **how):
+    def full(*how):
         raise OverflowError('it does not fit')
 
     r.bridge._publish, own = full, r.bridge._publish

@@ -4,6 +4,7 @@
 And what a simulation that waits for its nodes hears of them.
 """
 
+import os
 from types import SimpleNamespace
 
 import pytest
@@ -14,7 +15,7 @@ from builtin_interfaces.msg import Time
 
 from remaster_ros.errors import InputError
 from remaster_ros.nodes import simulated_clock
-from remaster_ros.nodes.simulated_clock import SILENT_WALL_S, ReportsTaken, SteadyTime
+from remaster_ros.nodes.simulated_clock import LEADS, SILENT_WALL_S, ReportsTaken, SteadyTime
 
 pytestmark = pytest.mark.ros
 
@@ -125,3 +126,16 @@ def test_reports_are_confirmed_ten_times_a_second_one_that_comes_again_too(wall)
         reports.take(Time(sec=7, nanosec=990_000_000))
     assert 9 <= len(confirmed) <= 11
     assert {message.stamp.nanosec for message in confirmed} == {990_000_000}
+
+
+def test_who_leads_the_arm_confirms_each_report_and_says_that_it_leads(wall):
+    node, confirmed = Node(), []
+    node.create_publisher = lambda *_: SimpleNamespace(publish=confirmed.append)
+    reports = ReportsTaken(node, RATE, leads=True)
+    for hundredths in range(50):
+        for _ in range(2):
+            reports.take(Time(sec=7, nanosec=hundredths * 10_000_000))
+    assert [message.stamp.nanosec for message in confirmed] == [
+        hundredths * 10_000_000 for hundredths in range(50)
+    ]
+    assert {message.frame_id for message in confirmed} == {f'{os.getpid()} {LEADS}'}

@@ -19,6 +19,8 @@ from remaster_ros.simulation.world_clock import (
     AHEAD_S,
     AHEAD_WALL_S,
     HELD_WALL_S,
+    LEAD_AHEAD_S,
+    LEAD_PATIENCE_WALL_S,
     PATIENCE_WALL_S,
     Pace,
     WorldClock,
@@ -131,6 +133,44 @@ def test_it_waits_for_a_node_that_takes_no_reports(scene):
     before = scene.clock.now()
     scene.run(5.0, taken=True)
     assert scene.clock.now() - before <= AHEAD + RATE * TICK_WALL_S
+
+
+def test_it_waits_for_each_report_that_who_leads_the_arm_has_not_taken(scene):
+    """The next piece of a move comes by it; else the arm would stop on its way."""
+    scene.pace = Pace(scene.clock, 0.1)
+    scene.pace.took(ME, scene.clock.now(), leads=True)
+    begun = scene.clock.now()
+    scene.run(5.0)
+    assert scene.clock.now() - begun <= LEAD_AHEAD_S + 2 * RATE * TICK_WALL_S
+    # One that keeps up is no slower for it.
+    before = scene.clock.now()
+    for _ in range(500):
+        scene.wall += TICK_WALL_S
+        now = scene.clock.now()
+        scene.pace.published(now)
+        scene.pace.took(ME, now, leads=True)
+        scene.pace.go_on()
+    assert scene.clock.now() - before > 0.95 * RATE
+    # One that gives no sign for long is waited for as others are.
+    scene.run(LEAD_PATIENCE_WALL_S + 1.0)
+    stood = scene.clock.now()
+    scene.run(1.0)
+    assert scene.clock.now() - stood <= AHEAD
+
+
+def test_who_leads_the_arm_and_is_killed_is_not_waited_for(scene):
+    process = subprocess.Popen([sys.executable, '-c', 'import time; time.sleep(60)'])
+    try:
+        scene.pace.published(scene.clock.now())
+        scene.pace.took(process.pid, scene.clock.now(), leads=True)
+        scene.run(1.0)
+        assert scene.passed() <= LEAD_AHEAD_S + 2 * RATE * TICK_WALL_S
+    finally:
+        process.kill()
+        process.wait()
+    before = scene.passed()
+    scene.run(1.0)
+    assert scene.passed() - before > 0.8 * RATE
 
 
 def test_a_robot_that_falls_silent_holds_nobody_up(scene):

@@ -1,0 +1,136 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the controller has of a move: a piece of a short time, which ends at rest on the way.
+
+A bridge that is killed, or whose host or cable fails, sends no stop. So the controller never has
+more of a move than what is over soon, with a stop at its end that stays on the line; while the
+bridge lives each piece is replaced by a later one before its stop begins.
+
+With a controller that keeps the stamp of a trajectory all pieces of a move are the same function
+of time up to there, and it goes on as if it had all of it from the start. Another one begins a
+trajectory when it comes, where the arm is or where it has led the arm to, which is not known of an
+arm that moves: it is given a long line in steps, each from rest to rest, and each when the arm
+stands at the end of the one before.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+
+from remaster_ros.motion.trajectory import RAMP_S, Line, Trajectory, Waypoint
+from remaster_ros.types import FloatArray
+
+HORIZON_S = 1.6
+"""A piece is over so long after it was sent, s. The first one begins `AHEAD_S` later: an arm that
+lags by 0.1 s, and settles, stands within 2 s; one that lags by more as much later.
+"""
+LEAST_HORIZON_S = 1.4
+"""With less of a move a busy machine would let the arm stop again and again, s."""
+RENEWED_S = 0.4
+"""A piece is replaced so long after it was sent, s."""
+GUARD_S = 0.2
+"""And not in the last moments before its stop begins, s of robot time: one that comes behind that
+would ask for a place that the arm has left. `following.LATENCY_S` and as much again."""
+AHEAD_S = 0.1
+"""With a stamp a move begins so long after it was decided, s: it may come at once, or twice as
+late as that, and no joint is faster or harder on its first ramp than its limits allow."""
+LEAST_PAST_S = 0.1
+"""So long before at the least, s."""
+JOINED_S = RAMP_S + LEAST_PAST_S
+"""Until `RAMP_S` the controller joins the line from where the arm stands: only a piece that begins
+behind that is the same function of time as the first one. None replaces it before this, s."""
+PAST_S = 0.3
+"""A piece that replaces another begins so long before it is sent, s: where the controller is in it
+when it arrives, it is on the way already, and nothing is joined to where the arm is reported. As
+late as reports may come and be believed (`joint_reports.LATE_S`, `LATE_WALL_S`), and more."""
+STEP_REST_S = 1.5
+"""How long an arm may rest between two steps until the next one comes too late, s: it has to come
+to rest after its lag, to stand for `following.STANDING_S`, and to be seen to."""
+SAME_S = 1e-6
+"""Times that are no further apart are one, s: controllers count nanoseconds."""
+
+
+@dataclass(frozen=True)
+class Piece:
+    """A part of a trajectory that ends at rest."""
+
+    waypoints: tuple[Waypoint, ...]  # At times from the trajectory's start
+    # Until when the arm is on the trajectory, s from its start; infinite for the last piece
+    cut_s: float
+    # Where the next piece ends, rad or m, (k,); of the last one its own end
+    next_end: FloatArray
+
+    @property
+    def end(self) -> FloatArray:
+        """Where it ends, rad or m, (k,)."""
+        return self.waypoints[-1].q
+
+    @property
+    def end_s(self) -> float:
+        """When it ends, s from the trajectory's start."""
+        return self.waypoints[-1].time_s
+
+    @property
+    def is_last(self) -> bool:
+        """Whether it ends with the trajectory."""
+        return not np.isfinite(self.cut_s)
+
+
+def piece_of(trajectory: Trajectory, sent_s: float, horizon_s: float) -> Piece:
+    """Return what is sent at a time of a trajectory, s from its start.
+
+    ``horizon_s``: it is over so much later, s.
+    """
+    piece = _piece(trajectory, sent_s, horizon_s)
+    following = _piece(trajectory, sent_s + RENEWED_S, horizon_s)[0]
+    return Piece(*piece, following[-1].q)
+
+
+def in_steps(trajectory: Trajectory, horizon_s: float) -> Trajectory:
+    """Return the trajectory along the same lines with a rest after `horizon_s` at the latest."""
+    lines: list[Line] = []
+    for line in trajectory.lines:
+        count = max(int(np.ceil((1.0 / line.rate) / (horizon_s - RAMP_S) - SAME_S)), 1)
+        places = line.start + np.linspace(0.0, 1.0, count + 1)[:, None] * line.way
+        # The ends as they are, to the last bit.
+        places[0], places[-1] = line.start, line.end
+        rate = min(line.rate * count, 1.0 / RAMP_S)
+        lines += [Line(start, end, rate) for start, end in pairwise(places)]
+    return Trajectory(tuple(lines), STEP_REST_S)
+
+
+def step_of(trajectory: Trajectory, index: int) -> Piece:
+    """Return the line of this number as a piece."""
+    line, start_s = trajectory.lines[index], trajectory.starts_s[index]
+    points = tuple(replace(p, time_s=start_s + p.time_s) for p in line.waypoints())
+    is_last = index + 1 == len(trajectory.lines)
+    following = line if is_last else trajectory.lines[index + 1]
+    cut_s = np.inf if is_last else trajectory.starts_s[index + 1]
+    return Piece(points, cut_s, following.end)
+
+
+def _piece(
+    trajectory: Trajectory, sent_s: float, horizon_s: float
+) -> tuple[tuple[Waypoint, ...], float]:
+    """Return the waypoints and until when the arm is on the trajectory, s."""
+    begins_s = max(sent_s - PAST_S, min(sent_s - LEAST_PAST_S, RAMP_S), 0.0)
+    points = [p for p in trajectory.waypoints() if p.time_s > begins_s + SAME_S]
+    if begins_s > 0.0:
+        points.insert(0, Waypoint(begins_s, *trajectory.at(begins_s)))
+    if sent_s + horizon_s >= trajectory.duration_s:
+        return tuple(points), np.inf
+    cut_s = sent_s + horizon_s - RAMP_S
+    index, since_s = trajectory.line_at(cut_s)
+    line, start_s = trajectory.lines[index], trajectory.starts_s[index]
+    if since_s >= line.duration_s - RAMP_S:
+        # The ramp at the end of the line is the stop, and the arm rests behind it.
+        over_s = start_s + line.duration_s
+        resting_s = trajectory.starts_s[index + 1] if index + 1 < len(trajectory.lines) else np.inf
+        return tuple(p for p in points if p.time_s <= over_s + SAME_S), resting_s
+    q, velocity = trajectory.at(cut_s)
+    points = [p for p in points if p.time_s < cut_s - SAME_S]
+    # As even as the line's own ramps: no faster than its cruising speed, in the same time.
+    stop = Waypoint(cut_s + RAMP_S, q + 0.5 * RAMP_S * velocity, np.zeros_like(q))
+    return (*points, Waypoint(cut_s, q, velocity), stop), cut_s
