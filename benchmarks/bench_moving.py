@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 
 import common
 import numpy as np
-from worlds.moving_bags import imported, recorded
+from worlds.moving_bags import imported, recorded, standing
 from worlds.moving_world import Dynamics, Errors
 
 from remaster_ros.calibration.dynamics import clocks_of, estimate_moving
@@ -134,11 +134,27 @@ def verdicts(count: int) -> str:
     )
 
 
+def stop_and_go(count: int) -> str:
+    """Return how offsets by moving frames of stop-and-go recordings agree with those at rest."""
+    apart = []
+    for seed in range(5000, 5000 + count):
+        world, recording = recorded(seed, seconds=18.0, stops=True)
+        session, _ = imported(world, recording)
+        moving, std = inner(estimate_moving(Problem.of(session)))
+        still, still_std = inner(estimate(Problem.of(standing(world, recording))))
+        apart.append((moving - still) / np.hypot(std, still_std))
+    return (
+        f'Moving frames of {count} stop-and-go recordings (some 22 stops, seeds from 5000) and '
+        f'their standstills: RMS z of the differences of offsets {_rms(np.array(apart)):.2f}.'
+    )
+
+
 def main() -> None:
     """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument('--sessions', type=int, default=12, help='of all worlds together')
     parser.add_argument('--verdicts', type=int, default=4, help='sessions whose fits are judged')
+    parser.add_argument('--stops', type=int, default=0, help='stop-and-go recordings')
     args = parser.parse_args()
     print(common.machine())
     each = args.sessions // len(WORLDS)
@@ -161,6 +177,8 @@ def main() -> None:
     print(common.table(header, rows))
     print(f'seeds {", ".join(f"{one.start} to {one.stop - 1}" for one in seeds)}')
     print(verdicts(args.verdicts))
+    if args.stops:
+        print(stop_and_go(args.stops))
 
 
 if __name__ == '__main__':

@@ -316,7 +316,7 @@ def moving_words(found: Estimate) -> str:
 def clocks_of(found: Estimate) -> dict[str, tuple[float, float]]:
     """Return how late the stamps of each sensor are beside the joints', and its std, s.
 
-    {} of a fit without parameters of motion.
+    Of sensors that measured while the arm moved; {} of a fit without parameters of motion.
     """
     extension, model = found.model.extension, found.model
     if extension is None or not extension.of_motion:
@@ -324,7 +324,12 @@ def clocks_of(found: Estimate) -> dict[str, tuple[float, float]]:
     theta, free = model.theta(found.mode.z), found.posterior.free
     variance = dict(zip(free.tolist(), np.diag(found.mode.covariance), strict=False))
     clocks = {}
-    for name in model.sensor_names:
+    m = found.problem.measurements
+    assert m.velocity is not None
+    for sensor, name in enumerate(model.sensor_names):
+        if np.isnan(m.velocity[m.sensor == sensor]).all():
+            # It measured at standstills alone.
+            continue
         index = extension.names.index(f'clock_{name}')
         taken = found.problem.session.clock_offset_s.get(name, 0.0)
         std = float(np.sqrt(variance.get(model.core + index, 0.0)))

@@ -7,7 +7,7 @@ marker. Which effects there are is defined in `discovery.effects`.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -67,6 +67,30 @@ class Extension:
     # Where to begin the search for the mode; None where that is to be found, too
     start: Start | None = None
     of_motion: bool = False  # What every fit of a moving session has (`dynamics`): no causes
+
+    def with_motion(self, other: Extension | None) -> Extension:
+        """Return these parameters and behind them those of motion, if another extension has any.
+
+        That has to be linearised at 0, as parameters of motion are.
+        """
+        if other is None or not other.of_motion:
+            return self
+        count, more = len(self.names), len(other.names)
+        precision = np.zeros((count + more, count + more))
+        precision[:count, :count] = self.prior_precision
+        precision[count:, count:] = other.prior_precision
+        moved = (
+            replace(term, where=slice(term.where.start + count, term.where.stop + count))
+            for term in other.terms
+        )
+        return replace(
+            self,
+            names=self.names + other.names,
+            units=self.units + other.units,
+            terms=(*self.terms, *moved),
+            theta0=np.concatenate((self.theta0, other.theta0)),
+            prior_precision=precision,
+        )
 
     def turns(self, theta: FloatArray, rows: IntArray) -> dict[int, FloatArray]:
         """Return the angles that theta (..., m) adds in n rows: joint -> rad, (..., n)."""

@@ -15,6 +15,7 @@ import numpy as np
 from remaster_ros.calibration.gauge_words import counted, listed
 from remaster_ros.cli.console import tell
 from remaster_ros.cli.options import number
+from remaster_ros.cli.sessions import refuse_moving
 from remaster_ros.cli.verify import require_same_arm
 from remaster_ros.compensation.checking import (
     SMALLEST_M,
@@ -78,6 +79,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Read, add to the history, judge, print."""
     session, baseline = read_session(args.session), read_compensation(args.baseline)
+    refuse_moving(session, args.session, 'check')
     require_same_arm(session, baseline, args.session)
     measured, chain = measured_of(session), baseline.model.chain
     iso = visited(baseline.model, measured, session.measurements.wanted)

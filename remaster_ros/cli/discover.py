@@ -12,7 +12,7 @@ import numpy as np
 
 from remaster_ros.cli.console import progress_bar, tell
 from remaster_ros.cli.options import add_sessions
-from remaster_ros.cli.sessions import read_together
+from remaster_ros.cli.sessions import read_together, refuse_moving
 from remaster_ros.discovery.confirmation import (
     confirm,
     require_other_session,
@@ -59,6 +59,9 @@ def run(args: argparse.Namespace) -> int:
     session, named = read_together(args.session)
     other = None if args.confirm is None else read_session(args.confirm)
     if other is not None:
+        assert args.confirm is not None
+        refuse_moving(session, args.session[0], 'discover --confirm')
+        refuse_moving(other, args.confirm, 'discover --confirm')
         # Before the long search.
         require_other_session(session, other)
     pairs: tuple[tuple[Named, Named], ...] = ()

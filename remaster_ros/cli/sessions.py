@@ -45,6 +45,15 @@ def _one_arm(session: Session, folder: Path) -> Session:
     return session
 
 
+def refuse_moving(session: Session, folder: Path, verb: str) -> None:
+    """Raise InputError if the arm moved while a session was measured."""
+    if session.is_moving:
+        raise InputError(
+            f'{folder}: was measured while the arm moved, which "remaster {verb}" does not take; '
+            'measure the same at standstills, or use "remaster fit" or "remaster discover"'
+        )
+
+
 def read_to_fit(folder: Path) -> Session:
     """Read a session to fit.
 

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from remaster_ros.cli.console import tell
+from remaster_ros.cli.sessions import refuse_moving
 from remaster_ros.compensation.file import Compensation, read_compensation
 from remaster_ros.compensation.verification import Estimate, Verdict, Verified, Visits, verify
 from remaster_ros.errors import InputError
@@ -58,6 +59,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Evaluate a session, and print the verdict."""
     session, compensation = read_session(args.session), read_compensation(args.compensation)
+    refuse_moving(session, args.session, 'verify')
     require_same_arm(session, compensation, args.session)
     found = verify(compensation.compensator, visits(session, args.session))
     warnings = _warnings(session, compensation)

@@ -28,7 +28,7 @@ def extension_of(residuals: Residuals, solution: Solution, found: Estimate) -> E
     x[found.posterior.free] += natural_steps(residuals, found, solution.base)
     names = tuple(name for cell in solution.cells for name in cell.parameters)
     units = tuple(cell.unit for cell in solution.cells for _ in cell.parameters)
-    return Extension(
+    extension = Extension(
         names,
         units,
         tuple(terms),
@@ -44,6 +44,7 @@ def extension_of(residuals: Residuals, solution: Solution, found: Estimate) -> E
             np.setdiff1d(found.problem.fitted, np.union1d(found.kept, residuals.rows.source)),
         ),
     )
+    return extension.with_motion(model.extension)
 
 
 def natural_steps(residuals: Residuals, found: Estimate, base: FloatArray) -> FloatArray:

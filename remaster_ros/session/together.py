@@ -13,7 +13,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from remaster_ros.calibration.estimate import Estimate
+from remaster_ros.calibration.dynamics import estimate_moving
+from remaster_ros.calibration.estimate import Estimate, estimate
 from remaster_ros.calibration.mistakes import sound_estimate
 from remaster_ros.calibration.one_arm import OffsetsApart, offsets_apart
 from remaster_ros.errors import InputError, InsufficientDataError, MistakeFoundError
@@ -136,7 +137,8 @@ def disagreements(sessions: Sequence[tuple[str, Session]]) -> tuple[list[str], l
     differing, silent = [], []
     for name, session in sessions:
         try:
-            found.append((name, sound_estimate(session)))
+            fitted = estimate_moving if session.is_moving else estimate
+            found.append((name, sound_estimate(session, fitted=fitted)))
         except MistakeFoundError as error:
             raise MistakeFoundError(f'{name}: {error}', error.options) from None
         except InsufficientDataError as error:

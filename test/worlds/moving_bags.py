@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from rosbags.typesys import Stores, get_typestore
 from worlds.moving_world import (
@@ -15,9 +17,10 @@ from worlds.moving_world import (
 )
 
 from remaster_ros.importing.moving import MarkerStream, MovingOptions, moving_session
-from remaster_ros.importing.standstills import Stream
+from remaster_ros.importing.standstills import Stream, joint_standstills
 from remaster_ros.session.bag_writer import BagWriter
 from remaster_ros.session.workcell import read_cell
+from remaster_ros.types import Measurements, Session
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 CELL = read_cell('demo')
@@ -53,7 +56,7 @@ def recorded(
             reach_of=world.tool_points,
             stops=stops,
         )
-        if path.x[-1] > seconds:
+        if path.x[-1] > seconds and not stops:
             end = max(4, int(np.searchsorted(path.x, seconds))) + 1
             path = CubicSpline(path.x[:end], path(path.x[:end]), bc_type='clamped')
         drawn.append((_uncertainty(path(np.linspace(0.0, path.x[-1], 200))), len(drawn), path))
@@ -98,6 +101,40 @@ def imported(world: MovingWorld, recording: Recording, seed: int = 0, **options)
         MovingOptions(**options),
         np.random.default_rng(seed),
     )
+
+
+def standing(world: MovingWorld, recording: Recording) -> Session:
+    """Return the session of the standstills of a recording, by the true offset of the clocks."""
+    still = joint_standstills(Stream.of(recording.joint_stamps, recording.joints))
+    stamps = recording.frame_stamps + recording.clock_s
+    moving, _ = imported(world, recording)
+    n, markers = len(still), len(world.nominal)
+    position = np.array(
+        [
+            recording.points[(stamps > begin + 0.5) & (stamps < end)].mean(axis=0)
+            for begin, end in zip(still.begin, still.end, strict=True)
+        ]
+    )
+    number = np.repeat(np.arange(n), markers)
+    nothing = Measurements.empty(len(CHAIN))
+    rows = replace(
+        nothing,
+        observation=np.arange(n * markers),
+        pose=number,
+        configuration=number,
+        is_validation=np.zeros(n * markers, bool),
+        stamp_s=still.begin[number],
+        sensor=np.zeros(n * markers, np.int64),
+        marker=np.tile(np.arange(markers), n),
+        q=still.mean[number],
+        from_q=np.full((n * markers, len(CHAIN)), np.nan),
+        position=position.reshape(-1, 3),
+        std=np.full((n * markers, 3), np.nan),
+        samples=np.full(n * markers, -1),
+        temperature_c=np.full(n * markers, np.nan),
+        frame=number,
+    )
+    return replace(moving, measurements=rows, clock_offset_s={})
 
 
 def _ros(kind, **fields):

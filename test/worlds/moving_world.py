@@ -22,6 +22,8 @@ from remaster_ros.types import FloatArray
 
 # Samples of the simulation a second.
 RATE_HZ = 500.0
+# Rest of a stop, s.
+REST_S = 4.0
 # Where the arm works: LWR 4+ of the demo's cell, rad.
 MIDDLE = np.array([0.0, 0.6, 0.0, -1.3, 0.0, 0.9, 0.0])
 REACH = np.array([1.0, 0.6, 1.0, 0.6, 1.2, 0.7, 1.5])
@@ -87,7 +89,7 @@ def path_of(
     tool_speed: float | None = None,
     reach_of=None,
     stops: bool = False,
-) -> CubicSpline:
+):
     """Return joint angles as a function of time, C2, within shares of the limits.
 
     ``tool_speed``, with ``reach_of`` (angles to points, m): the largest speed of the tool, m/s;
@@ -108,17 +110,33 @@ def path_of(
     times = times * faster
     if not stops:
         return CubicSpline(times, via, bc_type='clamped')
-    pieces, places, now = [], [], 0.0
-    for a, b, move in zip(via[:-1], via[1:], np.diff(times)):
-        for rest in (0.0, 2.0, 4.0):
-            pieces.append(now + rest)
-            places.append(a)
-        for part in (0.25, 0.5, 0.75):
-            s = part**3 * (10.0 - 15.0 * part + 6.0 * part**2)
-            pieces.append(now + 4.0 + 2.0 * move * part)
-            places.append(a + s * (b - a))
-        now += 4.0 + 2.0 * move
-    return CubicSpline(np.array(pieces), np.array(places), bc_type='clamped')
+    return StopAndGo(via, 2.0 * np.diff(times))
+
+
+class StopAndGo:
+    """Joint angles of an arm that rests for 4 s at each via point, and between goes straight."""
+
+    def __init__(self, via: FloatArray, seconds: FloatArray) -> None:
+        self._via, self._seconds = via, seconds
+        self._start = np.concatenate(([0.0], np.cumsum(seconds + REST_S)))
+        # First and last time, as a spline has them.
+        self.x = np.array([0.0, self._start[-1] + REST_S])
+
+    def __call__(self, t: FloatArray, derivative: int = 0) -> FloatArray:
+        """Return angles or their derivatives at times (n,), (n, k)."""
+        index = np.clip(np.searchsorted(self._start, t, side='right') - 1, 0, len(self._via) - 1)
+        last = index == len(self._via) - 1
+        seconds = np.append(self._seconds, 1.0)[index]
+        s = np.clip((t - self._start[index] - REST_S) / seconds, 0.0, 1.0)
+        s = np.where(last, 0.0, s)
+        along = (
+            s**3 * (10.0 - 15.0 * s + 6.0 * s**2),
+            30.0 * s**2 * (1.0 - s) ** 2 / seconds,
+            60.0 * s * (1.0 - s) * (1.0 - 2.0 * s) / seconds**2,
+        )[derivative]
+        step = np.concatenate((np.diff(self._via, axis=0), np.zeros((1, self._via.shape[1]))))
+        base = self._via[index] if derivative == 0 else 0.0
+        return base + along[:, None] * step[index]
 
 
 class MovingWorld:

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from remaster_ros.calibration.dynamics import friction_share
+from remaster_ros.calibration.extension import Extension, Term
 from remaster_ros.calibration.grouped_rows import Rows
 from remaster_ros.calibration.noise import Noise, NoiseModel
 from remaster_ros.calibration.path_noise import ORDERS, PathNoise, scatterless
@@ -105,3 +106,24 @@ def test_friction_turns_round_within_its_travel():
     expected = np.array(shares).reshape(100, 1000).mean(axis=1)
     np.testing.assert_allclose(found, expected, atol=0.02)
     assert np.abs(np.diff(expected)).max() > 0.5
+
+
+def test_parameters_of_motion_stand_behind_those_of_causes():
+    def extension(names, of_motion):
+        count = len(names)
+        terms = tuple(Term(slice(i, i + 1), i, np.full((3, 1), i + 1.0)) for i in range(count))
+        return Extension(
+            names, ('rad',) * count, terms, np.zeros((3, 3)), np.zeros(count),
+            np.diag(np.arange(1.0, count + 1.0)), of_motion=of_motion,
+        )  # fmt: skip
+
+    causes, motion = extension(('a', 'b'), False), extension(('clock',), True)
+    both = causes.with_motion(motion)
+    assert both.names == ('a', 'b', 'clock')
+    assert not both.of_motion
+    np.testing.assert_array_equal(np.diag(both.prior_precision), [1.0, 2.0, 1.0])
+    turned = both.turns(np.array([1.0, 10.0, 100.0]), np.arange(3))
+    np.testing.assert_array_equal(turned[0], [101.0] * 3)
+    np.testing.assert_array_equal(turned[1], [20.0] * 3)
+    assert causes.with_motion(None) is causes
+    assert causes.with_motion(causes) is causes
