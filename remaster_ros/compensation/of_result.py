@@ -448,7 +448,10 @@ def _splines(curve: Curve, driver: Driver, joint: int) -> tuple[Function, FloatA
 
 
 _OF_MEASUREMENT = 'it is an error of the measurement and not of the arm'
-_NOT_TOLD = 'it depends on what no controller is told (time, the last move, or what happened once)'
+_NOT_TOLD = (
+    'it depends on what no controller is told (time, the last move, what happened once, on which '
+    'side the base lies)'
+)
 
 
 def _left(

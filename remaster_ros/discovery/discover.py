@@ -26,7 +26,7 @@ from remaster_ros.discovery.effects.base import Cell
 from remaster_ros.discovery.effects.moments import changed
 from remaster_ros.discovery.effects.registry import EFFECTS, effects_of
 from remaster_ros.discovery.evidence import solve
-from remaster_ros.discovery.explain import FoundEffect, describe
+from remaster_ros.discovery.explain import FoundEffect, SearchRecord, describe
 from remaster_ros.discovery.gain import (
     Gain,
     gain_of,
@@ -107,6 +107,8 @@ class Discovery:
     std_if_drawn
         Standard deviation of the zero-offsets of ``fit`` if the arm is exactly its drawing; NaN
         where the gauge holds them, rad, (k,).
+    search
+        How far the chains of the walk agree, and the causes that are rather not there.
     geometry
         All lengths and tilts beside the zero-offsets, the same taken out; None where they cannot
         be fitted.
@@ -130,6 +132,7 @@ class Discovery:
     alone: FitResult
     std_if_drawn: FloatArray
     geometry: GeometryModel | None
+    search: SearchRecord
     thinning: Thinning | None = None
     unexplained: tuple[Unexplained, ...] = ()
     clocks: Mapping[str, tuple[float, float]] = field(default_factory=dict)
@@ -215,6 +218,7 @@ def discover_session(
     models, background = walk.solutions, walk.models[0].families
     solution = models[0][0]
     gain_of_all = walk.models[0].value - walk.bare.value
+    record = SearchRecord.of(walk, groups)
     # Its columns are most of the memory.
     del walk
     sampled = partial(_sampled, session, before, rng=rng, report=report, clock=clock)
@@ -307,6 +311,7 @@ def discover_session(
         alone=alone,
         std_if_drawn=if_drawn,
         geometry=geometry,
+        search=record,
         thinning=thinning,
         unexplained=unexplained,
         clocks={} if moving is None else clocks_of(moving),

@@ -16,7 +16,7 @@ from remaster_ros.discovery.effects.context import Context
 from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.discovery.solution import Solution
-from remaster_ros.discovery.walk import NEEDED, Walk, p_value
+from remaster_ros.discovery.walk import NEEDED, Walk, at_any_time, identity, p_value
 from remaster_ros.discovery.words import (
     KIND_OF_SUBJECT,
     clock_time,
@@ -32,6 +32,8 @@ from remaster_ros.types import BoolArray, FloatArray, IntArray
 CERTAIN = 0.95
 # A look-alike of a smaller probability is not mentioned.
 MENTIONED = 0.01
+# Causes that are rather not there: those of at least this probability are listed, so many at most.
+LISTED_FROM, MOST_LISTED = 0.05, 10
 # Of the size of a part of a cause, in its standard deviations: below it a sentence leaves it out.
 CLEAR = 2.0
 # Columns that agree to this in every pose are the same change under two names.
@@ -328,6 +330,55 @@ def _same(data: Residuals, cell: Cell, other: Cell) -> bool:
         spaces.append(np.linalg.qr(flat - base @ (base.T @ flat))[0])
     cosines = np.linalg.svd(spaces[0].T @ spaces[1], compute_uv=False)
     return bool(cosines.min() > SAME)
+
+
+@dataclass(frozen=True)
+class LessLikely:
+    """A cause that is rather not there than there."""
+
+    name: str
+    joints: tuple[int, ...]
+    title: str  # A heading for people
+    probability: float
+
+
+@dataclass(frozen=True)
+class SearchRecord:
+    """How far the chains of the walk agree.
+
+    ``log_posterior``: of the best model of each chain, from the offsets alone and from all kinds
+    of errors on; ``models``: models of a share worth mentioning; ``best_share``: of the best.
+    """
+
+    log_posterior: tuple[float, ...]
+    models: int
+    best_share: float
+    less_likely: tuple[LessLikely, ...]
+
+    @classmethod
+    def of(cls, walk: Walk, named: Sequence[tuple[Cell, ...]]) -> SearchRecord:
+        """Return the record of a walk in which these causes are named."""
+        taken = {at_any_time(cell) for group in named for cell in group}
+        cells = {identity(cell): cell for model in walk.models for cell in walk.present(model)}
+        less = [
+            LessLikely(
+                EFFECTS[cell.name].reported_as or cell.name,
+                cell.joints,
+                titled(cell, cell.joints),
+                walk.probability[key],
+            )
+            for key, cell in cells.items()
+            if at_any_time(cell) not in taken
+            and EFFECTS[cell.name].is_cause
+            and walk.probability[key] >= LISTED_FROM
+        ]
+        less.sort(key=lambda one: -one.probability)
+        return cls(
+            tuple(round(chain.best.value, 2) for chain in walk.chains),
+            len(walk.models),
+            float(walk.share[0]),
+            tuple(less[:MOST_LISTED]),
+        )
 
 
 CHANGED = (

@@ -84,6 +84,19 @@ def identity(cell: Cell) -> Identity:
     return cell.name, cell.joints, cell.place, cell.driver, cell.subject, change
 
 
+def at_any_time(cell: Cell) -> Identity:
+    """Return which cause a candidate is, whether it changes in mid-session or not."""
+    return *identity(cell)[:-1], 'at any time'
+
+
+def _claims(cell: Cell) -> Identity:
+    """Return what has to be in a model for a cause to be there.
+
+    What is there from the start is there in a model, too, in which it comes or goes near an end.
+    """
+    return at_any_time(cell) if cell.changes is None else identity(cell)
+
+
 def at_other_moments(cell: Cell, context: Context, low: float, high: float) -> list[Cell]:
     """Return what happened in the place of a cell in the gaps between two moments, s."""
     between, changes = EFFECTS[cell.name].between, EFFECTS[cell.name].changes
@@ -656,7 +669,7 @@ class Walk:
 
     def probability_of(self, cell: Cell) -> float:
         """Return the probability that a cause is there, at any moment or order."""
-        return self.probability.get(identity(cell), 0.0)
+        return self.probability.get(_claims(cell), 0.0)
 
     @cached_property
     def claimed(self) -> list[Cell]:
@@ -701,13 +714,13 @@ class Walk:
 
         Of models that have none of them: what is not in the best model.
         """
-        mine = {identity(cell) for cell in group}
+        mine = {_claims(cell) for cell in group}
         best = {identity(cell) for cell in self.named(self.models[0])}
         found: dict[Identity, float] = {}
         cells: dict[Identity, Cell] = {}
         for model, share in zip(self.models, self.share, strict=True):
             named = {identity(cell): cell for cell in self.named(model)}
-            if mine & named.keys():
+            if mine & {*named, *map(at_any_time, named.values())}:
                 continue
             for key in named.keys() - best:
                 cells.setdefault(key, named[key])
@@ -721,7 +734,8 @@ class Walk:
         for model, share in zip(self.models, self.share, strict=True):
             present: dict[Identity, float] = {}
             for cell, chance in self.present(model).items():
-                present[identity(cell)] = max(chance, present.get(identity(cell), 0.0))
+                for key in (identity(cell), at_any_time(cell)):
+                    present[key] = max(chance, present.get(key, 0.0))
             for key, chance in present.items():
                 found[key] = found.get(key, 0.0) + float(share) * chance
         return found

@@ -103,6 +103,7 @@ def discovery_content(
         },
         'untestable': discovery.untestable,
         'unexplained': discovery.unexplained,
+        'search': discovery.search,
         'joint_offsets_before': [
             {'joint': name, **row}
             for name, row in zip(

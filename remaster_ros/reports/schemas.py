@@ -575,6 +575,28 @@ class Unexplained(Struct):
     next: str
 
 
+class LessLikely(Struct):
+    """A cause that is rather not there than there."""
+
+    name: str
+    joints: list[int]
+    title: str
+    probability: float
+
+
+class Search(Struct):
+    """How far the chains of the walk over models agree.
+
+    ``log_posterior``: of the best model of each chain; ``models``: models of a share worth
+    mentioning, ``best_share``: share of the best.
+    """
+
+    log_posterior: list[float]
+    models: int
+    best_share: float
+    less_likely: list[LessLikely]
+
+
 class Discovered(Struct):
     """discovery.json."""
 
@@ -590,6 +612,7 @@ class Discovered(Struct):
     metrics: Mapping[str, Any] | UnsetType = UNSET
     untestable: dict[str, str] | UnsetType = UNSET
     unexplained: list[Unexplained] | UnsetType = UNSET
+    search: Search | UnsetType = UNSET
     joint_offsets_before: list[OffsetBefore] | UnsetType = UNSET
     sampler: Sampler | UnsetType = UNSET
     registration: dict[str, Registration] | UnsetType = UNSET

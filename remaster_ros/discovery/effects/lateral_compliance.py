@@ -58,8 +58,8 @@ EFFECT = Effect(
     unit='rad/(N m)',
     plausible=(1e-7, 1e-4),
     sign=1,
-    sentence='The weight carried tips {subject} across its axis (play or softness of the main '
-    'bearing, or a soft link).',
+    sentence='The weight carried tips the bearing of {subject} across its axis (play or softness '
+    'of a main bearing, or a soft link).',
     separate_by='the same poses with and without a payload, with the link stretched sideways',
     remedy='Have the main bearing of the joint checked for play with a dial gauge across the '
     'axis; correct what is left by the moment.',
