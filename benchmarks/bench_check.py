@@ -22,7 +22,7 @@ from worlds.checked_arms import NOISE_M, CheckedArm
 
 from remaster_ros.compensation import checking
 from remaster_ros.compensation.arm_model import ArmModel
-from remaster_ros.compensation.checking import POWER_STD, Checked, judge
+from remaster_ros.compensation.checking import POWER_STD, CheckResult, judge
 
 FIRST_SEED = 800
 DAYS = 60
@@ -34,7 +34,7 @@ DAY_S = 86_400.0
 checking.seen = cache(checking.seen)
 
 
-def of_arm(seed: int, kind: str, season_std: float) -> tuple[list[tuple[int, Checked]], int]:
+def of_arm(seed: int, kind: str, season_std: float) -> tuple[list[tuple[int, CheckResult]], int]:
     """Return what the checks of an arm say, by the day, and which joint has changed."""
     arm = CheckedArm(seed)
     rng = np.random.default_rng((seed, 3))

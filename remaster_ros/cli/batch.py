@@ -306,13 +306,13 @@ def _of_check(job: Job, session: Any) -> dict[str, Any]:
     from remaster_ros.cli.verify import require_same_arm
     from remaster_ros.compensation.checking import SMALLEST_M, judge
     from remaster_ros.compensation.file import read_compensation
-    from remaster_ros.compensation.iso9283 import visited
+    from remaster_ros.compensation.iso9283 import iso_figures
 
     baseline = read_compensation(job.baseline)
     require_same_arm(session, baseline, Path(job.session))
     measured = measured_of(session)
     found = judge(baseline.model, [measured])
-    iso = visited(baseline.model, measured, session.measurements.wanted)
+    iso = iso_figures(baseline.model, measured, session.measurements.wanted)
     return content_of(found, baseline.model.chain, [Path(job.session).name], 1e3 * SMALLEST_M, iso)
 
 

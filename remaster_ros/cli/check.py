@@ -19,14 +19,14 @@ from remaster_ros.cli.sessions import refuse_moving
 from remaster_ros.cli.verify import require_same_arm
 from remaster_ros.compensation.checking import (
     SMALLEST_M,
-    Checked,
+    CheckResult,
     JointCheck,
     Measured,
     Trend,
     judge,
 )
 from remaster_ros.compensation.file import Compensation, read_compensation
-from remaster_ros.compensation.iso9283 import Visited, visited
+from remaster_ros.compensation.iso9283 import IsoFigures, iso_figures
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.reports.check_page import write_check_page
@@ -82,7 +82,7 @@ def run(args: argparse.Namespace) -> int:
     refuse_moving(session, args.session, 'check')
     require_same_arm(session, baseline, args.session)
     measured, chain = measured_of(session), baseline.model.chain
-    iso = visited(baseline.model, measured, session.measurements.wanted)
+    iso = iso_figures(baseline.model, measured, session.measurements.wanted)
     _require_history(args.history)
     history = Journal(args.history)
     try:
@@ -210,11 +210,11 @@ def _before(
 
 
 def content_of(
-    found: Checked,
+    found: CheckResult,
     chain: SerialChain,
     names: list[str],
     smallest_mm: float,
-    iso: Visited,
+    iso: IsoFigures,
 ) -> dict[str, Any]:
     """Return what was found, as it is printed as JSON; null where a number is not known."""
 
@@ -267,7 +267,7 @@ def content_of(
     }
 
 
-def _trend(found: Checked, joint_names: tuple[str, ...], names: list[str]) -> dict[str, Any]:
+def _trend(found: CheckResult, joint_names: tuple[str, ...], names: list[str]) -> dict[str, Any]:
     one = found.trend
     assert one is not None
     return {
@@ -282,7 +282,7 @@ def _trend(found: Checked, joint_names: tuple[str, ...], names: list[str]) -> di
     }
 
 
-def _next_date(found: Checked) -> str | None:
+def _next_date(found: CheckResult) -> str | None:
     """Return the day of the next check, ISO 8601; None where the times are not known."""
     if not (found.in_days and math.isfinite(found.when_s)):
         return None
@@ -290,7 +290,7 @@ def _next_date(found: Checked) -> str | None:
     return (last + timedelta(days=found.next_in)).date().isoformat()
 
 
-def _next_in_words(found: Checked) -> str:
+def _next_in_words(found: CheckResult) -> str:
     if (date := _next_date(found)) is not None:
         return f'Next check on {date}.'
     if (more := math.ceil(found.next_in)) > 1:
@@ -298,7 +298,7 @@ def _next_in_words(found: Checked) -> str:
     return 'Go on with the usual checks.'
 
 
-def _span(found: Checked, trend: Trend) -> str:
+def _span(found: CheckResult, trend: Trend) -> str:
     """Return the duration of a trend, in words."""
     if not found.in_days:
         return f'in {counted(max(1, round(trend.span)), "check")}'
@@ -308,7 +308,7 @@ def _span(found: Checked, trend: Trend) -> str:
 
 
 def _trend_in_words(
-    found: Checked, joint_names: tuple[str, ...], names: list[str], smallest_mm: float
+    found: CheckResult, joint_names: tuple[str, ...], names: list[str], smallest_mm: float
 ) -> str:
     """Return a change that is certain and no alarm, and when to look again, in sentences."""
     one = found.trend
@@ -337,7 +337,7 @@ def _trend_in_words(
 
 
 def in_words(
-    found: Checked,
+    found: CheckResult,
     joint_names: tuple[str, ...],
     names: list[str],
     smallest_mm: float = 1e3 * SMALLEST_M,
@@ -403,7 +403,7 @@ def in_words(
     return 'No joint has changed by more than a check can see.'
 
 
-def _named(found: Checked, names: list[str]) -> str:
+def _named(found: CheckResult, names: list[str]) -> str:
     since = found.since or 0
     return f'{since + 1} ({names[since]})'
 

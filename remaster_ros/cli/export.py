@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from remaster_ros.cli.console import tell
-from remaster_ros.compensation.controller_forms import FORMS, exported, held
+from remaster_ros.compensation.controller_forms import FORMS, exported, form_content
 from remaster_ros.compensation.file import Compensation, read_compensation
 from remaster_ros.compensation.pad_pages import MotorNumber
 from remaster_ros.compensation.static_transforms import (
@@ -132,7 +132,7 @@ def run(args: argparse.Namespace) -> int:
     if args.base is not None:
         data = read_limited(args.base, URDF_LIMIT, 'name the file that is to be changed')
         base = args.base, decode_text(data, args.base)
-    one = held(compensation, args.to, np.random.default_rng(args.seed))
+    one = form_content(compensation, args.to, np.random.default_rng(args.seed))
     files = exported(
         compensation, args.to, one, base, driver_param=args.driver_param, motors=motors
     )
@@ -146,7 +146,7 @@ def run(args: argparse.Namespace) -> int:
             'rms_mm': one.rms_mm,
             'max_mm': one.max_mm,
             'parts': [asdict(part) for part in one.parts],
-            'corrected_in_no_form': [left.effect for left in one.never],
+            'corrected_in_no_form': [left.effect for left in one.uncorrectable],
         },
     }
     tell(args, content, *one.words, f'written: {args.out} ({", ".join(files)})')

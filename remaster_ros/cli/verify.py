@@ -14,7 +14,13 @@ import numpy as np
 from remaster_ros.cli.console import tell
 from remaster_ros.cli.sessions import refuse_moving
 from remaster_ros.compensation.file import Compensation, read_compensation
-from remaster_ros.compensation.verification import Estimate, Verdict, Verified, Visits, verify
+from remaster_ros.compensation.verification import (
+    Estimate,
+    Verdict,
+    VerificationResult,
+    Visits,
+    verify,
+)
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.motion.joint_units import JointUnits
@@ -198,7 +204,7 @@ def _warnings(session: Session, compensation: Compensation) -> list[str]:
     return found
 
 
-def _content(found: Verified, warnings: list[str]) -> dict[str, Any]:
+def _content(found: VerificationResult, warnings: list[str]) -> dict[str, Any]:
     """Return the verdict for --json."""
     return {
         'format': FORMAT,
@@ -218,7 +224,7 @@ def _content(found: Verified, warnings: list[str]) -> dict[str, Any]:
     }
 
 
-def _in_words(found: Verified) -> str:
+def _in_words(found: VerificationResult) -> str:
     """Return the verdict as a sentence."""
     words = WORDS[found.verdict]
     if found.verdict != 'unclear':
@@ -231,7 +237,7 @@ def _in_words(found: Verified) -> str:
     )
 
 
-def _text(found: Verified) -> str:
+def _text(found: VerificationResult) -> str:
     """Return the printed table and verdict."""
     lines = [f'{found.verdict}: {_in_words(found)}']
     lines.append(f'share that acts, of the rows with it on: {_share(found.absolute)}')

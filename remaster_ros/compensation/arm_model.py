@@ -1,20 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The arm as it was found to be: where its tool is at reported joint angles, and how surely.
+"""Calibrated model of an arm: pose of its tool at reported joint angles, with uncertainty.
 
 With q the reported angles, δ the zero-offsets and τ gravity's torques at q + δ::
 
     true angle of joint j = q_j + δ_j + Σ terms of joint j
     tool = base turn · Π_j (T_j · shift_j · turn_j · Rot(axis_j, true angle_j)) · T_tool
 
-A joint that slides has metres for radians, the shift along its axis for Rot, and for gravity's
-torque the force along it, N.
+A prismatic joint has metres in place of radians, the shift along its axis in place of Rot, and the
+force along its axis, N, in place of gravity's torque.
 
 T_j is the nominal origin of joint j. Shifts are in the frame of the link that the joint before
 moves, turns in the joint's own frame, and both may grow with the temperature. A link whose bearing
 gives way is turned about its joint's origin by gravity's moment across the joint's axis.
 
-Terms of an angle take the angle as it is reported; those of a torque or a moment take that of the
-nominal arm at q + δ.
+Terms driven by an angle take the reported angle; terms driven by a torque or a moment take that of
+the nominal arm at q + δ.
 """
 
 from __future__ import annotations
@@ -40,25 +40,24 @@ Driver = Literal['none', 'angle', 'gravity_torque', 'gravity_moment', 'temperatu
 Form = Literal['constant', 'linear', 'quadratic', 'sin', 'cos', 'bspline']
 GRAVITY = (0.0, 0.0, -9.81)
 TURN = 2.0 * np.pi
-# Rows at which slopes and errors are looked at, and slopes by steps of how much, rad.
-LOOKED_AT, SLOPE_STEP = 500, 1e-6
-# Rows of a block: frames and derivatives of so many take some ten megabytes.
+# Number of configurations at which slopes are evaluated, and step of the finite differences, rad.
+SAMPLED_ROWS, SLOPE_STEP = 500, 1e-6
+# Rows that are computed at once: their frames and derivatives take some ten megabytes.
 BLOCK_ROWS = 2_000
 
 
 @dataclass(frozen=True, eq=False)
 class Function:
-    """A function of one driver, linear in its coefficients."""
+    """Function of one driver, linear in its coefficients."""
 
-    # What it depends on; ``joint`` is the index of the joint whose angle or torque it is
-    driver: Driver
-    form: Form  # Of the m coefficients' m features
-    joint: int = -1  # -1 where the driver belongs to none
-    order: int = 0  # Of a sine or cosine: cycles per turn
-    # Of splines, in the driver's unit; beyond the ends the end value holds
+    driver: Driver  # Quantity on which the function depends
+    form: Form  # Shape of the m features, one for each coefficient
+    joint: int = -1  # Index of the joint whose angle or torque drives; -1 for other drivers
+    order: int = 0  # Cycles per turn of a sine or cosine
+    # Knots of splines, in the driver's unit; beyond the ends the end value holds
     knots: FloatArray = field(default_factory=lambda: np.zeros(0))
     degree: int = 0
-    # The driver is brought to the turn that begins there, rad; NaN where it is not, as of a slide
+    # Begin of the turn into which the driver is wrapped, rad; NaN for none (prismatic joint)
     turn_start: float = np.nan
 
     @property
@@ -67,7 +66,7 @@ class Function:
         return len(self.knots) - self.degree - 1 if self.form == 'bspline' else 1
 
     def features(self, values: FloatArray) -> FloatArray:
-        """Return what a unit of each coefficient adds, (n, m), at values of the driver, (n,)."""
+        """Contribution of each coefficient per unit, (n, m), at values of the driver, (n,)."""
         if self.form == 'bspline':
             inside = np.clip(self._in_turn(values), *self.ends)
             found = scipy.interpolate.BSpline.design_matrix(inside, self.knots, self.degree)
@@ -82,7 +81,7 @@ class Function:
         return np.asarray(wave(self.order * values))[:, None]
 
     def outside(self, values: FloatArray) -> BoolArray:
-        """Return where a value lies beyond the ends of splines, (n,)."""
+        """Mask of the values beyond the ends of the splines, (n,)."""
         if self.form != 'bspline':
             return np.zeros(len(values), dtype=bool)
         low, high = self.ends
@@ -92,10 +91,11 @@ class Function:
 
     @property
     def ends(self) -> tuple[float, float]:
-        """Between which values splines are defined."""
+        """Range of the driver in which the splines are defined."""
         return float(self.knots[self.degree]), float(self.knots[-self.degree - 1])
 
     def _in_turn(self, values: FloatArray) -> FloatArray:
+        """Values wrapped into the turn that begins at `turn_start`."""
         if np.isnan(self.turn_start):
             return values
         found: FloatArray = self.turn_start + np.mod(values - self.turn_start, TURN)
@@ -104,21 +104,20 @@ class Function:
 
 @dataclass(frozen=True, eq=False)
 class JointTerm:
-    """What adds to the angle of a joint beside its zero-offset."""
+    """Contribution to the angle of a joint in addition to its zero-offset."""
 
-    joint: int  # Its index
+    joint: int  # Index of the joint
     effect: str  # The physical cause, as in discovery.json
-    # Of its driver, rad or m, (m,)
     function: Function
-    coefficients: FloatArray
+    coefficients: FloatArray  # rad or m per unit of the features, (m,)
 
 
 @dataclass(frozen=True, eq=False)
 class BaseTerm:
-    """What turns the whole arm about the origin of R."""
+    """Rotation of the whole arm about the origin of R."""
 
     effect: str  # The physical cause
-    # Of one coefficient; of ``gravity_moment`` each axis of R has its own moment
+    # Function of one coefficient; with ``gravity_moment`` each axis of R has a moment of its own
     function: Function
     coefficients: FloatArray  # About x, y and z of R, rad per unit of the function, (3,)
 
@@ -128,19 +127,19 @@ Term = TypeVar('Term', JointTerm, BaseTerm)
 
 @dataclass(frozen=True, eq=False)
 class Geometry:
-    """Shifts and turns of the joints' origins; the last row is the tool's."""
+    """Shifts and rotations of the joints' origins; the last row is the tool's."""
 
     shifts: FloatArray  # In the frame of the link that the joint before moves, m, (k + 1, 3)
     turns: FloatArray  # Rotation vectors in the joint's frame, rad, (k + 1, 3)
 
     @classmethod
     def none(cls, joints: int) -> Geometry:
-        """Return that of the drawing."""
+        """Geometry without a change."""
         return cls(np.zeros((joints + 1, 3)), np.zeros((joints + 1, 3)))
 
     @property
     def is_any(self) -> bool:
-        """Whether it changes anything."""
+        """Whether any shift or rotation is not zero."""
         return bool(np.any(self.shifts) or np.any(self.turns))
 
 
@@ -149,13 +148,15 @@ class Drivers:
     """Values of the drivers in n rows."""
 
     q: FloatArray  # Reported angles, rad, (n, k)
-    warming: FloatArray  # Temperature above that at which nothing has grown, K, (n,)
-    torque: FloatArray  # Gravity's, N m or N, (n, k); zeros where no term takes it
-    base_moment: FloatArray  # Gravity's about the origin of R, N m, (n, 3); likewise
-    moment: FloatArray  # Gravity's on each link about its joint, N m, (n, k, 3); likewise
+    warming: FloatArray  # Temperature above the reference temperature, K, (n,)
+    # Gravity's torque on each joint, N m or N, (n, k); its moment about the origin of R, N m,
+    # (n, 3); and on each link about its joint, N m, (n, k, 3). Zeros if no term needs them
+    torque: FloatArray
+    base_moment: FloatArray
+    moment: FloatArray
 
     def of(self, function: Function) -> FloatArray:
-        """Return the value of a function's driver, (n,)."""
+        """Value of the driver of a function, (n,)."""
         if function.driver == 'angle':
             return self.q[:, function.joint]
         if function.driver == 'gravity_torque':
@@ -167,9 +168,9 @@ class Drivers:
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """Where the arm is in n rows."""
+    """Kinematic state of the arm in n rows."""
 
-    drivers: Drivers  # Values of the drivers
+    drivers: Drivers
     angles: FloatArray  # True joint angles, rad, (n, k)
     # Frame of each joint before and after its turn, in R, (n, k, 4, 4)
     before: FloatArray
@@ -179,33 +180,31 @@ class State:
 
 @dataclass(frozen=True, eq=False)
 class ArmModel:
-    """An arm of k joints as it was found to be."""
+    """Calibrated model of an arm of k joints."""
 
-    # The nominal robot; its masses are those that the torques were computed with
+    # The nominal robot, with the masses from which the torques were computed
     chain: SerialChain
     joint_offsets: FloatArray  # δ, rad, (k,)
-    # see `JointTerm`, `BaseTerm`
     joint_terms: tuple[JointTerm, ...]
     base_terms: tuple[BaseTerm, ...]
-    # Constant, and per kelvin
-    geometry: Geometry
-    growth: Geometry
-    # Of each link's bearing across the joint's axis, rad/(N m), (k,)
+    geometry: Geometry  # Constant changes of the origins
+    growth: Geometry  # Changes of the origins per kelvin
+    # Compliance of each link's bearing across the joint's axis, rad/(N m), (k,)
     lateral_compliance: FloatArray
-    reference_c: float  # Temperature at which nothing has grown, °C; NaN where nothing does
-    mean_c: float  # That of the measurements, taken where none is given, °C
+    reference_c: float  # Temperature without growth, °C; NaN if nothing grows
+    mean_c: float  # Mean temperature of the measurements, °C, used if none is given
     T_R_N: Mapping[str, FloatArray]  # Registrations that belong to the offsets, by sensor
-    markers: Mapping[str, FloatArray]  # Likewise, in T, m
+    markers: Mapping[str, FloatArray]  # Positions in T that belong to the offsets, m, by marker
     root: FloatArray  # U with U' U the covariance of `parameter_names`, (r, p)
-    # How many times larger standard deviations were found on poses left out than in theory
+    # Factor by which standard deviations on poses left out were larger than in theory
     widening: float
-    # E with E' E the second moments of the true parameters about these, (e, p), where more is
-    # known to differ than the covariance says: what has no place in the correction
+    # E with E' E the second moments of the true parameters about these, (e, p); includes errors
+    # that have no place in the correction. None if the covariance says all that is known
     error_root: FloatArray | None = None
 
     @classmethod
     def nominal(cls, chain: SerialChain) -> ArmModel:
-        """Return the arm as drawn, with no sensor and no marker."""
+        """The nominal arm, without sensors and markers."""
         k = len(chain)
         return cls(
             chain=chain,
@@ -230,24 +229,25 @@ class ArmModel:
 
     @property
     def grows(self) -> bool:
-        """Whether anything depends on the temperature."""
+        """Whether any part of the model depends on the temperature."""
         return self.growth.is_any or 'temperature' in self._needs
 
     @cached_property
     def _needs(self) -> set[str]:
+        """Drivers that the terms need; 'lateral' if a bearing is compliant."""
         drivers: set[str] = {term.function.driver for term in self.joint_terms}
         drivers |= {term.function.driver for term in self.base_terms}
         return drivers | ({'lateral'} if np.any(self.lateral_compliance) else set())
 
     def warming(self, rows: int, temperature_c: FloatArray | float | None) -> FloatArray:
-        """Return the temperature above the reference, K, (rows,)."""
+        """Temperature above the reference, K, (rows,); of `mean_c` if `temperature_c` is None."""
         if not self.grows:
             return np.zeros(rows)
         given = self.mean_c if temperature_c is None else np.asarray(temperature_c, dtype=float)
         return np.broadcast_to(given - self.reference_c, (rows,))
 
     def drivers(self, q: FloatArray, warming: FloatArray) -> Drivers:
-        """Return the values of the drivers at reported angles (n, k)."""
+        """Values of the drivers at reported angles (n, k)."""
         n, k = q.shape
         torque, base, moment = np.zeros((n, k)), np.zeros((n, 3)), np.zeros((n, k, 3))
         if self._needs & {'gravity_torque', 'gravity_moment', 'lateral'}:
@@ -265,29 +265,29 @@ class ArmModel:
         return Drivers(q, warming, torque, base, moment)
 
     def added_angles(self, drivers: Drivers) -> FloatArray:
-        """Return what offsets and terms add to the reported angles, rad, (n, k)."""
+        """Sum of offsets and terms, to be added to the reported angles, rad, (n, k)."""
         added = np.tile(self.joint_offsets, (len(drivers.q), 1))
         for term in self.joint_terms:
             values = term.function.features(drivers.of(term.function))
             added[:, term.joint] += values @ term.coefficients
         return added
 
-    def somewhere(self) -> FloatArray:
-        """Return angles all over the limits, the same each time, rad, (n, k)."""
+    def sampled_angles(self) -> FloatArray:
+        """Uniform random angles within the limits, rad, (n, k), equal in each call."""
         low, high = self.chain.usual_range
-        return np.random.default_rng(0).uniform(low, high, (LOOKED_AT, self.joints))
+        return np.random.default_rng(0).uniform(low, high, (SAMPLED_ROWS, self.joints))
 
-    def steepest(self) -> float:
-        """Return by how much offsets and terms change with the reported angles at the most.
+    def largest_slope(self) -> float:
+        """Largest slope of offsets and terms over the reported angles.
 
-        Largest sum of a joint's changes, rad per rad, at angles all over the limits; what slides
-        is counted by `SerialChain.per_radian`. Below 1 there is one command for each wanted angle,
-        and the fixed point goes to it (Banach).
+        Largest sum of the changes of one joint, rad per rad, at sampled angles; a prismatic joint
+        counts by `SerialChain.per_radian`. Below 1 there is one command for each wanted angle, to
+        which the fixed-point iteration converges (Banach).
         """
-        k, warming, unit = self.joints, np.zeros(LOOKED_AT), self.chain.per_radian
-        q = self.somewhere()
+        k, warming, unit = self.joints, np.zeros(SAMPLED_ROWS), self.chain.per_radian
+        q = self.sampled_angles()
         here = self.added_angles(self.drivers(q, warming))
-        slopes = np.zeros((LOOKED_AT, k))
+        slopes = np.zeros((SAMPLED_ROWS, k))
         for j in range(k):
             step = SLOPE_STEP * np.diag(unit)[j]
             there = self.added_angles(self.drivers(q + step, warming))
@@ -295,18 +295,19 @@ class ArmModel:
         return float(slopes.max())
 
     def state(self, q: FloatArray, temperature_c: FloatArray | float | None = None) -> State:
-        """Return where the arm is at reported angles (n, k)."""
+        """State of the arm at reported angles (n, k)."""
         return self._state(self.drivers(q, self.warming(len(q), temperature_c)))
 
     def rigid(self) -> SerialChain:
-        """Return the arm with zero-offsets, lengths and tilts built in, for reported angles.
+        """Chain with zero-offsets, lengths and tilts built in, which takes reported angles.
 
-        It is at the temperature of the measurements, and nothing depends on its angles or torques.
+        It has the temperature of the measurements, and no term that depends on angles or torques.
         """
         origins = self._origins(self.warming(1, None)).reshape(-1, 4, 4)
         return replace(self.chain, T_fixed=origins).with_offsets(self.joint_offsets)
 
     def _state(self, drivers: Drivers) -> State:
+        """State of the arm at values of the drivers."""
         n, k = drivers.q.shape
         angles = drivers.q + self.added_angles(drivers)
         turned = self.chain.motions(angles)
@@ -324,7 +325,7 @@ class ArmModel:
         return State(drivers, angles, before, frames, frame @ origins[..., k, :, :])
 
     def _origins(self, warming: FloatArray) -> FloatArray:
-        """Return the joints' origins with shifts and turns, (k + 1, 4, 4) or (n, k + 1, 4, 4)."""
+        """Joint origins with shifts and turns, (k + 1, 4, 4) or (n, k + 1, 4, 4)."""
         shifts, turns = self.geometry.shifts, self.geometry.turns
         if self.growth.is_any:
             shifts = shifts + warming[:, None, None] * self.growth.shifts
@@ -334,6 +335,7 @@ class ArmModel:
         return transform(rotation, drawn[:, :3, 3] + shifts)
 
     def _base_turn(self, drivers: Drivers) -> FloatArray:
+        """Rotation vector of the base, rad, (n, 3)."""
         turn = np.zeros((len(drivers.q), 3))
         for term in self.base_terms:
             turn += self._base_features(drivers, term) * term.coefficients
@@ -341,19 +343,20 @@ class ArmModel:
 
     @staticmethod
     def _base_features(drivers: Drivers, term: BaseTerm) -> FloatArray:
-        """Return what a unit about each axis turns, rad, (n, 3)."""
+        """Rotation about each axis for a unit coefficient, rad, (n, 3)."""
         if term.function.driver == 'gravity_moment':
             return drivers.base_moment
         return np.repeat(term.function.features(drivers.of(term.function)), 3, axis=1)
 
     def _lateral(self, drivers: Drivers, frame: FloatArray, joint: int) -> FloatArray:
-        own = frame[:, :3, :3] @ self.chain.axes[joint]
+        """Gravity's moment on a link across its joint's axis, N m, (n, 3)."""
+        axis = frame[:, :3, :3] @ self.chain.axes[joint]
         moment = drivers.moment[:, joint]
-        lateral: FloatArray = moment - np.sum(moment * own, axis=1)[:, None] * own
+        lateral: FloatArray = moment - np.sum(moment * axis, axis=1)[:, None] * axis
         return lateral
 
     def outside(self, q: FloatArray) -> BoolArray:
-        """Return which rows lie beyond the range of a curve, (n,)."""
+        """Mask of the rows beyond the range of a measured curve, (n,)."""
         drivers = self.drivers(q, np.zeros(len(q)))
         found = np.zeros(len(q), dtype=bool)
         for term in self.joint_terms:
@@ -382,12 +385,12 @@ class ArmModel:
         return tuple(names)
 
     def registration(self, sensor: str) -> tuple[slice, slice]:
-        """Return where shifts and turns of a registration stand among the parameters."""
+        """Slices of the shift and the rotation of a registration in the parameters."""
         start = self.joints + 6 * list(self.T_R_N).index(sensor)
         return slice(start, start + 3), slice(start + 3, start + 6)
 
     def marker(self, marker: str) -> slice:
-        """Return where a marker stands among the parameters."""
+        """Slice of a marker's position in the parameters."""
         start = self.joints + 6 * len(self.T_R_N) + 3 * list(self.markers).index(marker)
         return slice(start, start + 3)
 
@@ -420,7 +423,7 @@ class ArmModel:
 
     @cached_property
     def parameter_means(self) -> FloatArray:
-        """Values of the parameters; those of the registrations are steps from `T_R_N`, and 0."""
+        """Values of the parameters, (p,); 0 for registrations, which are steps from `T_R_N`."""
         parts = [
             self.joint_offsets,
             np.zeros(6 * len(self.T_R_N)),
@@ -435,8 +438,8 @@ class ArmModel:
         ]
         return np.concatenate(parts)
 
-    def moved(self, step: FloatArray) -> ArmModel:
-        """Return the arm with its parameters moved, (p,)."""
+    def with_step(self, step: FloatArray) -> ArmModel:
+        """Model with a step (p,) added to its parameters."""
         k, at = self.joints, 0
 
         def take(count: int) -> FloatArray:
@@ -473,7 +476,10 @@ class ArmModel:
         )
 
     def derivative(self, state: State, sensor: str, marker: str) -> FloatArray:
-        """Return the derivative of a marker's place, in R as `sensor` has it, (n, 3, p)."""
+        """Derivative of a marker's position by the parameters, (n, 3, p).
+
+        The position is in R as the registration of `sensor` has it.
+        """
         n, k, drivers = len(state.angles), self.joints, state.drivers
         points = apply(state.tool, self.markers[marker])
         arms = points[:, None, :] - state.frames[..., :3, 3]
@@ -482,9 +488,9 @@ class ArmModel:
         for name in self.T_R_N:
             mine = np.zeros((n, 3, 6))
             if name == sensor:
-                # The sensor further along is the arm further back.
+                # A shift of the sensor moves the arm by the opposite in its frame.
                 mine[:, :, :3] = -np.eye(3)
-                mine[:, :, 3:] = -_turned(np.eye(3)[None], points)
+                mine[:, :, 3:] = -_displacements(np.eye(3)[None], points)
             parts.append(mine)
         for name in self.markers:
             parts.append(state.tool[:, :3, :3] * (name == marker))
@@ -493,14 +499,14 @@ class ArmModel:
             parts.append(by_joint[:, :, [term.joint]] * features[:, None, :])
         for base_term in self.base_terms:
             features = self._base_features(drivers, base_term)
-            parts.append(_turned(np.eye(3)[None], points) * features[:, None, :])
-        moved = np.zeros((n, 3, k + 1, 6))
+            parts.append(_displacements(np.eye(3)[None], points) * features[:, None, :])
+        by_origins = np.zeros((n, 3, k + 1, 6))
         for j in range(k + 1):
             link = state.frames[:, j - 1] if j else self._base_frame(drivers)
             origin = state.before[:, j] if j < k else state.tool
-            moved[:, :, j, :3] = link[:, :3, :3]
-            moved[:, :, j, 3:] = _turned(origin[:, :3, :3], points - origin[:, :3, 3])
-        of_origins = moved.reshape(n, 3, -1)
+            by_origins[:, :, j, :3] = link[:, :3, :3]
+            by_origins[:, :, j, 3:] = _displacements(origin[:, :3, :3], points - origin[:, :3, 3])
+        of_origins = by_origins.reshape(n, 3, -1)
         parts += [of_origins, drivers.warming[:, None, None] * of_origins]
         lateral = [
             np.cross(self._lateral(drivers, state.frames[:, j], j), arms[:, j]) for j in range(k)
@@ -512,7 +518,7 @@ class ArmModel:
         return transform(rotation_vector_to_matrix(self._base_turn(drivers)), np.zeros(3))
 
     def in_sensor(self, state: State, sensor: str, marker: str) -> FloatArray:
-        """Return where a sensor sees a marker, in its frame N, m, (n, 3)."""
+        """Position of a marker in the frame N of a sensor, m, (n, 3)."""
         return apply(inverse(self.T_R_N[sensor]), apply(state.tool, self.markers[marker]))
 
 
@@ -520,18 +526,21 @@ _TURNS = ('rx', 'ry', 'rz')
 _UNITS = {'gravity_moment': '(N m)', 'temperature': 'K'}
 
 
-def unit_of(function: Function, chain: SerialChain, of: str = 'rad') -> str:
-    """Return the unit of a function's coefficients; ``of``: that of what they add to."""
+def unit_of(function: Function, chain: SerialChain, unit_of_sum: str = 'rad') -> str:
+    """Unit of a function's coefficients.
+
+    ``unit_of_sum``: unit of the quantity to which they add.
+    """
     if function.form not in ('linear', 'quadratic'):
-        return of
+        return unit_of_sum
     unit = _UNITS.get(function.driver, '')
     if function.driver == 'angle':
         unit = chain.units[function.joint]
     elif function.driver == 'gravity_torque':
         unit = chain.torque_units[function.joint]
-    return f'{of}/{unit}{"^2" if function.form == "quadratic" else ""}'
+    return f'{unit_of_sum}/{unit}{"^2" if function.form == "quadratic" else ""}'
 
 
-def _turned(axes: FloatArray, arms: FloatArray) -> FloatArray:
-    """Return what turning about the columns of rotations (n, 3, 3) does to arms (n, 3)."""
+def _displacements(axes: FloatArray, arms: FloatArray) -> FloatArray:
+    """Displacements of arms (n, 3) per radian about the columns of rotations (n, 3, 3)."""
     return np.swapaxes(np.cross(np.swapaxes(axes, -1, -2), arms[:, None, :]), -1, -2)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Joint changes whose tool is nearest to a wanted pose, within bounds of each joint.
+"""Joint changes whose tool pose is nearest to a wanted pose, within bounds of each joint.
 
 Gauss–Newton steps on the pose error, each the exact minimum of its linear least squares within the
 bounds (an active-set method, as of Lawson and Hanson, *Solving Least Squares Problems*, 1974, ch.
@@ -14,19 +14,19 @@ import numpy as np
 
 from remaster_ros.types import FloatArray, IntArray
 
-# Pose error in levers and rad that a change of one radian has to be worth: a direction in which
-# the arm moves its tool by less is not used. At 2 degrees it leaves a micrometre a metre.
+# Regularisation: pose error, in levers and rad, that a change of one radian must remove. A
+# direction that moves the tool by less is not used. At 2 degrees it leaves a micrometre a metre.
 LEAST_WORTH = 3e-5
-# Steps of Gauss and Newton: regular rows take four; near singularities they converge by half a
-# step at the worst, and a bound is reached before.
+# Limit of Gauss–Newton steps: regular rows take four; near singularities they halve the error at
+# the worst, and reach a bound before.
 MOST_STEPS = 30
-# No joint is commanded more finely: 1e-11 rad are 0.01 nm a metre away.
+# Convergence limit of a step, rad: 1e-11 rad are 0.01 nm a metre away.
 CONVERGED_RAD = 1e-11
-# A step that does not gain is halved so often before it is given up.
+# Number of halvings of a step that does not reduce the cost, before the row stops.
 HALVINGS = 6
-# Changes of the set of bounded joints: each joint enters and leaves it a few times at the most.
+# Limit, per joint, of changes of the active set: a joint enters and leaves it a few times at most.
 SETS_OF_JOINT = 8
-# A slope below this share of the largest is none.
+# A gradient below this share of the largest one counts as zero.
 ROUNDING = 1e-12
 
 # Changes x, (m, k), of some rows -> their pose errors (m, 6) and Jacobians (m, 6, k)
@@ -39,18 +39,18 @@ def nearest(
     bounds: tuple[FloatArray, FloatArray],
     avoided: FloatArray | None = None,
 ) -> FloatArray:
-    """Return the changes x of n rows that leave the least pose error, (n, k).
+    """Changes x of n rows with the least pose error, (n, k).
 
     Parameters
     ----------
     errors
-        Pose errors at changes of some rows.
+        Function of changes and row indices that returns pose errors and Jacobians.
     start
-        Where to begin, within the bounds, (n, k).
+        Initial changes, within the bounds, (n, k).
     bounds
         Least and largest change of each joint, (n, k) each.
     avoided
-        N of changes that are not to be made, with x'Nx for their cost, (n, k, k); None for none.
+        Matrix N of an additional cost x'Nx, (n, k, k); None for none.
     """
     low, high = bounds
     k = start.shape[1]
@@ -63,6 +63,7 @@ def nearest(
         cost += avoided
 
     def worth(error: FloatArray, at: FloatArray, rows: IntArray) -> FloatArray:
+        """Cost of pose errors and changes, (m,)."""
         of_change = np.einsum('ni,nij,nj->n', at, cost[rows], at)
         return np.asarray(np.sum(error**2, axis=1) + of_change)
 
@@ -102,7 +103,7 @@ def box_minimum(
     start: FloatArray,
     bounds: tuple[FloatArray, FloatArray],
 ) -> FloatArray:
-    """Return x within bounds of the least x'Hx / 2 - l'x of each row, (n, k).
+    """Minimum of x'Hx / 2 - l'x of each row within bounds, (n, k).
 
     ``hessian``: H, positive definite, (n, k, k); ``linear``: l, (n, k); ``start``: within the
     bounds, (n, k); ``bounds``: least and largest x, (n, k) each.
@@ -117,32 +118,32 @@ def box_minimum(
     for _ in range(SETS_OF_JOINT * k):
         if not len(rows):
             break
-        H, own, is_free = hessian[rows], x[rows], free[rows]
-        rest = np.where(is_free, 0.0, own)
+        H, x_active, is_free = hessian[rows], x[rows], free[rows]
+        rest = np.where(is_free, 0.0, x_active)
         right = linear[rows] - np.einsum('nij,nj->ni', H, rest)
         both = is_free[:, :, None] & is_free[:, None, :]
         best = np.linalg.solve(np.where(both, H, eye), np.where(is_free, right, rest)[..., None])[
             ..., 0
         ]
-        step = best - own
+        step = best - x_active
         # How much of the step each joint can go.
         end = np.where(step > 0.0, high[rows], low[rows])
         share = np.full_like(step, np.inf)
-        np.divide(end - own, step, out=share, where=is_free & (step != 0.0))
+        np.divide(end - x_active, step, out=share, where=is_free & (step != 0.0))
         first, part = share.argmin(axis=1), np.minimum(share.min(axis=1), 1.0)
-        own = np.clip(own + part[:, None] * step, low[rows], high[rows])
+        x_active = np.clip(x_active + part[:, None] * step, low[rows], high[rows])
         stopped = part < 1.0
         hit = np.flatnonzero(stopped)
-        own[hit, first[hit]] = end[hit, first[hit]]
+        x_active[hit, first[hit]] = end[hit, first[hit]]
         is_free[hit, first[hit]] = False
         # At the minimum of its set: the joint that gains most by leaving its bound.
-        slope = np.einsum('nij,nj->ni', H, own) - linear[rows]
-        outward = np.where(own >= high[rows], 1.0, -1.0)
+        slope = np.einsum('nij,nj->ni', H, x_active) - linear[rows]
+        outward = np.where(x_active >= high[rows], 1.0, -1.0)
         inward = np.where(is_free | (low[rows] >= high[rows]), 0.0, slope * outward)
         leaver = inward.argmax(axis=1)
         leaves = ~stopped & (inward.max(axis=1) > ROUNDING * np.abs(linear[rows]).max(axis=1))
         go = np.flatnonzero(leaves)
         is_free[go, leaver[go]] = True
-        x[rows], free[rows] = own, is_free
+        x[rows], free[rows] = x_active, is_free
         rows = rows[stopped | leaves]
     return x

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The configurations of a check: chosen once, kept as a table, and what is expected of them."""
+"""Configurations of a check of an arm: chosen once, kept as a table, with what a check finds."""
 
 from __future__ import annotations
 
@@ -18,39 +18,40 @@ from remaster_ros.session.files import read_limited
 from remaster_ros.session.workcell import Workcell
 from remaster_ros.types import FloatArray
 
-# Of a check: four see 0.26 mm where eight see 0.17, and sixteen take twice the time for 0.12.
+# Configurations of a check: four find a change of 0.26 mm, eight one of 0.17 mm, and sixteen take
+# twice the time for 0.12 mm.
 CHECK_POSES = 8
-# A check that takes longer is not made each day.
+# Longest time of a check, s, that is likely to be made each day.
 CHECK_S = 90.0
-# Of a table, bytes: 8 rows of joints are a thousandth of that.
+# Largest size of a table, bytes: 8 rows of joints have a thousandth of it.
 TABLE_LIMIT = 1_000_000
 
 
 @dataclass(frozen=True, eq=False)
 class CheckVisits:
-    """Configurations in the order of the visits, and what a check of them finds."""
+    """Configurations of a check in the order of the visits, and the changes that it can find."""
 
-    chain: SerialChain  # Of k joints
-    q: FloatArray  # rad, m of joints that slide, (n, k)
-    noise_m: float  # That the cell file states for its sensor, of one axis, m
-    # The smallest change of each joint that one check finds at that noise, m at the tool, (k,);
-    # NaN where a moved sensor looks the same
+    chain: SerialChain
+    q: FloatArray  # rad, m for prismatic joints, (n, k)
+    noise_m: float  # Noise of the sensor per axis, as in the cell file, m
+    # Smallest change of each joint that one check finds at that noise, m at the tool, (k,);
+    # NaN if a moved sensor has the same effect
     detectable_m: FloatArray
 
     def table(self) -> str:
-        """Return the text of the table, degrees, mm of joints that slide."""
+        """Text of the table, in degrees, mm for prismatic joints."""
         lines = [','.join(columns_of(self.chain))]
         shown = self.chain.shown_scale * self.q
         lines += [','.join(f'{value:.6f}' for value in row) for row in shown]
         return '\n'.join(lines) + '\n'
 
     def seconds(self, travel: TravelTime) -> float:
-        """Return the time from the first reading's settling to the last reading, s."""
+        """Time from the settling before the first reading to the last reading, s."""
         ways = sum(float(travel.straight(a, b[None])[0]) for a, b in zip(self.q, self.q[1:]))
         return ways + len(self.q) * travel.measuring_s
 
     def too_long(self, seconds: float) -> str:
-        """Return what to do about a check that takes too long; ''."""
+        """Remedy if a check takes too long; '' if it does not."""
         if seconds <= CHECK_S:
             return ''
         return (
@@ -59,7 +60,7 @@ class CheckVisits:
         )
 
     def expected(self) -> list[str]:
-        """Return the smallest change of each joint that one check finds, a line each."""
+        """Smallest change of each joint that one check finds, a line each."""
         return [
             f'{name}: '
             + ('none: looks like a sensor that was moved' if np.isnan(m) else f'{1e3 * m:.2f} mm')
@@ -74,16 +75,16 @@ def chosen_visits(
     travel: TravelTime | None,
     rng: np.random.Generator,
 ) -> CheckVisits:
-    """Choose configurations of a check, nearest in time first.
+    """Choose the configurations of a check, ordered by travel time from one to the next.
 
     Parameters
     ----------
     q
-        To choose from, rad or m, (c, k), c >= `CHECK_POSES`.
+        Candidate configurations, rad or m, (c, k), c >= `CHECK_POSES`.
     travel
-        What the order goes by; None to keep that of `q`, as it was chosen before.
+        Travel times that decide the order; None to keep the order of `q`.
     rng
-        See `checking.chosen_poses`.
+        Draws initial configurations; see `checking.chosen_poses`.
     """
     sensor = cell.sensors[cell.aim_at]
     places = {name: np.array(place) for name, place in cell.markers.items()}
@@ -93,25 +94,25 @@ def chosen_visits(
     if travel is not None:
         between, order = travel.between(q[rows]), [0]
         while len(order) < len(rows):
-            left = [i for i in range(len(rows)) if i not in order]
-            order.append(min(left, key=lambda i: float(between[order[-1], i])))
+            remaining = [i for i in range(len(rows)) if i not in order]
+            order.append(min(remaining, key=lambda i: float(between[order[-1], i])))
     noise = float(np.hypot(sensor.noise_m, sensor.pose_noise_m))
     return CheckVisits(chain, q[rows][order], noise, noise * sizes)
 
 
 def columns_of(chain: SerialChain) -> list[str]:
-    """Return the header of a table of configurations."""
+    """Header of a table of configurations."""
     names = zip(chain.joint_names, chain.shown_units, strict=True)
     return [f'{name} [{unit}]' for name, unit in names]
 
 
 def read_visits(path: Path, cell: Workcell, chain: SerialChain) -> CheckVisits:
-    """Return the configurations that `remaster plan CELL --check FILE` has written.
+    """Read the configurations that `remaster plan CELL --check FILE` has written.
 
     Raises
     ------
     InputError
-        One line: no such file, of another arm, or not as many finite places within its limits.
+        No such file, a table of another arm, or a row that is not finite or outside the limits.
     """
     try:
         text = read_limited(

@@ -1,14 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What to command so that the tool comes to where the nominal robot would have it, and back.
+"""Commands that bring the tool to the pose that the nominal robot would have, and the inverse.
 
-The tool pose that is wanted is that of the *nominal* robot at the wanted joints. Newton steps lead
-to it, within a budget: no joint is changed by more than `MOST_RAD`, or by what its own errors are
-where these are more. Near a singularity the budget does not suffice, and the best pose on its
-bound is taken. Of all changes that do equally well the smallest is made: seven joints change no
-more than they must.
+The wanted tool pose is that of the *nominal* robot at the wanted joints. Newton steps lead to it,
+within a budget: no joint is changed by more than `MOST_RAD`, or by its own errors if these are
+larger. Near a singularity the budget does not suffice, and the best pose on its bound is taken. Of
+all changes that do equally well the smallest is made: seven joints change no more than they must.
 
-What slides has metres for radians, and counts by `SerialChain.per_radian`. A shift counts in
-levers of the arm, so that a small arm is commanded as a large one of its shape.
+Prismatic joints have metres in place of radians, and count by `SerialChain.per_radian`. A shift
+counts in levers of the arm, so that a small arm is commanded as a large one of its shape.
 """
 
 from __future__ import annotations
@@ -25,31 +24,31 @@ from remaster_ros.compensation.bounded_poses import nearest
 from remaster_ros.kinematics.transforms import apply, matrix_to_rotation_vector
 from remaster_ros.types import BoolArray, FloatArray, IntArray
 
-# Largest change of a joint, rad: zeros are off by fractions of 2 degrees, and an arm that is off
-# by more was dismounted or has another model.
+# Largest change of a joint, rad: zero-offsets are fractions of 2 degrees, and an arm with larger
+# ones was dismounted or is another model.
 MOST_RAD = float(np.deg2rad(2.0))
-# A command less what was wanted is a change to so much, rad.
+# Rounding error of the difference of command and wanted angle, rad.
 ROUNDING_RAD = 1e-9
-# Size of a tool in levers of its arm: where not all of a pose is corrected, a turn counts by what
-# it shifts at such a distance. A tool of 5 cm at a metre: tip and marker 10 cm away err alike.
+# Size of a tool in levers of its arm. If a pose is not corrected in full, a rotation counts by the
+# shift at this distance: with 5 cm at a metre, tip and a marker 10 cm away err alike.
 TOOL_SIZE = 0.05
-# The fixed point begins the Newton steps. It converges by the largest slope of the terms, some
-# hundredths.
+# Fixed-point iterations before the Newton steps. Each reduces the error by the largest slope of
+# the terms, some hundredths.
 FIXED_POINT_STEPS = 2
-# A pose counts as corrected where no more of it is left, m and rad: sensors see no less.
+# Largest residual of a pose that counts as corrected, m and rad: no sensor resolves less.
 CORRECTED = 1e-5
 
 
 @dataclass(frozen=True, eq=False)
 class Correction:
-    """What was done to n rows of wanted joint angles."""
+    """Corrected commands for n rows of wanted joint angles."""
 
-    command: FloatArray  # What to command, rad, (n, k)
-    # How far the tool remains from where it is wanted, if the model is right, (n,)
+    command: FloatArray  # Joint angles to command, rad, (n, k)
+    # Remaining position and orientation error of the tool, if the model is right, (n,)
     residual_m: FloatArray
     residual_rad: FloatArray
-    incomplete: BoolArray  # Rows in which not all of the pose is corrected, (n,)
-    # Rows beyond the angles at which a curve was measured: its end value holds, (n,)
+    incomplete: BoolArray  # Mask of rows whose pose is not corrected in full, (n,)
+    # Mask of rows beyond the angles at which a curve was measured: its end value holds, (n,)
     outside_range: BoolArray
 
 
@@ -59,7 +58,7 @@ class Compensator:
     Parameters
     ----------
     model
-        The arm as it was found to be.
+        The calibrated arm.
     most_rad
         Largest change of a joint, rad.
     """
@@ -69,16 +68,16 @@ class Compensator:
 
     @cached_property
     def weights(self) -> FloatArray:
-        """What a metre and a radian of a pose error count, (6,)."""
+        """Weights of a metre and a radian in a pose error, (6,)."""
         chain = self.model.chain
-        frames = chain.frames(self.model.somewhere())
+        frames = chain.frames(self.model.sampled_angles())
         tips = (frames[:, -1] @ chain.T_fixed[-1])[:, :3, 3]
         shifts = chain.per_radian * chain.velocities(frames, tips)
         lever = float(np.linalg.norm(shifts, axis=1).max())
         return np.repeat((1.0 / lever, TOOL_SIZE), 3)
 
     def angle_errors(self, q: FloatArray, warming: FloatArray | None = None) -> FloatArray:
-        """Return the change that takes off the errors of the joint angles alone, rad, (n, k)."""
+        """Change that removes the errors of the joint angles alone, rad, (n, k)."""
         warming = self.model.warming(len(q), None) if warming is None else warming
         command = q
         for _ in range(FIXED_POINT_STEPS):
@@ -87,18 +86,18 @@ class Compensator:
 
     @property
     def joint_names(self) -> tuple[str, ...]:
-        """Of the k joints, base to tip."""
+        """Names of the k joints, base to tip."""
         return self.model.chain.joint_names
 
     def command(self, q: ArrayLike, temperature_c: ArrayLike | None = None) -> FloatArray:
-        """Return what to command so that the tool is where the nominal robot has it.
+        """Joint angles to command so that the tool is where the nominal robot has it.
 
         Parameters
         ----------
         q
             Wanted joint angles, those of the nominal robot, rad, (..., k).
         temperature_c
-            Of the arm, °C, one or one a row; None for that of the measurements.
+            Temperature of the arm, °C, one or one for each row; None for that of the measurements.
 
         Returns
         -------
@@ -108,9 +107,9 @@ class Compensator:
         return self._rows(lambda rows, warm: self._solved(rows, warm)[0], q, temperature_c)
 
     def true(self, q: ArrayLike, temperature_c: ArrayLike | None = None) -> FloatArray:
-        """Return the joint angles at which the nominal robot has its tool where the arm has it.
+        """Joint angles at which the nominal robot has its tool where the arm has it.
 
-        The inverse of `command`, ``true(command(q))`` is q, wherever all of a pose is corrected.
+        The inverse of `command`: ``true(command(q))`` is q, wherever a pose is corrected in full.
 
         Parameters
         ----------
@@ -120,7 +119,7 @@ class Compensator:
         return self._rows(lambda rows, warm: rows + self._way_back(rows, warm), q, temperature_c)
 
     def correct(self, q: ArrayLike, temperature_c: ArrayLike | None = None) -> Correction:
-        """Return commands (n, k) with what remains, and which rows are out of range."""
+        """Commands (n, k), remaining errors, and rows out of range."""
         wanted = self._checked(q).reshape(-1, self.model.joints)
         warming = self.model.warming(len(wanted), _given(temperature_c))
         command, error = np.empty_like(wanted), np.empty((len(wanted), 6))
@@ -129,13 +128,13 @@ class Compensator:
         return self.correction(command, error)
 
     def correction(self, command: FloatArray, error: FloatArray) -> Correction:
-        """Return the correction by commands (n, k), given the pose errors they leave, (n, 6)."""
+        """Correction for commands (n, k) and the pose errors that remain, (n, 6)."""
         shift, turn = (np.linalg.norm(part, axis=1) for part in np.split(error, 2, axis=1))
         incomplete = np.maximum(shift, turn) > CORRECTED
         return Correction(command, shift, turn, incomplete, self.model.outside(command))
 
     def tool(self, q: ArrayLike, temperature_c: ArrayLike | None = None) -> FloatArray:
-        """Return where the arm has its tool at reported joint angles, T_R_T, (..., 4, 4)."""
+        """Pose of the tool at reported joint angles, T_R_T, (..., 4, 4)."""
         q = self._checked(q)
         rows = q.reshape(-1, self.model.joints)
         found = self.model.state(rows, self._temperature(q, temperature_c)).tool
@@ -148,22 +147,22 @@ class Compensator:
         marker: str | None = None,
         temperature_c: ArrayLike | None = None,
     ) -> FloatArray:
-        """Return the mean square error of where the marker is, m², (..., 3, 3), along axes of R.
+        """Mean square error of the marker's position, m², (..., 3, 3), along axes of R.
 
-        Of its place in the frame of the sensor, at wanted joint angles after correction, as the
-        file's base frame and tool have it: uncertainty of offsets, causes, registration and marker
-        together, widened as poses that were left out have shown, and what of each pose the command
-        leaves. Where zero-offsets alone are corrected, lengths and tilts that stay as drawn are in
-        it too.
+        The error is that in the frame of the sensor, at wanted joint angles after correction, with
+        the base frame and tool of the file: it contains the uncertainty of offsets, causes,
+        registration and marker, widened as poses that were left out have shown, and the errors
+        that the command leaves. If only zero-offsets are corrected, it contains lengths and tilts
+        that stay nominal.
 
         Parameters
         ----------
         q
-            rad, (..., k).
+            Wanted joint angles, rad, (..., k).
         sensor, marker
-            Which of the file's; the first where None.
+            Names in the file; None for the first.
         temperature_c
-            As of `command`.
+            As in `command`.
         """
         q = self._checked(q)
         spread = self.spread(q, sensor, marker, temperature_c)
@@ -177,10 +176,10 @@ class Compensator:
         marker: str | None = None,
         temperature_c: ArrayLike | None = None,
     ) -> FloatArray:
-        """Return L, (..., 3, r), with L L' the second moments of all rows; see `uncertainty`.
+        """Factor L, (..., 3, r), with L L' the second moments of all rows; see `uncertainty`.
 
-        One column is one thing that is not known, and what it does to each row; the last one what
-        the commands leave.
+        A column is the effect of one uncertain quantity on each row; the last one is the error
+        that the commands leave.
         """
         model = self.model
         q = self._checked(q)
@@ -205,6 +204,7 @@ class Compensator:
         q: ArrayLike,
         temperature_c: ArrayLike | None,
     ) -> FloatArray:
+        """Apply a function of rows and warming to angles (..., k), in blocks."""
         q = self._checked(q)
         rows = q.reshape(-1, self.model.joints)
         warming = self.model.warming(len(rows), self._temperature(q, temperature_c))
@@ -214,11 +214,16 @@ class Compensator:
         return found.reshape(q.shape)
 
     def _temperature(self, q: FloatArray, given: ArrayLike | None) -> FloatArray | None:
+        """Temperatures as (rows,); None if none are given."""
         if given is None:
             return None
         return np.broadcast_to(np.asarray(given, dtype=float), q.shape[:-1]).reshape(-1)
 
     def _checked(self, q: ArrayLike) -> FloatArray:
+        """Angles as an array.
+
+        Raises ValueError for a wrong shape or numbers that are not finite.
+        """
         q = np.asarray(q, dtype=float)
         if q.ndim == 0 or q.shape[-1] != self.model.joints:
             raise ValueError(f'q has shape {q.shape}; its last size must be {self.model.joints}')
@@ -227,18 +232,18 @@ class Compensator:
         return q
 
     def _solved(self, wanted: FloatArray, warming: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return commands (n, k) and what is left of each pose, m and rad, (n, 6)."""
+        """Commands (n, k) and remaining pose errors, m and rad, (n, 6)."""
         problem = PoseProblem(self, wanted, warming)
         budget = problem.budget
-        change = nearest(problem.of_rows, problem.own, (-budget, budget))
-        return wanted + self.model.chain.per_radian * change, problem.left(change)
+        change = nearest(problem.of_rows, problem.angle_change, (-budget, budget))
+        return wanted + self.model.chain.per_radian * change, problem.remaining_error(change)
 
     def problem(self, q: FloatArray, temperature_c: float | None = None) -> PoseProblem:
-        """Return the pose errors at wanted angles (n, k) by changes of the joints."""
+        """Pose errors at wanted angles (n, k) as a function of joint changes."""
         return PoseProblem(self, q, self.model.warming(len(q), temperature_c))
 
     def _way_back(self, reported: FloatArray, warming: FloatArray) -> FloatArray:
-        """Return the difference of the nominal robot's angles from reported ones, rad, (n, k)."""
+        """Nominal robot's angles minus reported angles, rad, (n, k)."""
         added = self.model.added_angles(self.model.drivers(reported, warming))
         added /= self.model.chain.per_radian
         budget = np.maximum(self.most_rad, np.abs(added))
@@ -251,15 +256,16 @@ class Compensator:
         bounds: tuple[FloatArray, FloatArray],
         start: FloatArray,
     ) -> FloatArray:
-        """Return the bounded difference of the nominal robot's angles from reported ones, (n, k).
+        """Nominal robot's angles minus reported angles, within bounds, rad or m, (n, k).
 
         ``reported``: joint angles, rad, (n, k); ``warming``: K, (n,); ``bounds``: least and
-        largest of what is added, rad or `SerialChain.per_radian`, (n, k) each; ``start``: within
-        the bounds, (n, k).
+        largest difference, rad or `SerialChain.per_radian`, (n, k) each; ``start``: initial
+        difference within the bounds, (n, k).
         """
         model, unit, weights = self.model, self.model.chain.per_radian, self.weights
         state = model._state(model.drivers(reported, warming))
-        # A command has no part that moves no tool at that command: nor has what leads back.
+        # A command has no component in the null space of the tool's motion; so the way back has
+        # none either.
         right = np.linalg.svd(self.jacobian(state.frames, state.tool), full_matrices=False)[2]
         idle = np.eye(model.joints) - right.swapaxes(1, 2) @ right
 
@@ -272,9 +278,9 @@ class Compensator:
         return unit * nearest(errors, start, bounds, idle)
 
     def jacobian(self, frames: FloatArray, tool: FloatArray) -> FloatArray:
-        """Return the change of a tool pose in R, m and rad, for a radian of each joint, (n, 6, k).
+        """Derivative of a tool pose in R, m and rad, by each joint, (n, 6, k).
 
-        Or for what counts as one.
+        A prismatic joint counts by `SerialChain.per_radian`.
         """
         chain = self.model.chain
         axes = chain.axes_in_base(frames) * ~chain.slides[:, None]
@@ -283,22 +289,24 @@ class Compensator:
 
 
 class PoseProblem:
-    """The poses that a nominal robot has at n wanted angles, and what changes leave of them.
+    """Pose errors of the arm at n wanted angles as a function of changes of the joints.
 
-    Changes count in radians, or in what slides has for them (`SerialChain.per_radian`); errors by
-    `Compensator.weights`.
+    Changes count in radians, or in `SerialChain.per_radian` for prismatic joints; errors are
+    weighted by `Compensator.weights`.
     """
 
     def __init__(self, compensator: Compensator, wanted: FloatArray, warming: FloatArray) -> None:
         self._compensator, self._model = compensator, compensator.model
         self.wanted, self._warming = wanted, warming
         self._target = self._model.chain.forward(wanted)
-        # The change that takes off the errors of the joint angles alone, and the largest, (n, k)
-        self.own = compensator.angle_errors(wanted, warming) / self._model.chain.per_radian
-        self.budget = np.maximum(compensator.most_rad, np.abs(self.own))
+        # Change that removes the errors of the joint angles alone, and the largest change, (n, k)
+        self.angle_change = (
+            compensator.angle_errors(wanted, warming) / self._model.chain.per_radian
+        )
+        self.budget = np.maximum(compensator.most_rad, np.abs(self.angle_change))
 
     def of_rows(self, change: FloatArray, rows: IntArray) -> tuple[FloatArray, FloatArray]:
-        """Return weighted errors (m, 6) and Jacobians (m, 6, k) at changes (m, k) of some rows."""
+        """Weighted errors (m, 6) and Jacobians (m, 6, k) at changes (m, k) of some rows."""
         model, weights = self._model, self._compensator.weights
         command = self.wanted[rows] + model.chain.per_radian * change
         state = model._state(model.drivers(command, self._warming[rows]))
@@ -306,24 +314,26 @@ class PoseProblem:
         return weights * _pose_error(self._target[rows], state.tool), weights[:, None] * jacobian
 
     def errors(self, change: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return weighted errors (n, 6) and Jacobians (n, 6, k) at changes (n, k) of all rows."""
+        """Weighted errors (n, 6) and Jacobians (n, 6, k) at changes (n, k) of all rows."""
         return self.of_rows(change, np.arange(len(self.wanted)))
 
-    def left(self, change: FloatArray) -> FloatArray:
-        """Return the error of each pose after a change, m and rad, (n, 6)."""
+    def remaining_error(self, change: FloatArray) -> FloatArray:
+        """Error of each pose after a change, m and rad, (n, 6)."""
         return self.errors(change)[0] / self._compensator.weights
 
 
 def _pose_error(target: FloatArray, reached: FloatArray) -> FloatArray:
-    """Return how far poses are past their targets in R, m and rad (rotation vector), (n, 6)."""
+    """Poses relative to their targets in R, m and rad (rotation vector), (n, 6)."""
     turn = reached[:, :3, :3] @ np.swapaxes(target[:, :3, :3], 1, 2)
     shift = reached[:, :3, 3] - target[:, :3, 3]
     return np.concatenate((shift, matrix_to_rotation_vector(turn)), axis=1)
 
 
 def _blocks(rows: int) -> list[slice]:
+    """Slices of at most `BLOCK_ROWS` rows."""
     return [slice(start, start + BLOCK_ROWS) for start in range(0, rows, BLOCK_ROWS)]
 
 
 def _given(temperature_c: ArrayLike | None) -> FloatArray | None:
+    """Temperatures as an array; None if none are given."""
     return None if temperature_c is None else np.asarray(temperature_c, dtype=float)

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A correction in the forms that controllers and drivers take, with what each leaves out.
+"""A correction in the forms of controllers and drivers, and the errors that each form leaves.
 
-Where a form cannot hold all of a correction what it holds is fitted again to the whole one, base
-and marker too: offsets, lengths and tilts that belong to causes which are left out would be worse
-than none.
+If a form cannot hold all of a correction, its content is fitted again to the whole correction,
+with base and marker: offsets, lengths and tilts that were estimated together with causes that are
+left out would be worse than none.
 
 Tables of constant geometry are Denavit and Hartenberg's, Hayati's, and products of exponentials.
 With q the reported angles of k joints::
@@ -13,9 +13,9 @@ With q the reported angles of k joints::
           S = Rz(q + theta) · Tx(a) · Rx(alpha) · Ry(beta)                hayati
     POE:  tool = exp([s_1] q_1) · … · exp([s_k] q_k) · home,  s = (w, v), in the base frame
 
-A joint that slides adds q along z, Tz(q), in place of its turn, and w of its screw is 0.
-A step between joints whose nominal axes are parallel is Hayati's, since ``d`` has no bounds there.
-Base and end are x y z in m and roll pitch yaw in rad, Rz(yaw) · Ry(pitch) · Rx(roll).
+A prismatic joint adds q along z, Tz(q), in place of its rotation, and w of its screw is 0. A step
+between joints whose nominal axes are parallel is Hayati's, since ``d`` has no bounds there. Base
+and end are x y z in m and roll pitch yaw in rad, Rz(yaw) · Ry(pitch) · Rx(roll).
 """
 
 from __future__ import annotations
@@ -64,16 +64,17 @@ WITH_GEOMETRY = frozenset({'urdf', 'ur', 'json', 'csv'})
 KINEMATICS_FORMAT = 'remaster-kinematics/1'
 # Configurations in the measured range over which a form is compared with the whole correction.
 COMPARED = 400
-# Of Gauss and Newton: what is left out is at most some millimetres, so each leaves a thousandth.
+# Gauss–Newton steps: the content left out is at most some millimetres, of which each step leaves a
+# thousandth.
 STEPS = 3
-# How far lengths (m) and tilts (rad) go from those of the correction: what a drawing is wrong by,
-# a metre away. What is hardly told of them stays.
+# Prior std of lengths (m) and tilts (rad) about those of the correction: typical error of a
+# drawing a metre away. Parameters that the data hardly determine stay.
 GEOMETRY_STD = 1e-3
 NEARER = (
     'The compensation.json that "remaster fit" writes of the same session holds offsets, lengths '
     'and tilts alone, fitted to what was measured: export that one, it is nearer.'
 )
-# Of parts that are listed one by one: half of the last digit shown, RMS.
+# Least RMS size of a part that is listed by itself, mm: half of the last digit shown.
 LEAST_PART_MM = 5e-3
 # Links of a UR's kinematics file, by the ends of its joints' names.
 UR_LINKS = {
@@ -84,9 +85,10 @@ UR_LINKS = {
     'wrist_2_joint': 'wrist_2',
     'wrist_3_joint': 'wrist_3',
 }
-# A micrometre, and a micrometre a metre away: files have so many digits.
+# Tolerance of numbers in files, m and rad: a micrometre, and a micrometre a metre away.
 SAME = 1e-6
-# Errors of d are those of the axes' places divided by the sine of the angle between them.
+# Smallest angle between axes for a step with ``d``, rad: its error is that of the axes' positions
+# divided by the sine of the angle.
 PARALLEL_RAD = 0.1
 X, Y, Z = np.eye(3)
 TURNS = ('theta', 'alpha', 'beta', 'roll', 'pitch', 'yaw')
@@ -101,50 +103,50 @@ class Part:
 
 
 @dataclass(frozen=True, eq=False)
-class Held:
-    """What of a correction a form holds."""
+class HeldByForm:
+    """Content of a correction that a form can hold, and the error of leaving out the rest."""
 
-    model: ArmModel  # The arm that it makes of the nominal one
-    parts: tuple[Part, ...]  # What it does not hold
-    # At the marker after all, over the measured range
+    model: ArmModel  # The nominal arm with this content
+    parts: tuple[Part, ...]  # Parts that the form does not hold
+    # Error at the marker with this content, over the measured range
     rms_mm: float
     max_mm: float
-    never: tuple[LeftPart, ...] = ()  # What no form corrects
-    nearer: str = ''  # Which file's export is nearer to what was measured; ''
+    uncorrectable: tuple[LeftPart, ...] = ()  # Effects that no form corrects
+    better_file: str = ''  # Advice to export a file that is nearer to the measurements; ''
 
     @property
     def words(self) -> list[str]:
-        """What is left out, a line each."""
+        """The errors that remain, a line each."""
 
         def of_joints(joints: list[int]) -> str:
             several = 's' if len(joints) > 1 else ''
             return f' of joint{several} {", ".join(map(str, joints))}' if joints else ''
 
-        never = [
+        lines_uncorrectable = [
             f'Corrected in no form: {left.effect.replace("_", " ")}'
             f'{of_joints(left.joints)}, {left.size_mm:.3f} mm RMS: {left.instead}'
-            for left in self.never
+            for left in self.uncorrectable
         ]
         if not self.parts:
-            return ['Left out: nothing that can be corrected.', *never]
+            return ['Left out: nothing that can be corrected.', *lines_uncorrectable]
         shown = [part for part in self.parts if part.rms_mm >= LEAST_PART_MM]
-        rest = len(self.parts) - len(shown)
+        small_parts = len(self.parts) - len(shown)
         return [
             f'Left out: {self.rms_mm:.3f} mm RMS at the marker, {self.max_mm:.3f} mm at most, '
             'over the measured range, with what it holds fitted to the whole correction.',
             *(f'Left out: {part.what}, alone {part.rms_mm:.2f} mm RMS.' for part in shown),
-            *([f'Left out: {rest} more below 0.01 mm each.'] if rest else []),
-            *filter(None, [self.nearer]),
-            *never,
+            *([f'Left out: {small_parts} more below 0.01 mm each.'] if small_parts else []),
+            *filter(None, [self.better_file]),
+            *lines_uncorrectable,
         ]
 
 
-def held(compensation: Compensation, form: Form, rng: np.random.Generator) -> Held:
-    """Return what of a correction a form holds, and what it leaves out."""
+def form_content(compensation: Compensation, form: Form, rng: np.random.Generator) -> HeldByForm:
+    """Content of a correction that a form can hold, fitted to the whole correction."""
     model, content = compensation.model, compensation.content
     # A UR's kinematics file has no place for what carries the arm.
-    beside = model.chain.slides if form == 'ur' else np.zeros(model.joints, dtype=bool)
-    known = np.array([part.identifiable for part in content.joints]) & ~beside
+    prismatic = model.chain.slides if form == 'ur' else np.zeros(model.joints, dtype=bool)
+    known = np.array([part.identifiable for part in content.joints]) & ~prismatic
     k = model.joints
     geometry, with_geometry = Geometry.none(k), form in WITH_GEOMETRY and model.geometry.is_any
     if with_geometry:
@@ -153,7 +155,7 @@ def held(compensation: Compensation, form: Form, rng: np.random.Generator) -> He
             model.geometry.shifts[:k],
             model.geometry.turns[:k],
         )
-        geometry.shifts[:k][beside] = geometry.turns[:k][beside] = 0.0
+        geometry.shifts[:k][prismatic] = geometry.turns[:k][prismatic] = 0.0
     plain = replace(
         model,
         joint_offsets=np.where(known, model.joint_offsets, 0.0),
@@ -175,7 +177,7 @@ def held(compensation: Compensation, form: Form, rng: np.random.Generator) -> He
     free[:k] = known
     for where in (*plain.registration(sensor), plain.marker(marker)):
         free[where] = True
-    own = set(np.array(model.chain.joint_names)[~beside])
+    own = set(np.array(model.chain.joint_names)[~prismatic])
     of_geometry = np.array([_of_geometry(name) in own for name in plain.parameter_names])
     free |= of_geometry & with_geometry
     total = np.zeros(len(free))
@@ -193,36 +195,39 @@ def held(compensation: Compensation, form: Form, rng: np.random.Generator) -> He
             rcond=1e-9,
         )[0]
         total += step
-        plain = plain.moved(step)
-    left = np.linalg.norm(wanted - place(plain), axis=1)
+        plain = plain.with_step(step)
+    displacement = np.linalg.norm(wanted - place(plain), axis=1)
     parts = tuple(
         Part(what, 1e3 * float(np.sqrt(np.mean(np.sum((wanted - place(one)) ** 2, axis=1)))))
-        for what, one in _without(model, form)
+        for what, one in _models_without_parts(model, form)
     )
-    return Held(
+    return HeldByForm(
         plain,
         parts,
-        1e3 * float(np.sqrt(np.mean(left**2))),
-        1e3 * float(left.max(initial=0.0)),
+        1e3 * float(np.sqrt(np.mean(displacement**2))),
+        1e3 * float(displacement.max(initial=0.0)),
         tuple(content.not_corrected),
         NEARER if with_geometry and parts and content.source.made_by == 'discover' else '',
     )
 
 
 def _of_geometry(name: str) -> str:
-    """Return of which joint a parameter is a length or tilt, or of the tool; '' for others."""
-    kind, _, rest = name.partition('.')
-    return rest.rpartition('.')[0] if kind == 'geometry' else ''
+    """Joint (or 'tool') of a geometry parameter; '' for other parameters."""
+    kind, _, axis_name = name.partition('.')
+    return axis_name.rpartition('.')[0] if kind == 'geometry' else ''
 
 
-def _without(model: ArmModel, form: Form) -> list[tuple[str, ArmModel]]:
-    """Return the arm without each part that a form does not hold."""
+def _models_without_parts(model: ArmModel, form: Form) -> list[tuple[str, ArmModel]]:
+    """Name of each part that a form does not hold, and the model without it."""
     names, none = model.chain.joint_names, Geometry.none(model.joints)
     found = []
     for effect, joint in dict.fromkeys((term.effect, term.joint) for term in model.joint_terms):
-        rest = tuple(t for t in model.joint_terms if (t.effect, t.joint) != (effect, joint))
+        other_terms = tuple(t for t in model.joint_terms if (t.effect, t.joint) != (effect, joint))
         found.append(
-            (f'{effect.replace("_", " ")} of {names[joint]}', replace(model, joint_terms=rest))
+            (
+                f'{effect.replace("_", " ")} of {names[joint]}',
+                replace(model, joint_terms=other_terms),
+            )
         )
     for effect in dict.fromkeys(term.effect for term in model.base_terms):
         terms = tuple(term for term in model.base_terms if term.effect != effect)
@@ -239,8 +244,10 @@ def _without(model: ArmModel, form: Form) -> list[tuple[str, ArmModel]]:
         shifts, turns = model.geometry.shifts.copy(), model.geometry.turns.copy()
         if offsets[joint] or np.any(shifts[joint]) or np.any(turns[joint]):
             offsets[joint], shifts[joint], turns[joint] = 0.0, 0.0, 0.0
-            rest_of_it = replace(model, joint_offsets=offsets, geometry=Geometry(shifts, turns))
-            found.append((f'zero and place of {names[joint]}', rest_of_it))
+            remaining_model = replace(
+                model, joint_offsets=offsets, geometry=Geometry(shifts, turns)
+            )
+            found.append((f'zero and place of {names[joint]}', remaining_model))
     if form not in WITH_GEOMETRY and model.geometry.is_any:
         found.append(('lengths and tilts', replace(model, geometry=none)))
     return found
@@ -249,46 +256,49 @@ def _without(model: ArmModel, form: Form) -> list[tuple[str, ArmModel]]:
 def exported(
     compensation: Compensation,
     form: Form,
-    one: Held,
+    held_content: HeldByForm,
     base: tuple[Path, str] | None = None,
     *,
     driver_param: bool = False,
     motors: Mapping[str, MotorNumber] | None = None,
 ) -> dict[str, str]:
-    """Return the files of a form, name -> text.
+    """Files of a form, name -> text.
 
     Parameters
     ----------
     compensation, form
-        Which correction in which form.
-    one
-        What the form holds of it.
+        Correction and form.
+    held_content
+        Content that the form can hold.
     base
-        The file that is changed, path and text; the nominal URDF where None.
+        Path and text of the file that is changed; None for the nominal URDF.
     driver_param
-        Of ``ros2_control``: ``<param name="offset">`` in place of transmissions.
+        For ``ros2_control``: ``<param name="offset">`` in place of transmissions.
     motors
-        Of ``pad``: what the controller has stored, by joint.
+        For ``pad``: numbers that the controller has stored, by joint.
 
     Raises
     ------
     InputError
-        The file that is to be changed is not of this arm, or has not what is to be changed.
+        The file to be changed is not of this arm, or lacks the elements to be changed.
     """
-    offsets = _offsets(compensation, one)
-    notes = written_notes(offsets, one.words)
+    offsets = _offsets(compensation, held_content)
+    notes = written_notes(offsets, held_content.words)
     if form == 'urdf':
-        return {URDF_FILE: _urdf(compensation, offsets, one, notes)}
+        return {URDF_FILE: _urdf(compensation, offsets, held_content, notes)}
     if form == 'ur':
         if base is None:
             raise InputError("--to ur changes the arm's own kinematics file: name it with --base")
-        return {base[0].name: _ur_yaml(compensation, offsets, one, *base, notes)}
+        return {base[0].name: _ur_yaml(compensation, offsets, held_content, *base, notes)}
     if form == 'json':
-        return {'kinematics.json': _json(compensation, one)}
+        return {'kinematics.json': _json(compensation, held_content)}
     if form == 'csv':
-        return {'kinematics.csv': _csv(one)}
+        return {'kinematics.csv': _csv(held_content)}
     if form == 'pad':
-        files = {REMASTER_FILE: remaster_text(offsets, one.words, alone=True), **PAD_PAGES}
+        files = {
+            REMASTER_FILE: remaster_text(offsets, held_content.words, is_single_file=True),
+            **PAD_PAGES,
+        }
         if motors:
             files['motor_numbers.txt'] = motor_text(offsets, motors)
         return files
@@ -321,7 +331,8 @@ def exported(
     return {path.name: xml_text(text, root, [how, limits, *notes])}
 
 
-def _offsets(compensation: Compensation, one: Held) -> ZeroOffsets:
+def _offsets(compensation: Compensation, held_content: HeldByForm) -> ZeroOffsets:
+    """Zero-offsets of a form's content, with their standard deviations and remarks."""
     content, model = compensation.content, compensation.model
     was = content.state.get('accuracy_option', '')
     option = [f"Measured with the maker's accuracy option {was}: right in that state alone."]
@@ -332,7 +343,7 @@ def _offsets(compensation: Compensation, one: Held) -> ZeroOffsets:
     return ZeroOffsets(
         content.robot.urdf,
         model.chain,
-        one.model.joint_offsets,
+        held_content.model.joint_offsets,
         std,
         np.array([part.identifiable for part in content.joints]),
         [part.why for part in content.joints],
@@ -342,22 +353,30 @@ def _offsets(compensation: Compensation, one: Held) -> ZeroOffsets:
 
 
 def _urdf(
-    compensation: Compensation, offsets: ZeroOffsets, one: Held, notes: Sequence[str]
+    compensation: Compensation,
+    offsets: ZeroOffsets,
+    held_content: HeldByForm,
+    notes: Sequence[str],
 ) -> str:
+    """Nominal URDF with the offsets and geometry of a form's content."""
     return calibrated_urdf(
-        compensation.content.robot.urdf, offsets.chain, offsets.applied, notes, one.model.geometry
+        compensation.content.robot.urdf,
+        offsets.chain,
+        offsets.applied,
+        notes,
+        held_content.model.geometry,
     )
 
 
 def _ur_yaml(
     compensation: Compensation,
     offsets: ZeroOffsets,
-    one: Held,
+    held_content: HeldByForm,
     path: Path,
     text: str,
     notes: Sequence[str],
 ) -> str:
-    """Return the arm's own kinematics file with the origins of the corrected robot model."""
+    """Kinematics file of a UR with the origins of the corrected robot model."""
     try:
         content = load_yaml(text)
     except YamlError as error:
@@ -368,7 +387,7 @@ def _ur_yaml(
             f"{path}: no key 'kinematics'; give the arm's own kinematics file of a UR"
         )
     nominal = {joint.name: joint for joint in _joints(compensation.content.robot.urdf)}
-    changed = parsed_xml(_urdf(compensation, offsets, one, ()))
+    changed = parsed_xml(_urdf(compensation, offsets, held_content, ()))
     origins = {joint.get('name'): joint.find('origin') for joint in changed.findall('joint')}
     for name, slides in zip(offsets.chain.joint_names, offsets.chain.slides, strict=True):
         if slides:
@@ -411,10 +430,12 @@ def _ur_yaml(
 
 
 def _joints(urdf: str) -> list[Any]:
+    """Joints of a URDF."""
     return list(parse_urdf(urdf).parent_joint.values())
 
 
 def _rising(root: ElementTree.Element, by_joint: Mapping[str, float], path: Path) -> None:
+    """Add offsets to <calibration rising> of a URDF's joints."""
     joints = {joint.get('name'): joint for joint in root.findall('joint')}
     for name, offset in by_joint.items():
         joint = joints.get(name)
@@ -427,6 +448,7 @@ def _rising(root: ElementTree.Element, by_joint: Mapping[str, float], path: Path
 
 
 def _transmissions(root: ElementTree.Element, by_joint: Mapping[str, float], path: Path) -> None:
+    """Add offsets to the transmissions in <ros2_control> of a URDF."""
     found = {
         joint.get('name'): joint for joint in root.findall('.//ros2_control/transmission/joint')
     }
@@ -445,6 +467,7 @@ def _transmissions(root: ElementTree.Element, by_joint: Mapping[str, float], pat
 
 
 def _driver_params(root: ElementTree.Element, by_joint: Mapping[str, float], path: Path) -> None:
+    """Subtract offsets from <param name="offset"> of the joints in <ros2_control>."""
     found = {joint.get('name'): joint for joint in root.findall('.//ros2_control/joint')}
     missing = [name for name in by_joint if name not in found]
     if missing:
@@ -459,6 +482,7 @@ def _driver_params(root: ElementTree.Element, by_joint: Mapping[str, float], pat
 
 
 def _number(text: str, path: Path, joint: str) -> float:
+    """Finite number in an element. Raises InputError for other text."""
     try:
         value = float(text)
     except ValueError:
@@ -470,7 +494,8 @@ def _number(text: str, path: Path, joint: str) -> float:
     return value
 
 
-def _json(compensation: Compensation, one: Held) -> str:
+def _json(compensation: Compensation, held_content: HeldByForm) -> str:
+    """Text of kinematics.json."""
     robot = compensation.content.robot
     content = {
         'format': KINEMATICS_FORMAT,
@@ -487,16 +512,21 @@ def _json(compensation: Compensation, one: Held) -> str:
             'poe': 'exp of each screw (w, v) times its q, base to tip, then home',
             'base, end, home': 'x y z in m, roll pitch yaw in rad: Rz(yaw) Ry(pitch) Rx(roll)',
         },
-        'left_out': {'rms_mm': one.rms_mm, 'max_mm': one.max_mm, 'parts': list(one.parts)},
-        'rows': tables(one.model),
+        'left_out': {
+            'rms_mm': held_content.rms_mm,
+            'max_mm': held_content.max_mm,
+            'parts': list(held_content.parts),
+        },
+        'rows': tables(held_content.model),
     }
     return msgspec.json.format(msgspec.json.encode(content)).decode() + '\n'
 
 
-def _csv(one: Held) -> str:
+def _csv(held_content: HeldByForm) -> str:
+    """Text of kinematics.csv."""
     text = io.StringIO()
     writer = csv_writer(text, lineterminator='\n')
-    rows = [asdict(row) for row in tables(one.model)]
+    rows = [asdict(row) for row in tables(held_content.model)]
     writer.writerow(rows[0])
     writer.writerows(row.values() for row in rows)
     return text.getvalue()
@@ -504,20 +534,18 @@ def _csv(one: Held) -> str:
 
 @dataclass(frozen=True)
 class Row:
-    """One number of a table."""
+    """One number of a table of constant geometry."""
 
     table: str  # ``dh``, ``hayati`` or ``poe``
     part: str  # A joint, ``base``, ``end`` or ``home``
-    # Its name and unit
     parameter: str
     unit: str
-    # Of the nominal robot, and what is to be added
-    nominal: float
-    delta: float
+    nominal: float  # Value of the nominal robot
+    delta: float  # Correction to be added
 
 
 def tables(model: ArmModel) -> list[Row]:
-    """Return the numbers of all tables of an arm without terms."""
+    """Numbers of all tables of constant geometry for an arm without terms."""
     names = model.chain.joint_names
     nominal = ArmModel.nominal(model.chain)
     before, after = _Axes(nominal), _Axes(model)
@@ -544,7 +572,7 @@ def tables(model: ArmModel) -> list[Row]:
 
 
 class _Axes:
-    """Lines of the joints' axes in R at reported zero, and what stands at both ends."""
+    """Axes of the joints in R at reported zero, and poses of base and tool."""
 
     def __init__(self, model: ArmModel) -> None:
         state = model.state(np.zeros((1, model.joints)))
@@ -561,6 +589,10 @@ class _Axes:
 def _dh(
     axes: _Axes, parallel: Sequence[bool], names: Sequence[str]
 ) -> list[tuple[str, str, dict[str, float]]]:
+    """Denavit-Hartenberg parameters as rows of table, part and values.
+
+    Hayati's for parallel axes.
+    """
     frame = axes.base
     rows = [('dh', 'base', _placed(frame))]
     for i, name in enumerate(names[:-1]):
@@ -595,6 +627,7 @@ def _dh(
 
 
 def _poe(axes: _Axes, names: Sequence[str]) -> list[tuple[str, str, dict[str, float]]]:
+    """Screws of the joints and home pose as rows of table, part and values."""
     rows = []
     for name, w, point, slides in zip(names, axes.along, axes.points, axes.slides, strict=True):
         turns = [*w.tolist(), *np.cross(point, w).tolist()]
@@ -605,5 +638,6 @@ def _poe(axes: _Axes, names: Sequence[str]) -> list[tuple[str, str, dict[str, fl
 
 
 def _placed(T: FloatArray) -> dict[str, float]:
+    """Position and roll, pitch, yaw of a pose, by name."""
     values = (*T[:3, 3].tolist(), *rpy_of(T[:3, :3]))
     return dict(zip(('x', 'y', 'z', 'roll', 'pitch', 'yaw'), values, strict=True))

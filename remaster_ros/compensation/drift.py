@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Does a series of checks drift, since when, how fast, and when does that matter?
+"""Drifts in a series of checks: since when, how fast, and when they matter.
 
-Results x₁ … x_T at times t are a constant and noise, until from a check s on they are a line of a
-slope that is not known: μ + β max(0, t − t_s). Mean and noise are integrated out under their
-invariant priors as for a step (`checking`), the slope under normal priors of several widths, in
-standard deviations of a result a day, and s under a prior: the mean of the odds is an e-process
-again, at most 1 as long as nothing changes.
+Results x₁ … x_T at times t are a constant and noise, until from a check s on they are a line of
+unknown slope: μ + β max(0, t − t_s). Mean and noise are integrated out under their invariant
+priors as for a step (`checking`), the slope under normal priors of several widths, in standard
+deviations of a result a day, and s under a prior: the mean of the odds is an e-process again, of
+expected value at most 1 as long as nothing changes.
 """
 
 from __future__ import annotations
@@ -18,39 +18,37 @@ from scipy.special import stdtrit
 from remaster_ros.types import FloatArray
 
 RATES = (0.01, 0.03, 0.1, 0.3, 1.0)
-"""Widths of the priors of a slope, in standard deviations of a result a day: alike likely."""
+"""Widths of the priors of a slope, in standard deviations of a result a day; equally likely."""
 FROM_THE_FIRST = 0.5
 """Prior that a drift has been there since the first check; the rest is for a later onset."""
 BATCHES = 6
-"""Batches that the wander about a drift is told from: two of their numbers are its parameters."""
+"""Number of batches from which the wander about a drift is estimated; two parameters are "
+"fitted."""
 LONGEST_DAYS = 30.0
-"""A drift is looked after at least so often."""
+"""Longest time to the next check of a drift, days."""
 
 
 @dataclass(frozen=True)
 class Drift:
-    """A line in a series of T results from one of them on."""
+    """A line in a series of T results, from one result on."""
 
-    evidence: float  # Of the e-process of all drifts
-    at: int  # The first check of the line
-    # From there to the newest check, where the drift is most likely; half of its 95 % interval,
-    # infinite where there are too few results
+    evidence: float  # Value of the e-process over all drifts
+    at: int  # Index of the first check of the likeliest line
+    # Change from there to the newest check, and half of its 95 % interval, infinite if there are
+    # too few results
     size: float
     half: float
-    days: float  # How long that took
+    days: float  # Duration of the change, days
     weights: FloatArray  # The size is the sum of weights times results, (T,)
 
     def days_left(self, smallest: float) -> float:
-        """Days until a drift of the largest likely slope is as large as what matters; at least 0.
-
-        ``smallest``: what matters.
-        """
+        """Days until a drift of the largest likely slope reaches `smallest`; at least 0."""
         slope = (abs(self.size) + self.half) / self.days
         return max(0.0, (smallest - abs(self.size)) / slope)
 
 
 def drift(x: FloatArray, days: FloatArray) -> Drift:
-    """Return the drift that a series (T,) shows; days (T,) rise."""
+    """Drift in a series (T,) at ascending times `days` (T,)."""
     T = len(x)
     none = Drift(1.0, 0, 0.0, np.inf, 0.0, np.zeros(T))
     if T < 3 or days[-1] <= days[0]:
@@ -62,9 +60,9 @@ def drift(x: FloatArray, days: FloatArray) -> Drift:
     # Of checks at one and the same time a line has none.
     is_any = squares_of_line > 1e-12 * squares_of_line.max()
     squares_of_line = np.where(is_any, squares_of_line, 1.0)
-    off = x - x.mean()
-    squares = float(off @ off)
-    slope = np.where(is_any, lines @ off / squares_of_line, 0.0)
+    deviations = x - x.mean()
+    squares = float(deviations @ deviations)
+    slope = np.where(is_any, lines @ deviations / squares_of_line, 0.0)
     share = np.zeros(T - 1) if squares <= 0.0 else slope**2 * squares_of_line / squares
     share = np.minimum(share, 1.0)
     odds = np.zeros(T - 1)
@@ -85,24 +83,24 @@ def drift(x: FloatArray, days: FloatArray) -> Drift:
     size = float(weights @ x)
     half = np.inf
     if T > 3:
-        left_over = off - slope[at] * lines[at]
-        variance = float(left_over @ left_over) / (T - 2.0)
+        residuals = deviations - slope[at] * lines[at]
+        variance = float(residuals @ residuals) / (T - 2.0)
         std = float(np.sqrt(variance * float(weights @ weights)))
-        half = max(float(stdtrit(T - 2.0, 0.975)) * std, _interval_of_batches(left_over, weights))
+        half = max(float(stdtrit(T - 2.0, 0.975)) * std, _interval_of_batches(residuals, weights))
     return Drift(evidence, at, size, half, span, weights)
 
 
-def _interval_of_batches(left: FloatArray, weights: FloatArray) -> float:
-    """Return half of the 95 % interval of a drift by how what it leaves (T,) wanders.
+def _interval_of_batches(residuals: FloatArray, weights: FloatArray) -> float:
+    """Half of the 95 % interval of a drift, from the autocorrelation of its residuals (T,).
 
-    Means of what is left of results that follow one another, of a sixth of the series at most:
-    where days resemble one another they differ by more than their scatter says.
+    Means of consecutive residuals, of a sixth of the series at most: if days resemble one another,
+    they differ by more than their scatter predicts.
     """
-    T = len(left)
+    T = len(residuals)
     size = T // BATCHES
     count = T // size if size else 0
     if count < BATCHES:
         return 0.0
-    means = left[T - count * size :].reshape(count, size).mean(axis=1)
+    means = residuals[T - count * size :].reshape(count, size).mean(axis=1)
     variance = float(means @ means) / (count - 2.0) * size
     return float(stdtrit(count - 2.0, 0.975)) * float(np.sqrt(variance * (weights @ weights)))

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Ready ways to use the offsets: re-master, an offset layer, or a corrected URDF.
+"""The offsets in three forms: re-mastering, an offset layer, or a corrected URDF.
 
-The true joint angle is the reported one plus the offset. Each way corrects all of it, so only one
+The true joint angle is the reported one plus the offset. Each form corrects all of it, so only one
 may be in use at a time.
 
 An offset that the data do not determine is in none of the three: its mean is a choice of the fit
-(0, or where the marker's nominal place leads), and applied it would move the arm for no reason.
-Each file lists the joints that are left out, and why.
+(0, or a consequence of the marker's nominal position), and applied it would move the arm for no
+reason. Each file lists the joints that are left out, and why.
 """
 
 from __future__ import annotations
@@ -49,21 +49,21 @@ _LIMITS = {
 class ZeroOffsets:
     """Zero-offsets of k joints as they are written for a controller."""
 
-    # The nominal robot, text and joints
+    # The nominal robot: text of its URDF, and its joints
     urdf: str
     chain: SerialChain
-    # rad, m of joints that slide, (k,)
+    # Offsets and standard deviations, rad, m for prismatic joints, (k,)
     joint_offsets: FloatArray
     std: FloatArray
     identifiable: BoolArray  # Whether the data determine each, (k,); the others are not applied
-    why: Sequence[str]  # Of those that are not
-    # How the pad writes the joints; None where it writes them as the URDF, in degrees
+    why: Sequence[str]  # Reason for each offset that is not identifiable, '' for the others
+    # How the pad counts the joints; None if as the URDF, in degrees
     controller: Controller | None = None
-    check_first: Sequence[str] = ()  # What must be checked before anything is loaded, a line each
+    check_first: Sequence[str] = ()  # Checks before anything is loaded, a line each
 
     @classmethod
     def of(cls, result: FitResult, std: FloatArray | None = None) -> ZeroOffsets:
-        """Return the zero-offsets of a fit; ``std`` (k,) replaces its standard deviations."""
+        """Zero-offsets of a fit; ``std`` (k,) replaces its standard deviations."""
         return cls(
             result.session.urdf,
             result.chain,
@@ -77,12 +77,12 @@ class ZeroOffsets:
 
     @property
     def applied(self) -> FloatArray:
-        """What is applied, rad or m, (k,): 0 where the data determine nothing."""
+        """Offsets that are applied, rad or m, (k,): 0 for joints that are not identifiable."""
         return np.where(self.identifiable, self.joint_offsets, 0.0)
 
     @property
     def left_out(self) -> dict[str, str]:
-        """The joints whose offsets are not applied, and why."""
+        """Reason for each joint whose offset is not applied."""
         unknown = np.flatnonzero(~self.identifiable).tolist()
         return {self.chain.joint_names[i]: self.why[i] for i in unknown}
 
@@ -90,16 +90,16 @@ class ZeroOffsets:
 def exports(
     result: FitResult, remarks: Sequence[str] = (), std: FloatArray | None = None
 ) -> dict[str, str]:
-    """Return the files with the zero-offsets of the folder ``apply``: name -> text.
+    """Files of the folder ``apply`` with the zero-offsets: name -> text.
 
     Parameters
     ----------
     result
-        Whose offsets they hold.
+        The fit.
     remarks
-        For the user: what is not corrected, a line each.
+        Effects that are not corrected, a line each, for the user.
     std
-        Of the offsets, rad or m, (k,), where not those of an arm that is exactly its drawing.
+        Standard deviations of the offsets, rad or m, (k,), to replace those of a nominal geometry.
     """
     offsets = ZeroOffsets.of(result, std)
     notes = written_notes(offsets, remarks)
@@ -111,7 +111,7 @@ def exports(
 
 
 def written_notes(offsets: ZeroOffsets, remarks: Sequence[str] = ()) -> list[str]:
-    """Return the warnings for the user of a file, a line each."""
+    """Remarks and warnings for the user of a file, a line each."""
     words = [] if offsets.controller is None else pad_in_words(offsets.controller)
     return [
         *remarks,
@@ -132,16 +132,16 @@ def written_notes(offsets: ZeroOffsets, remarks: Sequence[str] = ()) -> list[str
 
 
 def check_first(result: FitResult) -> list[str]:
-    """Return what must be checked before anything is loaded."""
+    """Checks before anything is loaded, a line each."""
     return [f'CHECK FIRST: {line}' for line in result.implausible]
 
 
 def remaster_text(
-    offsets: ZeroOffsets, remarks: Sequence[str] = (), *, alone: bool = False
+    offsets: ZeroOffsets, remarks: Sequence[str] = (), *, is_single_file: bool = False
 ) -> str:
-    """Return the instructions for re-mastering on the robot's own pad, in the pad's numbers.
+    """Instructions for re-mastering on the robot's pad, in the pad's numbers.
 
-    With ``alone`` none of the other files of a fit is beside it.
+    ``is_single_file``: the text does not refer to the other files of a fit.
     """
     groups = mastering(
         offsets.controller,
@@ -160,7 +160,7 @@ def remaster_text(
     if slides:
         way = tuple(line.replace('the angle', 'the value') for line in way)
         way = tuple(line.replace('the same angle', 'the same amount') for line in way)
-    where = 'Left out' if alone else 'Left out of all three'
+    where = 'Left out' if is_single_file else 'Left out of all three'
     urdf_sha256 = hashlib.sha256(offsets.urdf.encode()).hexdigest()
     return '\n'.join(
         [
@@ -174,7 +174,7 @@ def remaster_text(
             *(('The true joint angle is the reported one plus the offset. Use no other form of',
                'this correction beside it.',
                '',
-               *(line[3:] for line in way)) if alone else
+               *(line[3:] for line in way)) if is_single_file else
               ('The true joint angle is the reported one plus the offset. Use ONE of three ways,',
                'never two at once:',
                '',
@@ -193,7 +193,7 @@ def remaster_text(
             *(('', 'How the angles of the robot description (URDF) come from those on the pad, as',
                'told when the session was made:', *(f'  {line}' for line in words),
                'The offsets above'
-               f'{" are" if alone else ", and ways 2 and 3, are"} in the numbers of the '
+               f'{" are" if is_single_file else ", and ways 2 and 3, are"} in the numbers of the '
                'description.')
               if words else ()),
             '',
@@ -216,11 +216,11 @@ _PAD = (
 
 
 def _plain_rows(steps: Sequence[MasteringStep]) -> list[str]:
-    """Return the table of joints that the pad has as the URDF has them."""
+    """Table of joints whose pad has the names and angles of the URDF."""
     rows = []
     for unit in ('deg', 'mm'):
-        own = [step for step in steps if step.unit == unit]
-        if not own:
+        steps_of_unit = [step for step in steps if step.unit == unit]
+        if not steps_of_unit:
             continue
         rows.append(
             f'  {"joint":<20} {f"offset, {unit}":>12} {f"std, {unit}":>10} '
@@ -228,13 +228,13 @@ def _plain_rows(steps: Sequence[MasteringStep]) -> list[str]:
         )
         rows += [
             f'  {step.joint:<20} {step.offset:>+12.4f} {step.std:>10.4f} {step.drive_to:>+16.4f}'
-            for step in own
+            for step in steps_of_unit
         ]
     return rows
 
 
 def _pad_rows(groups: Sequence[Sequence[MasteringStep]]) -> list[str]:
-    """Return the table of joints as the pad has them, with what belongs together."""
+    """Table of joints in the pad's names and angles, coupled joints in groups."""
     steps = [step for group in groups for step in group]
     wide = max(len('on the pad'), *(len(step.pad_name) for step in steps))
     long = max(len('in the URDF'), *(len(step.joint) for step in steps))
@@ -287,7 +287,7 @@ def _pad_rows(groups: Sequence[Sequence[MasteringStep]]) -> list[str]:
 
 
 def layer_text(offsets: ZeroOffsets, remarks: Sequence[str] = ()) -> str:
-    """Return the offsets as a ROS 2 parameter file for an offset layer."""
+    """The offsets as a ROS 2 parameter file for an offset layer."""
     slides = bool(offsets.chain.slides.any())
     head = (
         f'# Joint zero-offsets, rad{", m of joints that slide" if slides else ""}. '
@@ -320,26 +320,26 @@ def calibrated_urdf(
     notes: Sequence[str] = (),
     geometry: Geometry | None = None,
 ) -> str:
-    """Return the URDF whose kinematics at reported angles is that of the true ones.
+    """URDF whose kinematics at reported angles is that of the nominal one at true angles.
 
-    Each joint's origin is turned by its offset about its axis, or shifted along it where the
-    joint slides, and its limits are shifted the other way, so that they still stop the arm in the
-    same places. A joint that mimics one of them follows the true angle. What names the joints
-    elsewhere (``<transmission>``, ``<ros2_control>``, ``<gazebo>``) means reported angles and
-    stays as it is.
+    Each joint's origin is turned by its offset about its axis, or shifted along it for a prismatic
+    joint, and its limits are shifted the other way, so that they still stop the arm in the same
+    places. A joint that mimics one of them follows the true angle. Elements that name the joints
+    elsewhere (``<transmission>``, ``<ros2_control>``, ``<gazebo>``) refer to reported angles and
+    stay as they are.
 
     Parameters
     ----------
     urdf
-        The nominal robot, as `chain` was read from.
+        Text of the nominal robot from which `chain` was read.
     chain
         Its joints.
     joint_offsets
-        rad, m of joints that slide, (k,).
+        rad, m for prismatic joints, (k,).
     notes
         Further comments in the file, such as the joints left out.
     geometry
-        Changes of the joints' origins beside the offsets.
+        Changes of the joints' origins in addition to the offsets.
     """
     root = parsed_xml(urdf)
     # The robot's own children: a <transmission> or <ros2_control> has joints of the same names.
@@ -389,13 +389,13 @@ def calibrated_urdf(
 
 
 def parsed_xml(text: str) -> ElementTree.Element:
-    """Return the outermost element of a description, comments kept."""
+    """Root element of a description, with its comments."""
     parser = ElementTree.XMLParser(target=ElementTree.TreeBuilder(insert_comments=True))
     return ElementTree.fromstring(text, parser)
 
 
 def xml_text(before: str, root: ElementTree.Element, notes: Sequence[str]) -> str:
-    """Return a description that was changed, with comments in it and what stood before it."""
+    """Text of a changed description, with comments in it and the prolog of the original text."""
     for text in reversed(notes):
         # Two hyphens would end the comment.
         note = ElementTree.Comment(f' {re.sub("-(?=-)", "- ", text).rstrip("-")} ')
@@ -408,10 +408,10 @@ def xml_text(before: str, root: ElementTree.Element, notes: Sequence[str]) -> st
 
 
 def rpy_of(rotation: FloatArray) -> tuple[float, float, float]:
-    """Return roll, pitch, yaw of R = Rz(yaw) Ry(pitch) Rx(roll), exact at pitch ±90° too.
+    """Roll, pitch, yaw of R = Rz(yaw) Ry(pitch) Rx(roll), exact at pitch ±90° too.
 
-    The roll is taken after undoing the yaw, so that where the two act alike, an error in one is
-    corrected by the other.
+    The roll is taken after undoing the yaw, so that at pitch ±90°, where both act alike, an error
+    of one is corrected by the other.
     """
     R = rotation
     yaw = np.arctan2(R[1, 0], R[0, 0])

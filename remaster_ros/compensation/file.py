@@ -26,7 +26,7 @@ from remaster_ros.compensation.arm_model import (
     JointTerm,
 )
 from remaster_ros.compensation.compensator import Compensator
-from remaster_ros.compensation.of_result import Described
+from remaster_ros.compensation.of_result import CorrectedArm
 from remaster_ros.compensation.trajectories import CorrectedTrajectory, corrected_trajectory
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.pad_angles import coupled_in_circle
@@ -43,11 +43,11 @@ from remaster_ros.version import __version__
 FORMAT = 'remaster-compensation/1'
 COMPENSATION_FILE = 'compensation.json'
 FILE_LIMIT = 256 * 1024**2
-# Digits of what the covariance is made of: the errors of a marker are a millionth of those of its
-# parameters, which make up for each other.
+# Digits of the covariance's root: the errors of a marker are a millionth of those of the
+# parameters, which compensate each other.
 DIGITS = 10
-# Of any number of the file, in its unit: far beyond the widest prior of anything (300 m of a
-# sensor), and its fourth power is finite.
+# Largest magnitude of a number in the file, in its unit: far beyond the widest prior (300 m for a
+# sensor), and with a finite fourth power.
 LARGEST = 1e9
 
 Triple = tuple[float, float, float]
@@ -55,7 +55,7 @@ Source = Literal['fit', 'discover']
 
 
 class RobotPart(Struct):
-    """Whose correction it is: the nominal robot, whole."""
+    """The nominal robot, with the whole text of its URDF."""
 
     name: str
     urdf_sha256: str
@@ -66,7 +66,7 @@ class RobotPart(Struct):
 
 
 class SourcePart(Struct):
-    """What it was made of."""
+    """The result from which the correction was made."""
 
     made_by: Source
     result_sha256: str
@@ -92,7 +92,7 @@ class TermPart(Struct):
 
 
 class JointPart(Struct, kw_only=True):
-    """What adds to a joint's angle, or to the place of one that slides."""
+    """Offset and terms of a joint, in rad, or in m for a prismatic joint."""
 
     joint: str
     offset_rad: float | UnsetType = UNSET
@@ -105,7 +105,7 @@ class JointPart(Struct, kw_only=True):
 
 
 class OriginPart(Struct):
-    """How the origin of a joint, or of the tool, is off."""
+    """Change of the origin of a joint, or of the tool."""
 
     at: str
     shift: Triple
@@ -120,7 +120,7 @@ class GeometryPart(Struct):
 
 
 class MassPart(Struct):
-    """What hangs on a joint, in the frame after it."""
+    """Mass of the link after a joint, in the frame after that joint."""
 
     joint: str
     mass_kg: float
@@ -129,7 +129,7 @@ class MassPart(Struct):
 
 
 class TemperaturePart(Struct):
-    """What grows: `origins` per kelvin above the reference."""
+    """Growth: changes of origins per kelvin above the reference."""
 
     reference_c: float
     measured_at_c: float
@@ -137,14 +137,14 @@ class TemperaturePart(Struct):
 
 
 class ErrorPart(Struct):
-    """Second moments E' E of the true parameters about those of the file; E as U."""
+    """Root E of the second moments E' E of the true parameters about those of the file."""
 
     names: list[str]
     root: list[list[float]]
 
 
 class ParametersPart(Struct):
-    """Mean and covariance U' U; of U the rows of the upper triangle, from the diagonal on."""
+    """Means and covariance U' U of the parameters; rows of U from its diagonal on."""
 
     names: list[str]
     units: list[str]
@@ -155,7 +155,7 @@ class ParametersPart(Struct):
 
 
 class FramePart(Struct):
-    """Where a sensor's frame N is in R; std of shifts of R at its origin, and of its turns."""
+    """Pose of a sensor's frame N in R; std of shifts at the origin of R, and of rotations."""
 
     translation_m: Triple
     rotation_xyzw: tuple[float, float, float, float]
@@ -164,14 +164,14 @@ class FramePart(Struct):
 
 
 class MarkerPart(Struct):
-    """Where a marker is in T."""
+    """Position of a marker in T."""
 
     position_m: Triple
     std_m: Triple
 
 
 class MountPart(Struct):
-    """How a sensor stands on the tool: its origin at a marker, and its turn in T where known."""
+    """Sensor on the tool: its origin is at a marker; its rotation in T, if known."""
 
     marker: str
     rotation_xyzw: tuple[float, float, float, float] | UnsetType = UNSET
@@ -179,7 +179,7 @@ class MountPart(Struct):
 
 
 class LeftPart(Struct):
-    """What is not corrected."""
+    """An effect that is not corrected."""
 
     effect: str
     joints: list[int]
@@ -189,7 +189,7 @@ class LeftPart(Struct):
 
 
 class CompensationPart(Struct):
-    """The file."""
+    """Content of the file."""
 
     format: str
     robot: RobotPart
@@ -207,28 +207,28 @@ class CompensationPart(Struct):
     base_terms: list[TermPart] = []
     temperature: TemperaturePart | None = None
     controller: Controller | None = None
-    # Sensors on the tool, whose `base_frame` is that of what they see; files of earlier versions
-    # do not tell.
+    # Sensors on the tool, whose `base_frame` is the pose of the target that they see; unset in
+    # files of earlier versions.
     on_tool: dict[str, MountPart] | UnsetType = UNSET
 
     def per_joint(self, what: str, chain: SerialChain) -> FloatArray:
-        """Return offset or range of every joint, rad, m of those that slide, (k, ...)."""
+        """Offset or range of each joint, rad, m for prismatic ones, (k, ...)."""
         parts = zip(self.joints, chain.units, strict=True)
         return np.array([getattr(part, f'{what}_{unit}') for part, unit in parts])
 
 
 @dataclass(frozen=True, eq=False)
 class Compensation:
-    """What a file holds."""
+    """A correction read from a file."""
 
-    path: Path  # Where it was read from
+    path: Path
     compensator: Compensator  # The correction, ready to use
-    content: CompensationPart  # As it stands in the file
-    sha256: str  # Of the file
+    content: CompensationPart  # Content of the file
+    sha256: str  # Hash of the file
 
     @property
     def model(self) -> ArmModel:
-        """The arm as it was found to be."""
+        """The calibrated arm."""
         return self.compensator.model
 
     def command(self, q: Any, temperature_c: Any = None) -> FloatArray:
@@ -258,7 +258,7 @@ _FRAMES = (
 
 
 def written(
-    described: Described,
+    described: CorrectedArm,
     urdf: str,
     made_by: Source,
     hashes: tuple[str, str],
@@ -266,22 +266,22 @@ def written(
     controller: Controller | None = None,
     on_tool: Mapping[str, MountPart] | None = None,
 ) -> str:
-    """Return the text of compensation.json.
+    """Text of compensation.json.
 
     Parameters
     ----------
     described
-        The arm, and what is left.
+        Model of the arm, and the effects that are not corrected.
     urdf
-        The nominal robot's.
+        Text of the nominal robot.
     made_by
-        Which command.
+        Command that made the result.
     hashes
         SHA-256 of the result's file and of observations.csv.
     state
-        Of the controller while it was measured.
+        State of the controller during the measurements.
     controller
-        How the robot's own pad writes the joints.
+        How the robot's own pad counts the joints.
     on_tool
         Sensors that are on the tool.
     """
@@ -293,8 +293,8 @@ def written(
     kept, root = _triangle(model.root)
     error: ErrorPart | UnsetType = UNSET
     if model.error_root is not None:
-        apart, error_root = _triangle(model.error_root)
-        error = ErrorPart([model.parameter_names[i] for i in apart], error_root)
+        error_columns, error_root = _triangle(model.error_root)
+        error = ErrorPart([model.parameter_names[i] for i in error_columns], error_root)
     content = CompensationPart(
         format=FORMAT,
         robot=RobotPart(
@@ -378,27 +378,34 @@ def written(
 
 
 def _in_unit(unit: str, offset: float, both: tuple[float, float]) -> dict[str, Any]:
+    """Keys and values of the offset and range of a joint in its unit."""
     return {f'offset_{unit}': offset, f'range_{unit}': both}
 
 
 def _triangle(root: FloatArray) -> tuple[IntArray, list[list[float]]]:
-    """Return which parameters a root (r, p) has, and its rows from the diagonal on."""
+    """Columns of a root (r, p) that are not zero.
+
+    Last result: rows of its triangle from the diagonal on.
+    """
     kept = np.flatnonzero(np.any(root != 0.0, axis=0))
     rows = np.asarray(np.linalg.qr(root[:, kept], 'r')).tolist()
     return kept, [[float(f'{v:.{DIGITS}g}') for v in row[i:]] for i, row in enumerate(rows)]
 
 
 def _taken_at(driver: Driver) -> Literal['reported', 'with_offset']:
+    """Angle at which a driver is evaluated."""
     return 'with_offset' if driver.startswith('gravity') else 'reported'
 
 
 def _knots_key(driver: Driver, joint: int, chain: SerialChain) -> str:
+    """Key of a spline's knots, which has the unit of the angle."""
     return f'knots_{chain.units[joint]}' if driver == 'angle' else 'knots'
 
 
 def _term(
     effect: str, function: Function, coefficients: FloatArray, chain: SerialChain
 ) -> TermPart:
+    """Term of the file for a function."""
     part = TermPart(effect, function.driver, function.form, coefficients.tolist())
     if function.driver != 'none':
         part.driver_at = _taken_at(function.driver)
@@ -415,6 +422,7 @@ def _term(
 
 
 def _origins(geometry: Geometry, names: Sequence[str]) -> list[OriginPart]:
+    """Origins of the file that are changed."""
     return [
         OriginPart(name, _triple(shift), _triple(turn))
         for name, shift, turn in zip(
@@ -452,7 +460,7 @@ def read_compensation(path: str | os.PathLike[str]) -> Compensation:
 
 
 def of_text(data: bytes, path: Path) -> Compensation:
-    """Return what the text of a compensation.json holds; ``path`` is for messages.
+    """Compensation from the text of a compensation.json; ``path`` is for messages.
 
     Raises InputError as `read_compensation` does.
     """
@@ -471,7 +479,7 @@ def of_text(data: bytes, path: Path) -> Compensation:
 
 
 def _refuse_huge(content: CompensationPart) -> None:
-    """Refuse numbers that no arm has, whose products overflow."""
+    """Raise InputError for numbers beyond any arm's, whose products would overflow."""
     parts = msgspec.to_builtins(content)
     # What the controller reported is shown, never computed with.
     del parts['state']
@@ -487,13 +495,13 @@ def _refuse_huge(content: CompensationPart) -> None:
 
 
 class _AnyFile(Struct):
-    """What every JSON file of this program has."""
+    """The key that each JSON file of this program has."""
 
     format: str = ''
 
 
 def _other_format(data: bytes) -> str:
-    """Return which other file of this program it is; '' where that is not known."""
+    """Sentence that the file has another format of this program; '' if unknown."""
     try:
         given = msgspec.json.decode(data, type=_AnyFile).format
     except (msgspec.DecodeError, RecursionError):
@@ -503,6 +511,7 @@ def _other_format(data: bytes) -> str:
 
 
 def _not_one(path: Path, why: str) -> InputError:
+    """InputError that the file is no compensation.json."""
     return InputError(
         f'{path}: this is no {COMPENSATION_FILE} of remaster ({why}); give the one in the folder '
         'apply that fit, discover or report has written'
@@ -510,6 +519,7 @@ def _not_one(path: Path, why: str) -> InputError:
 
 
 def _model(content: CompensationPart) -> ArmModel:
+    """Model of the arm in a file. Raises InputError for contents that contradict each other."""
     robot = content.robot
     if hashlib.sha256(robot.urdf.encode()).hexdigest() != robot.urdf_sha256:
         raise _broken('robot.urdf', 'is not the text whose hash is urdf_sha256')
@@ -586,9 +596,11 @@ def _model(content: CompensationPart) -> ArmModel:
         raise _broken('base_frame and tool', 'are empty')
     if model.grows and warm is None:
         raise _broken('temperature', 'is missing, but something depends on it')
-    steepest = model.steepest()
-    if not steepest < 1.0:
-        what = f'change an angle by up to {steepest:.3g} rad per rad, which no command takes off'
+    largest_slope = model.largest_slope()
+    if not largest_slope < 1.0:
+        what = (
+            f'change an angle by up to {largest_slope:.3g} rad per rad, which no command takes off'
+        )
         raise _broken('joints', what)
     found = content.parameters
     root = _root(model, 'parameters', found.names, 'covariance_root', found.covariance_root)
@@ -602,7 +614,7 @@ def _model(content: CompensationPart) -> ArmModel:
 def _root(
     model: ArmModel, part: str, names: Sequence[str], key: str, rows: Sequence[Sequence[float]]
 ) -> FloatArray:
-    """Return an upper triangle of some parameters as one of all, (r, p)."""
+    """Matrix of all parameters, (r, p), from the upper triangle of some of them."""
     order = {name: i for i, name in enumerate(model.parameter_names)}
     strangers = [name for name in names if name not in order]
     count = len(names)
@@ -621,6 +633,7 @@ def _root(
 def _function(
     part: TermPart, where: str, chain: SerialChain, axes: int
 ) -> tuple[Function, FloatArray]:
+    """Function and coefficients of a term; `axes` is their number for each feature."""
     joint, names = -1, chain.joint_names
     if part.driver in ('angle', 'gravity_torque'):
         if part.driver_joint not in names:
@@ -660,6 +673,7 @@ def _function(
 
 
 def _geometry(origins: Sequence[OriginPart], names: Sequence[str]) -> Geometry:
+    """Changes of the origins of all joints and of the tool."""
     found = Geometry.none(len(names))
     every = (*names, 'tool')
     for part in origins:
@@ -671,4 +685,5 @@ def _geometry(origins: Sequence[OriginPart], names: Sequence[str]) -> Geometry:
 
 
 def _broken(where: str, what: str) -> InputError:
+    """InputError on a part of the file."""
     return InputError(f'{where} {what}; write the file again with fit or discover')

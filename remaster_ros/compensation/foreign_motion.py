@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Trajectories of other planners, corrected on their way to the controller, and the way back.
+"""Correction of other planners' trajectories on their way to the controller, and the inverse.
 
-A planner that knows nothing of a correction plans for the nominal arm. It must be told where that
-would have to be to have its tool where the arm has it (`TrueAngles`); what it then wants is
-corrected and handed to the motion gate (`passed_on`). Both ways fit: what is planned from the
-angles it was told begins where the arm is.
+A planner that knows nothing of a correction plans for the nominal arm. It must be given the angles
+at which the nominal arm would have its tool where the arm has it (`TrueAngles`); the trajectory
+that it then wants is corrected and handed to the motion gate (`corrected_for_controller`). The two
+directions are consistent: a plan from the given angles begins where the arm is.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ import numpy as np
 from remaster_ros.compensation.compensator import Compensator
 from remaster_ros.compensation.in_use import CorrectionInUse
 from remaster_ros.compensation.trajectories import (
+    ArmNow,
     DrawnPath,
-    Now,
     corrected_points,
     corrected_trajectory,
     largest_speeds,
@@ -37,55 +37,58 @@ from remaster_ros.motion.trajectory import Waypoint
 from remaster_ros.types import BoolArray, FloatArray
 
 SPEED_TOLERANCE = 0.01
-"""A planner's speeds may exceed the limits by this share: its splines are sampled."""
+"""Share by which a planner's speeds may exceed the limits, since its splines are sampled."""
 REST_RAD_S = 1e-7
-"""An end speed that is rounding, rad/s: joint_trajectory_controller takes no larger one (the
-resolution of a float)."""
+"""Largest end speed that counts as rest, rad/s: joint_trajectory_controller accepts no larger one
+(the resolution of a float)."""
 NEAR_RAD = 2e-4
-"""So near to angles whose correction is known it is taken as it is there, rad: it changes by some
-hundredths of the way. So near to the end of a trajectory the arm has arrived: it stands still."""
+"""Distance from angles with a known correction within which that correction is reused, rad: it
+changes by some hundredths of the distance. Within this distance of the end of a trajectory the arm
+has arrived."""
 KNOWN_RAD = 1e-7
-"""It is known where a further step changes less, rad: an encoder of 23 bits reads 7e-7."""
+"""A correction is known if a further step changes it by less, rad: an encoder of 23 bits resolves
+7e-7."""
 PLACES = 33
-"""A stretch of a path is looked at in so many places."""
+"""Number of samples on a stretch of a path."""
 LONGEST_S = 3600.0
-"""No trajectory of a planner takes longer, s: an hour. Switching waits for its end, and a slip of
-the unit is a thousand times as long."""
+"""Longest trajectory of a planner, s: an hour. Switching waits for its end, and a mistake of the
+unit makes it a thousand times as long."""
 EVERY_S = 0.02
-"""While the arm moves the correction of reported angles is found anew so often, s."""
+"""Interval at which the correction of reported angles is computed while the arm moves, s."""
 ADDED_RAD_S = 0.5
-"""So fast it changes at the most, rad/s: from one bound of its budget to the other in 0.14 s. It
-changes by some hundredths of the way, and joints go at a few radians a second."""
+"""Largest rate of change of the correction, rad/s: from one bound of its budget to the other in
+0.14 s. It changes by some hundredths of the way, and joints go at a few radians a second."""
 MOST_REACH_S = 0.2
-"""What was found longer ago is changed no further at once, s: reports that failed to come."""
+"""Longest time, s, over which the correction may change in one step, if reports failed to come."""
 
 
 @dataclass(frozen=True)
 class Trajectory:
-    """A planner's trajectory: n points of k joints in the arm's order."""
+    """Trajectory of a planner: n points of k joints in the arm's order."""
 
-    times_s: FloatArray  # From its start, (n,)
-    # rad and rad/s, (n, k); velocities are None where the controller draws lines
+    times_s: FloatArray  # Times from its start, (n,)
+    # rad and rad/s, (n, k); velocities are None if the controller draws lines
     positions: FloatArray
     velocities: FloatArray | None
 
 
 @dataclass(frozen=True)
-class Passed:
-    """What is sent in place of a planner's trajectory."""
+class SentTrajectory:
+    """Trajectory that is sent to the controller in place of a planner's."""
 
-    admitted: Admitted  # What the gate has let pass
-    end_s: float  # When it ends, from its start
-    # Where the arm was when this was worked out, rad and rad/s, (k,) each, and whether it stood
+    admitted: Admitted  # Waypoints that the gate has admitted
+    end_s: float  # Time of its end from its start, s
+    # Position and velocity of the arm at the computation, rad and rad/s, (k,) each, and whether it
+    # stood
     start: FloatArray
     velocity: FloatArray
     stood: bool
-    notes: tuple[str, ...] = ()  # What a person is to know of it, a line each
-    # What is commanded at its end, and what was wanted there, rad, (k,); None where it is held
+    notes: tuple[str, ...] = ()  # Remarks for a person, a line each
+    # Command at its end, and wanted angles there, rad, (k,); None if the arm is held
     end: tuple[FloatArray, FloatArray] | None = None
 
-    def places(self, since_s: float, until_s: float) -> FloatArray:
-        """Return where the controller leads the arm between two times from its start, (n, k)."""
+    def samples(self, since_s: float, until_s: float) -> FloatArray:
+        """Positions on the path between two times from its start, rad, (n, k)."""
         waypoints = self.admitted.waypoints
         times = np.array([0.0, *(point.time_s for point in waypoints)])
         q = np.array([self.start, *(point.q for point in waypoints)])
@@ -98,8 +101,8 @@ class Passed:
         return drawn.at(np.clip(between, times[first], times[-1]))
 
 
-class Present:
-    """Where an arm is by its last reports, how fast, and whether it stands."""
+class ArmReports:
+    """Position and velocity of an arm by its last reports, and whether it stands."""
 
     def __init__(self) -> None:
         self._reports: deque[tuple[float, FloatArray]] = deque()
@@ -107,10 +110,10 @@ class Present:
         self._still_rad = SettleRules().still_tolerance
 
     def take(self, stamp_s: float, q: FloatArray, wall_s: float) -> None:
-        """Take a report: its stamp, positions, rad, (k,), and when it came.
+        """Add a report: its stamp, positions, rad, (k,), and the wall time of its arrival.
 
-        One of the same time is the one before again; an earlier one begins anew: a clock was set
-        back.
+        A report with the stamp of the one before is ignored. An earlier stamp clears all reports
+        before, since a clock was set back.
         """
         reports = self._reports
         if reports and stamp_s == reports[-1][0]:
@@ -122,29 +125,29 @@ class Present:
             reports.popleft()
         self._wall_s = wall_s
 
-    def snapshot(self) -> Present:
-        """Return it as it is now, for another thread."""
-        taken = Present()
+    def snapshot(self) -> ArmReports:
+        """Copy of the reports for another thread."""
+        taken = ArmReports()
         taken._reports, taken._wall_s = self._reports.copy(), self._wall_s
         return taken
 
     def is_fresh(self, wall_s: float) -> bool:
-        """Whether the last report still shows where the arm is."""
+        """Whether the last report is recent enough to show the arm's position."""
         return wall_s - self._wall_s <= FRESH_S
 
     @property
     def q(self) -> FloatArray:
-        """Where it is, rad, (k,)."""
+        """Last reported position, rad, (k,)."""
         return self._reports[-1][1]
 
     @property
     def is_known(self) -> bool:
-        """Whether there are two reports, which it takes to know how fast it is."""
+        """Whether there are two reports, from which a velocity can be computed."""
         return len(self._reports) > 1
 
     @property
     def velocity(self) -> FloatArray:
-        """How fast, rad/s, (k,): none at all where it stands."""
+        """Velocity, rad/s, (k,): exactly 0 if the arm stands."""
         if self.stands:
             return np.zeros_like(self.q)
         (before_s, before), (stamp_s, q) = self._reports[-2], self._reports[-1]
@@ -152,7 +155,7 @@ class Present:
 
     @property
     def stands(self) -> bool:
-        """Whether it has not moved for `following.STANDING_S`."""
+        """Whether the arm has not moved for `following.STANDING_S`."""
         reports = self._reports
         if not reports or reports[-1][0] - reports[0][0] < STANDING_S:
             return False
@@ -162,34 +165,32 @@ class Present:
 class TrueAngles:
     """Angles of the nominal arm with its tool where the arm has it, report by report.
 
-    They go on from report to report: near singularities, where several do, no other ones are told
-    while the arm moves on. Where the arm comes to rest at the end of a trajectory they are what
-    the planner wanted there.
-
-    ``compensator``: the correction.
+    They are continuous from report to report: near singularities, where several solutions exist,
+    the branch is kept while the arm moves. When the arm comes to rest at the end of a trajectory,
+    they are the angles that the planner wanted there. ``compensator``: the correction.
     """
 
     def __init__(self, compensator: Compensator) -> None:
         self._compensator = compensator
-        # What is to be added to reported angles, rad, where that was found, and when (s).
+        # Correction of reported angles, rad; the angles and the time, s, of its computation.
         self.added: FloatArray = np.zeros(compensator.model.joints)
         self._at: FloatArray | None = None
         self._warm: float | None = None
         self._found_s = -np.inf
         self._is_known = False
-        # Where the last trajectory leads: what is commanded there, and what was wanted, (k,)
+        # Command and wanted angles at the end of the last trajectory, (k,)
         self._end: tuple[FloatArray, FloatArray] | None = None
 
-    def lead(self, passed: Passed) -> None:
-        """Take what is sent to the controller: there the planner expects what it has wanted."""
+    def lead(self, passed: SentTrajectory) -> None:
+        """Note the trajectory that is sent: at its end the planner expects its wanted angles."""
         self._end, self._is_known = passed.end, False
 
     def at(self, q: FloatArray, temperature_c: float | None, now_s: float) -> FloatArray:
-        """Return them for reported angles, rad, (k,).
+        """Nominal arm's angles for reported angles, rad, (k,).
 
-        What is added is found anew at most every `EVERY_S` while the arm moves and until it is
-        known where it stands, and goes there at `ADDED_RAD_S` at the most. Between, it is off by
-        the way in that time times the slope of the correction.
+        The correction is computed at most every `EVERY_S` while the arm moves, and until it is
+        known where the arm stands; it changes by `ADDED_RAD_S` at most. Between computations it is
+        off by the way in that time times the slope of the correction.
         """
         if self._at is None:
             self.added, self._is_known = self._compensator.true(q, temperature_c) - q, True
@@ -221,34 +222,35 @@ class TrueAngles:
         return q + self.added
 
 
-def passed_on(
+def corrected_for_controller(
     wanted: Trajectory,
-    arm: Present,
+    arm: ArmReports,
     gate: ForeignGate,
     correction: CorrectionInUse,
     tolerance_m: float,
     temperature_c: float | None = None,
-    told: FloatArray | None = None,
-) -> Passed:
-    """Return what to send to the controller for a planner's trajectory.
+    believed_q: FloatArray | None = None,
+) -> SentTrajectory:
+    """Trajectory to send to the controller for a planner's trajectory.
 
-    From where the arm stands on, points are added and time is stretched as
-    `trajectories.corrected_trajectory` does. While it moves the points alone are corrected: how
-    the controller comes to the first of them is its own.
+    If the arm stands, points are added and time is stretched as
+    `trajectories.corrected_trajectory` does. If it moves, only the points are corrected: how the
+    controller gets to the first of them is its own. ``wanted``: the trajectory, which begins at
+    once; without points: hold the arm; ``arm``: its reports; ``gate``: checks the trajectory that
+    is sent; ``correction``: may be one that corrects nothing; ``tolerance_m``: largest distance of
+    the tool from the wanted path between points, m; ``temperature_c``: of the arm; ``believed_q``:
+    position of the arm that the planner was given, rad, (k,); None for that of `Compensator.true`.
 
-    ``wanted``: the trajectory, which begins at once; of no points: the arm is to be held; ``arm``:
-    where it is now; ``gate``: checks what is sent; ``correction``: may be one that corrects
-    nothing; ``tolerance_m``: how far the tool may leave the wanted path between points, m;
-    ``temperature_c``: of the arm; ``told``: where the planner was told that the arm is, rad, (k,);
-    as `Compensator.true` has it where None.
-    Raises InputError: the trajectory is refused; one line.
+    Raises InputError, in one line, if the trajectory is refused.
     """
     if not len(wanted.times_s):
         return _passed(gate.admit((), arm.q, arm.velocity), 0.0, arm, [])
     _refuse_bad_numbers(wanted)
-    if told is None:
-        told = correction.compensator.true(arm.q, temperature_c)
-    t, q, v, notes = _corrected(wanted, arm, gate, correction, tolerance_m, temperature_c, told)
+    if believed_q is None:
+        believed_q = correction.compensator.true(arm.q, temperature_c)
+    t, q, v, notes = _corrected(
+        wanted, arm, gate, correction, tolerance_m, temperature_c, believed_q
+    )
     velocities = np.zeros_like(q) if v is None else v.copy()
     if np.abs(velocities[-1]).max() <= REST_RAD_S:
         velocities[-1] = 0.0
@@ -271,14 +273,16 @@ def passed_on(
 def _passed(
     admitted: Admitted,
     end_s: float,
-    arm: Present,
+    arm: ArmReports,
     notes: list[str],
     end: tuple[FloatArray, FloatArray] | None = None,
-) -> Passed:
-    return Passed(admitted, end_s, arm.q, arm.velocity, arm.stands, tuple(notes), end)
+) -> SentTrajectory:
+    """Trajectory to send, with the state of the arm at its computation."""
+    return SentTrajectory(admitted, end_s, arm.q, arm.velocity, arm.stands, tuple(notes), end)
 
 
 def _refuse_bad_numbers(wanted: Trajectory) -> None:
+    """Raise InputError for numbers that are not finite, and for times out of order or range."""
     t, q, v = wanted.times_s, wanted.positions, wanted.velocities
     if not all(np.all(np.isfinite(one)) for one in (t, q, v) if one is not None):
         raise InputError('a number of it is not finite')
@@ -291,7 +295,10 @@ def _refuse_bad_numbers(wanted: Trajectory) -> None:
 def _refuse_too_fast(
     t: FloatArray, q: FloatArray, v: FloatArray | None, limits: MotionLimits
 ) -> None:
-    """Refuse what a planner wants itself beyond the limits; time is stretched for ours alone."""
+    """Raise InputError if the planner's own speeds exceed the limits.
+
+    Only ours are slowed down.
+    """
     largest = largest_speeds(t, q, v)
     if np.any(largest > limits.velocity * (1.0 + SPEED_TOLERANCE)):
         joint = int(np.argmax(largest / limits.velocity))
@@ -303,27 +310,27 @@ def _refuse_too_fast(
 
 def _corrected(
     wanted: Trajectory,
-    arm: Present,
+    arm: ArmReports,
     gate: ForeignGate,
     correction: CorrectionInUse,
     tolerance_m: float,
     temperature_c: float | None,
-    told: FloatArray,
+    believed_q: FloatArray,
 ) -> tuple[FloatArray, FloatArray, FloatArray | None, list[str]]:
-    """Return times, positions, velocities and notes of what is to be sent."""
+    """Times, positions, velocities and remarks of the trajectory to send."""
     compensator, t, q, v = (
         correction.compensator, wanted.times_s, wanted.positions, wanted.velocities,
     )  # fmt: skip
     notes: list[str] = []
     begins_at_once = t[0] <= 0.0
     if not (arm.stands or begins_at_once):
-        now = Now(arm.q, told, arm.velocity)
+        now = ArmNow(arm.q, believed_q, arm.velocity)
         limits = gate.limits.acceleration
         done, v = corrected_points(compensator, t, q, v, now, limits, temperature_c)
         _refuse_too_large(correction, done.command - q)
         return t, done.command, v, _notes(done.residual_m, done.incomplete, done.outside_range)
     if not begins_at_once:
-        t, q = np.concatenate(([0.0], t)), np.concatenate((told[None], q))
+        t, q = np.concatenate(([0.0], t)), np.concatenate((believed_q[None], q))
         v = None if v is None else np.concatenate((np.zeros((1, q.shape[1])), v))
     if len(t) == 1:
         raise InputError('it has a single point, for now: give it a time_from_start')
@@ -337,7 +344,7 @@ def _corrected(
         velocity_limits=gate.limits.velocity,
         acceleration_limits=gate.limits.acceleration,
         temperature_c=temperature_c,
-        begins=q[0] + (arm.q - told),
+        begins=q[0] + (arm.q - believed_q),
     )
     _refuse_too_large(correction, found.change)
     if found.stretched > 1.0:
@@ -353,12 +360,14 @@ def _corrected(
 
 
 def _refuse_too_large(correction: CorrectionInUse, change: FloatArray) -> None:
+    """Raise InputError if the correction changes a joint by too much."""
     refused = correction.too_large(change)
     if refused:
         raise InputError(next(iter(refused.values())))
 
 
 def _notes(residual_m: FloatArray, incomplete: BoolArray, outside: BoolArray) -> list[str]:
+    """Remarks on points near a singularity or beyond a measured range."""
     notes = []
     if count := int(np.sum(incomplete)):
         notes.append(

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A correction of what an arm is commanded, and where the arm then is.
+"""A correction applied to all commands of an arm, and the true arm for checking paths.
 
-It is held against the arm first: one of another robot, or one that changes a joint by more than
-any mastering is off by, is refused before anything moves. Paths are to be checked for the true
-arm: zero-offsets, lengths and tilts are built into it, and what bends it by its angles and
-gravity's torques is bounded in sampled configurations.
+The correction is compared with the arm first: one of another robot, or one that changes a joint by
+more than mastering errors, is refused before anything moves. Paths are to be checked for the true
+arm: zero-offsets, lengths and tilts are built into it, and the bending by its angles and gravity's
+torques is bounded in sampled configurations.
 """
 
 from __future__ import annotations
@@ -25,52 +25,52 @@ from remaster_ros.kinematics.transforms import inverse, matrix_to_rotation_vecto
 from remaster_ros.types import BoolArray, Correction, FloatArray
 
 MOST_DEG = float(np.degrees(MOST_RAD))
-"""A joint is changed by so much at most, degrees."""
+"""Largest change of a joint, degrees."""
 KNOWN_OFFSET_RAD = float(np.deg2rad(0.1))
-"""What may still be wrong with a joint whose offset is in use, for the clearance of paths."""
+"""Least assumed error of a joint whose offset is in use, rad, for the clearance of paths."""
 OFFSET_STDS = 3.0
-"""Or so many standard deviations of the offset that is known least."""
+"""Standard deviations of the least certain offset that the clearance covers at least."""
 SAMPLED = 2000
-"""Configurations in which largest changes are looked for: they are smooth in the angles, and of
-seven joints some hundreds come near each extreme."""
+"""Configurations sampled for the largest changes: these are smooth in the angles, and with seven
+joints some hundreds of samples come near each extreme."""
 SEED = 22
 
 
 @dataclass(frozen=True, eq=False)
 class Commands:
-    """What is commanded for n wanted configurations."""
+    """Commands for n wanted configurations."""
 
-    # What to command, and how much that is from what was wanted, rad, (n, k); of a refused row the
-    # command is not a number
+    # Command, and its difference from the wanted angles, rad, (n, k); the command of a refused row
+    # is NaN
     command: FloatArray
     change: FloatArray
     refused: dict[int, str]  # Row -> why it must not be commanded
-    notes: tuple[str, ...]  # What a person is to know of a row, a line each
-    # As of a `compensator.Correction`, (n,)
+    notes: tuple[str, ...]  # Remarks on rows for a person, a line each
+    # As in `compensator.Correction`, (n,)
     incomplete: BoolArray
     outside_range: BoolArray
 
 
 class CorrectionInUse:
-    """A correction that is made of every configuration commanded.
+    """A correction applied to each commanded configuration.
 
     Parameters
     ----------
     path
         Its compensation.json, which is read now and never again.
     chain, urdf
-        The arm that is commanded, and its URDF's text; that of the file where None.
+        The arm that is commanded, and its URDF's text; None for those of the file.
     urdf_file
-        Of that, for messages.
+        Name of that URDF, for messages.
     most_deg
-        By so much a joint is changed at most, degrees.
+        Largest change of a joint, degrees.
 
     Attributes
     ----------
     sha256
-        Of the file as it was read.
+        Hash of the file as it was read.
     compensator
-        What it does.
+        The correction.
 
     Raises
     ------
@@ -112,7 +112,7 @@ class CorrectionInUse:
             )
 
     def off(self) -> CorrectionInUse:
-        """Return what corrects nothing, of the same arm."""
+        """A correction of the same arm that corrects nothing."""
         other = copy.copy(self)
         for name in ('true_arm', 'shifts', '_bends'):
             other.__dict__.pop(name, None)
@@ -122,12 +122,12 @@ class CorrectionInUse:
 
     @cached_property
     def true_arm(self) -> SerialChain:
-        """The arm with zero-offsets, lengths and tilts built in: it takes reported angles."""
+        """The arm with zero-offsets, lengths and tilts built in; it takes reported angles."""
         return self.compensator.model.rigid()
 
     @cached_property
     def _bends(self) -> FloatArray:
-        """Turn of each joint that `true_arm` has not, rad, (n, k), in sampled configurations."""
+        """Rotation at each joint that `true_arm` lacks, rad, (n, k), in sampled configurations."""
         frames = self.compensator.model.state(self._sampled).frames
         rigid = self.true_arm.frames(self._sampled)
         steps = [_steps(one) for one in (frames, rigid)]
@@ -136,27 +136,27 @@ class CorrectionInUse:
         )
         return np.asarray(np.linalg.norm(turns, axis=-1))
 
-    def unknown_rad(self, before_rad: float) -> float:
-        """Return what a joint's true angle may be off from that of `true_arm`, rad.
+    def joint_angle_bound(self, before_rad: float) -> float:
+        """Upper bound on the error of a joint's angle in `true_arm`, rad.
 
-        Clearances grow by it times the root of the sum of the squares of the levers: no bodies
-        come nearer by what turns each joint, if it is the root of the sum of the squares of these
-        turns (Cauchy and Schwarz). Turns across an axis count by the levers of other joints.
+        Clearances grow by it times the root of the sum of the squares of the levers: it bounds the
+        root of the sum of the squares of all joints' errors, so that no bodies come nearer (Cauchy
+        and Schwarz). Rotations across an axis count by the levers of other joints.
 
         Parameters
         ----------
         before_rad
-            The same without a correction: it remains where an offset could not be identified.
+            The bound without a correction, which remains if an offset could not be identified.
         """
         model = self.compensator.model
         std = model.widening * np.linalg.norm(model.root[:, : model.joints], axis=0)
         known = all(part.identifiable for part in self._compensation.content.joints)
-        left = max(KNOWN_OFFSET_RAD, OFFSET_STDS * float(std.max())) if known else before_rad
-        return left + float(np.linalg.norm(self._bends, axis=1).max())
+        bound = max(KNOWN_OFFSET_RAD, OFFSET_STDS * float(std.max())) if known else before_rad
+        return bound + float(np.linalg.norm(self._bends, axis=1).max())
 
     @cached_property
     def shifts(self) -> FloatArray:
-        """The least and the largest that is to be added to reported angles, rad, (2, k)."""
+        """Least and largest sum to be added to reported angles, rad, (2, k)."""
         model = self.compensator.model
         drivers = model.drivers(self._sampled, model.warming(len(self._sampled), None))
         added = model.added_angles(drivers)
@@ -164,7 +164,7 @@ class CorrectionInUse:
 
     @property
     def remarks(self) -> list[str]:
-        """What a person is to know of it when it is put in use, a line each."""
+        """Remarks for the person who puts the correction in use, a line each."""
         lines = []
         model, state = self.compensator.model, self._compensation.content.state
         if model.grows:
@@ -180,7 +180,7 @@ class CorrectionInUse:
         return lines
 
     def too_large(self, change: FloatArray) -> dict[int, str]:
-        """Return which rows change a joint by too much, and how, for changes (n, k), rad."""
+        """Reason for each row of changes (n, k), rad, that changes a joint by too much."""
         refused = {}
         most = np.abs(change).max(axis=1, initial=0.0)
         # A change at the bound is at it to rounding.
@@ -192,17 +192,18 @@ class CorrectionInUse:
             )
         return refused
 
-    def on_the_way(self, waypoints: FloatArray) -> tuple[FloatArray, dict[int, str]]:
-        """Return what to command for waypoints, rad, (n, k), and why some must not be.
+    def for_waypoints(self, waypoints: FloatArray) -> tuple[FloatArray, dict[int, str]]:
+        """Commands for waypoints, rad, (n, k), and the reason for each that is refused.
 
-        The true joint angles are those of the planned way, so that the arm keeps to it: no tool
-        has to be anywhere there, and near a singularity no joint goes further than it errs.
+        The true joint angles are those of the planned way, so that the arm keeps to it. Waypoints
+        need no exact tool pose, so that near a singularity no joint moves further than its own
+        error.
         """
         change = self.compensator.angle_errors(waypoints)
         return waypoints + change, self.too_large(change)
 
     def commands(self, wanted: FloatArray) -> Commands:
-        """Return what to command for wanted configurations, rad, (n, k)."""
+        """Commands for wanted configurations, rad, (n, k)."""
         finite = np.all(np.isfinite(wanted), axis=-1)
         done = self.compensator.correct(np.where(finite[:, None], wanted, 0.0))
         change = done.command - wanted
@@ -223,7 +224,7 @@ class CorrectionInUse:
                     'measured: its end value is taken'
                 )
         command = done.command.copy()
-        # No check lets it pass either.
+        # NaN fails each later check as well.
         command[list(refused)] = np.nan
         incomplete, outside = done.incomplete & finite, done.outside_range & finite
         return Commands(command, change, refused, tuple(notes), incomplete, outside)
@@ -232,6 +233,7 @@ class CorrectionInUse:
 def _refuse_another_arm(
     found: Compensation, chain: SerialChain, urdf: str, urdf_file: str
 ) -> None:
+    """Raise InputError if the correction is of another URDF, other links or joints."""
     robot = found.content.robot
     sha256 = hashlib.sha256(urdf.encode()).hexdigest()
     if robot.urdf_sha256 != sha256:
@@ -252,14 +254,14 @@ def _refuse_another_arm(
 
 
 def _sampled(chain: SerialChain) -> FloatArray:
-    """Return configurations within the limits, rad, (n, k)."""
+    """Random configurations within the limits, rad, (n, k)."""
     lower = np.where(np.isfinite(chain.lower), chain.lower, -np.pi)
     upper = np.where(np.isfinite(chain.upper), chain.upper, np.pi)
     return np.random.default_rng(SEED).uniform(lower, upper, (SAMPLED, len(chain)))
 
 
 def _steps(frames: FloatArray) -> FloatArray:
-    """Return each joint's frame in the one before, (n, k, 4, 4)."""
+    """Frame of each joint in the one before, (n, k, 4, 4)."""
     found: FloatArray = np.concatenate(
         (frames[:, :1], inverse(frames[:, :-1]) @ frames[:, 1:]), axis=1
     )

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Position accuracy and repeatability of a session whose visits are those that ISO 9283 asks for.
+"""Position accuracy and repeatability of a session with the visits that ISO 9283 requires.
 
 References
 ----------
@@ -15,7 +15,7 @@ import numpy as np
 
 from remaster_ros.calibration.registration import register_points
 from remaster_ros.compensation.arm_model import ArmModel
-from remaster_ros.compensation.checking import Measured, together
+from remaster_ros.compensation.checking import Measured, is_same_pose
 from remaster_ros.kinematics.transforms import apply
 from remaster_ros.types import FloatArray
 
@@ -24,18 +24,18 @@ CYCLES = 30
 
 
 @dataclass(frozen=True, eq=False)
-class Visited:
-    """What the sensor and the marker that saw most say of repeated visits."""
+class IsoFigures:
+    """Accuracy and repeatability by the sensor and marker with most readings."""
 
-    # Of each configuration, most first, (p,). Readings one after the other are one visit.
+    # Visits of each configuration, most first, (p,). Consecutive readings are one visit.
     visits: tuple[int, ...]
-    # AP and RP of each of the configurations with `CYCLES` visits, m; empty where fewer than
-    # `POSES` have so many
+    # AP and RP of each configuration with `CYCLES` visits, m; empty if fewer than `POSES` have so
+    # many
     accuracy_m: FloatArray
     repeatability_m: FloatArray
 
     def text(self) -> str:
-        """Return the figures, or what is missing, in a sentence."""
+        """The figures, or what is missing for them, in a sentence."""
         if len(self.accuracy_m):
             return (
                 f'ISO 9283, {len(self.accuracy_m)} poses of {CYCLES} visits and more: accuracy '
@@ -52,18 +52,18 @@ class Visited:
         )
 
 
-def visited(model: ArmModel, measured: Measured, wanted: FloatArray | None) -> Visited:
-    """Return accuracy and repeatability of repeated visits.
+def iso_figures(model: ArmModel, measured: Measured, wanted: FloatArray | None) -> IsoFigures:
+    """Accuracy and repeatability of repeated visits.
 
     Parameters
     ----------
     model
-        The marker on the tool is taken from it, the arm as it is drawn: what is asked is how far
-        from the pose that was commanded the tool came.
+        Gives the marker on the tool and the nominal arm: the error is that from the commanded
+        pose.
     measured
         Readings in the order in which they were taken.
     wanted
-        Joints before any correction, rad, (n, k), NaN where nothing was corrected; or None.
+        Joints before any correction, rad, (n, k), NaN if nothing was corrected; or None.
     """
     pairs = list(zip(measured.sensor, measured.marker, strict=True))
     most = max(dict.fromkeys(pairs), key=pairs.count)
@@ -75,7 +75,7 @@ def visited(model: ArmModel, measured: Measured, wanted: FloatArray | None) -> V
     last = -1
     for row, angles in enumerate(q):
         known = np.array(places).reshape(-1, len(angles))
-        near = np.flatnonzero(together(model.chain, known, angles))
+        near = np.flatnonzero(is_same_pose(model.chain, known, angles))
         at = int(near[0]) if len(near) else len(places)
         if not len(near):
             places.append(angles)
@@ -88,7 +88,7 @@ def visited(model: ArmModel, measured: Measured, wanted: FloatArray | None) -> V
     counts = tuple(sorted(map(len, visits), reverse=True))
     enough = [each for each in visits if len(each) >= CYCLES]
     if len(enough) < POSES:
-        return Visited(counts, np.empty(0), np.empty(0))
+        return IsoFigures(counts, np.empty(0), np.empty(0))
     attained = [np.array([position[rows].mean(axis=0) for rows in each]) for each in enough]
     centres = np.array([points.mean(axis=0) for points in attained])
     rows = [np.concatenate(each) for each in enough]
@@ -99,7 +99,7 @@ def visited(model: ArmModel, measured: Measured, wanted: FloatArray | None) -> V
         np.linalg.norm(some - centre, axis=1)
         for some, centre in zip(attained, centres, strict=True)
     ]
-    return Visited(
+    return IsoFigures(
         counts,
         np.linalg.norm(apply(T_R_N, centres) - points, axis=1),
         np.array([each.mean() + 3.0 * each.std(ddof=1) for each in distances]),

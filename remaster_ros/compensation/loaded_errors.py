@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is left of a session with a file that a robot can load: by that very file.
+"""Errors of a session with a file that a robot can load, computed with that very file.
 
-Whatever a result has in memory, its figure is that of what is written: with the offsets that are
-not applied left out, the base and the marker that belong to the file, and nothing that it has no
+The figure of a result is then that of the written file: without the offsets that are not applied,
+with the base and the marker that belong to the file, and without anything that the file has no
 place for.
 """
 
@@ -23,9 +23,9 @@ from remaster_ros.types import FloatArray, Measurements, Session
 
 
 def errors_with_urdf(session: Session, urdf: str, gross: Sequence[int] = ()) -> FloatArray:
-    """Return the error of every row with a robot model as it is, m, (n, 3).
+    """Errors of all rows with the model of a URDF, m, (n, 3).
 
-    Registrations and markers are fitted to the optimization rows, but for ``gross``: their
+    Registrations and markers are fitted to the optimization rows, except ``gross``: their
     ``observation``.
     """
     session = replace(session, urdf=urdf)
@@ -37,10 +37,10 @@ def errors_with_urdf(session: Session, urdf: str, gross: Sequence[int] = ()) -> 
 
 
 def errors_with_correction(model: ArmModel, measurements: Measurements) -> FloatArray:
-    """Return the error of every row with the arm of a compensation.json, m, (n, 3).
+    """Errors of all rows with the arm of a compensation.json, m, (n, 3).
 
-    What a command leaves, near singularities, is in it; nothing is fitted. ``measurements`` have
-    the model's sensors and markers by their indices.
+    They contain the errors that a command leaves near singularities; nothing is fitted.
+    ``measurements`` have the model's sensors and markers by their indices.
     """
     m = measurements
     known = np.isfinite(m.temperature_c)
@@ -50,21 +50,21 @@ def errors_with_correction(model: ArmModel, measurements: Measurements) -> Float
     markers = np.stack(list(model.markers.values()))[m.marker]
     frames = np.stack(list(model.T_R_N.values()))[m.sensor]
     there = apply(model.state(m.q, warm).tool, markers)
-    left = apply(reached, markers) - apply(wanted, markers)
+    command_error = apply(reached, markers) - apply(wanted, markers)
     # From R to each row's sensor.
-    seen = np.einsum('nji,nj->ni', frames[:, :3, :3], there - left - frames[:, :3, 3])
+    seen = np.einsum('nji,nj->ni', frames[:, :3, :3], there - command_error - frames[:, :3, 3])
     return np.asarray(m.position - seen)
 
 
-def without_errors_of_measuring(fit: FitResult, where: slice | FloatArray) -> FloatArray:
-    """Return the positions of every row less what further parameters of a fit do, m, (n, 3).
+def without_errors_of_measuring(fit: FitResult, parameters: slice | FloatArray) -> FloatArray:
+    """Positions of all rows minus the effect of some further parameters of a fit, m, (n, 3).
 
-    ``where``: which of its further parameters, slice or mask.
+    ``parameters``: slice or mask of the further parameters, those of measurement errors.
     """
     measured = fit.session.measurements.position
     model, after = fit.predictive.model, fit.predictive.after
     z = after.copy()
-    z[model.core :][where] = 0.0
+    z[model.core :][parameters] = 0.0
     if fit.found is None or np.array_equal(z, after):
         return measured
     whole, less = (predicted_rows(fit.found.problem, model, at) for at in (after, z))

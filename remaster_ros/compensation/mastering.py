@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a person does on the robot's own pad so that a joint's zero is right, in the pad's numbers.
+"""Steps on the robot's own pad that set the zero of each joint, in the pad's numbers.
 
-In a place in which the pad shows x it has to show y = x + d afterwards, with d the offset on the
-pad (`PadAngles`): whatever the place is, and whatever the controller keeps a zero of, the motor or
-the angle that it shows. Of coupled joints the first one's new zero may change what the pad shows
-of the next. So they are all driven to their places first, and are set there one after the other
-without a move between, each behind those that are added to it.
+At a position where the pad shows x it has to show y = x + d afterwards, with d the offset on the
+pad (`PadAngles`), whatever the position is, and whether the controller stores the zero of the
+motor or of the shown angle. With coupled joints, a new zero of the first may change what the pad
+shows for the next. So they are all driven to their positions first, and are set there one after
+the other without a move between, each after those that are added to it.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from remaster_ros.kinematics.pad_angles import PadAngles
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.types import AngleUnit, BoolArray, Controller, FloatArray, PadJoint
 
-# As in `importing.units`; of digits so many that rounding is less than 0.0001 degrees.
+# Units as in `importing.units`; digits with which rounding is less than 0.0001 degrees.
 _PER_RAD = {'deg': 180.0 / np.pi, 'rad': 1.0, 'gon': 200.0 / np.pi}
 _DIGITS = {'deg': 4, 'rad': 6, 'gon': 4, 'mm': 3}
 _MM_PER_M = 1e3
-# Where the URDF's zero is out of reach the place is one of whole so many degrees, or mm.
+# If the URDF's zero is out of reach, the position is a multiple of this, degrees or mm.
 _STEP_DEG = 10.0
 _STEP_MM = 10.0
 
@@ -34,48 +34,47 @@ _STEP_MM = 10.0
 class MasteringStep:
     """One joint to be set on the pad."""
 
-    # Its name in the URDF and on the pad
-    joint: str
+    joint: str  # Name in the URDF
     pad_name: str
-    unit: AngleUnit | Literal['mm']  # Of what the pad shows; mm of a joint that slides
-    # False where the joint's own zero stays, and what the pad shows changes with another joint
+    unit: AngleUnit | Literal['mm']  # Unit on the pad; mm for a prismatic joint
+    # False if the joint's own zero stays, and the pad's number changes with a coupled joint
     determined: bool
-    # Of the URDF's joint, in degrees; in mm of a joint that slides
+    # Offset of the URDF's joint and its standard deviation, degrees; mm for a prismatic joint
     offset: float
     std: float
-    # What the pad shows in the place in which it is set, before and after, in `unit`
+    # Numbers on the pad at the position of setting, before and after, in `unit`
     drive_to: float
     set_to: float
     zero_in_reach: bool  # Whether the joint can be driven to where the pad shows 0 afterwards
 
     @property
     def slides(self) -> bool:
-        """Whether it is of a joint that slides."""
+        """Whether the joint is prismatic."""
         return self.unit == 'mm'
 
     @property
     def digits(self) -> int:
-        """Digits behind the point."""
+        """Number of decimal places."""
         return _DIGITS[self.unit]
 
     def shown(self, value: float) -> str:
-        """Return an angle as the pad shows it, with its sign."""
+        """An angle as the pad shows it, with its sign."""
         return f'{value:+.{self.digits}f}'
 
     def in_degrees(self, value: float) -> float:
-        """Return an angle of the pad's unit in degrees."""
+        """An angle of the pad's unit in degrees. Raises ValueError for a prismatic joint."""
         if self.unit == 'mm':
             raise ValueError(f'{self.joint} slides: {value} mm is no angle')
         return float(np.degrees(value / _PER_RAD[self.unit]))
 
     @property
     def is_plain(self) -> bool:
-        """Whether the pad has the URDF's name and degrees, and it is set where it is to show 0."""
+        """Whether the pad has the URDF's name and unit, and the joint is set to 0."""
         return self.pad_name == self.joint and self.unit in ('deg', 'mm') and self.set_to == 0.0
 
     @property
     def to_set_zero(self) -> str:
-        """Where to drive instead where the controller sets nothing but 0."""
+        """Number to drive to if the controller can only set 0."""
         return self.shown(self.drive_to - self.set_to)
 
 
@@ -86,16 +85,16 @@ def mastering(
     std: FloatArray,
     known: BoolArray,
 ) -> tuple[tuple[MasteringStep, ...], ...]:
-    """Return the joints to set: those of a group are all driven to first, and set in its order.
+    """Joints to set, in groups: drive to all positions of a group first, then set them in order.
 
     Parameters
     ----------
     controller
-        How the pad writes the joints; None where it writes them as the URDF does, in degrees.
+        How the pad counts the joints; None if as the URDF does, in degrees.
     chain
         The k joints of the URDF.
     offsets, std
-        Zero-offsets of the URDF's joints, rad, m of joints that slide, (k,).
+        Zero-offsets of the URDF's joints, rad, m for prismatic joints, (k,).
     known
         Whether the data determine them, (k,); the others stay as they are.
     """
@@ -142,11 +141,11 @@ def mastering(
 
     # Also a joint with a zero of its own that stays, where a coupled one's does not.
     moved = [i for i in range(len(chain)) if known[i] or change[i] != 0.0]
-    return tuple(tuple(step(i) for i in group) for group in _together(moved, pad))
+    return tuple(tuple(step(i) for i in group) for group in _coupled_groups(moved, pad))
 
 
 def _places(chain: SerialChain, offsets: FloatArray) -> FloatArray:
-    """Return true places at which the joints are set, rad or m, (k,): 0 where they can be."""
+    """True positions at which the joints are set, rad or m, (k,): 0 if it can be reached."""
     turn = np.where(chain.slides, np.inf, np.pi)
     lower, upper = np.maximum(chain.lower, -turn), np.minimum(chain.upper, turn)
     step = np.where(chain.slides, _STEP_MM / _MM_PER_M, np.radians(_STEP_DEG))
@@ -156,11 +155,11 @@ def _places(chain: SerialChain, offsets: FloatArray) -> FloatArray:
     return np.where(reached, 0.0, middle)
 
 
-def _together(joints: Sequence[int], pad: PadAngles) -> list[list[int]]:
-    """Return the joints in groups of coupled ones, each behind those that are added to it."""
+def _coupled_groups(joints: Sequence[int], pad: PadAngles) -> list[list[int]]:
+    """Groups of coupled joints, each joint after those that are added to it."""
     groups: list[list[int]] = []
     for i in joints:
-        mine = [g for g in groups if any(i in pad.coupled(j) or j in pad.coupled(i) for j in g)]
-        groups = [group for group in groups if group not in mine]
-        groups.append([i, *(j for group in mine for j in group)])
+        coupled = [g for g in groups if any(i in pad.coupled(j) or j in pad.coupled(i) for j in g)]
+        groups = [group for group in groups if group not in coupled]
+        groups.append([i, *(j for group in coupled for j in group)])
     return sorted((sorted(group, key=pad.order.index) for group in groups), key=min)

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From a fit and the cells of a discovery to the arm that they describe.
+"""Calibrated arm from a fit and the cells of a discovery.
 
-Where a cell of `discovery.effects` goes follows from its place, its driver and its form, not from
-its name: one that a newcomer adds is corrected as well, if its place, driver and form are among
-these. What does not belong to the arm, or depends on what no controller is told (the time, the
-side a joint comes from), is listed with what to do instead.
+Where a cell of `discovery.effects` goes in the model follows from its place, driver and form, not
+from its name: a new effect is corrected as well if its place, driver and form are among these.
+Effects that do not belong to the arm, or that depend on quantities that no controller knows (the
+time, the approach direction), are listed with a remedy.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.transforms import inverse, matrix_to_rotation_vector
 from remaster_ros.types import FloatArray, Measurements
 
-# Each takes away all of the difference but for what is of its second order.
+# Iterations of `_as_predicted`, each of which leaves only the second order of the difference.
 EXACT_STEPS = 2
 _DRIVERS: dict[str, Driver] = {
     'own_angle': 'angle',
@@ -55,91 +55,91 @@ _DRIVERS: dict[str, Driver] = {
 
 @dataclass(frozen=True)
 class Slot:
-    """Where in an `ArmModel` some coefficients stand."""
+    """Location of some coefficients in an `ArmModel`."""
 
     kind: str  # ``joint``, ``base``, ``geometry``, ``growth`` or ``lateral``
-    joint: int = -1  # Its index; k for the tool
-    # Of a term; None for the others
+    joint: int = -1  # Index of the joint; k for the tool
+    # Effect and function of a term; '' and None for the other kinds
     effect: str = ''
     function: Function | None = None
 
 
 @dataclass(frozen=True)
 class NotCorrected:
-    """What a correction leaves as it is."""
+    """An effect that a correction leaves."""
 
-    # As in discovery.json
-    effect: str
+    effect: str  # Name in discovery.json
     joints: tuple[int, ...]
     size_m: float  # RMS displacement of the marker over the rows of the session, m
-    # A sentence each
-    why: str
-    instead: str
+    why: str  # Reason, a sentence
+    instead: str  # Remedy, a sentence
 
 
 @dataclass(frozen=True, eq=False)
-class Described:
-    """The arm of a result, and what is not in it."""
+class CorrectedArm:
+    """Model of a corrected arm, and the effects that are not in it."""
 
-    model: ArmModel  # The arm
-    # Of each joint's offset, as of `FitResult`
+    model: ArmModel
+    # Whether each joint's offset is identifiable, and why not, as in `FitResult`
     identifiable: tuple[bool, ...]
     why: tuple[str, ...]
     # Least and largest reported angle of each joint in the rows fitted, rad or m, (k, 2)
     ranges: FloatArray
-    not_corrected: tuple[NotCorrected, ...] = ()  # What is left
+    not_corrected: tuple[NotCorrected, ...] = ()
     notes: tuple[str, ...] = field(default=())
 
 
-def offsets_alone(
-    fit: FitResult, widening: float, notes: Sequence[str] = (), geometry: Described | None = None
-) -> Described:
-    """Return the arm of a fit's zero-offsets; those that are not identifiable stay as they are.
+def arm_of_offsets(
+    fit: FitResult,
+    widening: float,
+    notes: Sequence[str] = (),
+    geometry: CorrectedArm | None = None,
+) -> CorrectedArm:
+    """Arm with the zero-offsets of a fit; offsets that are not identifiable are 0.
 
-    Registrations and markers are the most likely ones with these offsets: where a prior alone
-    tells an offset from a place of the marker, leaving out the one moves the other.
-
-    No arm is its drawing: where it stays so in the correction, the error to be expected is that
-    against the arm with all lengths and tilts, see `geometry_too`, of which ``geometry`` is.
+    Registrations and markers are the most likely ones with these offsets: if only a prior
+    separates an offset from a position of the marker, leaving out the one moves the other. If
+    ``geometry`` is given (see `arm_of_geometry`), the expected error is that against the arm with
+    all lengths and tilts, since no arm is exactly its drawing.
     """
     described = _described(fit, [], np.zeros(0), None, widening)
     model = described.model
     k, root = model.joints, model.root
     offsets = np.where(fit.identifiable, fit.joint_offsets, 0.0)
     if np.any(offsets != model.joint_offsets):
-        tied = np.linalg.pinv(root[:, :k], rcond=1e-9)
-        step = root.T @ (tied.T @ (offsets - model.joint_offsets))
-        left = root - root[:, :k] @ (tied @ root)
-        left[:, :k] = 0.0
-        model = replace(model.moved(step), joint_offsets=offsets, root=left)
+        projection = np.linalg.pinv(root[:, :k], rcond=1e-9)
+        step = root.T @ (projection.T @ (offsets - model.joint_offsets))
+        residual_root = root - root[:, :k] @ (projection @ root)
+        residual_root[:, :k] = 0.0
+        model = replace(model.with_step(step), joint_offsets=offsets, root=residual_root)
         if fit.found is not None:
             model = _as_predicted(model, fit, fit.found.problem, [])
         model = replace(model, root=root)
     if geometry is not None:
-        model = replace(model, error_root=_about(model, geometry.model))
+        model = replace(model, error_root=_second_moments_about(model, geometry.model))
     return replace(described, model=model, notes=(*described.notes, *notes))
 
 
-def _about(loaded: ArmModel, known: ArmModel) -> FloatArray:
-    """Return E, (e, p), with E' E the second moments of an arm's parameters about those loaded.
+def _second_moments_about(loaded: ArmModel, known: ArmModel) -> FloatArray:
+    """Root E, (e, p), of the second moments E' E of an arm's parameters about those loaded.
 
-    Where ``known`` is their posterior, of mean m and covariance C, it is
-    C + (m - loaded) (m - loaded)'.
+    If ``known`` is their posterior, of mean m and covariance C, the moments are C + (m - loaded)
+    (m - loaded)'.
     """
-    apart = known.parameter_means - loaded.parameter_means
+    difference = known.parameter_means - loaded.parameter_means
     for sensor, T_R_N in loaded.T_R_N.items():
         step = known.T_R_N[sensor] @ inverse(T_R_N)
         shift, turn = loaded.registration(sensor)
-        apart[shift], apart[turn] = step[:3, 3], matrix_to_rotation_vector(step[:3, :3])
-    return np.vstack((known.widening * known.root, apart))
+        difference[shift], difference[turn] = step[:3, 3], matrix_to_rotation_vector(step[:3, :3])
+    return np.vstack((known.widening * known.root, difference))
 
 
-def geometry_too(
+def arm_of_geometry(
     fit: FitResult,
     geometry: GeometryModel,
     measurements: Measurements,
-) -> Described:
-    """Return the arm with all lengths and tilts of a fit, and the zero-offsets that go with them.
+) -> CorrectedArm:
+    """Arm with all lengths and tilts of a fit, and the zero-offsets that belong to them.
 
     Its covariance is that at the mode. ``measurements`` are those that were fitted, with the
     indices of the sensors and markers that occur in them.
@@ -148,33 +148,33 @@ def geometry_too(
     posterior = mode.linearisation.posterior
     root = np.zeros((len(posterior.free), posterior.model.size))
     root[:, posterior.free] = np.linalg.cholesky(mode.covariance).T
-    # As many points as make the covariance, on either side of the mode.
+    # Sigma points: on either side of the mode, with the covariance of the posterior.
     reach = np.sqrt(len(root) - 0.5)
     draws = mode.z + np.concatenate((reach * root, -reach * root))
     # No errors of the measurement are beside the members of a fit.
     noise = posterior.noise(np.tile(mode.eta, (1, 2, 1)))
     sigma = posterior.noise_model.total_noise(noise)
-    beside = replace(
+    geometry_fit = replace(
         fit,
         predictive=Predictive(posterior.model, mode.z, draws, sigma.reshape(-1, *sigma.shape[2:])),
         noise=noise_estimates(posterior, noise),
     )
-    widening = predict(beside, measurements).widening
+    widening = predict(geometry_fit, measurements).widening
     theta = posterior.model.theta(posterior.model.natural(mode.z))
-    return _described(beside, geometry.members, theta, None, widening)
+    return _described(geometry_fit, geometry.members, theta, None, widening)
 
 
-def everything(fit: FitResult, cells: Sequence[Cell], data: Residuals) -> Described:
-    """Return the arm of a sampled model with effects; its predictions are not widened.
+def arm_of_effects(fit: FitResult, cells: Sequence[Cell], data: Residuals) -> CorrectedArm:
+    """Arm of a sampled model with effects; its predictions are not widened.
 
     Parameters
     ----------
     fit
-        With the cells' parameters as ``theta``.
+        Fit with the cells' parameters as ``theta``.
     cells
-        Of the model, in that order.
+        Cells of the model, in that order.
     data
-        What was searched.
+        Residuals in which the effects were sought.
     """
     return _described(fit, cells, fit.theta, data, 1.0)
 
@@ -185,31 +185,32 @@ def _described(
     theta: FloatArray,
     data: Residuals | None,
     widening: float,
-) -> Described:
+) -> CorrectedArm:
+    """Arm of a fit with cells and their parameters `theta`."""
     chain = fit.chain
     slots: dict[Slot, int] = {}
     maps: list[tuple[Slot, slice, FloatArray]] = []
-    left: list[tuple[Cell, slice]] = []
+    uncorrected: list[tuple[Cell, slice]] = []
     start = 0
     for cell in cells:
-        where = slice(start, start + cell.size)
+        parameters = slice(start, start + cell.size)
         start += cell.size
-        found = None if cell.of_measurement else list(placed(cell, chain))
+        found = None if cell.of_measurement else list(slots_of(cell, chain))
         if not found:
-            left.append((cell, where))
+            uncorrected.append((cell, parameters))
             continue
         for slot, matrix in found:
             slots.setdefault(slot, len(matrix))
-            maps.append((slot, where, matrix))
+            maps.append((slot, parameters, matrix))
     # The file has the terms of one joint after those of another, and counts parameters so.
     slots = dict(sorted(slots.items(), key=lambda item: item[0].joint))
     draws, mean = _draws(fit)
     values = {slot: np.zeros(size) for slot, size in slots.items()}
     spread = {slot: np.zeros((len(draws), size)) for slot, size in slots.items()}
     theta_draws = fit.predictive.model.theta(fit.predictive.draws)
-    for slot, where, matrix in maps:
-        values[slot] += matrix @ theta[where]
-        spread[slot] += theta_draws[:, where] @ matrix.T
+    for slot, parameters, matrix in maps:
+        values[slot] += matrix @ theta[parameters]
+        spread[slot] += theta_draws[:, parameters] @ matrix.T
     measurements = fit.session.measurements
     model = _model(chain, fit, values, _temperatures(measurements), widening)
     columns = _in_order(model, slots, spread, len(draws))
@@ -220,13 +221,15 @@ def _described(
     model = replace(model, root=root, joint_offsets=mean)
     if cells and fit.found is not None:
         # What has no place in the arm bends nothing of it: backlash no less than a sensor's scale.
-        model = _as_predicted(model, fit, fit.found.problem, [where for _, where in left])
-    return Described(
+        model = _as_predicted(
+            model, fit, fit.found.problem, [parameters for _, parameters in uncorrected]
+        )
+    return CorrectedArm(
         model,
         tuple(bool(known) for known in fit.identifiable),
         tuple(fit.why),
         np.stack((fitted.min(axis=0), fitted.max(axis=0)), axis=1),
-        tuple(_left(left, theta, data)) if data is not None else (),
+        tuple(_not_corrected(uncorrected, theta, data)) if data is not None else (),
         tuple(check_first(fit)),
     )
 
@@ -234,16 +237,16 @@ def _described(
 def _as_predicted(
     model: ArmModel, fit: FitResult, problem: Problem, without: Sequence[slice]
 ) -> ArmModel:
-    """Return the arm that predicts the fitted rows as the fit does without some parameters.
+    """Arm that predicts the fitted rows as the fit does, without some parameters.
 
     The fit has lengths, tilts and the like to first order, about the zero-offsets that were found
-    without them; this model has them exactly. The difference is undone within what the posterior
-    leaves open: a step C J' d / σ² with its covariance C. Where the data determine all, C is
+    without them; this model has them exactly. The difference is removed within the posterior's
+    uncertainty: a step C J' d / σ² with its covariance C. If the data determine everything, C is
     (J' J / σ²)⁻¹, and the largest eigenvalue of J C J' is σ².
     """
     z = fit.predictive.after.copy()
-    for where in without:
-        z[fit.predictive.model.core :][where] = 0.0
+    for parameters in without:
+        z[fit.predictive.model.core :][parameters] = 0.0
     rows = of_spread_poses(problem.measurements, problem.fitted)
     m = problem.measurements.select(rows)
     expected = predicted_rows(problem, fit.predictive.model, z)[rows]
@@ -254,28 +257,28 @@ def _as_predicted(
         error, parts = np.empty((len(rows), 3)), np.empty((len(rows), 3, len(model.root)))
         for i, sensor in enumerate(model.T_R_N):
             for j, marker in enumerate(model.markers):
-                mine = (m.sensor == i) & (m.marker == j)
-                if mine.any():
+                seen = (m.sensor == i) & (m.marker == j)
+                if seen.any():
                     turn = model.T_R_N[sensor][:3, :3]
                     off = expected - model.in_sensor(state, sensor, marker)
-                    error[mine] = off[mine] @ turn.T
-                    parts[mine] = (model.derivative(state, sensor, marker) @ model.root.T)[mine]
+                    error[seen] = off[seen] @ turn.T
+                    parts[seen] = (model.derivative(state, sensor, marker) @ model.root.T)[seen]
         spread = parts.reshape(-1, len(model.root))
         gram = spread.T @ spread
         step = spread.T @ error.ravel() / np.linalg.eigvalsh(gram)[-1]
-        model = model.moved(model.root.T @ step)
+        model = model.with_step(model.root.T @ step)
     return model
 
 
 def _draws(fit: FitResult) -> tuple[FloatArray, FloatArray]:
-    """Return draws of offsets, registrations and markers, (draws, p), and the mean offsets.
+    """Draws of offsets, registrations and markers, (draws, p), and the mean offsets.
 
-    Of the registrations the step from the mean, in R.
+    Registrations are steps from their mean, in R.
     """
     model, z = fit.predictive.model, fit.predictive.draws.copy()
-    # What the gauge holds is at zero, exactly.
-    held = np.flatnonzero(fit.predictive.after[: model.joints] == 0.0)
-    z[:, held] = 0.0
+    # Offsets that the gauge fixes are exactly zero.
+    fixed = np.flatnonzero(fit.predictive.after[: model.joints] == 0.0)
+    z[:, fixed] = 0.0
     x, mean = model.natural(z), model.natural(fit.predictive.after)
     steps = model.T_R_N(x) @ inverse(model.T_R_N(mean))
     turns = matrix_to_rotation_vector(steps[..., :3, :3])
@@ -295,6 +298,7 @@ def _model(
     temperatures: tuple[float, float],
     widening: float,
 ) -> ArmModel:
+    """Model with coefficients in their slots."""
     joints = len(chain)
     found = fit.predictive.model
     x = found.natural(fit.predictive.after)
@@ -332,7 +336,7 @@ def _model(
 def _in_order(
     model: ArmModel, slots: Mapping[Slot, int], spread: Mapping[Slot, FloatArray], count: int
 ) -> FloatArray:
-    """Return the draws of the model's further parameters in its order, (count, p)."""
+    """Draws of the further parameters in the order of the model, (count, p)."""
     joints = model.joints
     parts = [spread[slot] for slot in slots if slot.kind == 'joint']
     parts += [spread[slot] for slot in slots if slot.kind == 'base']
@@ -345,7 +349,7 @@ def _in_order(
 
 
 def _temperatures(measurements: Measurements) -> tuple[float, float]:
-    """Return the first known temperature, as `Context.warming` has it, and the mean, °C."""
+    """First known temperature, as in `Context.warming`, and mean temperature, °C."""
     known = np.isfinite(measurements.temperature_c)
     if not known.any():
         return np.nan, np.nan
@@ -355,10 +359,10 @@ def _temperatures(measurements: Measurements) -> tuple[float, float]:
     return float(first), float(fitted.mean() if len(fitted) else given.mean())
 
 
-def placed(cell: Cell, chain: SerialChain) -> Iterator[tuple[Slot, FloatArray]]:
-    """Give where a cell's parameters stand in an `ArmModel`; nothing where it has no place for it.
+def slots_of(cell: Cell, chain: SerialChain) -> Iterator[tuple[Slot, FloatArray]]:
+    """Yield the slots of a cell in an `ArmModel`; nothing if the model has no place for the cell.
 
-    Each place with the matrix from the cell's m parameters to its coefficients.
+    Each slot comes with the matrix from the cell's m parameters to its coefficients.
     """
     if cell.changes is not None:
         # The arm is as it was after the change.
@@ -378,6 +382,7 @@ def placed(cell: Cell, chain: SerialChain) -> Iterator[tuple[Slot, FloatArray]]:
 
 
 def _of_links(cell: Cell, chain: SerialChain) -> Iterator[tuple[Slot, FloatArray]]:
+    """Yield slots and matrices of a cell of a link."""
     zeros = np.zeros((3, cell.size))
     if cell.driver == 'gravity_moment' and cell.size == 1:
         yield Slot('lateral', cell.joints[0] - 1), np.ones((1, 1))
@@ -396,6 +401,7 @@ def _of_links(cell: Cell, chain: SerialChain) -> Iterator[tuple[Slot, FloatArray
 
 
 def _of_base(cell: Cell) -> Iterator[tuple[Slot, FloatArray]]:
+    """Yield slots and matrices of a cell of the base."""
     if cell.driver == 'gravity_moment' and cell.form == 'linear':
         axes = {'isotropic': np.ones((3, 1)), 'by axis': np.eye(3)[:, :2]}
         if cell.variant in axes:
@@ -410,7 +416,7 @@ def _of_base(cell: Cell) -> Iterator[tuple[Slot, FloatArray]]:
 
 
 def _functions(cell: Cell, joint: int) -> Iterator[tuple[Function, FloatArray]]:
-    """Give the functions that a cell's features are; ``joint`` is that of a driver without one."""
+    """Yield functions and matrices of a cell; ``joint`` is for a driver that names none."""
     if cell.happened:
         # The arm is as it was after what happened.
         if cell.form == 'step':
@@ -420,23 +426,23 @@ def _functions(cell: Cell, joint: int) -> Iterator[tuple[Function, FloatArray]]:
     driver = _DRIVERS.get(stem)
     if driver is None:
         return
-    of = -1 if driver == 'temperature' else int(given) - 1 if given else joint
+    driver_joint = -1 if driver == 'temperature' else int(given) - 1 if given else joint
     if cell.form in ('linear', 'quadratic') and cell.size == 1:
         form: Form = 'quadratic' if cell.form == 'quadratic' else 'linear'
-        yield Function(driver, form, of), np.ones((1, 1))
+        yield Function(driver, form, driver_joint), np.ones((1, 1))
     elif cell.form == 'sin/cos':
         orders = [int(part) for part in cell.variant.split('+')] if cell.variant else [1]
         if cell.size == 2 * len(orders):
             # Sine and cosine of each order, in this order.
             for i, order in enumerate(orders):
-                yield Function(driver, 'sin', of, order), np.eye(cell.size)[[2 * i]]
-                yield Function(driver, 'cos', of, order), np.eye(cell.size)[[2 * i + 1]]
+                yield Function(driver, 'sin', driver_joint, order), np.eye(cell.size)[[2 * i]]
+                yield Function(driver, 'cos', driver_joint, order), np.eye(cell.size)[[2 * i + 1]]
     elif cell.curve is not None and cell.size == len(cell.curve.places):
-        yield _splines(cell.curve, driver, of)
+        yield _splines(cell.curve, driver, driver_joint)
 
 
 def _splines(curve: Curve, driver: Driver, joint: int) -> tuple[Function, FloatArray]:
-    """Return a curve as splines, and the matrix from its free heights to all coefficients."""
+    """A curve as splines, and the matrix from its free heights to all coefficients."""
     heights = curve.heights
     if curve.closed:
         # The last splines are the first ones of the next turn.
@@ -454,19 +460,19 @@ _NOT_TOLD = (
 )
 
 
-def _left(
+def _not_corrected(
     cells: Sequence[tuple[Cell, slice]], theta: FloatArray, data: Residuals
 ) -> Iterator[NotCorrected]:
-    """Give what is not corrected, all cells of an effect at the same joints together."""
-    together: dict[tuple[str, tuple[int, ...], bool], FloatArray] = {}
+    """Yield the effects that are not corrected; cells of one effect at the same joints are one."""
+    by_effect: dict[tuple[str, tuple[int, ...], bool], FloatArray] = {}
     remedies = {}
     for cell, where in cells:
         key = (cell.name, cell.joints, cell.of_measurement or cell.place == 'marker')
-        moved = data.columns([cell]) @ theta[where]
-        together[key] = together[key] + moved if key in together else moved
+        displacement = data.columns([cell]) @ theta[where]
+        by_effect[key] = by_effect[key] + displacement if key in by_effect else displacement
         remedies[key] = EFFECTS[cell.name].remedy_of(cell)
-    for (name, joints, of_measurement), moved in together.items():
-        size = float(np.sqrt(np.mean(np.sum(moved**2, axis=-1))))
+    for (name, joints, of_measurement), displacement in by_effect.items():
+        size = float(np.sqrt(np.mean(np.sum(displacement**2, axis=-1))))
         if round(1e3 * size, 3) == 0.0:
             # It shows as nothing wherever it is listed.
             continue

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pages for re-mastering on makers' pads, and numbers that controllers store of motors."""
+"""Pages for re-mastering on makers' pads, and motor numbers that controllers store."""
 
 from __future__ import annotations
 
@@ -84,15 +84,15 @@ belong to that state alone.
 
 @dataclass(frozen=True)
 class MotorNumber:
-    """What a controller has stored of a motor."""
+    """A number that a controller has stored for a motor."""
 
     old: float  # The stored number
-    counts_per_degree: float  # Of the joint, above 0
-    direction: int  # 1 where the reported angle grows with the stored number, -1 where it falls
+    counts_per_degree: float  # Counts per degree of the joint, above 0
+    direction: int  # 1 if the reported angle grows with the stored number, -1 if it falls
 
 
 def motor_text(offsets: ZeroOffsets, motors: Mapping[str, MotorNumber]) -> str:
-    """Return the numbers to store, of joints that are not coupled to others."""
+    """Text with the motor numbers to store, for joints that are not coupled to others."""
     pad = PadAngles.of(offsets.controller, offsets.chain.joint_names)
     shown = np.degrees(pad.offsets_on_pad(offsets.applied))
     lines = [

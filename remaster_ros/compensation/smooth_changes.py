@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """The correction along a path: as near to the wanted tool as accelerations allow.
 
-At each of n times the change c of the joints and its speed are sought; between them it is the
+The change c of the joints and its speed are sought at each of n times; between them it is the
 cubic that a trajectory controller draws. With the pose errors e of the tool and its Jacobian J::
 
     minimise  Σ h |e + J Δc|² + μ² h |c|² + Σ κ h |c - f|² + Σ ρ h |acceleration of c|²
 
 The weights ρ of intervals whose accelerations or speeds would pass a limit are raised until none
-does, and κ, which holds the change at that of the joint angles' own errors f, where a change
-passes its bound: in directions in which the tool hardly moves a singularity so is passed smoothly,
-while all that the tool shows is kept. On the bounds themselves the change could only jump from the
-one to the other: a direction that is singular has one sign before and the other behind.
+does. The weights κ pull the change to that of the joint angles' own errors f, and are raised where
+a change passes its bound: so a singularity is passed smoothly in directions in which the tool
+hardly moves, while the visible part of the correction is kept. On the bounds themselves the change
+could only jump from one to the other, as the sign of a singular direction changes.
 """
 
 from __future__ import annotations
@@ -24,22 +24,23 @@ import scipy
 from remaster_ros.compensation.bounded_poses import LEAST_WORTH
 from remaster_ros.types import BoolArray, FloatArray
 
-# An added acceleration as large as the limit weighs as a tool error of a micrometre a metre,
-# before any limit is passed.
+# Initial ρ: an added acceleration as large as the limit weighs as a tool error of a micrometre a
+# metre.
 FIRST_WEIGHT = 1e-6
-# Least and largest factor of a weight ρ whose interval passes a limit, or one of so many beside.
+# Least and largest factor of ρ for an interval that passes a limit, and the number of neighbouring
+# intervals to which it applies.
 HEAVIER = (4.0, 1e3)
-BESIDE = 2
-# What a change may add to an acceleration that passes its limit without it.
+NEIGHBOURS = 2
+# Share that a change may add to an acceleration that passes its limit already.
 ADDED = 0.1
-# First κ, that of a direction in which a radian moves the tool by a hundredth of a lever, and its
-# factor where it does not suffice.
-FIRST_HELD, HELD_HEAVIER = 1e-4, 10.0
-# Added to what has 1 on its diagonal: rounding makes no direction negative.
+# Initial κ, as of a direction in which a radian moves the tool by a hundredth of a lever, and its
+# factor if it does not suffice.
+FIRST_PULL, PULL_HEAVIER = 1e-4, 10.0
+# Added to a matrix with 1 on its diagonal, so that rounding makes no eigenvalue negative.
 ROUNDING = 1e-13
-# Rounds of weights: most paths take ten, and no path of the tests more than thirty.
+# Limit of rounds of weights: most paths take ten, and no path of the tests more than thirty.
 ROUNDS = 40
-# A round without a limit passed is repeated until the change is this near, rad.
+# Convergence limit of the change once no limit is passed, rad.
 CONVERGED_RAD = 1e-6
 
 # Changes (n, k) -> weighted pose errors (n, 6) and Jacobians (n, 6, k)
@@ -48,40 +49,40 @@ Errors = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
 
 @dataclass(frozen=True, eq=False)
 class Limits:
-    """What a corrected path must keep to; k joints, n times."""
+    """Limits of a corrected path; k joints, n times."""
 
-    acceleration: FloatArray  # Of the path with its change, rad/s², (k,)
+    acceleration: FloatArray  # Acceleration of the path with its change, rad/s², (k,)
     speed: FloatArray  # rad/s, (k,)
     change: FloatArray  # rad, (n, k)
 
 
 @dataclass(frozen=True, eq=False)
 class Ends:
-    """What is known of the change at the first and at the last time, rad and rad/s, (k,) each.
+    """Known changes at the first and the last time, rad and rad/s, (k,) each.
 
-    None where it is free.
+    None if the change is free there.
     """
 
     first: FloatArray | None
     last: FloatArray | None
-    # Whether the path rests there: so must the change
+    # Whether the path rests there, and with it the change
     first_rests: bool
     last_rests: bool
 
 
 @dataclass(frozen=True, eq=False)
 class SmoothChanges:
-    """The correction along a path, and the weights that have made it so."""
+    """The correction along a path, and the weights that produced it."""
 
     times_s: FloatArray  # Ascending, (n,)
     change: FloatArray  # At each time, rad, (n, k)
     speed: FloatArray  # Of the change, rad/s, (n, k)
     # ρ of each interval and joint, (n - 1, k), and κ of each time, (n,)
     weight: FloatArray
-    held: FloatArray
+    pull: FloatArray
 
     def at(self, times: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return changes and speeds between, (m, k) each."""
+        """Changes and speeds at times, (m, k) each."""
         cubic = scipy.interpolate.CubicHermiteSpline(self.times_s, self.change, self.speed)
         return np.asarray(cubic(times)), np.asarray(cubic(times, 1))
 
@@ -89,31 +90,31 @@ class SmoothChanges:
 def smooth_changes(
     errors: Errors,
     times_s: FloatArray,
-    own: FloatArray,
+    angle_change: FloatArray,
     wanted: tuple[FloatArray, FloatArray],
     limits: Limits,
     ends: Ends,
     before: SmoothChanges | None = None,
 ) -> SmoothChanges:
-    """Return the correction along a path.
+    """The correction along a path.
 
     Parameters
     ----------
     errors
-        Pose errors at changes.
+        Function of changes that returns pose errors and Jacobians.
     times_s
         Ascending, (n,), n >= 2.
-    own
-        f, the change that takes off the errors of the joint angles alone, (n, k).
+    angle_change
+        f, the change that removes the errors of the joint angles alone, (n, k).
     wanted
-        Of the path: accelerations at the start and the end of each interval, (n - 1, 2, k), and
+        Accelerations of the path at the start and the end of each interval, (n - 1, 2, k), and
         speeds at each time, (n, k).
     limits, ends
-        What is kept to.
+        Constraints of the corrected path.
     before
-        That of other times of the same path, to begin with.
+        Result for other times of the same path, to begin with.
     """
-    n, k = own.shape
+    n, k = angle_change.shape
     h = np.diff(times_s)
     share = np.zeros(n)
     share[:-1] += 0.5 * h
@@ -127,15 +128,15 @@ def smooth_changes(
         ),
         axis=1,
     )
-    held = np.zeros(n)
+    pull = np.zeros(n)
     weight = np.tile((FIRST_WEIGHT / limits.acceleration) ** 2, (n - 1, 1))
     state = np.zeros((n, 2, k))
-    state[:, 0] = own
+    state[:, 0] = angle_change
     if before is not None:
         state[:, 0], state[:, 1] = before.at(times_s)
         inside = np.searchsorted(before.times_s, times_s, side='right') - 1
         last = len(before.times_s) - 2
-        weight, held = before.weight[np.minimum(inside[:-1], last)], before.held[inside]
+        weight, pull = before.weight[np.minimum(inside[:-1], last)], before.pull[inside]
     for end, given in ((0, ends.first), (n - 1, ends.last)):
         if given is not None:
             state[end, 0] = given
@@ -144,34 +145,34 @@ def smooth_changes(
     fixed[0, 1], fixed[-1, 1] = ends.first_rests, ends.last_rests
     for _ in range(ROUNDS):
         error, jacobian = errors(state[:, 0])
-        step = _step(error, jacobian, state, own, rows, h, share, weight, held, fixed)
+        step = _step(error, jacobian, state, angle_change, rows, h, share, weight, pull, fixed)
         state = state + step
-        over = _over(state[:, 1], accelerations(rows, state), wanted, limits)
+        over = _limit_shares(state[:, 1], accelerations(rows, state), wanted, limits)
         far = np.any((np.abs(state[:, 0]) > limits.change) & ~fixed[:, 0], axis=1)
         if over.max() > 1.0 or far.any():
             # A weight of an interval alone would only move what is too much to the next ones.
-            near = scipy.ndimage.maximum_filter1d(over, 2 * BESIDE + 1)
+            near = scipy.ndimage.maximum_filter1d(over, 2 * NEIGHBOURS + 1)
             factor = np.clip(near**2, HEAVIER[0], HEAVIER[1])
             weight = np.where(near > 1.0, factor, 1.0)[:, None] * weight
-            held = np.where(far, np.maximum(HELD_HEAVIER * held, FIRST_HELD), held)
+            pull = np.where(far, np.maximum(PULL_HEAVIER * pull, FIRST_PULL), pull)
         elif np.abs(step[:, 0]).max() < CONVERGED_RAD:
             break
-    return SmoothChanges(times_s, state[:, 0], state[:, 1], weight, held)
+    return SmoothChanges(times_s, state[:, 0], state[:, 1], weight, pull)
 
 
 def accelerations(rows: FloatArray, state: FloatArray) -> FloatArray:
-    """Return those of cubics at both ends of each interval, (n - 1, 2, k)."""
+    """Accelerations of cubics at both ends of each interval, (n - 1, 2, k)."""
     both = np.concatenate((state[:-1], state[1:]), axis=1)
     return np.asarray(np.einsum('nej,njk->nek', rows, both))
 
 
-def _over(
+def _limit_shares(
     speed: FloatArray,
     acceleration: FloatArray,
     wanted: tuple[FloatArray, FloatArray],
     limits: Limits,
 ) -> FloatArray:
-    """Return the largest share of a limit that each interval takes, (n - 1,).
+    """Largest share of a limit that each interval takes, (n - 1,).
 
     ``speed, acceleration``: of the change. Where the path passes a limit by itself, a change may
     add `ADDED` of that.
@@ -186,26 +187,26 @@ def _step(
     error: FloatArray,
     jacobian: FloatArray,
     state: FloatArray,
-    own: FloatArray,
+    angle_change: FloatArray,
     rows: FloatArray,
     h: FloatArray,
     share: FloatArray,
     weight: FloatArray,
-    held: FloatArray,
+    pull: FloatArray,
     fixed: BoolArray,
 ) -> FloatArray:
-    """Return the Gauss–Newton step of changes and speeds, (n, 2, k)."""
+    """Gauss–Newton step of changes and speeds, (n, 2, k)."""
     n, _, k = state.shape
     turned = jacobian.swapaxes(1, 2)
     change = state[:, 0]
     on_change = share[:, None, None] * (
-        turned @ jacobian + (LEAST_WORTH**2 + held)[:, None, None] * np.eye(k)
+        turned @ jacobian + (LEAST_WORTH**2 + pull)[:, None, None] * np.eye(k)
     )
     slope = np.zeros((n, 2, k))
     slope[:, 0] = share[:, None] * (
         (turned @ error[..., None])[..., 0]
         + LEAST_WORTH**2 * change
-        + held[:, None] * (change - own)
+        + pull[:, None] * (change - angle_change)
     )
     # Of each joint by itself: (n - 1, k, 4, 4).
     gram = np.einsum('nea,neb->nab', rows, rows) * h[:, None, None]

@@ -22,7 +22,7 @@ from remaster_ros.types import FloatArray
 TF = 'tf'
 LAUNCH_FILE = 'static_transforms.launch.xml'
 MESSAGE_FILE = 'static_transforms.yaml'
-# Behind the name of a sensor on the tool: the board that it sees.
+# Suffix of the frame of the board that a sensor on the tool sees.
 BOARD = '_board'
 # Names that a launch line and a YAML need no quotes for; tf2 refuses a leading slash.
 FRAME = re.compile(r'[A-Za-z_][A-Za-z0-9_./-]*')
@@ -54,7 +54,7 @@ class StaticTransform:
 
     @property
     def words(self) -> str:
-        """Its frames and standard deviations."""
+        """Frames and standard deviations, as text."""
         mm = ' '.join(f'{1e3 * value:.3f}' for value in self.std_m)
         degrees = ' '.join(f'{value:.4f}' for value in np.degrees(self.std_rad))
         return f'{self.parent} -> {self.child}: std x y z {mm} mm, about x y z {degrees} deg'
@@ -68,15 +68,15 @@ def static_transforms(
     Parameters
     ----------
     compensation
-        With the registrations.
+        Correction with the registrations.
     frames
-        Sensor -> the name of its frame in tf, where it is not the sensor's.
+        Sensor -> name of its frame in tf; the sensor's name if absent.
 
     Raises
     ------
     InputError
-        No such sensor, a name that tf2 does not take or that two frames have, or a sensor on the
-        tool whose turn is not known.
+        No such sensor, a name that tf2 does not accept or that two frames have, or a sensor on the
+        tool whose rotation is unknown.
     """
     content = compensation.content
     for sensor in frames:
@@ -168,4 +168,5 @@ def transform_files(transforms: list[StaticTransform]) -> dict[str, str]:
 
 
 def _node_name(frame: str) -> str:
+    """Name of the node that publishes a frame."""
     return 'static_transform_of_' + re.sub(r'[^A-Za-z0-9_]', '_', frame)

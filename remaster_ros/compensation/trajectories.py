@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A trajectory whose tool path is that of the nominal robot, on points of its own.
+"""Trajectories whose tool path is that of the nominal robot, with points added as needed.
 
-Between points a trajectory controller draws a straight line where they have positions alone, a
-cubic where they have velocities too. The correction is not what it draws: so points are added
-where its path would leave the wanted one by more than a tolerance. At both ends the correction is
-that of a single target; between them as much is corrected as the limits of acceleration allow
-(`smooth_changes`). Where the corrected trajectory still passes a limit all of it is slowed down;
-the path stays.
+Between points a trajectory controller draws a straight line if they have positions alone, a cubic
+if they have velocities too. The correction is neither: so points are added where the drawn path
+would leave the wanted one by more than a tolerance. At both ends the correction is that of a
+single target; between them as much is corrected as the limits of acceleration allow
+(`smooth_changes`). If the corrected trajectory still passes a limit, all of it is slowed down; the
+path stays.
 """
 
 from __future__ import annotations
@@ -22,54 +22,53 @@ from remaster_ros.compensation.smooth_changes import Ends, Limits, SmoothChanges
 from remaster_ros.errors import InputError
 from remaster_ros.types import BoolArray, FloatArray, IntArray
 
-# Waves of the correction are seen with eight points each, and turns of the arm by half a radian
-# where it has none.
+# Points for each wave of the correction; longest step, rad, of a correction without waves.
 POINTS_OF_WAVE = 8
 LONGEST_STEP_RAD = 0.5
-# Where between two points the path is compared. A cubic leaves a wave most in the middle: what it
-# leaves elsewhere where that is none is, with eight points a wave, 4e-5 of the wave. A line may
-# leave 1 % there.
+# Places between two points at which the path is compared, by whether it is a cubic. A cubic
+# deviates from a wave most in the middle; elsewhere it deviates by 4e-5 of the wave, with eight
+# points a wave. A line may deviate by 1 % elsewhere.
 COMPARED = {True: np.array([0.5]), False: np.array([0.25, 0.5, 0.75])}
-# Controllers run at up to a kilohertz: no more points than that.
+# Shortest interval of points, s: controllers run at up to a kilohertz.
 SHORTEST_S = 1e-3
-# Times of messages are whole nanoseconds.
+# Shortest difference of times, s: messages have whole nanoseconds.
 LEAST_S = 0.9e-9
-# The correction of points nearer to each other than this is drawn through some of them, s: it is
-# as smooth as an arm's accelerations are.
+# Distance of the knots of the correction, s: points nearer to each other are interpolated, as it
+# is as smooth as an arm's accelerations are.
 KNOTS_S = 0.02
-# A correction may make a trajectory so much slower before less is corrected.
+# Largest factor by which a correction may slow down a trajectory before less is corrected.
 SLOWER = 1.05
-# Of the limit of acceleration, what corrected points take that are sent one by one while the arm
-# moves: where it then is is known to some milliradians.
+# Share of the acceleration limit for points that are sent one by one while the arm moves: its
+# position is then known only to some milliradians.
 SHARE_OF_STREAM = 0.9
 
 
 @dataclass(frozen=True, eq=False)
-class Now:
-    """Where an arm of k joints is."""
+class ArmNow:
+    """Current state of an arm of k joints."""
 
     q: FloatArray  # Reported, rad, (k,)
-    told: FloatArray  # Where the nominal robot would be, rad, (k,)
+    nominal_q: FloatArray  # Angles of the nominal robot with the same tool, rad, (k,)
     velocity: FloatArray  # rad/s, (k,)
 
 
 @dataclass(frozen=True, eq=False)
 class CorrectedTrajectory:
-    """What to send: n points of k joints."""
+    """Trajectory to send: n points of k joints."""
 
-    times_s: FloatArray  # From the start, (n,)
-    # rad and rad/s, (n, k); velocities are None where none were given
+    times_s: FloatArray  # Times from the start, (n,)
+    # rad and rad/s, (n, k); velocities are None if none were given
     positions: FloatArray
     velocities: FloatArray | None
-    change: FloatArray  # Of the positions, by the correction, rad, (n, k)
-    stretched: float  # How many times longer it takes than it was to
-    # Largest distance of the tool from the wanted path between points, where it was compared
+    change: FloatArray  # Change of the positions by the correction, rad, (n, k)
+    stretched: float  # Factor by which it takes longer than wanted
+    # Largest distance of the tool from the wanted path at the compared places, m
     deviation_m: float
-    # Of each joint's largest, before all was slowed down, as a share of the wanted one, (k,); 0
-    # where the joint was to stand, and NaN for accelerations of straight lines
+    # Increase of each joint's largest speed and acceleration before slowing down, as a share of
+    # the wanted one, (k,); 0 if the joint was to stand, NaN for accelerations of straight lines
     added_speed: FloatArray
     added_acceleration: FloatArray
-    # As of a `Correction`, (n,)
+    # As in `Correction`, (n,)
     residual_m: FloatArray
     incomplete: BoolArray
     outside_range: BoolArray
@@ -87,15 +86,16 @@ def corrected_trajectory(
     temperature_c: float | None = None,
     begins: FloatArray | None = None,
 ) -> CorrectedTrajectory:
-    """Return the trajectory to send for a wanted one of the nominal robot.
+    """Trajectory to send for a wanted trajectory of the nominal robot.
 
     ``compensator``: the correction; ``times_s``: ascending, (n,), n >= 2; ``positions,
-    velocities``: wanted, rad and rad/s, (n, k); ``tolerance_m``: of the tool between points;
-    ``velocity_limits, acceleration_limits``: rad/s and rad/s², (k,); those of the URDF, and none,
-    where None; ``temperature_c``: of the arm; ``begins``: what is commanded at the start, rad,
-    (k,); the best command there where None.
-    Raises InputError: numbers that are not finite, times that do not ascend, other shapes, or a
-    path whose correction no point per millisecond follows.
+    velocities``: wanted, rad and rad/s, (n, k); ``tolerance_m``: largest deviation of the tool
+    between points; ``velocity_limits, acceleration_limits``: rad/s and rad/s², (k,); None for
+    those of the URDF, and for no limit; ``temperature_c``: of the arm; ``begins``: command at the
+    start, rad, (k,); None for the best command there.
+
+    Raises InputError for numbers that are not finite, times that do not ascend, other shapes, or a
+    path whose correction cannot be followed with a point per millisecond.
     """
     t, q, v = _checked(compensator, times_s, positions, velocities)
     wanted = DrawnPath(t, q, v)
@@ -113,14 +113,14 @@ def corrected_trajectory(
     fixed = Ends(
         (first - q[0]) / unit, (ends[1] - q[-1]) / unit, wanted.rests(0), wanted.rests(-1)
     )
-    times, apart_s = _spread(compensator, wanted), KNOTS_S
+    times, apart_s = _sampling_times(compensator, wanted), KNOTS_S
     changes: SmoothChanges | None = None
     while True:
-        knots = _thinned(times, apart_s)
+        knots = _knot_indices(times, apart_s)
         sent, done, changes = _corrected(
             compensator, wanted, times, knots, limits, fixed, temperature_c, changes
         )
-        off = _between(compensator, wanted, sent, knots, temperature_c)
+        off = _deviation_between(compensator, wanted, sent, knots, temperature_c)
         far = off.max(axis=1) > tolerance_m
         if not far.any():
             break
@@ -155,34 +155,34 @@ def corrected_trajectory(
 def largest_speeds(
     times_s: FloatArray, positions: FloatArray, velocities: FloatArray | None
 ) -> FloatArray:
-    """Return the largest speed of each joint of what a controller draws, rad/s, (k,)."""
+    """Largest speed of each joint on the path that a controller draws, rad/s, (k,)."""
     return DrawnPath(times_s, positions, velocities).largest()[0]
 
 
 class DrawnPath:
-    """What a controller draws through points."""
+    """Path that a controller draws through points: lines, or cubics if there are velocities."""
 
     def __init__(self, t: FloatArray, q: FloatArray, v: FloatArray | None) -> None:
         self.t, self.q, self.v = t, q, v
         self._cubic = None if v is None else scipy.interpolate.CubicHermiteSpline(t, q, v)
 
     def at(self, times: FloatArray) -> FloatArray:
-        """Return positions, (n, k)."""
+        """Positions at times, (n, k)."""
         if self._cubic is not None:
             return np.asarray(self._cubic(times))
         return np.stack([np.interp(times, self.t, q) for q in self.q.T], axis=1)
 
     def speed(self, times: FloatArray) -> FloatArray:
-        """Return velocities of a cubic, (n, k)."""
+        """Velocities of a cubic at times, (n, k)."""
         assert self._cubic is not None
         return np.asarray(self._cubic(times, 1))
 
     def rests(self, end: int) -> bool:
-        """Return whether it rests at its first (0) or last (-1) point, as a cubic can."""
+        """Whether a cubic has no velocity at its first (0) or last (-1) point."""
         return self.v is not None and not np.any(self.v[end])
 
     def accelerations(self) -> FloatArray:
-        """Return those at the start and the end of each interval, (n - 1, 2, k); 0 of lines."""
+        """Accelerations at the start and the end of each interval, (n - 1, 2, k); 0 for lines."""
         h = np.diff(self.t)[:, None]
         if self.v is None:
             return np.zeros((len(h), 2, self.q.shape[1]))
@@ -191,13 +191,13 @@ class DrawnPath:
         return np.stack((start, (2.0 * first + 4.0 * last - 6.0 * slope) / h), axis=1)
 
     def largest(self) -> tuple[FloatArray, FloatArray]:
-        """Return the largest speed and acceleration of each joint, (k,) each."""
+        """Largest speed and acceleration of each joint, (k,) each."""
         h = np.diff(self.t)[:, None]
         if self.v is None:
             slope = np.diff(self.q, axis=0) / h
             return np.abs(slope).max(axis=0), np.full(self.q.shape[1], np.nan)
         first = self.v[:-1]
-        # Of a cubic the acceleration is linear, and the speed has a vertex where it is none.
+        # The acceleration of a cubic is linear, and its speed has a vertex where that is zero.
         start, end = self.accelerations().swapaxes(0, 1)
         change = start - end
         share = np.divide(start, change, out=np.zeros_like(start), where=change != 0.0)
@@ -214,6 +214,7 @@ def _checked(
     positions: ArrayLike,
     velocities: ArrayLike | None,
 ) -> tuple[FloatArray, FloatArray, FloatArray | None]:
+    """Times, positions and velocities as arrays. Raises InputError if they are not usable."""
     t, q = np.asarray(times_s, dtype=float), np.asarray(positions, dtype=float)
     v = None if velocities is None else np.asarray(velocities, dtype=float)
     shape = (len(t) if t.ndim == 1 else 0, compensator.model.joints)
@@ -230,8 +231,8 @@ def _checked(
     return t, q, v
 
 
-def _spread(compensator: Compensator, wanted: DrawnPath) -> FloatArray:
-    """Return times between which the correction cannot hide a wave."""
+def _sampling_times(compensator: Compensator, wanted: DrawnPath) -> FloatArray:
+    """Times dense enough that the correction has no unseen wave between them."""
     orders = [term.function.order for term in compensator.model.joint_terms]
     step = min(LONGEST_STEP_RAD, 2.0 * np.pi / (POINTS_OF_WAVE * max([1, *orders])))
     h = np.diff(wanted.t)
@@ -254,11 +255,11 @@ def _allowed(
     speed_limits: FloatArray,
     acceleration_limits: FloatArray | None,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the largest speeds and accelerations of a corrected path, (k,) each.
+    """Largest speeds and accelerations of a corrected path, (k,) each.
 
-    Those at which it is slowed down by `SLOWER`, beside what the wanted path has to be slowed down
-    itself. Without limits of acceleration, twice the largest of the wanted path, or of joints that
-    go over a radian at its speed.
+    They allow for slowing down by `SLOWER`, in addition to the slowing down that the wanted path
+    itself requires. Without limits of acceleration: twice the largest of the wanted path, or of
+    joints that go over a radian at its speed.
     """
     speed, acceleration = wanted
     slower = max(1.0, float(np.max(speed / speed_limits)))
@@ -272,12 +273,12 @@ def _allowed(
     return speed_limits * SLOWER * slower, allowed
 
 
-def _thinned(times: FloatArray, apart_s: float) -> IntArray:
-    """Return the indices of times of which each is so far behind the one before, both ends too."""
+def _knot_indices(times: FloatArray, interval_s: float) -> IntArray:
+    """Indices of times at intervals of at least `interval_s`, with both ends."""
     chosen = [0]
     last = len(times) - 1
     while chosen[-1] < last:
-        following = int(np.searchsorted(times, times[chosen[-1]] + apart_s))
+        following = int(np.searchsorted(times, times[chosen[-1]] + interval_s))
         chosen.append(min(max(following, chosen[-1] + 1), last))
     return np.array(chosen)
 
@@ -292,7 +293,10 @@ def _corrected(
     temperature_c: float | None,
     before: SmoothChanges | None,
 ) -> tuple[DrawnPath, Correction, SmoothChanges]:
-    """Return the corrected path through points at these times, and what was done to them."""
+    """Corrected path through points at given times, the correction of the points.
+
+    Last result: its changes.
+    """
     q = wanted.at(times)
     v = None if wanted.v is None else wanted.speed(times)
     path = DrawnPath(times, q, v)
@@ -302,7 +306,7 @@ def _corrected(
     changes = smooth_changes(
         problem.errors,
         times[knots],
-        problem.own,
+        problem.angle_change,
         (_largest_between(path.accelerations(), knots) / unit, speeds[knots] / unit),
         Limits(limits[1] / unit, limits[0] / unit, problem.budget),
         ends,
@@ -311,15 +315,15 @@ def _corrected(
     change, added = changes.at(times)
     command = q + unit * change
     every = problem if len(knots) == len(times) else compensator.problem(q, temperature_c)
-    done = compensator.correction(command, every.left(change))
+    done = compensator.correction(command, every.remaining_error(change))
     return DrawnPath(times, command, None if v is None else v + unit * added), done, changes
 
 
 def _largest_between(accelerations: FloatArray, knots: IntArray) -> FloatArray:
-    """Return the largest acceleration between knots, of either sign, at both ends, (m, 2, k).
+    """Largest acceleration between knots, of either sign, at both ends, (m, 2, k).
 
-    ``accelerations``: at both ends of each interval, (n, 2, k), as they are where no interval lies
-    between two knots but one.
+    ``accelerations``: at both ends of each interval, (n, 2, k), returned unchanged where two knots
+    have a single interval between them.
     """
     ends = accelerations.reshape(-1, accelerations.shape[2])
     first = 2 * knots[:-1]
@@ -331,16 +335,16 @@ def _largest_between(accelerations: FloatArray, knots: IntArray) -> FloatArray:
     return found
 
 
-def _between(
+def _deviation_between(
     compensator: Compensator,
     wanted: DrawnPath,
     sent: DrawnPath,
     knots: IntArray,
     temperature_c: float | None,
 ) -> FloatArray:
-    """Return how far the tool is off in each interval beside what it is at knots, m, (n - 1, m).
+    """Deviation of the tool in each interval beyond that at the knots, m, (n - 1, m).
 
-    What is not corrected at two knots is expected to go from the one to the other in a line.
+    The error that remains at two knots is expected to change linearly between them.
     """
     times, share = sent.t, COMPARED[sent.v is not None]
     inside = times[:-1, None] + np.diff(times)[:, None] * np.concatenate((share, [1.0]))
@@ -350,8 +354,8 @@ def _between(
     off = compensator.tool(sent.at(at), temperature_c)[:, :3, 3] - nominal
     off, between = np.split(off, [len(knots)])
     expected = [np.interp(inside.ravel(), times[knots], one) for one in off.T]
-    beside = np.linalg.norm(between - np.stack(expected, axis=1), axis=1)
-    return np.asarray(beside.reshape(inside.shape))
+    deviation = np.linalg.norm(between - np.stack(expected, axis=1), axis=1)
+    return np.asarray(deviation.reshape(inside.shape))
 
 
 def corrected_points(
@@ -359,18 +363,18 @@ def corrected_points(
     times_s: FloatArray,
     q: FloatArray,
     v: FloatArray | None,
-    now: Now,
+    now: ArmNow,
     acceleration_limits: FloatArray,
     temperature_c: float | None = None,
 ) -> tuple[Correction, FloatArray | None]:
-    """Return what to command for the points of an arm that moves, and their velocities.
+    """Commands for the points of a moving arm, and their velocities.
 
-    ``compensator, temperature_c, acceleration_limits``: as of `corrected_trajectory`;
-    ``times_s``: from now on, above 0, (n,); ``q, v``: wanted, rad and rad/s, (n, k), None where
-    there are no velocities; ``now``: where the arm is.
+    ``compensator, temperature_c, acceleration_limits``: as in `corrected_trajectory`; ``times_s``:
+    from now on, above 0, (n,); ``q, v``: wanted, rad and rad/s, (n, k), None without velocities;
+    ``now``: current state of the arm.
     """
     unit = compensator.model.chain.per_radian
-    times, q = np.concatenate(([0.0], times_s)), np.concatenate((now.told[None], q))
+    times, q = np.concatenate(([0.0], times_s)), np.concatenate((now.nominal_q[None], q))
     speeds = None if v is None else np.concatenate((now.velocity[None], v))
     problem = compensator.problem(q, temperature_c)
     limits = Limits(
@@ -379,16 +383,17 @@ def corrected_points(
     found = smooth_changes(
         problem.errors,
         times,
-        problem.own,
+        problem.angle_change,
         (DrawnPath(times, q, speeds).accelerations() / unit, np.zeros_like(q)),
         limits,
         # The controller goes on from the speed of the arm, whatever part the correction has in it.
-        Ends((now.q - now.told) / unit, None, True, v is not None and not np.any(v[-1])),
+        Ends((now.q - now.nominal_q) / unit, None, True, v is not None and not np.any(v[-1])),
     )
     command = (q + unit * found.change)[1:]
-    done = compensator.correction(command, problem.left(found.change)[1:])
+    done = compensator.correction(command, problem.remaining_error(found.change)[1:])
     return done, None if v is None else v + unit * found.speed[1:]
 
 
 def _added(before: FloatArray, after: FloatArray) -> FloatArray:
+    """Relative increase of values, 0 if there was none before."""
     return np.divide(after, before, out=np.ones_like(after), where=before > 0.0) - 1.0

@@ -1,15 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether a correction acts exactly once, and what remains: from poses with what was wanted there.
+"""Whether a correction acts exactly once.
 
-A marker is measured where the arm went for wanted joint angles w, those of the nominal robot.
-Four states predict where that is, exactly: the correction acts (its command of w), does not (w),
-acts twice, or with the wrong sign. Beside them, ``other``: each joint has a share of its own.
+Last result: the errors that remain, from poses with known targets.
 
-*Absolute*: of the rows with the correction on, base and marker fitted again. *Toggle*: of the
+A marker is measured at the pose to which the arm went for wanted joint angles w, those of the
+nominal robot. Four states predict its position exactly: the correction acts (its command of w),
+does not (w), acts twice, or with the wrong sign. A further state, ``other``: each joint has a
+share of its own.
+
+*Absolute*: from the rows with the correction on, base and marker fitted again. *Toggle*: from the
 differences on - off of one configuration; it sees only what is switched, not what the controller
-has besides. A state is called where its odds are `ODDS` against each of the others, and neither
-``other`` nor a single joint in another state, where these rows can tell it, is more likely;
-``other``, where its odds are `ODDS`. The noise is not known: likelihoods are integrated over its
+has in addition. A state is called if its odds are `ODDS` against each of the others, and neither
+``other`` nor a single joint in another state, if these rows can tell it, is more likely;
+``other``, if its odds are `ODDS`. The noise is unknown: likelihoods are integrated over its
 logarithm.
 """
 
@@ -36,28 +39,29 @@ STATES: Mapping[Verdict, float] = {
     'wrong_sign': -1.0,
 }
 ODDS = 1000.0
-# Prior std of a joint's share under `other`: between the states there are 1 to 3.
+# Prior std of a joint's share under `other`: the states' shares differ by 1 to 3.
 SHARE_STD = 2.0
-# From a tenth of the best tracker's noise to ten times a poor camera's, m, in steps of a tenth.
+# Noise over which likelihoods are integrated, m: from a tenth of the best tracker's to ten times a
+# poor camera's, in steps of a tenth.
 SIGMAS = np.geomspace(1e-6, 1e-2, 98)
-# The odds of 1000 are exceeded in 97.5 % where their expected logarithm is this: it has the
-# variance of twice its mean, m - 2 sqrt(2 m) = log 1000.
+# Expected log odds with which the odds of 1000 are exceeded in 97.5 % of cases: their variance is
+# twice their mean, m - 2 sqrt(2 m) = log 1000.
 ENOUGH = float((np.sqrt(2.0) + np.sqrt(2.0 + np.log(ODDS))) ** 2)
 MOST_POSES = 1000
-# Steps of Gauss and Newton for the shares: moves are linear in them to some per cent.
+# Gauss–Newton steps for the shares: displacements are linear in them to some per cent.
 STEPS = 3
-# Two-sided, of odds of 1000.
+# Standard deviations, two-sided, that correspond to odds of 1000.
 BEYOND_STD = 3.3
 
 
 @dataclass(frozen=True, eq=False)
 class Visits:
-    """Rows that were measured for wanted joint angles; n rows of k joints."""
+    """Rows measured for wanted joint angles; n rows of k joints."""
 
-    wanted: FloatArray  # Of the nominal robot, rad, (n, k)
+    wanted: FloatArray  # Angles of the nominal robot, rad, (n, k)
     on: BoolArray  # Whether the correction was on, (n,)
-    configuration: IntArray  # Rows of one belong together, on and off, (n,)
-    # Names of them, (n,)
+    configuration: IntArray  # Index of the configuration, which may be visited on and off, (n,)
+    # Names of sensor and marker of each row, (n,)
     sensor: tuple[str, ...]
     marker: tuple[str, ...]
     position: FloatArray  # In the sensor's frame, m, (n, 3)
@@ -65,7 +69,7 @@ class Visits:
 
 @dataclass(frozen=True)
 class Estimate:
-    """A share of the correction that acts, with the std of its posterior, and what it is."""
+    """Share of the correction that acts, its posterior standard deviation, and its state."""
 
     share: float
     std: float
@@ -81,35 +85,34 @@ class Mean:
 
 
 @dataclass(frozen=True)
-class Verified:
-    """What the rows say."""
+class VerificationResult:
+    """Result of a verification."""
 
-    verdict: Verdict  # Of the absolute estimate
+    verdict: Verdict  # State by the absolute estimate
     toggle: Estimate | None  # None without configurations that were visited on and off
-    # Of the rows with the correction on; of each joint, by name
-    absolute: Estimate
-    joints: Mapping[str, Estimate]
-    # Against what was wanted, base and marker fitted to each; None where there are too few
+    absolute: Estimate  # From the rows with the correction on
+    joints: Mapping[str, Estimate]  # Absolute estimate of each joint, by name
+    # Errors from the wanted positions, base and marker fitted to each; None for too few rows
     error_on: Mean
     error_off: Mean | None
-    # RMS of what the rows with the correction on leave, less what base and marker take up
+    # RMS residual of the rows with the correction on, corrected for the fit of base and marker
     remains_mm: float
-    # RMS of the differences on - off less the best share of the predicted move, of one row; None
-    # without toggles
+    # RMS noise of one row, from the differences on - off less the best share of the predicted
+    # displacement; None without toggles
     noise_mm: float | None
-    # How many would do, where it is unclear; None where none would, or where it is clear
+    # Number of poses that would decide an unclear verdict; None if it is clear or none would
     poses: int | None
 
 
-def verify(compensator: Compensator, visits: Visits) -> Verified:
-    """Judge whether a correction is in use.
+def verify(compensator: Compensator, visits: Visits) -> VerificationResult:
+    """Decide whether a correction is in use.
 
     Raises
     ------
     InsufficientDataError
         Too few rows with the correction on to fit base and marker again.
     """
-    on = _Side(compensator, visits, np.flatnonzero(visits.on))
+    on = _ProjectedRows(compensator, visits, np.flatnonzero(visits.on))
     off_rows = np.flatnonzero(~visits.on)
     spread = 3 * len(visits.on[visits.on]) - on.base_columns
     if spread <= 3:
@@ -121,12 +124,12 @@ def verify(compensator: Compensator, visits: Visits) -> Verified:
     toggle, noise = _toggle(compensator, visits)
     off = None
     if len(off_rows) and 3 * len(off_rows) > on.base_columns + 3:
-        off = _Side(compensator, visits, off_rows).error()
+        off = _ProjectedRows(compensator, visits, off_rows).error()
     left = on.projected(on.measured - on.at['in_use'])
     poses = None
     if absolute.verdict == 'unclear':
         poses = _poses(on, rivals)
-    return Verified(
+    return VerificationResult(
         absolute.verdict,
         toggle,
         absolute,
@@ -139,8 +142,8 @@ def verify(compensator: Compensator, visits: Visits) -> Verified:
     )
 
 
-class _Side:
-    """Rows with the correction on, or off: what is measured and what each state predicts, in R."""
+class _ProjectedRows:
+    """Rows with the correction on, or off: measured and predicted positions in R."""
 
     def __init__(self, compensator: Compensator, visits: Visits, rows: IntArray) -> None:
         self.compensator, self.model = compensator, compensator.model
@@ -170,30 +173,31 @@ class _Side:
         free = np.concatenate(columns, axis=2).reshape(3 * len(rows), -1)
         left, sizes, _ = np.linalg.svd(free)
         self.base_columns = int(np.sum(sizes > 1e-9 * sizes[0]))
-        self._rest = left[:, self.base_columns :]
+        self._complement = left[:, self.base_columns :]
 
     def seen(self, q: FloatArray) -> FloatArray:
-        """Return where the markers are at commanded angles, in R, (n, 3)."""
+        """Positions of the markers at commanded angles, in R, (n, 3)."""
         return apply(self.compensator.tool(q), self.places)
 
     def projected(self, columns: FloatArray) -> FloatArray:
-        """Return what base and marker cannot take up, of rows of R."""
-        found: FloatArray = self._rest.T @ columns
+        """Columns in rows of R, projected on the complement of the fit of base and marker."""
+        found: FloatArray = self._complement.T @ columns
         return found
 
     def moves(self, q: FloatArray) -> FloatArray:
-        """Return what a share of 1 of each joint's correction does, (3 n, k)."""
+        """Displacements by a share of 1 of each joint's correction, (3 n, k)."""
         change = self.command - self.wanted
         return (self._derivative(q)[:, :, : self.model.joints] * change[:, None, :]).reshape(
             3 * len(q), -1
         )
 
     def unsure(self, q: FloatArray) -> FloatArray:
-        """Return what one standard deviation of each thing that is not known does, (3 n, r)."""
+        """Displacements by one standard deviation of each uncertain parameter, (3 n, r)."""
         spread = self.model.widening * (self._derivative(q) @ self.model.root.T)
         return spread.reshape(3 * len(q), -1)
 
     def _derivative(self, q: FloatArray) -> FloatArray:
+        """Derivative of the markers' positions by the parameters, (n, 3, p)."""
         sensor, state = next(iter(self.model.T_R_N)), self.model.state(q)
         found = np.zeros((len(q), 3, len(self.model.parameter_names)))
         for marker in dict.fromkeys(self.markers):
@@ -202,13 +206,13 @@ class _Side:
         return found
 
     def error(self) -> Mean:
-        """Return the error against what was wanted, base and marker fitted again."""
-        left = self._rest @ self.projected(self.measured - self.nominal.ravel())
-        return _mean(np.linalg.norm(left.reshape(-1, 3), axis=1))
+        """Mean error from the wanted positions, base and marker fitted again."""
+        errors = self._complement @ self.projected(self.measured - self.nominal.ravel())
+        return _mean(np.linalg.norm(errors.reshape(-1, 3), axis=1))
 
 
 def commands(compensator: Compensator, wanted: FloatArray) -> dict[Verdict, FloatArray]:
-    """Return what reaches the joints for wanted ones in each state, rad, (n, k)."""
+    """Angles that reach the joints for wanted ones in each state, rad, (n, k)."""
     once = compensator.command(wanted)
     return {
         'in_use': once,
@@ -219,37 +223,39 @@ def commands(compensator: Compensator, wanted: FloatArray) -> dict[Verdict, Floa
 
 
 def _mean(errors: FloatArray) -> Mean:
+    """Mean of errors, m, and its 95 % interval."""
     mean = float(errors.mean())
     half = 1.96 * float(errors.std(ddof=1)) / np.sqrt(len(errors)) if len(errors) > 1 else np.inf
     return Mean(1e3 * mean, (1e3 * max(0.0, mean - half), 1e3 * (mean + half)))
 
 
 def _log_likelihood(residual: FloatArray, columns: FloatArray) -> FloatArray:
-    """Return the log density of a residual (d,) for each of `SIGMAS`.
+    """Log density of a residual (d,) for each of `SIGMAS`.
 
-    Its covariance is σ² and that of standard normal coefficients of ``columns`` (d, m).
+    Its covariance is σ² plus that of standard normal coefficients of ``columns`` (d, m).
     """
     left, sizes, _ = np.linalg.svd(columns, full_matrices=False)
     along = left.T @ residual
-    rest = max(0.0, float(residual @ residual - along @ along))
+    outside_squares = max(0.0, float(residual @ residual - along @ along))
     var = SIGMAS[:, None] ** 2
     wide = var + sizes**2
     d, m = len(residual), len(sizes)
     found: FloatArray = -0.5 * (
         np.sum(along**2 / wide + np.log(wide), axis=1)
-        + rest / SIGMAS**2
+        + outside_squares / SIGMAS**2
         + 2.0 * (d - m) * np.log(SIGMAS)
     )
     return found
 
 
 def _integrated(values: FloatArray) -> float:
+    """Logarithm of the mean of likelihoods over the noise, from their logarithms."""
     top = values.max()
     return float(top + np.log(np.mean(np.exp(values - top))))
 
 
-def _absolute(side: _Side) -> tuple[Estimate, list[Estimate], list[FloatArray]]:
-    """Return the estimates, and the displacements by what was not excluded, projected."""
+def _absolute(side: _ProjectedRows) -> tuple[Estimate, list[Estimate], list[FloatArray]]:
+    """Estimate of the whole, of each joint, and displacements of the alternatives not excluded."""
     states, other = {}, {}
     for state, q in side.commands.items():
         residual = side.projected(side.measured - side.at[state])
@@ -264,21 +270,26 @@ def _absolute(side: _Side) -> tuple[Estimate, list[Estimate], list[FloatArray]]:
         for state, value in states.items()
         if state != best and states[best] - value < np.log(ODDS)
     ]
-    rivals += _odd_joints(side, best, sigma, states[best])
-    verdict = _called(states, _integrated(other[best]))
+    rivals += _single_joint_alternatives(side, best, sigma, states[best])
+    verdict = _decided(states, _integrated(other[best]))
     if verdict == best and rivals:
         verdict = 'unclear'
     share, std = _shares(side, best, sigma, whole=True)
-    every, stds = _shares(side, best, sigma, whole=False)
+    joint_shares, stds = _shares(side, best, sigma, whole=False)
     joints = [
-        Estimate(float(one), float(s), _nearest(float(one), float(s)))
-        for one, s in zip(every, stds, strict=True)
+        Estimate(float(one), float(s), _state_of_share(float(one), float(s)))
+        for one, s in zip(joint_shares, stds, strict=True)
     ]
     return Estimate(float(share[0]), float(std[0]), verdict), joints, rivals
 
 
-def _odd_joints(side: _Side, best: Verdict, sigma: float, evidence: float) -> list[FloatArray]:
-    """Return what single joints in another state would do that these rows can tell, and do not."""
+def _single_joint_alternatives(
+    side: _ProjectedRows, best: Verdict, sigma: float, evidence: float
+) -> list[FloatArray]:
+    """Displacements by single joints in another state that is not excluded.
+
+    Only joints whose state the rows could tell are considered.
+    """
     unsure = side.projected(side.unsure(side.commands[best]))
     residual = side.projected(side.measured - side.at[best])
     moves = side.projected(side.moves(side.commands[best]))
@@ -295,13 +306,13 @@ def _odd_joints(side: _Side, best: Verdict, sigma: float, evidence: float) -> li
 
 
 def _expected(step: FloatArray, unsure: FloatArray, sigma: float) -> float:
-    """Return the expected logarithm of the odds between two states that are a step apart."""
+    """Expected log odds between two states whose prediction differs by a step."""
     covariance = sigma**2 * np.eye(len(step)) + unsure @ unsure.T
     return 0.5 * float(step @ np.linalg.solve(covariance, step))
 
 
-def _called(states: Mapping[Verdict, float], other: float) -> Verdict:
-    """Return the state that the log evidence is for, if its odds are enough."""
+def _decided(states: Mapping[Verdict, float], other: float) -> Verdict:
+    """State with the best log evidence, if its odds suffice; else 'unclear' or 'other'."""
     first, second = sorted(states, key=lambda state: states[state], reverse=True)[:2]
     if other - states[first] > np.log(ODDS):
         return 'other'
@@ -311,9 +322,9 @@ def _called(states: Mapping[Verdict, float], other: float) -> Verdict:
 
 
 def _shares(
-    side: _Side, start: Verdict, sigma: float, whole: bool
+    side: _ProjectedRows, start: Verdict, sigma: float, whole: bool
 ) -> tuple[FloatArray, FloatArray]:
-    """Return shares and their std: one of the whole correction, or one of each joint."""
+    """Shares and their standard deviations: of the whole correction, or of each joint."""
     begin = STATES[start]
     change = side.command - side.wanted
     k = change.shape[1]
@@ -336,17 +347,19 @@ def _shares(
     return shares, np.sqrt(np.diag(np.linalg.inv(precision)))
 
 
-def _nearest(share: float, std: float) -> Verdict:
-    """Return the state that a share is, if its odds against the others are enough."""
-    off = {state: ((share - value) / std) ** 2 for state, value in STATES.items()}
-    first, second = sorted(off, key=lambda state: off[state])[:2]
-    if std >= 0.5 * SHARE_STD or 0.5 * (off[second] - off[first]) < np.log(ODDS):
+def _state_of_share(share: float, std: float) -> Verdict:
+    """State of a share, if its odds against the others suffice; else 'unclear' or 'other'."""
+    squared_distance = {state: ((share - value) / std) ** 2 for state, value in STATES.items()}
+    first, second = sorted(squared_distance, key=lambda state: squared_distance[state])[:2]
+    if std >= 0.5 * SHARE_STD or 0.5 * (
+        squared_distance[second] - squared_distance[first]
+    ) < np.log(ODDS):
         return 'unclear'
-    return first if off[first] < BEYOND_STD**2 else 'other'
+    return first if squared_distance[first] < BEYOND_STD**2 else 'other'
 
 
 def _toggle(compensator: Compensator, visits: Visits) -> tuple[Estimate | None, float | None]:
-    """Return the share that is switched, and the noise of a row in mm."""
+    """Share that is switched, and the noise of a row, mm; None for too few pairs."""
     pairs = []
     for row in np.flatnonzero(visits.on):
         same = [
@@ -361,7 +374,7 @@ def _toggle(compensator: Compensator, visits: Visits) -> tuple[Estimate | None, 
     if len(pairs) < 2:
         return None, None
     on, off = (np.array(rows) for rows in zip(*pairs, strict=True))
-    side = _Side(compensator, visits, on)
+    side = _ProjectedRows(compensator, visits, on)
     turned = np.empty((len(pairs), 3))
     for sensor in dict.fromkeys(visits.sensor[row] for row in on):
         mine = np.array([visits.sensor[row] == sensor for row in on])
@@ -383,14 +396,14 @@ def _toggle(compensator: Compensator, visits: Visits) -> tuple[Estimate | None, 
     inverse = np.linalg.inv(sigma**2 * np.eye(len(move)) + unsure @ unsure.T)
     precision = float(move @ inverse @ move)
     share = float(move @ inverse @ difference) / precision
-    verdict = _called({s: _integrated(v) for s, v in states.items()}, _integrated(other))
+    verdict = _decided({s: _integrated(v) for s, v in states.items()}, _integrated(other))
     left = difference - share * move
     noise = 1e3 * float(np.sqrt(3.0 * left @ left / (len(left) - 1) / 2.0))
     return Estimate(share, precision**-0.5, verdict), noise
 
 
-def _poses(side: _Side, rivals: list[FloatArray]) -> int | None:
-    """Return how many poses would exclude what these do not; None where so many would not."""
+def _poses(side: _ProjectedRows, rivals: list[FloatArray]) -> int | None:
+    """Number of poses that would exclude the alternatives; None if `MOST_POSES` would not."""
     unsure = side.projected(side.unsure(side.command))
     residual = side.projected(side.measured - side.at['in_use'])
     sigma = float(SIGMAS[np.argmax(_log_likelihood(residual, unsure))])

@@ -150,7 +150,7 @@ class CompensatorNode(RemasterNode):
         self._chain = self._correction.compensator.model.chain
         self._names = self._chain.joint_names
         self._true = foreign_motion.TrueAngles(self._correction.compensator)
-        self._present = foreign_motion.Present()
+        self._present = foreign_motion.ArmReports()
         self._order = JointOrder(self._names)
         self._states = ArmStates(self, self._names, HOLD_S)
         # Whether it corrects; None before the arm was seen to stand.
@@ -299,8 +299,8 @@ class CompensatorNode(RemasterNode):
         q, since_s = self._present.q, self.now_s() - self._begun_s
         passed = self._passed
         if passed is not None and passed.admitted.waypoints and since_s < passed.end_s + STOPPED_S:
-            places = passed.places(since_s - allowed_lag_s(SupervisorRules(), 1.0), since_s)
-            if np.abs(places - q).max(axis=1).min() <= ON_PATH_RAD:
+            samples = passed.samples(since_s - allowed_lag_s(SupervisorRules(), 1.0), since_s)
+            if np.abs(samples - q).max(axis=1).min() <= ON_PATH_RAD:
                 return ''
             return 'the arm is not reported on the way of the trajectory that was passed on'
         return self._led.elsewhere(q)
@@ -494,7 +494,7 @@ class CompensatorNode(RemasterNode):
     ) -> tuple[Any, JointTrajectory]:
         """Return what is passed on, and its message; reads nothing that callbacks change."""
         wanted = self._motion.Trajectory(*_points(message, self._names))
-        passed = self._motion.passed_on(
+        passed = self._motion.corrected_for_controller(
             wanted, arm, gate, in_use, 1e-3 * self.p.tolerance_mm, warm, told
         )
         return passed, self._message(passed.admitted)
@@ -537,13 +537,13 @@ class CompensatorNode(RemasterNode):
         passed, since_s = self._passed, self.now_s() - self._begun_s
         if passed is not None and passed.admitted.waypoints and since_s < passed.end_s:
             lag_s = allowed_lag_s(SupervisorRules(), 1.0)
-            self._keep(*passed.places(since_s - lag_s, since_s + lag_s))
+            self._keep(*passed.samples(since_s - lag_s, since_s + lag_s))
         self._passed, self._end_s = None, self.now_s()
 
-    def _keep(self, *places: FloatArray) -> None:
-        self._led.lead_to(*places)
+    def _keep(self, *samples: FloatArray) -> None:
+        self._led.lead_to(*samples)
         if self._keeps_end:
-            write = partial(self._command_file.write, places[-1], time.time_ns())
+            write = partial(self._command_file.write, samples[-1], time.time_ns())
             self._disk.submit(write, self._on_written)
 
     def _on_written(self, result: object) -> None:

@@ -376,7 +376,7 @@ class RobotBridge(RemasterNode):
         if correction is not None:
             # Paths are checked where the arm is, not where its encoders put it.
             true_arm, self._shifts = correction.true_arm, correction.shifts
-            unknown_rad = correction.unknown_rad(np.deg2rad(cell.unknown_offset_deg))
+            unknown_rad = correction.joint_angle_bound(np.deg2rad(cell.unknown_offset_deg))
         # What it has changed of each solution of the pose, rad, (m, k); None where it is off.
         self._changes: FloatArray | None = None
         model = cell.collision_model(true_arm, unknown_rad)
@@ -562,7 +562,7 @@ class RobotBridge(RemasterNode):
             done = self._correction.commands(targets)
             targets, self._changes = done.command, done.change
             for number, points in waypoints.items():
-                waypoints[number], too_far = self._correction.on_the_way(points)
+                waypoints[number], too_far = self._correction.for_waypoints(points)
                 for why in too_far.values():
                     refused[number] = f'on its way {why}'
             refused |= done.refused

@@ -26,11 +26,11 @@ from remaster_ros.compensation.loaded_errors import (
     without_errors_of_measuring,
 )
 from remaster_ros.compensation.of_result import (
-    Described,
+    CorrectedArm,
     NotCorrected,
-    everything,
-    geometry_too,
-    offsets_alone,
+    arm_of_effects,
+    arm_of_geometry,
+    arm_of_offsets,
 )
 from remaster_ros.discovery.confirmation import Confirmation
 from remaster_ros.discovery.decision import Decision, Named
@@ -222,7 +222,7 @@ def applied(discovery: Discovery, widening: float, result_sha256: str) -> dict[s
 _ALONE = 'only zero-offsets are corrected here'
 
 
-def compensation_of(discovery: Discovery, widening: float) -> Described:
+def compensation_of(discovery: Discovery, widening: float) -> CorrectedArm:
     """Return the arm that compensation.json holds: everything, where that predicts better.
 
     Causes and zero-offsets belong together: where the causes are left out the zero-offsets are
@@ -234,14 +234,14 @@ def compensation_of(discovery: Discovery, widening: float) -> Described:
     alone = discovery.alone
     rows = discovery.residuals.context.measurements
     drawn = discovery.geometry
-    geometry = None if drawn is None else geometry_too(alone, drawn, rows)
+    geometry = None if drawn is None else arm_of_geometry(alone, drawn, rows)
     notes = []
     if discovery.solution.cells:
         notes.append(
             'zero-offsets alone: the model with everything that was found predicts held-out poses '
             'no better'
         )
-    described = offsets_alone(alone, predict(alone, rows).widening, notes, geometry)
+    described = arm_of_offsets(alone, predict(alone, rows).widening, notes, geometry)
     left = tuple(
         NotCorrected(e.name, e.joints, e.size_m, _ALONE, e.remedy) for e in discovery.effects
     )
@@ -253,14 +253,14 @@ def holds_everything(discovery: Discovery) -> bool:
     alone = _held_out_mean(discovery, errors_to_load(discovery)['offsets'])
     every = _held_out_mean(discovery, errors_to_load(discovery)['everything'])
     better = bool(np.isnan(alone)) or round(every, 3) < round(alone, 3)
-    can_be_commanded = _everything(discovery).model.steepest() < 1.0
+    can_be_commanded = _everything(discovery).model.largest_slope() < 1.0
     return better and can_be_commanded and bool(discovery.solution.cells)
 
 
 @lru_cache(maxsize=1)
-def _everything(discovery: Discovery) -> Described:
+def _everything(discovery: Discovery) -> CorrectedArm:
     """Return the arm with everything corrected."""
-    return everything(discovery.fit, discovery.solution.cells, discovery.residuals)
+    return arm_of_effects(discovery.fit, discovery.solution.cells, discovery.residuals)
 
 
 @lru_cache(maxsize=1)
@@ -282,7 +282,7 @@ def errors_to_load(discovery: Discovery) -> dict[str, FloatArray]:
             plain, model_text(alone, discovery.geometry), left_out
         )
     described = _everything(discovery)
-    if described.model.steepest() < 1.0:
+    if described.model.largest_slope() < 1.0:
         text = correction_text(described, session, 'discover', '').encode()
         of_measuring = np.repeat(
             np.array([cell.of_measurement for cell in cells], dtype=bool),

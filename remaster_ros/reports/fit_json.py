@@ -33,7 +33,7 @@ from remaster_ros.compensation.file import (
     written,
 )
 from remaster_ros.compensation.loaded_errors import errors_with_correction, errors_with_urdf
-from remaster_ros.compensation.of_result import Described, geometry_too, offsets_alone
+from remaster_ros.compensation.of_result import CorrectedArm, arm_of_geometry, arm_of_offsets
 from remaster_ros.discovery.geometry_model import GeometryModel, geometry_model
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.serial_chain import SerialChain
@@ -189,17 +189,17 @@ def compensation_text(result: FitResult, result_sha256: str) -> str:
     Near singularities no command reaches what they ask for; a robot model with them needs none.
     """
     geometry, rows = geometry_of(result), result.measurements
-    described = None if geometry is None else geometry_too(result, geometry, rows)
+    described = None if geometry is None else arm_of_geometry(result, geometry, rows)
     if described is not None and geometry is not None:
         text = _of_fit(described, result, result_sha256)
         model = of_text(text.encode(), Path(COMPENSATION_FILE)).model
         if replace(geometry, errors=errors_with_correction(model, rows)).is_better:
             return text
-    alone = offsets_alone(result, predict(result, rows).widening, geometry=described)
+    alone = arm_of_offsets(result, predict(result, rows).widening, geometry=described)
     return _of_fit(alone, result, result_sha256)
 
 
-def _of_fit(described: Described, result: FitResult, result_sha256: str) -> str:
+def _of_fit(described: CorrectedArm, result: FitResult, result_sha256: str) -> str:
     mounts = _mounts(result, described.model)
     return correction_text(described, result.session, 'fit', result_sha256, mounts)
 
@@ -234,7 +234,7 @@ def _mounts(result: FitResult, model: ArmModel) -> dict[str, MountPart]:
 
 
 def correction_text(
-    described: Described,
+    described: CorrectedArm,
     session: Session,
     made_by: Source,
     result_sha256: str,

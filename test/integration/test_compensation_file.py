@@ -17,7 +17,7 @@ from worlds.hidden_sessions import HiddenSession, Recipe, hidden_session, third_
 
 import remaster_ros
 from remaster_ros.compensation.compensator import Compensator
-from remaster_ros.compensation.of_result import everything, geometry_too, offsets_alone
+from remaster_ros.compensation.of_result import arm_of_effects, arm_of_geometry, arm_of_offsets
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.transforms import inverse
 from remaster_ros.reports.discovery_json import compensation_of, holds_everything, predictions_of
@@ -57,7 +57,7 @@ def test_the_hidden_arm_is_where_the_nominal_one_would_be(hidden, found):
     assert every.content.source.made_by == 'discover'
     tour = third_visits(RECIPE)
     good = judged(hidden, every.compensator, tour)
-    alone = judged(hidden, Compensator(offsets_alone(discovery.alone, 1.0).model), tour)
+    alone = judged(hidden, Compensator(arm_of_offsets(discovery.alone, 1.0).model), tour)
     assert alone.rms_m > 0.4e-3
     # Of half as many poses as the 0.05 mm of the campaign takes.
     assert good.rms_m < 0.07e-3
@@ -125,7 +125,7 @@ def test_of_a_fit_the_file_has_its_offsets_and_nothing_else(fit, tmp_path):
     assert np.linalg.eigvalsh(file.uncertainty(q)).min() > 0.0
     # An offset that only a prior tells from a place of the marker is left out, its effect is not.
     assert np.any(fit.joint_offsets[~known] != 0.0)
-    alone, m = offsets_alone(fit, 1.0).model, fit.session.measurements
+    alone, m = arm_of_offsets(fit, 1.0).model, fit.session.measurements
     assert not np.any(alone.joint_offsets[~known])
     rows = ~m.is_validation
     seen = alone.in_sensor(alone.state(m.q[rows]), 'mocap', 'sir')
@@ -136,8 +136,8 @@ def test_of_a_fit_the_file_has_its_offsets_and_nothing_else(fit, tmp_path):
 def test_offsets_alone_err_by_what_the_arm_with_lengths_and_tilts_has_elsewhere(fit, tmp_path):
     """Mean square: covariance there, and the square of what lies between the two predictions."""
     rows = fit.found.problem.measurements
-    drawn = geometry_too(fit, geometry_of(fit), rows)
-    alone = offsets_alone(fit, 1.0, geometry=drawn)
+    drawn = arm_of_geometry(fit, geometry_of(fit), rows)
+    alone = arm_of_offsets(fit, 1.0, geometry=drawn)
     q, sensor, marker = rows.q[:30], 'mocap', 'sir'
     seen = [one.in_sensor(one.state(q), sensor, marker) for one in (drawn.model, alone.model)]
     apart = (seen[0] - seen[1]) @ alone.model.T_R_N[sensor][:3, :3].T
@@ -145,7 +145,7 @@ def test_offsets_alone_err_by_what_the_arm_with_lengths_and_tilts_has_elsewhere(
     found = Compensator(alone.model).uncertainty(q)
     scale = np.trace(expected, axis1=1, axis2=2).mean()
     np.testing.assert_allclose(found, expected, atol=0.02 * scale)
-    bare = Compensator(offsets_alone(fit, 1.0).model).uncertainty(q)
+    bare = Compensator(arm_of_offsets(fit, 1.0).model).uncertainty(q)
     assert np.trace(found, axis1=1, axis2=2).mean() > 1.2 * np.trace(bare, axis1=1, axis2=2).mean()
     path = tmp_path / 'compensation.json'
     path.write_text(correction_text(alone, fit.session, 'fit', ''), encoding='utf-8')
@@ -214,7 +214,7 @@ def test_a_marker_near_an_axis_turns_no_joint_by_degrees():
     session = replace(session, measurements=replace(m, position=m.position + shift))
     found = remaster_ros.discover(session)
     fit, cells = found.fit, found.solution.cells
-    model = everything(fit, cells, found.residuals).model
+    model = arm_of_effects(fit, cells, found.residuals).model
     change = model.added_angles(model.drivers(m.q, model.warming(len(m.q), None)))
     assert np.abs(change - change.mean(axis=0)).max() < np.radians(2.0)
-    assert model.steepest() < 0.15
+    assert model.largest_slope() < 0.15

@@ -25,7 +25,7 @@ import remaster_ros
 from remaster_ros.calibration.comparison import predicted_rows
 from remaster_ros.compensation.compensator import Compensator
 from remaster_ros.compensation.file import read_compensation
-from remaster_ros.compensation.of_result import placed
+from remaster_ros.compensation.of_result import slots_of
 from remaster_ros.reports.result_folder import save_discovery
 
 EVALUATOR = Path(__file__).parents[2] / 'docs/examples/evaluate_compensation.py'
@@ -173,7 +173,7 @@ def test_the_compensation_predicts_its_session_as_the_discovery_does(result):
     seen = file.model.in_sensor(file.model.state(m.q), sensor, marker)
     expected = taken_out(
         found, found.fit, found.solution.cells,
-        lambda cell: cell.of_measurement or not [*placed(cell, CHAIN)],
+        lambda cell: cell.of_measurement or not [*slots_of(cell, CHAIN)],
     ) - found.fit.residuals_after  # fmt: skip
     apart = np.linalg.norm(seen - expected, axis=1)
     # The fit has lengths and the like to first order.

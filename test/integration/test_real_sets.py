@@ -12,7 +12,7 @@ import pytest
 from remaster_ros import read_compensation
 from remaster_ros.calibration.fit import FitResult, fit_session
 from remaster_ros.compensation.compensator import Compensator
-from remaster_ros.compensation.controller_forms import held
+from remaster_ros.compensation.controller_forms import form_content
 from remaster_ros.discovery.discover import discover_session
 from remaster_ros.reports.discovery_json import (
     compensation_of,
@@ -98,9 +98,9 @@ def test_what_can_be_loaded_of_a_panda(tmp_path: Path) -> None:
     covariances = [one.uncertainty(q) for one in (memory, file.compensator)]
     np.testing.assert_allclose(covariances[0], covariances[1], rtol=1e-4, atol=1e-18)
     # A URDF holds lengths and tilts: those beside its soft base would leave 1.16 mm.
-    left = held(file, 'urdf', np.random.default_rng(0))
+    left = form_content(file, 'urdf', np.random.default_rng(0))
     assert left.rms_mm < 0.9
-    assert 'export that one' in left.nearer
+    assert 'export that one' in left.better_file
     loadable = json.loads((tmp_path / 'discovery.json').read_text())['loadable']
     offsets, geometry, everything = (row['held_out_mean_mm'] for row in loadable)
     assert offsets > 1.0

@@ -48,7 +48,7 @@ def seen(reported: np.ndarray, rng: np.random.Generator, more=0.0) -> np.ndarray
     return points + rng.normal(0.0, NOISE_M, points.shape)
 
 
-def somewhere(rng: np.random.Generator, rows: int) -> np.ndarray:
+def sampled_angles(rng: np.random.Generator, rows: int) -> np.ndarray:
     margin = 0.05 * (CHAIN.upper - CHAIN.lower)
     return rng.uniform(CHAIN.lower + margin, CHAIN.upper - margin, (rows, len(CHAIN)))
 
@@ -63,7 +63,7 @@ def folder(tmp_path_factory):
     """A session of 60 rows to fit and 40 held out, and its fit in f."""
     print(f'seed {SEED}')
     rng, folder = np.random.default_rng(SEED), tmp_path_factory.mktemp('slide')
-    q = somewhere(rng, 100)
+    q = sampled_angles(rng, 100)
     held_out = np.arange(100) >= 60
     write_session(folder / 's', session_of(q, seen(q, rng), is_validation=held_out))
     remaster('fit', folder / 's', '--out', folder / 'f', '--quiet', '--no-figures')
@@ -85,7 +85,7 @@ def test_each_form_holds_the_offset_in_mm(folder, tmp_path):
     for form in ('urdf', 'pad', 'rising'):
         remaster('export', file, '--to', form, '--out', tmp_path / form, '--quiet')
     urdf = (tmp_path / 'urdf/robot_calibrated.urdf').read_text()
-    q = somewhere(np.random.default_rng(1), 50)
+    q = sampled_angles(np.random.default_rng(1), 50)
     true = places(q + np.where(KNOWN, OFFSETS, 0.0))
     assert np.linalg.norm(places(q, urdf) - true, axis=1).max() < 0.3e-3
     assert np.linalg.norm(places(found.command(q), urdf) - places(q), axis=1).max() < 1e-6
@@ -113,7 +113,7 @@ def test_the_corrected_model_leaves_nothing_to_fit(folder, tmp_path):
 def test_verify_tells_whether_it_is_in_use(folder, tmp_path, state):
     rng = np.random.default_rng(3)
     file = folder / 'f/apply/compensation.json'
-    wanted = somewhere(rng, 12)
+    wanted = sampled_angles(rng, 12)
     reported = read_compensation(file).command(wanted) if state == 'in_use' else wanted
     on = np.ones(len(wanted), np.int64)
     session = session_of(reported, seen(reported, rng), wanted=wanted, correction=on)
@@ -126,7 +126,7 @@ def test_verify_tells_whether_it_is_in_use(folder, tmp_path, state):
 
 def test_a_check_names_a_slide_whose_zero_has_moved_and_by_how_many_mm(folder, tmp_path):
     rng, file = np.random.default_rng(4), folder / 'f/apply/compensation.json'
-    q, moved = somewhere(rng, 8), 0.5e-3 * (np.arange(6) == SLIDE)
+    q, moved = sampled_angles(rng, 8), 0.5e-3 * (np.arange(6) == SLIDE)
     given = ('--baseline', file, '--history', tmp_path / 'arm.jsonl')
     for day in range(16):
         # The rail stands a little elsewhere each day: that is the same pose.
@@ -148,7 +148,7 @@ def test_a_check_names_a_slide_whose_zero_has_moved_and_by_how_many_mm(folder, t
 
 def test_a_table_of_targets_is_corrected_in_its_own_units(folder, tmp_path):
     file = folder / 'f/apply/compensation.json'
-    q = somewhere(np.random.default_rng(6), 20)
+    q = sampled_angles(np.random.default_rng(6), 20)
     shown = np.degrees(q)
     shown[:, SLIDE] = 1e3 * q[:, SLIDE]
     units = ['deg', 'deg', 'mm', 'deg', 'deg', 'deg']

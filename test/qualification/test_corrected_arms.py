@@ -18,7 +18,7 @@ from worlds.hidden_sessions import Recipe, hidden_session, third_visits
 
 import remaster_ros
 from remaster_ros.compensation.compensator import Compensator
-from remaster_ros.compensation.of_result import offsets_alone
+from remaster_ros.compensation.of_result import arm_of_offsets
 from remaster_ros.reports.discovery_json import compensation_of, predictions_of
 
 ARMS = int(os.environ.get('COMPENSATED_ARMS', '20'))
@@ -41,7 +41,7 @@ def compensated(number):
     hidden = hidden_session(recipe)
     found = remaster_ros.discover(hidden.session)
     every = Compensator(compensation_of(found, predictions_of(found).widening).model)
-    alone = Compensator(offsets_alone(found.alone, 1.0).model)
+    alone = Compensator(arm_of_offsets(found.alone, 1.0).model)
     tour = third_visits(recipe)
     return number, kinds, judged(hidden, every, tour), judged(hidden, alone, tour)
 

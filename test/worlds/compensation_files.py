@@ -11,7 +11,7 @@ import numpy as np
 
 from remaster_ros.compensation.arm_model import ArmModel
 from remaster_ros.compensation.file import written
-from remaster_ros.compensation.of_result import Described
+from remaster_ros.compensation.of_result import CorrectedArm
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.types import Controller
 
@@ -37,7 +37,7 @@ def save(
     root[:, :k] = offset_std * np.eye(k)
     identifiable = tuple(known) or (True,) * k
     why = tuple('' if one else 'not told' for one in identifiable)
-    described = Described(
+    described = CorrectedArm(
         replace(model, root=root), identifiable, why, np.tile([-2.0, 2.0], (k, 1))
     )
     path = folder / 'compensation.json'

@@ -14,7 +14,7 @@ from worlds.sliding_cells import rail, telescope
 
 from remaster_ros.compensation.arm_model import ArmModel, Function, Geometry, JointTerm
 from remaster_ros.compensation.compensator import Compensator
-from remaster_ros.compensation.of_result import placed
+from remaster_ros.compensation.of_result import slots_of
 from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.kinematics.transforms import apply, matrix_to_rotation_vector
 
@@ -85,7 +85,7 @@ def test_each_cell_moves_the_arm_as_its_effect_defines(context):
     nothing = replace(nothing, reference_c=first, mean_c=first)
     corrected, left = set(), set()
     for cell in the_cells(context):
-        slots = list(placed(cell, chain))
+        slots = list(slots_of(cell, chain))
         if not slots:
             left.add((cell.name, cell.place, cell.driver.partition('_of_')[0]))
             continue
@@ -154,7 +154,7 @@ def test_derivative_is_that_of_the_model(name):
     rng = np.random.default_rng(3)
     step = 1e-7 * rng.standard_normal(derivative.shape[2])
     units = np.array([1e-3 if 'growth' in name else 1.0 for name in model.parameter_names])
-    moved = model.moved(step * units)
+    moved = model.with_step(step * units)
     change = moved.in_sensor(moved.state(q), 'mocap', 'sir') - model.in_sensor(
         model.state(q), 'mocap', 'sir'
     )
@@ -213,7 +213,7 @@ def test_on_the_bound_there_is_no_better_pose(budget_deg):
     found = compensator.correct(q)
     own = compensator.angle_errors(q)
     bound = np.maximum(np.radians(budget_deg), np.abs(own))
-    frames = model.chain.frames(model.somewhere())
+    frames = model.chain.frames(model.sampled_angles())
     lever = np.linalg.norm(
         model.chain.velocities(frames, (frames[:, -1] @ model.chain.T_fixed[-1])[:, :3, 3]), axis=1
     ).max()

@@ -10,13 +10,13 @@ from worlds.checked_arms import NOISE_M, CheckedArm
 from remaster_ros.cli.check import content_of
 from remaster_ros.compensation.checking import POWER_STD, SMALLEST_M, judge
 from remaster_ros.compensation.drift import RATES, drift
-from remaster_ros.compensation.iso9283 import Visited
+from remaster_ros.compensation.iso9283 import IsoFigures
 
 BEFORE, JOINT = 20, 2
 DAY_S = 86_400.0
 # 28 November 2026, noon UTC.
 FIRST_S = 1_795_867_200.0
-NOT_VISITED = Visited((1,), np.zeros(0), np.zeros(0))
+NOT_VISITED = IsoFigures((1,), np.zeros(0), np.zeros(0))
 
 
 def test_the_odds_are_those_of_the_slope_integrated_out():

@@ -11,11 +11,11 @@ from worlds.drawn_moves import drawn, line
 from worlds.hidden_tours import robot
 
 from remaster_ros.compensation.foreign_motion import (
-    Passed,
-    Present,
+    ArmReports,
+    SentTrajectory,
     Trajectory,
     TrueAngles,
-    passed_on,
+    corrected_for_controller,
 )
 from remaster_ros.compensation.in_use import CorrectionInUse
 from remaster_ros.errors import InputError
@@ -36,13 +36,13 @@ def gate_of(correction, acceleration=ACCELERATION):
 
 
 def standing(q):
-    arm = Present()
+    arm = ArmReports()
     for i in range(20):
         arm.take(0.02 * i, q, 0.02 * i)
     return arm
 
 
-def points(passed: Passed):
+def points(passed: SentTrajectory):
     found = passed.admitted.waypoints
     return [np.array(one) for one in zip(*((w.time_s, w.q, w.velocity) for w in found))]
 
@@ -77,7 +77,9 @@ def test_paths_through_singularities_keep_the_limits_and_the_tool_its_path(tmp_p
         wanted = line(start, end, ACCELERATION, chain, share=1.0)
         at = compensator.command(start)
         began_s = time.process_time()
-        passed = passed_on(wanted, standing(at), gate, correction, TOLERANCE_M, told=start)
+        passed = corrected_for_controller(
+            wanted, standing(at), gate, correction, TOLERANCE_M, believed_q=start
+        )
         cpu_s += time.process_time() - began_s
         assert isinstance(passed.admitted, Admitted)
         t, q, v = points(passed)
@@ -127,22 +129,22 @@ def test_what_is_planned_from_the_angles_it_was_told_begins_where_the_arm_is(tmp
     told = TrueAngles(compensator).at(at, None, 0.0)
     np.testing.assert_allclose(compensator.command(told), at, atol=1e-9)
     wanted = line(told, target, ACCELERATION, chain)
-    t, q, v = points(passed_on(wanted, arm, gate, correction, TOLERANCE_M))
+    t, q, v = points(corrected_for_controller(wanted, arm, gate, correction, TOLERANCE_M))
     assert t[0] == 0.0
     np.testing.assert_allclose(q[[0, -1]], [at, compensator.command(target)], atol=1e-9)
     # Without its start, as many programs send: the same path, begun by the controller itself.
     later = Trajectory(*(one[1:] for one in _parts(wanted)))
-    t, q, v = points(passed_on(later, arm, gate, correction, TOLERANCE_M))
+    t, q, v = points(corrected_for_controller(later, arm, gate, correction, TOLERANCE_M))
     assert t[0] > 0.0
     np.testing.assert_allclose(q[-1], compensator.command(target), atol=1e-9)
     # A planner that reads the arm's own joint_states.
     wrong = line(at, target, ACCELERATION, chain)
     with pytest.raises(InputError, match=r"begins .* must read this node's joint_states") as error:
-        passed_on(wrong, arm, gate, correction, TOLERANCE_M)
+        corrected_for_controller(wrong, arm, gate, correction, TOLERANCE_M)
     assert '\n' not in str(error.value)
     # Not in use: as it comes.
     off = correction.off()
-    t, q, v = points(passed_on(wrong, arm, gate_of(off), off, TOLERANCE_M))
+    t, q, v = points(corrected_for_controller(wrong, arm, gate_of(off), off, TOLERANCE_M))
     np.testing.assert_allclose(t, wrong.times_s, rtol=1e-3)
     np.testing.assert_allclose(q, wrong.positions, atol=1e-12)
     np.testing.assert_allclose(v, wrong.velocities, rtol=1e-3, atol=1e-9)
@@ -157,7 +159,7 @@ def test_lines_and_single_points_and_a_hold(tmp_path):
     gate = gate_of(correction)
     at, target = configurations(compensator.model, 2, 8) * 0.5
     arm = standing(at)
-    passed = passed_on(
+    passed = corrected_for_controller(
         Trajectory(np.array([8.0]), target[None], None), arm, gate, correction, TOLERANCE_M
     )
     assert passed.admitted.is_straight
@@ -173,7 +175,9 @@ def test_lines_and_single_points_and_a_hold(tmp_path):
     assert np.median(off) < TOLERANCE_M
     assert off.max() < 0.2e-3
     none = Trajectory(np.zeros(0), np.zeros((0, 6)), None)
-    assert passed_on(none, arm, gate, correction, TOLERANCE_M).admitted.waypoints == ()
+    assert (
+        corrected_for_controller(none, arm, gate, correction, TOLERANCE_M).admitted.waypoints == ()
+    )
 
 
 def test_while_the_arm_moves_its_points_are_corrected(tmp_path):
@@ -182,7 +186,7 @@ def test_while_the_arm_moves_its_points_are_corrected(tmp_path):
     compensator = correction.compensator
     gate = gate_of(correction)
     at = configurations(compensator.model, 1, 10)[0] * 0.5
-    arm, speed = Present(), np.full(6, 0.1)
+    arm, speed = ArmReports(), np.full(6, 0.1)
     for i in range(20):
         arm.take(0.02 * i, at + 0.02 * i * speed, 0.02 * i)
     assert not arm.stands
@@ -190,26 +194,30 @@ def test_while_the_arm_moves_its_points_are_corrected(tmp_path):
     there = compensator.true(arm.q)
     to = there + 0.1 * speed
     wanted = Trajectory(np.array([0.1]), to[None], np.zeros((1, 6)))
-    _, q, v = points(passed_on(wanted, arm, gate, correction, TOLERANCE_M))
+    _, q, v = points(corrected_for_controller(wanted, arm, gate, correction, TOLERANCE_M))
     # A tenth of a second on: the change goes there as far as the accelerations of so short a
     # way allow.
     assert np.abs(q - to - (arm.q - there)).max() < 0.5 * ACCELERATION * 0.1**2 / 4
     assert np.all(v == 0.0)
     wanted = Trajectory(np.array([0.1, 0.4]), np.array([to, to]), None)
-    assert passed_on(wanted, arm, gate, correction, TOLERANCE_M).admitted.is_straight
+    assert corrected_for_controller(
+        wanted, arm, gate, correction, TOLERANCE_M
+    ).admitted.is_straight
     # The controller would jump there; an arm that is coming to rest it follows.
     wanted = Trajectory(np.array([0.0, 0.4]), np.array([there, to]), np.zeros((2, 6)))
-    slow = Present()
+    slow = ArmReports()
     for i in range(20):
         slow.take(0.02 * i, arm.q + 0.01 * (0.02 * i - 0.38), 0.02 * i)
     assert not slow.stands
-    assert len(points(passed_on(wanted, slow, gate, correction, TOLERANCE_M))[0]) >= 2
+    assert (
+        len(points(corrected_for_controller(wanted, slow, gate, correction, TOLERANCE_M))[0]) >= 2
+    )
     with pytest.raises(InputError, match='begins at once while the arm moves'):
-        passed_on(wanted, arm, gate, correction, TOLERANCE_M)
+        corrected_for_controller(wanted, arm, gate, correction, TOLERANCE_M)
     # From its speed to rest in no time.
     wanted = Trajectory(np.array([0.01]), to[None], np.zeros((1, 6)))
     with pytest.raises(InputError, match=r'would have a (speed|acceleration)'):
-        passed_on(wanted, arm, gate, correction, TOLERANCE_M)
+        corrected_for_controller(wanted, arm, gate, correction, TOLERANCE_M)
 
 
 def test_what_is_refused_is_one_line(tmp_path):
@@ -221,7 +229,7 @@ def test_what_is_refused_is_one_line(tmp_path):
 
     def refused(words, wanted, on=correction, by=gate):
         with pytest.raises(InputError, match=words) as caught:
-            passed_on(wanted, arm, by, on, TOLERANCE_M)
+            corrected_for_controller(wanted, arm, by, on, TOLERANCE_M)
         assert '\n' not in str(caught.value)
 
     good = line(told, target, ACCELERATION, chain)
@@ -245,7 +253,7 @@ def test_what_is_refused_is_one_line(tmp_path):
     refused('would go to', line(told, beyond + 0.05, ACCELERATION, chain))
     # What is planned faster than the limit of acceleration is slowed down.
     fast = line(told, target, 4 * ACCELERATION, chain)
-    slowed = passed_on(fast, arm, gate, correction, TOLERANCE_M)
+    slowed = corrected_for_controller(fast, arm, gate, correction, TOLERANCE_M)
     assert 'slowed down to' in slowed.notes[0]
     assert slowed.end_s > 1.5 * fast.times_s[-1]
     far = CorrectionInUse(
@@ -278,7 +286,7 @@ def test_true_angles_are_exact_where_the_arm_stands(tmp_path):
 
 
 def test_an_arm_stands_that_was_reported_at_one_place_long_enough():
-    arm = Present()
+    arm = ArmReports()
     assert not arm.is_known
     assert not arm.stands
     for i in range(10):
@@ -293,7 +301,7 @@ def test_an_arm_stands_that_was_reported_at_one_place_long_enough():
     arm.take(0.30, np.array([5e-4, 0.0]), 50.3)
     assert not arm.stands
     # Slow, but on its way.
-    arm = Present()
+    arm = ArmReports()
     for i in range(100):
         arm.take(0.02 * i, np.array([0.0, 1e-3 * 0.02 * i]), 0.02 * i)
         assert not arm.stands

@@ -73,7 +73,7 @@ def test_the_true_arm_is_within_the_clearance_of_the_one_that_is_checked(tmp_pat
     there = model.state(q).frames[..., :3, 3]
     checked = correction.true_arm.frames(q)
     off = np.linalg.norm(there - checked[..., :3, 3], axis=-1)
-    unknown = correction.unknown_rad(np.deg2rad(1.0))
+    unknown = correction.joint_angle_bound(np.deg2rad(1.0))
     axes, used = CHAIN.axes_in_base(checked), []
     for link in range(1, len(CHAIN)):
         arms = checked[:, link, None, :3, 3] - checked[:, :link, :3, 3]
@@ -90,7 +90,7 @@ def test_lengths_and_tilts_are_built_in(tmp_path):
     correction = in_use(save(tmp_path, model, URDF))
     q = configurations(50, 5)
     np.testing.assert_allclose(correction.true_arm.forward(q), model.state(q).tool, atol=1e-12)
-    assert correction.unknown_rad(1.0) == pytest.approx(KNOWN_OFFSET_RAD, abs=1e-7)
+    assert correction.joint_angle_bound(1.0) == pytest.approx(KNOWN_OFFSET_RAD, abs=1e-7)
 
 
 def test_limits_are_shifted_by_the_least_and_the_largest(tmp_path):
@@ -175,7 +175,9 @@ def test_the_clearance_covers_what_is_still_unknown(tmp_path, std_deg, known, un
     model = arm(URDF, joint_offsets=np.full(len(CHAIN), 0.01))
     identifiable = [True] * (len(CHAIN) - 1) + [known]
     path = save(tmp_path, model, URDF, np.radians(std_deg), identifiable)
-    assert in_use(path).unknown_rad(np.radians(1.3)) == pytest.approx(np.radians(unknown_deg))
+    assert in_use(path).joint_angle_bound(np.radians(1.3)) == pytest.approx(
+        np.radians(unknown_deg)
+    )
 
 
 def test_what_must_hold_for_it_is_told(tmp_path):

@@ -29,7 +29,7 @@ from worlds.compensation_files import save
 from worlds.drawn_moves import line
 
 from remaster_ros.compensation.compensator import Compensator
-from remaster_ros.compensation.controller_forms import exported, held
+from remaster_ros.compensation.controller_forms import exported, form_content
 from remaster_ros.compensation.file import read_compensation
 from remaster_ros.errors import InputError
 from remaster_ros.nodes.messages import stamp_of
@@ -91,7 +91,7 @@ def test_what_is_refused_has_its_reason(rig):
     r.peer.destroy_publisher(rival)
     assert r.run(PATIENCE_S, lambda: not r.node._trouble())
     # A description that has the correction in it, another arm's, and then the nominal one again.
-    one = held(read_compensation(r.file), 'urdf', np.random.default_rng(1))
+    one = form_content(read_compensation(r.file), 'urdf', np.random.default_rng(1))
     urdf = exported(read_compensation(r.file), 'urdf', one)['robot_calibrated.urdf']
     for text, words in (
         (urdf, 'holds this correction already'),
@@ -232,7 +232,7 @@ def test_what_is_worked_out_keeps_nothing_waiting(rig, monkeypatch):
     """An empty trajectory holds the arm at once, and what is worked out is not passed on."""
     r = rig().ready()
     begun, go_on = threading.Event(), threading.Event()
-    own = r.node._motion.passed_on
+    own = r.node._motion.corrected_for_controller
 
     def slow(wanted, *rest):
         if len(wanted.times_s):
@@ -240,7 +240,7 @@ def test_what_is_worked_out_keeps_nothing_waiting(rig, monkeypatch):
             assert go_on.wait(PATIENCE_S)
         return own(wanted, *rest)
 
-    monkeypatch.setattr(r.node._motion, 'passed_on', slow)
+    monkeypatch.setattr(r.node._motion, 'corrected_for_controller', slow)
     said = []
     r.node._say = said.append
     r.planned.publish(r.plan(r.told[-1], TARGET))

@@ -341,8 +341,8 @@ def test_what_is_no_better_in_the_figures_shown_is_not_to_be_loaded(monkeypatch)
         solution=SimpleNamespace(cells=(SimpleNamespace(of_measurement=True, size=1),)),
         loads_geometry=True,
     )
-    model = SimpleNamespace(steepest=lambda: 0.1)
-    monkeypatch.setattr(discovery_json, 'everything', lambda *_: SimpleNamespace(model=model))
+    model = SimpleNamespace(largest_slope=lambda: 0.1)
+    monkeypatch.setattr(discovery_json, 'arm_of_effects', lambda *_: SimpleNamespace(model=model))
     left = {'offsets': 2.0 * errors, 'geometry': errors, 'everything': 0.9999 * errors}
     monkeypatch.setattr(discovery_json, 'errors_to_load', lambda _: left)
     results = loadable(found)
@@ -350,7 +350,7 @@ def test_what_is_no_better_in_the_figures_shown_is_not_to_be_loaded(monkeypatch)
     assert load_words(results[-1])[1].startswith('only where no robot model can be loaded')
     # What the reader of the file refuses is not offered, however well it predicts.
     assert results[-1].file.endswith('compensation.json')
-    model.steepest = lambda: 1.5
+    model.largest_slope = lambda: 1.5
     discovery_json._everything.cache_clear()
     assert loadable(found)[-1].file == ''
 
