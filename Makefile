@@ -7,7 +7,7 @@
 #   make check    lint, types, layers; CI runs this and make test
 #   make bench    the benchmarks, small (BENCH='bench_speed …' chooses, FULL=1 for all sizes)
 #   make docs     the site, build/docs/index.html, and its pages that come from the code
-#   make faults   the tables of docs/faults.md from what the tests observe (FAULTS=add keeps the old)
+#   make faults   the tables of test/faults/observed.md from what the tests observe (FAULTS=add keeps the old)
 # The first of them makes a virtual environment. With ROS 2 Jazzy sourced its rclpy is used and the
 # system's NumPy kept; else the ROS 2 wheels are installed. PYTHON=... chooses the interpreter.
 
@@ -46,7 +46,7 @@ test: $(VENV)/installed
 	tools/run-tests $(BIN)/python $(PYTEST)
 
 # What make test leaves out as well, in the same two groups: repetitions, sweeps, campaigns, every row
-# of docs/faults.md. An hour and a half on two cores.
+# of test/faults/observed.md. An hour and a half on two cores.
 # PYTEST=test/… runs these files alone, PYTEST='-k name' those of all that have the name.
 qualify: $(VENV)/qualify-installed
 	tools/run-tests $(BIN)/python --qualify $(PYTEST)

@@ -22,8 +22,7 @@ RATES = (0.01, 0.03, 0.1, 0.3, 1.0)
 FROM_THE_FIRST = 0.5
 """Prior that a drift has been there since the first check; the rest is for a later onset."""
 BATCHES = 6
-"""Number of batches from which the wander about a drift is estimated; two parameters are "
-"fitted."""
+"""Number of batches from which the wander about a drift is estimated; two numbers are fitted."""
 LONGEST_DAYS = 30.0
 """Longest time to the next check of a drift, days."""
 

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What to do after a fit and a search for causes, what it brings, and what remains."""
+"""The answer of a report after a fit and a search for causes: action, gain.
+
+Last result: remaining errors.
+"""
 
 from __future__ import annotations
 
@@ -68,36 +71,36 @@ from remaster_ros.types import BoolArray, FloatArray, Session
 if TYPE_CHECKING:
     from remaster_ros.session.plan_journal import RecordedPlan
 
-# What it is made of: a session, its fit, and its discovery if any.
+# Inputs: a session, its fit, and its discovery if any.
 
 
 @dataclass(frozen=True, eq=False)
 class Inputs:
-    """What was read; n rows."""
+    """Session and results that a report is made of; n rows."""
 
-    session: Session  # All rows
-    # fit.json and discovery.json; None without the latter
+    session: Session
+    # Contents of fit.json and discovery.json (None without the latter)
     fit: Fit
     found: Discovered | None
-    # 3-D error of every row with all offsets at zero and with those of the fit, (n,)
+    # 3-D error of each row with all offsets at zero, and with those of the fit, (n,)
     before_mm: FloatArray
     after_mm: FloatArray
-    causes_mm: FloatArray | None  # With the causes as well, (n,); None where there are none
-    # With the robot model of all lengths, tilts and zero-offsets and nothing else, (n,); None
-    # where there is none that predicts held-out poses better
+    causes_mm: FloatArray | None  # Error with the causes as well, (n,); None without causes
+    # Error with the robot model of all lengths, tilts and zero-offsets, (n,); None if no such
+    # model predicts held-out poses better
     model_mm: FloatArray | None = None
-    model: Path | None = None  # That file
-    plan: RecordedPlan | None = None  # Of its collection; None where the session's folder has none
+    model: Path | None = None  # File of that model
+    plan: RecordedPlan | None = None  # Plan of the collection; None if the session has none
 
     @property
     def judgement(self) -> Judgement:
-        """Of the fit."""
+        """Judgement of the fit."""
         assert isinstance(self.fit.judgement, Judgement)
         return self.fit.judgement
 
     @property
     def gross(self) -> list[int]:
-        """``observation`` of the gross errors: with the causes some are none that the fit has."""
+        """``observation`` of the gross errors, by the discovery or, without one, by the fit."""
         if self.found is not None:
             return self.found.noise.outliers
         checks = self.fit.explained_by_noise
@@ -106,12 +109,12 @@ class Inputs:
 
     @cached_property
     def fit_left_out(self) -> dict[int, str]:
-        """``observation`` of every row that was not fitted, and why."""
+        """Reason by ``observation`` for each row that was not fitted."""
         return {row.observation: row.why for row in self.fit.left_out}
 
     @property
     def T_R_N(self) -> dict[str, FloatArray]:
-        """Where every sensor stands as fitted, (4, 4)."""
+        """Fitted registration of each sensor, (4, 4)."""
         return {
             sensor: transform(
                 matrix_from_quaternion_xyzw(np.array(frame.rotation_xyzw)),
@@ -122,7 +125,10 @@ class Inputs:
 
 
 def located(path: Path) -> Path:
-    """Return the file fit.json or discovery.json that a path is, or that is in a folder."""
+    """File fit.json or discovery.json at a path, or in a folder.
+
+    Raises InputError if a folder has both or neither.
+    """
     if not path.is_dir():
         return path
     there = [path / name for name in (FIT_FILE, DISCOVERY_FILE) if (path / name).exists()]
@@ -137,21 +143,21 @@ def located(path: Path) -> Path:
 def read_inputs(
     session: Session, fit_path: Path, found_path: Path | None, plan: RecordedPlan | None = None
 ) -> Inputs:
-    """Read the results of a session, and refuse those of another.
+    """Read the results of a session.
 
     Parameters
     ----------
     session
-        As read from its folder.
+        Session as read from its folder.
     fit_path, found_path
-        fit.json and discovery.json; residuals.csv and predictions.csv are beside them.
+        fit.json and discovery.json, with residuals.csv and predictions.csv in their folders.
     plan
-        Of the session.
+        Plan of the session.
 
     Raises
     ------
     InputError
-        One line naming file and remedy.
+        Results of another session, or a damaged file; one line naming file and remedy.
     """
     fit = read_fit(fit_path)
     _require_same(session, fit, fit_path, 'fit')
@@ -180,13 +186,14 @@ def read_inputs(
 
 
 def _file_of(source: Loadable | FittedGeometry | msgspec.UnsetType) -> str:
+    """File of a loadable result; '' if there is none."""
     return '' if isinstance(source, msgspec.UnsetType) else source.file
 
 
 def _model(
     session: Session, result: Path, file: str, verb: str
 ) -> tuple[Path | None, FloatArray | None]:
-    """Return a result's robot model and the errors with it, mm; None where it has none."""
+    """Path of a result's robot model and the errors with it, mm; None if there is no model."""
     if not file:
         return None, None
     path = result.parent / APPLY_FOLDER / MODEL_FILE
@@ -195,7 +202,7 @@ def _model(
 
 
 def all_taken_out(found: Discovered | None) -> bool:
-    """Whether all causes surely lie in how the arm was measured, and there is at least one."""
+    """Whether there are causes, and all are certain errors of the measurement."""
     return (
         found is not None
         and found.verdict != 'undetermined'
@@ -205,12 +212,12 @@ def all_taken_out(found: Discovered | None) -> bool:
 
 
 def errors_with_model_mm(session: Session, urdf: str) -> FloatArray:
-    """Return the 3-D error of every row with another robot model, as it is, mm, (n,)."""
+    """3-D error of each row with the robot model of a URDF, mm, (n,)."""
     return lengths_mm(errors_with_urdf(session, urdf))
 
 
 def _require_same(session: Session, result: Fit | Discovered, path: Path, verb: str) -> None:
-    """Refuse the result of other data, or of a version whose files lack what the page has."""
+    """Raise InputError for the result of other data, or of a version that lacks needed keys."""
     if (
         not isinstance(result.session, msgspec.Struct)
         or not isinstance(result.judgement, msgspec.Struct)
@@ -225,12 +232,12 @@ def _require_same(session: Session, result: Fit | Discovered, path: Path, verb: 
 
 
 def parts(paths: Sequence[Path]) -> tuple[Path | None, Path | None]:
-    """Return which of at most two paths is fit.json and which discovery.json.
+    """Paths of fit.json and of discovery.json among at most two paths; None if absent.
 
     Raises
     ------
     InputError
-        Two of one kind, or a file of another name.
+        Two files of one kind, or a file of another name.
     """
     found: dict[str, Path] = {}
     for path in map(located, paths):
@@ -246,99 +253,99 @@ def parts(paths: Sequence[Path]) -> tuple[Path | None, Path | None]:
     return found.get(FIT_FILE), found.get(DISCOVERY_FILE)
 
 
-# What to do, and what it brings.
+# Action, and its gain.
 
 ALL_FILES = (REMASTER_FILE, URDF_FILE, LAYER_FILE, MODEL_FILE)
 Mood = Literal['good', 'caution', 'bad']
 
 
 class Stage(NamedTuple):
-    """The 3-D errors of the judged rows at one stage, mm."""
+    """3-D errors of the judged rows at one stage of correction, mm."""
 
-    title: str  # What is corrected
-    errors: FloatArray  # Of the judged rows, mm, (m,)
+    title: str  # Parts that are corrected
+    errors: FloatArray  # Errors of the judged rows, mm, (m,)
 
     @property
     def mean(self) -> float:
-        """Mean, mm."""
+        """Mean error, mm."""
         return float(self.errors.mean())
 
     @property
     def most(self) -> float:
-        """What 95 % of the rows stay below, mm."""
+        """95 % quantile of the errors, mm."""
         return float(np.quantile(self.errors, 0.95))
 
     @property
     def largest(self) -> float:
-        """Largest, mm."""
+        """Largest error, mm."""
         return float(self.errors.max())
 
 
 class SensorNoise(NamedTuple):
-    """The mean 3-D error that a sensor's noise makes, mm."""
+    """Mean 3-D error due to a sensor's noise, mm."""
 
     sensor: str
-    reading_mm: float  # Of one reading
-    # With what all readings of a pose have in common; None where that is not known
+    reading_mm: float  # Noise of one reading
+    # With the noise that all readings of a pose share; None if unknown
     shared_mm: float | None
 
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """The first screen."""
+    """Content of the first screen."""
 
-    # The judgement: 'good' where held-out poses bear out all of it
+    # Judgement: 'good' if held-out poses confirm all of it
     mood: Mood
     headline: str
-    # 'set' the offsets, 'wait' with them, or 'nothing' has to be set
+    # Set the offsets ('set'), set nothing yet ('wait'), or no need to set anything ('nothing')
     action: Literal['set', 'wait', 'nothing']
-    # The offsets are those of the model with the causes: all lie in the measurement
+    # Whether the offsets are those of the model with causes, as all lie in the measurement
     uses_causes: bool
-    # The deed is to load the robot model with all lengths, tilts and zero-offsets
+    # Whether the action is to load the robot model with all lengths, tilts and zero-offsets
     loads_model: bool
-    stages: tuple[Stage, ...]  # From today on, each with more corrected
-    brings: int  # Index of the stage that the deed reaches
-    final_mm: FloatArray  # The error of every row there, (n,)
-    held_out: bool  # The stages are judged by poses that were never fitted
-    not_counted: int  # Of their readings so many are gross errors, by which no stage is judged
-    noise: tuple[SensorNoise, ...]  # Of every sensor for which it is known
-    remains: tuple[Remaining, ...]  # What the deed leaves
-    offsets: tuple[JointOffset, ...]  # Of every joint
-    # What to do on the robot's pad, in its own numbers, in groups of coupled joints
+    stages: tuple[Stage, ...]  # From today's state, each with more corrected
+    brings: int  # Index of the stage that the action reaches
+    final_mm: FloatArray  # Error of each row at that stage, (n,)
+    held_out: bool  # Whether the stages are judged by poses that were never fitted
+    not_counted: int  # Number of gross errors among them, by which no stage is judged
+    noise: tuple[SensorNoise, ...]  # Noise of each sensor for which it is known
+    remains: tuple[Remaining, ...]  # Errors that the action leaves
+    offsets: tuple[JointOffset, ...]  # One for each joint
+    # Steps on the robot's pad, in its numbers, in groups of coupled joints
     on_the_pad: tuple[tuple[MasteringStep, ...], ...]
-    pad_names: Mapping[str, str]  # Joint of the URDF -> its name on the pad, where that is known
+    pad_names: Mapping[str, str]  # Joint of the URDF -> its name on the pad, if known
 
     @property
     def plain_pad(self) -> bool:
-        """Whether the pad has the URDF's joints and degrees, each set where it is to show 0."""
+        """Whether the pad counts the joints as the URDF, and each is set where it shows 0."""
         return all(len(group) == 1 and group[0].is_plain for group in self.on_the_pad)
 
     @property
     def slides(self) -> bool:
-        """Whether the arm has a joint that slides."""
+        """Whether the arm has a prismatic joint."""
         return any(row.unit == 'mm' for row in self.offsets)
 
     @property
     def left_alone(self) -> list[str]:
-        """The joints to leave as they are, by their names on the pad: their zeros are unknown."""
-        told = {step.joint for group in self.on_the_pad for step in group}
+        """Names on the pad of the joints to leave as they are, whose offsets are unknown."""
+        set_joints = {step.joint for group in self.on_the_pad for step in group}
         return [
             called if called == row.joint else f'{called} ({row.joint})'
             for row in self.offsets
-            if not row.identifiable and row.joint not in told
+            if not row.identifiable and row.joint not in set_joints
             for called in [self.pad_names.get(row.joint, row.joint)]
         ]
 
     @property
     def files(self) -> list[str]:
-        """The files that belong to the deed, in the folder ``apply``."""
+        """Names of the files in the folder ``apply`` that belong to the action."""
         if self.action != 'set':
             return []
         return [name for name in ALL_FILES if self.loads_model or name != MODEL_FILE]
 
 
 def answer_of(inputs: Inputs) -> Answer:
-    """Return what to do, what it brings, and what remains."""
+    """Action, gain and remaining errors for a session and its results."""
     fit, found = inputs.fit, inputs.found
     effects = found.effects if found is not None else []
     judged, held_out = judged_rows(inputs)
@@ -393,6 +400,7 @@ def answer_of(inputs: Inputs) -> Answer:
 def _on_the_pad(
     session: Session, offsets: Sequence[JointOffset]
 ) -> tuple[tuple[MasteringStep, ...], ...]:
+    """Steps on the pad for the offsets of a session."""
     return mastering(
         session.controller,
         SerialChain.from_urdf(session.urdf, session.base_link, session.tip_link),
@@ -403,7 +411,7 @@ def _on_the_pad(
 
 
 def judged_rows(inputs: Inputs) -> tuple[BoolArray, bool]:
-    """Return the rows that the stages are judged by, (n,), and whether they were held out."""
+    """Mask of the rows by which the stages are judged, (n,), and whether they were held out."""
     m = inputs.session.measurements
     if m.is_validation.any():
         gross = m.is_validation & np.isin(m.observation, inputs.gross)
@@ -415,7 +423,7 @@ def judged_rows(inputs: Inputs) -> tuple[BoolArray, bool]:
 
 
 def _stages(inputs: Inputs) -> list[tuple[str, FloatArray]]:
-    """Return title and errors of all rows, mm, at each stage."""
+    """Title, and errors of all rows, mm, at each stage."""
     rows = [('today', inputs.before_mm), ('with the zero-offsets', inputs.after_mm)]
     if inputs.causes_mm is not None and all_taken_out(inputs.found):
         return [*rows, ('with zero-offsets, measuring errors taken out', inputs.causes_mm)]
@@ -433,7 +441,7 @@ def _action(
     after: float,
     offsets: list[JointOffset],
 ) -> tuple[Literal['set', 'wait', 'nothing'], str]:
-    """Return what to do, and where it is not to set the offsets, why."""
+    """Action, and the reason if it is not to set the offsets."""
     if judgement.mood == 'bad':
         return 'wait', f'Set nothing yet. {judgement.headline}'
     slipped = [e for e in effects if e.moment_s is not None and not e.of_measurement]
@@ -454,7 +462,7 @@ def _action(
 
 
 def _noise(inputs: Inputs) -> tuple[SensorNoise, ...]:
-    """Return the noise of the final model where there is one, else what the fit counts on."""
+    """Noise by sensor: of the model with causes if there is one, else that assumed by the fit."""
     rows: list[SensorNoise] = []
     if inputs.found is not None and isinstance(inputs.found.noise.sensors, dict):
         for sensor, noise in inputs.found.noise.sensors.items():
@@ -476,7 +484,7 @@ def _noise(inputs: Inputs) -> tuple[SensorNoise, ...]:
 
 
 def _mood(inputs: Inputs, loads_model: bool, may_be_good: bool) -> Mood:
-    """Return 'good' only where the fit, the discovery and the held-out poses all agree."""
+    """Judgement: 'good' only if the fit, the discovery and the held-out poses all agree."""
     fit, found = inputs.judgement, inputs.found
     if fit.mood == 'bad':
         return 'bad'
@@ -503,47 +511,48 @@ def _headline(
     loads_model: bool,
     gross: int,
 ) -> str:
-    """Return the deed and its gain; ``measured`` is what was found of the measurement."""
+    """Sentence with the action and its gain; ``measured``: titles of the measurement's errors."""
     before, after = stages[0], stages[brings]
-    deed = f'Set the zero-offset{"s" if joints > 1 else ""} of {counted(joints, "joint")}'
+    action = f'Set the zero-offset{"s" if joints > 1 else ""} of {counted(joints, "joint")}'
     if loads_model:
-        deed = 'Load the robot model with all lengths, tilts and zero-offsets'
-    where = 'poses that were never fitted' if held_out else 'the fitted poses'
+        action = 'Load the robot model with all lengths, tilts and zero-offsets'
+    poses_text = 'poses that were never fitted' if held_out else 'the fitted poses'
     if gross:
-        where += f' ({not_counted(gross)})'
+        poses_text += f' ({not_counted(gross)})'
     if uses_causes:
         # That part of the errors was never the arm's.
         return (
-            f'{deed}: with them the mean error on {where} is {after.mean:.3f} mm, once the '
+            f'{action}: with them the mean error on {poses_text} is {after.mean:.3f} mm, once the '
             f'measuring error ({listed(measured)}) is taken out; the {before.mean:.3f} mm of '
             'today contain it.'
         )
-    both = f' Both contain what the measurement errs by ({listed(measured)}).' if measured else ''
+    note = f' Both contain what the measurement errs by ({listed(measured)}).' if measured else ''
     return (
-        f'{deed}: the mean error on {where} falls from {before.mean:.3f} mm to {after.mean:.3f} '
-        f'mm, {times_smaller(before.mean, after.mean)}.{both}'
+        f'{action}: the mean error on {poses_text} falls from {before.mean:.3f} mm to '
+        f'{after.mean:.3f} '
+        f'mm, {times_smaller(before.mean, after.mean)}.{note}'
     )
 
 
-# What the deed leaves: causes, gross errors, data that disagree, and the remedy.
+# Errors that the action leaves: causes, gross errors, data that disagree, and the remedy.
 
-# Fewer gross errors are in the table of left-out rows alone.
+# Fewer gross errors than these, in number and share, are in the table of left-out rows only.
 FEWEST_GROSS, LEAST_SHARE = 3, 0.01
-# In place of a remedy that is a file: it is beside the page only where it belongs to the deed.
+# Stands in place of a remedy that is a file if the file does not belong to the action.
 NO_FILE = (
     'No robot model beside this page holds it: correcting it brings no noticeable gain beside the '
     'zero-offsets, or the page says to set nothing.'
 )
-# The first screen names so many causes, with so many sizes each; all of them stand below.
+# Numbers of causes, and of sizes of each, on the first screen; all of them are listed below.
 MOST_NAMED, MOST_SIZES = 4, 2
 
 
-# Where nothing shows how large the noise is, or too little was held out to say.
+# Name of an error if nothing shows how large the noise is, or too little was held out.
 NOISE_UNKNOWN = 'May be sensor noise alone'
 
 
 class Remaining(NamedTuple):
-    """Something that the deed leaves: its name, its size in words, and what to do."""
+    """An error that the action leaves: name, size in words, and remedy."""
 
     what: str
     size: str
@@ -551,13 +560,13 @@ class Remaining(NamedTuple):
 
     @property
     def sentence(self) -> str:
-        """All of it."""
+        """Name, size and remedy in a sentence."""
         size = self.size.rstrip('.')
         return f'{self.what}{": " if size else ""}{size}. {self.remedy}'.rstrip()
 
 
 def what_remains(inputs: Inputs, loads_model: bool, held_out: bool) -> list[Remaining]:
-    """Return what the deed leaves, the causes first."""
+    """Errors that the action leaves, the causes first."""
     found, judgement = inputs.found, inputs.judgement
     rows = [] if found is None else _of_discovery(found, loads_model)
     if found is None and (lines := judgement.findings or judgement.doubts):
@@ -610,7 +619,7 @@ def what_remains(inputs: Inputs, loads_model: bool, held_out: bool) -> list[Rema
 
 
 def _of_discovery(found: Discovered, loads_model: bool) -> list[Remaining]:
-    """Return the causes that stay, and what has none."""
+    """Causes that remain, and errors without a cause."""
     rows: list[Remaining] = []
     stay = [e for e in found.effects if not (loads_model and e.in_robot_model)]
     for effect in stay[:MOST_NAMED]:
@@ -637,7 +646,7 @@ def _of_discovery(found: Discovered, loads_model: bool) -> list[Remaining]:
 
 
 def _gross(inputs: Inputs) -> Remaining | None:
-    """Return how many readings are gross errors, of which sensors and when; None of few."""
+    """Number, sensors and time of the gross errors; None if there are few."""
     session, m = inputs.session, inputs.session.measurements
     rows = np.isin(m.observation, inputs.gross)
     if rows.sum() < max(FEWEST_GROSS, LEAST_SHARE * len(m)):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Many sessions on one page: which differ from the others, and which joints change along them."""
+"""Page of many sessions: those that differ from the others, and joints that change along them."""
 
 from __future__ import annotations
 
@@ -18,28 +18,28 @@ from remaster_ros.session.files import write_atomically
 from remaster_ros.types import FloatArray
 
 MAD_STD = 1.4826
-"""Standard deviations of a normal variable in a median of absolute deviations."""
+"""Factor from a median absolute deviation to the standard deviation of a normal variable."""
 OWN_STD = 5.0
-"""One differs only if it is so many of its own standard deviations from the median: of ten joints
-in a thousand sessions, none is by chance."""
+"""Least distance from the median, in its own standard deviations, of a session that differs: of
+ten joints in a thousand sessions, none exceeds it by chance."""
 FALSE = 0.01
-"""How often any of a kind of arm is said to differ, where all are drawn alike."""
+"""Probability that any of a kind of arm is reported to differ if all are alike."""
 FEW = 5
-"""Sessions of which one can be told from the scatter of the others."""
+"""Least number of sessions from which one can be found to differ."""
 
 
 def summary_of(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Return what is to be said over all rows.
+    """Summary over all rows.
 
     Parameters
     ----------
     rows
-        Of rows.jsonl, in the order of the sessions given.
+        Rows of rows.jsonl, in the order of the sessions given.
 
     Returns
     -------
     dict
-        ``counts`` by status; ``joints``: one of each joint of each kind of arm; ``lines``.
+        ``counts`` by status; ``joints``: one of each joint of each kind of arm; ``lines`` of text.
     """
     counts: dict[str, int] = defaultdict(int)
     arms: dict[tuple[str, tuple[str, ...]], list[Mapping[str, Any]]] = defaultdict(list)
@@ -75,38 +75,38 @@ def summary_of(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def differing(values: FloatArray, level: float) -> list[int]:
-    """Return which of the values (n,) are none of the normal distribution of the others.
+    """Indices of the values (n,) that do not belong to the normal distribution of the others.
 
-    ``level``: how often any is named where none differs; simulated for 5 to 200 values.
-
-    The generalised extreme Studentised deviate test: values are taken out one by one, up to a
-    third of them, so that several do not hide each other (B. Rosner, "Percentage points for a
-    generalized ESD many-outlier procedure", Technometrics 25, 1983, equation 2.5).
+    ``level``: probability that any is named if none differs; simulated for 5 to 200 values. The
+    generalised extreme Studentised deviate test: values are taken out one by one, up to a third of
+    them, so that several do not hide each other (B. Rosner, "Percentage points for a generalized
+    ESD many-outlier procedure", Technometrics 25, 1983, equation 2.5).
     """
-    left = list(range(len(values)))
-    out: list[int] = []
+    remaining = list(range(len(values)))
+    removed: list[int] = []
     differ = 0
     for _ in range((len(values) - 1) // 3):
-        n = len(left)
-        off = np.abs(values[left] - np.mean(values[left]))
-        worst = int(np.argmax(off))
+        n = len(remaining)
+        deviation = np.abs(values[remaining] - np.mean(values[remaining]))
+        worst = int(np.argmax(deviation))
         t = float(stdtrit(n - 2.0, 1.0 - level / (2.0 * n)))
         limit = (n - 1.0) * t / np.sqrt((n - 2.0 + t**2) * n)
-        beyond = off[worst] > limit * np.std(values[left], ddof=1)
-        out.append(left.pop(worst))
+        beyond = deviation[worst] > limit * np.std(values[remaining], ddof=1)
+        removed.append(remaining.pop(worst))
         if beyond:
-            differ = len(out)
-    return sorted(out[:differ])
+            differ = len(removed)
+    return sorted(removed[:differ])
 
 
 def _shown(one: Mapping[str, Any], key: str) -> str:
-    """Return a number of a joint with its unit."""
+    """Value of a joint with its unit, as text."""
     return f'{one[key + "_" + one["unit"]]:+.4f} {one["unit"]}'
 
 
 def _joint(
     robot: str, name: str, index: int, rows: Sequence[Mapping[str, Any]], level: float
 ) -> dict[str, Any]:
+    """Median, scatter and outliers of a joint's offset over the sessions of one kind of arm."""
     unit = rows[0]['fit']['joints'][index].get('unit', 'deg')
     known = [row for row in rows if row['fit']['joints'][index].get(f'mean_{unit}') is not None]
     mean = np.array([row['fit']['joints'][index][f'mean_{unit}'] for row in known])
@@ -133,7 +133,7 @@ def _joint(
 
 
 def _fit_shown(row: Mapping[str, Any]) -> dict[str, Any] | None:
-    """Return the fit of a row, without the advice to look for causes where that was done."""
+    """Fit of a row; without the advice to search for causes if that was done."""
     fit = row.get('fit')
     if not fit or 'discovery' not in row:
         return fit
@@ -143,7 +143,7 @@ def _fit_shown(row: Mapping[str, Any]) -> dict[str, Any] | None:
 def write_batch_page(
     path: Path, rows: Sequence[Mapping[str, Any]], over_all: Mapping[str, Any]
 ) -> None:
-    """Write the page; `InputError` where it cannot be written."""
+    """Write the page. Raises InputError if the file cannot be written."""
     shown = [
         {
             'name': Path(row['session']).name,

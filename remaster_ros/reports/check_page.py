@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The checks of an arm on a page: what they say, and the trend of each joint."""
+"""Page of the checks of an arm: their results, and the trend of each joint."""
 
 from __future__ import annotations
 
@@ -29,16 +29,16 @@ def write_check_page(
     Parameters
     ----------
     content
-        As of ``remaster check --json``.
+        Output of ``remaster check --json``.
     series_m
-        What each check says of each joint, at the tool, m, (T, k).
+        Change of each joint in each check, at the tool, m, (T, k).
     names
-        Of the checks, oldest first.
+        Names of the checks, oldest first.
 
     Raises
     ------
     InputError
-        It cannot be written.
+        The file cannot be written.
     """
     from remaster_ros.reports.figures import as_svg
 
@@ -49,7 +49,7 @@ def write_check_page(
 
 
 def _draw(trend: Trend) -> Figure:
-    """Draw each joint's results over the checks, m at the tool, mm."""
+    """Figure of each joint's change over the checks, at the tool, mm."""
     from matplotlib.figure import Figure
     from matplotlib.ticker import MaxNLocator
 

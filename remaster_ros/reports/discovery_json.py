@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""discovery.json, and what of it a robot can load (format ``remaster-discovery/1``)."""
+"""Content of discovery.json, and its files that a robot can load (``remaster-discovery/1``)."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ from remaster_ros.version import __version__
 def _with_exact_drawing(
     discovery: Discovery, rows: Sequence[Mapping[str, Any]]
 ) -> list[dict[str, Any]]:
-    """Return the zero-offsets with their std if the arm is exactly its drawing."""
+    """Rows of zero-offsets with their std for an arm of exactly nominal geometry added."""
     drawn = of_joints(discovery.fit.chain, std_if_exactly_drawn=discovery.std_if_drawn)
     found = []
     for row, exact in zip(rows, drawn, strict=True):
@@ -70,7 +70,7 @@ def _with_exact_drawing(
 
 
 def predictions_of(discovery: Discovery) -> Predictions:
-    """Return where the final model predicts every row of the session."""
+    """Predictions of the final model for each row of the session."""
     context = discovery.residuals.context
     return predict(discovery.fit, context.measurements)
 
@@ -81,7 +81,7 @@ def discovery_content(
     predictions: Predictions | None = None,
     decided: Sequence[Decision] = (),
 ) -> Discovered:
-    """Return a discovery as discovery.json has it; predictions are made where none are given."""
+    """Content of discovery.json; predictions are computed if not given."""
     predictions = predictions_of(discovery) if predictions is None else predictions
     fit = estimates(discovery.fit)
     before, before_std = discovery.offsets_before
@@ -145,7 +145,7 @@ def discovery_content(
 def confirmation_content(
     effects: Sequence[FoundEffect], confirmation: Confirmation
 ) -> dict[str, Any]:
-    """Return how causes do in another session as discovery.json has it."""
+    """Results of a confirmation in another session, as in discovery.json."""
     return vars(confirmation) | {
         'offsets_rms_sigmas': confirmation.offsets_rms_sigmas,
         'parameters_rms_sigmas': confirmation.parameters_rms_sigmas,
@@ -157,7 +157,10 @@ def confirmation_content(
 
 
 def _covariance(discovery: Discovery) -> dict[str, Any]:
-    """Return that of the offsets and the causes; of all kinds it stands in compensation.json."""
+    """Posterior covariance of identifiable offsets and of the named causes' parameters.
+
+    compensation.json has that of all terms of the model.
+    """
     fit = discovery.fit
     units = {n: c.unit for group in discovery.groups for c in group for n in c.parameters}
     known = np.flatnonzero(fit.identifiable)
@@ -175,6 +178,7 @@ def _covariance(discovery: Discovery) -> dict[str, Any]:
 
 
 def _regions(discovery: Discovery, predictions: Predictions) -> dict[str, Any]:
+    """Share of held-out and fitted rows in their predicted 95 % regions."""
     measurements = discovery.residuals.context.measurements
     gross = [observation for observation, _ in discovery.outliers]
     kept = ~np.isin(measurements.observation, gross)
@@ -187,7 +191,7 @@ def _regions(discovery: Discovery, predictions: Predictions) -> dict[str, Any]:
 
 
 def read_discovery(path: str | os.PathLike[str]) -> Discovered:
-    """Read discovery.json and check it against the contract; further keys are left out.
+    """Read discovery.json and check it against its schema; unknown keys are dropped.
 
     Raises
     ------
@@ -199,11 +203,11 @@ def read_discovery(path: str | os.PathLike[str]) -> Discovered:
     )
 
 
-# What of a discovery a robot can load, with its error on held-out poses, and the files.
+# Results of a discovery that a robot can load, with their errors on held-out poses, and the files.
 
 
 def applied(discovery: Discovery, widening: float, result_sha256: str) -> dict[str, str]:
-    """Return the files of the folder ``apply``: name -> text; ``widening``: of the predictions."""
+    """Files of the folder ``apply``: name -> text; ``widening``: factor of the predictions."""
     files = exports(discovery.alone, _remarks(discovery))
     if discovery.loads_geometry:
         assert discovery.geometry is not None
@@ -223,13 +227,13 @@ _ALONE = 'only zero-offsets are corrected here'
 
 
 def compensation_of(discovery: Discovery, widening: float) -> CorrectedArm:
-    """Return the arm that compensation.json holds: everything, where that predicts better.
+    """Arm in compensation.json: with all effects if that predicts held-out poses better.
 
-    Causes and zero-offsets belong together: where the causes are left out the zero-offsets are
-    those fitted without them.
+    Causes and zero-offsets belong together: without the causes, the zero-offsets are those that
+    were fitted without them.
     """
     if holds_everything(discovery):
-        described = _everything(discovery)
+        described = _arm_with_effects(discovery)
         return replace(described, model=replace(described.model, widening=widening))
     alone = discovery.alone
     rows = discovery.residuals.context.measurements
@@ -242,37 +246,37 @@ def compensation_of(discovery: Discovery, widening: float) -> CorrectedArm:
             'no better'
         )
     described = arm_of_offsets(alone, predict(alone, rows).widening, notes, geometry)
-    left = tuple(
+    uncorrected = tuple(
         NotCorrected(e.name, e.joints, e.size_m, _ALONE, e.remedy) for e in discovery.effects
     )
-    return replace(described, not_corrected=left)
+    return replace(described, not_corrected=uncorrected)
 
 
 def holds_everything(discovery: Discovery) -> bool:
-    """Whether compensation.json holds everything in the model, and not the offsets alone."""
+    """Whether compensation.json has all effects of the model, not zero-offsets only."""
     alone = _held_out_mean(discovery, errors_to_load(discovery)['offsets'])
     every = _held_out_mean(discovery, errors_to_load(discovery)['everything'])
     better = bool(np.isnan(alone)) or round(every, 3) < round(alone, 3)
-    can_be_commanded = _everything(discovery).model.largest_slope() < 1.0
+    can_be_commanded = _arm_with_effects(discovery).model.largest_slope() < 1.0
     return better and can_be_commanded and bool(discovery.solution.cells)
 
 
 @lru_cache(maxsize=1)
-def _everything(discovery: Discovery) -> CorrectedArm:
-    """Return the arm with everything corrected."""
+def _arm_with_effects(discovery: Discovery) -> CorrectedArm:
+    """Arm with all effects that can be corrected."""
     return arm_of_effects(discovery.fit, discovery.solution.cells, discovery.residuals)
 
 
 @lru_cache(maxsize=1)
 def errors_to_load(discovery: Discovery) -> dict[str, FloatArray]:
-    """Return the error of every row with each of the files, as `Loadable` names them, m, (n, 3).
+    """Errors of all rows with each loadable file, by the names of `Loadable`, m, (n, 3).
 
-    Each is of the text that is written, or would be if it were worth it. Errors of the measurement
-    that the file has nothing of are taken out: the certain ones, of compensation.json all.
+    Each is computed with the text of the file, written or not. Errors of the measurement that the
+    file does not contain are taken out: the certain ones, and for compensation.json all.
     """
     alone, fit, cells = discovery.alone, discovery.fit, discovery.solution.cells
     session, rows = alone.session, discovery.residuals.context.measurements
-    # Beside the offsets that are loaded alone nothing was fitted but certain errors of measuring.
+    # The fit of offsets alone contains no further parameters than certain errors of measuring.
     measured = without_errors_of_measuring(alone, slice(None))
     plain = replace(session, measurements=replace(session.measurements, position=measured))
     left_out = [observation for observation, _ in alone.left_out]
@@ -281,7 +285,7 @@ def errors_to_load(discovery: Discovery) -> dict[str, FloatArray]:
         found['geometry'] = errors_with_urdf(
             plain, model_text(alone, discovery.geometry), left_out
         )
-    described = _everything(discovery)
+    described = _arm_with_effects(discovery)
     if described.model.largest_slope() < 1.0:
         text = correction_text(described, session, 'discover', '').encode()
         of_measuring = np.repeat(
@@ -298,14 +302,14 @@ def errors_to_load(discovery: Discovery) -> dict[str, FloatArray]:
 
 
 def _held_out_mean(discovery: Discovery, errors: FloatArray) -> float:
-    """Return the mean error on held-out poses, mm; gross errors do not count."""
+    """Mean error on held-out poses without gross errors, mm; NaN if there are none."""
     m = discovery.residuals.context.measurements
     gross = [observation for observation, _ in discovery.outliers]
     return 1e3 * mean_length(errors[m.is_validation & ~np.isin(m.observation, gross)])
 
 
 def loadable(discovery: Discovery) -> list[Loadable]:
-    """Return the results that a robot can load, the plainest first."""
+    """Results that a robot can load, the simplest first."""
     files = {
         'offsets': f'{APPLY_FOLDER}/{URDF_FILE}',
         'geometry': f'{APPLY_FOLDER}/{MODEL_FILE}' if discovery.loads_geometry else '',
@@ -329,37 +333,39 @@ def loadable(discovery: Discovery) -> list[Loadable]:
 
 
 def _remarks(discovery: Discovery) -> list[str]:
-    """Return what the files with the zero-offsets leave, a line each."""
+    """Remarks on the effects that the files with zero-offsets do not correct, a line each."""
     measured = [effect for effect in discovery.effects if effect.of_measurement]
-    held = [effect for effect in discovery.effects if effect.in_robot_model]
-    left = [effect for effect in discovery.effects if effect not in (*measured, *held)]
+    in_model = [effect for effect in discovery.effects if effect.in_robot_model]
+    not_in_model = [effect for effect in discovery.effects if effect not in (*measured, *in_model)]
     remarks = []
     if certain := [effect for effect in measured if effect.is_taken_out]:
         remarks.append(f'Taken out, as errors of the measurement: {_titles(certain)}.')
     if doubtful := [effect for effect in measured if not effect.is_taken_out]:
         remarks.append(f'Not taken out, as they are not certain: {_titles(doubtful)}.')
-    if held:
-        where = (
+    if in_model:
+        note = (
             f'{MODEL_FILE} has them, with zero-offsets of its own: load it in place of this file'
             if discovery.loads_geometry
             else 'no robot model with them predicts held-out poses better'
         )
-        remarks.append(f'Not corrected here: {_titles(held)}; {where}.')
-    if left:
+        remarks.append(f'Not corrected here: {_titles(in_model)}; {note}.')
+    if not_in_model:
         remarks.append(
-            f'Not corrected here: {_titles(left)}; {COMPENSATION_FILE} has all of it that can be '
+            f'Not corrected here: {_titles(not_in_model)}; {COMPENSATION_FILE} has all of it that '
+            'can be '
             'corrected, with zero-offsets of its own: use it in place of this file.'
             if holds_everything(discovery)
-            else f'Corrected in none of these files: {_titles(left)}.'
+            else f'Corrected in none of these files: {_titles(not_in_model)}.'
         )
     return remarks
 
 
 def _titles(effects: Sequence[FoundEffect]) -> str:
+    """Titles of effects, separated by commas."""
     return ', '.join(sentence_case(effect.title) for effect in effects)
 
 
-# Causes and their look-alikes, to be separated and decided between.
+# Causes and their look-alikes, which a plan separates and a later session decides between.
 
 
 def read_causes(
@@ -367,16 +373,16 @@ def read_causes(
     joint_names: Sequence[str] = (),
     observations_sha256: str = '',
 ) -> tuple[FoundCause, ...]:
-    """Return the causes of a discovery.json that have look-alikes.
+    """Causes of a discovery.json that have look-alikes.
 
     Parameters
     ----------
     path
         The file.
     joint_names
-        Of the arm that it has to be of; empty for any.
+        Joints that its arm must have; empty for any.
     observations_sha256
-        Of the observations that it has to be of; '' for any.
+        Hash that its observations must have; '' for any.
 
     Raises
     ------
@@ -385,8 +391,8 @@ def read_causes(
         look-alike.
     """
     found = _read(path, joint_names)
-    of = found.session and found.session.observations_sha256
-    if observations_sha256 and of != observations_sha256:
+    found_sha256 = found.session and found.session.observations_sha256
+    if observations_sha256 and found_sha256 != observations_sha256:
         raise InputError(
             f'{path} is not of the observations that the session has now; call /remaster/discover '
             'first'
@@ -413,16 +419,16 @@ def read_causes(
 def earlier_pairs(
     path: str | os.PathLike[str], joint_names: Sequence[str] = (), created: str = ''
 ) -> tuple[tuple[Named, Named], ...]:
-    """Return causes and look-alikes of a discovery.json, and those that it has decided between.
+    """Pairs of causes and look-alikes of a discovery.json, open ones and decided ones.
 
     Parameters
     ----------
     path
         The file.
     joint_names
-        Of the arm that it has to be of; empty for any.
+        Joints that its arm must have; empty for any.
     created
-        When the session was begun that it has to be of; of another there are none. '' for any.
+        Begin of its session; () is returned for another session. '' for any.
 
     Raises
     ------
@@ -432,14 +438,19 @@ def earlier_pairs(
     found = _read(path, joint_names)
     if created and (not found.session or found.session.created != created):
         return ()
-    pairs = [(_named(one.cause), _named(one.look_alike)) for one in found.decided or ()]
+    pairs = [
+        (_named_cause(one.cause), _named_cause(one.look_alike)) for one in found.decided or ()
+    ]
     pairs += [
-        (_named(effect), _named(other)) for effect in found.effects for other in _separable(effect)
+        (_named_cause(effect), _named_cause(other))
+        for effect in found.effects
+        for other in _separable(effect)
     ]
     return tuple(pairs)
 
 
 def _read(path: str | os.PathLike[str], joint_names: Sequence[str]) -> Discovered:
+    """Content of a discovery.json. Raises InputError if its arm has other joints."""
     found = read_discovery(path)
     names = found.robot.joint_names if found.robot else joint_names
     if joint_names and list(names) != list(joint_names):
@@ -450,10 +461,11 @@ def _read(path: str | os.PathLike[str], joint_names: Sequence[str]) -> Discovere
     return found
 
 
-def _named(cause: schemas.NamedCause | schemas.Effect | LookAlike) -> Named:
+def _named_cause(cause: schemas.NamedCause | schemas.Effect | LookAlike) -> Named:
+    """Name and joints of a cause."""
     return Named(cause.name, tuple(cause.joints))
 
 
 def _separable(effect: schemas.Effect) -> list[LookAlike]:
-    """Return the look-alikes of an effect that are neither another name nor a free form of it."""
+    """Look-alikes of an effect that are neither another name nor a general form of it."""
     return [other for other in effect.confusable_with if not other.same and not other.general]

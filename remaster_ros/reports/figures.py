@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The figures of a fit, of its causes and of the answer, as SVG text.
+"""Figures of a fit, of causes and of the answer, as SVG text.
 
-Drawn on Matplotlib figures of their own (no pyplot, no window, no shared state). Lines and text
-are in marker colours, so that a page can swap them for its own in the dark; data colours are
-readable on both.
+Drawn on separate Matplotlib figures (no pyplot, no window, no shared state). Lines and text are in
+marker colours that a page replaces by its own in the dark; data colours are readable on both.
 """
 
 from __future__ import annotations
@@ -56,14 +55,14 @@ Drawn = TypeVar('Drawn')
 
 STYLE: Any = {
     'svg.fonttype': 'none',
-    # Wider than the fonts that pages use: what fits in it is never cut off in them.
+    # Wider than the fonts that pages use, so that text that fits in it is never cut off there.
     'font.family': 'sans-serif',
     'font.sans-serif': ['DejaVu Sans'],
     'font.size': 8.0,
     'axes.titlesize': 8.5,
     'axes.titleweight': 'bold',
     'axes.titlelocation': 'left',
-    # Given, as nothing stands above a panel: to find it lays out the labels of the axis once more.
+    # Fixed, as nothing is above a panel: finding it would lay out the labels of the axis again.
     'axes.titley': 1.0,
     'axes.formatter.useoffset': False,
     'axes.labelsize': 8.0,
@@ -88,18 +87,18 @@ STYLE: Any = {
     'legend.fontsize': 7.5,
     'figure.facecolor': PAPER,
     'lines.linewidth': 0.6,
-    # Points: what moves a line by less than its own width is not seen.
+    # In points: a deviation smaller than the width of the line is invisible.
     'path.simplify_threshold': 0.5,
 }
 
 
 def draw_fit(result: FitResult) -> dict[str, str]:
-    """Return every figure as SVG text, by file name without ending."""
+    """All figures of a fit as SVG text, by file name without ending."""
     return as_svg(fit_figures(result), result)
 
 
 def fit_figures(_: FitResult) -> dict[str, Callable[[FitResult], Figure]]:
-    """Return what draws each figure of a fit, by file name without ending."""
+    """Function that draws each figure of a fit, by file name without ending."""
     return {
         'posteriors': posteriors,
         'traces': traces,
@@ -113,13 +112,13 @@ def fit_figures(_: FitResult) -> dict[str, Callable[[FitResult], Figure]]:
 def as_figures(
     figures: Mapping[str, Callable[[Drawn], Figure]], subject: Drawn
 ) -> dict[str, Figure]:
-    """Draw figures of a fit or a discovery, by the same names."""
+    """Figures of a fit or a discovery, by the same names."""
     with matplotlib.rc_context(STYLE):
         return {name: draw(subject) for name, draw in figures.items()}
 
 
 def as_svg(figures: dict[str, Callable[[Drawn], Figure]], subject: Drawn) -> dict[str, str]:
-    """Draw figures of a fit or a discovery and return them as SVG text, by the same names."""
+    """Figures of a fit or a discovery as SVG text, by the same names."""
     texts = {}
     for name, draw in figures.items():
         # The salt makes the same result give the same file.
@@ -132,12 +131,12 @@ def as_svg(figures: dict[str, Callable[[Drawn], Figure]], subject: Drawn) -> dic
 
 
 def evenly(count: int, most: int) -> IntArray:
-    """Return at most so many of the numbers 0 to count - 1, evenly spread, the ends among them."""
+    """At most `most` of the numbers 0 to count - 1, evenly spaced, with both ends."""
     return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(np.int64))
 
 
 def arm_lines(chain: SerialChain, q: FloatArray, offsets: FloatArray | None = None) -> FloatArray:
-    """Return base, joints and tip of arms at n configurations, rad, m, (n, k + 2, 3)."""
+    """Base, joints and tip of arms at n configurations, rad, m, (n, k + 2, 3)."""
     joints = chain.frames(q, offsets)[..., :3, 3]
     tips = chain.forward(q, offsets)[:, None, :3, 3]
     return np.concatenate((np.zeros((len(q), 1, 3)), joints, tips), axis=1)
@@ -205,7 +204,7 @@ def traces(result: FitResult) -> Figure:
 
 
 def errors_by_configuration(result: FitResult) -> Figure:
-    """Draw the error of every row before and after, by configuration and sensor."""
+    """Draw the error of each row before and after, by configuration and sensor."""
     m = result.session.measurements
     before, after = _norms_mm(result)
     splits = _splits(result)
@@ -243,7 +242,7 @@ def errors_by_configuration(result: FitResult) -> Figure:
 
 
 def residual_distribution(result: FitResult) -> Figure:
-    """Draw how large the errors are with and without the offsets."""
+    """Draw the distribution of the errors with and without the offsets."""
     before, after = _norms_mm(result)
     splits = _splits(result)
     figure, axes = _stacked(len(splits), 2.1)
@@ -255,11 +254,11 @@ def residual_distribution(result: FitResult) -> Figure:
 
 
 def tool_places_of_one(result: FitResult) -> Figure:
-    """Draw where the marker may be at one configuration, from three sides (Fig. 5)."""
+    """Draw possible positions of the marker at one configuration, in three views (Fig. 5)."""
     m = result.measurements
     lengths = np.linalg.norm(result.residuals_before, axis=1)
     fitted = np.flatnonzero(~m.is_validation)
-    # The one whose error before is the median.
+    # The row whose error before is the median.
     row = int(fitted[np.argsort(lengths[fitted])[len(fitted) // 2]])
     places = tool_places(result.predictive, m, row, TOOL_DRAWS, np.random.default_rng(0))
     before, after, drawn, noisy = (1e3 * (place - places.after) for place in places)
@@ -290,7 +289,7 @@ def tool_places_of_one(result: FitResult) -> Figure:
 
 
 def accuracy_map(result: FitResult) -> Figure:
-    """Draw the predicted error over the workspace: from the side and from above."""
+    """Draw the predicted error over the workspace, from the side and from above."""
     m = result.measurements
     found = predicted_accuracy(result.predictive, m, MAP_POINTS, np.random.default_rng(0))
     error_mm = 1e3 * found.error
@@ -326,8 +325,8 @@ def accuracy_map(result: FitResult) -> Figure:
         ax.set_ylabel(up)
         ax.set_aspect('equal')
         ax.grid(False)
-    beside = figure.add_axes((1.0 - 0.85 / WIDTH_IN, 0.2, 0.15 / WIDTH_IN, 0.7))
-    bar = figure.colorbar(tiles, cax=beside, label='predicted error (mm)')
+    colorbar_axes = figure.add_axes((1.0 - 0.85 / WIDTH_IN, 0.2, 0.15 / WIDTH_IN, 0.7))
+    bar = figure.colorbar(tiles, cax=colorbar_axes, label='predicted error (mm)')
     # Drawn as a picture it would be the only one of a page that is not lines.
     if bar.solids is not None:
         bar.solids.set(rasterized=False, edgecolor='face')
@@ -361,9 +360,9 @@ def _panels(
     right: float = 0.1,
     down: float = 0.0,
 ) -> tuple[Figure, list[Axes]]:
-    """Return a figure of panels (rows, columns), with margins and the space below a panel, inches.
+    """Figure of panels (rows, columns), with margins and the space below a panel, inches.
 
-    They are given: to find them takes longer than to draw the figure.
+    They are fixed, as finding them takes longer than drawing the figure.
     """
     rows, columns = shape
     across = left + 0.1
@@ -384,7 +383,7 @@ def _panels(
 def _joint_panels(
     result: FitResult, height_in: float, left: float, top: float
 ) -> tuple[Figure, list[Axes]]:
-    """Return a figure with one titled panel per joint, two in a row."""
+    """Figure with a titled panel for each joint, two in a row."""
     joints = result.joint_names
     rows = -(-len(joints) // 2)
     figure, axes = _panels(
@@ -398,11 +397,12 @@ def _joint_panels(
 
 
 def _stacked(count: int, height_in: float) -> tuple[Figure, list[Axes]]:
+    """Figure of panels one below the other."""
     return _panels(height_in * count + 0.2, (count, 1), left=0.65, bottom=0.5, top=0.3, down=0.8)
 
 
 def legend_above(ax: Axes, handles: list[Line2D] | None = None) -> None:
-    """Put the legend at the right above the panel, in one row."""
+    """Put the legend above the panel at the right, in one row."""
     shown: Sequence[Artist] = ax.get_legend_handles_labels()[0] if handles is None else handles
     ax.legend(
         handles=shown,
@@ -416,7 +416,7 @@ def legend_above(ax: Axes, handles: list[Line2D] | None = None) -> None:
 
 
 def legend_entry(marker: str, color: str, name: str) -> Line2D:
-    """Return the entry of a legend for points of a marker and colour; a long name is cut."""
+    """Entry of a legend for points of a marker and colour; a long name is cut."""
     return Line2D(
         [],
         [],
@@ -430,14 +430,14 @@ def legend_entry(marker: str, color: str, name: str) -> Line2D:
 
 
 def _write_instead(ax: Axes, text: str) -> None:
-    """Write a text in a panel instead of a drawing."""
+    """Write a text in a panel in place of a drawing."""
     ax.set_axis_off()
     lines = textwrap.fill(text, 50)
     ax.text(0.0, 0.8, lines, transform=ax.transAxes, va='top', linespacing=1.4)
 
 
 def _short(why: str) -> str:
-    """Return the reason up to the remedy, which the page gives in full."""
+    """Reason without the remedy, which the page gives in full."""
     reason = why.split(';')[0]
     return f'Not identifiable: {reason}.'
 
@@ -452,13 +452,13 @@ def log_axis(ax: Axes, which: str) -> None:
 
 
 def _norms_mm(result: FitResult) -> tuple[FloatArray, FloatArray]:
-    """Return the 3-D error of every row before and after, mm, never quite zero."""
+    """3-D error of each row before and after, mm, at least 1e-6."""
     before, after = map(lengths_mm, (result.residuals_before, result.residuals_after))
     return np.maximum(before, 1e-6), np.maximum(after, 1e-6)
 
 
 def _splits(result: FitResult) -> list[tuple[str, BoolArray]]:
-    """Return title and rows of the splits that have any; gross errors are not among the fitted."""
+    """Title and mask of the splits that have rows; gross errors are not among the fitted."""
     m = result.session.measurements
     left_out = np.isin(m.observation, [observation for observation, _ in result.left_out])
     splits = [
@@ -468,31 +468,31 @@ def _splits(result: FitResult) -> list[tuple[str, BoolArray]]:
     return [(title, rows) for title, rows in splits if rows.any()]
 
 
-# Of a discovery: errors by driver, causes with their bands, the gain.
+# Figures of a discovery: errors by driver, causes with their bands, the gain.
 
 ARC_MINUTE = np.radians(1.0 / 60.0)
 BINS = 12
 CAUSE_POINTS = 800
 MOST_CAUSES = 8
-# Of a larger session the curves are drawn at the rows that were searched.
+# In a larger session curves are drawn at the searched rows only.
 MOST_DRAWN = 20_000
-# A curve's line ends so many knots from the last value that was measured.
+# Distance from the last measured value, in knots, at which a curve's line ends.
 NEAR = 0.5
-# A wave is not drawn across a larger share of its range without a measurement.
+# Largest gap between measurements, as a share of the range, across which a wave is drawn.
 WIDE_GAP = 1.0 / 30.0
-# Nor is anything else across such a share.
+# Largest gap across which any other curve is drawn.
 EMPTY = 1.0 / 8.0
-# A part of that range that is no wider is a place.
+# A part of the range that is no wider counts as a single place.
 PLACE = 0.01
 
 
 def draw_discovery(discovery: Discovery) -> dict[str, str]:
-    """Return every figure as SVG text, by file name without ending."""
+    """All figures of a discovery as SVG text, by file name without ending."""
     return as_svg(discovery_figures(discovery), discovery)
 
 
 def discovery_figures(discovery: Discovery) -> dict[str, Callable[[Discovery], Figure]]:
-    """Return what draws each figure of a discovery, by file name without ending."""
+    """Function that draws each figure of a discovery, by file name without ending."""
     figures: dict[str, Callable[[Discovery], Figure]] = {'gain': gain, 'drivers': drivers}
     if discovery.groups:
         figures['causes'] = causes
@@ -500,7 +500,7 @@ def discovery_figures(discovery: Discovery) -> dict[str, Callable[[Discovery], F
 
 
 def gain(discovery: Discovery) -> Figure:
-    """Draw the errors before and after, and what a pose's readings share of them, where known."""
+    """Draw the errors before and after, and the noise that the readings of a pose share."""
     figure = Figure(figsize=(WIDTH_IN, 2.6), layout='constrained')
     left, right = figure.subplots(1, 2, width_ratios=(3, 2))
     data = discovery.residuals
@@ -539,7 +539,7 @@ def gain(discovery: Discovery) -> Figure:
 
 
 def drivers(discovery: Discovery) -> Figure:
-    """Draw, joint by joint, the errors along the joint's motion against every driver."""
+    """Draw the errors along each joint's motion against each driver."""
     data = discovery.residuals
     context = data.part
     shown = context.chain.shown_scale
@@ -616,7 +616,7 @@ def _binned(ax: Axes, x: FloatArray, y: FloatArray, color: str) -> None:
 
 
 def causes(discovery: Discovery) -> Figure:
-    """Draw each cause: what is left without it against what drives it, and the fit with band."""
+    """Draw each cause: residuals without it against its driver, and the fit with its band."""
     panels = [
         cell
         for group in discovery.groups
@@ -643,7 +643,7 @@ def causes(discovery: Discovery) -> Figure:
 
 
 def _sizes(ax: Axes, discovery: Discovery, effects: Sequence[FoundEffect]) -> None:
-    """Draw how large the causes without a curve are, beside the noise."""
+    """Draw the sizes of the causes without a curve, and the noise."""
     sizes = [1e3 * effect.size_m for effect in effects]
     noise = 1e3 * discovery.gain.noise_floor_m
     y = np.arange(len(sizes) + 1)
@@ -659,34 +659,34 @@ def _sizes(ax: Axes, discovery: Discovery, effects: Sequence[FoundEffect]) -> No
 
 
 def _estimate(discovery: Discovery, cell: Cell) -> FloatArray:
-    """Return a cause's parameters in the whole model, where they may be some of a larger cell."""
+    """Parameters of a cause in the whole model, in which they may belong to a larger cell."""
     solution = discovery.solution
     names = [name for one in solution.cells for name in one.parameters]
     return solution.parameters[[names.index(name) for name in cell.parameters]]
 
 
 def _step(ax: Axes, discovery: Discovery, cell: Cell) -> None:
-    """Draw a jump of a sensor, marker or base over time, along its own direction, mm."""
+    """Draw a jump of a sensor, marker or base over time, along its direction, mm."""
     data, solution = discovery.residuals, discovery.solution
     context = data.part
     columns = cell.columns(context).displacement(context)
     jump = columns @ _estimate(discovery, cell)
     moved = np.linalg.norm(jump, axis=1) > 0.0
-    # Before the moment every column is zero: what moved later tells which rows it is about.
-    own = np.isin(context.sensor, context.sensor[moved]) & np.isin(
+    # Before the moment all columns are zero: the rows that move later have the sensor and marker.
+    affected = np.isin(context.sensor, context.sensor[moved]) & np.isin(
         context.marker, context.marker[moved]
     )
     way = jump[moved].mean(axis=0)
     way /= np.linalg.norm(way)
     along = 1e3 * (data.left(solution) + jump) @ way
     minutes = context.elapsed_s / 60.0
-    ax.plot(minutes[own], along[own], '.', color=BEFORE, markersize=3, alpha=0.6)
+    ax.plot(minutes[affected], along[affected], '.', color=BEFORE, markersize=3, alpha=0.6)
     index = {name: i for i, name in enumerate(discovery.fit.theta_names)}
     draws = discovery.fit.theta_draws.reshape(-1, len(index))
     chosen = draws[:, [index[name] for name in cell.parameters]]
     levels = 1e3 * np.einsum('nij,i->nj', columns[moved], way).mean(axis=0) @ chosen.T
     edge = cell.moment / 60.0
-    low, high = minutes[own].min(), minutes[own].max()
+    low, high = minutes[affected].min(), minutes[affected].max()
     ax.plot([low, edge], [0.0, 0.0], color=AFTER, linewidth=1.3)
     level, width = float(levels.mean()), 2.0 * float(levels.std())
     ax.fill_between([edge, high], level - width, level + width, color=AFTER, alpha=0.25)
@@ -698,9 +698,9 @@ def _step(ax: Axes, discovery: Discovery, cell: Cell) -> None:
 
 
 def _driver(context: Context, cell: Cell, features: FloatArray) -> tuple[str, FloatArray, float]:
-    """Return label and value (n,) of what drives a cause, and how much of it the label's unit is.
+    """Label and values (n,) of a cause's driver, and the driver's value for one shown unit.
 
-    What is no single number is drawn by what it adds per unit of its first parameter.
+    A driver of several numbers is drawn by the feature of the cause's first parameter.
     """
     driver = driver_named(context, cell.driver, cell.joints[-1])
     if driver is None:
@@ -711,23 +711,25 @@ def _driver(context: Context, cell: Cell, features: FloatArray) -> tuple[str, Fl
 
 
 def _cause(ax: Axes, discovery: Discovery, cell: Cell) -> None:
-    """Draw one cause at a joint's angle, in arc minutes, or at the place of one that slides."""
+    """Draw one cause at a joint's angle, in arc minutes, or in mm for a prismatic joint."""
     data, solution = discovery.residuals, discovery.solution
     whole = len(data.context) <= MOST_DRAWN
     context = data.context if whole else data.part
-    left = data.unexplained(solution) if whole else data.left(solution)
-    # A change is drawn where it is there.
-    there = np.ones(len(context), dtype=bool)
+    remaining = data.unexplained(solution) if whole else data.left(solution)
+    # A change is drawn at the rows after its moment, or before if it ends there.
+    present = np.ones(len(context), dtype=bool)
     if cell.changes is not None:
-        there = (context.elapsed_s > cell.moment) != cell.ends
-    fitted = there.copy()
+        present = (context.elapsed_s > cell.moment) != cell.ends
+    fitted = present.copy()
     if whole:
         fitted &= np.isin(np.arange(len(context)), data.rows.source)
-    one, unit = (1e-3, 'mm') if context.slides(cell.joints[0]) else (ARC_MINUTE, 'arc minutes')
-    parameters = _estimate(discovery, cell) / one
+    shown_unit_value, unit = (
+        (1e-3, 'mm') if context.slides(cell.joints[0]) else (ARC_MINUTE, 'arc minutes')
+    )
+    parameters = _estimate(discovery, cell) / shown_unit_value
     index = {name: i for i, name in enumerate(discovery.fit.theta_names)}
     chosen = [index[name] for name in cell.parameters]
-    draws = discovery.fit.theta_draws[..., chosen].reshape(-1, len(chosen)) / one
+    draws = discovery.fit.theta_draws[..., chosen].reshape(-1, len(chosen)) / shown_unit_value
     mean = draws.mean(axis=0)
     draws = draws[:: max(1, len(draws) // 400)]
     columns = cell.columns(context)
@@ -742,14 +744,14 @@ def _cause(ax: Axes, discovery: Discovery, cell: Cell) -> None:
     # What is left, as an angle of this joint: only where the marker is far from its axis.
     square = np.sum(motion**2, axis=1)
     far = fitted & (square > 0.1 * np.median(square))
-    angle = np.sum(motion * left, axis=1)[far] / square[far] / one
+    angle = np.sum(motion * remaining, axis=1)[far] / square[far] / shown_unit_value
     shown = slice(None, None, max(1, int(far.sum()) // CAUSE_POINTS))
     points = (values[far] @ parameters + angle)[shown]
     if cell.driver.startswith('approach'):
         band = 2.0 * (values @ draws.T).std(axis=1)
-        _sides(ax, x[there], effect[there], band[there], (x[far][shown], points))
+        _sides(ax, x[present], effect[present], band[present], (x[far][shown], points))
     else:
-        order = np.flatnonzero(there)[np.argsort(x[there])]
+        order = np.flatnonzero(present)[np.argsort(x[present])]
         at, line = x[order], effect[order]
         if cell.curve is not None:
             # Everywhere, so that the band opens where nothing was measured; the line is not there.
@@ -794,10 +796,10 @@ def _cause(ax: Axes, discovery: Discovery, cell: Cell) -> None:
 def _at_places(
     ax: Axes, at: FloatArray, middle: FloatArray, spread: FloatArray, holes: IntArray
 ) -> None:
-    """Draw an estimate and its band where a joint stood at single places, as a rail is held at.
+    """Draw an estimate and its band where a joint stood only at single places, such as a rail.
 
-    ``at``: the driver of the rows, sorted, in parts that begin at ``holes``; nothing where any of
-    them has a width, in which a line and a band are seen.
+    ``at``: driver of the rows, sorted, in parts that begin at ``holes``. Draws nothing if any part
+    is wide enough for a line and a band.
     """
     parts = np.split(np.arange(len(at)), holes)
     if any(np.ptp(at[part]) > PLACE * np.ptp(at) for part in parts):
@@ -814,7 +816,7 @@ def _sides(
     band: FloatArray,
     shown: tuple[FloatArray, FloatArray],
 ) -> None:
-    """Draw a step: the points of each side spread out, and the step's level beside them."""
+    """Draw a step: the points of each side spread out, and the level of each side."""
     places, points = shown
     spread_out = places + 0.3 * np.linspace(-1.0, 1.0, len(places))
     ax.plot(spread_out, points, '.', color=BEFORE, markersize=2.5, alpha=0.6)
@@ -827,7 +829,7 @@ def _sides(
     ax.set_xticks([-1.0, 1.0], ['from above', 'from below'])
 
 
-# Of `remaster report`: errors by stage, over the session, and over the workspace.
+# Figures of `remaster report`: errors by stage, over the session, and over the workspace.
 
 MODEL, ALL_CAUSES = '#8a6fc4', '#2f9e78'
 # Narrower than the figures of many panels: to be read on a phone.
@@ -837,7 +839,7 @@ LETTERS = 'ABCDEFGHIJKLMNOPQRSTUVWXYZ'
 
 
 class Subject(NamedTuple):
-    """What is drawn."""
+    """Data that the figures of a report show."""
 
     inputs: Inputs
     answer: Answer
@@ -845,7 +847,7 @@ class Subject(NamedTuple):
 
 
 def draw_answer(subject: Subject) -> dict[str, str]:
-    """Return every figure as SVG text, by file name without ending."""
+    """All figures of a report as SVG text, by file name without ending."""
     figures: dict[str, Callable[[Subject], Figure]] = {
         'session': over_session,
         'workspace': workspace,
@@ -856,12 +858,12 @@ def draw_answer(subject: Subject) -> dict[str, str]:
 
 
 def draw_stages(answer: Answer) -> dict[str, str]:
-    """Return the figure of the first screen as SVG text, by its name."""
+    """Figure of the first screen as SVG text, by its name."""
     return as_svg({'stages': stages}, answer)
 
 
 def stages(answer: Answer) -> Figure:
-    """Draw the errors of the judged rows at each stage, with their mean and 95 %."""
+    """Draw the errors of the judged rows at each stage, with mean and 95 % quantile."""
     shown = answer.stages
     figure = Figure(figsize=(NARROW_IN, 0.62 * len(shown) + 0.75), layout='constrained')
     ax = figure.subplots()
@@ -897,7 +899,7 @@ def stages(answer: Answer) -> Figure:
 
 
 def over_session(subject: Subject) -> Figure:
-    """Draw the error of every row in the order measured, as it is today and after the deed."""
+    """Draw the error of each row in the order measured, today and after the action."""
     inputs, answer = subject.inputs, subject.answer
     m = inputs.session.measurements
     timed = inputs.session.timed
@@ -935,6 +937,7 @@ def over_session(subject: Subject) -> Figure:
 
 
 def _mark_moments(ax: Axes, subject: Subject) -> None:
+    """Mark the moments of causes that came at once."""
     found = subject.inputs.found
     for effect in found.effects if found is not None else ():
         if effect.moment_s is None:
@@ -955,7 +958,7 @@ def _mark_moments(ax: Axes, subject: Subject) -> None:
 
 
 def workspace(subject: Subject) -> Figure:
-    """Draw from above and from the side where the markers were, coloured by what remains."""
+    """Draw the markers' positions from above and from the side, coloured by remaining error."""
     inputs, chain = subject.inputs, subject.chain
     m = inputs.session.measurements
     frames = inputs.T_R_N
@@ -996,7 +999,7 @@ def workspace(subject: Subject) -> Figure:
 
 
 def planned(subject: Subject) -> Figure:
-    """Draw from above and from the side where the tool was to be, and what became of that."""
+    """Draw planned tool positions from above and from the side, and how they ended."""
     from remaster_ros.planning.tour_order import FITTED, REFERENCE
 
     plan, chain = subject.inputs.plan, subject.chain
@@ -1041,9 +1044,9 @@ def planned(subject: Subject) -> Figure:
 def two_views(
     figure: Figure, everything: FloatArray, frames: dict[str, FloatArray]
 ) -> list[tuple[Axes, tuple[int, int]]]:
-    """Return panels from above and from the side, with the sensors, each with its two axes.
+    """Panels from above and from the side, with the sensors, each with its two axes.
 
-    ``everything``: points that must be in them, in the robot base, m, (n, 3).
+    ``everything``: points that must be inside, in the robot base, m, (n, 3).
     """
     middle = 0.5 * (everything.min(axis=0) + everything.max(axis=0))
     reach = 0.55 * float(np.ptp(everything, axis=0).max())
@@ -1063,12 +1066,12 @@ def two_views(
 
 
 def _with_room() -> ConstrainedLayoutEngine:
-    """Return a layout for figures with a title on top: printers draw letters a little higher."""
+    """Layout for figures with a title on top: printers draw letters a little higher."""
     return ConstrainedLayoutEngine(h_pad=0.1)
 
 
 def sensor_entries(frames: dict[str, FloatArray]) -> list[Line2D]:
-    """Return what the legend of `two_views` has of the sensors."""
+    """Legend entries of `two_views` for the sensors."""
     labels = [
         f'{letter}: {name[:24]}, {np.linalg.norm(T[:3, 3]):.1f} m from the base'
         for letter, (name, T) in zip(LETTERS, frames.items(), strict=False)
@@ -1083,7 +1086,7 @@ def _sensors(
     reach: float,
     plane: tuple[int, int],
 ) -> None:
-    """Draw a sensor at its place, or the direction to one that lies outside, with its distance."""
+    """Draw a sensor at its position, or the direction to one outside the panel."""
     for letter, T in zip(LETTERS, frames.values(), strict=False):
         centre = middle[list(plane)]
         way = T[:3, 3][list(plane)] - centre
@@ -1108,7 +1111,7 @@ def _sensors(
 
 
 def _two_lines(text: str) -> str:
-    """Break a title near its middle."""
+    """A title broken near its middle."""
     words = text.split(' ')
     if len(words) < 3:
         return text

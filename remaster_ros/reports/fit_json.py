@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""fit.json: the result of a fit as other programs read it (format ``remaster-fit/1``)."""
+"""Content of fit.json (format ``remaster-fit/1``), and the correction of a fit."""
 
 from __future__ import annotations
 
@@ -53,15 +53,15 @@ FIT_FILE = 'fit.json'
 REPORT_FILE = 'report.html'
 DISCOVERY_FILE = 'discovery.json'
 FORMATS = {FIT_FILE: schemas.FIT_FORMAT, DISCOVERY_FILE: schemas.DISCOVERY_FORMAT}
-# What the commands write beside their result.
+# Files that the commands write in addition to their result.
 WRITTEN = (REPORT_FILE, APPLY_FOLDER, 'figures', 'predictions.csv', RESIDUALS_FILE)
 FIT_LIMIT = 64 * 1024**2
 
 
 def estimates(result: FitResult) -> dict[str, Any]:
-    """Return what was estimated of which arm and session, as fit.json and discovery.json have it.
+    """Estimates of a fit as fit.json and discovery.json have them.
 
-    Keys as there: robot, session, joint_offsets, registration, markers, noise, sampler.
+    Keys: robot, session, joint_offsets, registration, markers, noise, sampler.
     """
     session, sampler = result.session, result.sampler
     limits = {'std_is_lower_limit': True} if result.other_errors else {}
@@ -99,6 +99,7 @@ def estimates(result: FitResult) -> dict[str, Any]:
 
 
 def _offsets(result: FitResult) -> list[dict[str, Any]]:
+    """Rows of joint_offsets."""
     rows = table_rows(joint=result.joint_names, identifiable=result.identifiable, why=result.why)
     values = of_joints(
         result.chain,
@@ -110,9 +111,9 @@ def _offsets(result: FitResult) -> list[dict[str, Any]]:
 
 
 def of_joints(chain: SerialChain, **columns: FloatArray) -> list[dict[str, Any]]:
-    """Return a row for each joint of values in rad or m, (k, ...): in degrees or mm.
+    """A row for each joint of values in rad or m, (k, ...), converted to degrees or mm.
 
-    A column x is x_deg, and of a joint that slides x_mm, where x_deg is null.
+    A column x becomes x_deg, and for a prismatic joint x_mm, with x_deg null.
     """
     rows = []
     for joint, (unit, scale) in enumerate(zip(chain.shown_units, chain.shown_scale)):
@@ -124,7 +125,7 @@ def of_joints(chain: SerialChain, **columns: FloatArray) -> list[dict[str, Any]]
 
 @lru_cache(maxsize=2)
 def geometry_of(result: FitResult) -> GeometryModel | None:
-    """Return the lengths and tilts that the session of a fit shows; None without an estimate."""
+    """Lengths and tilts estimated from a fit's session; None without an estimate."""
     if result.found is None:
         return None
     geometry = geometry_model(result.found)
@@ -139,18 +140,18 @@ def geometry_of(result: FitResult) -> GeometryModel | None:
 
 
 class Uncertainty(NamedTuple):
-    """Of the zero-offsets of k joints; rad, m of joints that slide."""
+    """Uncertainty of the zero-offsets of k joints; rad, m for prismatic joints."""
 
     std: FloatArray  # (k,)
     interval95: FloatArray  # (k, 2)
 
 
 def uncertainty(result: FitResult) -> Uncertainty:
-    """Return the uncertainty of a fit's offsets on an arm that is off its drawing, as it is shown.
+    """Uncertainty of a fit's offsets as it is shown, for an arm that is not exactly its drawing.
 
-    What lengths and tilts of the drawing's tolerance do to an offset leaves nothing in the
-    residuals. Without an estimate of them, and of offsets that the data do not determine, it is
-    that of an arm that is exactly its drawing.
+    Lengths and tilts within the tolerance of the drawing may change an offset without any
+    residual. Without an estimate of them, and for offsets that are not identifiable, it is the
+    uncertainty of an arm that is exactly its drawing.
     """
     drawn = Uncertainty(result.joint_offsets_std, result.joint_offsets_interval95)
     geometry = geometry_of(result)
@@ -163,7 +164,7 @@ def uncertainty(result: FitResult) -> Uncertainty:
 
 
 def model_text(result: FitResult, geometry: GeometryModel) -> str:
-    """Return the robot model with lengths, tilts and offsets fitted together."""
+    """URDF with lengths, tilts and offsets fitted together."""
     remark = (
         f'Load this model in place of {URDF_FILE}, never beside another correction: lengths, '
         'tilts and zero-offsets were fitted together.'
@@ -184,9 +185,10 @@ def model_text(result: FitResult, geometry: GeometryModel) -> str:
 
 
 def compensation_text(result: FitResult, result_sha256: str) -> str:
-    """Return the correction of a fit, with lengths and tilts where a commanded arm gains by them.
+    """compensation.json of a fit, with lengths and tilts if a commanded arm gains by them.
 
-    Near singularities no command reaches what they ask for; a robot model with them needs none.
+    Near singularities no command reaches the poses that they require; a robot model with them
+    needs none.
     """
     geometry, rows = geometry_of(result), result.measurements
     described = None if geometry is None else arm_of_geometry(result, geometry, rows)
@@ -200,15 +202,16 @@ def compensation_text(result: FitResult, result_sha256: str) -> str:
 
 
 def _of_fit(described: CorrectedArm, result: FitResult, result_sha256: str) -> str:
+    """compensation.json of a corrected arm of a fit."""
     mounts = _mounts(result, described.model)
     return correction_text(described, result.session, 'fit', result_sha256, mounts)
 
 
 def _mounts(result: FitResult, model: ArmModel) -> dict[str, MountPart]:
-    """How each sensor on the tool stands there, by its name, with the arm of a correction.
+    """Rotation of each sensor on the tool, by its name, with the arm of a correction.
 
-    The turns of the fit belong to its own zero-offsets. A correction leaves out those that are not
-    identifiable: with it the turn is the mean of what the fitted rows show.
+    The rotations of the fit belong to its zero-offsets. A correction leaves out those that are not
+    identifiable: with it the rotation is the mean that the fitted rows show.
     """
     session, found, m = result.session, result.orientations, result.measurements
     left_out = [observation for observation, _ in result.left_out]
@@ -240,9 +243,9 @@ def correction_text(
     result_sha256: str,
     mounts: Mapping[str, MountPart] | None = None,
 ) -> str:
-    """Return compensation.json of the arm that a result describes.
+    """compensation.json of a corrected arm.
 
-    Without ``mounts`` how the sensors on the tool are turned is not known.
+    Without ``mounts`` the rotations of sensors on the tool are unknown.
     """
     if mounts is None:
         mounts = {sensor: MountPart(session.sensors[sensor]) for sensor in session.on_tool}
@@ -252,13 +255,16 @@ def correction_text(
 
 
 def _geometry(result: FitResult, geometry: GeometryModel) -> dict[str, Any]:
+    """Key geometry of fit.json."""
+
     def std_mm(name: str) -> float | None:
-        mine = [
+        """RMS displacement by the lengths or tilts, mm; None if the fit has none."""
+        stds = [
             std
             for one, std in zip(geometry.members, geometry.std_m, strict=True)
             if one.name == name
         ]
-        return 1e3 * float(mine[0]) if mine else None
+        return 1e3 * float(stds[0]) if stds else None
 
     imitations = []
     for index in np.flatnonzero(result.identifiable):
@@ -285,6 +291,7 @@ def _geometry(result: FitResult, geometry: GeometryModel) -> dict[str, Any]:
 
 
 def _orientation(result: FitResult, found: Orientations) -> dict[str, Any]:
+    """Key orientation of fit.json."""
     tell = found.tell
     return {
         'fitted': not found.why_not,
@@ -313,20 +320,20 @@ def _orientation(result: FitResult, found: Orientations) -> dict[str, Any]:
 
 
 def _by_positions(result: FitResult) -> dict[str, dict[str, float | None]]:
-    """Return the std of each offset by the positions alone, in degrees and, of slides, in mm."""
+    """Std of each offset from the positions alone, degrees, and mm for prismatic joints."""
     found: dict[str, dict[str, float | None]] = {'std_positions_deg': {}}
     tell = None if result.orientations is None else result.orientations.tell
     if tell is None:
         return found
     for joint in np.flatnonzero(result.identifiable).tolist():
         std = float(result.chain.shown_scale[joint] * tell.std_without[joint])
-        own = found.setdefault(f'std_positions_{result.chain.shown_units[joint]}', {})
-        own[result.joint_names[joint]] = std if np.isfinite(std) else None
+        by_joint = found.setdefault(f'std_positions_{result.chain.shown_units[joint]}', {})
+        by_joint[result.joint_names[joint]] = std if np.isfinite(std) else None
     return found
 
 
 def fit_content(result: FitResult) -> schemas.Fit:
-    """Return a fit as fit.json has it."""
+    """Content of fit.json."""
     draws, sampler = result.draws.reshape(-1, result.draws.shape[-1]), result.sampler
     content: dict[str, Any] = {
         'format': schemas.FIT_FORMAT,
@@ -392,11 +399,12 @@ def clocks_content(clocks: Mapping[str, tuple[float, float]]) -> dict[str, Any]:
 
 
 def table_rows(**columns: Iterable[Any]) -> list[dict[str, Any]]:
-    """Return equally long columns as rows."""
+    """Rows of equally long columns."""
     return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
 
 
 def _noise(noise: NoiseEstimate) -> dict[str, Any]:
+    """Noise of a sensor, without keys of frame noise that it does not have."""
     directions = {
         f'{direction}_{key}': value
         for direction, part in noise.directions.items()
@@ -411,6 +419,7 @@ def _noise(noise: NoiseEstimate) -> dict[str, Any]:
 
 
 def _describe(session: Session) -> dict[str, Any]:
+    """Counts, sensors and origin of a session."""
     m = session.measurements
     counts = {
         name: {
@@ -431,7 +440,7 @@ def _describe(session: Session) -> dict[str, Any]:
 
 
 def read_fit(path: str | os.PathLike[str]) -> schemas.Fit:
-    """Read fit.json and check it against the contract; further keys are left out.
+    """Read fit.json and check it against its schema; unknown keys are dropped.
 
     Raises
     ------
@@ -444,7 +453,10 @@ def read_fit(path: str | os.PathLike[str]) -> schemas.Fit:
 def read_result(
     path: Path, schema: type[schemas.Content], form: str, name: str, verb: str
 ) -> schemas.Content:
-    """Read the file `name` that a verb wrote, and check it against its schema and format."""
+    """Read the file `name` that the command `verb` wrote, and check its format and schema.
+
+    Raises InputError if it is damaged, of another format, or lacks a key.
+    """
     data = read_limited(path, FIT_LIMIT, f'give the {name} that "remaster {verb}" wrote')
     try:
         content = msgspec.json.decode(data)
@@ -460,18 +472,18 @@ def read_result(
 
 
 def joint_offsets_of(fit: schemas.Fit, chain: SerialChain) -> tuple[FloatArray, FloatArray]:
-    """Return the offsets of a fit.json in the order of a robot's joints, with their std.
+    """Offsets of a fit.json in the order of a robot's joints, with their standard deviations.
 
     Returns
     -------
     offsets, std
-        rad, m of joints that slide, (k,) each; the std is that of an arm that is exactly its
-        drawing, as predictions take it, and of one that is not identifiable 0.
+        rad, m for prismatic joints, (k,) each; the std is that of an arm that is exactly its
+        drawing, as predictions use it, and 0 for offsets that are not identifiable.
 
     Raises
     ------
     InputError
-        The offsets are for other joints, in another unit, or no offsets of any arm.
+        The offsets are for other joints, in another unit, or beyond any arm's.
     """
     rows = {row.joint: row for row in fit.joint_offsets}
     joint_names = chain.joint_names
@@ -504,7 +516,7 @@ def joint_offsets_of(fit: schemas.Fit, chain: SerialChain) -> tuple[FloatArray, 
 
 
 def require_own(path: Path, format_: str) -> None:
-    """Refuse to replace a file that is no JSON of this format, or not of this program."""
+    """Raise InputError if a file to be replaced is not a JSON file of this format."""
     try:
         content = msgspec.json.decode(read_limited(path, FIT_LIMIT, 'it was there'))
     except (msgspec.DecodeError, RecursionError):

@@ -1,22 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
 """Web server of the live page: fixed files, the view as JSON, and five commands.
 
-Whoever may command here lets an arm move, so every request is judged as if it came from somebody
-who is not meant to:
+A command lets an arm move, so each request is checked as if it came from an attacker:
 
-- Host has to be a name of this server (a foreign page that has its own name resolve to this
-  address is refused), and Origin, which every command needs, this server's own.
+- Host has to be a name of this server (a foreign page whose own name resolves to this address is
+refused), and Origin, which each command needs, this server's own.
 - View, scene and commands need the token in the header Authorization. No cookie is set: browsers
-  would send it with requests of other pages, and to servers on other ports of this address. The
-  token stands behind the # of the page's address, which browsers never send.
-- ``collect`` and ``confirm`` also name the view that the person has seen. A request that was held
-  up on its way, or that belongs to another state of the collection or another plan, is refused.
+would send it with requests of other pages, and to servers on other ports of this address. The
+token is behind the # of the page's address, which browsers never send.
+- ``collect`` and ``confirm`` also name the view that the person has seen. A delayed request, or
+one that belongs to another state of the collection or another plan, is refused.
 - The page of a plan, which a browser opens without a header, has an address that only the view
-  tells, and is shown as a stranger's: it reaches neither this server nor the token (sandbox).
-- Nothing is written, no path comes from a request, bodies are small, no page may frame this one,
-  and no script runs here but the ones of this package.
-- Connections are few, and those that have not shown the token live for one request
-  (`live_connections`). Trouble is one line a minute, which is left out where nobody reads.
+contains, and is shown as a foreign one: it reaches neither this server nor the token (sandbox).
+- Nothing is written, no path comes from a request, bodies are small, no other page may frame this
+one, and only scripts of this package run here.
+- Connections are few, and those that have not shown the token live for one request. Errors are
+reported once a minute, and not at all if nobody reads them.
 """
 
 from __future__ import annotations
@@ -55,55 +54,57 @@ from tornado.web import Application, HTTPError, RequestHandler
 from remaster_ros.errors import InputError
 from remaster_ros.reports.robot_scene import view_script
 
-# Connections to the live page: few, short until they have shown the token, and no flood of words.
+# Connections to the live page: few, and short until they have shown the token.
 #
-# Whoever reaches the port can open connections: on the computer of the page every user can, and
-# from its own address, too. So nobody is refused for where he comes from. Where there are too
-# many connections, the oldest one without the token is closed, of the address that has the most:
-# the page of its owner, which has shown the token, is kept, and a browser that opens the page
-# needs milliseconds.
+# Anybody who reaches the port can open connections; on the computer of the page each user can,
+# and from its own address, too. So no address is refused. If there are too many connections, the
+# oldest one without the token is closed, of the address that has the most: the page of the owner,
+# which has shown the token, is kept, and a browser that opens the page needs milliseconds.
 
 
 MOST = 128
-"""Connections in all: a browser opens six to a page, so this is for twenty browsers."""
+"""Largest number of connections: a browser opens six to a page, so this is for twenty browsers."""
 MOST_EACH = 64
-"""Of one address: one cannot take the place of all others."""
+"""Largest number of connections of one address, so that none can take the place of all others."""
 REQUEST_S = 5.0
 """From the begin of a connection, or its last answer, to the end of a request, s."""
 ANSWER_TAKEN_S = 60.0
-"""So long an answer may be on its way, s: the page has 1.5 MB, 0.2 Mbit/s take a minute."""
+"""Longest time to send an answer, s: the page has 1.5 MB, which takes a minute at 0.2 Mbit/s."""
 IDLE_S = 30.0
-"""How long a page that has shown the token may ask for nothing, s."""
+"""Longest time without a request of a page that has shown the token, s."""
 LINE_EVERY_S = 60.0
 LONGEST_LINE = 400
-"""Characters: a line that a pipe takes at once where it takes anything (PIPE_BUF is 4096)."""
+"""Characters of a line that a pipe accepts as a whole (PIPE_BUF is 4096 bytes)."""
 
 
 @dataclass
-class _Held:
-    """A connection that is open: whose, since when it owes a request, whether it has the token."""
+class _OpenConnection:
+    """An open connection: its address, since when it owes a request.
+
+    Last result: whether it has the token.
+    """
 
     address: str
     since_s: float = field(default_factory=time.monotonic)
-    believed: bool = False
+    has_token: bool = False
 
 
 class BoundedServer(HTTPServer):
-    """A web server with a bounded number of connections; parameters as of `HTTPServer`."""
+    """Web server with a bounded number of connections; parameters as of `HTTPServer`."""
 
     def initialize(self, *args: Any, **kwargs: Any) -> None:
-        """As in tornado."""
+        """Set up as in tornado, and begin to close late connections."""
         super().initialize(*args, **kwargs)
-        self._held: dict[IOStream, _Held] = {}
+        self._open: dict[IOStream, _OpenConnection] = {}
         PeriodicCallback(self._close_late, 500.0).start()
 
     def handle_stream(self, stream: IOStream, address: tuple[Any, ...]) -> None:
-        """Take a new connection, and close another one where there are too many."""
-        held = self._held[stream] = _Held(_network(str(address[0])))
-        counts = Counter(other.address for other in self._held.values())
-        if counts[held.address] > MOST_EACH:
-            self._close_oldest(held.address)
-        elif len(self._held) > MOST:
+        """Accept a connection, and close another one if there are too many."""
+        connection = self._open[stream] = _OpenConnection(_network(str(address[0])))
+        counts = Counter(other.address for other in self._open.values())
+        if counts[connection.address] > MOST_EACH:
+            self._close_oldest(connection.address)
+        elif len(self._open) > MOST:
             self._close_oldest(max(counts, key=counts.__getitem__))
         if not stream.closed():
             super().handle_stream(stream, address)
@@ -112,47 +113,53 @@ class BoundedServer(HTTPServer):
         """Forget a connection that has ended."""
         assert isinstance(server_conn, HTTP1ServerConnection)
         super().on_close(server_conn)
-        self._held.pop(server_conn.stream, None)
+        self._open.pop(server_conn.stream, None)
 
-    def believe(self, request: HTTPServerRequest) -> None:
-        """Keep the connection of a request that has shown the token."""
-        if (held := self._held.get(_stream(request))) is not None:
-            held.believed = True
+    def trust(self, request: HTTPServerRequest) -> None:
+        """Mark the connection of a request as one that has shown the token."""
+        if (connection := self._open.get(_stream(request))) is not None:
+            connection.has_token = True
 
-    def answered(self, request: HTTPServerRequest) -> None:
-        """Note that a request is answered; the next one has its own time."""
-        if (held := self._held.get(_stream(request))) is not None:
-            held.since_s = time.monotonic()
+    def note_answer(self, request: HTTPServerRequest) -> None:
+        """Note that a request is answered, so that the time for the next one begins."""
+        if (connection := self._open.get(_stream(request))) is not None:
+            connection.since_s = time.monotonic()
 
     def _close_oldest(self, address: str) -> None:
-        """Close the connection of an address that is dearest to nobody: without token, oldest."""
-        of_it = [(held.believed, held.since_s, id(stream)) for stream, held in self._of(address)]
+        """Close the oldest connection of an address, those without the token first."""
+        of_it = [
+            (connection.has_token, connection.since_s, id(stream))
+            for stream, connection in self._of(address)
+        ]
         worst = min(of_it)[2]
         self._close(next(stream for stream, _ in self._of(address) if id(stream) == worst))
 
-    def _of(self, address: str) -> list[tuple[IOStream, _Held]]:
-        return [item for item in self._held.items() if item[1].address == address]
+    def _of(self, address: str) -> list[tuple[IOStream, _OpenConnection]]:
+        """Connections of an address."""
+        return [item for item in self._open.items() if item[1].address == address]
 
     def _close_late(self) -> None:
-        """Close connections whose request does not come, or whose answer is not taken."""
+        """Close connections whose request does not come, or whose answer is not read."""
         now = time.monotonic()
-        for stream, held in list(self._held.items()):
-            allowed = IDLE_S if held.believed else REQUEST_S
-            if now - held.since_s > (ANSWER_TAKEN_S if stream.writing() else allowed):
+        for stream, connection in list(self._open.items()):
+            allowed = IDLE_S if connection.has_token else REQUEST_S
+            if now - connection.since_s > (ANSWER_TAKEN_S if stream.writing() else allowed):
                 self._close(stream)
 
     def _close(self, stream: IOStream) -> None:
-        self._held.pop(stream, None)
+        """Close a connection and forget it."""
+        self._open.pop(stream, None)
         stream.close()
 
 
 def _stream(request: HTTPServerRequest) -> IOStream:
+    """Stream of a request's connection."""
     stream: IOStream = request.connection.stream  # type: ignore[union-attr]
     return stream
 
 
 def _network(address: str) -> str:
-    """Return what one user has: an IPv4 address, or all of a network of IPv6."""
+    """Key of one user's addresses: an IPv4 address, or a network of IPv6."""
     with contextlib.suppress(ValueError):
         if isinstance(
             parsed := ipaddress.ip_address(address.partition('%')[0]), ipaddress.IPv6Address
@@ -161,15 +168,15 @@ def _network(address: str) -> str:
     return address
 
 
-class _Rarely(logging.Handler):
-    """Writes a line a minute to stderr, with how many were left out; never waits for a reader."""
+class _RareHandler(logging.Handler):
+    """Handler that writes a line a minute to stderr, and counts the others; it never blocks."""
 
     def __init__(self) -> None:
         super().__init__(logging.WARNING)
         self._next_s, self._left_out = float('-inf'), 0
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Write a line, or count it."""
+        """Write a record, or count it."""
         self.note(' '.join(record.getMessage().split()))
 
     def note(self, text: str) -> None:
@@ -181,16 +188,16 @@ class _Rarely(logging.Handler):
         more = f' ({self._left_out} more since the last such line)' if self._left_out else ''
         self._next_s, self._left_out = now + LINE_EVERY_S, 0
         line = f'live page: {text[:LONGEST_LINE]}{more}\n'.encode(errors='replace')
-        # Another program may have closed what this one has as stderr.
+        # Another program may have closed this one's stderr.
         with contextlib.suppress(OSError, ValueError):
-            where = sys.stderr.fileno()
-            if select.select([], [where], [], 0.0)[1]:
-                os.write(where, line)
+            descriptor = sys.stderr.fileno()
+            if select.select([], [descriptor], [], 0.0)[1]:
+                os.write(descriptor, line)
 
 
 def log_rarely(loop: asyncio.AbstractEventLoop) -> None:
-    """Have what tornado and a loop report in one line a minute."""
-    handler = _Rarely()
+    """Report errors of tornado and of a loop in one line a minute."""
+    handler = _RareHandler()
     logger = logging.getLogger('tornado')
     logger.handlers, logger.propagate = [handler], False
 
@@ -204,20 +211,20 @@ def log_rarely(loop: asyncio.AbstractEventLoop) -> None:
 
 @dataclass(frozen=True)
 class Place:
-    """Where the page is served."""
+    """Address and port at which the page is served."""
 
-    # The IP address to listen on, and the port; 0 for any free one
+    # IP address to listen on, and port; 0 for any free port
     address: str = '127.0.0.1'
     port: int = 0
-    # Names of this computer by which a browser may ask besides the address
+    # Further names of this computer that a browser may use
     names: tuple[str, ...] = ()
-    # PEM files for https; an address that other computers reach needs them
+    # PEM files for https, required for an address that other computers reach; '' for http
     certificate: str = ''
     key: str = ''
 
 
 def listen(place: Place) -> socket.socket:
-    """Return a socket that listens there."""
+    """Socket that listens at a place. Raises InputError if it cannot."""
     try:
         address = ipaddress.ip_address(place.address)
     except ValueError:
@@ -243,7 +250,7 @@ def listen(place: Place) -> socket.socket:
 
 
 def tls(place: Place) -> ssl.SSLContext | None:
-    """Return what https needs; None for http."""
+    """TLS context of the certificate; None for http. Raises InputError if it cannot be read."""
     if not place.certificate:
         return None
     context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
@@ -255,7 +262,7 @@ def tls(place: Place) -> ssl.SSLContext | None:
 
 
 def hosts(place: Place, port: int) -> tuple[str, ...]:
-    """Return what the header Host may be; the first one stands in the page's address."""
+    """Allowed values of the header Host; the first one is in the page's address."""
     address = ipaddress.ip_address(place.address)
     shown = f'[{address}]' if address.version == 6 else str(address)
     names = [*place.names]
@@ -269,11 +276,11 @@ def hosts(place: Place, port: int) -> tuple[str, ...]:
 CONFIRM = 'confirm'
 COMMANDS = ('collect', 'pause', 'stop', 'fit', CONFIRM)
 SEEN_FIRST = ('collect', CONFIRM)
-"""What a person must have seen something of who asks for it."""
+"""Commands that are accepted only from a person who has seen the current view."""
 FRESH_S = 3.0
-"""A view that is older has not been seen just now."""
+"""Largest age of a view that counts as current, s."""
 ANSWER_S = 5.0
-"""So long a command is waited for."""
+"""Longest wait for the outcome of a command, s."""
 WATCHED_S = 5.0
 LARGEST_BODY = 1024
 Done = Callable[[bool, str], None]
@@ -300,20 +307,20 @@ _HEADERS = {
 }
 
 
-class Seen(msgspec.Struct, forbid_unknown_fields=True):
-    """What a person has seen who lets the arm move or confirms: number and mark of the view."""
+class SeenView(msgspec.Struct, forbid_unknown_fields=True):
+    """View that a person has seen who lets the arm move or confirms: its number and mark."""
 
     view: int
     seen: str
 
 
 class LiveServer:
-    """Serves the page in a thread of its own.
+    """Server of the page, in a thread of its own.
 
-    ``token`` is what view and commands ask for, ``scene`` the fixed part of the 3-D view, JSON.
+    ``token`` is required for view and commands, ``scene`` is the fixed part of the 3-D view, JSON.
     ``send`` is called in the server's thread with the name of a command (``confirm/NAME`` for the
-    plan of that name) and with what takes its outcome, from any thread: whether it was done, and a
-    line for the person. An `InputError` where address or certificate cannot be used.
+    plan of that name) and with a callback for its outcome, which any thread may call: success, and
+    a line for the person. Raises InputError if address or certificate cannot be used.
     """
 
     def __init__(self, place: Place, token: str, scene: bytes, send: Send) -> None:
@@ -334,51 +341,57 @@ class LiveServer:
 
     @property
     def url(self) -> str:
-        """The address of the page, with the token."""
+        """Address of the page, with the token."""
         return f'{self.scheme}://{self.hosts[0]}/#token={self.token}'
 
     @property
     def watched(self) -> bool:
-        """Whether somebody has asked for the view within the last seconds."""
+        """Whether anybody has requested the view within the last seconds."""
         return time.monotonic() - self._asked_s < WATCHED_S
 
     def publish(self, view: dict[str, Any]) -> None:
         """Show a view from now on.
 
         Its ``seen`` is the mark that `collect` and `confirm` have to name; its ``confirmation``
-        has the plan that is confirmed with it.
+        has the plan that they confirm.
         """
         content = msgspec.json.encode(view)  # NaN becomes null, which browsers read.
         plan = view['confirmation']['plan'] if view['confirmation'] else ''
         self._loop.call_soon_threadsafe(self._show, content, str(view['seen']), plan)
 
     def _show(self, content: bytes, seen: str, plan: str) -> None:
+        """Replace the view; runs in the server's thread."""
         self._issued.append((self._issued[-1][0] + 1, time.monotonic()))
         self._view, self._seen, self._plan = content, seen, plan
 
     def show_plan(self, html: bytes) -> str:
-        """Serve the page of a plan in place of the one before; return its address."""
+        """Serve the page of a plan in place of the previous one; returns its address."""
         name = secrets.token_urlsafe(32)
         self._loop.call_soon_threadsafe(self._take_plan, name, gzip.compress(html, 6))
         return f'plan/{name}'
 
     def _take_plan(self, name: str, content: bytes) -> None:
+        """Replace the page of the plan; runs in the server's thread."""
         self._plan_page = name, content
 
     def plan_page(self, name: str) -> bytes:
-        """Return the page of the plan, compressed, where this is its name; empty otherwise."""
-        own, content = self._plan_page
-        return content if own and hmac.compare_digest(own.encode(), name.encode()) else b''
+        """Page of the plan of this name, compressed; empty for another name."""
+        current_name, content = self._plan_page
+        return (
+            content
+            if current_name and hmac.compare_digest(current_name.encode(), name.encode())
+            else b''
+        )
 
     def view(self) -> bytes:
-        """Return the view as JSON, with its number and age."""
+        """The view as JSON, with its number and age."""
         self._asked_s = time.monotonic()
         number, issued_s = self._issued[-1]
         age_s = min(self._asked_s - issued_s, 1e6)
         return b'{"number":%d,"age_s":%.2f,"view":%s}' % (number, age_s, self._view)
 
-    def refusal(self, seen: Seen) -> str:
-        """Return why a person who has seen this must look again; ''."""
+    def refusal(self, seen: SeenView) -> str:
+        """Reason why a person who has seen this view must look again; '' if it is current."""
         issued = dict(self._issued).get(seen.view, float('-inf'))
         if time.monotonic() - issued > FRESH_S or seen.view <= self._used:
             return 'the page was not up to date; look again'
@@ -389,18 +402,18 @@ class LiveServer:
         return ''
 
     def command(self, name: str) -> str:
-        """Return what `send` is asked for; '' where the view has no plan to confirm."""
+        """Command passed to `send`; '' if the view has no plan to confirm."""
         if name != CONFIRM:
             return name
         return f'{CONFIRM}/{self._plan}' if self._plan else ''
 
-    def believe(self, request: HTTPServerRequest) -> None:
-        """Keep the connection of a request that has shown the token, whatever others do."""
-        self._connections.believe(request)
+    def trust(self, request: HTTPServerRequest) -> None:
+        """Keep the connection of a request that has shown the token."""
+        self._connections.trust(request)
 
-    def answered(self, request: HTTPServerRequest) -> None:
-        """Give the connection of a request time for the next one."""
-        self._connections.answered(request)
+    def note_answer(self, request: HTTPServerRequest) -> None:
+        """Begin the time for the next request of a connection."""
+        self._connections.note_answer(request)
 
     def close(self) -> None:
         """End the server and its thread."""
@@ -408,6 +421,7 @@ class LiveServer:
         self._thread.join(5.0)
 
     def _run(self) -> None:
+        """Serve until the loop is stopped."""
         asyncio.set_event_loop(self._loop)
         log_rarely(self._loop)
         application = Application(
@@ -441,7 +455,7 @@ class LiveServer:
 
 
 class _Handler(RequestHandler):
-    """Refuses what does not come from the page of this server."""
+    """Request handler that refuses requests of other pages."""
 
     SUPPORTED_METHODS = ('GET', 'HEAD', 'POST')  # type: ignore[assignment]
 
@@ -449,7 +463,7 @@ class _Handler(RequestHandler):
         self._server = server
 
     def on_finish(self) -> None:
-        self._server.answered(self.request)
+        self._server.note_answer(self.request)
 
     def set_default_headers(self) -> None:
         self.clear_header('Server')
@@ -484,7 +498,7 @@ class _File(_Handler):
 
 
 class _Plan(_Handler):
-    """The page of a plan, by the address that the view tells to those who have the token."""
+    """Page of a plan, at an address that only the view contains."""
 
     def get(self, name: str) -> None:
         content = self._server.plan_page(name)
@@ -509,7 +523,7 @@ class _WithToken(_Handler):
         wanted = f'Bearer {self._server.token}'
         if len(given) != 1 or not hmac.compare_digest(given[0].encode(), wanted.encode()):
             raise HTTPError(401, reason='open the page by the address that remaster watch gives')
-        self._server.believe(self.request)
+        self._server.trust(self.request)
 
 
 class _View(_WithToken):
@@ -532,7 +546,7 @@ class _Command(_WithToken):
             raise HTTPError(409, reason='no plan waits for a confirmation')
         if name in SEEN_FIRST:
             try:
-                seen = msgspec.json.decode(self.request.body, type=Seen)
+                seen = msgspec.json.decode(self.request.body, type=SeenView)
             except (msgspec.MsgspecError, RecursionError):
                 raise HTTPError(400, reason=f'{name} needs view and seen') from None
             if refusal := self._server.refusal(seen):
@@ -554,13 +568,14 @@ class _Command(_WithToken):
 
 
 def _set(future: asyncio.Future[tuple[bool, str]], outcome: tuple[bool, str]) -> None:
+    """Set the result of a future that may be done."""
     if not future.done():
         future.set_result(outcome)
 
 
 @cache
 def _files() -> dict[str, tuple[bytes, str]]:
-    """Return the page's files by name, compressed, with their types."""
+    """Compressed files of the page by name, with their types."""
     folder = importlib.resources.files(__package__).joinpath('live_page')
     plotly = importlib.resources.files('plotly').joinpath('package_data', 'plotly.min.js')
     script = 'text/javascript; charset=utf-8'

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""State of the live page: what the nodes publish in, a view for people out. No ROS, no clock.
+"""State of the live page: built from what the nodes publish, shown as a view. No ROS, no clock.
 
-Every text that a view holds came over the network: it is clipped here and shown as text there.
-Which commands a view offers is for the eye; what they do is decided by the nodes that serve them.
+All texts of a view came over the network: they are clipped here, and shown as text by the page.
+The commands offered by a view are only a display; the nodes that serve them decide.
 """
 
 from __future__ import annotations
@@ -33,35 +33,35 @@ STOP_NOTE = (
 
 @dataclass(frozen=True)
 class PlanPage:
-    """Where the page of a plan is served."""
+    """Address at which the page of a plan is served."""
 
     plan: str = ''  # Fingerprint of the plan
-    address: str = ''  # Below that of the live page; '' where it is not served
-    trouble: str = ''  # Why it is not; ''
+    address: str = ''  # Relative to the live page; '' if it is not served
+    trouble: str = ''  # Reason if it is not served; '' otherwise
 
 
 @dataclass(frozen=True)
 class FitFacts:
-    """What is known of a fit beside its offsets."""
+    """Facts of a fit other than its offsets."""
 
     shown: Mapping[str, str] = field(default_factory=dict)  # Label -> text
-    unidentifiable: frozenset[str] = frozenset()  # Joints whose offset is not to be believed
-    # Where the markers were found, in the tool frame, m, (3,)
+    unidentifiable: frozenset[str] = frozenset()  # Joints whose offset is not identifiable
+    # Fitted position of each marker in the tool frame, m, (3,)
     markers: Mapping[str, FloatArray] = field(default_factory=dict)
 
 
 SILENT_S = 3.0
-"""A node that was not heard for longer counts as gone."""
+"""Time without a message after which a node counts as gone, s."""
 LONGEST_TEXT = 400
 LONGEST_DESCRIPTION = 4000
-"""Of a plan, characters: those of this planner have some 500, and stand behind a fold."""
+"""Characters of a plan's description: those of this planner have some 500, behind a fold."""
 MOST_NODES = 30
 MOST_MESSAGES = 40
 MOST_POINTS = 400
 LONGEST_WAY = 200
 UNDETERMINED_RAD = 0.0873
-"""5 degrees, 22 mm of a slide: what the fit assumes of a zero-offset before it has seen anything.
-"""
+"""Std from which on an offset counts as undetermined, 5 degrees (22 mm for a prismatic joint): its
+prior in the fit."""
 SHOWN_COUNTS = ('phase', 'poses_done', 'poses', 'configurations_done', 'configurations')
 SHOWN_PLAN = ('plan_page', 'plan_shown', 'confirmed')
 _PLAN_NAME = re.compile('[0-9a-f]{8}')
@@ -77,7 +77,7 @@ class _Node:
 
 
 class LiveView:
-    """What is known of a collection.
+    """State of a collection as received from its nodes.
 
     ``markers``: sensor -> its markers -> their positions in the tool frame, m, (3,).
     """
@@ -100,13 +100,13 @@ class LiveView:
         self._q: FloatArray | None = None
         self._target: FloatArray | None = None
         self._way: FloatArray = np.empty((0, 3))
-        # Where registered sensors stand, sensor -> (4, 4)
+        # Registrations, sensor -> (4, 4)
         self.registration: dict[str, FloatArray] = {}
         self._precision = Precision()
         self._offsets: Mapping[str, tuple[float, float]] = {}
         self._fit = FitFacts()
         self._plan_page = PlanPage()
-        # Whether the planner offers the service that confirms the plan which is next
+        # Whether the planner offers the service that confirms the next plan
         self.plan_offered = False
 
     # What comes in
@@ -114,7 +114,7 @@ class LiveView:
     def take_summary(
         self, node: str, level: str, message: str, values: Mapping[str, str], now_s: float
     ) -> None:
-        """Take what a node shows to people (a status of /remaster/status)."""
+        """Take a status of a node from /remaster/status."""
         if node not in self._nodes and len(self._nodes) >= MOST_NODES:
             return
         self._nodes[node] = _Node(level, _clip(message), now_s)
@@ -144,9 +144,10 @@ class LiveView:
             case events.ConfigurationEnded():
                 self._end(body, now_s)
             case _:
-                self._tell(body, now_s)
+                self._add_message(body, now_s)
 
     def _end(self, end: events.ConfigurationEnded, now_s: float) -> None:
+        """Note the end of a configuration."""
         recorded = end.result in ('recorded', 'partial')
         q = self._open.pop((end.stamp, end.solution), None)
         registering = self._values.get('phase') == 'registration'
@@ -154,7 +155,8 @@ class LiveView:
         if end.result != 'recorded':
             self._messages.append((now_s, _clip(f'configuration {end.result}: {end.reason}')))
 
-    def _tell(self, body: events.State | events.Event, now_s: float) -> None:
+    def _add_message(self, body: events.State | events.Event, now_s: float) -> None:
+        """Add a message on an event that a person should see."""
         match body:
             case events.SolutionFailed(reason=reason):
                 text = f'configuration failed: {reason}'
@@ -171,31 +173,31 @@ class LiveView:
         self._messages.append((now_s, _clip(text)))
 
     def take_plan_page(self, page: PlanPage) -> None:
-        """Take where the page of a plan is served, or why it is not."""
+        """Take the address of a plan's page, or why it is not served."""
         self._plan_page = page
 
     def take_joints(self, q: FloatArray) -> None:
-        """Take where the arm is, rad, (k,)."""
+        """Take the arm's joint positions, rad, (k,)."""
         if np.all(np.isfinite(q)):
             self._q = q
 
     def take_target(self, T_R_T: FloatArray) -> None:
-        """Take the pose of the tool that the arm goes to, (4, 4)."""
+        """Take the target pose of the tool, (4, 4)."""
         if np.all(np.isfinite(T_R_T)):
             self._target = T_R_T
 
     def take_way(self, way: FloatArray) -> None:
-        """Take the configurations that the arm goes through next, rad, (n, k)."""
+        """Take the next configurations on the arm's path, rad, (n, k)."""
         if np.all(np.isfinite(way)):
             self._way = tool_path(self._chain, way[:LONGEST_WAY])
 
     def take_registration(self, sensor: str, T_R_N: FloatArray) -> None:
-        """Take where a sensor stands, (4, 4)."""
+        """Take the registration of a sensor, (4, 4)."""
         if sensor in self._sensors and np.all(np.isfinite(T_R_N)):
             self.registration[sensor] = T_R_N
 
     def take_offsets(self, means: Mapping[str, float], stds: Mapping[str, float]) -> None:
-        """Take the zero-offsets of a fit and their standard deviations, joint -> rad or m."""
+        """Take zero-offsets of a fit and their standard deviations, joint -> rad or m."""
         names = self._chain.joint_names
         values = [by_name.get(name, np.nan) for by_name in (means, stds) for name in names]
         if np.all(np.isfinite(values)):
@@ -203,23 +205,26 @@ class LiveView:
             self.residuals.use_offsets(np.array([means[name] for name in names]))
 
     def take_fit(self, fit: FitFacts) -> None:
-        """Take what else is known of the fit whose offsets were taken."""
+        """Take further facts of the fit whose offsets were taken."""
         self._fit = fit
         self.residuals.use_markers(fit.markers)
 
     def take_precision(self, text: str) -> None:
-        """Take what is known so far (JSON of /remaster/precision); errors as of msgspec."""
+        """Take the precision so far (JSON of /remaster/precision).
+
+        Raises MsgspecError if invalid.
+        """
         self._precision = msgspec.json.decode(text, type=Precision)
 
     # What goes out
 
     def plan_to_show(self) -> tuple[str, str]:
-        """Return name and page of the plan that is next; two empty texts where none is shown."""
+        """Name and page of the next plan; two empty texts if none is shown."""
         plan, page = self._values.get('plan_shown', ''), self._values.get('plan_page', '')
         return (plan, page) if page and _PLAN_NAME.fullmatch(plan) else ('', '')
 
     def view(self, now_s: float) -> dict[str, Any]:
-        """Return what the page shows now, of plain types."""
+        """Content of the page now, of plain types."""
         return {
             'run': self._run(now_s),
             'halted': _clip(self._bridge.halted) if self._bridge else '',
@@ -238,10 +243,10 @@ class LiveView:
         }
 
     def seen(self, now_s: float) -> str:
-        """Return a mark of what a person must have seen who lets the arm move.
+        """Mark of the state that a person must have seen who lets the arm move.
 
-        It is another one as soon as the state of the run, a halt, a change of the set-up, the
-        plan that is next, whether it is confirmed or whether the planner is heard is another.
+        It changes with the state of the run, a halt, a change of the set-up, the next plan, its
+        confirmation, and whether the planner is heard.
         """
         silent = self._silent(PLANNER, now_s)
         state = self._planner.state if self._planner else ''
@@ -252,15 +257,18 @@ class LiveView:
         return hashlib.sha256(what.encode()).hexdigest()[:16]
 
     def _silent(self, node: str, now_s: float) -> bool:
+        """Whether a node was not heard for `SILENT_S`."""
         return now_s - self._nodes[node].heard_s > SILENT_S
 
     def _count(self, name: str) -> int:
+        """A count of the planner's status; 0 if it is no number."""
         try:
             return int(self._values.get(name, '0'))
         except ValueError:
             return 0
 
     def _run(self, now_s: float) -> dict[str, Any]:
+        """State and progress of the collection."""
         done, of = self._count('configurations_done'), self._count('configurations')
         phase = self._values.get('phase', '')
         collecting = phase == 'collection' and of > 0
@@ -285,6 +293,7 @@ class LiveView:
         }
 
     def _node_rows(self, now_s: float) -> list[dict[str, Any]]:
+        """State of each node."""
         rows = []
         for name, node in self._nodes.items():
             age_s = now_s - node.heard_s
@@ -297,6 +306,7 @@ class LiveView:
         return rows
 
     def _sensor_row(self, name: str) -> dict[str, Any]:
+        """State and residuals of a sensor."""
         report = self._reports.get(name)
         ages = self._recorder.read_age_s if self._recorder else {}
         norms = 1e3 * self.residuals.norms_m(name)
@@ -315,7 +325,7 @@ class LiveView:
         }
 
     def _precision_table(self) -> dict[str, Any]:
-        """Return the standard deviations by configurations and minutes."""
+        """Standard deviations of the offsets by configurations and minutes."""
         looks = self._precision.looks[-MOST_POINTS:]
         return {
             'message': _clip(self._precision.message),
@@ -328,6 +338,7 @@ class LiveView:
         }
 
     def _result(self) -> dict[str, Any]:
+        """Offsets and facts of the last fit."""
         return {
             'joints': [
                 self._offset_row(joint, name, *self._offsets[name])
@@ -338,7 +349,7 @@ class LiveView:
         }
 
     def _offset_row(self, joint: int, name: str, mean: float, std: float) -> dict[str, Any]:
-        """Return an offset and its standard deviation, None as long as nearly nothing is known."""
+        """Offset of a joint and its standard deviation, None while it is undetermined."""
         as_angle = std / float(self._chain.per_radian[joint])
         known = name not in self._fit.unidentifiable and as_angle < UNDETERMINED_RAD
         if self._chain.slides[joint]:
@@ -351,7 +362,7 @@ class LiveView:
         }
 
     def _confirmation(self) -> dict[str, Any] | None:
-        """Return which plan is next, and where it can be looked at; None where none is shown."""
+        """Next plan and the address of its page; None if none is shown."""
         plan, page = self.plan_to_show()
         if not plan:
             return None
@@ -366,7 +377,7 @@ class LiveView:
         }
 
     def _commands(self, now_s: float) -> dict[str, dict[str, Any]]:
-        """Return what each command is called, whether it is of use now, and a note."""
+        """Label of each command, whether it is enabled now, and a note."""
         state = self._planner.state if self._planner else ''
         silent, confirmation = self._silent(PLANNER, now_s), self._confirmation()
         unconfirmed = self._values.get('confirmed') == 'no'
@@ -399,6 +410,7 @@ class LiveView:
         }
 
     def _scene(self) -> dict[str, Any]:
+        """Moving part of the 3-D view."""
         q, target = self._q, self._target
         return {
             'q': None if q is None else _rounded(q, 6),
@@ -414,7 +426,7 @@ class LiveView:
 
 
 def tool_path(chain: SerialChain, way: FloatArray, steps: int = 12) -> FloatArray:
-    """Return where the tool goes along straight lines between configurations (n, k), m, (m, 3)."""
+    """Tool positions along straight lines between configurations (n, k), m, (m, 3)."""
     if len(way) < 2:
         return np.empty((0, 3))
     share = np.linspace(0.0, 1.0, steps)[:, None]
@@ -423,10 +435,12 @@ def tool_path(chain: SerialChain, way: FloatArray, steps: int = 12) -> FloatArra
 
 
 def _clip(text: str, longest: int = LONGEST_TEXT) -> str:
+    """Text cut to a length."""
     return text if len(text) <= longest else f'{text[: longest - 1]}…'
 
 
 def _as_sentence(text: str) -> str:
+    """Text with a capital letter and a full stop; '' for none."""
     return f'{text[:1].upper()}{text[1:]}.' if text else ''
 
 
@@ -435,4 +449,5 @@ def _degrees(radians: float) -> float:
 
 
 def _rounded(values: FloatArray | Sequence[float], digits: int) -> Any:
+    """Values as rounded lists."""
     return np.round(np.asarray(values, dtype=float), digits).tolist()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the reports share: templates of this package, figures made part of a page, numbers."""
+"""Common parts of the reports: templates, inlined figures, numbers."""
 
 from __future__ import annotations
 
@@ -42,14 +42,14 @@ from remaster_ros.session.files import make_folder, write_atomically
 
 
 def law(effect: Effect) -> str:
-    """Return equation and source of an effect; one without a name has those of its form."""
+    """Equation and source of an effect; for an effect without a name, those of its form."""
     happened = effect.name == NO_NAME.name and effect.moment_s is not None
     kind = EFFECTS.get('step' if happened else effect.name)
     return '' if kind is None else f'{kind.equation} ({kind.source})'
 
 
 def page(template: str, **content: Any) -> str:
-    """Return a page from a template of this package, everything in it escaped."""
+    """Page from a template of this package, with all content escaped."""
     environment = Environment(
         autoescape=True,
         undefined=StrictUndefined,
@@ -84,17 +84,18 @@ def page(template: str, **content: Any) -> str:
 
 
 def summarized(effect: Mapping[str, Any]) -> Markup:
-    """Return a cause with its size, for a list."""
+    """A cause with its size, for a list."""
     size = size_words(msgspec.convert(effect, Effect))
     return Markup('{} <span class="soft">({})</span>').format(effect['cause'], size)
 
 
 def _template(name: str) -> str:
+    """Text of a template."""
     return importlib.resources.files(__package__).joinpath(name).read_text(encoding='utf-8')
 
 
 def inlined(name: str, svg: str) -> Markup:
-    """Make a figure part of the page: its colours, its font, its width, identifiers of its own."""
+    """A figure as part of a page: with the page's colours, font, width, and unique identifiers."""
     svg = svg[svg.index('<svg') :]
     for color, ours in ((INK, 'var(--ink)'), (GRID, 'var(--line)'), (PAPER, 'none')):
         svg = svg.replace(color, ours)
@@ -106,13 +107,13 @@ def inlined(name: str, svg: str) -> Markup:
 
 
 def compressed(text: str) -> str:
-    """Return text compressed and in base64, as the pages take it apart again."""
+    """Text compressed and in base64, for the pages to unpack."""
     # The highest level takes twice as long, for a hundredth less.
     return base64.b64encode(gzip.compress(text.encode(), 5, mtime=0)).decode()
 
 
 def write_report(folder: Path, drawings: dict[str, str], html: str) -> Path:
-    """Write report.html, and the figures as SVG files under ``figures``; return its path."""
+    """Write report.html, and the figures as SVG files in ``figures``; returns its path."""
     make_folder(folder / 'figures')
     for name, text in drawings.items():
         write_atomically(folder / 'figures' / f'{name}.svg', text)
@@ -121,13 +122,15 @@ def write_report(folder: Path, drawings: dict[str, str], html: str) -> Path:
 
 
 def _fixed(number: float | None, digits: int) -> str:
+    """Number with `digits` decimal places; a dash for None."""
     return '–' if number is None else _minus(f'{number:.{digits}f}')
 
 
 def _signed(number: float, digits: int) -> str:
+    """Number with its sign."""
     return _minus(f'{number:+.{digits}f}')
 
 
 def _minus(text: str) -> str:
-    """Return a number with a minus sign of its own; zero has none."""
+    """Number with a typographic minus sign, and none for zero."""
     return text.removeprefix('-') if float(text) == 0.0 else text.replace('-', '−')

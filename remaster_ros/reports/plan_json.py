@@ -20,13 +20,12 @@ HELD_OUT = 'validation'
 
 
 def plan_to_dict(plan: CollectionPlan) -> dict[str, Any]:
-    """Return what ``remaster plan --json`` prints.
+    """Output of ``remaster plan --json``.
 
-    ``robot_time_s`` is that of the whole session: registration, what is fitted, what is held out
-    and references. ``dropped`` counts poses that lost all their solutions,
-    ``dropped_configurations`` solutions. Joints that slide are in ``expected_std_mm`` in place of
-    ``expected_std_deg``. ``expected_tool_std_mm`` is the root mean square of the
-    3-D error of the predicted markers.
+    ``robot_time_s`` is that of the whole session: registration, fitted and held-out poses, and
+    references. ``dropped`` counts poses that lost all their solutions, ``dropped_configurations``
+    solutions. Prismatic joints are in ``expected_std_mm`` in place of ``expected_std_deg``.
+    ``expected_tool_std_mm`` is the RMS 3-D error of the predicted markers.
     """
     visits = Counter(visit.split for visit in plan.visits)
     design = plan.design_result
@@ -60,6 +59,7 @@ def plan_to_dict(plan: CollectionPlan) -> dict[str, Any]:
 
 
 def _separated(design: SeparatingDesign) -> dict[str, Any]:
+    """Configurations that separate causes, and by how much."""
     return {
         'configurations': sum(len(pose.solutions) for pose in design.poses),
         'q_deg': [
@@ -79,11 +79,12 @@ def _separated(design: SeparatingDesign) -> dict[str, Any]:
 
 
 def _at_poses(configurations: int, poses: int) -> str:
+    """Numbers of configurations and poses as text."""
     return f'{counted(configurations, "configuration")} at {counted(poses, "pose")}'
 
 
 def plan_text(plan: CollectionPlan, settings: DesignSettings) -> str:
-    """Return the same for people, one subject a line."""
+    """A plan as text, one subject a line."""
     visits = Counter(visit.split for visit in plan.visits)
     poses = plan.poses
     lines = [
@@ -113,7 +114,7 @@ def plan_text(plan: CollectionPlan, settings: DesignSettings) -> str:
 
 
 def outlook_to_dict(tour: Tour, expected: Expected) -> dict[str, Any]:
-    """Return a plan without its ways, with the words of `plan_to_dict`."""
+    """A plan without paths, with the keys of `plan_to_dict`."""
     return {
         'configurations': sum(tour.configurations.values()),
         'poses': sum(tour.poses.values()),
@@ -129,7 +130,7 @@ def outlook_to_dict(tour: Tour, expected: Expected) -> dict[str, Any]:
 
 
 def outlook_text(tour: Tour, expected: Expected) -> str:
-    """Return the same for people, one subject a line."""
+    """A plan without paths as text, one subject a line."""
     counts = {split: (tour.configurations[split], poses) for split, poses in tour.poses.items()}
     fitted, held_out = counts[FITTED], counts.get(HELD_OUT, (0, 0))
     lines = [
@@ -143,6 +144,7 @@ def outlook_text(tour: Tour, expected: Expected) -> str:
 def _expected_lines(
     chain: SerialChain, joint_std: Mapping[str, float | None], joint_rms: float, tool_rms: float
 ) -> list[str]:
+    """Expected standard deviations, a line each."""
     lines = ['expected standard deviation of the offsets:']
     for joint, (name, std) in enumerate(joint_std.items()):
         value = 'not identifiable' if std is None else chain.shown_offset(joint, std, 4)
@@ -155,7 +157,7 @@ def _expected_lines(
 
 
 def slides_in_rms(chain: SerialChain) -> str:
-    """Return how joints that slide count in a root mean square of degrees; '' for none."""
+    """Remark how prismatic joints count in an RMS in degrees; '' if there are none."""
     per_degree = 1e3 * np.radians(LEVER_M)
     return f', where {per_degree:.2f} mm count as a degree' if chain.slides.any() else ''
 
@@ -163,7 +165,7 @@ def slides_in_rms(chain: SerialChain) -> str:
 def _expected_std(
     joint_std: Mapping[str, float | None], chain: SerialChain
 ) -> dict[str, dict[str, float | None]]:
-    """Return them in degrees, and in mm where there are joints that slide."""
+    """Expected standard deviations in degrees, and in mm for prismatic joints."""
     found: dict[str, dict[str, float | None]] = {'expected_std_deg': {}}
     if chain.slides.any():
         found['expected_std_mm'] = {}
@@ -173,6 +175,7 @@ def _expected_std(
 
 
 def _separated_text(design: SeparatingDesign) -> list[str]:
+    """Configurations that separate causes, in lines."""
     count = sum(len(pose.solutions) for pose in design.poses)
     lines = [f'of these to separate causes: {_at_poses(count, len(design.poses))}']
     for pair in design.pairs:
@@ -186,12 +189,12 @@ def _separated_text(design: SeparatingDesign) -> list[str]:
 
 
 def minutes_text(seconds: float) -> str:
-    """Return a time for people."""
+    """A time in minutes, as text."""
     return f'{seconds / 60:.1f} min'
 
 
 def missed_goal(plan: CollectionPlan) -> str:
-    """Return which goal an optimal design does not reach, and what would help; '' for none."""
+    """Goal that an optimal design does not reach, with a remedy; '' if it does."""
     if plan.design_result is None or plan.goal_reached:
         return ''
     return (
@@ -202,5 +205,6 @@ def missed_goal(plan: CollectionPlan) -> str:
 
 
 def _counts(counts: dict[str, int] | Counter[str]) -> str:
+    """Counts by reason, as text."""
     ordered = Counter(counts).most_common()
     return ', '.join(f'{count} {reason}' for reason, count in ordered) or 'none'

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A planned collection as one page: the arm in 3-D with every way and configuration, and figures.
+"""Page of a planned collection: the arm in 3-D with all paths and configurations, and figures.
 
-The page is complete in itself: nothing is fetched when it is opened.
+The page is self-contained: nothing is fetched when it is opened.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from remaster_ros.version import __version__
 
 GENERATOR = 'remaster plan'
 HEAD_BYTES = 2000
-"""So far the page tells what it is."""
+"""Length of the head that identifies the page, bytes."""
 LARGEST_PAGE = 50_000_000
 _MARK = f'<meta name="generator" content="{GENERATOR}">'.encode()
 WORDS = {
@@ -44,20 +44,20 @@ def plan_page(
     registered: bool = False,
     confirm: str = '',
 ) -> str:
-    """Return the page.
+    """HTML of the page.
 
     Parameters
     ----------
     plan
-        What is going to be done.
+        The planned collection.
     scene
-        The arm and all around it.
+        The arm and its surroundings.
     cell
-        What the cell is called.
+        Name of the cell.
     registered
-        Whether the sensors are where they were measured, not at their rough places.
+        Whether the sensors are drawn at their measured positions, not at rough ones.
     confirm
-        Name of the plan where the arm waits until it is confirmed.
+        Name of the plan if the arm waits for its confirmation; '' otherwise.
     """
     # Only here: it brings the libraries of figures.
     from remaster_ros.reports.pages import compressed, page
@@ -105,7 +105,7 @@ def plan_page(
 
 
 def check_plan_page(path: Path) -> None:
-    """Refuse a file that is there and is no page of a plan: `InputError`."""
+    """Raise InputError if a file exists and is no page of a plan."""
     if not path.exists():
         return
     if path.is_file():
@@ -116,14 +116,14 @@ def check_plan_page(path: Path) -> None:
 
 
 def read_plan_page(path: Path, plan: str) -> bytes:
-    """Return the page of a plan that waits for a confirmation.
+    """Page of a plan that waits for a confirmation.
 
     Parameters
     ----------
     path
-        Whoever publishes on the network may have chosen it: nothing but such a page is returned.
+        The file; its name may come from the network, so no other content is returned.
     plan
-        Its fingerprint.
+        Fingerprint of the plan.
 
     Raises
     ------
@@ -143,12 +143,12 @@ def read_plan_page(path: Path, plan: str) -> bytes:
 
 
 def write_plan_page(path: Path, html: str) -> None:
-    """Write the page, also over one that was written before, but over nothing else.
+    """Write the page; only a page of a plan is replaced.
 
     Raises
     ------
     InputError
-        Something else is there, or it cannot be written.
+        Another file is there, or it cannot be written.
     """
     check_plan_page(path)
     with undone_on_failure():
@@ -157,7 +157,7 @@ def write_plan_page(path: Path, html: str) -> None:
 
 
 def _points(plan: CollectionPlan) -> list[str]:
-    """Return what asks for attention."""
+    """Warnings on a plan."""
     points = [missed_goal(plan)]
     if plan.undetermined:
         points.append(f'A fit of these configurations states nothing: {plan.undetermined}')
@@ -167,6 +167,7 @@ def _points(plan: CollectionPlan) -> list[str]:
 
 
 def _splits(plan: CollectionPlan) -> list[dict[str, Any]]:
+    """Words and counts of each split."""
     rows = []
     for split, (words, why) in WORDS.items():
         visits = [visit for visit in plan.visits if visit.split == split]
@@ -179,7 +180,7 @@ def _splits(plan: CollectionPlan) -> list[dict[str, Any]]:
 
 
 def _dropped(plan: CollectionPlan) -> dict[str, tuple[int, int]]:
-    """Return why poses and configurations were dropped, the most frequent reason first."""
+    """Numbers of dropped poses and configurations by reason, the most frequent first."""
     poses, solutions = plan.tour.dropped, plan.dropped
     counts = {
         name: (poses.get(name, 0), solutions.get(name, 0)) for name in {**poses, **solutions}
@@ -188,6 +189,7 @@ def _dropped(plan: CollectionPlan) -> dict[str, tuple[int, int]]:
 
 
 def _joints(plan: CollectionPlan, chain: SerialChain) -> list[dict[str, Any]]:
+    """Expected std and range of each joint."""
     q = chain.shown_scale * np.array([visit.q for visit in plan.visits])
     return [
         {
@@ -203,13 +205,14 @@ def _joints(plan: CollectionPlan, chain: SerialChain) -> list[dict[str, Any]]:
 
 
 def _limits(chain: SerialChain, joint: int) -> str:
+    """Limits of a joint as text."""
     if not np.isfinite([chain.lower[joint], chain.upper[joint]]).all():
         return 'none'
     return chain.shown_limits(joint).replace('-', '\N{MINUS SIGN}')
 
 
 def _played(plan: CollectionPlan, scene: RobotScene) -> dict[str, Any]:
-    """Return what plan_page.js plays: joint positions in rad and m, times in s."""
+    """Data that plan_page.js plays: joint positions in rad and m, times in s."""
     return {
         'scene': scene_to_dict(scene),
         'start': _rounded(plan.visits[0].points[0]),

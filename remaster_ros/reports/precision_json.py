@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is known while a collection is under way, as JSON on ``remaster/precision``."""
+"""Precision reached during a collection, as JSON on ``remaster/precision``."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ FORMAT = 'remaster-precision/1'
 
 
 class Known(Struct):
-    """What was known after so many configurations; None where nothing is."""
+    """Precision after a number of configurations; None if unknown."""
 
     configurations: int
     minutes: float | None
@@ -25,11 +25,11 @@ class Known(Struct):
     tool_rms_mm: float | None = None
     degrees_of_freedom: int = 0
     parameters: int = 0
-    joint_std_mm: dict[str, float | None] = {}  # Of joints that slide, which are not in `…_deg`
+    joint_std_mm: dict[str, float | None] = {}  # Prismatic joints, which are not in `…_deg`
 
 
 class Precision(Struct):
-    """All looks so far, the newest last, in degrees, millimetres and minutes."""
+    """Precision at all looks so far, the newest last, in degrees, millimetres and minutes."""
 
     format: str = FORMAT
     goal: dict[str, float | None] = {}
@@ -42,7 +42,7 @@ class Precision(Struct):
 
 
 def precision_json(rule: StoppingRule, looks: Sequence[Look]) -> str:
-    """Return at least one look, and how the newest does by the rule."""
+    """JSON of at least one look, and of the stopping rule's result for the newest."""
     last, goal = looks[-1], rule.goal
     found = Precision(
         goal={
@@ -86,5 +86,5 @@ def precision_json(rule: StoppingRule, looks: Sequence[Look]) -> str:
 
 
 def _scaled(value: float | None, factor: float) -> float | None:
-    """Return a value in another unit; None for what is not known."""
+    """Value times a factor; None if unknown."""
     return None if value is None or not np.isfinite(value) else float(value * factor)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""report.html of a fit, of a discovery and of both: self-contained pages; the last also as PDF."""
+"""Pages of a fit, of a discovery and of both, self-contained; the last one also as PDF."""
 
 from __future__ import annotations
 
@@ -72,38 +72,38 @@ if TYPE_CHECKING:
 
 ARMS_SHOWN = 5
 ROWS_SHOWN = 600
-# A sensor farther from the middle of the data than so many times their extent is not at its place.
+# Distance from the middle of the data, in their extents, beyond which only a sensor's direction is
+# drawn.
 FAR = 1.0
 
 
 class View3D(NamedTuple):
-    """What fit_page.js shows, and the figures of its caption."""
+    """Data that fit_page.js shows, and figures of its caption."""
 
-    # Everything in the robot base R, m: `scene` (`scene_to_dict`), `arms` (a, k + 2, 3), `points`
-    # (n, 3) with `text`, where the errors at them end (`before` and `after`, (n, 3)), `sensors`
-    # with `text` and `line` (from, to), and the `legend`
+    # All in the robot base R, m: `scene` (`scene_to_dict`), `arms` (a, k + 2, 3), `points` (n, 3)
+    # with `text`, ends of their error vectors (`before` and `after`, (n, 3)), `sensors` with
+    # `text` and `line` (from, to), and the `legend`
     picture: dict[str, Any]
-    magnification: int  # By what the error vectors are drawn too long
-    # How many observations are drawn, of how many
+    magnification: int  # Factor by which the error vectors are enlarged
+    # Numbers of observations that are drawn, and of all
     rows_shown: int
     rows: int
-    # Sensors so far off that only their direction is drawn: at its place one would leave the arm
-    # tiny
+    # Sensors so far away that only their direction is drawn, as the arm would be tiny otherwise
     far_sensors: list[str]
 
     @property
     def data(self) -> str:
-        """The picture as the page unpacks it."""
+        """The picture, compressed for the page."""
         return compressed(json.dumps(self.picture, separators=(',', ':'), allow_nan=False))
 
     @property
     def code(self) -> str:
-        """The scripts as the page unpacks them."""
+        """The scripts, compressed for the page."""
         return compressed(view_script('fit_page.js'))
 
 
 def draw_view(result: FitResult) -> View3D:
-    """Return the 3-D view."""
+    """3-D view of a fit."""
     m, chain = result.session.measurements, result.chain
     shown = evenly(len(m), ROWS_SHOWN)
     sensors = [result.session.sensor_names[i] for i in m.sensor[shown]]
@@ -141,7 +141,7 @@ def draw_view(result: FitResult) -> View3D:
         'scene': scene_to_dict(RobotScene(chain, (), (), 0.0, ())),
         'arms': _rounded(arms),
         'points': _rounded(points),
-        'text': _told(result, shown),
+        'text': _point_texts(result, shown),
         'errors': {when: _rounded(points + times * of) for when, of in vectors.items()},
         'sensors': marked,
         'legend': {
@@ -156,12 +156,12 @@ def draw_view(result: FitResult) -> View3D:
 
 
 def _rounded(points: FloatArray) -> Any:
-    """Return points as lists, to the hundredth of a millimetre."""
+    """Points as lists, to a hundredth of a millimetre."""
     return np.round(points, 5).tolist()
 
 
-def _told(result: FitResult, shown: IntArray) -> list[str]:
-    """Return what each point is."""
+def _point_texts(result: FitResult, shown: IntArray) -> list[str]:
+    """Description of each point."""
     m = result.session.measurements
     before, after = (
         lengths_mm(residuals[shown])
@@ -176,7 +176,7 @@ def _told(result: FitResult, shown: IntArray) -> list[str]:
 
 
 def _round_factor(factor: float) -> int:
-    """Return the largest of 1, 2, 5, 10, 20, … that is at most `factor`, at least 1."""
+    """Largest of 1, 2, 5, 10, 20, … that is at most `factor`; at least 1."""
     if factor < 2:
         return 1
     power = 10 ** int(np.floor(np.log10(factor)))
@@ -184,7 +184,7 @@ def _round_factor(factor: float) -> int:
 
 
 def accuracy_rows(accuracy: Accuracy) -> list[dict[str, Any]]:
-    """Return one row per split and metric, and the reason where there is no number."""
+    """A row for each split and metric, with the reason if there is no number."""
     rows = []
     for split in ('validation', 'optimization'):
         metrics = getattr(accuracy, split)
@@ -211,7 +211,7 @@ def accuracy_rows(accuracy: Accuracy) -> list[dict[str, Any]]:
 
 
 def marker_rows(fit: Mapping[str, Any], session: Session) -> list[dict[str, Any]]:
-    """Return one row per marker of a fit.json: place, std, and how far from the nominal place."""
+    """A row for each marker of a fit.json: position, std, and distance from the nominal one."""
     rows = []
     for name, marker in fit['markers'].items():
         position = np.array(marker['position_m'])
@@ -227,19 +227,22 @@ def marker_rows(fit: Mapping[str, Any], session: Session) -> list[dict[str, Any]
 
 
 def write_fit_report(result: FitResult, folder: Path) -> Path:
-    """Write report.html and the figures of a fit to a folder, made if missing; return its path."""
+    """Write report.html and the figures of a fit to a folder, made if missing.
+
+    Returns its path.
+    """
     drawings = draw_fit(result) | draw_stages(answer_of(inputs_of(result)))
     return write_report(folder, drawings, fit_html(result, drawings))
 
 
 def inputs_of(result: FitResult) -> Inputs:
-    """Return a fit as the first screen takes it."""
+    """Inputs of the first screen for a fit without a discovery."""
     before_mm, after_mm = map(lengths_mm, (result.residuals_before, result.residuals_after))
     return Inputs(result.session, fit_content(result), None, before_mm, after_mm, None)
 
 
 def fit_html(result: FitResult, drawings: dict[str, str]) -> str:
-    """Return the page; with drawings (of `draw_fit`) it also has the 3-D view."""
+    """Page of a fit; with drawings (of `draw_fit`) also the 3-D view."""
     scene: View3D | None = None
     if drawings:
         scene = draw_view(result)
@@ -263,18 +266,18 @@ def fit_html(result: FitResult, drawings: dict[str, str]) -> str:
     )
 
 
-# The page of a discovery.
+# Page of a discovery.
 
 
 def write_discovery_report(discovery: Discovery, content: Discovered, folder: Path) -> Path:
-    """Write report.html and the figures of what was found to a folder; return its path."""
+    """Write report.html and the figures of a discovery to a folder; returns its path."""
     drawings = draw_discovery(discovery)
     html = discovery_html(content, discovery.fit.session, drawings)
     return write_report(folder, drawings, html)
 
 
 def discovery_html(content: Discovered, session: Session, drawings: dict[str, str]) -> str:
-    """Return the page, with those drawings (of `draw_discovery`) that are given."""
+    """Page of a discovery, with the given drawings (of `draw_discovery`)."""
     return page(
         'discovery.html.jinja',
         found=msgspec.to_builtins(content),
@@ -285,18 +288,18 @@ def discovery_html(content: Discovered, session: Session, drawings: dict[str, st
     )
 
 
-# What was planned, what became of it, what it gave.
+# The plan of a collection, its outcome, and the precision reached.
 
 PLAN_FILE = 'plan.html'
 RECORDED = ('recorded', 'partial')
 NOT_VISITED = 'not visited'
 AS_EXPECTED = 1.5
-"""Standard deviations that are, in the middle, no more than so many times larger or smaller than
-the expected ones are as expected."""
+"""Largest factor between expected and reached standard deviations, in the median, that counts as
+agreement."""
 
 
 class PlannedRow(NamedTuple):
-    """A split: what was planned, and what became of it."""
+    """Planned and recorded configurations of a split, and numbers of lost ones by reason."""
 
     words: str
     poses: int
@@ -306,7 +309,7 @@ class PlannedRow(NamedTuple):
 
 
 class StdRow(NamedTuple):
-    """Standard deviation of a joint's offset: expected, and of the fit; None for none."""
+    """Standard deviation of a joint's offset: expected, and of the fit; None if unknown."""
 
     joint: str
     unit: Literal['deg', 'mm']
@@ -316,24 +319,24 @@ class StdRow(NamedTuple):
 
 @dataclass(frozen=True)
 class PlanFacts:
-    """What the page has of a plan."""
+    """Facts of a plan for the page."""
 
-    name: str  # Its fingerprint
-    rows: tuple[PlannedRow, ...]  # Of each split
-    visits: int  # Visits to references that were recorded
-    minutes: float | None  # From the first reading to the last; None where times are not known
+    name: str  # Fingerprint of the plan
+    rows: tuple[PlannedRow, ...]  # One for each split
+    visits: int  # Number of recorded visits to references
+    minutes: float | None  # From the first reading to the last; None if times are unknown
     # Reason -> poses and configurations that were never in the plan
     dropped: dict[str, tuple[int, int]]
-    stds: tuple[StdRow, ...]  # Of each joint; empty where nothing was noted
-    # Median of the fit's standard deviations over the expected ones; None where there are none
+    stds: tuple[StdRow, ...]  # One for each joint; empty if none were expected
+    # Median ratio of the fit's standard deviations to the expected ones; None if unknown
     ratio: float | None
-    tool_mm: float | None  # Expected error of the predicted markers (RMS); None
-    enough: bool  # Whether poses were left out as enough was known
-    drawn: bool  # Whether there is a page that plays it
+    tool_mm: float | None  # Expected RMS error of the predicted markers; None if unknown
+    enough: bool  # Whether poses were left out because the precision sufficed
+    drawn: bool  # Whether there is a page that plays the plan
 
     @property
     def verdict(self) -> str:
-        """What the standard deviations tell of the readings; '' where nothing is known."""
+        """Sentence on expected and reached standard deviations; '' if unknown."""
         if self.ratio is None:
             return ''
         if self.ratio < 1.0 / AS_EXPECTED:
@@ -352,7 +355,7 @@ class PlanFacts:
 
 
 def plan_facts(inputs: Inputs) -> PlanFacts | None:
-    """Return what the page has of the session's plan; None where it has none."""
+    """Facts of the session's plan; None if it has none."""
     plan, session = inputs.plan, inputs.session
     if plan is None:
         return None
@@ -384,17 +387,19 @@ def plan_facts(inputs: Inputs) -> PlanFacts | None:
 
 
 def _row(plan: RecordedPlan, split: str, words: str) -> PlannedRow:
+    """Planned and recorded configurations of a split."""
     poses = plan.tour.plans[split].poses
     ends = Counter(result for (own, *_), result in plan.outcomes.items() if own == split)
     recorded = sum(ends.pop(result, 0) for result in RECORDED)
     planned = plan.tour.configurations[split]
-    left = planned - recorded - ends.total()
+    missing = planned - recorded - ends.total()
     lost = {result.replace('_', ' '): count for result, count in ends.most_common()}
-    lost |= {NOT_VISITED: left} if left > 0 else {}
+    lost |= {NOT_VISITED: missing} if missing > 0 else {}
     return PlannedRow(words, len(poses), planned, recorded, lost)
 
 
 def _stds(inputs: Inputs, plan: RecordedPlan) -> tuple[StdRow, ...]:
+    """Expected and reached standard deviation of each joint."""
     if plan.expected is None:
         return ()
     expected = plan.expected.joint_std_rad
@@ -413,7 +418,7 @@ def _stds(inputs: Inputs, plan: RecordedPlan) -> tuple[StdRow, ...]:
 
 
 def drawn_plan(plan: RecordedPlan) -> bytes:
-    """Return the page that plays the plan, where the planner has left one beside the session."""
+    """Page that plays the plan, if the planner left one with the session; b'' otherwise."""
     from remaster_ros.collection.plan_confirmation import fingerprint
     from remaster_ros.reports.plan_page import read_plan_page
 
@@ -424,14 +429,14 @@ def drawn_plan(plan: RecordedPlan) -> bytes:
 
 
 def copy_plan(plan: RecordedPlan | None, folder: Path) -> None:
-    """Copy the page of the plan, so that this one can be handed on with it."""
+    """Copy the page of the plan to a folder, so that the report is complete."""
     (folder / PLAN_FILE).unlink(missing_ok=True)
     if plan is not None and (html := drawn_plan(plan)):
         write_atomically(folder / PLAN_FILE, html)
 
 
 def plan_to_dict(plan: PlanFacts) -> dict[str, Any]:
-    """Return what ``remaster report --json`` prints of it."""
+    """Facts of a plan in ``remaster report --json``."""
     return {
         'name': plan.name,
         'splits': [row._asdict() for row in plan.rows],
@@ -451,12 +456,12 @@ def plan_to_dict(plan: PlanFacts) -> dict[str, Any]:
     }
 
 
-# The page of `remaster report`: the answer first, then its reasons.
+# Page of `remaster report`: the answer first, then its reasons.
 
 PDF_FILE = 'report.pdf'
 ANSWER_GENERATOR = 'remaster report'
 WORST_ROWS = 10
-# Of the figures that `fit` and `discover` wrote, those that this page shows.
+# Figures written by `fit` and `discover` that this page shows.
 FIT_FIGURES = ('posteriors', 'traces', 'tool_places', 'accuracy_map')
 FOUND_FIGURES = ('causes', 'drivers')
 FILE_LIMIT = 64 * 1024**2
@@ -464,7 +469,7 @@ PDF_REMEDY = "pip install 'remaster_ros[pdf]'"
 
 
 class WorstRow(NamedTuple):
-    """A row with a large error: which, when, where, and how large."""
+    """A row with a large error."""
 
     observation: int
     pose: int
@@ -486,23 +491,24 @@ def write_answer(
     figures: bool = True,
     pdf: bool = False,
 ) -> Answer:
-    """Write report.html, the files to apply and, if asked for, report.pdf; return the answer.
+    """Write report.html, the files to apply and, on demand, report.pdf; return the answer.
 
     Parameters
     ----------
     inputs
-        What was read.
+        Session and results.
     fit_folder, found_folder
-        Of the fit and of the discovery, which hold figures and files to apply.
+        Folders of the fit and of the discovery, with figures and files to apply.
     folder
-        Where to; made if missing.
+        Destination, made if missing.
     figures, pdf
         Whether to have figures, and report.pdf.
 
     Raises
     ------
     InputError
-        The folder holds another's report or cannot be written to, or there is no library for PDF.
+        The folder has the report of another command or cannot be written to, or the library for
+        PDF is missing.
     """
     printer = require_ready(folder, pdf)
     answer = answer_of(inputs)
@@ -534,12 +540,12 @@ def write_answer(
 
 
 def require_ready(folder: Path, pdf: bool) -> Any:
-    """Refuse a folder with a report of another command; return the library for PDF if asked for.
+    """Library for PDF if asked for, else None; checks the destination before the long work.
 
     Raises
     ------
     InputError
-        One line with the remedy.
+        The folder has the report of another command, or the library is missing.
     """
     from remaster_ros.reports.plan_page import check_plan_page
 
@@ -555,7 +561,7 @@ def require_ready(folder: Path, pdf: bool) -> Any:
 
 
 def answer_html(subject: Subject, drawings: dict[str, Markup], printing: bool = False) -> str:
-    """Return the page."""
+    """Page of a report."""
     inputs, answer = subject.inputs, subject.answer
     fit = msgspec.to_builtins(inputs.fit)
     found = msgspec.to_builtins(inputs.found) if inputs.found is not None else None
@@ -591,12 +597,13 @@ def answer_html(subject: Subject, drawings: dict[str, Markup], printing: bool = 
 
 
 def _chain(inputs: Inputs) -> SerialChain:
+    """Chain of a session."""
     session = inputs.session
     return SerialChain.from_urdf(session.urdf, session.base_link, session.tip_link)
 
 
 def _how_sure(inputs: Inputs, answer: Answer) -> list[str]:
-    """Return what else matters: of the fit, of the model with causes, of the other session."""
+    """Further remarks on the fit, on the model with causes, and on the other session."""
     judgement, found = inputs.judgement, inputs.found
     answered = judgement.findings if found is not None else []
     lines = [] if answer.uses_causes else judgement.points
@@ -607,7 +614,7 @@ def _how_sure(inputs: Inputs, answer: Answer) -> list[str]:
 
 
 def measured_when(inputs: Inputs) -> str:
-    """Return the date of the measurement, from the session or from its times."""
+    """Date of the measurement, from the session or from its times."""
     stamps = inputs.session.measurements.stamp_s
     if inputs.session.timed and (first := clock_time(float(stamps.min()))):
         last = clock_time(float(stamps.max()))
@@ -616,14 +623,14 @@ def measured_when(inputs: Inputs) -> str:
 
 
 def _fitted_left_out(inputs: Inputs, answer: Answer) -> int:
-    """Return how many readings to fit were gross errors: beside causes, or for the offsets."""
+    """Number of gross errors among the rows to fit, of the model that is used."""
     m = inputs.session.measurements
     left_out = inputs.gross if answer.uses_causes else list(inputs.fit_left_out)
     return int(np.sum(~m.is_validation & np.isin(m.observation, left_out)))
 
 
 def worst_rows(inputs: Inputs, answer: Answer) -> list[WorstRow]:
-    """Return the rows with the largest errors after the deed, the largest first."""
+    """Rows with the largest errors after the action, the largest first."""
     session, m = inputs.session, inputs.session.measurements
     final = answer.final_mm
     frames = inputs.T_R_N
@@ -658,10 +665,10 @@ def worst_rows(inputs: Inputs, answer: Answer) -> list[WorstRow]:
 def _copy_apply(
     source: Path, model: Path | None, compensation: Path | None, answer: Answer, folder: Path
 ) -> None:
-    """Copy the files of the deed, so that the page can be handed on with them."""
+    """Copy the files of the action to the folder, so that the report is complete."""
     make_folder(folder / APPLY_FOLDER)
     for name in ALL_FILES:
-        # One of an earlier page would contradict this one.
+        # A file of an earlier page would contradict this one.
         (folder / APPLY_FOLDER / name).unlink(missing_ok=True)
     (folder / APPLY_FOLDER / COMPENSATION_FILE).unlink(missing_ok=True)
     if answer.files and compensation is not None:
@@ -674,7 +681,7 @@ def _copy_apply(
 
 
 def _figures_of(folder: Path, names: Sequence[str]) -> dict[str, str]:
-    """Return those figures of a fit or a discovery that are there."""
+    """Figures of a fit or a discovery in a folder, of those that exist."""
     texts = {}
     for name in names:
         path = folder / 'figures' / f'{name}.svg'
@@ -684,7 +691,7 @@ def _figures_of(folder: Path, names: Sequence[str]) -> dict[str, str]:
     return texts
 
 
-# What Matplotlib draws with. A page runs nothing, and loads nothing, that a file brings along.
+# Elements that Matplotlib uses. A page must not run or load anything from a foreign file.
 SVG_ELEMENTS = {
     *('svg', 'g', 'path', 'use', 'text', 'tspan', 'rect', 'clipPath', 'defs', 'style', 'title'),
     *('metadata', 'line', 'circle', 'image', 'pattern', 'linearGradient', 'stop'),
@@ -692,7 +699,7 @@ SVG_ELEMENTS = {
 
 
 def checked_svg(text: str, path: Path) -> str:
-    """Return a figure, refused where it holds more than a drawing."""
+    """Text of a figure. Raises InputError if it has more than a drawing."""
     try:
         root = ElementTree.fromstring(text)
     except ElementTree.ParseError:
@@ -710,13 +717,13 @@ def checked_svg(text: str, path: Path) -> str:
 
 
 def as_image(svg: str) -> Markup:
-    """Return a figure as an image of its own, in the colours of paper."""
+    """A figure as an embedded image, in the colours of paper."""
     data = base64.b64encode(svg.encode()).decode()
     return Markup('<img alt="" src="data:image/svg+xml;base64,{}">').format(data)
 
 
 def _pdf_library() -> Any:
-    """Import the library that makes PDF; an `InputError` says how to get it."""
+    """Library for PDF. Raises InputError, with the way to install it, if it is missing."""
     try:
         import weasyprint
     except ImportError:

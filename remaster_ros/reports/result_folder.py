@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A folder of results: made ready before the long work, written after it."""
+"""Folder of results: checked before the long work, written after it."""
 
 from __future__ import annotations
 
@@ -44,19 +44,18 @@ if TYPE_CHECKING:
 
 
 def prepare_folder(folder: str | os.PathLike[str], result: str) -> None:
-    """Create the folder for results and make sure that files can be written there.
+    """Create a folder for results and check that files can be written there, before the long work.
 
     Parameters
     ----------
     result
-        The file that the command writes there, `FIT_FILE` or `DISCOVERY_FILE`. With it in the
-        folder, and without that of the other, the folder is one of the command's own.
+        File that the command writes there, `FIT_FILE` or `DISCOVERY_FILE`. A folder that has it,
+        and not that of the other command, belongs to the command.
 
     Raises
     ------
     InputError
-        They cannot, or would replace what this command has not written. This is checked before
-        the long work, not after it.
+        The folder cannot be written to, or has files of another command that would be replaced.
     """
     folder = Path(folder)
     make_folder(folder)
@@ -85,10 +84,10 @@ def _remove_report(folder: Path) -> None:
 
 
 def save_fit(result: FitResult, folder: str | os.PathLike[str], figures: bool = True) -> Path:
-    """Write fit.json, residuals.csv, the files to apply the offsets, and the report with figures.
+    """Write fit.json, residuals.csv, the files to apply, and the report with figures.
 
-    Without figures there is no report; that of an earlier fit in the folder would contradict
-    fit.json and is removed.
+    Without figures there is no report; that of an earlier fit in the folder is removed, as it
+    would contradict fit.json.
 
     Returns
     -------
@@ -129,9 +128,9 @@ def save_discovery(
     figures: bool = True,
     decided: Sequence[Decision] = (),
 ) -> Path:
-    """Write discovery.json, predictions.csv, what to apply and, with figures, the report.
+    """Write discovery.json, predictions.csv, the files to apply and, with figures, the report.
 
-    ``decided`` is what was decided between causes and look-alikes of an earlier search.
+    ``decided`` are decisions between causes and look-alikes of an earlier search.
 
     Returns
     -------
@@ -167,7 +166,10 @@ def save_discovery(
 
 
 def _write_applied(folder: Path, files: Mapping[str, str | bytes]) -> None:
-    """Write what a robot can load; a model of an earlier run would contradict it."""
+    """Write the files to apply.
+
+    Last result: remove models of an earlier run, which would contradict them.
+    """
     make_folder(folder / APPLY_FOLDER)
     for name in (MODEL_FILE, COMPENSATION_FILE):
         (folder / APPLY_FOLDER / name).unlink(missing_ok=True)

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An arm and what stands around it as surfaces, for pictures in 3-D.
+"""An arm and its surroundings as surfaces, for 3-D pictures.
 
-Only plain arrays, in base_link or in the frames that move: whatever draws them, a page or a
-viewer, needs nothing of kinematics or files. The arm is drawn with the meshes of its URDF where
-all of a link's can be read, else with what stands for that link in the collision checks.
+Only plain arrays, in base_link or in moving frames: a page or a viewer that draws them needs
+neither kinematics nor files. A link is drawn with the meshes of its URDF if all can be read, else
+with its shape in the collision checks.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ Color = tuple[float, float, float]
 MeshParts = Callable[[str], Sequence[MeshPart]]
 
 MOST_TRIANGLES = 2500
-"""So many triangles a surface has at most; arms of today have twenty such surfaces."""
+"""Largest number of triangles of a surface; an arm has some twenty surfaces."""
 _EQUAL_M = 1e-5
 _FINEST_M, _COARSEST_M = 5e-4, 0.05
 
@@ -43,37 +43,37 @@ _FINEST_M, _COARSEST_M = 5e-4, 0.05
 class Surface:
     """Triangles that move together."""
 
-    name: str  # What it is, for people
-    link: int  # 0 for what stands still, i for what moves with joint i
+    name: str  # Name for people
+    link: int  # 0 for a fixed surface, i for one that moves with joint i
     role: str  # link, tool, marker or obstacle
     vertices: FloatArray  # In the frame of `RobotScene.transforms` for that link, m, (n, 3)
-    # Which three vertices each triangle has, (m, 3), seen from outside counter-clockwise
+    # Vertex indices of each triangle, (m, 3), counter-clockwise seen from outside
     faces: IntArray
-    # Red, green and blue, 0 to 1; None where the robot description gives none
+    # Red, green and blue, 0 to 1; None if the robot description gives none
     color: Color | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class RobotScene:
-    """An arm, its tool and what stands around it."""
+    """An arm, its tool and its surroundings."""
 
     chain: SerialChain  # The arm
-    surfaces: Sequence[Surface]  # All that is drawn
-    sights: Sequence[LineOfSight]  # Where each sensor is, and which marker it follows
-    floor_z: float | None  # Height of the floor, m; None where there is none
-    notes: Sequence[str]  # What is not drawn as the robot description has it, and the remedy
+    surfaces: Sequence[Surface]
+    sights: Sequence[LineOfSight]  # Position of each sensor, and the marker that it follows
+    floor_z: float | None  # Height of the floor, m; None without a floor
+    notes: Sequence[str]  # Parts not drawn as in the robot description, and the remedy
 
     def transforms(self, q: FloatArray) -> FloatArray:
-        """Return where the links are at joint angles (..., k), rad: T_R_link, (..., k + 1, 4, 4).
+        """Poses of the links at joint angles (..., k), rad: T_R_link, (..., k + 1, 4, 4).
 
-        The first is the base's own, the identity.
+        The first is that of the base, the identity.
         """
         frames = self.chain.frames(q)
         base = np.broadcast_to(np.eye(4), (*frames.shape[:-3], 1, 4, 4))
         return np.concatenate((base, frames), axis=-3)
 
     def with_sensors(self, T_R_N: Mapping[str, FloatArray]) -> RobotScene:
-        """Return the scene with these sensors where they were measured to be, (4, 4) each."""
+        """Scene with sensors at their measured poses, (4, 4) each."""
         sights = [
             replace(sight, sensor_R=T_R_N[sight.sensor][:3, 3]) if sight.sensor in T_R_N else sight
             for sight in self.sights
@@ -82,14 +82,14 @@ class RobotScene:
 
 
 def robot_scene(cell: Workcell, scene: PlanningScene) -> RobotScene:
-    """Return the scene of a cell.
+    """Scene of a cell.
 
     Parameters
     ----------
     cell
         The cell.
     scene
-        Its planning scene: what the collision checks have, and the sensors.
+        Its planning scene: bodies of the collision checks, and sensors.
     """
     chain, folder = scene.model.chain, Path(cell.file).parent
     urdf, mesh_path = folder / cell.robot.urdf, [folder / path for path in cell.mesh_path]
@@ -102,10 +102,10 @@ def robot_scene(cell: Workcell, scene: PlanningScene) -> RobotScene:
 def arm_surfaces(
     visuals: Sequence[Visual], bodies: Sequence[Body], mesh_parts: MeshParts
 ) -> tuple[list[Surface], list[str]]:
-    """Return the surfaces of an arm and all around it, and what is not drawn as described.
+    """Surfaces of an arm and its surroundings, and notes on parts not drawn as described.
 
-    Of the ``bodies`` of the collision checks tool, markers and obstacles are drawn, and the links
-    whose visual geometry is missing. An InputError of ``mesh_parts`` means that a mesh is missing.
+    Of the ``bodies`` of the collision checks, tool, markers and obstacles are drawn, and the links
+    without visual geometry. ``mesh_parts`` raises InputError for a missing mesh.
     """
     surfaces: list[Surface] = []
     missing: dict[str, None] = {}
@@ -131,6 +131,7 @@ def arm_surfaces(
 
 
 def _notes(missing: Sequence[str]) -> list[str]:
+    """Note on meshes that cannot be read; [] if there are none."""
     if not missing:
         return []
     more = f' and {len(missing) - 1} more' if len(missing) > 1 else ''
@@ -141,7 +142,7 @@ def _notes(missing: Sequence[str]) -> list[str]:
 
 
 def _drawn(visual: Visual, mesh_parts: MeshParts) -> list[Surface]:
-    """Return the surfaces of a visual element; none where it cannot be drawn."""
+    """Surfaces of a visual element; [] if it cannot be drawn."""
     if visual.shape is not None:
         points, faces = _hull(visual.shape)
         parts = [MeshPart(points, faces, None)]
@@ -167,29 +168,30 @@ def _drawn(visual: Visual, mesh_parts: MeshParts) -> list[Surface]:
 def coarser(
     vertices: FloatArray, faces: IntArray, most: int = MOST_TRIANGLES
 ) -> tuple[FloatArray, IntArray]:
-    """Return a mesh with at most so many triangles, vertices that are near each other as one.
+    """Mesh with at most `most` triangles, in which vertices near each other are merged.
 
-    Vertices of one cell of a grid become their mean, and triangles that lose a corner go (J.
-    Rossignac and P. Borrel, "Multi-resolution 3D approximations for rendering complex scenes",
-    1993); the grid widens until few enough are left. Equal vertices are always merged.
+    Vertices of one cell of a grid become their mean, and triangles that lose a corner are dropped
+    (J. Rossignac and P. Borrel, "Multi-resolution 3D approximations for rendering complex scenes",
+    1993); the grid widens until few enough remain. Equal vertices are always merged.
 
     Parameters
     ----------
     vertices, faces
         m, (n, 3), and (m, 3).
     most
-        How many triangles are left at most; more only where cells of 5 cm leave more.
+        Largest number of triangles; exceeded only if cells of 5 cm leave more.
     """
-    points, left = _clustered(vertices, faces, _EQUAL_M)
+    points, remaining = _clustered(vertices, faces, _EQUAL_M)
     cell = _FINEST_M
-    while len(left) > most and cell < _COARSEST_M:
-        points, left = _clustered(vertices, faces, cell)
+    while len(remaining) > most and cell < _COARSEST_M:
+        points, remaining = _clustered(vertices, faces, cell)
         # The number of triangles falls with the square of the cell, where it falls.
-        cell *= max(1.1, 0.95 * float(np.sqrt(len(left) / most)))
-    return points, left
+        cell *= max(1.1, 0.95 * float(np.sqrt(len(remaining) / most)))
+    return points, remaining
 
 
 def _clustered(vertices: FloatArray, faces: IntArray, cell: float) -> tuple[FloatArray, IntArray]:
+    """Mesh with the vertices of each cell of a grid merged."""
     steps = np.round((vertices - vertices.min(axis=0)) / cell).astype(np.int64)
     _, index = np.unique(_numbered(steps), return_inverse=True)
     counts = np.bincount(index)
@@ -203,19 +205,19 @@ def _clustered(vertices: FloatArray, faces: IntArray, cell: float) -> tuple[Floa
 
 
 def _numbered(rows: IntArray) -> IntArray:
-    """Return one number for each different row of three numbers from 0 on, (n,)."""
+    """A number for each different row of three numbers from 0 on, (n,)."""
     size = rows.max(axis=0, initial=0) + 1
     return (rows[:, 0] * size[1] + rows[:, 1]) * size[2] + rows[:, 2]
 
 
 def _used(points: FloatArray, faces: IntArray) -> tuple[FloatArray, IntArray]:
-    """Return the points that triangles have, and the triangles with the new numbers."""
+    """Points that occur in triangles, and the triangles with the new indices."""
     used, renumbered = np.unique(faces, return_inverse=True)
     return points[used], renumbered.reshape(-1, 3).astype(np.int64)
 
 
 def _hull(shape: Shape) -> tuple[FloatArray, IntArray]:
-    """Return a convex shape as a surface in its own frame."""
+    """Surface of a convex shape in its own frame."""
     points = shape.outline
     if shape.ball > 0.0:
         # Its outline encloses it with few points; this is the shape itself, rounder.
@@ -226,7 +228,7 @@ def _hull(shape: Shape) -> tuple[FloatArray, IntArray]:
 
 @cache
 def _ball() -> FloatArray:
-    """Return points spread evenly over the unit sphere, (n, 3), along a spiral."""
+    """Points spread evenly over the unit sphere, (n, 3), along a spiral."""
     count = 200
     z = 1.0 - (2.0 * np.arange(count) + 1.0) / count
     turn = np.arange(count) * np.pi * (3.0 - 5.0**0.5)
@@ -234,7 +236,7 @@ def _ball() -> FloatArray:
     return np.column_stack((radius * np.cos(turn), radius * np.sin(turn), z))
 
 
-# What a page needs to draw a scene: the scene as JSON, and the scripts.
+# Data for a page to draw a scene: the scene as JSON, and the scripts.
 #
 # three.js, compressed, comes with trimesh, and robot_view.js with this package: a page that holds
 # them and the scene fetches nothing.
@@ -243,10 +245,10 @@ VIEWER = 'resources/templates/viewer.zip'
 
 
 def scene_to_dict(scene: RobotScene) -> dict[str, Any]:
-    """Return a scene as robot_view.js takes it; lengths in metres, matrices row by row.
+    """Scene in the form that robot_view.js takes; lengths in metres, matrices row by row.
 
-    Vertices are numbers of 16 bit between the lowest and the highest of their surface (0.02 mm
-    for a link of a metre), these and the triangles in base64.
+    Vertices are 16-bit numbers between the lowest and the highest of their surface (0.02 mm for a
+    link of a metre), these and the triangles in base64.
     """
     chain = scene.chain
     reach = np.linalg.norm(chain.T_fixed[:, :3, 3], axis=1).sum()
@@ -273,10 +275,12 @@ def scene_to_dict(scene: RobotScene) -> dict[str, Any]:
 
 
 def _limit(angle: float) -> float | None:
+    """Limit of a joint; None if infinite."""
     return float(angle) if np.isfinite(angle) else None
 
 
 def _surface(surface: Surface) -> dict[str, Any]:
+    """Surface in the form that robot_view.js takes."""
     low = surface.vertices.min(axis=0)
     step = np.maximum(np.ptp(surface.vertices, axis=0) / 65535.0, 1e-12)
     large = len(surface.vertices) > 65535
@@ -294,11 +298,15 @@ def _surface(surface: Surface) -> dict[str, Any]:
 
 
 def _base64(values: Any, kind: str) -> str:
+    """Values as numbers of a type, in base64."""
     return base64.b64encode(np.asarray(values).astype(kind).tobytes()).decode()
 
 
 def three_js() -> str:
-    """Return the source of three.js, as trimesh has it in the page of its own viewer."""
+    """Source of three.js, from the page of trimesh's viewer.
+
+    Raises InputError if it is not there.
+    """
     # Found without importing trimesh, which takes a second.
     spec = importlib.util.find_spec('trimesh')
     folder = Path(spec.origin).parent if spec is not None and spec.origin else Path()
@@ -318,7 +326,7 @@ _REMEDY = 'install trimesh as constraints.txt has it'
 
 
 def view_script(*names: str) -> str:
-    """Return three.js, robot_view.js and these scripts of this package as one script."""
+    """three.js, robot_view.js and the named scripts of this package as one script."""
     ours = importlib.resources.files(__package__)
     texts = [ours.joinpath(name).read_text(encoding='utf-8') for name in ('robot_view.js', *names)]
     return '\n'.join([three_js(), *texts])

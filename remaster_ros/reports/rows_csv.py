@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files with a line for every row: residuals.csv of `fit`, predictions.csv of `discover`."""
+"""Files with a line for each row: residuals.csv of `fit`, predictions.csv of `discover`."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ PREDICTION_COLUMNS = (
 
 
 def rows_text(session: Session, columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
-    """Return a file: which row of the session it is, then these columns."""
+    """Text of a file: identity of each row of the session, then the given columns."""
     m = session.measurements
     text = io.StringIO()
     writer = csv.writer(text, lineterminator='\n')
@@ -61,15 +61,15 @@ def rows_text(session: Session, columns: Sequence[str], rows: Iterable[Sequence[
 
 
 def lengths_mm(errors: FloatArray) -> FloatArray:
-    """Return the 3-D error of every row, mm, (n,), of errors in m, (n, 3)."""
+    """3-D error of each row, mm, (n,), from errors in m, (n, 3)."""
     return np.asarray(1e3 * np.linalg.norm(errors, axis=1))
 
 
 def residuals_text(result: FitResult) -> str:
-    """Return residuals.csv: measured minus modelled position in the frame of the sensor, m.
+    """Text of residuals.csv: measured minus modelled position in the frame of the sensor, m.
 
-    ``before`` with all offsets held at zero, ``after`` with the offsets; ``left_out`` is 1 for a
-    gross error.
+    ``before`` with all offsets at zero, ``after`` with the offsets; ``left_out`` is 1 for a gross
+    error.
     """
     gross = {observation for observation, _ in result.left_out}
     residuals = np.concatenate((result.residuals_before, result.residuals_after), axis=1)
@@ -83,7 +83,7 @@ def residuals_text(result: FitResult) -> str:
 
 
 def predictions_text(session: Session, predictions: Predictions, left_out: set[int]) -> str:
-    """Return the file: positions in the frame of the row's sensor, m; 1 is yes and 0 no.
+    """Text of predictions.csv: positions in the frame of the row's sensor, m; 1 is yes and 0 no.
 
     ``left_out``: ``observation`` of the gross errors.
     """
@@ -104,7 +104,11 @@ def predictions_text(session: Session, predictions: Predictions, left_out: set[i
 
 
 def read_columns(path: Path, session: Session, columns: Sequence[str], verb: str) -> FloatArray:
-    """Read columns of numbers of such a file, (n, columns), one line for each row of a session."""
+    """Columns of numbers of such a file, (n, columns), a line for each row of a session.
+
+    Raises InputError if the file is of another session, or a number is missing. ``verb``: command
+    that writes the file.
+    """
     data = read_limited(path, ROWS_LIMIT, f'run "remaster {verb}" again, which writes it')
     reader = csv.DictReader(io.StringIO(decode_text(data, path)))
     missing = {'observation', *columns} - set(reader.fieldnames or ())

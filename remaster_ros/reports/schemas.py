@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What fit.json and discovery.json hold: each key once, to write and to read.
+"""Schemas of fit.json and discovery.json: each key once, for writing and reading.
 
-A key without a default is what other programs rely on, and a file without it is refused. One that
-is `UNSET` by default is written where it has a value; the files of other programs may lack it.
-Keys that are not here are kept as they are.
+A key without a default is part of the contract, and a file without it is refused. A key that is
+`UNSET` by default is written if it has a value; other programs' files may lack it. Unknown keys
+are ignored.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ Content = TypeVar('Content', bound=Struct)
 
 
 class Robot(Struct):
-    """Whose offsets these are."""
+    """Arm to which the offsets belong."""
 
     name: str
     urdf_sha256: str
@@ -40,7 +40,7 @@ class Robot(Struct):
 
 
 class Counts(Struct):
-    """What was measured of a split."""
+    """Numbers of observations, configurations and poses of a split."""
 
     observations: int
     configurations: int
@@ -48,7 +48,7 @@ class Counts(Struct):
 
 
 class MeasuredSession(Struct):
-    """What was measured: counts, sensor -> marker, date, how it ended, hash; if it has times."""
+    """The session: counts, sensor -> marker, date, exit status, hash, and whether it has times."""
 
     optimization: Counts
     validation: Counts
@@ -60,13 +60,13 @@ class MeasuredSession(Struct):
 
 
 class JointOffset(Struct):
-    """One joint's zero-offset; where ``identifiable`` is false, ``why`` is the reason.
+    """Zero-offset of a joint; if ``identifiable`` is false, ``why`` is the reason.
 
-    ``std_deg`` and ``interval95_deg`` contain what lengths and tilts off their drawing would do to
-    the offset (``geometry``); ``std_if_exactly_drawn_deg`` is without them, and ``model_std_deg``,
-    where errors are left (``intervals``), also without those.
+    ``std_deg`` and ``interval95_deg`` include the effect of lengths and tilts off their drawing
+    (``geometry``); ``std_if_exactly_drawn_deg`` is without it, and ``model_std_deg``, present if
+    errors remain that the model does not have (``intervals``), is also without those.
 
-    Of a joint that slides ``unit`` is mm, the values end in ``_mm``, and those in ``_deg`` are
+    For a prismatic joint ``unit`` is mm, the values end in ``_mm``, and those in ``_deg`` are
     null: there is no such angle.
     """
 
@@ -87,7 +87,7 @@ class JointOffset(Struct):
 
     @property
     def mean_and_std(self) -> tuple[float, float]:
-        """Mean and standard deviation, rad; m of a joint that slides."""
+        """Mean and standard deviation, rad; m for a prismatic joint."""
         if self.mean_deg is None or self.std_deg is None:
             assert self.mean_mm is not UNSET
             assert self.std_mm is not UNSET
@@ -96,7 +96,7 @@ class JointOffset(Struct):
 
     @property
     def std_if_exactly_drawn(self) -> float:
-        """Standard deviation on an arm that is its drawing, rad or m; ``std`` in older files."""
+        """Std for an arm of nominal geometry, rad or m; ``std`` in older files."""
         std = getattr(self, f'std_if_exactly_drawn_{self.unit}')
         if std is UNSET:
             return self.mean_and_std[1]
@@ -106,8 +106,8 @@ class JointOffset(Struct):
 class Registration(Struct):
     """T_R_N: the sensor's frame N in the robot base R.
 
-    ``std_is_lower_limit`` is true where errors are left that the model has not: they move
-    registrations and markers by more than it states, by how much no data show.
+    ``std_is_lower_limit`` is true if errors remain that the model does not have: they move
+    registrations and markers by more than the std, by an unknown amount.
     """
 
     translation_m: Triple
@@ -118,7 +118,7 @@ class Registration(Struct):
 
 
 class Marker(Struct):
-    """A marker's position in the tool frame T; ``std_is_lower_limit`` as of a registration."""
+    """Position of a marker in the tool frame T; ``std_is_lower_limit`` as in `Registration`."""
 
     position_m: Triple
     std_m: Triple
@@ -126,10 +126,10 @@ class Marker(Struct):
 
 
 class Noise(Struct):
-    """A sensor's noise per axis: of one row, and common to a pose (None: not separable).
+    """Noise of a sensor per axis: of one row, and shared by a pose (None: not separable).
 
-    Where it has several markers in a frame, also what these share. Where it differs along and
-    across the line of sight, both stand there as well.
+    If it has several markers in a frame, also the noise that these share. If it differs along and
+    across the line of sight, both are given as well.
     """
 
     sigma_m: float
@@ -153,11 +153,11 @@ class Noise(Struct):
 
 
 class Sampler(Struct):
-    """How the posterior was sampled; ``draws`` are kept draws of each chain.
+    """Sampling of the posterior; ``draws`` are kept draws of each chain.
 
-    ``precision`` is the Monte Carlo error of the worst mean in standard deviations;
-    ``method`` is 'metropolis' for chains, 'laplace' for a Gaussian about the mode; ``pareto_k``,
-    where chains were given up, is the shape of the tail of their proposals' weights.
+    ``precision`` is the Monte Carlo error of the worst mean in standard deviations; ``method`` is
+    'metropolis' for chains, 'laplace' for a Gaussian about the mode; ``pareto_k``, if chains were
+    given up, is the shape of the tail of their proposals' weights.
     """
 
     name: str
@@ -176,7 +176,7 @@ class Sampler(Struct):
 
 
 class SampledParameter(Struct):
-    """A parameter in the unit of its name (m, rad), and how well it was sampled."""
+    """A parameter in the unit of its name (m, rad), and its convergence diagnostics."""
 
     name: str
     mean: float
@@ -187,21 +187,21 @@ class SampledParameter(Struct):
 
 
 class Accuracy(Struct):
-    """The three metrics by split; ``validation`` is None where nothing was held out."""
+    """The three metrics by split; ``validation`` is None if nothing was held out."""
 
     optimization: Mapping[str, Any] | None
     validation: Mapping[str, Any] | None
 
 
 class LeftOut(Struct):
-    """A row that was not fitted, and why."""
+    """A row that was not fitted, and the reason."""
 
     observation: int
     why: str
 
 
 class TurnNoise(Struct):
-    """Noise of a sensor's orientations per axis, degrees: of one row, and common to a pose."""
+    """Noise of a sensor's orientations per axis, degrees: of one row, and shared by a pose."""
 
     sigma_deg: float
     std_deg: float
@@ -209,18 +209,19 @@ class TurnNoise(Struct):
 
 
 class Body(Struct):
-    """How a measured body stands on the tool, R_T_B; the std is about the axes of T."""
+    """Rotation of a measured body on the tool, R_T_B; the std is about the axes of T."""
 
     rotation_xyzw: list[float]
     std_deg: Triple
 
 
 class Orientation(Struct):
-    """What came of measured orientations.
+    """Result of measured orientations.
 
-    ``p_value`` is that positions and orientations agree on the offsets; ``std_positions_deg`` is
-    what the positions alone would know of each (None: nothing), ``std_positions_mm`` the same of
-    joints that slide. Where they are not fitted ``why`` has the reason.
+    ``p_value`` is that of agreement of positions and orientations on the offsets;
+    ``std_positions_deg`` is the std of each offset from the positions alone (None: unknown),
+    ``std_positions_mm`` that of prismatic joints. If orientations are not fitted, ``why`` has the
+    reason.
     """
 
     fitted: bool
@@ -234,12 +235,12 @@ class Orientation(Struct):
 
 
 class NoiseCheck(Struct):
-    """Does noise explain what is left of a sensor's errors?
+    """Comparison of a sensor's remaining errors with its noise.
 
-    ``after_m`` is the mean error after (held out where there are such rows, without the worst
-    twentieth), ``noise_m`` what the noise makes that the sensor states for a reading, the mean of
-    its samples, and that shows within poses (None where neither does, as ``explained``). ``gross``
-    has the observations of the held-out rows that are gross errors.
+    ``after_m`` is the mean error after (of held-out rows if there are any, without the worst
+    twentieth), ``noise_m`` the error expected from the noise that the sensor states for the mean
+    of its samples, and that shows within poses (None if neither is known, as ``explained``).
+    ``gross`` has the observations of the held-out rows that are gross errors.
     """
 
     explained: bool | None
@@ -251,11 +252,11 @@ class NoiseCheck(Struct):
 
 
 class Judgement(Struct):
-    """A result for a reader who did not measure it: green, amber or red, and why.
+    """Judgement of a result for a reader who did not measure it: green, amber or red, and why.
 
-    ``points`` is what else matters before it is used. Of these, ``findings`` are what noise does
-    not explain, but causes may; ``doubts`` are what these data cannot show; ``disagreements`` are
-    data that contradict each other.
+    ``points`` are further remarks. Of these, ``findings`` are errors that noise does not explain,
+    but causes may; ``doubts`` are limits of the data; ``disagreements`` are data that contradict
+    each other.
     """
 
     mood: Literal['good', 'caution', 'bad']
@@ -267,10 +268,10 @@ class Judgement(Struct):
 
 
 class StructureTest(Struct):
-    """Do the residuals follow a driver: in the means of the poses, or in deviations from them?
+    """Test whether the residuals follow a driver: in the means of the poses, or within poses.
 
-    The driver 'held_out' asks whether those of a ``sensor`` are larger on held-out poses than on
-    poses left out of the fit: ``ratio`` times, in units of what is uncertain of their prediction.
+    The driver 'held_out' tests whether the residuals of a ``sensor`` are larger on held-out poses
+    than on poses left out of the fit: ``ratio`` times, in units of their prediction's uncertainty.
     """
 
     driver: str
@@ -282,10 +283,10 @@ class StructureTest(Struct):
 
 
 class Imitation(Struct):
-    """Which length or tilt moves a joint's offset most: by ``deg`` if it is the tolerance off.
+    """Length or tilt that changes a joint's offset most: by ``deg`` if it is off by the tolerance.
 
-    ``joint`` is the joint's name; ``link_length`` ``of`` 2 is that of the link after joint 2. Of a
-    joint that slides it is ``mm``, and ``deg`` is null.
+    ``joint`` is the joint's name; ``link_length`` ``of`` 2 is that of the link after joint 2. For
+    a prismatic joint the change is ``mm``, and ``deg`` is null.
     """
 
     joint: str
@@ -297,7 +298,7 @@ class Imitation(Struct):
 
     @property
     def as_angle(self) -> float:
-        """How much it is, what slides by the angle that it counts as, rad."""
+        """Change as an angle, rad; a length by the angle that it counts as."""
         if self.deg is not None:
             return math.radians(self.deg)
         assert self.mm is not UNSET
@@ -305,17 +306,17 @@ class Imitation(Struct):
 
     @property
     def shown(self) -> str:
-        """How much it is, as people read it."""
+        """Change with its unit, as text."""
         return f'{self.mm:.3f} mm' if self.deg is None else f'{self.deg:.3f} deg'
 
 
 class FittedGeometry(Struct):
-    """All link lengths and axis tilts fitted beside the offsets, one variance for either kind.
+    """All link lengths and axis tilts, fitted together with the offsets.
 
-    Standard deviations are RMS displacements of the marker by each length and each tilt, at least
-    ``tolerance_mm``. Errors are means over the validation rows, with the offsets on the drawing
-    and with the robot model that has these lengths and tilts; ``file`` is that model where it
-    predicts them better, '' where it does not.
+    There is one prior variance for lengths and one for tilts. Standard deviations are RMS
+    displacements of the marker by each length and each tilt, at least ``tolerance_mm``. Errors are
+    means over the validation rows, with nominal geometry and with the robot model that has these
+    lengths and tilts; ``file`` is that model if it predicts them better, '' otherwise.
     """
 
     tolerance_mm: float
@@ -335,10 +336,10 @@ class Clock(Struct):
 
 
 class Fit(Struct):
-    """fit.json.
+    """Content of fit.json.
 
-    ``intervals`` is 'model' where those of the offsets are the posterior's, 'robust' where they
-    are wider because errors are left that the model has not.
+    ``intervals`` is 'model' if those of the offsets are the posterior's, 'robust' if they are
+    wider because errors remain that the model does not have.
     """
 
     format: str
@@ -364,11 +365,12 @@ class Fit(Struct):
 
 
 def checked(content: Mapping[str, Any], schema: type[Content]) -> Content:
-    """Return a file's content by its schema: arrays as lists, NaN as None, other keys left out."""
+    """Content by its schema: arrays as lists, NaN as None, unknown keys dropped."""
     return msgspec.json.decode(msgspec.json.encode(content, enc_hook=_plain), type=schema)
 
 
 def _plain(values: Any) -> Any:
+    """Arrays and mappings as plain types."""
     if isinstance(values, np.ndarray | np.generic):
         return values.tolist()
     if isinstance(values, Mapping):
@@ -377,11 +379,11 @@ def _plain(values: Any) -> Any:
 
 
 def encode(content: Struct) -> bytes:
-    """Return a file's bytes, indented."""
+    """Bytes of a file, indented."""
     return msgspec.json.format(msgspec.json.encode(content), indent=2) + b'\n'
 
 
-# Beside what it shares with fit.json: what discovery.json holds.
+# Keys of discovery.json that fit.json does not have.
 
 
 class NamedCause(Struct):
@@ -392,7 +394,7 @@ class NamedCause(Struct):
 
 
 class Decided(Struct):
-    """What was decided between a cause and its look-alike; see `decision.Decision`."""
+    """Decision between a cause and its look-alike; see `decision.Decision`."""
 
     cause: NamedCause
     look_alike: NamedCause
@@ -403,12 +405,12 @@ class Decided(Struct):
 
 
 class Effect(Struct):
-    """A cause; ``size_m`` is the RMS at the marker after absorption, ``share`` of the gain.
+    """A cause; ``size_m`` is the RMS at the marker after absorption, ``share`` that of the gain.
 
-    ``sizes`` are its parts in arc minutes and millimetres, ``remedy`` is what to do about it.
-    ``title`` is a heading; '' in files of earlier versions, which lack what follows it, too:
-    whether a corrected robot model holds it, whether it lies in how the arm was measured, and when
-    it happened if it came at one moment and stayed.
+    ``sizes`` are its parts in arc minutes and millimetres, ``remedy`` is the advice. ``title`` is
+    a heading, '' in files of earlier versions, which lack the keys after it, too: whether a
+    corrected robot model contains the cause, whether it lies in the measurement, and when it
+    happened if it came at one moment and stayed.
     """
 
     name: str
@@ -433,15 +435,15 @@ class Effect(Struct):
 
     @property
     def is_taken_out(self) -> bool:
-        """As of `FoundEffect`."""
+        """Whether it is a certain error of the measurement, as in `FoundEffect`."""
         known = self.probability is None or self.probability >= CERTAIN
         return self.of_measurement and known
 
 
 class Gain(Struct):
-    """RMS of the 3-D error over every validation row, and what the noise alone makes.
+    """RMS of the 3-D error over all validation rows, and of the noise alone.
 
-    ``held_out_kept_…`` is the same without the ``held_out_gross`` rows that are gross errors.
+    ``held_out_kept_…`` is the RMS without the ``held_out_gross`` rows that are gross errors.
     """
 
     held_out_rms_before_m: float | None
@@ -453,11 +455,11 @@ class Gain(Struct):
 
 
 class Loadable(Struct):
-    """What of the result a robot can load, and the mean 3-D error on held-out poses with it.
+    """A result that a robot can load, and the mean 3-D error on held-out poses with it.
 
-    'offsets' by themselves, 'geometry': all link lengths, axis tilts and zero-offsets together, or
-    'everything' that the model holds. ``better`` than all before it, or there is no reason to load
-    it. ``file`` is '' where no file holds it.
+    'offsets' alone, 'geometry': all link lengths, axis tilts and zero-offsets together, or
+    'everything' in the model. ``better`` than all before it, or there is no reason to load it.
+    ``file`` is '' if no file contains it.
     """
 
     result: Literal['offsets', 'geometry', 'everything']
@@ -467,7 +469,7 @@ class Loadable(Struct):
 
 
 class NoiseOfDiscovery(Struct):
-    """What the search found of the noise."""
+    """Noise as estimated by the search."""
 
     pose_common_fraction: float
     outliers: list[int]
@@ -476,9 +478,9 @@ class NoiseOfDiscovery(Struct):
 
 
 class OffsetBefore(Struct):
-    """A joint's zero-offset without the effects; None where nothing bounds it.
+    """Zero-offset of a joint without the effects; None if nothing bounds it.
 
-    Of a joint that slides as `JointOffset` has it.
+    Units of prismatic joints as in `JointOffset`.
     """
 
     joint: str
@@ -490,7 +492,7 @@ class OffsetBefore(Struct):
 
 
 class Compared(Struct):
-    """A parameter in both sessions, and by how many standard deviations of both they differ."""
+    """A parameter in both sessions, and their difference in standard deviations of both."""
 
     name: str
     unit: str
@@ -502,12 +504,12 @@ class Compared(Struct):
 
 
 class ConfirmedEffect(Struct):
-    """How an effect does in the other session.
+    """Result for an effect in another session.
 
-    ``rows_common`` of its rows have its driver where it was seen; ``carried_over`` is the share of
-    what it could gain there; None where that is nothing. ``answer`` is what the evidence says, and
-    ``log_evidence`` that of the cause shared by both sessions, of a size of its own there, and
-    absent there, less the best.
+    ``rows_common`` of its rows have a driver in the range of the first session; ``carried_over``
+    is the share of the possible gain there, None if nothing could be gained. ``answer`` is the
+    decision by the evidence, and ``log_evidence`` that of the cause shared by both sessions, of a
+    separate size there, and absent there, relative to the best.
     """
 
     name: str
@@ -522,7 +524,7 @@ class ConfirmedEffect(Struct):
 
 
 class Confirmed(Struct):
-    """How the effects do in another session of the arm; see `confirmation.Confirmation`."""
+    """Results for all effects in another session of the arm; see `confirmation.Confirmation`."""
 
     rms_before_m: float | None
     rms_after_m: float | None
@@ -546,7 +548,7 @@ class Confirmed(Struct):
 class PredictedRegions(Struct):
     """The 95 % regions of predictions.csv: ``widening`` is the factor on their size.
 
-    It is what the fitted rows take when their pose is left out, so that 95 % of them lie inside.
+    It is chosen so that 95 % of the fitted rows lie inside if their pose is left out.
     """
 
     widening: float
@@ -555,7 +557,7 @@ class PredictedRegions(Struct):
 
 
 class JointCovariance(Struct):
-    """Covariance of the zero-offsets that are identifiable and of all of the causes' parameters.
+    """Covariance of the identifiable zero-offsets and of all parameters of the causes.
 
     ``matrix`` is in the units of its parameters, to six figures.
     """
@@ -566,7 +568,7 @@ class JointCovariance(Struct):
 
 
 class Unexplained(Struct):
-    """Structure that no cause explains: where it shows, its size, and what to do next."""
+    """Structure that no cause explains: its place, its size, and the next step."""
 
     where: str
     driver: str
@@ -598,7 +600,7 @@ class Search(Struct):
 
 
 class Discovered(Struct):
-    """discovery.json."""
+    """Content of discovery.json."""
 
     format: str
     verdict: Literal['effects', 'none', 'undetermined', 'unexplained']

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a fit and its causes are worth, in words: green, amber or red, and why."""
+"""Sentences on a fit and its causes: judgement (green, amber or red) and reasons."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import msgspec
 import numpy as np
 from msgspec import UNSET, Struct, UnsetType
 
+from remaster_ros.calibration.convergence import SamplerInfo
 from remaster_ros.calibration.dynamics import late_words
 from remaster_ros.calibration.gauge_words import counted, in_a_line, listed
 from remaster_ros.calibration.measured_again import MeasuredAgain
@@ -50,14 +51,14 @@ if TYPE_CHECKING:
     from remaster_ros.types import Session
 
 
-# Less than this is no gain a user would notice.
+# Least ratio of errors that counts as a noticeable gain.
 NOTICEABLE_GAIN = 1.1
-# Fewer held-out poses than this show nothing by themselves.
+# Least number of held-out poses that prove a gain.
 FEWEST_HELD_OUT = 3
 FEW_POSES = 'So few poses do not show'
 NOT_PROVEN = 'No poses were held out, so the gain is not proven: measure some, and run this again.'
 NO_TIMES = 'without times, so nothing that changes with time can be seen'
-# Of accuracy in fit.json.
+# Titles of the metrics of fit.json.
 METRICS = {
     'post_registration': 'position, sensor registered (eq. 18)',
     'post_registration_orientation': '… orientation',
@@ -68,12 +69,12 @@ METRICS = {
     'theoretical_random': 'the same at 1,000 random configurations',
     'paper_theoretical_random': '… in the robot base, as the paper has it',
 }
-# Of a curve's hundred values a table has one line; discovery.json has them all.
+# A cause with more parameters, such as a curve, has one line in tables; discovery.json has all.
 MOST_PARAMETERS = 8
 
 
 def hardly_proven(held_out_poses: int) -> str:
-    """Return that few poses were held out, a sentence; '' of none or enough."""
+    """Sentence that few poses were held out; '' if none or enough were."""
     if not 0 < held_out_poses < FEWEST_HELD_OUT:
         return ''
     return (
@@ -83,23 +84,24 @@ def hardly_proven(held_out_poses: int) -> str:
 
 
 def _held_out_poses(session: Session) -> int:
+    """Number of held-out poses of a session."""
     m = session.measurements
     return len(np.unique(m.pose[m.is_validation]))
 
 
 def not_counted(gross: int) -> str:
-    """Return '3 gross errors not counted'."""
+    """Text such as '3 gross errors not counted'."""
     return f'{counted(gross, "gross error")} not counted'
 
 
 def times_smaller(before: float, after: float) -> str:
-    """Return '9.0 times smaller'."""
+    """Text such as '9.0 times smaller'."""
     times = before / max(after, 1e-9)
     return f'{times:.{1 if times < 10 else 0}f} times smaller'
 
 
 def references(result: FitResult) -> tuple[int, list[str]]:
-    """Return the rounds of the references, and what changed in the session, a sentence each."""
+    """Number of rounds of the references, and sentences on changes during the session."""
     if result.session.references is None:
         return 0, []
     # What judges them plans as well; few sessions have any.
@@ -110,7 +112,7 @@ def references(result: FitResult) -> tuple[int, list[str]]:
 
 
 def verdict(result: FitResult) -> Judgement:
-    """Judge a fit: what was gained, whether the chains agree, what is not identifiable."""
+    """Judgement of a fit: gain, convergence, and offsets that are not identifiable."""
     validated = result.accuracy['validation'] is not None
     before, after = _mean_errors_mm(result, validated)
     gain = before / max(after, 1e-9)
@@ -183,23 +185,7 @@ def verdict(result: FitResult) -> Judgement:
         points.append(NOT_PROVEN)
     elif hardly:
         points.append(hardly)
-    sampler = result.sampler
-    if sampler.converged and sampler.method == 'metropolis':
-        points.append(f'The chains agree with each other ({sampler.message}).')
-    elif sampler.converged:
-        points.append(f'The weighted draws pass their check ({sampler.message}).')
-    elif sampler.method != 'metropolis':
-        points.append(
-            f'Do not trust the uncertainties ({sampler.message}): measure poses that are spread '
-            'further and turn the tool, or state what is known of these parameters (--prior).'
-        )
-    elif sampler.wandering:
-        points.append(
-            f'Do not trust offsets or uncertainties ({sampler.message}); '
-            'fit again with more draws.'
-        )
-    else:
-        points.append(f'The chains agree, but are shorter than asked for ({sampler.message}).')
+    points.append(_sampling(result.sampler))
     unknown = [
         joint
         for joint, known in zip(result.joint_names, result.identifiable, strict=True)
@@ -226,8 +212,34 @@ def verdict(result: FitResult) -> Judgement:
     return Judgement(mood, headline, points, findings, doubts, disagreements)
 
 
+def _sampling(sampler: SamplerInfo) -> str:
+    """Sentence on the convergence of the sampling, with the next step if it has not converged.
+
+    Its figures, such as R-hat, are in the appendix of a report.
+    """
+    exact = f'every mean is exact to {100 * sampler.precision:.1f} % of its standard deviation'
+    if sampler.converged and sampler.method == 'metropolis':
+        return f'The sampling of the offsets has converged: {exact}.'
+    if sampler.converged:
+        return f'The approximation of the uncertainties has passed its check: {exact}.'
+    if sampler.method != 'metropolis':
+        return (
+            f'Do not trust the uncertainties ({sampler.message}): measure poses that are spread '
+            'further and turn the tool, or state what is known of these parameters (--prior).'
+        )
+    if sampler.wandering:
+        return (
+            'Do not trust offsets or uncertainties, as the sampling has not converged: fit again '
+            'with more draws (--draws).'
+        )
+    return (
+        f'The sampling of the offsets is sound, but less exact than was asked for: {exact}. Fit '
+        'again with more draws (--draws) if you need it.'
+    )
+
+
 def _mean_errors_mm(result: FitResult, validated: bool) -> tuple[float, float]:
-    """Return the mean 3-D error before and after, mm, of the rows judged less gross errors."""
+    """Mean 3-D error before and after, mm, of the judged rows without gross errors."""
     gross = [row for check in result.noise_checks for row in check.gross]
     if not (validated and gross):
         split = 'validation' if validated else 'optimization'
@@ -240,14 +252,14 @@ def _mean_errors_mm(result: FitResult, validated: bool) -> tuple[float, float]:
 
 
 def _structure(result: FitResult) -> list[str]:
-    """Return what the residuals follow."""
+    """Sentences on the drivers that the residuals follow."""
     found = result.structure.found if result.structure is not None else ()
-    told = [(test.words(result.session.timed), test.chance) for test in found]
-    return [f'{words[0].upper()}{words[1:]} ({chance}).' for words, chance in told]
+    tests = [(test.words(result.session.timed), test.chance) for test in found]
+    return [f'{words[0].upper()}{words[1:]} ({chance}).' for words, chance in tests]
 
 
 def _widening(result: FitResult) -> list[str]:
-    """Return what errors that the model leaves out do to the intervals."""
+    """Sentences on the effect of unmodelled errors on the intervals."""
     lines = []
     if np.any(result.widening > 1.0):
         lines.append(
@@ -266,12 +278,12 @@ SEARCH = 'run "remaster discover"'
 
 
 def without_search(headline: str) -> str:
-    """Return the headline of a fit whose causes were looked for already."""
+    """Headline of a fit without the advice to search for causes."""
     return headline.replace(f'; {SEARCH}', '')
 
 
 def _dominated(result: FitResult, unexplained: Sequence[NoiseCheck]) -> str:
-    """Return why the error after is no success, and what to do."""
+    """Reason why the error after is no success, and the next step."""
     if not result.other_errors:
         return 'Whether noise explains what is left, this session cannot show.'
     if result.structure is not None and result.structure.too_few:
@@ -287,7 +299,7 @@ def _dominated(result: FitResult, unexplained: Sequence[NoiseCheck]) -> str:
 
 
 def _compared(check: NoiseCheck) -> str:
-    """Return the figures of a sensor whose error noise does not explain."""
+    """Error and noise of a sensor whose error noise does not explain, as a sentence."""
     if check.is_of_no_instrument:
         return check.no_instrument
     if check.noise_error_m is None:
@@ -314,26 +326,26 @@ def _compared(check: NoiseCheck) -> str:
     )
 
 
-# What a discovery is worth: green where held-out poses bear it out, else amber.
+# Judgement of a discovery: green if held-out poses confirm it, else amber.
 
-# Regions meant for 95 % of the held-out rows that hold clearly less than this are too small.
+# Least share of held-out rows in their 95 % regions; below it the regions are too small.
 FEWEST_INSIDE = 0.92
-# So many times the noise the error on held-out poses may be, and more by chance with few rows.
+# Largest ratio of the error on held-out poses to the noise, apart from chance with few rows.
 MOST_OVER_NOISE = 1.25
 FEW_HELD_OUT = 'by chance, as so few poses were held out'
-# Where a cause could move the marker by more than this share of the noise and not be found, it
-# proves nothing that none is.
+# If a cause could move the marker by more than this share of the noise without being found, the
+# verdict "none" proves nothing.
 MOST_UNSEEN = 0.5
-# A cause is found from about so many standard deviations on.
+# Size in standard deviations from which on a cause is found.
 DETECTED = 4.5
 
 
 def judgement(
     discovery: Discovery, confirmation: Confirmation | None, content: Discovered
 ) -> Judgement:
-    """Judge what was found: 'good' where all data agree with the verdict, else 'caution'.
+    """Judgement of a discovery: 'good' if all data agree with the verdict, else 'caution'.
 
-    ``content``: the same as discovery.json has it.
+    ``content``: the content of discovery.json.
     """
     more = more_than_noise(content)
     again = MeasuredAgain.of(discovery.fit.session.measurements)
@@ -362,7 +374,7 @@ def judgement(
 
 
 def more_than_noise(content: Discovered) -> str:
-    """Return in what held-out rows show that the model does not have something; ''."""
+    """Sentence that held-out rows show an error that the model does not have; '' if not."""
     left = 'something is left that the model does not have.'
     if isinstance(content.session, Struct) and content.session.validation.poses < FEWEST_HELD_OUT:
         # The rows of a pose share its error, which may be large by chance.
@@ -385,7 +397,7 @@ def more_than_noise(content: Discovered) -> str:
 
 
 def _is_proven(discovery: Discovery, confirmation: Confirmation | None) -> bool:
-    """Whether poses that were never fitted, and the other session if there is one, agree."""
+    """Whether held-out poses, and the other session if there is one, agree with the verdict."""
     if discovery.verdict in ('undetermined', 'unexplained') or discovery.unexplained:
         return False
     if not discovery.fit.sampler.converged:
@@ -410,9 +422,9 @@ def _is_proven(discovery: Discovery, confirmation: Confirmation | None) -> bool:
 
 
 def least_seen_m(discovery: Discovery) -> float:
-    """Return how far, RMS, a cause moves the marker that is about to be found, m.
+    """Smallest RMS displacement of the marker, m, by a cause that would be found.
 
-    Where everything else is fitted anew it leaves `DETECTED` standard deviations of all rows
+    After everything else is fitted again it amounts to `DETECTED` standard deviations of all rows
     together.
     """
     numbers = discovery.residuals.errors.size
@@ -426,7 +438,7 @@ def _spoilt(discovery: Discovery) -> bool:
 
 
 def _gross(discovery: Discovery) -> str:
-    """Return how many readings are gross errors, a sentence; '' of none."""
+    """Sentence on the number of gross errors; '' if there are none."""
     count, of = len(discovery.outliers), len(discovery.residuals.context.measurements)
     if not count:
         return ''
@@ -437,12 +449,12 @@ def _gross(discovery: Discovery) -> str:
 
 
 def _would_show(discovery: Discovery) -> bool:
-    """Whether a cause that matters beside the noise would have been found."""
+    """Whether a cause that matters compared with the noise would have been found."""
     return least_seen_m(discovery) < MOST_UNSEEN * discovery.gain.noise_floor_m
 
 
 def _uncertain(discovery: Discovery) -> str:
-    """Return which causes are not certain, each with its probability; ''."""
+    """Sentence on causes that are not certain, with their probabilities; '' if there are none."""
     names = [
         f'{sentence_case(effect.title)} (probability {probability_text(effect.probability)})'
         for effect in discovery.effects
@@ -454,19 +466,27 @@ def _uncertain(discovery: Discovery) -> str:
 def headline(
     discovery: Discovery, confirmation: Confirmation | None = None, more: str = ''
 ) -> str:
-    """Return the result in one or a few sentences; `more` is what held-out rows show beside it."""
-    result = _result(discovery, confirmation, left=bool(more) or bool(discovery.outliers))
+    """Result in one or a few sentences; `more` is a finding on held-out rows."""
+    result = _result(
+        discovery, confirmation, something_left=bool(more) or bool(discovery.outliers)
+    )
     return result + (f' {more}' if more else '') + _gross(discovery)
 
 
-def _result(discovery: Discovery, confirmation: Confirmation | None, *, left: bool) -> str:
+def _result(
+    discovery: Discovery, confirmation: Confirmation | None, *, something_left: bool
+) -> str:
+    """Sentence on the verdict and the errors on held-out poses."""
     gain = discovery.gain
     change = ''
     if words := _held_out(gain):
         change = f' The error on poses it never fitted: {words}.'
     doubt = ''
     if not discovery.fit.sampler.converged:
-        doubt = f' How uncertain the figures are is not known: {discovery.fit.sampler.message}.'
+        doubt = (
+            ' How uncertain these figures are is not known, as the sampling has not converged: '
+            'search again with another --seed, or measure more poses.'
+        )
     change += doubt
     if discovery.verdict == 'none':
         if discovery.gain.held_out_rms_before_m is None:
@@ -483,19 +503,22 @@ def _result(discovery: Discovery, confirmation: Confirmation | None, *, left: bo
                 f'{len(discovery.residuals)} readings would not show a cause {seen}: measure more '
                 f'poses.{doubt}'
             )
-        nothing = 'Nothing was found' if left else 'Nothing is there'
+        nothing = 'Nothing was found' if something_left else 'Nothing is there'
         return (
             f'{nothing} beyond the zero-offsets and the noise; a cause {seen} would not '
             f'show.{change}'
         )
     if discovery.verdict == 'unexplained':
-        return f'Something is there that no cause explains.{change}'
+        return (
+            'Errors remain that no known cause explains: see where they are and what to measure '
+            f'next.{change}'
+        )
     count = len(discovery.effects)
     causes = 'one cause' if count == 1 else f'{count} causes'
     if discovery.verdict == 'undetermined':
         return (
-            f'Something is there, but two explanations fit equally well: see which measurements '
-            f'would decide.{change}'
+            'There is an error beyond the zero-offsets, but two causes explain it equally well: '
+            f'see which measurements would decide.{change}'
         )
     change += _uncertain(discovery)
     them = 'it' if count == 1 else 'them'
@@ -515,7 +538,7 @@ def _result(discovery: Discovery, confirmation: Confirmation | None, *, left: bo
 
 
 def _held_out(gain: Gain) -> str:
-    """Return the errors on held-out poses in words; '' without such poses."""
+    """Errors on held-out poses in words; '' without such poses."""
     before, after = gain.held_out_kept_before_m, gain.held_out_kept_after_m
     if before is None or after is None or gain.held_out_rms_after_m is None:
         return ''
@@ -529,11 +552,11 @@ def _held_out(gain: Gain) -> str:
     return words
 
 
-# What one fact is called wherever it stands: on the terminal, on a page, in a file.
+# Texts of single facts, the same on the terminal, on a page and in a file.
 
 
 def counts_words(session: MeasuredSession) -> str:
-    """Return how much was fitted and held out."""
+    """Numbers of fitted and held-out observations, as text."""
     fitted, held_out = (
         f'({counts.configurations} configurations of {counts.poses} poses)'
         for counts in (session.optimization, session.validation)
@@ -545,12 +568,12 @@ def counts_words(session: MeasuredSession) -> str:
 
 
 def at_marker(size_m: float) -> str:
-    """Return the size of an error."""
+    """Size of an error, as text."""
     return f'{1e3 * size_m:.3f} mm RMS at the marker'
 
 
 def size_words(effect: Effect) -> str:
-    """Return the size of a cause, and what is lost without it; '' in files of others."""
+    """Size of a cause, and the loss without it; '' in files of other programs."""
     if not isinstance(effect.size_m, float):
         return ''
     if not isinstance(effect.share, float):
@@ -560,21 +583,22 @@ def size_words(effect: Effect) -> str:
 
 
 def look_alike_name(effect: Effect, other: LookAlike) -> str:
-    """Return what a look-alike of a cause is called."""
+    """Name of a look-alike of a cause."""
     fewer = part_words(effect.name, effect.joints, other.name, other.joints)
     return fewer or sentence_case(other.title or called(other.name, other.joints))
 
 
 def _of_probability(other: LookAlike) -> str:
+    """Probability of a look-alike in brackets; '' if unknown."""
     if other.probability is None:
         return ''
     return f' (probability {probability_text(other.probability)})'
 
 
 def coverage_words(held_out: Coverage, gross: int) -> str:
-    """Return how many held-out rows lie where they were predicted; '' where there are none.
+    """Share of held-out rows in their predicted regions, as text; '' if there are none.
 
-    ``gross``: how many held-out rows are gross errors.
+    ``gross``: number of held-out rows that are gross errors.
     """
     if held_out.share is None:
         return ''
@@ -588,7 +612,7 @@ EXACTLY_DRAWN = 'if the arm is exactly its drawing'
 
 
 def std_remark(tolerance_m: float) -> str:
-    """Return what the standard deviations of offsets contain, a sentence for files."""
+    """Sentence for files on what the standard deviations of offsets include."""
     return (
         'The standard deviations contain what links and axes that are off their drawing by '
         f'{1e3 * tolerance_m:.2g} mm would do to the offsets.'
@@ -596,7 +620,7 @@ def std_remark(tolerance_m: float) -> str:
 
 
 def as_drawn(geometry: FittedGeometry, imitations: Sequence[Imitation]) -> str:
-    """Return what lengths and tilts off their drawing do to the offsets."""
+    """Effect on the offsets of lengths and tilts off their drawing, as text."""
     moved = '; '.join(
         f'{"link" if one.cause == "link_length" else "the axis of joint"} {one.of} is '
         f'{one.shown} at {one.joint}'
@@ -609,7 +633,7 @@ def as_drawn(geometry: FittedGeometry, imitations: Sequence[Imitation]) -> str:
 
 
 def loadable_of_fit(geometry: FittedGeometry) -> list[Loadable]:
-    """Return the results of a fit that a robot can load, as of a discovery."""
+    """Results of a fit that a robot can load, as for a discovery."""
     return [
         Loadable(
             'offsets', geometry.drawing_held_out_mean_mm, True, f'{APPLY_FOLDER}/{URDF_FILE}'
@@ -619,7 +643,7 @@ def loadable_of_fit(geometry: FittedGeometry) -> list[Loadable]:
 
 
 def load_words(row: Loadable) -> tuple[str, str]:
-    """Return what a result is, and what to do with it."""
+    """Name of a result, and what to do with it."""
     file = f'{row.file}{_MORE.get(row.result, "")}'
     worse = row.result != 'offsets' and row.held_out_mean_mm is not None and not row.better
     if worse and row.result == 'everything' and row.file:
@@ -647,11 +671,11 @@ _MORE = {
 }
 
 
-# A whole result on the terminal, from what its file holds.
+# A whole result on the terminal, from the content of its file.
 
 
 def fit_lines(fit: Fit) -> list[str]:
-    """Return offsets, errors and verdict, a line each."""
+    """Offsets, errors and verdict of a fit, a line each."""
     assert isinstance(fit.judgement, Judgement)
     width = max(len(row.joint) for row in fit.joint_offsets)
     lines = [f'{row.joint:{width}s} {_offset(row)}' for row in fit.joint_offsets]
@@ -696,6 +720,7 @@ def clock_lines(clocks: dict[str, Clock] | UnsetType) -> list[str]:
 
 
 def _offset(row: JointOffset) -> str:
+    """Offset of a joint, as text."""
     if not row.identifiable:
         return f'   not identifiable: {in_a_line(row.why)}'
     mean, std, drawn = (
@@ -706,6 +731,7 @@ def _offset(row: JointOffset) -> str:
 
 
 def _to_load(rows: Sequence[Loadable], effects: Sequence[Effect] = ()) -> list[str]:
+    """Results that can be loaded, a line each."""
     lines = []
     for row in rows:
         what, to_do = load_words(row)
@@ -721,7 +747,7 @@ def _to_load(rows: Sequence[Loadable], effects: Sequence[Effect] = ()) -> list[s
 
 
 def discovery_lines(found: Discovered) -> list[str]:
-    """Return verdict, causes, what can be loaded, and the coverage of held-out rows in lines."""
+    """Verdict, causes, loadable results, and coverage of held-out rows, in lines."""
     assert isinstance(found.judgement, Judgement)
     lines = [f'verdict: {found.verdict}', found.judgement.headline, *clock_lines(found.clocks)]
     for effect in found.effects:
@@ -755,7 +781,7 @@ def discovery_lines(found: Discovered) -> list[str]:
 
 
 def _side_by_side(found: Discovered, confirmation: Confirmed) -> list[str]:
-    """Return a table of the zero-offsets and the causes' parameters in both sessions."""
+    """Table of the zero-offsets and the causes' parameters in both sessions."""
     tables = [('zero-offsets', confirmation.joint_offsets or [])]
     tables += [
         (effect.title, cause.parameters or [])
@@ -765,10 +791,11 @@ def _side_by_side(found: Discovered, confirmation: Confirmed) -> list[str]:
     lines = []
     for name, rows in tables:
         if len(rows) > MOST_PARAMETERS:
-            apart = [row.sigmas for row in rows if row.sigmas is not None]
+            differences = [row.sigmas for row in rows if row.sigmas is not None]
             lines.append(
                 f'    {name}: {len(rows)} values, which differ by '
-                f'{np.sqrt(np.mean(np.square(apart))):.1f} standard deviations on the average'
+                f'{np.sqrt(np.mean(np.square(differences))):.1f} standard deviations on the '
+                'average'
             )
             continue
         for row in rows:

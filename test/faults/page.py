@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The tables of docs/faults.md, which the tests write (FAULTS_PAGE=write or add) or compare.
+"""The tables of observed.md, which the tests write (FAULTS_PAGE=write or add) or compare.
 
 ``write`` replaces the rows that were tried; ``add`` keeps what they were before as well: where a
 fault ends differently from time to time, the page has a line for each.
@@ -11,7 +11,7 @@ import os
 import re
 from pathlib import Path
 
-PAGE = Path(__file__).parents[2] / 'docs' / 'faults.md'
+PAGE = Path(__file__).with_name('observed.md')
 BEGIN, END = '<!-- observed by the tests: {} -->', '<!-- end -->'
 MODE = os.environ.get('FAULTS_PAGE', '')
 WRITES = MODE in ('write', 'add')
@@ -58,7 +58,9 @@ def compare(name: str, heading: tuple[str, ...], row: str, column: str, seen: st
         replace(name, table(heading, lines))
         return
     page = known.get(row, {}).get(column, 'nothing')
-    assert page == seen, f'docs/faults.md is not what was observed (make faults): {row}, {column}'
+    assert page == seen, (
+        f'test/faults/observed.md is not what was observed (make faults): {row}, {column}'
+    )
 
 
 def same(first: tuple[str, ...], second: tuple[str, ...]) -> bool:

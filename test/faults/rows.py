@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The faults of docs/faults.md that are tried on real nodes.
+"""The faults of test/faults/observed.md that are tried on real nodes.
 
 A row is one fault in the middle of a running collection (`faults.observation`).
 """

@@ -3,7 +3,8 @@
 
 Real drivers and real sockets, fake devices that do the wrong things. Whatever happens: no reading
 from where the marker never was, and readings again once the fault is over. `make faults` writes
-the tables of docs/faults.md; what the nodes make of faults is in test/system/test_fault_rows.py.
+the tables of test/faults/observed.md; what the nodes make of faults is in
+test/system/test_fault_rows.py.
 """
 
 from __future__ import annotations

@@ -153,7 +153,7 @@ DISCOVER = {
         ('--effect', 'encoder_scale@2:0.4'),
         'undetermined',
         'caution',
-        'two explanations fit equally well',
+        'two causes explain it equally well',
     ),
 }
 
@@ -212,7 +212,7 @@ def test_causes_that_do_harm_on_held_out_poses_are_not_returned(tmp_path: Path) 
             assert abs(after['mean_deg'] - before['mean_deg']) < 0.3 * after['std_deg']
     page, mood, _ = page_of(out)
     assert mood == 'caution'
-    assert 'Something is there that no cause explains' in page
+    assert 'Errors remain that no known cause explains' in page
     assert left['next'] in page
 
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Faults in running collections of real nodes, and the page of them.
 
-`make faults` tries every row and writes docs/faults.md, `make qualify` compares with it. What is
-injected is in `faults.rows`, and what must hold whatever happens in `faults.observation`.
+`make faults` tries every row and writes test/faults/observed.md, `make qualify` compares with it.
+What is injected is in `faults.rows`, and what must hold whatever happens in `faults.observation`.
 """
 
 import itertools
@@ -98,7 +98,9 @@ def compare(section, row):
         write(section, row)
         return
     known, lines = is_on_page(section, row)
-    assert known, f'docs/faults.md is not what was observed (make faults):\n{row}\n{lines}'
+    assert known, (
+        f'test/faults/observed.md is not what was observed (make faults):\n{row}\n{lines}'
+    )
 
 
 def cells(row, seen):

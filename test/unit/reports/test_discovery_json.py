@@ -351,7 +351,7 @@ def test_what_is_no_better_in_the_figures_shown_is_not_to_be_loaded(monkeypatch)
     # What the reader of the file refuses is not offered, however well it predicts.
     assert results[-1].file.endswith('compensation.json')
     model.largest_slope = lambda: 1.5
-    discovery_json._everything.cache_clear()
+    discovery_json._arm_with_effects.cache_clear()
     assert loadable(found)[-1].file == ''
 
 

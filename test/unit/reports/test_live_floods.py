@@ -228,7 +228,7 @@ def test_a_full_pipe_is_not_waited_for(monkeypatch):
     os.set_blocking(write, True)
     with os.fdopen(write, 'w') as pipe:
         monkeypatch.setattr(sys, 'stderr', pipe)
-        rarely = live_server._Rarely()
+        rarely = live_server._RareHandler()
         rarely.note('a line')
         rarely.note('another')
         # Now somebody reads.
