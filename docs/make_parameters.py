@@ -57,8 +57,8 @@ def section(node: str) -> str:
         [
             f'## {node}',
             '',
-            '| parameter | default | unit | range | what it is |',
-            '|---|---|---|---|---|',
+            '| parameter | what it is (default; range) |',
+            '|---|---|',
             *rows,
             '',
         ]
@@ -68,15 +68,18 @@ def section(node: str) -> str:
 def row(field: dataclasses.Field[Any]) -> str:
     """Return the table row of one parameter."""
     meta = field.metadata
-    cells = (
-        f'`{field.name}`',
-        f'`{json.dumps(field.default)}`',
-        meta['unit'],
-        limits(meta['low'], meta['high'], meta['choices'])
-        + ('' if meta['off'] is None else f', or {meta["off"]:g}'),
-        meta['description'],
+    default = ' '.join(filter(None, (f'`{json.dumps(field.default)}`', meta['unit'])))
+    allowed = ', or '.join(
+        filter(
+            None,
+            (
+                limits(meta['low'], meta['high'], meta['choices']),
+                '' if meta['off'] is None else f'{meta["off"]:g}',
+            ),
+        )
     )
-    return f'| {" | ".join(cells)} |'
+    facts = '; '.join(filter(None, (default, allowed)))
+    return f'| `{field.name}` | {meta["description"]} ({facts}) |'
 
 
 def limits(low: float | None, high: float | None, choices: tuple[str, ...]) -> str:

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from enum import StrEnum
 from pathlib import Path
 
-from remaster_ros.motion.states import ARM, CONSENT, PLACE, Arm, Consent, Event, Place, Then
+from remaster_ros.motion.states import ARM, Arm, Event, Then
 
 PAGE = Path(__file__).parent / 'safety.md'
 BEGIN, END = '<!-- states: written by make docs -->', '<!-- end of states -->'
@@ -56,14 +56,7 @@ def states() -> str:
         for state, rows in ARM.items()
     }
     words = [event for event in Event if any(event in rows for rows in ARM.values())]
-    parts = [drawing(), table(words, arm)]
-    for states_of, kept in ((Place, PLACE), (Consent, CONSENT)):
-        events = list(dict.fromkeys(event for rows in kept.values() for event in rows))
-        cells = {
-            state: {event: str(then) for event, then in kept[state].items()} for state in states_of
-        }
-        parts.append(table(events, cells))
-    return '\n\n'.join(parts)
+    return '\n\n'.join((drawing(), table(words, arm)))
 
 
 def page(text: str) -> str:

@@ -3,7 +3,7 @@
 
 `ARM`: what the arm does by this program, and what leaves the bridge with each step. `PLACE`: how
 far it is known that the arm is where it is reported, and so which move comes next. `CONSENT`:
-whether the program may go on by itself. Each is drawn on docs/safety.md as it stands here. What
+whether the program may go on by itself. The first is on docs/safety.md as it stands here. What
 has no row in `ARM` does not happen: the supervisor halts the arm where it is asked for.
 """
 
