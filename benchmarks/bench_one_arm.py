@@ -18,7 +18,7 @@ from common import table
 from worlds.hidden_sessions import NOISES, Recipe, another_session, hidden_session
 
 from remaster_ros.calibration.mistakes import sound_estimate
-from remaster_ros.calibration.one_arm import OffsetsApart, offsets_apart
+from remaster_ros.calibration.one_arm import OffsetDifferences, offset_differences
 from remaster_ros.types import Session
 
 KINDS: tuple[tuple[str, ...], ...] = (
@@ -33,12 +33,12 @@ ROBOTS = ('iiwa7', 'six', 'ur10')
 FIRST_SEED = 700
 
 
-def compared(one: Session, other: Session) -> OffsetsApart | None:
+def compared(one: Session, other: Session) -> OffsetDifferences | None:
     """Compare the offsets of two sessions."""
-    return offsets_apart(*(sound_estimate(session) for session in (one, other)))
+    return offset_differences(*(sound_estimate(session) for session in (one, other)))
 
 
-def word(found: OffsetsApart | None) -> str:
+def word(found: OffsetDifferences | None) -> str:
     """Return what is said of a pair."""
     if found is None:
         return 'not comparable'

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From observations to joint offsets with their uncertainty."""
+"""Joint offsets with their uncertainty, from observations."""

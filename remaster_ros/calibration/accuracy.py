@@ -2,9 +2,9 @@
 """The paper's three measures of accuracy, section V of Van Wyk et al.
 
 The first two are free of the gauge: the relative error compares distances; the absolute one
-compares points in the sensor's frame, where a turn of joint 1 and of the registration cancel. Of
-the third there are two versions, see `theoretical`. Means and the 2.5 and 97.5 % quantiles are
-over configurations (and draws), in mm, as in Tables III to VIII.
+compares points in the sensor's frame, in which a rotation of joint 1 and of the registration
+cancel. There are two versions of the third, see `theoretical`. Means and the 2.5 and 97.5 %
+quantiles are over configurations (and draws), in mm, as in Tables III to VIII.
 """
 
 from __future__ import annotations
@@ -27,28 +27,28 @@ from remaster_ros.calibration.predictive_accuracy import (
 )
 from remaster_ros.types import FloatArray, IntArray, Measurements
 
-# Of more pairs of solutions (100,000 rows at three dozen poses have 1e8) this many are drawn.
+# Largest number of pairs of solutions; of more (100,000 rows at three dozen poses have 1e8) this
+# number is drawn.
 MOST_PAIRS = 200_000
 THEORETICAL = ('theoretical', 'paper_theoretical')
 
 
 def summary(errors: FloatArray) -> dict[str, Any]:
-    """Return mean and 95 % interval of errors in m as ``mean_mm`` and ``interval95_mm``."""
+    """Mean and 95 % interval of errors in m as ``mean_mm`` and ``interval95_mm``."""
     low, high = np.quantile(errors, (0.025, 0.975)) * 1e3
     return {'mean_mm': float(np.mean(errors) * 1e3), 'interval95_mm': [float(low), float(high)]}
 
 
 def unavailable(names: Sequence[str], why: str) -> dict[str, Any]:
-    """Return a metric that the session does not allow, with the reason."""
+    """Metric without numbers, with the reason why the session has none."""
     return {**dict.fromkeys(names), 'why': why}
 
 
 def solution_pairs(measurements: Measurements, rng: np.random.Generator) -> IntArray:
-    """Return the rows i < j seen by the same sensor on the same marker at the same pose, (m, 2).
+    """Rows i < j seen by the same sensor on the same marker at the same pose, (m, 2).
 
     The sums of eq. 17 of Van Wyk et al.; rows of one configuration are the same solution and make
-    no pair, nor do those of an arm that moved. Of more than 200,000 pairs as many are drawn at
-    random.
+    no pair, nor do those of an arm that moved. At most 200,000 pairs, drawn at random from more.
     """
     if measurements.velocity is not None:
         # Rows of a moving arm's segment are no solutions of one pose.
@@ -74,11 +74,10 @@ def solution_pairs(measurements: Measurements, rng: np.random.Generator) -> IntA
 def relative_errors(
     measurements: Measurements, predicted: FloatArray, pairs: IntArray
 ) -> FloatArray:
-    """Return the difference of measured and modelled distances between solutions (eq. 17).
+    """Absolute difference of measured and modelled distances between solutions (eq. 17), m, (m,).
 
-    ``measurements``: n observations; ``predicted``: where the model has the markers, in any one
-    frame per sensor, m, (n, 3); ``pairs``: of `solution_pairs`, (m, 2).
-    Returns m, (m,).
+    ``measurements``: n observations; ``predicted``: modelled markers in any one frame per sensor,
+    m, (n, 3); ``pairs``: of `solution_pairs`, (m, 2).
     """
     first, second = pairs.T
     measured = np.linalg.norm(measurements.position[first] - measurements.position[second], axis=1)
@@ -95,25 +94,24 @@ def accuracy_of(
     rng: np.random.Generator,
     modelled: ToolOrientations | None = None,
 ) -> dict[str, Any]:
-    """Return the three metrics before and after, as fit.json has them.
+    """The three metrics before and after, as fit.json has them.
 
     Parameters
     ----------
     measurements
         n observations.
     fitted
-        Indices of the optimization rows that count, those not left out. A split without rows
-        gives None, the validation rows are all of them.
+        Indices of the optimization rows that were not left out. A split without rows gives None;
+        the validation split has all validation rows.
     predicted_before, predicted_after
         Modelled markers in the sensors' frames with offsets at zero and as estimated, m, (n, 3).
     predictive
-        For the theoretical metric, with the pinned parameters of the fit with offsets at zero;
-        None where no posterior is at hand.
+        For the theoretical metric: the posterior, and the pinned parameters of the fit with
+        offsets at zero; None without a posterior.
     rng
         For the theoretical metric.
     modelled
-        Where full poses were measured, the modelled orientations: then their errors stand beside
-        those of the positions.
+        Modelled orientations if full poses were measured: the metrics then include their errors.
     """
     at_random: dict[str, Any] = {}
     if predictive is not None:
@@ -148,7 +146,7 @@ def _measured(
     chosen: IntArray,
     pairs: IntArray,
 ) -> dict[str, Any]:
-    """Return the two metrics that need no posterior, of the chosen rows and pairs of them."""
+    """The two metrics that need no posterior, of the chosen rows and pairs."""
     predicted = {'before': predicted_before, 'after': predicted_after}
     if len(pairs) > 0:
         relative = {
@@ -170,7 +168,7 @@ def _measured(
 
 
 def _theoretical(both: Sequence[Distances], suffix: str = '') -> dict[str, Any]:
-    """Return the summaries of the invariant and of the paper's version."""
+    """Summaries of the invariant version and of the paper's version."""
     return {
         name + suffix: {side: summary(values) for side, values in distances._asdict().items()}
         for name, distances in zip(THEORETICAL, both, strict=True)

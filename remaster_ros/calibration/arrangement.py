@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Are a session's tables as the robot has it? Signs, order, zeros, units and rows, tried on data.
+"""Arrangements of a table that fit the robot: signs, order, zeros, units and rows, by trial.
 
-Tables of others have a joint that counts the other way round, columns in another order, a zero
-position 90 degrees off, other units, points beside the joints of another row. Every such
+A foreign table may have a joint that counts in the other direction, columns in another order, a
+zero position 90 degrees off, other units, or points next to the joints of another row. Each such
 arrangement is tried in closed form: with any 3×3 matrix G in the place of the sensor's rotation
 and scale (as in `initial_guess`),
 
     T_R_T(q) · marker = G p + t
 
-is linear in marker, G and t. What comes nearest is fitted as any session is. What is otherwise
-from a row on, or of the tool, is tried in `mistakes`.
+is linear in marker, G and t. The nearest arrangements are fitted as any session is. Changes from a
+row on, or of the tool, are tried in `mistakes`.
 """
 
 from __future__ import annotations
@@ -34,70 +34,70 @@ from remaster_ros.kinematics.serial_chain import LIMIT_TOLERANCE_RAD, SerialChai
 from remaster_ros.kinematics.transforms import rotation_vector_to_matrix
 from remaster_ros.types import BoolArray, FloatArray, IntArray, Measurements, Session
 
-# Fewer rows fit to one of so many arrangements by chance: each point has 3 coordinates, the linear
-# problem 15 unknowns.
+# Least number of rows: fewer fit to one of the arrangements by chance, as a point has 3
+# coordinates and the linear problem 15 unknowns.
 FEWEST_ROWS = 12
-# Rows that are tried at most, evenly spread; in the linear problem, of 15 unknowns, fewer do.
+# Largest numbers of rows, evenly spread, in the fit and in the linear problem of 15 unknowns.
 MOST_ROWS = 200
 _MOST_LINEAR = 40
-# The fit leaves out so many gross rows; of the others, a tenth of three-dimensional Gaussian
-# errors is longer than so many standard deviations.
+# Share of rows that the fit keeps; and the length, in standard deviations, that this share of
+# three-dimensional Gaussian errors does not exceed.
 _MOST = 1.0 - LARGEST_SHARE
 _MOST_CHI3 = 2.5003
-# An arrangement is proposed if it fits so many times as well.
+# Factor by which an arrangement must fit better than the given one to be proposed.
 CONVINCING = 5.0
-# Those whose errors are less than so many times those of the closest fit as well: the offsets that
-# an arm has leave some of any two the larger error.
+# Fits with errors below this factor times those of the closest one are proposed too: the offsets
+# of an arm leave a larger error with one of any two.
 ALIKE = 2.0
-# So many of the best linear ones are fitted, those whose error is no larger share of the points'
-# extent: zero-offsets of some degrees leave less.
+# Number of the best linear solutions that are fitted, and the largest error of these as a share of
+# the points' extent: zero-offsets of some degrees leave less.
 _FITTED = 6
 _LARGEST_LINEAR = 0.15
-# Frames of so many rows at a time, to bound the memory.
+# Rows that are computed at once, to bound the memory.
 _BATCH_FRAMES = 20_000
 _QUARTER = np.pi / 2.0
-# What belongs to the joints of a row and not to its point.
+# Columns that belong to the joints of a row, not to its point.
 _OF_JOINTS = (
     *('pose', 'configuration', 'is_validation', 'is_reference'),
     *('q', 'from_q', 'effort', 'wanted', 'correction', 'velocity', 'acceleration'),
 )
-# Of angles that are degrees taken for radians, and the other way round.
+# Scales of angles: right, degrees taken for radians, radians taken for degrees.
 _SCALES = (1.0, np.pi / 180.0, 180.0 / np.pi)
 
 
 @dataclass(frozen=True)
 class Arrangement:
-    """How the robot's joints come from the k columns of a table."""
+    """Relation of the robot's joints and points to the columns of a table."""
 
     order: tuple[int, ...]  # Column of each joint, base to tip
     signs: tuple[int, ...]  # 1 or -1 for each joint
-    quarters: tuple[int, ...]  # What is added to each joint, in quarters of a turn
-    angle_scale: float = 1.0  # What the angles are multiplied by
-    # What joint 3 takes of joint 2: 1 or -1 on arms that count it from the horizontal (FANUC, and
-    # arms with a parallelogram), else 0
+    quarters: tuple[int, ...]  # Quarter turns added to each joint
+    angle_scale: float = 1.0  # Factor of the angles
+    # Factor of joint 2 that is added to joint 3: 1 or -1 on arms that count joint 3 from the
+    # horizontal (FANUC, and arms with a parallelogram), else 0
     coupled: int = 0
-    mirrored: bool = False  # True where X and Y of the points are exchanged
-    length_scale: float = 1.0  # What the points are multiplied by
-    # A row's point belongs to the joints so many rows before, of those with its sensor and marker
+    mirrored: bool = False  # Whether X and Y of the points are exchanged
+    length_scale: float = 1.0  # Factor of the points
+    # Number of rows, of the same sensor and marker, by which points come after their joints
     shift: int = 0
-    # Indices of two markers whose labels are exchanged; () where none are
+    # Indices of two markers whose labels are exchanged; () for none
     exchanged: tuple[int, ...] = ()
-    # Observations between which rows are shifted or labels exchanged, the latter excluded; None
-    # where from the first, or to the last
+    # Observations from which (inclusive) and until which (exclusive) rows are shifted or labels
+    # exchanged; None for the first and behind the last
     since: int | None = None
     until: int | None = None
-    # Axis and quarters of a turn by which the markers' places are turned in the tool frame
+    # Axis, and quarter turns by which the markers are turned about it in the tool frame
     turned: tuple[int, int] = (0, 0)
-    tip_link: str = ''  # Tool frame; '' where as given
+    tip_link: str = ''  # Tool frame; '' for the given one
 
     @classmethod
     def given(cls, joints: int) -> Arrangement:
-        """Return the arrangement of a table that is right as it is."""
+        """Arrangement of a table that needs no change."""
         return cls(tuple(range(joints)), (1,) * joints, (0,) * joints)
 
     @property
     def changes(self) -> int:
-        """How many things are other than given."""
+        """Number of changes from the given arrangement; rare ones count more."""
         # Two that are exchanged are one thing, and so are all of them tip to base.
         moved = sum(column != joint for joint, column in enumerate(self.order)) // 2
         return (
@@ -119,7 +119,7 @@ class Arrangement:
         )
 
     def joints(self, columns: FloatArray) -> FloatArray:
-        """Return the robot's joint angles, rad, (n, k), of the columns (n, k)."""
+        """Joint angles of the robot, rad, (n, k), from the columns (n, k)."""
         turned = columns[:, list(self.order)] * self.angle_scale
         if self.coupled:
             turned[:, 2] += self.coupled * turned[:, 1]
@@ -132,39 +132,39 @@ class Arrangement:
         return scale * columns[:, list(self.order)] * np.array(self.signs)
 
     def points(self, points: FloatArray) -> FloatArray:
-        """Return the points, m, (n, 3), of the table's."""
+        """Points, m, (n, 3), from those of the table."""
         return (points[:, [1, 0, 2]] if self.mirrored else points) * self.length_scale
 
 
 @dataclass(frozen=True, eq=False)
 class Fitted:
-    """A robust fit of one arrangement."""
+    """Robust fit of one arrangement."""
 
-    arrangement: Arrangement  # The arrangement
+    arrangement: Arrangement
     error_m: float  # Median distance of the points from the fit, m
-    # rad, or m of joints that slide, and how much of that counts as a radian, (k,); 0 where the
-    # data do not determine them, as of the outer two
+    # rad, m for prismatic joints, (k,); 0 for offsets that the data do not determine, such as
+    # those of the outer two joints
     joint_offsets: FloatArray
-    marker_shift_m: float  # Largest distance of a marker from where it was said to be, m
-    # The distance that nine of ten points keep within, as a median of Gaussian errors, m: larger
-    # than the median where a part of the points is off
+    marker_shift_m: float  # Largest distance of a marker from its stated position, m
+    # 90 % quantile of the distances, scaled to the median of Gaussian errors, m: larger than the
+    # median if a part of the points is off
     most_error_m: float
-    per_radian: FloatArray
+    per_radian: FloatArray  # Offset of each joint that counts as a radian, (k,)
 
     @property
     def gross(self) -> bool:
-        """Whether the table is hardly that of this robot."""
+        """Whether the table is unlikely to be that of this robot."""
         turned = np.abs(self.joint_offsets) > LARGEST_OFFSET * self.per_radian
-        return bool(self.left_m > UNCALIBRATED_ERROR_M or turned.any())
+        return bool(self.worst_error_m > UNCALIBRATED_ERROR_M or turned.any())
 
     @property
-    def left_m(self) -> float:
-        """What the fit leaves, also where it leaves it in a part of the points alone, m."""
+    def worst_error_m(self) -> float:
+        """Larger one of the median and the scaled quantile, m."""
         return max(self.error_m, self.most_error_m)
 
 
 def arranged(session: Session, arrangement: Arrangement) -> Session:
-    """Return a session with its joints, points, labels and tool rearranged."""
+    """Session with its joints, points, labels and tool rearranged."""
     m = session.measurements
     moved = replace(
         m,
@@ -195,7 +195,7 @@ def arranged(session: Session, arrangement: Arrangement) -> Session:
 
 
 def between(m: Measurements, since: int | None, until: int | None) -> BoolArray:
-    """Return which rows stand from one observation on and before another, (n,)."""
+    """Mask of the rows from one observation on and before another, (n,)."""
     row = np.arange(len(m))
     first = 0 if since is None else _row_of(m, since)
     last = len(m) if until is None else _row_of(m, until)
@@ -203,12 +203,13 @@ def between(m: Measurements, since: int | None, until: int | None) -> BoolArray:
 
 
 def _row_of(m: Measurements, observation: int) -> int:
+    """Index of the first row of an observation; the number of rows if there is none."""
     found = np.flatnonzero(m.observation == observation)
     return int(found[0]) if len(found) else len(m)
 
 
 def exchanged(m: Measurements, a: int, b: int, concerned: BoolArray) -> Measurements:
-    """Return the measurements with the labels of two markers exchanged in the rows concerned."""
+    """Measurements with the labels of two markers exchanged in the concerned rows."""
     marker = m.marker.copy()
     marker[concerned & (m.marker == a)] = b
     marker[concerned & (m.marker == b)] = a
@@ -216,37 +217,43 @@ def exchanged(m: Measurements, a: int, b: int, concerned: BoolArray) -> Measurem
 
 
 def shifted(m: Measurements, shift: int, concerned: BoolArray) -> Measurements:
-    """Return the measurements with each point beside the joints so many rows before its own.
+    """Measurements with each concerned point next to the joints `shift` rows before.
 
-    The rows of each sensor and marker are moved among themselves; those without joints are left
+    The rows of each sensor and marker are shifted among themselves; those without joints are left
     out.
     """
-    of, kept = came_from(m, shift, concerned)
+    joint_rows, kept = joint_rows_of_points(m, shift, concerned)
     joints: dict[str, Any] = {
-        name: None if (column := getattr(m, name)) is None else column[of] for name in _OF_JOINTS
+        name: None if (column := getattr(m, name)) is None else column[joint_rows]
+        for name in _OF_JOINTS
     }
     return replace(m, **joints).select(kept)
 
 
-def came_from(m: Measurements, shift: int, concerned: BoolArray) -> tuple[IntArray, BoolArray]:
-    """Return the row whose joints belong to each point, (n,), and which points have one, (n,)."""
-    of, kept = np.arange(len(m)), np.ones(len(m), bool)
+def joint_rows_of_points(
+    m: Measurements, shift: int, concerned: BoolArray
+) -> tuple[IntArray, BoolArray]:
+    """Row whose joints belong to each point, (n,), and mask of the points that have one, (n,)."""
+    joint_rows, kept = np.arange(len(m)), np.ones(len(m), bool)
     for rows in streams(m):
-        mine = rows[concerned[rows]]
-        of[mine] = np.roll(mine, shift)
-        kept[mine[:shift] if shift > 0 else mine[shift:]] = False
-    return of, kept
+        shifted_rows = rows[concerned[rows]]
+        joint_rows[shifted_rows] = np.roll(shifted_rows, shift)
+        kept[shifted_rows[:shift] if shift > 0 else shifted_rows[shift:]] = False
+    return joint_rows, kept
 
 
 def streams(m: Measurements) -> Iterator[IntArray]:
-    """Give the rows of each sensor and marker, in their order."""
+    """Yield the rows of each pair of sensor and marker, in their order."""
     _, which = np.unique(np.stack((m.sensor, m.marker)), axis=1, return_inverse=True)
     for index in np.unique(which):
         yield np.flatnonzero(which.ravel() == index)
 
 
 def some_rows(session: Session) -> Session:
-    """Return the optimization rows of a session, or evenly spread ones where there are many."""
+    """The optimization rows of a session.
+
+    Evenly spread ones if there are more than `MOST_ROWS`.
+    """
     rows = np.flatnonzero(~session.measurements.is_validation)
     if len(rows) > MOST_ROWS:
         rows = rows[np.linspace(0, len(rows) - 1, MOST_ROWS).astype(np.int64)]
@@ -254,9 +261,9 @@ def some_rows(session: Session) -> Session:
 
 
 def closest_fit(problem: Problem) -> tuple[Model, FloatArray, Rows]:
-    """Return the model, its parameters (size,) and the rows of the best of a few starts.
+    """Model, parameters (size,) and rows of the best of a few starts.
 
-    Raises InsufficientDataError: too few rows or poses to register a sensor.
+    Raises InsufficientDataError if there are too few rows or poses to register a sensor.
     """
     model = problem.empty_model()
     start, z = closest_start(
@@ -273,10 +280,7 @@ def closest_fit(problem: Problem) -> tuple[Model, FloatArray, Rows]:
 def fit_arrangement(session: Session, arrangement: Arrangement) -> Fitted:
     """Fit one arrangement robustly, however badly it fits.
 
-    Raises
-    ------
-    InsufficientDataError
-        Too few rows or poses to register a sensor.
+    Raises InsufficientDataError if there are too few rows or poses to register a sensor.
     """
     problem = Problem.of(some_rows(arranged(session, arrangement)))
     start, z, rows = closest_fit(problem)
@@ -299,15 +303,14 @@ def fit_arrangement(session: Session, arrangement: Arrangement) -> Fitted:
 def determined_offsets(
     model: Model, z: FloatArray, rows: Rows, priors: Sequence[Prior], sigma: float
 ) -> FloatArray:
-    """Return the offsets of a fit, rad, (k,); 0 where their value says nothing.
+    """Offsets of a fit, rad, (k,); 0 for offsets that the data do not determine.
 
-    That of the joint before one that never moves, for instance, turns the marker about it.
-
-    ``sigma``: standard deviation of the errors, per axis, m.
+    An example is the joint before one that never moves, which turns the marker about it.
+    ``sigma``: standard deviation of the errors per axis, m.
     """
     derivative = model.jacobian(z, rows).reshape(3 * len(rows), -1) / sigma
     _, by_z = prior_rows(model, priors, z)
-    # So little that 10 rad and 10 m are known: what nothing determines has to have some value.
+    # A weak prior of 10 rad and 10 m, so that the matrix can be inverted.
     H = derivative.T @ derivative + by_z.T @ by_z + 1e-2 * np.eye(len(z))
     std = np.sqrt(np.diag(np.linalg.inv(H)))
     offsets = model.offsets(z)
@@ -318,12 +321,11 @@ def determined_offsets(
 def linear_errors(
     chain: SerialChain, session: Session, arrangements: Sequence[Arrangement]
 ) -> tuple[FloatArray, FloatArray]:
-    """Return how near each arrangement comes to the points in the linear problem.
+    """Errors of arrangements in the linear problem, as shares of the points' extent.
 
-    Only the sensor and marker with most rows are looked at.
-
-    Returns errors: Median distance over the extent of the points, (arrangements,); scales: Signed:
-    metres of the robot for one of the points, negative where G mirrors them.
+    Only the sensor and marker with most rows are used. Returns errors: median distance over the
+    extent of the points, (arrangements,); and scales: metres of the robot for one unit of the
+    points, negative if G mirrors them.
     """
     m = session.measurements
     rows = max(streams(m), key=len)
@@ -343,24 +345,24 @@ def linear_errors(
 def linear_fit(
     chain: SerialChain, q: FloatArray, points: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return how near joints come to points in the linear problem, whatever the points' unit.
+    """Errors of joints against points in the linear problem, whatever the points' unit.
 
     Parameters
     ----------
     q
-        rad, (m, n, k): of m ways to have n rows.
+        m alternatives for the joints of n rows, rad, (m, n, k).
     points
         (n, 3).
 
     Returns
     -------
     errors, scales
-        As of `linear_errors`, (m,).
+        As in `linear_errors`, (m,).
     """
     n = len(points)
     centred = points - points.mean(axis=0)
     extent = np.median(np.linalg.norm(centred, axis=1))
-    # What G and t can do is projected out; it is the same for all of them.
+    # The columns of G and t are projected out; they are the same for all alternatives.
     base = np.linalg.svd(np.column_stack((centred, np.ones(n))), full_matrices=False)[0]
     tools = chain.forward(q)
     flat = tools[..., :3, :].reshape(len(q), n, 12)
@@ -369,7 +371,7 @@ def linear_fit(
     target = -left[..., 3].reshape(len(q), 3 * n, 1)
     by_marker = np.swapaxes(design, 1, 2)
     normal = by_marker @ design
-    # Where the tool hardly turns, the marker is not determined, and stays near the tool.
+    # If the tool hardly turns, the marker is not determined, and stays near the tool.
     ridge = 1e-9 * np.trace(normal, axis1=1, axis2=2)[:, None, None] + 1e-15
     marker = np.linalg.solve(normal + ridge * np.eye(3), by_marker @ target)
     residual = (design @ marker - target).reshape(len(q), n, 3)
@@ -384,22 +386,20 @@ def linear_fit(
 
 
 def search(session: Session, given: Fitted, lengths: Sequence[float] = ()) -> list[Fitted]:
-    """Find the arrangements that fit where the given one is gross, the simplest first.
+    """Arrangements that fit, if the given one is gross, the simplest first.
 
-    Several of them can fit equally well: an arm with a plane of symmetry, mirrored, is the same
-    arm with some joints reversed.
+    Several can fit equally well: an arm with a plane of symmetry, mirrored, is the same arm with
+    some joints reversed. Units, orders, zero positions by quarter turns, a coupling of joint 3 to
+    joint 2, and rows shifted by one are tried, all of them with any signs.
 
-    Tried are units, the order, zero positions by quarters of a turn, joint 3 coupled to joint 2,
-    and rows shifted by one, all of them with any signs.
-
-    ``session``: with its markers open: one that is firm at a wrong place would bend the fit;
-    ``given``: the fit of the table as it is; ``lengths``: length scales that are likely: metres of
-    other units over those of the given one.
+    ``session``: with free markers, since fixed ones at wrong positions would bend the fit;
+    ``given``: fit of the table as it is; ``lengths``: likely length scales, in metres of other
+    units over those of the given one.
     """
     if len(session.measurements) < FEWEST_ROWS:
         return []
     chain = SerialChain.from_urdf(session.urdf, session.base_link, session.tip_link)
-    if given.left_m <= UNCALIBRATED_ERROR_M:
+    if given.worst_error_m <= UNCALIBRATED_ERROR_M:
         turns = np.round(given.joint_offsets / _QUARTER).astype(int)
         if not np.any(turns % 4):
             return []
@@ -421,25 +421,25 @@ def search(session: Session, given: Fitted, lengths: Sequence[float] = ()) -> li
             fit = fit_arrangement(session, arrangement)
         except (InsufficientDataError, np.linalg.LinAlgError):
             continue
-        convincing = fit.left_m * CONVINCING < given.left_m
-        if not fit.gross and (given.left_m <= UNCALIBRATED_ERROR_M or convincing):
+        convincing = fit.worst_error_m * CONVINCING < given.worst_error_m
+        if not fit.gross and (given.worst_error_m <= UNCALIBRATED_ERROR_M or convincing):
             found.append(fit)
     return closest(found)
 
 
 def closest(found: Sequence[Fitted]) -> list[Fitted]:
-    """Return the fits that are about as close as the closest, the simplest first."""
-    best = min((fit.left_m for fit in found), default=0.0)
-    alike = [fit for fit in found if fit.left_m < ALIKE * best]
-    return sorted(alike, key=lambda fit: (fit.arrangement.changes, fit.left_m))
+    """Fits with errors near the smallest ones, the simplest first."""
+    best = min((fit.worst_error_m for fit in found), default=0.0)
+    alike = [fit for fit in found if fit.worst_error_m < ALIKE * best]
+    return sorted(alike, key=lambda fit: (fit.arrangement.changes, fit.worst_error_m))
 
 
 def within_limits(
     arrangement: Arrangement, chain: SerialChain, columns: FloatArray
 ) -> Arrangement | None:
-    """Return the arrangement, whole turns added, with which all angles keep the joints' limits.
+    """Arrangement with whole turns added so that all angles keep the joints' limits.
 
-    None where there is none: what was measured on this arm, and a reader takes, keeps them.
+    None if there is none: data measured on this arm keep them.
     """
     q = arrangement.joints(columns)
     low, high = q.min(axis=0) + LIMIT_TOLERANCE_RAD, q.max(axis=0) - LIMIT_TOLERANCE_RAD
@@ -460,7 +460,7 @@ def within_limits(
 
 
 def keeps_limits(chain: SerialChain, q: FloatArray, joint: int) -> bool:
-    """Return whether all angles of a joint, rad, (n,), are within its limits."""
+    """Whether all angles of a joint, rad, (n,), are within its limits."""
     low, high = chain.lower[joint] - LIMIT_TOLERANCE_RAD, chain.upper[joint] + LIMIT_TOLERANCE_RAD
     return bool(np.all((q >= low) & (q <= high)))
 
@@ -468,7 +468,7 @@ def keeps_limits(chain: SerialChain, q: FloatArray, joint: int) -> bool:
 def _nearest(
     chain: SerialChain, session: Session, lengths: Sequence[float]
 ) -> Iterator[Arrangement]:
-    """Give the arrangements of each kind that come nearest in the linear problem."""
+    """Yield the arrangements of each kind that come nearest in the linear problem."""
     everywhere = np.ones(len(session.measurements), bool)
     for shift, candidates in _stages(len(chain)):
         m = session.measurements
@@ -487,7 +487,7 @@ def _nearest(
 
 
 def _stages(joints: int) -> Iterator[tuple[int, list[Arrangement]]]:
-    """Give the kinds of arrangements, each with any signs, and by how much rows are shifted."""
+    """Yield the row shift and the arrangements of each kind, with all signs."""
     plain = Arrangement.given(joints)
     signs = list(product((1, -1), repeat=joints))
     yield 0, [replace(plain, signs=some, angle_scale=by) for by in _SCALES for some in signs]
@@ -500,7 +500,7 @@ def _stages(joints: int) -> Iterator[tuple[int, list[Arrangement]]]:
 
 
 def _orders(joints: int) -> Iterable[tuple[int, ...]]:
-    """Give the likely orders: tip to base, any two exchanged, all moved along by one."""
+    """Likely orders of columns: tip to base, any two exchanged, all moved along by one."""
     plain = list(range(joints))
     orders = {tuple(plain[::-1]), (*plain[1:], 0), (joints - 1, *plain[:-1])}
     for a, b in combinations(plain, 2):
@@ -511,9 +511,9 @@ def _orders(joints: int) -> Iterable[tuple[int, ...]]:
 
 
 def _turns(joints: int) -> Iterable[tuple[int, ...]]:
-    """Give zero positions of up to two inner joints that are off by quarters of a turn.
+    """Zero positions of up to two inner joints, in quarter turns.
 
-    Those of the outer two are taken up by the registration and by the marker.
+    Those of the outer two joints are absorbed by the registration and the marker.
     """
     turns = set()
     for pair in combinations(range(1, joints - 1), min(2, max(joints - 2, 0))):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A fit beside the same one with all offsets held at zero."""
+"""Comparison of a fit with the same fit with all offsets at zero."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ from remaster_ros.types import FloatArray, IntArray
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """What the offsets change."""
+    """Residuals and accuracy without and with the offsets."""
 
     T_R_N_before: Mapping[str, FloatArray]  # Registrations with the offsets at zero, by sensor
-    # Measured minus modelled position in N for every row of the session, m, (n, 3)
+    # Measured minus modelled position in N with the offsets at zero, all rows, m, (n, 3)
     residuals_before: FloatArray
     accuracy: Mapping[str, Any]  # The three metrics as fit.json has them
 
@@ -36,11 +36,11 @@ def compared(
     predictive: Predictive,
     rng: np.random.Generator,
 ) -> Comparison:
-    """Compare.
+    """Compare a fit with the fit with offsets at zero.
 
-    ``problem``: what was fitted; ``kept``: indices of the fitted rows that count; ``before,
-    after``: pinned parameters with offsets at zero and as estimated, (size,); ``predictive``: the
-    posterior as predictions take it; ``rng``: for the theoretical metric.
+    ``problem``: the fitted problem; ``kept``: indices of the fitted rows that count; ``before,
+    after``: pinned parameters with offsets at zero and as estimated, (size,); ``predictive``:
+    posterior for predictions; ``rng``: for the theoretical metric.
     """
     model, measurements = predictive.model, problem.measurements
     predicted_before = predicted_rows(problem, model, before)
@@ -61,7 +61,7 @@ def compared(
 
 
 def predicted_rows(problem: Problem, model: Model, z: FloatArray) -> FloatArray:
-    """Return where the sensors should see the markers of all rows by pinned z, (n, 3)."""
+    """Predicted positions of all rows' markers in the sensors' frames, by pinned z, (n, 3)."""
     measurements = problem.measurements
     rows = model.rows(measurements, np.arange(len(measurements))).of_points
     predicted = np.empty((len(measurements), 3))

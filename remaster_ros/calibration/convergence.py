@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Have the chains mixed, and how many independent draws are they worth?
+"""Convergence of chains, and their number of independent draws.
 
 Rank-normalised split R-hat and effective sample sizes of Vehtari, Gelman, Simpson, Carpenter and
 Bürkner (2021), "Rank-normalization, folding, and localization", Bayesian Analysis 16(2),
-doi:10.1214/20-BA1221. ``draws`` has the shape (chains, draws, ...) everywhere; every further index
-is a quantity of its own. The figures of a quantity that never moves are NaN.
+doi:10.1214/20-BA1221. ``draws`` always has the shape (chains, draws, ...); each further index is a
+separate quantity. The diagnostics of a constant quantity are NaN.
 """
 
 from __future__ import annotations
@@ -28,11 +28,10 @@ TAILS = (0.05, 0.95)
 
 
 def r_hat(draws: FloatArray) -> FloatArray:
-    """Return the rank-normalised split R-hat: the larger of the one of the bulk and of the tails.
+    """Rank-normalised split R-hat, (...): the larger one of bulk and tails.
 
-    ``draws``: chains of draws, (chains, draws, ...).
-    Returns (...); near 1 when the chains agree, 1.01 is the usual limit.
-    Raises InsufficientDataError: with fewer than 8 draws in a chain.
+    ``draws``: (chains, draws, ...). Near 1 if the chains agree; 1.01 is the usual limit. Raises
+    InsufficientDataError with fewer than 8 draws in a chain.
     """
 
     def of(flat: FloatArray) -> FloatArray:
@@ -44,12 +43,12 @@ def r_hat(draws: FloatArray) -> FloatArray:
 
 
 def ess_bulk(draws: FloatArray) -> FloatArray:
-    """Return the effective sample size of the centre of the distribution, (...); see `r_hat`."""
+    """Effective sample size of the centre of the distribution, (...); see `r_hat`."""
     return _figures(lambda flat: _effective(_normal_scores(_halves(flat))), draws)
 
 
 def ess_tail(draws: FloatArray) -> FloatArray:
-    """Return the effective sample size of the tails, (...): the smaller of the 5 % and 95 %."""
+    """Effective sample size of the tails, (...): the smaller one of the 5 % and 95 % quantiles."""
 
     def of(flat: FloatArray) -> FloatArray:
         quantiles = np.quantile(flat, TAILS, axis=(0, 1))
@@ -59,7 +58,11 @@ def ess_tail(draws: FloatArray) -> FloatArray:
 
 
 def _figures(of: Callable[[FloatArray], FloatArray], draws: FloatArray) -> FloatArray:
-    """Return a figure of draws (chains, draws, quantities) for every quantity, (...)."""
+    """Apply a diagnostic to draws (chains, draws, ...), for each quantity, (...).
+
+    ``of``: function of draws (chains, draws, quantities). Raises InsufficientDataError for short
+    chains.
+    """
     length = draws.shape[1]
     if length < MINIMUM_DRAWS:
         raise InsufficientDataError(
@@ -77,13 +80,13 @@ def _figures(of: Callable[[FloatArray], FloatArray], draws: FloatArray) -> Float
 
 
 def _halves(draws: FloatArray) -> FloatArray:
-    """Count the halves of chains (c, n, p) as chains of their own, (2 c, n // 2, p)."""
+    """Halves of chains (c, n, p) as separate chains, (2 c, n // 2, p)."""
     half = draws.shape[1] // 2
     return np.concatenate((draws[:, :half], draws[:, -half:]))
 
 
 def _normal_scores(draws: FloatArray) -> FloatArray:
-    """Return the normal quantiles of the ranks (eq. 14); equal draws share the mean of theirs."""
+    """Normal quantiles of the ranks (eq. 14); equal draws share their mean rank."""
     columns = draws.reshape(-1, draws.shape[2]).T
     rank = np.empty_like(columns)
     for of_one, column in zip(rank, columns, strict=True):
@@ -94,7 +97,7 @@ def _normal_scores(draws: FloatArray) -> FloatArray:
 
 
 def _split_r_hat(draws: FloatArray) -> FloatArray:
-    """Return R-hat (eq. 1 to 4) of chains (c, n, p), (p,)."""
+    """R-hat (eq. 1 to 4) of chains (c, n, p), (p,)."""
     n = draws.shape[1]
     within = np.var(draws, axis=1, ddof=1).mean(axis=0)
     between = np.var(draws.mean(axis=1), axis=0, ddof=1)
@@ -103,16 +106,16 @@ def _split_r_hat(draws: FloatArray) -> FloatArray:
 
 
 def _effective(draws: FloatArray) -> FloatArray:
-    """Return the effective sample size (eq. 10 to 13) of chains (c, n, p), (p,).
+    """Effective sample size (eq. 10 to 13) of chains (c, n, p), (p,).
 
-    Correlations of later and later draws are added in pairs while these are positive, none larger
-    than the one before it (Geyer 1992, doi:10.1214/ss/1177011137).
+    Autocorrelations are added in pairs of lags while these are positive, none larger than the pair
+    before (Geyer 1992, doi:10.1214/ss/1177011137).
     """
     c, n, p = draws.shape
-    apart = draws - draws.mean(axis=1, keepdims=True)
+    centred = draws - draws.mean(axis=1, keepdims=True)
     # Padded, so that the end of a chain is not correlated with its beginning.
     size = scipy.fft.next_fast_len(2 * n, real=True)
-    spectrum = np.abs(scipy.fft.rfft(apart, size, axis=1)) ** 2
+    spectrum = np.abs(scipy.fft.rfft(centred, size, axis=1)) ** 2
     covariance = scipy.fft.irfft(spectrum.mean(axis=0), size, axis=0)[:n] / n
     within = covariance[0] * n / (n - 1.0)
     total = covariance[0] + np.var(draws.mean(axis=1), axis=0, ddof=1)
@@ -133,36 +136,34 @@ def _effective(draws: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class SamplerInfo:
-    """How the draws were made and whether they are reliable."""
+    """Method of sampling, and diagnostics of its draws."""
 
-    name: str  # Which sampler it was, for the report
-    # Number of chains, and of draws kept of each
+    name: str  # Name of the sampler, for the report
+    # Number of chains, and of draws kept in each
     chains: int
     draws: int
-    acceptance_rate: float  # Share of proposals taken
-    # Per parameter of `FitResult.parameter_names`, (p,)
+    acceptance_rate: float  # Share of accepted proposals
+    # Diagnostics of each parameter of `FitResult.parameter_names`, (p,)
     r_hat: FloatArray
     ess_bulk: FloatArray
     ess_tail: FloatArray
     # Largest Monte Carlo error of a mean over its parameter's standard deviation, reached and
-    # asked for; None where a number of draws was asked for instead
+    # requested; None if a number of draws was requested instead
     precision: float
     precision_wanted: float | None
-    seconds: float  # By the clock passed in; NaN without one
-    # Every R-hat at most 1.01 and every effective sample size at least what the precision takes,
-    # 400 where none was asked for. A Gaussian about the mode counts where the parameters are too
-    # many to be sampled; not where chains were given up.
+    seconds: float  # Time by the clock passed in; NaN without one
+    # Whether each R-hat is at most 1.01 and each effective sample size at least that of the
+    # requested precision (400 without one). True for a Gaussian about the mode if there are too
+    # many parameters to sample; false if chains were given up
     converged: bool
-    message: str  # The verdict with its figures, for the report
-    # 'metropolis' or 'laplace', as `Chains` has it. The latter has no R-hat.
-    method: Method = 'metropolis'
-    # Where chains were given up: the shape of the tail of the proposals' importance weights. Else
-    # NaN.
+    message: str  # Verdict with its figures, for the appendix of the report
+    method: Method = 'metropolis'  # 'laplace' has no R-hat
+    # If chains were given up: tail shape of the proposals' importance weights; NaN otherwise
     pareto_k: float = float('nan')
 
     @property
     def wandering(self) -> bool:
-        """Whether these are chains that do not agree, or are worth too few draws to tell."""
+        """Whether chains disagree, or have too few effective draws to judge."""
         if self.method != 'metropolis':
             return False
         few = np.min((self.ess_bulk, self.ess_tail)) < ESS_LIMIT
@@ -179,7 +180,7 @@ class SamplerInfo:
         seconds: float,
         weakest: str = '',
     ) -> SamplerInfo:
-        """Judge the draws of p named parameters; the rest as the attributes.
+        """Diagnostics of the draws of p named parameters; arguments as the attributes.
 
         ``weakest`` names the parameters that the observations determine worst together.
         """

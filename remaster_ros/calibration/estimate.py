@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From a session to the posterior's mode: gauge fixed, gross errors left out, nothing sampled."""
+"""Mode of a session's posterior: gauge fixed, gross errors left out, nothing sampled."""
 
 from __future__ import annotations
 
@@ -40,45 +40,49 @@ from remaster_ros.types import (
     Session,
 )
 
-# Fewer rows of a sensor do not determine its noise.
+# Least number of rows that determine a sensor's noise, and of poses that register it.
 FEWEST_ROWS = 4
 FEWEST_POSES = 3
-# Limits of chi-squared with 1 to 3 degrees of freedom at an error rate of 1 in 1,000: so often a
-# sensor whose noise is the same in all directions gets one of its own along the line of sight.
-# Without its orientations a session is fitted as any other.
+# Sentence if the orientations of a session cannot be fitted; its positions are fitted without
+# them.
 NOT_FITTED = (
     'the orientations are not fitted: {}; check that the quaternions are in the order x, y, z, w '
     "and give the body's axes in the sensor's frame"
 )
+# Limits of chi-squared with 1 to 3 degrees of freedom at an error rate of 1 in 1,000 for a
+# separate noise along the line of sight.
 DIRECTION_LIMITS = {1: 10.828, 2: 13.816, 3: 16.266}
 
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """What a session gives to fit, reduced to the sensors and markers that occur in it."""
+    """Data of a session to fit, reduced to the sensors and markers that occur in it."""
 
-    session: Session  # As it was given
+    session: Session  # The whole session
     chain: SerialChain  # The nominal robot
-    # Those with at least one row
+    # Sensors and markers with at least one row
     sensor_names: tuple[str, ...]
     marker_names: tuple[str, ...]
     # All rows in file order, ``sensor`` and ``marker`` being indices into these names
     measurements: Measurements
-    # Nominal positions and how well they are known, m, (markers, 3) and (markers,)
+    # Nominal positions and their standard deviations, m, (markers, 3) and (markers,)
     markers: FloatArray
     marker_std_m: FloatArray
     fitted: IntArray  # Indices of the optimization rows
-    priors: Priors  # What is known beforehand of offsets and registrations
-    path_noise: PathNoise | None = None  # Of errors along a path; None where there are none
+    priors: Priors  # Prior knowledge of offsets and registrations
+    path_noise: PathNoise | None = None  # Errors along a path; None if there are none
 
     @classmethod
     def of(cls, session: Session, priors: Priors | None = None) -> Problem:
-        """Reduce and check a session; priors replace its own of the same markers and sensors.
+        """Reduce and check a session.
+
+        ``priors`` replace its own ones of the same markers and sensors.
 
         Raises
         ------
         InputError
-            A robot that does not fit the session, or priors on what the session has not.
+            A robot that does not fit the session, or priors on things that the session does not
+            have.
         InsufficientDataError
             Too few observations, of one sensor or of all.
         """
@@ -152,14 +156,14 @@ class Problem:
         )
 
     def marker_priors(self, model: Model) -> tuple[Prior, ...]:
-        """Return the priors on the markers."""
+        """Priors on the markers."""
         return tuple(
             marker_prior(model, index, self.markers[index], float(self.marker_std_m[index]))
             for index in range(len(self.markers))
         )
 
     def other_priors(self, model: Model) -> tuple[Prior, ...]:
-        """Return the priors on registrations and offsets that are known beforehand."""
+        """Priors on registrations and offsets."""
         base = tuple(
             base_prior(model, index, self.priors.base[name])
             for index, name in enumerate(self.sensor_names)
@@ -171,7 +175,7 @@ class Problem:
         )
 
     def plausibility(self, model: Model, free: IntArray) -> tuple[Prior, ...]:
-        """Return a wide prior on the free offsets of which nothing else is known beforehand."""
+        """Wide prior on the free offsets without another prior; () if there are none."""
         unknown = [
             joint
             for joint, name in enumerate(self.chain.joint_names)
@@ -180,7 +184,7 @@ class Problem:
         return (plausible_offsets(model, unknown),) if unknown else ()
 
     def empty_model(self, extension: Extension | None = None) -> Model:
-        """Return a model with registrations still unknown."""
+        """Model with unknown registrations."""
         count = len(self.sensor_names)
         return Model(
             self.chain,
@@ -200,40 +204,42 @@ class Problem:
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """The mode with offsets and, for comparison, with offsets held at zero."""
+    """Mode of the posterior with free offsets, and the rows it is based on."""
 
-    # What was fitted
     problem: Problem
     model: Model
-    gauge: Gauge  # What the data do not determine
-    mode: Mode  # With offsets
+    gauge: Gauge  # Combinations of parameters that the data do not determine
+    mode: Mode
     left_out: tuple[tuple[int, str], ...]  # (row of the measurements, reason) of the gross errors
     kept: IntArray  # Indices of the optimization rows that were fitted
-    # Why measured orientations are not fitted, a sentence; '' where they are, or none were
+    # Reason why measured orientations are not fitted, a sentence; '' if they are, or if none were
     # measured
     without_turns: str = ''
 
     @property
     def posterior(self) -> Posterior:
-        """The posterior that `mode` is the mode of."""
+        """Posterior of which `mode` is the mode."""
         return self.mode.linearisation.posterior
 
     @cached_property
     def before(self) -> Mode:
-        """With all offsets at zero, registrations and markers fitted; errors as of `find_mode`."""
-        return hold_offsets(self.mode, np.zeros(self.model.joints))
+        """Mode with all offsets at zero, registrations and markers fitted.
+
+        Errors as of `find_mode`.
+        """
+        return mode_at_offsets(self.mode, np.zeros(self.model.joints))
 
 
 @one_thread
 def estimate(problem: Problem, extension: Extension | None = None) -> Estimate:
-    """Find the mode, with the parameters of an extension where one is given.
+    """Find the mode, with the parameters of an extension if one is given.
 
     Raises
     ------
     InsufficientDataError
-        Where the data do not determine the parameters.
+        The data do not determine the parameters.
     MisfitError
-        Where they disagree with the model altogether.
+        The data disagree with the model altogether.
     """
     measurements = problem.measurements
     empty = problem.empty_model(extension)
@@ -256,7 +262,7 @@ def estimate(problem: Problem, extension: Extension | None = None) -> Estimate:
     except MisfitError as error:
         if not model.bodies:
             raise
-        # Where the positions are those of another robot, too, this is refused by them.
+        # Positions of another robot are refused here as well.
         found = _estimated(problem, replace(model, bodies=()), z[: model.markers_end], start)
         without_turns = NOT_FITTED.format(error.what)
     return replace(found, without_turns=without_turns)
@@ -316,7 +322,7 @@ def _estimated(problem: Problem, model: Model, z: FloatArray, start: Start | Non
 
 
 def of_positions_alone(found: Estimate) -> Estimate:
-    """Return the estimate by the positions alone, for models that say nothing of orientations."""
+    """Estimate by the positions only, for models without orientations."""
     if not found.model.bodies:
         return found
     session = found.problem.session.positions_alone()
@@ -325,23 +331,25 @@ def of_positions_alone(found: Estimate) -> Estimate:
 
 
 def stating_directions(measurements: Measurements, rows: IntArray) -> list[int]:
-    """Return the sensors whose samples vary otherwise along their line of sight than across it.
+    """Sensors whose samples scatter differently along the line of sight and across it.
 
-    In the frame of the sensor each axis has the variance across, and its share of what that along
-    the line has more or less. The samples of a few readings tell what their means do not.
+    In the sensor's frame each axis has the variance across, plus its share of the difference along
+    the line. The scatter of samples shows it with fewer readings than their means.
     """
     found = []
     for sensor in np.unique(measurements.sensor[rows]).tolist():
-        mine = rows[(measurements.sensor[rows] == sensor) & (measurements.samples[rows] > 1)]
-        mine = mine[(measurements.std[mine] > 0.0).all(axis=1)]
-        if len(mine) < FEWEST_ROWS:
+        sensor_rows = rows[
+            (measurements.sensor[rows] == sensor) & (measurements.samples[rows] > 1)
+        ]
+        sensor_rows = sensor_rows[(measurements.std[sensor_rows] > 0.0).all(axis=1)]
+        if len(sensor_rows) < FEWEST_ROWS:
             continue
-        square = measurements.position[mine] ** 2
+        square = measurements.position[sensor_rows] ** 2
         # A point at the origin of the sensor's frame has no line of sight.
         length = np.maximum(square.sum(axis=1, keepdims=True), np.finfo(float).tiny)
         share = (square / length).ravel()
-        variance = (measurements.std[mine] ** 2).ravel()
-        weight = np.repeat(measurements.samples[mine] - 1.0, 3)
+        variance = (measurements.std[sensor_rows] ** 2).ravel()
+        weight = np.repeat(measurements.samples[sensor_rows] - 1.0, 3)
         share -= np.average(share, weights=weight)
         variance -= np.average(variance, weights=weight)
         spread = weight @ share**2
@@ -354,11 +362,11 @@ def stating_directions(measurements: Measurements, rows: IntArray) -> list[int]:
 
 
 def with_directions(mode: Mode, stating: Sequence[int] = ()) -> Mode:
-    """Return the mode with a noise along the line of sight of every sensor that shows one.
+    """Mode with a separate noise along the line of sight for each sensor that shows one.
 
     One sensor after the other, by a likelihood-ratio test of the noise with the parameters
-    integrated out. Where there is no difference it finds one in 1 of 1,000 cases, less often where
-    a pose_sigma is zero. ``stating``: sensors whose readings state it themselves.
+    integrated out. Its error rate is 1 in 1,000, less if a pose_sigma is zero. ``stating``:
+    sensors whose readings state it themselves.
     """
     posterior = mode.linearisation.posterior
     split: list[int] = []
@@ -378,8 +386,8 @@ def with_directions(mode: Mode, stating: Sequence[int] = ()) -> Mode:
     return mode
 
 
-def hold_offsets(mode: Mode, joint_offsets: FloatArray) -> Mode:
-    """Return the mode of the same posterior with the joint offsets held at given values.
+def mode_at_offsets(mode: Mode, joint_offsets: FloatArray) -> Mode:
+    """Mode of the same posterior with the joint offsets fixed at given values.
 
     ``mode``: of the fit with free offsets; ``joint_offsets``: rad, (k,).
     """
@@ -396,9 +404,9 @@ def hold_offsets(mode: Mode, joint_offsets: FloatArray) -> Mode:
 
 
 def _judged_at(mode: Mode, gauge: Gauge, priors: Sequence[Prior]) -> Gauge:
-    """Return the gauge with what is badly determined at the mode, where any offset is.
+    """Gauge with the directions that are badly determined at the mode, if any offset is.
 
-    The start that it was found at may lie far along such a direction.
+    The start at which it was found may lie far along such a direction.
     """
     posterior = mode.linearisation.posterior
     std = np.sqrt(np.diag(mode.covariance))
@@ -414,6 +422,7 @@ def _judged_at(mode: Mode, gauge: Gauge, priors: Sequence[Prior]) -> Gauge:
 
 
 def _require_information(count: int, free: IntArray, model: Model) -> None:
+    """Raise InsufficientDataError for fewer coordinates than unknowns."""
     needed = int(np.sum(free < model.joints + 6 * len(model.sensor_names))) + 3
     if 3 * count < needed:
         raise InsufficientDataError(
@@ -423,7 +432,7 @@ def _require_information(count: int, free: IntArray, model: Model) -> None:
 
 
 def _moved(problem: Problem, rows: Rows, errors: FloatArray) -> str:
-    """Return from when on sensors with too many gross errors are off; '' if nothing shows it."""
+    """Sentence since when sensors with too many gross errors are off; '' if nothing shows it."""
     text = ''
     for sensor, span in rows.of_points.spans:
         moved = moved_since(problem.measurements, rows.source[span], errors[span])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Judge given zero-offsets on any session of the robot: `remaster accuracy`."""
+"""Accuracy of any session of a robot with given zero-offsets: `remaster accuracy`."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from remaster_ros.calibration.accuracy import accuracy_of
 from remaster_ros.calibration.comparison import predicted_rows
-from remaster_ros.calibration.estimate import Estimate, Problem, hold_offsets
+from remaster_ros.calibration.estimate import Estimate, Problem, mode_at_offsets
 from remaster_ros.calibration.laplace import Mode
 from remaster_ros.calibration.linearisation import linearise
 from remaster_ros.calibration.mistakes import sound_estimate
@@ -24,10 +24,10 @@ DRAWS = 2000
 
 @dataclass(frozen=True)
 class OffsetsJudgement:
-    """What the offsets do for a session."""
+    """Accuracy of a session without and with given offsets."""
 
     accuracy: dict[str, Any]  # The three metrics before and after, as fit.json has them
-    # (observation, reason) of every gross error; neither fitted nor among the metrics of the
+    # (observation, reason) of each gross error, which is neither fitted nor in the metrics of the
     # optimization rows
     left_out: tuple[tuple[int, str], ...]
 
@@ -40,12 +40,13 @@ def accuracy_with_offsets(
 ) -> OffsetsJudgement:
     """Compare a session with the robot without and with given zero-offsets.
 
-    Registrations and markers are fitted to the session's optimization rows (to all rows where it
-    has none), once with the offsets at zero and once with the given ones, and applied to all rows.
-    Offsets that a registration or a marker takes up, as that of joint 1, therefore do not count.
+    Registrations and markers are fitted to the session's optimization rows (to all rows if it has
+    none), once with the offsets at zero and once with the given ones, and applied to all rows.
+    Offsets that a registration or a marker absorbs, such as that of joint 1, therefore do not
+    count.
 
     The theoretical metric (section V-C of Van Wyk et al.) draws the offsets from independent
-    Gaussians about the given ones, the registrations and markers from their posterior given these
+    Gaussians about the given ones, and registrations and markers from their posterior given these
     offsets. Correlations between the offsets are not in fit.json.
 
     Parameters
@@ -55,8 +56,8 @@ def accuracy_with_offsets(
     joint_offsets
         rad, (k,).
     joint_offsets_std
-        rad, (k,); 0 for joints that are not identifiable, which are not drawn. Without it there is
-        no theoretical metric.
+        rad, (k,); 0 for joints that are not identifiable, which are not drawn. None for no
+        theoretical metric.
     rng
         Source of all randomness.
 
@@ -80,7 +81,7 @@ def accuracy_with_offsets(
             )
     found = sound_estimate(session)
     model = found.model
-    given = hold_offsets(found.mode, np.asarray(joint_offsets, dtype=float))
+    given = mode_at_offsets(found.mode, np.asarray(joint_offsets, dtype=float))
     predicted_before = predicted_rows(problem, model, found.before.z)
     predicted_after = predicted_rows(problem, model, given.z)
     predictive = None
@@ -111,7 +112,7 @@ def accuracy_with_offsets(
 def _draws(
     found: Estimate, given: Mode, joint_offsets_std: FloatArray, rng: np.random.Generator
 ) -> FloatArray:
-    """Draw offsets, and registrations and markers given the offsets, as pinned (draws, size)."""
+    """Draws of offsets, and of registrations and markers given them, pinned, (draws, size)."""
     model = found.model
     joints = np.arange(1, model.joints - 1)
     # In pinned coordinates the outer two joints move nothing.

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Further parameters of the model: what physical effects add, linear in each observation.
+"""Extension of the model by physical effects, linear in their parameters.
 
-An effect is what it does to each row of the measurements: it turns joints, or it displaces the
-marker. Which effects there are is defined in `discovery.effects`.
+An effect turns joints, or displaces the marker, in each row of the measurements. The effects are
+defined in `discovery.effects`.
 """
 
 from __future__ import annotations
@@ -16,20 +16,20 @@ from remaster_ros.types import FloatArray, IntArray
 
 @dataclass(frozen=True, eq=False)
 class Term:
-    """What some of the parameters do, in one place."""
+    """Effect of some of the parameters at one place."""
 
-    where: slice  # Which parameters, in order
-    # Index of the joint whose angle they add to; None where they displace the marker
+    where: slice  # Slice of the parameters
+    # Index of the joint whose angle they change; None if they displace the marker
     at: int | None
-    # Added joint angle, rad per unit, (n, c), or displacement in base coordinates R, m per unit,
-    # (n, 3, c): of all that does not enter through a joint angle (links, base, marker, sensor
-    # frame), the derivative at ``theta0``
+    # Added joint angle, rad per unit, (n, c); or, for effects on links, base, marker or sensor
+    # frame, derivative of the displacement in base coordinates R at ``theta0``, m per unit,
+    # (n, 3, c)
     values: FloatArray
 
 
 @dataclass(frozen=True)
 class Start:
-    """Where the effects were found: a solution near the mode."""
+    """Solution near the mode, at which the effects were found."""
 
     joint_offsets: FloatArray  # rad, (k,)
     T_R_N: FloatArray  # Registration of each sensor, (sensors, 4, 4)
@@ -39,12 +39,12 @@ class Start:
 
 @dataclass(frozen=True, eq=False)
 class Extension:
-    """Further parameters theta (m,): physical effects, each row deviating linearly in them.
+    """Further parameters theta (m,): physical effects, each linear in each row.
 
     The marker of row n is predicted at::
 
         chain.positions(q + offsets + Σ turning terms: values @ theta)
-        + displacement0 + Σ displacing terms: values @ (theta - theta0)
+            + displacement0 + Σ displacing terms: values @ (theta - theta0)
 
     in base coordinates R, then registered as without an extension. Rows are those of the
     `Measurements` (``Rows.source``).
@@ -52,19 +52,19 @@ class Extension:
 
     names: tuple[str, ...]  # 'compliance_2', …, m names
     units: tuple[str, ...]  # 'rad/(N m)', …, m units
-    # What they do. A curve of a joint has a hundred parameters, which concern this joint alone.
+    # Effects of the parameters; a curve of a joint has a hundred, which concern this joint only
     terms: tuple[Term, ...]
-    # Exact value at ``theta0`` of what the displacing terms are derivatives of, m, (n, 3)
+    # Exact displacement at ``theta0`` of the displacing terms, m, (n, 3)
     displacement0: FloatArray
-    theta0: FloatArray  # Where it was linearised, (m,)
-    # Gaussian prior about 0 (plausible size, smoothness); zeros where flat, (m, m)
+    theta0: FloatArray  # Point of linearisation, (m,)
+    # Precision of the Gaussian prior about 0 (plausible size, smoothness), (m, m); zeros if flat
     prior_precision: FloatArray
-    # Zero-offsets that the effects were searched with, those that the gauge held at 0, rad, (k,);
-    # None where nothing is known of them
+    # Zero-offsets of the search for effects, 0 for those fixed by the gauge, rad, (k,); None if
+    # unknown
     joint_offsets: FloatArray | None = None
-    # How far from there offsets beside the effects may be: a Gaussian prior, rad
+    # Std of a Gaussian prior of the offsets about these, rad
     step_std: float = np.inf
-    # Where to begin the search for the mode; None where that is to be found, too
+    # Start of the search for the mode; None to find one
     start: Start | None = None
     of_motion: bool = False  # What every fit of a moving session has (`dynamics`): no causes
 
@@ -93,7 +93,7 @@ class Extension:
         )
 
     def turns(self, theta: FloatArray, rows: IntArray) -> dict[int, FloatArray]:
-        """Return the angles that theta (..., m) adds in n rows: joint -> rad, (..., n)."""
+        """Angles added by theta (..., m) in n rows: joint -> rad, (..., n)."""
         added: dict[int, FloatArray] = {}
         for term in self.terms:
             if term.at is not None:
@@ -102,7 +102,7 @@ class Extension:
         return added
 
     def shifts(self, theta: FloatArray, rows: IntArray) -> FloatArray:
-        """Return the displacements of n rows by theta (..., m), in R, m, (..., n, 3)."""
+        """Displacements of n rows by theta (..., m), in R, m, (..., n, 3)."""
         step = theta - self.theta0
         shift = np.zeros((*theta.shape[:-1], len(rows), 3))
         for term in self.terms:
@@ -121,9 +121,9 @@ class Extension:
         by_joints
             Derivative of the points by the joint angles, m/rad, (n, 3, k).
         turn
-            Rotation that displacements are turned by, (3, 3).
+            Rotation applied to displacements, (3, 3).
         rows
-            Their indices in the measurements, (n,).
+            Indices of the points in the measurements, (n,).
         """
         for term in self.terms:
             part, values = result[:, :, term.where], term.values[rows]
@@ -134,7 +134,7 @@ class Extension:
 
 
 def _product(values: FloatArray, theta: FloatArray) -> FloatArray:
-    """Return values (n, ..., c) times theta (draws..., c): (draws..., n, ...), one product."""
+    """Product of values (n, ..., c) and theta (draws..., c): (draws..., n, ...)."""
     c = values.shape[-1]
     product = theta.reshape(-1, c) @ values.reshape(-1, c).T
     return product.reshape(*theta.shape[:-1], *values.shape[:-1])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`fit_session`: zero-offsets, registrations, markers and noise of a session, with uncertainty."""
+"""Fit of a session: zero-offsets, registrations, markers and noise, with uncertainty."""
 
 from __future__ import annotations
 
@@ -26,7 +26,8 @@ __all__ = ['PRECISION', 'FitResult', 'fit_session']
 
 Sampler = Literal['fast', 'paper']
 
-# Coarser, and convergence cannot be judged; finer takes more draws than memory holds.
+# Range of the precision: with a coarser one convergence cannot be judged, a finer one requires
+# more draws than memory holds.
 COARSEST_PRECISION = 0.1
 FINEST_PRECISION = 0.002
 
@@ -151,6 +152,7 @@ def _fast(
     rng: np.random.Generator,
     report: Progress,
 ) -> Sampled:
+    """Sampled posterior by the Metropolis sampler."""
     posterior, model = found.posterior, found.model
 
     def columns(points: FloatArray) -> FloatArray:

@@ -14,20 +14,20 @@ from remaster_ros.calibration.model import Model
 from remaster_ros.calibration.priors import Prior, prior_rows
 from remaster_ros.types import FloatArray
 
-# Parameters of a direction that a message names: those above this share of the largest. Of more
-# than so many only some are listed.
+# Largest numbers of parameters of a direction that a message names and lists; only those above
+# this share of the largest are named.
 MOST_NAMED, MOST_LISTED = 5, 20
 LEAST_SHARE = 0.2
 EFFECTS_PRIOR = 'the prior on the effects'
 
 
 def counted(number: int, what: str) -> str:
-    """Return '1 pose', '2 poses'."""
+    """Number and noun: '1 pose', '2 poses'."""
     return f'{number} {what}{"" if number == 1 else "s"}'
 
 
 def in_words(model: Model, direction: FloatArray) -> str:
-    """Return which parameters change together without any effect, and what would separate them."""
+    """Sentence on parameters that change together without effect, and how to separate them."""
     joints = np.flatnonzero(direction[: model.joints])
     sensors = [
         index
@@ -42,7 +42,8 @@ def in_words(model: Model, direction: FloatArray) -> str:
         effects = np.flatnonzero(direction[model.core :]) + model.core
         if len(effects) and not sensors and not markers:
             return (
-                f'{joint} offset = {_first([model.names[index] for index in effects])} changed '
+                f'{joint} offset = {_shortened([model.names[index] for index in effects])} '
+                'changed '
                 'together; only what is known of these effects beforehand separates them'
             )
         if not sensors and not markers:
@@ -97,49 +98,50 @@ def in_words(model: Model, direction: FloatArray) -> str:
             ]
             return f'{joint} offset = {listed(moved)}; a measured marker would separate them'
     return (
-        f'{together(model, direction)} change no observation; poses that are spread further and '
+        f'{combination_text(model, direction)} change no observation; poses that are spread '
+        'further and '
         'turn the tool, or a prior on one of them, would separate them'
     )
 
 
-def together(model: Model, direction: FloatArray) -> str:
-    """List the parameters of a direction with their shares."""
+def combination_text(model: Model, direction: FloatArray) -> str:
+    """Parameters of a direction with their shares, as text."""
     moved = [
         f'{name} ({value:+.3g})'
         for name, value in zip(model.names, direction, strict=True)
         if value != 0.0
     ]
-    return f'{_first(moved)} together'
+    return f'{_shortened(moved)} together'
 
 
-def _first(parts: Sequence[str]) -> str:
-    """Join parts; of very many, which the curve of a joint has, some and the number of others."""
+def _shortened(parts: Sequence[str]) -> str:
+    """Parts joined by commas; of very many, some and the number of the others."""
     if len(parts) > MOST_LISTED:
-        rest = len(parts) - MOST_NAMED
-        return listed([*parts[:MOST_NAMED], f'{rest} more'])
+        others = len(parts) - MOST_NAMED
+        return listed([*parts[:MOST_NAMED], f'{others} more'])
     return listed(parts)
 
 
-# The share of a parameter in a direction, and what it moves by.
+# The share of a parameter in a direction, or its displacement.
 _AMOUNT = re.compile(r' \([+-][\d.e+-]+\)|(?: tangentially)?, [\d.]+ mm per degree')
 _MOST_SHOWN = 2
 
 
 def in_a_line(why: str) -> str:
-    """Return a reason of `in_words` for a terminal: without amounts, of many names the first."""
-    cause, *rest = why.split('; ')
+    """Short form of a reason of `in_words` for a terminal: no amounts, the first of many names."""
+    cause, *remedies = why.split('; ')
     before, sign, after = _AMOUNT.sub('', cause).partition(' = ')
     text = after if sign else before
     names = re.split(r', | and ', text)
     if len(names) > _MOST_SHOWN + 1:
         text = f'{", ".join(names[:_MOST_SHOWN])} and {len(names) - _MOST_SHOWN} more'
-    remedy = next((part for part in rest if 'separate' in part or 'show' in part), '')
+    remedy = next((part for part in remedies if 'separate' in part or 'show' in part), '')
     looks = f'looks like {text}' if sign else text
     return f'{looks}; {remedy}' if remedy else looks
 
 
 def hardly_seen(names: Sequence[str], loadings: FloatArray) -> str:
-    """Name the parameters with the largest loadings (f,) of a direction, with their shares."""
+    """Parameters with the largest loadings (f,) of a direction, with their shares, as text."""
     size = np.abs(loadings) / np.max(np.abs(loadings))
     order = [index for index in np.argsort(-size)[:MOST_NAMED] if size[index] > LEAST_SHARE]
     if len(order) == 1:
@@ -150,14 +152,14 @@ def hardly_seen(names: Sequence[str], loadings: FloatArray) -> str:
 
 
 def the(kind: str, name: str) -> str:
-    """Return 'the sensor mocap'; 'the sensor' and 'sensor_2' of names that tell the kind."""
+    """'the sensor mocap'; or 'the sensor' and 'sensor_2' if the name contains the kind."""
     if name.lower() == kind:
         return f'the {kind}'
     return name if name.lower().startswith(kind) else f'the {kind} {name}'
 
 
 def listed(parts: Sequence[str]) -> str:
-    """Join parts by commas and an `and`."""
+    """Parts joined by commas and an `and`."""
     if len(parts) < 2:
         return ''.join(parts)
     return f'{", ".join(parts[:-1])} and {parts[-1]}'
@@ -166,7 +168,7 @@ def listed(parts: Sequence[str]) -> str:
 def resolving_priors(
     priors: Sequence[Prior], x: FloatArray, directions: FloatArray, model: Model
 ) -> list[str]:
-    """Name the priors that hold each of d directions (size, d): those that change along it."""
+    """Descriptions of the priors that fix each of d directions (size, d)."""
     core = replace(model, extension=None)
     names = [*(prior.description for prior in priors), EFFECTS_PRIOR]
     rows = [prior_rows(core, [prior], x[: model.core], natural=True)[1] for prior in priors]

@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Limits of p-values for a test that is looked at again and again while data come in.
+"""Limits of p-values for a test that is repeated while data come in.
 
-A test at 1 % that is looked at a dozen times fires in far more than 1 % of the sessions where
-nothing is wrong. Here each look may spend a part of the error rate: after the share t of all
-data 2 - 2 Φ(z / √t) of it, z being the upper quantile at half of the error rate (Lan and DeMets
-1983, doi:10.1093/biomet/70.3.659, in the form of O'Brien and Fleming 1979). Early looks spend next
-to nothing, so that the last one is nearly as powerful as a single test.
+A test at 1 % that is repeated a dozen times fires in far more than 1 % of the sessions without a
+fault. Here each look may spend a part of the error rate: after the share t of all data 2 - 2 Φ(z /
+√t) of it, z being the upper quantile at half of the error rate (Lan and DeMets 1983,
+doi:10.1093/biomet/70.3.659, in the form of O'Brien and Fleming 1979). Early looks spend next to
+nothing, so that the last one is nearly as powerful as a single test.
 
 The limits follow from the joint distribution of the looks (Armitage, McPherson and Rowe 1969,
-doi:10.2307/2343787). Between looks at shares s < t of the data a mean correlates by √(s / t), the
-sum of many squares, such as an F statistic with many degrees of freedom, by s / t. The smaller
-one is taken: by Slepian's inequality the error rate is then held for either.
+doi:10.2307/2343787). Between looks at shares s < t of the data a mean correlates by √(s / t), and
+the sum of many squares, such as an F statistic with many degrees of freedom, by s / t. The smaller
+one is used: by Slepian's inequality the error rate then holds for both.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ import scipy
 from remaster_ros.types import FloatArray
 
 LOWEST = -8.0
-"""Below this many standard deviations the statistic never is, as good as."""
+"""Lower end of the statistic's grid, in standard deviations; its probability is negligible."""
 POINTS = 401
-"""Of the grid on which the density of what no look has stopped is followed."""
+"""Points of the grid for the density of the tests that no look has stopped."""
 NEGLIGIBLE = 1e-14
-"""Of the error rate: what a look spends less is not followed on the grid."""
+"""Share of the error rate below which a look is not computed on the grid."""
 
 
 def spent(share: FloatArray, error_rate: float) -> FloatArray:
-    """Return what may be spent of the error rate after shares (n,) of all data, above 0 to 1."""
+    """Part of the error rate that may be spent after shares (n,) of all data, above 0 to 1."""
     z = scipy.special.ndtri(0.5 * error_rate)
     found: FloatArray = 2.0 * scipy.special.ndtr(z / np.sqrt(share))
     return found
@@ -39,14 +39,14 @@ def spent(share: FloatArray, error_rate: float) -> FloatArray:
 
 @lru_cache(maxsize=64)
 def p_value_limits(shares: tuple[float, ...], error_rate: float) -> tuple[float, ...]:
-    """Return below which p-value the test fires at each look.
+    """P-value limit of each look, below which the test fires.
 
     Parameters
     ----------
     shares
-        Of all data that each look has, ascending, above 0 to 1.
+        Shares of all data at each look, ascending, above 0 to 1.
     error_rate
-        Of all looks together, where nothing is wrong.
+        Error rate of all looks together.
     """
     t = np.array(shares)
     steps = np.diff(spent(t, error_rate), prepend=0.0)
@@ -74,5 +74,5 @@ def p_value_limits(shares: tuple[float, ...], error_rate: float) -> tuple[float,
 def _above(
     limit: float, grid: FloatArray, density: FloatArray, place: float, width: float, step: float
 ) -> float:
-    """Return how much more than a step of the error rate lies above a limit."""
+    """Probability above a limit, minus the part of the error rate to be spent."""
     return float(density @ scipy.special.ndtr((grid - limit * place) / width)) - step

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Observations sorted for the estimators: by sensor, then by pose, then by frame.
 
-Where a sensor measures how a body stands, too, its orientations are rows of their own behind those
-of all positions: three numbers each, rad, of a noise of its own (`model` has their prediction).
+If a sensor measures orientations of bodies, these are further rows after those of all positions:
+three numbers each, rad, with a separate noise (`model` has their prediction).
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from remaster_ros.kinematics.transforms import apply
 from remaster_ros.types import BoolArray, FloatArray, IntArray, Measurements
 
 Bodies = tuple[tuple[int, int], ...]
-"""(sensor, marker) of every body whose orientation is fitted."""
+"""(sensor, marker) of each body whose orientation is fitted."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,32 +32,32 @@ class Rows:
     source: IntArray  # Index of each row in the `Measurements` it came from, (n,)
     q: FloatArray  # rad, (n, k)
     marker: IntArray  # Marker index, (n,)
-    # Measured positions in the base coordinates of the reference registrations, m, (n, 3); 0 of an
-    # orientation, whose prediction is the turn from the measured to the modelled one
+    # Measured positions in the base coordinates of the reference registrations, m, (n, 3); 0 for
+    # an orientation, whose prediction is the rotation from the measured to the modelled one
     target: FloatArray
-    # (sensor index, slice of its rows) of every sensor present. The orientations of sensor
+    # (sensor index, slice of its rows) of each sensor present. The orientations of sensor
     # ``turning[i]`` have the index S + i, S being the number of sensors.
     spans: tuple[tuple[int, slice], ...]
-    # The rows of one sensor at one pose share an error: where each group starts, how many rows and
-    # which sensor it has, (groups,)
+    # Groups of rows that share an error, one sensor at one pose: first row, number of rows and
+    # sensor of each, (groups,)
     group_start: IntArray
     group_size: IntArray
     group_sensor: IntArray
-    # Number of each row's frame, ascending from 0, (n,): the markers of one frame share an error,
-    # too. None where every row is a frame by itself.
+    # Index of each row's frame, ascending from 0, (n,): the markers of one frame share an error,
+    # too. None if each row is a frame of its own.
     frame: IntArray | None = None
     # Measured orientations of the last r rows in the base coordinates of the reference
-    # registrations, (r, 3, 3); None where none are fitted
+    # registrations, (r, 3, 3); None if none are fitted
     turned: FloatArray | None = None
-    turning: tuple[int, ...] = ()  # Sensors whose orientations these are
-    # Index of each row's body, (n,); -1 where it has none. None as ``turned``.
+    turning: tuple[int, ...] = ()  # Sensors of these orientations
+    # Index of each row's body, (n,); -1 if it has none. None as ``turned``.
     body: IntArray | None = None
-    # What a sensor on the tool measured, m, (n, 3): the point in its own frame, which is the
-    # body's, and 0 in rows of other sensors; None where no sensor is on the tool. ``target`` is
-    # then the origin of the measured thing, which is frame N.
+    # Point measured by a sensor on the tool in its own frame, m, (n, 3); 0 in rows of other
+    # sensors, None without a sensor on the tool. ``target`` is then the origin of the measured
+    # target, which is frame N.
     lever: FloatArray | None = None
-    # Where the position of a row was measured, in the base coordinates of the reference, m, (n,
-    # 3); None where that is ``target``
+    # Measured position of each row in the base coordinates of the reference, m, (n, 3); None if
+    # that is ``target``
     place: FloatArray | None = None
     # Of each sensor whose errors are correlated along the path; () where none are
     decorrelation: tuple[Decorrelation, ...] = ()
@@ -104,7 +104,7 @@ class Rows:
         bodies: Bodies,
         on_tool: Sequence[int] = (),
     ) -> Rows:
-        """Sort as `of`, with the orientations of bodies behind the positions.
+        """Sort as `of`, with the orientations of bodies after the positions.
 
         ``on_tool`` are sensors on the tool: see ``lever``.
         """
@@ -196,28 +196,28 @@ class Rows:
         return apart.reshape(values.shape)
 
     def __len__(self) -> int:
-        """Return the number of rows."""
+        """Number of rows."""
         return len(self.source)
 
     @property
     def points(self) -> int:
-        """Number of positions, which are the first of the rows."""
+        """Number of positions, which are the first rows."""
         return len(self) - (0 if self.turned is None else len(self.turned))
 
     @property
     def measured(self) -> FloatArray:
-        """Where the positions were measured, in the base coordinates of the reference, (n, 3)."""
+        """Measured positions in the base coordinates of the reference, (n, 3)."""
         return self.target if self.place is None else self.place
 
     def whole(self, rows: BoolArray) -> BoolArray:
-        """Return the same with the other half of each reading: its position or orientation."""
+        """Mask of rows, extended to both halves (position and orientation) of each reading."""
         if self.turned is None:
             return rows
         return np.asarray(np.isin(self.source, self.source[rows]))
 
     @property
     def of_points(self) -> Rows:
-        """The positions alone."""
+        """Rows of the positions only."""
         if self.turned is None:
             return self
         count = int(np.searchsorted(self.group_start, self.points))
@@ -228,14 +228,14 @@ class Rows:
         return _sum(self._rows_of_groups, values)
 
     def blocks(self, rows: int) -> list[tuple[int, int]]:
-        """Cut the groups into runs (first, behind the last) of about so many rows each."""
+        """Runs of groups (first, end) of about `rows` rows each."""
         number = self.group_start // max(1, rows)
         edges = np.flatnonzero(np.diff(number)) + 1
         cuts = [0, *edges.tolist(), len(self.group_start)]
         return list(itertools.pairwise(cuts))
 
     def of_groups(self, first: int, last: int) -> Rows:
-        """Return the rows of the groups from ``first`` to before ``last``."""
+        """Rows of the groups from ``first`` to before ``last``."""
         if first == 0 and last == len(self.group_start):
             return self
         start = int(self.group_start[first])
@@ -258,10 +258,7 @@ class Rows:
         )
 
     def picked(self, rows: slice | IntArray) -> Rows:
-        """Return the columns of some rows; how they are grouped is left to the caller.
-
-        Some rows by themselves are not decorrelated.
-        """
+        """Columns of some rows; the grouping is left to the caller, without decorrelation."""
         names = ('source', 'q', 'marker', 'target', 'frame', 'body', 'lever', 'place')
         columns: dict[str, Any] = {
             name: value[rows] for name in names if (value := getattr(self, name)) is not None
@@ -275,24 +272,24 @@ class Rows:
 
     @cached_property
     def frame_start(self) -> IntArray:
-        """Where each frame starts, (frames,)."""
+        """First row of each frame, (frames,)."""
         if self.frame is None:
             return np.arange(len(self))
         return np.flatnonzero(np.diff(self.frame, prepend=-1))
 
     @cached_property
     def frame_size(self) -> IntArray:
-        """Rows of each frame, (frames,)."""
+        """Number of rows of each frame, (frames,)."""
         return np.diff(np.append(self.frame_start, len(self)))
 
     @cached_property
     def first_frame(self) -> IntArray:
-        """The first frame of each group, (groups,)."""
+        """First frame of each group, (groups,)."""
         return np.searchsorted(self.frame_start, self.group_start)
 
     @cached_property
     def group_frames(self) -> IntArray:
-        """Frames of each group, (groups,)."""
+        """Number of frames of each group, (groups,)."""
         return np.diff(np.append(self.first_frame, len(self.frame_start)))
 
     @cached_property
@@ -302,7 +299,7 @@ class Rows:
 
     @cached_property
     def mean_frame_size(self) -> FloatArray:
-        """Harmonic mean of the frames' rows in each group, (groups,)."""
+        """Harmonic mean of the frames' sizes in each group, (groups,)."""
         inverse = np.add.reduceat(1.0 / self.frame_size, self.first_frame)
         # Groups alike have the same number to the last digit.
         return np.round(self.group_frames / inverse, 9)
@@ -329,13 +326,13 @@ class Rows:
 
 
 def _members(start: IntArray, count: int) -> csr_array:
-    """Return which of so many neighbours are of each run, (runs, count)."""
+    """Indicator matrix of consecutive runs, (runs, count), from their first indices."""
     edges = np.append(start, count)
     return csr_array((np.ones(count, np.int8), np.arange(count), edges), (len(start), count))
 
 
 def _sum(members: csr_array, values: FloatArray) -> FloatArray:
-    """Return the sums of runs of values, or these where each is a run by itself."""
+    """Sums of runs of values; the values themselves if each is a run."""
     if members.shape[0] == members.shape[1]:
         return values
     # A tenth of the time of `np.add.reduceat`.

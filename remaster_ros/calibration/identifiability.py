@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which combinations of parameters the data do not determine, and what fixes each of them.
+"""Combinations of parameters that the data do not determine, and their resolution.
 
-The null space of the data's Jacobian (priors left out) over every parameter group, found
-numerically for the data at hand. A direction that a proper prior resolves is left to the prior;
-any other is fixed by holding one joint at zero. Directions that the data determine badly are
-reported as well.
+The null space of the data's Jacobian (without priors) over all parameter groups, computed for the
+data at hand. A direction that a proper prior resolves is left to the prior; any other is fixed by
+holding one joint at zero. Directions that the data determine badly are reported as well.
 """
 
 from __future__ import annotations
@@ -16,9 +15,9 @@ import numpy as np
 
 from remaster_ros.calibration.gauge_words import (
     EFFECTS_PRIOR,
+    combination_text,
     in_words,
     resolving_priors,
-    together,
 )
 from remaster_ros.calibration.grouped_rows import Rows
 from remaster_ros.calibration.initial_guess import robust_spread
@@ -32,8 +31,8 @@ from remaster_ros.types import BoolArray, FloatArray, IntArray
 # Singular values (of unit columns, relative to the largest) that are rounding errors.
 ROUNDING = 1e-9
 # An angle with a larger standard deviation counts as unknown: over such a range neither the
-# prediction nor a prior is linear. Of a joint that slides as much as such an angle does at
-# `LEVER_M`, here and in what follows.
+# prediction nor a prior is linear. For a prismatic joint angles count by `LEVER_M`, here and
+# below.
 UNKNOWN_ANGLE = np.radians(5.0)
 # An offset with a standard deviation above this, and this many times that of the median one, is
 # reported as badly determined, with the parts of its direction above this share of the largest.
@@ -42,36 +41,35 @@ WEAK_FACTOR = 5.0
 WEAK_SHARE = 0.1
 # A mastering is off by tenths of a degree: an offset known worse than this is not measured.
 OPEN_ANGLE = np.radians(1.0)
-# An offset that a prior determines counts as identifiable where its standard deviation is at most
-# so many times the median of those that the data determine.
+# An offset that a prior determines counts as identifiable if its standard deviation is at most
+# this factor times the median of those that the data determine.
 AS_GOOD_AS_SEEN = 2.0
 # Entries of a direction below this share of its largest are rounding errors.
 NEGLIGIBLE = 1e-5
-# Rows whose derivatives are at hand at a time.
+# Rows whose derivatives are in memory at once.
 BLOCK_ROWS = 2_000
 
 
 @dataclass(frozen=True)
 class GaugeDirection:
-    """A combination of parameters that can change without any change in the data."""
+    """Combination of parameters that can change without any change in the data."""
 
-    # How far each parameter moves, rad and m, the largest entry 1. Registrations are corrections
-    # of the robot's points on their way to the sensor, along the axes of R and about its origin
-    # (see `model`).
+    # Change of each parameter, rad and m, the largest entry 1. Registrations are corrections of
+    # the robot's points on their way to the sensor, along the axes of R and about its origin (see
+    # `model`).
     combination: Mapping[str, float]
     why: str  # The same as a sentence for the report
-    fixed_by: str  # What decides where on the direction the result lies
+    fixed_by: str  # Prior or joint at zero that decides the result along the direction
 
 
 @dataclass(frozen=True)
 class Gauge:
-    """All of the directions, and what follows for the joints."""
+    """All gauge directions, and their consequences for the joints."""
 
     directions: tuple[GaugeDirection, ...]  # One per dimension of the null space
     # Indices of the joints held at zero and of the effects held where they were linearised, (h,)
     held: IntArray
-    # For each joint what the data do not distinguish its offset from; '' where it is determined, k
-    # strings
+    # Reason for each joint whose offset the data do not determine; '' for the others, k strings
     why: tuple[str, ...]
 
 
@@ -81,19 +79,19 @@ def find_gauge(
     rows: Rows,
     priors: Sequence[Prior],
 ) -> Gauge:
-    """Find the null space at a solution, name it, and fix what no prior does.
+    """Find the null space at a solution, name it, and fix the directions that no prior fixes.
 
     Parameters
     ----------
     model, rows, priors
-        What is fitted, to which rows, and what is known beforehand.
+        The model, the fitted rows, and prior knowledge.
     x
         Natural parameters, (size,).
 
     Raises
     ------
     InsufficientDataError
-        Where a registration or a marker is not determined: holding a joint does not help.
+        A registration or a marker is not determined, so that holding a joint does not help.
     """
     scale, null, pivots, weak = _null_space(model, x, rows)
     _, by_x = prior_rows(model, priors, x, natural=True)
@@ -127,14 +125,12 @@ def find_gauge(
 def known_offsets(
     chain: SerialChain, why: tuple[str, ...], by_data: FloatArray, std: FloatArray
 ) -> tuple[BoolArray, tuple[str, ...]]:
-    """Return which offsets are identifiable, (k,), and why the others are not.
+    """Mask of the identifiable offsets, (k,), and the reasons for the others.
 
-    Those that the data determine, or a prior nearly as well; none that is known to no better than
-    a degree once all is counted.
-
-    ``chain``: the k joints; ``why``: of each joint why the data do not determine its offset, ''
-    where they do; ``by_data, std``: standard deviation by the model, and with what is known to be
-    left out of it, rad or m, (k,).
+    Identifiable are those that the data determine, or a prior nearly as well; none with a total
+    std above a degree. ``chain``: the k joints; ``why``: reason for each joint that the data do
+    not determine, '' for the others; ``by_data, std``: standard deviation by the model, and with
+    known unmodelled errors, rad or m, (k,).
     """
     by_data = by_data / chain.per_radian
     seen = np.array([not text for text in why])
@@ -158,6 +154,7 @@ def known_offsets(
 
 
 def _entries(model: Model, combination: FloatArray) -> dict[str, float]:
+    """Parameters of a direction that are not zero, by name."""
     return {
         name: round(float(value), 9)
         for name, value in zip(model.names, combination, strict=True)
@@ -168,13 +165,14 @@ def _entries(model: Model, combination: FloatArray) -> dict[str, float]:
 def _badly_determined(
     model: Model, direction: FloatArray, joint: int, std: float, scale: FloatArray
 ) -> GaugeDirection:
-    """Describe a direction along which a joint's offset has a large ``std``, rad or m."""
+    """Gauge direction along which a joint's offset has a large ``std``, rad or m."""
     size = np.abs(direction * scale)
     main = np.where(size > WEAK_SHARE * size.max(), direction, 0.0)
     main[joint] = direction[joint]
     combination = _about_origin(model, main, scale)
     words = (
-        f'{together(model, combination)} hardly change the observations; poses that are spread '
+        f'{combination_text(model, combination)} hardly change the observations; poses that are '
+        'spread '
         f'further and turn the tool, or a prior on {model.names[joint]}, would separate them'
     )
     known = f'the data, though {model.names[joint]} only to {model.chain.shown_offset(joint, std)}'
@@ -184,13 +182,14 @@ def _badly_determined(
 def _null_space(
     model: Model, x: FloatArray, rows: Rows
 ) -> tuple[FloatArray, FloatArray, list[int], list[tuple[FloatArray, int, float]]]:
-    """Return the scale of each parameter, a basis of the null space, (size, d), and its pivots.
+    """Scale of each parameter, (size,), basis of the null space, (size, d), and its pivots.
 
-    Last come the badly determined joints: direction, index and standard deviation, rad or m.
+    Last result: badly determined joints as direction, index and standard deviation, rad or m.
     """
     triangle = _triangle(model, x, rows)
     scale = np.linalg.norm(triangle, axis=0)
-    # The scale of what the data do not determine is that of its prior, else the largest of all.
+    # Parameters that the data do not determine have the scale of their prior, else the largest
+    # one.
     unseen = np.full(model.size, scale.max())
     if model.extension is not None:
         known = np.sqrt(np.diag(model.extension.prior_precision))
@@ -217,9 +216,9 @@ def _null_space(
 
 
 def _triangle(model: Model, x: FloatArray, rows: Rows) -> FloatArray:
-    """Return R of the data's Jacobian J = Q R in units of their spread, (size, size) at most.
+    """Factor R of the data's Jacobian J = Q R in units of their spread, at most (size, size).
 
-    From blocks of rows, so that memory does not grow with their number.
+    Computed from blocks of rows, so that memory does not grow with their number.
     """
     errors = rows.target - model.predict(model.pinned(x), rows)
     spread = np.ones(len(model.sensor_names) + len(rows.turning))
@@ -244,12 +243,12 @@ def _nearly_null(
     limit: float,
     factor: float = 0.0,
 ) -> list[tuple[FloatArray, int, float]]:
-    """Return the directions along which an angle has a standard deviation above a limit, rad.
+    """Directions along which an angle has a standard deviation above a limit, rad.
 
-    The zeros of joints that slide are among the angles, ``per_radian`` of the parameters' units,
-    (size,). It is above a factor times the median of all angles as well, or above `OPEN_ANGLE`.
-    With the pivots of the null space held the rest has a covariance; its column of the worst angle
-    is how everything moves with that angle. Then that one is held too.
+    The zeros of prismatic joints are among the angles, ``per_radian`` of the parameters' units,
+    (size,). The limit is also at least a factor times the median of all angles, and at most
+    `OPEN_ANGLE`. With the pivots of the null space fixed the others have a covariance; its column
+    of the worst angle is the direction. Then that angle is fixed too.
     """
     found = []
     active = ~np.isin(np.arange(len(scale)), pivots)
@@ -271,7 +270,7 @@ def _nearly_null(
 
 
 def _angles(model: Model) -> BoolArray:
-    """Return which of the model's parameters are angles, (size,); effects are not counted."""
+    """Mask of the parameters that are angles, (size,); effects are not."""
     angles = np.arange(model.size) < model.joints
     for sensor in range(len(model.sensor_names)):
         angles[model.registration(sensor)][3:] = True
@@ -280,12 +279,12 @@ def _angles(model: Model) -> BoolArray:
 
 
 def _per_radian(model: Model) -> FloatArray:
-    """Return how much of each parameter counts as a radian, (size,): 1 but of what slides."""
+    """Amount of each parameter that counts as a radian, (size,): 1 except for prismatic joints."""
     return np.append(model.chain.per_radian, np.ones(model.size - model.joints))
 
 
 def _kinds(model: Model) -> tuple[IntArray, ...]:
-    """Return the indices of effects, joints, tools and registrations: the order of pivots."""
+    """Indices of effects, joints, markers and registrations: the order of pivots."""
     end = model.joints + 6 * len(model.sensor_names)
     return (
         np.arange(model.core, model.size),
@@ -298,10 +297,10 @@ def _kinds(model: Model) -> tuple[IntArray, ...]:
 def _reduce(
     work: FloatArray, scale: FloatArray, kinds: tuple[IntArray, ...]
 ) -> tuple[FloatArray, list[int]]:
-    """Bring a basis (size, d) to reduced echelon form: one pivot each, 1 there, 0 in the others.
+    """Basis (size, d) in reduced echelon form, and its pivots.
 
-    The basis comes in units of the scale (size,) and is returned in those of the parameters. So
-    each direction has few parameters: any rotation of the basis spans the same space.
+    The basis comes in units of the scale (size,) and is returned in units of the parameters. Any
+    rotation of the basis spans the same space; in this form each direction has few parameters.
     """
     pivots: list[int] = []
     for column in range(work.shape[1]):
@@ -327,10 +326,11 @@ def _reduce(
 def _unresolved(
     by_direction: FloatArray, pivots: list[int], model: Model, scale: FloatArray
 ) -> set[int]:
-    """Return the pivots that no prior resolves; all of them must be joints or effects, to be held.
+    """Pivots that no prior resolves, which are joints or effects and will be fixed.
 
-    A pivot counts as unknown from a certain standard deviation by the priors on. For an effect, of
-    any unit, that is a million times what the data would leave it if it were alone.
+    A pivot is unresolved above a certain standard deviation by the priors; for an effect, of any
+    unit, that is a million times the std by the data if it were alone. Raises
+    InsufficientDataError if a registration or marker is among them.
     """
     limit = np.where(_angles(model), UNKNOWN_ANGLE * _per_radian(model), 1e3)
     limit[model.core :] = 1e6 / scale[model.core :]
@@ -353,7 +353,7 @@ def _unresolved(
 
 
 def _standard_deviations(by_direction: FloatArray) -> FloatArray:
-    """Return how far priors (m rows) let each direction (d columns) go, (d,); inf without any."""
+    """Standard deviation by priors (m rows) of each of d directions, (d,); inf without any."""
     norm = np.linalg.norm(by_direction, axis=0)
     held = norm > 0.0
     unit = by_direction[:, held] / norm[held]
@@ -366,7 +366,7 @@ def _standard_deviations(by_direction: FloatArray) -> FloatArray:
 
 
 def _about_origin(model: Model, direction: FloatArray, scale: FloatArray) -> FloatArray:
-    """Turn corrections about the centroids into ones about the origin of R; scale and clean up."""
+    """Corrections about the centroids converted to corrections about the origin of R, scaled."""
     size = np.abs(direction * scale)
     moved = np.where(size > NEGLIGIBLE * size.max(), direction, 0.0)
     for sensor, centroid in enumerate(model.centroid):

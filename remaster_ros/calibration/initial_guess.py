@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A first solution, robust against a few gross outliers and badly known markers.
+"""First solution, robust against a few gross outliers and badly known markers.
 
 Closed-form starts (registration by points; registration and markers together as one linear
 problem), each refined by damped Gauss–Newton steps on a Cauchy cost; the best one is returned.
@@ -25,15 +25,16 @@ from remaster_ros.types import FloatArray, IntArray, Measurements
 
 # Errors beyond this many robust standard deviations lose their weight in the start.
 CAUCHY_WIDTH = 2.5
-# Rows of a sensor that the start uses at most.
+# Largest number of rows of a sensor in the start.
 LARGEST_START = 5000
-# With larger errors than this share of the points' extent, the model is that of another robot.
+# Errors above this share of the points' extent mean that the model is that of another robot.
 LARGEST_RELATIVE_ERROR = 0.1
-# Errors of a mirrored sensor: beyond this share of the points' extent, and below this share of it
-# when its points are mirrored back.
+# A sensor is mirrored if its errors are above the first share of the points' extent, and below the
+# second share of themselves when its points are mirrored back.
 LEAST_MIRRORED, MIRRORED = 0.03, 0.3
-# Fewer orientations of a body do not determine how it stands and their noise. Half of them farther
-# from the robot than this, rad, are no measurement of this body: a mastering is off by less.
+# Least number of orientations that determine a body's rotation on the tool and their noise;
+# largest median difference from the robot, rad, of orientations of this body: mastering errors are
+# smaller.
 FEWEST_TURNS = 4
 LARGEST_TURN = np.radians(10.0)
 
@@ -48,13 +49,13 @@ def robust_start(
 ) -> tuple[Model, FloatArray]:
     """Find a solution near the mode.
 
-    ``model``: only its chain and names are used; ``measurements, rows``: the observations, and
-    which of them to fit; ``nominal_markers, marker_std_m``: markers in the tool frame, m,
-    (markers, 3), and how well they are known; ``priors``: priors on the markers.
-    Returns model: With its reference registrations at the solution; z: Pinned parameters there,
-    the outer joints at 0, (size,).
-    Raises InsufficientDataError: when the points of a sensor do not fix a registration;
-    MisfitError: when they are not those of this robot.
+    ``model``: only its chain and names are used; ``measurements, rows``: the observations, and the
+    rows to fit; ``nominal_markers, marker_std_m``: markers in the tool frame, m, (markers, 3), and
+    their std; ``priors``: priors on the markers.
+
+    Returns the model with its reference registrations at the solution, and the pinned parameters
+    there, the outer joints at 0, (size,). Raises InsufficientDataError if the points of a sensor
+    do not fix a registration, MisfitError if they are not those of this robot.
     """
     everything, rows = rows, _some_rows(measurements, rows)
     start, z = closest_start(model, measurements, rows, nominal_markers, marker_std_m, priors)
@@ -69,7 +70,7 @@ def robust_start(
 def given_start(
     model: Model, measurements: Measurements, rows: IntArray, start: Start
 ) -> tuple[Model, FloatArray]:
-    """Return the model with its reference registrations at a known solution, and z there."""
+    """Model with its reference registrations at a known solution, and z there."""
     moved = referenced(model, measurements, rows, start.T_R_N)
     return moved, moved.pinned(moved.vector(start.joint_offsets, start.markers))
 
@@ -82,7 +83,10 @@ def closest_start(
     marker_std_m: float,
     priors: Sequence[Prior],
 ) -> tuple[Model, FloatArray]:
-    """Find the closest solution, however far the data are from the robot; as `robust_start`."""
+    """Closest solution, however far the data are from the robot.
+
+    Arguments as of `robust_start`.
+    """
     chain = model.chain
     tool = chain.forward(measurements.q[rows])
     sensor, marker = measurements.sensor[rows], measurements.marker[rows]
@@ -111,12 +115,11 @@ def closest_start(
 def with_bodies(
     model: Model, z: FloatArray, measurements: Measurements, rows: IntArray
 ) -> tuple[Model, FloatArray, str]:
-    """Return a model that fits the orientations measured, and z with how the bodies stand.
+    """Model that fits measured orientations, and z with the rotations of the bodies.
 
-    ``model, z``: near the mode by the positions; ``measurements, rows``: the observations, and
-    which of them to fit.
-    Returns model, z: As given where no orientations can be fitted; why: A sentence where
-    orientations were measured and cannot; else ''.
+    ``model, z``: near the mode by the positions; ``measurements, rows``: the observations, and the
+    rows to fit. Last result: the reason, a sentence, if orientations were measured and cannot be
+    fitted (model and z are then unchanged), else ''.
     """
     if measurements.orientation is None or model.extension is not None:
         return model, z, ''
@@ -133,7 +136,7 @@ def with_bodies(
         count = int(mine.sum())
         if count < FEWEST_TURNS:
             continue
-        middle, away = _middle(R_T_B[mine])
+        middle, away = _median_rotation(R_T_B[mine])
         if away > LARGEST_TURN:
             name = model.sensor_names[sensor]
             why = (
@@ -151,12 +154,11 @@ def with_bodies(
     return turned, np.concatenate((z, np.zeros(3 * len(bodies)))), ''
 
 
-def _middle(turns: Rotation) -> tuple[FloatArray, float]:
-    """Return the median of rotations, (3, 3), and that of their angles from it, rad.
+def _median_rotation(turns: Rotation) -> tuple[FloatArray, float]:
+    """Median of rotations, (3, 3), and the median of their angles from it, rad.
 
-    The mean with each weighted by the inverse of its angle, again and again (Weiszfeld 1937, on
-    rotations Hartley, Aftab and Trumpf 2011, doi:10.1109/CVPR.2011.5995745): some gross ones do
-    not move it.
+    The mean weighted by the inverse angles, iterated (Weiszfeld 1937, on rotations Hartley, Aftab
+    and Trumpf 2011, doi:10.1109/CVPR.2011.5995745), is insensitive to some gross errors.
     """
     weight = np.ones(len(turns))
     for _ in range(30):
@@ -167,17 +169,17 @@ def _middle(turns: Rotation) -> tuple[FloatArray, float]:
 
 
 def _some_rows(measurements: Measurements, rows: IntArray) -> IntArray:
-    """Return all rows, or evenly spread ones of a sensor that has more than a start needs."""
+    """Rows, evenly spread for a sensor with more than `LARGEST_START`."""
     chosen = []
     for sensor in np.unique(measurements.sensor[rows]):
-        mine = rows[measurements.sensor[rows] == sensor]
-        count = min(len(mine), LARGEST_START)
-        chosen.append(mine[np.linspace(0, len(mine) - 1, count).astype(np.int64)])
+        sensor_rows = rows[measurements.sensor[rows] == sensor]
+        count = min(len(sensor_rows), LARGEST_START)
+        chosen.append(sensor_rows[np.linspace(0, len(sensor_rows) - 1, count).astype(np.int64)])
     return np.sort(np.concatenate(chosen))
 
 
 def register(points_R: FloatArray, points_N: FloatArray, sensor: str) -> FloatArray:
-    """Return T_R_N of one sensor from pairs of points; errors name the sensor."""
+    """T_R_N of one sensor from pairs of points. Raises InsufficientDataError with its name."""
     try:
         return register_points(points_R, points_N)[0]
     except InsufficientDataError as error:
@@ -187,16 +189,16 @@ def register(points_R: FloatArray, points_N: FloatArray, sensor: str) -> FloatAr
 def referenced(
     model: Model, measurements: Measurements, rows: IntArray, reference: FloatArray
 ) -> Model:
-    """Return the model with these registrations as reference, centred on each sensor's data."""
+    """Model with these registrations as reference, centred on each sensor's data."""
     centroid = []
     for index, T_R_N in enumerate(reference):
-        mine = rows[measurements.sensor[rows] == index]
-        centroid.append(apply(T_R_N, np.median(measurements.position[mine], axis=0)))
+        sensor_rows = rows[measurements.sensor[rows] == index]
+        centroid.append(apply(T_R_N, np.median(measurements.position[sensor_rows], axis=0)))
     return replace(model, reference=reference, centroid=np.array(centroid))
 
 
 def _require_right_hand(model: Model, rows: Rows, predicted: FloatArray) -> None:
-    """Refuse points that agree with the robot only when they are mirrored."""
+    """Raise MisfitError for points that agree with the robot only when mirrored."""
     for sensor, span in rows.spans:
         here, there = rows.target[span], predicted[span]
         here, there = here - here.mean(axis=0), there - there.mean(axis=0)
@@ -217,7 +219,7 @@ def _require_right_hand(model: Model, rows: Rows, predicted: FloatArray) -> None
 
 
 def _require_likeness(model: Model, rows: Rows, errors: FloatArray) -> None:
-    """Refuse data that do not fit the robot at all: wrong units, joints or markers."""
+    """Raise MisfitError for data that do not fit the robot: wrong units, joints or markers."""
     spread = robust_spread(errors, rows)
     for error, (sensor, span) in zip(spread, rows.spans, strict=True):
         extent = np.median(np.linalg.norm(rows.target[span] - model.centroid[sensor], axis=1))
@@ -246,8 +248,8 @@ def _linear_markers(
     """Estimate marker positions without any registration.
 
     With any 3×3 matrix G in the place of the sensor's rotation, tool · marker = G p + t is linear
-    in marker, G and t together: one least-squares problem, no start needed. Rows that disagree
-    lose their weight in a few repetitions.
+    in marker, G and t together: one least-squares problem without a start. Rows that disagree lose
+    their weight in a few repetitions.
     """
     sensors, markers = int(sensor.max()) + 1, len(nominal)
     design = np.zeros((len(measured), 3, 12 * sensors + 3 * markers))
@@ -281,10 +283,10 @@ def _linear_markers(
 def _refined(
     model: Model, rows: Rows, priors: Sequence[Prior], z: FloatArray
 ) -> tuple[FloatArray, float]:
-    """Minimise the Cauchy cost by damped Gauss–Newton; return the solution and its spread.
+    """Minimise the Cauchy cost by damped Gauss–Newton; return the solution and its log spread.
 
-    The outer joints stay at 0: in pinned coordinates the data do not depend on them. The
-    extension stays where it was linearised.
+    The outer joints stay at 0, as in pinned coordinates the data do not depend on them. The
+    extension stays at its point of linearisation.
     """
     free = np.setdiff1d(np.arange(model.core), (0, model.joints - 1))
     least_damping = 1e-6
@@ -319,16 +321,18 @@ def _refined(
 
 
 def _squares(errors: FloatArray) -> FloatArray:
+    """Squared lengths of errors, (n,)."""
     return np.einsum('ni,ni->n', errors, errors)
 
 
 def robust_spread(errors: FloatArray, rows: Rows) -> FloatArray:
-    """Return the robust standard deviation per axis of each sensor's errors, m, (sensors,)."""
+    """Robust standard deviation per axis of each sensor's errors, m, (sensors,)."""
     length = np.sqrt(_squares(errors))
     return np.array([np.median(length[s]) / MEDIAN_LENGTH + RESOLUTION_M for _, s in rows.spans])
 
 
 def _cost(errors: FloatArray, scale: FloatArray, prior_residual: FloatArray) -> float:
+    """Cauchy cost of errors plus the prior's cost."""
     width = CAUCHY_WIDTH**2
     data = 0.5 * width * np.sum(np.log1p(_squares(errors) / (width * scale**2)))
     return float(data + 0.5 * prior_residual @ prior_residual)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The mode of a posterior, and its width there.
+"""Mode of a posterior, and its covariance there.
 
-Gauss-Newton steps to where the linearised posterior (`linearisation`) peaks, the noise at the peak
-of its marginal density.
+Gauss–Newton steps to the peak of the linearised posterior (`linearisation`), with the noise at the
+peak of its marginal density.
 """
 
 from __future__ import annotations
@@ -21,30 +21,30 @@ from remaster_ros.calibration.posterior import Posterior
 from remaster_ros.errors import InsufficientDataError
 from remaster_ros.types import BoolArray, FloatArray
 
-# Steps to the mode end when they are shorter than this, in standard deviations. Where the
-# predictions bend along a badly known direction they shorten slowly: then this is near enough for
-# proposals, which the sampler corrects.
+# Length of a step, in standard deviations, at which the search ends; and the length that is near
+# enough, for proposals that the sampler corrects, if steps along a badly known direction shorten
+# slowly.
 SETTLED, NEAR_ENOUGH = 1e-2, 0.1
 FIRST_STEPS, MOST_STEPS = 12, 60
-# A longer step may lead to where the tangent no longer holds: it is halved then, so many times.
+# Longest step within which the tangent holds; a longer one may be halved this number of times.
 TRUSTED = 0.1
 HALVINGS = 10
-# Share of a step by which the bend of the predictions along it is judged.
+# Share of a step for the finite differences of the predictions' bend along it.
 BENT = 0.05
-# The density of the noise is even in a shared part's coordinate: at zero it has no slope, whether
-# it rises or falls from there, and a search that begins at zero would stay.
+# Least start of a shared part's coordinate: the noise density is even in it, so that its slope at
+# zero is zero and a search would stay there.
 OFF_ZERO = 0.1
-# Of the noise's coordinates, to take derivatives by.
+# Step of finite differences in the noise's coordinates.
 DIFFERENCE = 0.02
 
 
 @dataclass(frozen=True, eq=False)
 class Mode:
-    """Where the linearised posterior peaks, and how wide it is."""
+    """Peak of the linearised posterior, and its width."""
 
     z: FloatArray  # Pinned parameters, (size,)
-    eta: FloatArray  # (e,)
-    linearisation: Linearisation  # About z
+    eta: FloatArray  # Coordinates of the noise, (e,)
+    linearisation: Linearisation  # Linearisation about z
 
     @cached_property
     def eta_covariance(self) -> FloatArray:
@@ -53,10 +53,10 @@ class Mode:
 
     @cached_property
     def of_points(self) -> Mode:
-        """The same mode with the positions alone as data.
+        """The same mode with only the positions as data, for analyses of position errors.
 
-        What the orientations tell of the parameters is in the Gram matrix of the priors, at the
-        noise of the mode. For what looks at the errors of positions.
+        The information of the orientations on the parameters is in the Gram matrix of the priors,
+        at the noise of the mode.
         """
         whole = self.linearisation.posterior
         if not whole.rows.turning:
@@ -82,15 +82,15 @@ class Mode:
 
     @property
     def log_evidence(self) -> float:
-        """Log likelihood of the noise at the mode, the parameters integrated out."""
+        """Log likelihood of the noise at the mode, with the parameters integrated out."""
         marginal = self.linearisation.whitened(self.eta)[2]
         return float(marginal - self.linearisation.posterior.log_noise_prior(self.eta))
 
     @property
     def weakest(self) -> str:
-        """Names of the parameters that are determined worst together; effects not counted.
+        """Names of the parameters that are determined worst together, without effects.
 
-        A curve of a joint always has a coefficient that only its smoothness determines.
+        A curve of a joint always has a coefficient that only its smoothness prior determines.
         """
         posterior = self.linearisation.posterior
         core = posterior.free < posterior.model.core
@@ -111,9 +111,9 @@ def find_mode(posterior: Posterior, begun: Mode | None = None) -> Mode:
     """Find the mode by Gauss–Newton steps, the noise at the peak of its marginal density.
 
     ``posterior``: with ``reference`` near the mode (see `initial_guess.robust_start`); ``begun``:
-    the `noise_mode` there; the noise is guessed from the errors at the reference where None.
-    Raises InsufficientDataError: when the steps do not settle: the rows do not determine the free
-    parameters. The message names those along which they go.
+    `noise_mode` there, None to guess the noise from the errors at the reference. Raises
+    InsufficientDataError, naming the parameters, if the steps do not settle: the rows do not
+    determine the free parameters.
     """
     z = posterior.reference
     eta = _noise_guess(posterior) if begun is None else begun.eta
@@ -155,11 +155,11 @@ def find_mode(posterior: Posterior, begun: Mode | None = None) -> Mode:
 
 
 def noise_mode(posterior: Posterior) -> Mode:
-    """Return the mode of the noise at a mode of the parameters of other noise, the reference.
+    """Mode of the noise at the reference, a mode of the parameters with another noise.
 
     The parameters are integrated out by their tangent there: its log evidence is that of
-    `find_mode` to first order, for one linearisation in place of several.
-    Raises InsufficientDataError: as `find_mode`.
+    `find_mode` to first order, with one linearisation in place of several. Raises
+    InsufficientDataError as `find_mode`.
     """
     linearisation = linearise(posterior, posterior.reference)
     try:
@@ -172,10 +172,10 @@ def noise_mode(posterior: Posterior) -> Mode:
 def _uphill(
     linearisation: Linearisation, free: FloatArray, step: FloatArray, eta: FloatArray
 ) -> FloatArray:
-    """Return the free parameters after a step, or the best of shorter ones, at a higher density.
+    """Free parameters after a step, or after the best of shorter ones, at a higher density.
 
-    Given the noise each Gauss-Newton step points uphill. A shorter one than the whole may follow
-    the bend of the predictions (Transtrum & Sethna 2012, arXiv:1201.5885).
+    Given the noise each Gauss–Newton step points uphill. A shorter one may follow the bend of the
+    predictions (Transtrum & Sethna 2012, arXiv:1201.5885).
     """
     posterior = linearisation.posterior
 
@@ -197,9 +197,9 @@ def _uphill(
 
 
 def _bend(linearisation: Linearisation, step: FloatArray, eta: FloatArray) -> FloatArray:
-    """Return what the free parameters change by, to second order of a step (f,), beside it, (f,).
+    """Second-order change of the free parameters, (f,), to be added to a step (f,).
 
-    Where the predictions bend, the errors along the step are then as small as its own.
+    It reduces the errors if the predictions bend along the step.
     """
     posterior, z = linearisation.posterior, linearisation.z
     model, free, f = posterior.model, posterior.free, len(step)
@@ -216,9 +216,9 @@ def _bend(linearisation: Linearisation, step: FloatArray, eta: FloatArray) -> Fl
 
 
 def _open_direction(linearisation: Linearisation, eta: FloatArray, step: FloatArray) -> FloatArray:
-    """Return loadings (f,) of the worst determined direction that a step (f,) goes along.
+    """Loadings (f,) of the worst determined direction along which a step (f,) goes.
 
-    Each in units of what the parameter alone does to the observations.
+    In units of the effect of each parameter by itself on the observations.
     """
     f = len(step)
     gram = linearisation.gram(eta)[:f, :f]
@@ -231,6 +231,7 @@ def _open_direction(linearisation: Linearisation, eta: FloatArray, step: FloatAr
 
 
 def _noise_guess(posterior: Posterior) -> FloatArray:
+    """Coordinates of the noise, (e,), from the errors at the reference."""
     errors = posterior.rows.target - posterior.model.predict(posterior.reference, posterior.rows)
     noise = posterior.noise_model
     sums = noise.sums_of_squares(errors)
@@ -259,7 +260,7 @@ def _noise_guess(posterior: Posterior) -> FloatArray:
 
 
 def _noise_peak(linearisation: Linearisation, start: FloatArray, shortest: float) -> FloatArray:
-    """Climb to the peak of the noise's log density by Newton steps no longer than 1.
+    """Peak of the noise's log density by Newton steps no longer than 1.
 
     They end below the shortest length that counts.
     """
@@ -285,7 +286,7 @@ def _noise_peak(linearisation: Linearisation, start: FloatArray, shortest: float
 
 
 def _noise_covariance(linearisation: Linearisation, peak: FloatArray) -> FloatArray:
-    """Return the noise's covariance by its curvature; of a shared part near zero by its spread."""
+    """Covariance of the noise by curvature; for a shared part near zero by its spread."""
     precision = _noise_curvature(linearisation, peak)
     count = len(linearisation.posterior.noise_model.channels)
     std = 1.0 / np.sqrt(np.maximum(np.diag(precision), 0.45))
@@ -313,7 +314,7 @@ def _noise_covariance(linearisation: Linearisation, peak: FloatArray) -> FloatAr
 def _noise_slope(
     linearisation: Linearisation, at: FloatArray
 ) -> tuple[float, FloatArray, FloatArray]:
-    """Return the noise's log density, its gradient and about its negative second derivative."""
+    """Log density of the noise, its gradient, and its approximate negative second derivative."""
     posterior = linearisation.posterior
     value, slope, information = linearisation.by_variances(at)
 
@@ -327,10 +328,9 @@ def _noise_slope(
 
 
 def _noise_curvature(linearisation: Linearisation, at: FloatArray) -> FloatArray:
-    """Return the negative second derivative of the noise's log density.
+    """Negative second derivative of the noise's log density.
 
-    By differences of its gradient, which takes one factor where the density itself takes one for
-    each of dozens of points.
+    By differences of its gradient, which needs one factorisation for dozens of the density's.
     """
     around = DIFFERENCE * np.stack((np.eye(len(at)), -np.eye(len(at))))
     plus, minus = (
@@ -343,9 +343,9 @@ def _noise_curvature(linearisation: Linearisation, at: FloatArray) -> FloatArray
 def _curvature(
     density: Callable[[FloatArray], FloatArray], at: FloatArray
 ) -> tuple[float, FloatArray, FloatArray]:
-    """Return a log density, its gradient and its negative second derivative by differences.
+    """Log density, gradient and negative second derivative by differences.
 
-    All in one batch: the density costs microseconds, its derivative a page.
+    All points in one batch: the density costs microseconds, its analytic derivative a page.
     """
     e, step = len(at), DIFFERENCE
     unit = step * np.eye(e)

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Are held-out poses predicted as well as poses that are left out of the fit in turn?
+"""Comparison of held-out poses with poses that are left out of the fit in turn.
 
-Parameters and noise of a fit take up a part of the model's errors on the poses fitted, and
-nothing of those on held-out ones: a sensor that was moved before them, or a model that does not
-hold where they lie, shows there. Each pose is judged in units of what is uncertain of its
-prediction, the parameters included, and by a noise estimated without it.
+Parameters and noise of a fit absorb a part of the model's errors on the fitted poses, and nothing
+on held-out ones: a sensor that was moved before them, or a model that does not hold there, shows.
+Each pose is judged in units of its prediction's uncertainty, the parameters included, and by a
+noise estimated without it.
 
 In units of the noise a pose has the errors e and the derivative X, and the fit the covariance Σ.
 To first order, with the pose left out, its errors and their covariance are::
@@ -28,33 +28,32 @@ from remaster_ros.calibration.residual_structure import LEAST_NOISE_M, Structure
 from remaster_ros.calibration.smooth_functions import spread_poses, whitened
 from remaster_ros.types import FloatArray, IntArray, Measurements
 
-# Fewer poses of a sensor say little, held out or fitted.
+# Least numbers of held-out and of fitted poses of a sensor for a comparison.
 FEWEST_HELD_OUT, FEWEST_FITTED = 4, 8
-# Beyond, their ranks are as good as normal: SciPy's own limit, for the same p-values.
+# Number of poses above which their ranks count as normal: SciPy's own limit, for equal p-values.
 FEW = 8
-# So many poses of the fit are left out, evenly spread.
+# Largest number of poses that are left out, evenly spread.
 MOST_LEFT_OUT = 1_000
-# A pose is not left out where the others would know less than this share about a direction.
+# A pose is not left out if the others have less than this share of the information on a direction.
 LEAST_SHARE = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
 class Contrasts:
-    """Of each sensor's rows at a pose the mean, and deviations that are independent of it.
+    """Mean and deviations of each sensor's rows at a pose, independent, in units of the noise.
 
-    In units of the noise. The mean shows a sensor or base that was moved, deviations what differs
-    between joint solutions. (The rows of Helmert's matrix: the first is of equal numbers, all are
-    of length one.)
+    The mean shows a sensor or base that was moved, deviations show differences between joint
+    solutions. (The rows of Helmert's matrix: the first has equal numbers, all have length one.)
     """
 
-    pose: IntArray  # Number of each one's pose in the session, (n,)
-    kind: IntArray  # Twice the sensor's number, and one more for a mean, (n,)
+    pose: IntArray  # Pose of each contrast in the session, (n,)
+    kind: IntArray  # Twice the sensor's index, and one more for a mean, (n,)
     derivative: FloatArray  # (n, 3, f)
     errors: FloatArray  # (n, 3)
 
     @classmethod
     def of(cls, rows: Rows, measurements: Measurements, white: FloatArray) -> Contrasts:
-        """Form them of the rows' [derivative | error] in units of the noise, (n, 3, f + 1)."""
+        """Contrasts of the rows' [derivative | error] in units of the noise, (n, 3, f + 1)."""
         formed = np.empty_like(white)
         for size in np.unique(rows.group_size).tolist():
             at = rows.group_start[rows.group_size == size][:, None] + np.arange(size)
@@ -64,41 +63,44 @@ class Contrasts:
         return cls(measurements.pose[rows.source], kind, formed[..., :-1], formed[..., -1])
 
     def gram(self, kind: int) -> FloatArray:
-        """Return the Gram matrix of [derivative | error] of one kind, (f + 1, f + 1)."""
-        mine = self.kind == kind
-        both = np.concatenate((self.derivative[mine], self.errors[mine][..., None]), axis=2)
+        """Gram matrix of [derivative | error] of one kind, (f + 1, f + 1)."""
+        of_kind = self.kind == kind
+        both = np.concatenate((self.derivative[of_kind], self.errors[of_kind][..., None]), axis=2)
         flat = both.reshape(-1, both.shape[2])
         gram: FloatArray = flat.T @ flat
         return gram
 
     def distances(self, kind: int, covariance: FloatArray) -> Iterator[float]:
-        """Give the squared distance over its size of each pose that was not fitted."""
+        """Yield the squared distance per number of each pose that was not fitted."""
         for pose in np.unique(self.pose[self.kind == kind]):
-            mine = (self.kind == kind) & (self.pose == pose)
-            X, e = self.derivative[mine].reshape(-1, len(covariance)), self.errors[mine].ravel()
+            of_pose = (self.kind == kind) & (self.pose == pose)
+            X, e = (
+                self.derivative[of_pose].reshape(-1, len(covariance)),
+                self.errors[of_pose].ravel(),
+            )
             yield float(e @ np.linalg.solve(np.eye(len(e)) + X @ covariance @ X.T, e)) / len(e)
 
 
 def compared(
     fitted: Contrasts, held_out: Contrasts, covariance: FloatArray
 ) -> Iterator[tuple[int, float, float]]:
-    """Compare held-out poses with poses left out of the fit, kind by kind of contrasts.
+    """Compare held-out poses with poses left out of the fit, for each kind of contrasts.
 
-    By ranks (Mann and Whitney 1947, doi:10.1214/aoms/1177730491), which a few poses do not
-    decide, however far out.
+    By ranks (Mann and Whitney 1947, doi:10.1214/aoms/1177730491), which a few far outliers do not
+    decide.
 
     Parameters
     ----------
     fitted, held_out
-        What the model leaves of either.
+        Contrasts of the errors of either.
     covariance
-        Of the parameters, (f, f).
+        Covariance of the parameters, (f, f).
 
     Yields
     ------
     int, float, float
-        The kind, the probability of errors as large by chance, and the ratio of the typical
-        errors, each in units of what is uncertain of it; of each kind with enough poses of either.
+        Kind, probability of errors as large by chance, and ratio of the typical errors, each in
+        units of their uncertainty; for each kind with enough poses of either.
     """
     expected = left_out_distances(fitted, covariance)
     for kind in np.intersect1d(fitted.kind, held_out.kind).tolist():
@@ -112,7 +114,7 @@ def compared(
 
 
 def _p_value_larger(found: FloatArray, expected: FloatArray) -> float:
-    """Return how probable it is by chance that numbers (n,) rank as high beside others (m,)."""
+    """Probability by chance that numbers (n,) rank as high among others (m,)."""
     n, m = len(found), len(expected)
     if min(n, m) <= FEW:
         # All orders are counted. SciPy's statistics take half a second to import.
@@ -123,14 +125,14 @@ def _p_value_larger(found: FloatArray, expected: FloatArray) -> float:
 
 
 def left_out_distances(fitted: Contrasts, covariance: FloatArray) -> dict[int, FloatArray]:
-    """Return squared distances of poses left out in turn, in units of the noise without them."""
+    """Squared distances of poses left out in turn, in units of the noise without them, by kind."""
     kinds = np.unique(fitted.kind).tolist()
     f = len(covariance)
     distances: dict[int, list[float]] = {kind: [] for kind in kinds}
     grams = {kind: fitted.gram(kind) for kind in kinds}
     flat = fitted.derivative.reshape(-1, f)
     spread = flat @ covariance
-    # What determines the noise of a kind, of each row: the change of its degrees of freedom.
+    # Change of a kind's degrees of freedom by each row, which determines its noise.
     by_kind = {kind: spread @ grams[kind][:f, :f] @ covariance for kind in kinds}
     free = {kind: float(np.sum(grams[kind][:f, :f] * covariance)) for kind in kinds}
     of_kind = np.repeat(fitted.kind, 3)
@@ -158,7 +160,7 @@ def left_out_distances(fitted: Contrasts, covariance: FloatArray) -> dict[int, F
 
 
 def _variance(gram: FloatArray, size: int, covariance: FloatArray) -> float:
-    """Return that of the noise, by ``size`` numbers that determined parameters."""
+    """Variance of the noise from ``size`` numbers, corrected for the fitted parameters."""
     freedom = size - np.sum(gram[:-1, :-1] * covariance)
     return float(gram[-1, -1] / max(freedom, 1.0))
 
@@ -166,10 +168,10 @@ def _variance(gram: FloatArray, size: int, covariance: FloatArray) -> float:
 def held_out_tests(
     mode: Mode, measurements: Measurements, gross: IntArray
 ) -> tuple[StructureTest, ...]:
-    """Test for each sensor of a fit whether held-out poses are worse predicted.
+    """Test for each sensor of a fit whether held-out poses are predicted worse.
 
-    ``mode``: of the posterior of the rows fitted; ``measurements``: that the rows were taken from;
-    ``gross``: ``observation`` of every held-out row that is a gross error.
+    ``mode``: of the posterior of the fitted rows; ``measurements``: all rows; ``gross``:
+    ``observation`` of each held-out row that is a gross error.
     """
     posterior = mode.linearisation.posterior
     kept = measurements.is_validation & ~np.isin(measurements.observation, gross)
@@ -187,6 +189,7 @@ def held_out_tests(
 
 
 def _contrasts(mode: Mode, measurements: Measurements, rows: Rows) -> Contrasts:
+    """Contrasts of rows at a mode."""
     white = whitened(mode, rows, {})
     joined = np.concatenate((white['model'], white['errors']), axis=2)
     return Contrasts.of(rows, measurements, joined)

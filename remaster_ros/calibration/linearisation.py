@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The posterior of a model that is linear about a point: Gaussian given the noise.
+"""Posterior of the model linearised about a point: Gaussian given the noise.
 
-Mean and precision follow from a handful of Gram matrices whatever the noise: a rotation of well
-under a degree bends so little that this is nearly the exact posterior, so it serves as proposal of
-the exact sampler.
+Its mean and precision follow from a few Gram matrices for any noise. Registrations turn by less
+than a degree, so that the linearised posterior is nearly the exact one and serves as the proposal
+of the exact sampler.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from remaster_ros.types import FloatArray
 
 
 def linearise(posterior: Posterior, z: FloatArray) -> Linearisation:
-    """Return the posterior with the predictions replaced by their tangent at z (size,)."""
+    """Posterior with the predictions replaced by their tangent at z (size,)."""
     model, free = posterior.model, posterior.free
 
     def joined(rows: Rows, _: slice) -> FloatArray:
@@ -38,35 +38,36 @@ def linearise(posterior: Posterior, z: FloatArray) -> Linearisation:
 
 @dataclass(frozen=True, eq=False)
 class Linearisation:
-    """The posterior of a model that is linear about ``z``: Gaussian given the noise."""
+    """Posterior of the model linearised about ``z``: Gaussian given the noise."""
 
-    posterior: Posterior  # The one it approximates
+    posterior: Posterior  # The exact posterior
     z: FloatArray  # Pinned parameters, (size,)
     # Gram matrix of [derivative | error] in each error group, (error groups, f+1, f+1)
     grams: FloatArray
     prior: FloatArray  # Gram matrix of the priors, (f+1, f+1)
 
     def gram(self, eta: FloatArray) -> FloatArray:
-        """Return the weighted Gram matrices (..., f+1, f+1) for noise coordinates (..., e)."""
+        """Weighted Gram matrices (..., f+1, f+1) for noise coordinates (..., e)."""
         return np.tensordot(1.0 / self.posterior.variances(eta), self.grams, axes=1) + self.prior
 
     def conditional(self, eta: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return the Gaussian of the free parameters given the noise, and the noise's density.
+        """Gaussian of the f free parameters given the noise.
 
-        ``eta``: (..., e).
-        Returns mean: Free pinned parameters, (..., f); cholesky: Lower Cholesky factor of the
-        precision, (..., f, f); log_marginal: Log density of the noise coordinates with the
-        parameters integrated out, (...).
+        Last result: the marginal density of the noise.
+
+        ``eta``: noise coordinates, (..., e). Returns the mean of the free pinned parameters (...,
+        f), the lower Cholesky factor of their precision (..., f, f), and the log density of the
+        noise coordinates with the parameters integrated out (...).
         """
         factor, pull, log_marginal = self.whitened(eta)
         step = np.linalg.solve(np.swapaxes(factor, -1, -2), pull[..., None])[..., 0]
         return self.z[self.posterior.free] + step, factor, log_marginal
 
     def whitened(self, eta: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return the same Gaussian as its factor L and the vector L' (mean - z), and the density.
+        """Factor L of the precision (..., f, f), L' (mean - z), and the marginal log density.
 
-        All follow from one factor of the bordered matrix: its last row holds the vector, its last
-        entry the root of what the parameters leave of the weighted sum of squares.
+        All three follow from one Cholesky factor of the bordered matrix: its last row is the
+        vector, its last entry the root of the weighted sum of squares that remains at the mean.
         """
         posterior = self.posterior
         gram = self.gram(eta)
@@ -91,14 +92,12 @@ class Linearisation:
         return inner, factor[..., f, :f], log_marginal
 
     def by_variances(self, eta: FloatArray) -> tuple[float, FloatArray, FloatArray]:
-        """Return the noise's log density, and how it depends on the log variance of each group.
+        """Log density of the noise, with gradient and information for each group's log variance.
 
-        All from one factor, where differences would take dozens.
-
-        ``eta``: (e,).
-        Returns log_marginal: As `conditional` gives it; slope: Gradient without the prior of the
-        noise, (error groups,); information: Average of observed and expected information (Gilmour,
-        Thompson & Cullis 1995, Biometrics 51), (error groups, error groups).
+        One Cholesky factor gives all three; finite differences would need dozens. ``eta``: (e,).
+        Returns the log density as in `conditional`; its gradient without the prior of the noise,
+        (error groups,); and the average of observed and expected information (Gilmour, Thompson &
+        Cullis 1995, Biometrics 51), (error groups, error groups).
         """
         factor, pull, log_marginal = self.whitened(eta)
         root = np.asfortranarray(factor)
@@ -118,5 +117,5 @@ class Linearisation:
 
 
 def log_determinant(factor: FloatArray) -> FloatArray:
-    """Return the log determinant of triangular factors (..., f, f), (...)."""
+    """Log determinants (...) of triangular factors (..., f, f)."""
     return np.sum(np.log(np.diagonal(factor, axis1=-2, axis2=-1)), axis=-1)

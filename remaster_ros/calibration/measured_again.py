@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Held-out configurations that were fitted as well: they prove nothing of others."""
+"""Held-out configurations that were fitted as well, and so are no test of others."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ SAME_RAD = float(np.radians(0.05))
 
 @dataclass(frozen=True)
 class MeasuredAgain:
-    """How many of the held-out configurations were fitted as well."""
+    """Number of held-out configurations, and of those that were fitted as well."""
 
     again: int
     held_out: int
 
     @classmethod
     def of(cls, measurements: Measurements) -> MeasuredAgain:
-        """Count, by joint angles."""
+        """Count of configurations with joint angles within `SAME_RAD` of a fitted one."""
         first = np.unique(measurements.configuration, return_index=True)[1]
         q, held_out = measurements.q[first], measurements.is_validation[first]
         if not held_out.any() or held_out.all():
@@ -33,12 +33,12 @@ class MeasuredAgain:
 
     @property
     def most(self) -> bool:
-        """Whether it is more than half of them."""
+        """Whether more than half of the held-out configurations were fitted as well."""
         return self.again > 0.5 * self.held_out
 
     @property
     def words(self) -> str:
-        """What that means, a sentence; '' where there are none."""
+        """Sentence for the report; '' if no held-out configuration was fitted as well."""
         if not self.again:
             return ''
         return (

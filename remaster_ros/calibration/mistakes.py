@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which mistake of a person makes a session fit its robot? Tried on data, where it does not fit.
+"""Mistakes in a session that does not fit its robot: each is corrected by trial and fitted.
 
-Joints that count the other way round, columns in another order, zero positions 90 degrees off,
-units, mirrored points and points beside the joints of another row come from `arrangement`. Here
-come those that begin at a row, found by two fits that do not contain the row, and those of the
-tool: another link, a turned frame, a wrong place of the marker. What is named was tried: the
-session without it is estimated as any session is.
+Reversed joints, columns in another order, zero positions 90 degrees off, units, mirrored points
+and points next to the joints of another row are tried in `arrangement`. Here are tried the
+mistakes that begin at a row, found by two fits without that row, and those of the tool: another
+tip link, a turned tool frame, a wrong marker position. A mistake is named only if the session
+without it is estimated like any other session.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ from remaster_ros.calibration.arrangement import (
     Arrangement,
     Fitted,
     arranged,
-    came_from,
     closest,
     closest_fit,
     exchanged,
     fit_arrangement,
+    joint_rows_of_points,
     search,
     some_rows,
 )
@@ -49,11 +49,11 @@ from remaster_ros.kinematics.urdf import parse_urdf
 from remaster_ros.linear_algebra import one_thread
 from remaster_ros.types import FloatArray, Measurements, Priors, Session
 
-# Where nothing is known of a marker's place (the session format's own advice).
+# Standard deviation of an unknown marker position, as the session format advises.
 UNKNOWN_MARKER_STD_M = 0.3
-# A marker found at least so far from where it was said to be is on another link, m.
+# Smallest distance between the fitted and the stated position of a marker on another link, m.
 MARKER_SHIFT_M = UNCALIBRATED_ERROR_M
-# Units that tables are in, m and rad.
+# Units of tables, in m and in rad.
 LENGTHS: Mapping[str, float] = {'m': 1.0, 'cm': 1e-2, 'mm': 1e-3, 'um': 1e-6, 'in': 0.0254}
 ANGLES: Mapping[str, float] = {'rad': 1.0, 'deg': np.pi / 180.0, 'gon': np.pi / 200.0}
 TRIED = (
@@ -65,25 +65,18 @@ TRIED = (
 
 @dataclass(frozen=True, eq=False)
 class Mistakes:
-    """What trying has shown."""
+    """Result of the trial of mistakes."""
 
-    given: Fitted  # The fit of the session as it is, its markers' places left open
-    # The mistakes without which it fits, the simplest first; several where the data cannot tell
+    given: Fitted  # The fit of the session as it is, with unknown marker positions
+    # Fits without a mistake, the simplest first; several if the data cannot tell them apart
     fitting: tuple[Fitted, ...]
 
 
 def find_mistakes(session: Session) -> Mistakes:
-    """Look for the mistakes without which a session fits its robot.
+    """Mistakes without which a session fits its robot.
 
-    Parameters
-    ----------
-    session
-        That does not fit, or is gross.
-
-    Raises
-    ------
-    InsufficientDataError
-        Too few rows to fit anything.
+    ``session``: does not fit its robot, or fits with gross offsets or errors. Raises
+    InsufficientDataError if there are too few rows for a fit.
     """
     joints = session.measurements.q.shape[1]
     # A marker that is firm at a wrong place would bend the fit.
@@ -93,22 +86,22 @@ def find_mistakes(session: Session) -> Mistakes:
     slides = not np.all(given.per_radian == 1.0)
     if len(session.measurements) < FEWEST_ROWS or slides:
         return Mistakes(given, ())
-    found = [] if given.gross else _of_the_tool(session, given)
+    found = [] if given.gross else _tool_mistakes(session, given)
     if not found:
         lengths = {a / b for a, b in product(LENGTHS.values(), repeat=2) if a != b}
         found = search(part, given, sorted(lengths))
-        for arrangement in () if found else _from_a_row_on(part):
+        for arrangement in () if found else _mistakes_from_row(part):
             try:
                 fit = fit_arrangement(part, arrangement)
             except RemasterError:
                 continue
-            if not fit.gross and fit.left_m * CONVINCING < given.left_m:
+            if not fit.gross and fit.worst_error_m * CONVINCING < given.worst_error_m:
                 found.append(fit)
-    return Mistakes(given, tuple(fit for fit in closest(found) if _holds(session, fit)))
+    return Mistakes(given, tuple(fit for fit in closest(found) if _is_sound(session, fit)))
 
 
-def _holds(session: Session, fit: Fitted) -> bool:
-    """Return whether the session as rearranged is estimated like any other, and is not gross."""
+def _is_sound(session: Session, fit: Fitted) -> bool:
+    """Whether the rearranged session can be estimated without gross offsets or errors."""
     try:
         found = estimate(Problem.of(some_rows(arranged(session, fit.arrangement))))
     except (RemasterError, np.linalg.LinAlgError):
@@ -117,7 +110,7 @@ def _holds(session: Session, fit: Fitted) -> bool:
 
 
 def is_gross(found: Estimate) -> bool:
-    """Return whether an estimate has larger offsets or errors than a mastered robot leaves."""
+    """Whether an estimate has larger offsets or errors than a mastered robot can have."""
     offsets = found.mode.z[: found.model.joints]
     sigma = found.posterior.noise(found.mode.eta).sigma
     limit = LARGEST_OFFSET * found.model.chain.per_radian
@@ -130,16 +123,10 @@ def sound_estimate(
     priors: Priors | None = None,
     fitted: Callable[[Problem], Estimate] = estimate,
 ) -> Estimate:
-    """Estimate a session; where it does not fit its robot, name the mistake without which it does.
+    """Estimate of a session that fits its robot; ``fitted``: function that estimates it.
 
-    ``fitted``: how it is estimated.
-
-    Raises
-    ------
-    MistakeFoundError
-        It does not fit, or is gross, and does without a mistake that is named.
-    MisfitError
-        It does not fit, and none of the mistakes that were tried mends it.
+    Raises MistakeFoundError if the session does not fit, or is gross, and fits without a mistake
+    that the error names; MisfitError if none of the tried mistakes explains it.
     """
     try:
         found = fitted(Problem.of(session, priors))
@@ -150,7 +137,7 @@ def sound_estimate(
             return found
         mistakes = find_mistakes(session)
         if mistakes.fitting:
-            raise _named(session, mistakes, 'the session does not fit the robot')
+            raise _mistake_found(session, mistakes, 'the session does not fit the robot')
         return found
     try:
         mistakes = find_mistakes(session)
@@ -167,20 +154,22 @@ def sound_estimate(
             else f'tried, and it is none of these: {TRIED}'
         )
         raise MisfitError(refused.what, f'{refused.remedy}; {why}')
-    raise _named(session, mistakes, refused.what)
+    raise _mistake_found(session, mistakes, refused.what)
 
 
-def _named(session: Session, mistakes: Mistakes, what: str) -> MistakeFoundError:
+def _mistake_found(session: Session, mistakes: Mistakes, what: str) -> MistakeFoundError:
+    """Error that names the mistakes, with the options of the import that correct them."""
     chain = SerialChain.from_urdf(session.urdf, session.base_link, session.tip_link)
     columns = Columns(chain.joint_names, chain.joint_names)
-    sentence, options = in_a_sentence(mistakes, session, columns)
+    sentence, options = sentence_of_mistakes(mistakes, session, columns)
     return MistakeFoundError(f'{what}; {sentence}', options)
 
 
-def _of_the_tool(session: Session, given: Fitted) -> list[Fitted]:
-    """Return the links and turns with which the markers are where they were said to be.
+def _tool_mistakes(session: Session, given: Fitted) -> list[Fitted]:
+    """Tip links and turns of the tool with which the markers are at their stated positions.
 
-    Where there are none, that the markers' places are wrong.
+    If there are none: the fit with other marker positions. Empty if the markers are at their
+    stated positions already.
     """
     allowed = max(DISPLACED * session.marker_std_m, MARKER_SHIFT_M)
     if given.marker_shift_m < allowed:
@@ -208,18 +197,18 @@ def _of_the_tool(session: Session, given: Fitted) -> list[Fitted]:
 
 
 def _pairs(m: Measurements) -> list[tuple[int, int]]:
-    """Return the pairs of markers that one sensor has measured."""
+    """Pairs of markers that one sensor has measured."""
     pairs: set[tuple[int, int]] = set()
     for sensor in np.unique(m.sensor):
         pairs |= set(combinations(np.unique(m.marker[m.sensor == sensor]).tolist(), 2))
     return sorted(pairs)
 
 
-def _from_a_row_on(session: Session) -> Iterator[Arrangement]:
-    """Give what may be otherwise from a row on, with the row that divides the session best.
+def _mistakes_from_row(session: Session) -> Iterator[Arrangement]:
+    """Arrangements with a mistake that begins or ends at a row, each with the row that fits best.
 
-    One half of the rows contains no such row. The first half, as given, and the last half, as it
-    would be, are fitted; every row is compared with either.
+    One half of the rows has no such change. The first half as given, and the last half with the
+    change, are fitted; every row is compared with both fits.
     """
     m = session.measurements
     plain, everywhere = Arrangement.given(m.q.shape[1]), np.ones(len(m), bool)
@@ -231,13 +220,13 @@ def _from_a_row_on(session: Session) -> Iterator[Arrangement]:
         for row in _divisions(session, other, m):
             yield replace(plain, exchanged=pair, until=numbers[row])
     for shift in (-1, 1):
-        of, _ = came_from(m, shift, everywhere)
+        of, _ = joint_rows_of_points(m, shift, everywhere)
         for row in _divisions(session, m, replace(m, q=m.q[of])):
             yield replace(plain, shift=shift, since=numbers[row])
 
 
 def _divisions(session: Session, before: Measurements, after: Measurements) -> Iterator[int]:
-    """Give the rows from which on the second is the better table, the first before them."""
+    """Rows at which a change from the first table to the second fits best, from either half."""
     half = len(before) // 2
     if half < FEWEST_ROWS:
         return
@@ -252,7 +241,7 @@ def _divisions(session: Session, before: Measurements, after: Measurements) -> I
 def _costs(
     session: Session, part: Measurements, before: Measurements, after: Measurements
 ) -> tuple[FloatArray, FloatArray] | None:
-    """Return the robust cost of every row of two tables, by a fit of a part; None without one."""
+    """Robust cost of every row of two tables by the fit of a part; None if the fit fails."""
 
     def problem(m: Measurements) -> Problem:
         fitted = replace(m, is_validation=np.zeros(len(m), bool))
@@ -280,25 +269,29 @@ def _costs(
 
 @dataclass(frozen=True)
 class Columns:
-    """How a table names what it holds."""
+    """Names and units of a table's columns."""
 
-    # Its columns of joints, and how they are called in a sentence
+    # Columns of joints, and their names in a sentence
     joints: tuple[str, ...]
     shown: tuple[str, ...]
-    points: tuple[str, ...] = ('x_m', 'y_m', 'z_m')  # Its columns of x, y and z
-    # In which its numbers were taken to be
+    points: tuple[str, ...] = ('x_m', 'y_m', 'z_m')  # Columns of x, y and z
+    # Units in which the numbers were read
     length_unit: str = 'm'
     angle_unit: str = 'rad'
 
 
-def in_a_sentence(mistakes: Mistakes, session: Session, columns: Columns) -> tuple[str, str]:
-    """Return which mistakes make the session fit, and the options that undo the first of them."""
+def sentence_of_mistakes(
+    mistakes: Mistakes, session: Session, columns: Columns
+) -> tuple[str, str]:
+    """Sentence with the mistakes, and the options that correct the first of them."""
     found, given = mistakes.fitting[0], mistakes.given
     words, options = in_words(found.arrangement, session, columns)
     sentence = f'with {words} the data fit to {shown_mm(found.error_m)}; without, to '
     # Where only a part of the rows is off, the median does not show it.
-    sentence += shown_mm(given.error_m if given.error_m > UNCALIBRATED_ERROR_M else given.left_m)
-    if given.left_m < ALIKE * found.left_m:
+    sentence += shown_mm(
+        given.error_m if given.error_m > UNCALIBRATED_ERROR_M else given.worst_error_m
+    )
+    if given.worst_error_m < ALIKE * found.worst_error_m:
         largest, least = (
             np.degrees(np.abs(np.angle(np.exp(1j * fit.joint_offsets))).max())
             for fit in (given, found)
@@ -324,7 +317,7 @@ def in_a_sentence(mistakes: Mistakes, session: Session, columns: Columns) -> tup
 
 
 def in_words(found: Arrangement, session: Session, columns: Columns) -> tuple[str, str]:
-    """Return what is other than given, and the options of ``remaster import`` that make it so."""
+    """Changes of an arrangement in words, and the options of ``remaster import`` for them."""
     names = [columns.shown[column] for column in found.order]
     words, options = [], []
     given = Arrangement.given(len(names))
@@ -363,7 +356,7 @@ def in_words(found: Arrangement, session: Session, columns: Columns) -> tuple[st
         x, y, z = columns.points
         words.append('X and Y exchanged (the points are mirrored)')
         options.append(f'--points {quote(f"{y},{x},{z}")}')
-    stretch, at = _stretch(found)
+    stretch, at = _row_range(found)
     if found.shift:
         where = 'before' if found.shift > 0 else 'behind'
         words.append(f'each point{stretch} moved to the joints of the row {where} it')
@@ -382,8 +375,8 @@ def in_words(found: Arrangement, session: Session, columns: Columns) -> tuple[st
     return ', '.join(words), ' '.join(options)
 
 
-def _stretch(found: Arrangement) -> tuple[str, str]:
-    """Return the rows of a mistake in words, and as options have them."""
+def _row_range(found: Arrangement) -> tuple[str, str]:
+    """Rows of a mistake in words, and as options have them."""
     if found.since is not None:
         return f' from observation {found.since} on', f'@{found.since}-'
     if found.until is not None:
@@ -392,6 +385,6 @@ def _stretch(found: Arrangement) -> tuple[str, str]:
 
 
 def shown_mm(length: float) -> str:
-    """Return a length for a sentence."""
+    """Length, m, in mm for a sentence."""
     size = 1e3 * length
     return f'{size:.0f} mm' if size >= 10.0 else f'{size:.2g} mm'

@@ -1,42 +1,42 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Chain, registrations and markers together: where each sensor should measure each marker.
+"""Model of the observations: chain, registrations and markers give the reading of each sensor.
 
 The model of one observation (eq. 8 of Van Wyk et al., with the marker's position as a parameter)::
 
-    p_N = inverse(T_R_N) f(q + joint_offsets, marker)
+  p_N = inverse(T_R_N) f(q + joint_offsets, marker)
 
 Parameters are one flat vector x, base units m and rad, in the order joint offsets (k),
-registration of each sensor (6), position of each marker (3), turn of each body (3) whose
-orientation is fitted, and theta (m) of an `Extension` where there is one. A registration
-is a correction C applied to the robot's points on their way to the sensor, along and about the
+registration of each sensor (6), position of each marker (3), rotation of each body (3) whose
+orientation is fitted, and theta (m) of an `Extension` if there is one. A registration is a
+correction C of the robot's points before they are transformed to the sensor, along and about the
 axes of the base R::
 
-    inverse(T_R_N) = inverse(T_R_N of the reference) C,    C(p) = c + exp(r) (p - c) + t
+  inverse(T_R_N) = inverse(T_R_N of the reference) C,    C(p) = c + exp(r) (p - c) + t
 
-with t = (x, y, z) and r = (rx, ry, rz), about the centroid c of that sensor's data, which keeps t
-and r nearly uncorrelated. Everything is computed in the reference's base coordinates: distances
-there equal distances in N.
+with t = (x, y, z) and r = (rx, ry, rz), about the centroid c of that sensor's data, so that t and
+r are nearly uncorrelated. All predictions are in the reference's base coordinates: distances there
+equal distances in N.
 
-*Orientations.* Where a sensor measures how a body stands, R_N_B, it should be::
+*Orientations.* If a sensor measures the orientation of a body, R_N_B, the model is::
 
-    R_N_B = R_R_N' R_R_T(q + joint_offsets) R_T_B,    R_T_B = exp(b) R_T_B of the reference
+  R_N_B = R_R_N' R_R_T(q + joint_offsets) R_T_B,    R_T_B = exp(b) R_T_B of the reference
 
-How the body stands on the tool, b, is unknown like its place. The prediction of such a row is the
-rotation vector from the measured to the modelled orientation, along the axes of R, so that minus
-it is the error. A camera on the tool that measures a board is the same arm: the board is the
-sensor's frame N, the camera's frame C the body. What it measures is the board's origin l in C, at
-the place T_R_T (marker + R_T_C l) of the arm, which should be the origin of N; as its noise is in
-C, that is compared, not the camera's place in front of the board, in which noise of the
-orientation stands at the distance's lever.
+The orientation of the body on the tool, b, is unknown like its position. The prediction of such a
+row is the rotation vector from the measured to the modelled orientation, along the axes of R, so
+that minus the prediction is the error. A camera on the tool that measures a board is the same arm:
+the board is the sensor's frame N, the camera's frame C the body. Its reading is the board's origin
+l in C, at the position T_R_T (marker + R_T_C l) of the arm, which the model puts at the origin of
+N. The noise is in C: so the board's origin is compared, not the camera's position in front of the
+board, in which noise of the orientation is multiplied by the distance.
 
-*Pinned coordinates.* Turning joint 1 is the same as turning the registrations about its axis, and
-turning joint k the same as turning markers and bodies about its axis: no data can distinguish
-them, orientations no more than positions. The samplers use coordinates in which this is exact at
-any size: C' = C Rot_1(offset of joint 1), marker' = Rot_k(offset of joint k) marker and R_T_B' =
-Rot_k(offset of joint k) R_T_B. Predictions depend on C', marker', R_T_B' and the inner joints; the
-outer two joints move nothing but the priors. `pinned` and `natural` convert. Displacements of
-an extension turn with joint 1 like the arm they belong to, so this holds with an extension too.
-Where an outer joint slides, Rot is the shift along it: the same holds, in metres.
+*Pinned coordinates.* A rotation of joint 1 is the same as a rotation of the registrations about
+its axis, and a rotation of joint k the same as one of markers and bodies about its axis: no data
+can distinguish them, orientations no more than positions. The samplers use coordinates in which
+this is exact for rotations of any size: C' = C Rot_1(offset of joint 1), marker' = Rot_k(offset of
+joint k) marker and R_T_B' = Rot_k(offset of joint k) R_T_B. Predictions depend on C', marker',
+R_T_B' and the inner joints; the outer two joints change only the priors. `pinned` and `natural`
+convert. Displacements of an extension turn with joint 1 like the arm, so that the coordinates are
+exact with an extension too. If an outer joint slides, Rot is the shift along it, in metres.
 """
 
 from __future__ import annotations
@@ -65,21 +65,21 @@ REGISTRATION_AXES = ('x', 'y', 'z', 'rx', 'ry', 'rz')
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """The parameters' layout and the prediction with its derivative."""
+    """Layout of the parameters, and the prediction with its derivative."""
 
     chain: SerialChain  # The nominal robot, k joints
-    # In the order of the indices in `Measurements`
+    # Names in the order of the indices in `Measurements`
     sensor_names: tuple[str, ...]
     marker_names: tuple[str, ...]
     reference: FloatArray  # The registration T_R_N at (t, r) = 0 of each sensor, (sensors, 4, 4)
     centroid: FloatArray  # Point in R about which each sensor's correction turns, m, (sensors, 3)
-    # Further parameters, given for every row of the `Measurements`; None without any. Its
-    # displacements say nothing of turns: with one no orientation is fitted.
+    # Effects with parameters of their own, for every row of the `Measurements`; None without
+    # effects. An extension has displacements but no rotations: with one no orientation is fitted.
     extension: Extension | None = None
     bodies: Bodies = ()  # (sensor, marker) of every body whose orientation is fitted
     # R_T_B at b = 0 of each body, (bodies, 3, 3)
     body_reference: FloatArray = field(default_factory=lambda: np.zeros((0, 3, 3)))
-    # Sensors on the tool, whose readings are those of the sensor in front of what it sees
+    # Sensors on the tool, whose readings are positions of their target in the sensor's own frame
     on_tool: tuple[int, ...] = ()
     path_noise: PathNoise | None = None  # Of errors along a path; None of an arm that stood still
 
@@ -100,7 +100,7 @@ class Model:
 
     @property
     def markers_end(self) -> int:
-        """Where the parameters of the bodies begin, behind those of the markers."""
+        """Index behind the markers' parameters, where those of the bodies begin."""
         return self.joints + 6 * len(self.sensor_names) + 3 * len(self.marker_names)
 
     @property
@@ -124,7 +124,7 @@ class Model:
 
     @property
     def body_names(self) -> tuple[str, ...]:
-        """Names of the bodies: of their markers, with the sensor where several measure it."""
+        """Names of the bodies: marker, with the sensor if several sensors measure the marker."""
         markers = [marker for _, marker in self.bodies]
         return tuple(
             self.marker_names[marker]
@@ -134,7 +134,7 @@ class Model:
         )
 
     def rows(self, measurements: Measurements, rows: IntArray) -> Rows:
-        """Return given rows sorted, with the orientations that are fitted."""
+        """Given rows, sorted, with their orientations if these are fitted."""
         return Rows.with_turns(measurements, rows, self.reference, self.bodies, self.on_tool)
 
     def rows_of_path(self, measurements: Measurements, rows: IntArray) -> Rows:
@@ -142,49 +142,52 @@ class Model:
         return self.rows(measurements, rows).along_path(self.path_noise)
 
     def registration(self, sensor: int) -> slice:
-        """Return where the correction of a sensor lies in the vector."""
+        """Slice of a sensor's correction in the parameter vector."""
         start = self.joints + 6 * sensor
         return slice(start, start + 6)
 
     def marker(self, marker: int) -> slice:
-        """Return where the position of a marker lies in the vector."""
+        """Slice of a marker's position in the parameter vector."""
         start = self.joints + 6 * len(self.sensor_names) + 3 * marker
         return slice(start, start + 3)
 
     def body(self, body: int) -> slice:
-        """Return where the turn of a body lies in the vector."""
+        """Slice of a body's rotation in the parameter vector."""
         start = self.markers_end + 3 * body
         return slice(start, start + 3)
 
     def vector(self, joint_offsets: FloatArray, markers: FloatArray) -> FloatArray:
-        """Assemble the vector of these offsets and markers at the references, theta0 included."""
+        """Parameter vector of offsets (k,) and markers (markers, 3).
+
+        Registrations are at the references, theta is at theta0.
+        """
         corrections = np.zeros(6 * len(self.sensor_names))
         theta0 = self.extension.theta0 if self.extension is not None else np.zeros(0)
         turns = np.zeros(3 * len(self.bodies))
         return np.concatenate((joint_offsets, corrections, np.ravel(markers), turns, theta0))
 
     def offsets(self, x: FloatArray) -> FloatArray:
-        """Return the joint offsets, rad, (..., k)."""
+        """Joint offsets, rad, (..., k)."""
         return x[..., : self.joints]
 
     def markers(self, x: FloatArray) -> FloatArray:
-        """Return the marker positions in T, m, (..., markers, 3)."""
+        """Marker positions in T, m, (..., markers, 3)."""
         start = self.joints + 6 * len(self.sensor_names)
         part = x[..., start : self.markers_end]
         return part.reshape(*x.shape[:-1], len(self.marker_names), 3)
 
     def R_T_B(self, x: FloatArray) -> FloatArray:
-        """Return how the bodies stand on the tool, (..., bodies, 3, 3), of natural parameters."""
+        """Orientations of the bodies on the tool, (..., bodies, 3, 3), of natural parameters."""
         turns = x[..., self.markers_end : self.core]
         turns = turns.reshape(*x.shape[:-1], len(self.bodies), 3)
         return np.asarray(rotation_vector_to_matrix(turns) @ self.body_reference)
 
     def theta(self, x: FloatArray) -> FloatArray:
-        """Return the extension's parameters, (..., m)."""
+        """Parameters of the extension, (..., m)."""
         return x[..., self.core :]
 
     def corrections(self, x: FloatArray) -> FloatArray:
-        """Return the corrections C as transforms, (..., sensors, 4, 4)."""
+        """Corrections C of the registrations as transforms, (..., sensors, 4, 4)."""
         end = self.joints + 6 * len(self.sensor_names)
         parts = x[..., self.joints : end].reshape(*x.shape[:-1], len(self.sensor_names), 6)
         turn = rotation_vector_to_matrix(parts[..., 3:])
@@ -192,11 +195,11 @@ class Model:
         return transform(turn, shift)
 
     def T_R_N(self, x: FloatArray) -> FloatArray:
-        """Return the registrations, (..., sensors, 4, 4), of natural parameters (..., size)."""
+        """Registrations, (..., sensors, 4, 4), of natural parameters (..., size)."""
         return inverse(self.corrections(x)) @ self.reference
 
     def with_corrections(self, x: FloatArray, corrections: FloatArray) -> FloatArray:
-        """Return x with its registrations replaced by transforms C (..., sensors, 4, 4)."""
+        """Parameters x with the corrections C, (..., sensors, 4, 4), in the place of their own."""
         shift = apply(corrections, self.centroid) - self.centroid
         turn = matrix_to_rotation_vector(corrections[..., :3, :3])
         parts = np.concatenate((shift, turn), axis=-1)
@@ -206,22 +209,22 @@ class Model:
         return result
 
     def pinned(self, x: FloatArray) -> FloatArray:
-        """Convert natural to pinned coordinates, (..., size)."""
+        """Pinned coordinates (..., size) of natural ones."""
         return self._turned(x, 1.0)
 
     def natural(self, z: FloatArray) -> FloatArray:
-        """Convert pinned to natural coordinates, (..., size)."""
+        """Natural coordinates (..., size) of pinned ones."""
         return self._turned(z, -1.0)
 
     def _turned(self, x: FloatArray, sign: float) -> FloatArray:
-        """Turn registrations with joint 1 and markers with joint k."""
+        """Parameters with registrations turned with joint 1, and markers with joint k."""
         if not np.any(x[..., [0, self.joints - 1]]):
             # Nothing turns, as where neither joint has a prior.
             return x.copy()
-        base = self._moved_by_first(sign * x[..., 0])
+        base = self._transform_of_first_joint(sign * x[..., 0])
         result = self.with_corrections(x, self.corrections(x) @ base[..., None, :, :])
         last = sign * x[..., self.joints - 1]
-        tool = _moved_along(*self.tool_axis, last, bool(self.chain.slides[-1]))
+        tool = _transform_about_axis(*self.tool_axis, last, bool(self.chain.slides[-1]))
         markers = apply(tool[..., None, :, :], self.markers(x))
         start = self.joints + 6 * len(self.sensor_names)
         result[..., start : self.markers_end] = markers.reshape(*x.shape[:-1], -1)
@@ -231,16 +234,16 @@ class Model:
             result[..., self.markers_end : self.core] = turns.reshape(*x.shape[:-1], -1)
         return result
 
-    def _moved_by_first(self, amount: FloatArray) -> FloatArray:
-        """Return what joint 1 does in R when it moves by an amount (...), (..., 4, 4)."""
-        return _moved_along(*self.base_axis, amount, bool(self.chain.slides[0]))
+    def _transform_of_first_joint(self, amount: FloatArray) -> FloatArray:
+        """Transform in R by joint 1 moving by an amount (...), (..., 4, 4)."""
+        return _transform_about_axis(*self.base_axis, amount, bool(self.chain.slides[0]))
 
     @cached_property
     def extension_root(self) -> FloatArray:
-        """W with W theta standard normal by the extension's prior, (rank, m)."""
+        """Matrix W, (rank, m): W theta is standard normal by the extension's prior."""
         if self.extension is None:
             return np.zeros((0, 0))
-        # In units of each parameter's own: those of rad and of m/s differ by ten decades.
+        # Each parameter in units of its prior: rad and m/s differ by ten powers of ten.
         precision = self.extension.prior_precision
         unit = np.sqrt(np.diag(precision))
         unit = np.where(unit > 0.0, unit, 1.0)
@@ -262,19 +265,12 @@ class Model:
         return last[:3, 3], last[:3, :3] @ self.chain.axes[-1]
 
     def predict(self, z: FloatArray, rows: Rows) -> FloatArray:
-        """Return the predicted markers in the references' base coordinates.
+        """Predicted markers in the references' base coordinates, m, (..., n, 3).
 
-        Parameters
-        ----------
-        z
-            Pinned parameters, (..., size).
-        rows
-            n observations, those of one sensor next to each other.
+        Of orientations the rotation vector from the measured one, rad.
 
-        Returns
-        -------
-        ndarray
-            m, (..., n, 3); of an orientation the turn from the measured one, rad.
+        ``z``: pinned parameters, (..., size); ``rows``: n observations, those of one sensor
+        consecutive.
         """
         turns, shifts = self._extended(z, rows)
         count, offsets = rows.points, self._inner_offsets(z)
@@ -297,17 +293,17 @@ class Model:
         return np.concatenate((points, self._turns(z, offsets, rows, corrections)), axis=-2)
 
     def seen(self, z: FloatArray, rows: Rows) -> FloatArray:
-        """Return where the sensors should see the markers, as `predict`, of positions alone.
+        """Predicted positions as the sensors see them, m, (..., n, 3), without orientations.
 
-        A sensor on the tool: as far from its measured place in front of what it measures as that
-        is from where it should be in the sensor's frame. Its own place by the readings has the
-        noise of the orientation at the distance's lever, which is no error of the arm.
+        For a sensor on the tool: the measured position plus the error of `predict`. The sensor's
+        own position by its readings has the noise of the orientation multiplied by the distance,
+        which is no error of the arm.
         """
         predicted = self.predict(z, rows)
         return predicted if rows.lever is None else predicted + (rows.measured - rows.target)
 
     def _places(self, z: FloatArray, rows: Rows) -> FloatArray:
-        """Return where on the tool the points of the rows are, m, (..., n, 3)."""
+        """Positions of the rows' points on the tool, m, (..., n, 3)."""
         places = self.markers(z)[..., rows.marker, :]
         if rows.lever is not None:
             assert rows.body is not None
@@ -317,7 +313,7 @@ class Model:
     def _turns(
         self, x: FloatArray, offsets: FloatArray, rows: Rows, corrections: FloatArray
     ) -> FloatArray:
-        """Return the rotation vectors from measured to modelled orientations, (..., r, 3)."""
+        """Rotation vectors from measured to modelled orientations, rad, (..., r, 3)."""
         assert rows.turned is not None
         assert rows.body is not None
         start = rows.points
@@ -336,12 +332,12 @@ class Model:
         return _rotation_vector(R_R_B @ np.swapaxes(rows.turned, -1, -2))
 
     def _sensor(self, rows: Rows, index: int) -> int:
-        """Return the sensor of a span of positions or orientations."""
+        """Sensor of a span of positions or orientations."""
         count = len(self.sensor_names)
         return index if index < count else rows.turning[index - count]
 
     def jacobian(self, z: FloatArray, rows: Rows) -> FloatArray:
-        """Return the derivative of `predict` by the pinned parameters, (n, 3, size).
+        """Derivative of `predict` by the pinned parameters, (n, 3, size).
 
         The columns of the outer two joints are zero.
         """
@@ -350,16 +346,16 @@ class Model:
         return derivative
 
     def natural_jacobian(self, x: FloatArray, rows: Rows) -> FloatArray:
-        """Return the derivative of the prediction by the natural parameters, (n, 3, size)."""
+        """Derivative of `predict` by the natural parameters, (n, 3, size)."""
         return self._derivative(self.offsets(x), x, rows)
 
     def inner_pose(self, z: FloatArray, rows: Rows) -> Pose:
-        """Return where the arm stands in each row before registration, joints 1 and k at 0."""
+        """Pose of the arm in each row before registration, with joints 1 and k at 0."""
         return self._pose(self._inner_offsets(z), z, rows)
 
     def _pose(self, offsets: FloatArray, x: FloatArray, rows: Rows) -> Pose:
         turns, shifts = self._extended(x, rows)
-        shifts = shifts @ self._moved_by_first(offsets[0])[:3, :3].T
+        shifts = shifts @ self._transform_of_first_joint(offsets[0])[:3, :3].T
         angles = rows.q + offsets
         for joint, turn in turns.items():
             angles[..., joint] += turn
@@ -367,7 +363,7 @@ class Model:
         tool = frames[..., -1, :, :] @ self.chain.T_fixed[-1]
         points = apply(tool, self._places(x, rows))
         by_joints = self.chain.velocities(frames, points)
-        # Joint 1 carries the displacements along, turned where it turns.
+        # Displacements turn with joint 1.
         if not self.chain.slides[0]:
             by_joints[..., 0] += np.cross(self.base_axis[1], shifts)
         return Pose(tool, points + shifts, self.chain.axes_in_base(frames), by_joints)
@@ -378,7 +374,7 @@ class Model:
         return offsets
 
     def _extended(self, x: FloatArray, rows: Rows) -> tuple[dict[int, FloatArray], FloatArray]:
-        """Return the angles of joints, rad, and displacements, m, that theta adds to each row."""
+        """Angles of joints, rad, and displacements, m, that the extension adds to each row."""
         if self.extension is None:
             return {}, np.zeros(3)
         given, theta = self.extension, self.theta(x)
@@ -387,7 +383,7 @@ class Model:
     def _derivative(self, offsets: FloatArray, x: FloatArray, rows: Rows) -> FloatArray:
         derivative = np.zeros((len(rows.q), 3, self.size))
         tool, points, axes, by_joints = self._pose(offsets, x, rows)
-        base, turned = self._moved_by_first(offsets[0])[:3, :3], by_joints
+        base, turned = self._transform_of_first_joint(offsets[0])[:3, :3], by_joints
         if self.extension is not None and not self.chain.slides[0]:
             # The joints themselves turn under the displacements.
             turned = by_joints.copy()
@@ -434,17 +430,20 @@ class Model:
     def _by_bodies(
         self, derivative: FloatArray, x: FloatArray, rows: Rows, span: slice, by_turn: FloatArray
     ) -> None:
-        """Fill in how rows depend on b, ``by_turn`` being by a small turn of the body in T."""
+        """Derivative of rows by b, written into ``derivative``.
+
+        ``by_turn`` is by a small rotation of the body in T.
+        """
         assert rows.body is not None
         for body in range(len(self.bodies)):
-            mine = (rows.body[span] == body)[:, None, None]
+            of_body = (rows.body[span] == body)[:, None, None]
             derivative[span, :, self.body(body)] = (
-                by_turn @ _left_jacobian(x[self.body(body)]) * mine
+                by_turn @ _left_jacobian(x[self.body(body)]) * of_body
             )
 
 
 class Pose(NamedTuple):
-    """Where an arm stands in n rows, in its base R."""
+    """Pose of an arm in n rows, in its base R."""
 
     tool: FloatArray  # T_R_T, (n, 4, 4)
     points: FloatArray  # Markers, displaced by an extension, m, (n, 3)
@@ -452,12 +451,12 @@ class Pose(NamedTuple):
     by_joints: FloatArray  # Derivative of the points by the joint angles, m/rad or m/m, (n, 3, k)
 
 
-def _moved_along(
+def _transform_about_axis(
     point: FloatArray, axis: FloatArray, amount: FloatArray, slides: bool
 ) -> FloatArray:
-    """Return the transform that turns by an angle (...) about an axis, or shifts along it.
+    """Rotation by an angle (...) about an axis, or shift by an amount (...) along it, (..., 4, 4).
 
-    (..., 4, 4).
+    ``point``: on the axis, m, (3,); ``slides``: whether the amount is a shift, m.
     """
     vector = np.asarray(amount)[..., None] * axis
     if slides:
@@ -467,12 +466,12 @@ def _moved_along(
 
 
 def _cross_matrix(vectors: FloatArray) -> FloatArray:
-    """Return the matrices K with K w = v × w, (..., 3, 3)."""
+    """Matrices K (..., 3, 3) with K w = v × w."""
     return np.swapaxes(np.cross(vectors[..., None, :], np.eye(3)), -1, -2)
 
 
 def _left_jacobian(vector: FloatArray) -> FloatArray:
-    """Return what turns a change of a rotation vector into a small rotation on its left."""
+    """Left Jacobian (3, 3): change of a rotation vector to small rotation on its left."""
     angle = float(np.linalg.norm(vector))
     K = _cross_matrix(vector)
     if angle < 1e-4:
@@ -483,9 +482,11 @@ def _left_jacobian(vector: FloatArray) -> FloatArray:
 
 
 def _rotation_vector(rotation: FloatArray) -> FloatArray:
-    """Return the rotation vectors (..., 3) of matrices (..., 3, 3), rad: small ones, fast.
+    """Rotation vectors (..., 3), rad, of matrices (..., 3, 3) with small angles.
 
-    Half a turn, where this has no axis, is left to the other way.
+    Faster than SciPy's.
+
+    A rotation by half a turn has no axis here; `matrix_to_rotation_vector` converts it.
     """
     skew = rotation - np.swapaxes(rotation, -1, -2)
     axis = 0.5 * np.stack((skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]), axis=-1)
@@ -502,7 +503,7 @@ def _rotation_vector(rotation: FloatArray) -> FloatArray:
 
 
 def _inverse_left_jacobian(vectors: FloatArray) -> FloatArray:
-    """Return the inverses (n, 3, 3) of `_left_jacobian` of rotation vectors (n, 3)."""
+    """Inverses (n, 3, 3) of `_left_jacobian` of rotation vectors (n, 3)."""
     angle = np.linalg.norm(vectors, axis=-1)
     K = _cross_matrix(vectors)
     near = angle < 1e-4

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From when on a sensor's readings are off: it, or its marker, was moved, or the readings drift.
+"""Moment from which the readings of a sensor are shifted: sensor or marker moved, or a drift.
 
-Errors that grow with the temperature, or that differ in another region, also have other means
-late in a session than early. A step is claimed only if it is more probable than all drifts and
-fields, and if the places before and after it are not others.
+Errors that grow with temperature, or that differ between regions, also have other means late in a
+session than early. A step is claimed only if it is more probable than all drifts and fields, and
+if the positions before and after it cover the same region.
 """
 
 from __future__ import annotations
@@ -18,40 +18,34 @@ from numpy.polynomial import legendre
 from remaster_ros.types import FloatArray, IntArray, Measurements
 
 FEWEST_POSES = 8
-# Of any step, at all moments at which one is tried.
+# Probability of a false step, over all moments at which a step is tried.
 SIGNIFICANCE = 1e-3
 # Time constants of a warm-up that are tried, as shares of the session.
 WARM_UP = 0.03, 0.1, 0.3
 # Moments at which a drift may begin or end, as shares of the session.
 BENDS = np.arange(0.1, 1.0, 0.1)
-# A session whose places tell early from late poses by more than this share of the variance cannot
-# tell a step from another region: half of what is seen of the step is then seen of the place.
+# Largest share of a step's variance that the positions explain. Above it a step cannot be told
+# from a difference between regions: early and late poses are in different places.
 SEPARATED = 0.5
 
 
 class Moved(NamedTuple):
-    """A change of the readings in time."""
+    """Change of the readings of a sensor in time."""
 
-    observation: int  # About the first one after it
-    shift: FloatArray  # Of the readings from then on against those before, m, (3,)
+    observation: int  # First observation after the change, approximately
+    shift: FloatArray  # Mean of the readings after the change less that before, m, (3,)
     is_step: bool  # Whether a drift is ruled out
 
 
 def moved_since(measurements: Measurements, rows: IntArray, errors: FloatArray) -> Moved | None:
-    """Return from when on errors are others than before; None if time does not explain them.
+    """Change of the readings in time; None if time does not explain their errors.
 
-    The moment is the one between two poses that divides the means of the poses best. The step is
-    tested by F, at all moments (Bonferroni), and against drifts and places by the Bayesian
-    information criterion (Schwarz 1978): it has to be 1 / `SIGNIFICANCE` times as probable.
+    The moment divides the means of the poses best. A step is tested by F over all moments
+    (Bonferroni), and against drifts and positions by the Bayesian information criterion (Schwarz
+    1978): it has to be 1 / `SIGNIFICANCE` times as probable.
 
-    Parameters
-    ----------
-    measurements
-        Of the session.
-    rows
-        Those of one sensor, in any order, (n,).
-    errors
-        Measured minus modelled positions of these rows, in any one frame, m, (n, 3).
+    ``rows``: rows of one sensor in any order, (n,); ``errors``: measured minus modelled positions
+    of these rows in any one frame, m, (n, 3).
     """
     order = np.argsort(measurements.stamp_s[rows], kind='stable')
     rows, errors = rows[order], errors[order]
@@ -91,7 +85,7 @@ def moved_since(measurements: Measurements, rows: IntArray, errors: FloatArray) 
 
 
 def _of_poses(values: FloatArray, index: IntArray) -> FloatArray:
-    """Return the means of the rows (n, m) of each pose, (poses, m)."""
+    """Means (poses, m) of the rows (n, m) of each pose."""
     count = np.bincount(index)
     return np.column_stack([np.bincount(index, axis) / count for axis in values.T])
 
@@ -102,7 +96,7 @@ def _standardised(values: FloatArray) -> FloatArray:
 
 
 def _drifts(time: FloatArray) -> Iterator[FloatArray]:
-    """Give the columns of each drift over times (n,), (n, p)."""
+    """Columns (n, p) of each drift over times (n,)."""
     share = (time - time.min()) / np.ptp(time)
     polynomials = _polynomials(time)
     for degree in range(1, polynomials.shape[1] + 1):
@@ -115,7 +109,7 @@ def _drifts(time: FloatArray) -> Iterator[FloatArray]:
 
 
 def _places(time: FloatArray, place: FloatArray) -> Iterator[FloatArray]:
-    """Give the columns of each field over places (n, 3), also of one that grows with time."""
+    """Columns of each field over positions (n, 3), constant or growing with time."""
     first, second = np.triu_indices(3)
     fields = place, np.concatenate((place, place[:, first] * place[:, second]), axis=1)
     drift = _polynomials(time)[:, :1]
@@ -126,24 +120,24 @@ def _places(time: FloatArray, place: FloatArray) -> Iterator[FloatArray]:
 
 
 def _polynomials(time: FloatArray) -> FloatArray:
-    """Return Legendre polynomials of degrees 1 to 3 over the range of times (n,), (n, 3)."""
+    """Legendre polynomials of degrees 1 to 3 over the range of times (n,), (n, 3)."""
     share = (time - time.min()) / np.ptp(time)
     return legendre.legvander(2.0 * share - 1.0, 3)[:, 1:]
 
 
 def _unexplained(values: FloatArray, columns: FloatArray) -> float:
-    """Return the sum of squares of values (n, m) left by a constant and columns (n, p)."""
+    """Sum of squares of values (n, m) that a constant and columns (n, p) leave."""
     columns = np.column_stack((np.ones(len(values)), columns))
     fitted = columns @ np.linalg.lstsq(columns, values, rcond=None)[0]
     return max(float(np.sum((values - fitted) ** 2)), 1e-30)
 
 
 def _criterion_of(means: FloatArray, columns: FloatArray) -> float:
-    """Return the criterion of means (n, 3) explained by columns (n, p) and a constant."""
+    """Criterion of means (n, 3) explained by columns (n, p) and a constant."""
     return _criterion(_unexplained(means, columns), columns.shape[1] + 1, len(means))
 
 
 def _criterion(unexplained: float, columns: float, poses: int) -> float:
-    """Return the Bayesian information criterion of three axes with common noise."""
+    """Bayesian information criterion of three axes with common noise."""
     count = 3 * poses
     return float(count * np.log(unexplained / count) + 3 * columns * np.log(count))

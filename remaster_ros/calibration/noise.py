@@ -1,34 +1,34 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Noise of the sensors: what is independent, what rows share, and the sums by which data enter.
+"""Noise of the sensors: independent parts, parts common to rows, and the sums of squares of both.
 
 The error of a row is independent per point and axis with standard deviation sigma, plus a part
-that all rows of one sensor at one pose share, with standard deviation pose_sigma per axis. With
-the error's group means m_g and sizes n_g, the likelihood of a sensor is::
+that is common to all rows of one sensor at one pose, with standard deviation pose_sigma per axis.
+With the error's group means m_g and sizes n_g, the likelihood of a sensor is::
 
-    N(deviations from m_g | 0, sigma^2)  x  prod_g N(m_g | 0, pose_sigma^2 + sigma^2 / n_g)
+  N(deviations from m_g | 0, sigma^2)  x  prod_g N(m_g | 0, pose_sigma^2 + sigma^2 / n_g)
 
 So the data enter through one sum of squares about the group means, and one of the means for every
-group size: the error groups. Where a sensor's noise along its line of sight differs from the one
-across it, the two are channels with a sigma and a pose_sigma each, of dimension 1 and 2 instead
-of 3.
+group size: the error groups. If a sensor's noise along its line of sight differs from the one
+across it, the two are channels with a sigma and a pose_sigma each, of dimension 1 and 2 instead of
+3.
 
-Where a sensor has one row at every pose the two parts cannot be distinguished: sigma is then their
+If a sensor has one row at every pose the two parts cannot be distinguished: sigma is then their
 sum, and there is no pose_sigma.
 
-*Several markers.* The markers that a sensor has in one frame share a further part, with standard
-deviation frame_sigma per axis: of the sensor, and of how well the arm repeats itself. With M
+*Several markers.* The markers that a sensor has in one frame have a further common part, with
+standard deviation frame_sigma per axis: from the sensor, and from the arm's repeatability. With M
 markers in a frame its mean has the variance sigma^2 / M + frame_sigma^2, and a pose with m frames
 enters by three kinds of errors, whose variances are::
 
-    deviations from the frames' means           sigma^2
-    those of the frames' means, times sqrt(M)   sigma^2 + M frame_sigma^2
-    the pose's mean, times sqrt(m M)            sigma^2 + M frame_sigma^2 + m M pose_sigma^2
+  deviations from the frames' means           sigma^2
+  those of the frames' means, times sqrt(M)   sigma^2 + M frame_sigma^2
+  the pose's mean, times sqrt(m M)            sigma^2 + M frame_sigma^2 + m M pose_sigma^2
 
-This is exact where the frames of a pose have equally many markers. Where some were hidden in some
-of them, M is the harmonic mean of their numbers and every frame has the same weight (the analysis
-of unweighted means, Burdick and Graybill 1992, Confidence Intervals on Variance Components): the
-sums then have these variances on average. Without frames of several markers M is 1, and nothing is
-said of frame_sigma. Where every pose has one frame only, frame_sigma contains pose_sigma.
+This is exact if the frames of a pose have equally many markers. If some markers were hidden in
+some frames, M is the harmonic mean of their numbers and every frame has the same weight (the
+analysis of unweighted means, Burdick and Graybill 1992, Confidence Intervals on Variance
+Components): the sums then have these variances on average. Without frames of several markers M is
+1, and there is no frame_sigma. If every pose has one frame only, frame_sigma contains pose_sigma.
 """
 
 from __future__ import annotations
@@ -49,11 +49,11 @@ from remaster_ros.types import FloatArray, IntArray
 
 @dataclass(frozen=True)
 class Channel:
-    """Errors of one sensor that have one noise."""
+    """Errors of one sensor, along some axes, with one noise."""
 
-    sensor: int  # Its index
+    sensor: int  # Index of the sensor
     direction: str  # 'along' the line of sight, 'across' it, or '' for all axes alike
-    axes: tuple[int, int]  # Which axes of the rows' frames these are: first and behind the last
+    axes: tuple[int, int]  # Axes of the rows' frames: first and behind the last
 
     @property
     def dimension(self) -> int:
@@ -63,12 +63,12 @@ class Channel:
 
 @dataclass(frozen=True, eq=False)
 class ErrorGroup:
-    """Errors of one channel that have one variance.
+    """Errors of one channel with one variance.
 
     The variance is sigma² + frame_size frame_sigma² + size pose_sigma².
     """
 
-    channel: int  # Its index
+    channel: int  # Index of the channel
     # 'rows' for the deviations from the means of the frames, 'frames' for those of the frames'
     # means from the mean of their pose, 'poses' for the poses' means
     kind: Literal['rows', 'frames', 'poses']
@@ -76,17 +76,17 @@ class ErrorGroup:
     # m M for m frames in a pose, which is the number of its rows where the frames are of one size;
     # 0 but of 'poses'
     size: float
-    # The rows' groups that these errors belong to, (g,): of 'frames' those with several
+    # Groups of rows that these errors belong to, (g,): for 'frames' those with several frames
     groups: IntArray
     freedom: int  # Number of independent errors
 
 
 def error_groups(channels: Sequence[Channel], rows: Rows) -> tuple[ErrorGroup, ...]:
-    """Sort the groups of each channel by their frames; what has no independent error is none."""
+    """Error groups of each channel, by frame sizes; only groups with independent errors."""
     found = []
     for index, channel in enumerate(channels):
-        mine = np.flatnonzero(rows.group_sensor == channel.sensor)
-        frames, size = rows.group_frames[mine], rows.mean_frame_size[mine]
+        groups_of_sensor = np.flatnonzero(rows.group_sensor == channel.sensor)
+        frames, size = rows.group_frames[groups_of_sensor], rows.mean_frame_size[groups_of_sensor]
 
         def add(
             kind: Literal['rows', 'frames', 'poses'],
@@ -101,9 +101,15 @@ def error_groups(channels: Sequence[Channel], rows: Rows) -> tuple[ErrorGroup, .
                 freedom = channel.dimension * errors
                 found.append(ErrorGroup(index, kind, frame_size, size, groups, freedom))
 
-        add('rows', 0.0, 0.0, mine, int(np.sum(rows.group_size[mine] - frames)))
+        add(
+            'rows',
+            0.0,
+            0.0,
+            groups_of_sensor,
+            int(np.sum(rows.group_size[groups_of_sensor] - frames)),
+        )
         for value in np.unique(size).tolist():
-            alike = mine[size == value]
+            alike = groups_of_sensor[size == value]
             number = frames[size == value]
             add('frames', value, 0.0, alike[number > 1], int(np.sum(number - 1)))
             for count in np.unique(number).tolist():
@@ -112,59 +118,53 @@ def error_groups(channels: Sequence[Channel], rows: Rows) -> tuple[ErrorGroup, .
     return tuple(found)
 
 
-# No sensor of this kind resolves better than 0.1 µm; keeps noise-free (simulated) data proper.
+# Resolution that no sensor of this kind exceeds; keeps the density of noise-free data proper.
 RESOLUTION_M = 1e-7
 # Median length of a standard normal vector in three dimensions.
 MEDIAN_LENGTH = 1.5381722545
-# Rows whose features are held in memory at once while their Gram matrix is summed up.
+# Number of rows whose features are in memory at once for the sum of their Gram matrices.
 GRAM_ROWS = 2_000
 
 
 @dataclass(frozen=True, eq=False)
 class Noise:
-    """Standard deviations per axis of each channel, m, (..., channels)."""
+    """Standard deviations per axis of the noise of each channel, m, (..., channels)."""
 
-    sigma: FloatArray  # Of the part that is independent between rows
-    # Of the part that the rows of one sensor at one pose share; 0 where the channel has none
+    sigma: FloatArray  # Part that is independent between rows
+    # Part common to the rows of one sensor at one pose; 0 if the channel has none
     pose_sigma: FloatArray
-    # Of the part that the markers of one frame share; 0 where the channel has none
+    # Part common to the markers of one frame; 0 if the channel has none
     frame_sigma: FloatArray
 
     @property
     def total(self) -> FloatArray:
-        """Standard deviation of all parts together, m, (..., channels)."""
+        """Standard deviation of the sum of all parts, m, (..., channels)."""
         total: FloatArray = np.sqrt(self.sigma**2 + self.pose_sigma**2 + self.frame_sigma**2)
         return total
 
 
 @dataclass(frozen=True, eq=False)
 class NoiseModel:
-    """Which errors of some rows have which variance."""
+    """Variances of the errors of some rows."""
 
     rows: Rows  # n rows, sorted by sensor and pose
     sensors: int  # Number of sensors, those without rows included
-    # Those of sensor 0, of sensor 1, …, last those of orientations, whose noise is in rad
+    # Channels of sensor 0, of sensor 1, …, last those of orientations, whose noise is in rad
     channels: tuple[Channel, ...]
     # Indices of the channels with a pose_sigma, and with a frame_sigma of their own, ascending
     separable: tuple[int, ...]
     framed: tuple[int, ...]
-    error_groups: tuple[ErrorGroup, ...]  # What the data enter by
+    error_groups: tuple[ErrorGroup, ...]  # Sums of squares by which the data enter
     # Rows of a matrix: the line of sight and two directions across it, in the coordinates of
     # `Rows.target`, one for all rows of a group, (n, 3, 3); None where no sensor needs them
     frames: FloatArray | None
 
     @classmethod
     def of(cls, rows: Rows, reference: FloatArray, split: Sequence[int] = ()) -> NoiseModel:
-        """Assemble.
+        """Noise model of n rows.
 
-        Parameters
-        ----------
-        rows
-            n observations.
-        reference
-            T_R_N of every sensor, (sensors, 4, 4): where the lines of sight begin.
-        split
-            Sensors with one noise along and another across their line of sight.
+        ``reference``: T_R_N of every sensor, (sensors, 4, 4), where the lines of sight begin;
+        ``split``: sensors with one noise along and another across their line of sight.
         """
         channels: list[Channel] = []
         for sensor in range(len(reference) + len(rows.turning)):
@@ -186,15 +186,18 @@ class NoiseModel:
 
     @property
     def split(self) -> tuple[int, ...]:
-        """Sensors with a noise along their line of sight, orientations as `Rows.spans`."""
+        """Sensors with a separate noise along their line of sight.
+
+        Orientations as in `Rows.spans`.
+        """
         return tuple(channel.sensor for channel in self.channels if channel.direction == 'along')
 
     @property
     def of_points(self) -> NoiseModel:
-        """That of the positions alone, whose channels and error groups are the first of these."""
+        """Noise model of the positions only, with the first channels and error groups."""
         if not self.rows.turning:
             return self
-        channels = tuple(one for one in self.channels if one.sensor < self.sensors)
+        channels = tuple(channel for channel in self.channels if channel.sensor < self.sensors)
         rows = self.rows.of_points
         return replace(
             self,
@@ -202,7 +205,9 @@ class NoiseModel:
             channels=channels,
             separable=tuple(index for index in self.separable if index < len(channels)),
             framed=tuple(index for index in self.framed if index < len(channels)),
-            error_groups=tuple(one for one in self.error_groups if one.channel < len(channels)),
+            error_groups=tuple(
+                channel for channel in self.error_groups if channel.channel < len(channels)
+            ),
             frames=None if self.frames is None else self.frames[: len(rows)],
         )
 
@@ -227,19 +232,21 @@ class NoiseModel:
         return np.array([group.freedom for group in self.error_groups], dtype=float)
 
     def variances(self, noise: Noise) -> FloatArray:
-        """Return the variance of each error group, m², (..., error groups)."""
+        """Variance of each error group, m², (..., error groups)."""
         of = self.channel_of
-        own = noise.sigma[..., of] ** 2 + self.frame_size_of * noise.frame_sigma[..., of] ** 2
-        variances: FloatArray = own + self.size_of * noise.pose_sigma[..., of] ** 2
+        variance_of_rows = (
+            noise.sigma[..., of] ** 2 + self.frame_size_of * noise.frame_sigma[..., of] ** 2
+        )
+        variances: FloatArray = variance_of_rows + self.size_of * noise.pose_sigma[..., of] ** 2
         return variances
 
     @property
     def shares(self) -> list[int]:
-        """Channels of the parts that rows share: those `separable`, then those `framed`."""
+        """Channels of the common parts: those `separable`, then those `framed`."""
         return [*self.separable, *self.framed]
 
     def noise(self, sigma: FloatArray, shared: FloatArray) -> Noise:
-        """Return the noise with sigma of the channels and the parts `shares`, m, (..., s)."""
+        """Noise with sigma of the channels and the common parts of `shares`, m, (..., s)."""
         pose_sigma, frame_sigma = np.zeros_like(sigma), np.zeros_like(sigma)
         count = len(self.separable)
         pose_sigma[..., list(self.separable)] = shared[..., :count]
@@ -247,19 +254,20 @@ class NoiseModel:
         return Noise(sigma, pose_sigma, frame_sigma)
 
     def shared(self, noise: Noise) -> FloatArray:
-        """Return the parts `shares` of a noise, m, (..., s)."""
+        """Common parts, as in `shares`, of a noise, m, (..., s)."""
         parts = noise.pose_sigma[..., self.separable], noise.frame_sigma[..., self.framed]
         return np.concatenate(parts, axis=-1)
 
     def of_sensors(self, sigma: FloatArray, pose_sigma: FloatArray) -> Noise:
-        """Return the noise with one sigma and pose_sigma for each sensor, m, (sensors,) each."""
+        """Noise with one sigma and pose_sigma for each sensor, m, (sensors,) each."""
         sensor = [channel.sensor for channel in self.channels]
         return Noise(sigma[..., sensor], pose_sigma[..., sensor], np.zeros(len(sensor)))
 
     def sensor_noise(self, noise: Noise) -> Noise:
-        """Return the noise of each sensor, root mean square over the axes, m, (..., sensors).
+        """Noise of each sensor, root mean square over the axes, m, (..., sensors).
 
-        Behind those the noise of the orientations of each sensor that measures them, rad.
+        After the sensors: the noise of the orientations of each sensor that measures orientations,
+        rad.
         """
         share = np.zeros((len(self.channels), self.sensors + len(self.rows.turning)))
         for index, channel in enumerate(self.channels):
@@ -268,9 +276,10 @@ class NoiseModel:
         return Noise(*(np.sqrt(part**2 @ share) for part in parts))
 
     def total_noise(self, noise: Noise) -> FloatArray:
-        """Return the noise of each sensor, all its parts together, m, (..., sensors, 2).
+        """Noise of each sensor, sum of all parts, m, (..., sensors, 2).
 
-        Along the line of sight, and per axis across it: equal where the sensor has one channel.
+        Last axis: along the line of sight, and per axis across it; equal if the sensor has one
+        channel.
         """
         total = noise.total
         result = np.empty((*total.shape[:-1], self.sensors, 2))
@@ -282,7 +291,7 @@ class NoiseModel:
         return result
 
     def sums_of_squares(self, errors: FloatArray) -> FloatArray:
-        """Return the sum of squares in each error group, m², of errors (..., n, 3)."""
+        """Sum of squares in each error group, m², of errors (..., n, 3)."""
         if self.frames is not None:
             errors = np.einsum('nij,...nj->...ni', self.frames, errors)
         values = self.rows.decorrelated(np.moveaxis(errors, (-2, -1), (0, 1)))
@@ -295,45 +304,36 @@ class NoiseModel:
         return np.maximum(sums, 0.0)
 
     def gram(self, features: Callable[[Rows, slice], FloatArray], width: int) -> FloatArray:
-        """Return the Gram matrix of features in each error group, (error groups, width, width).
+        """Gram matrix of features in each error group, (error groups, width, width).
 
-        Parameters
-        ----------
-        features
-            As of `parts`.
-        width
-            Number of features.
+        ``features``: as of `parts`; ``width``: number of features.
         """
         result = np.zeros((len(self.error_groups), width, width))
         for index, part in self.parts(features):
             result[index] += part.T @ part
-        for index, others in self.contained.items():
-            result[index] -= result[others].sum(axis=0)
+        for index, contained_groups in self.contained.items():
+            result[index] -= result[contained_groups].sum(axis=0)
         return result
 
     def parts(
         self, features: Callable[[Rows, slice], FloatArray]
     ) -> Iterator[tuple[int, FloatArray]]:
-        """Give error groups with columns whose products are those of features, (r, width).
+        """Error groups with columns (r, width) whose products sum up to those of the features.
 
-        Each several times, less the products of what is `contained` in it.
-
-        Parameters
-        ----------
-        features
-            Rows, and where they are among all rows, to features (rows, 3, width), vectors in the
-            coordinates of `Rows.target`; called with some thousand rows at a time, so that memory
-            does not grow with their number.
+        A group comes several times; the products of the groups `contained` in it are to be
+        subtracted. ``features``: of rows, and of their slice among all rows, to vectors (rows, 3,
+        width) in the coordinates of `Rows.target`; called with some thousand rows at a time, so
+        that memory does not grow with their number.
         """
         # Rows that are correlated along the path are taken whole.
         most = len(self.rows) + 1 if self.rows.decorrelation else GRAM_ROWS
         for first, last in self.rows.blocks(most):
             rows = self.rows.of_groups(first, last)
             start = int(self.rows.group_start[first])
-            where = slice(start, start + len(rows))
-            values = features(rows, where)
+            span = slice(start, start + len(rows))
+            values = features(rows, span)
             if self.frames is not None:
-                values = self.frames[where] @ values
+                values = self.frames[span] @ values
             values = rows.decorrelated(values)
             for index, part in self._parts(rows, values, first):
                 yield index, part.reshape(-1, values.shape[2])
@@ -341,12 +341,11 @@ class NoiseModel:
     def _parts(
         self, rows: Rows, values: FloatArray, first: int
     ) -> Iterator[tuple[int, FloatArray]]:
-        """Return of each error group the vectors whose squares its sum is made of.
+        """Vectors of each error group, whose squares its sum consists of.
 
-        Of 'frames' those of the means themselves, which contain the poses' means (`contained`).
-
-        ``rows``: n of the rows, whole groups from the one with index ``first`` on; ``values``:
-        vectors in the axes of the channels, (n, 3, ...).
+        For 'frames' these are the frames' means, which contain the poses' means (`contained`).
+        ``rows``: whole groups from the index ``first`` on; ``values``: vectors in the axes of the
+        channels, (n, 3, ...).
         """
         shape = (-1, *(1,) * (values.ndim - 1))
         means = frames = values
@@ -369,7 +368,7 @@ class NoiseModel:
 
     @cached_property
     def contained(self) -> dict[int, list[int]]:
-        """Error groups of kind 'frames' -> those whose sums theirs contains at first."""
+        """Error groups of kind 'frames' -> the groups whose sums are contained in theirs."""
         return {
             index: [
                 other
@@ -384,9 +383,9 @@ class NoiseModel:
         }
 
     def whitened(self, values: NDArray[Any], noise: Noise) -> NDArray[Any]:
-        """Return vectors (n, 3, ...) in units of the noise: independent, variance 1 in all rows.
+        """Vectors (n, 3, ...) in units of the noise: independent, with variance 1 in all rows.
 
-        Where a sensor's noise has directions they are returned in the rows' `frames`.
+        If a sensor's noise depends on the direction, the vectors are in the rows' `frames`.
         """
         rows, kind = self.rows, values.dtype
         flat = values.reshape(len(rows), 3, -1)
@@ -419,19 +418,19 @@ class NoiseModel:
         return white.reshape(values.shape)
 
     def _of_groups(self, noise: Noise) -> FloatArray:
-        """Return sigma, pose_sigma and frame_sigma of each group and axis, m, (3, groups, 3)."""
+        """Sigma, pose_sigma and frame_sigma of each group and axis, m, (3, groups, 3)."""
         rows, parts = self.rows, np.ones((3, len(self.rows.group_size), 3))
         for index, channel in enumerate(self.channels):
-            mine, axes = rows.group_sensor == channel.sensor, slice(*channel.axes)
+            of_sensor, axes = rows.group_sensor == channel.sensor, slice(*channel.axes)
             for part, of_channel in zip(
                 parts, (noise.sigma, noise.pose_sigma, noise.frame_sigma), strict=True
             ):
-                part[mine, axes] = of_channel[index]
+                part[of_sensor, axes] = of_channel[index]
         return parts
 
 
 def _frames(rows: Rows, reference: FloatArray) -> FloatArray:
-    """Return the line of sight of each row's group, and two directions across it, (n, 3, 3)."""
+    """Line of sight of each row's group, and two directions across it, (n, 3, 3)."""
     middle = rows.group_sum(rows.measured) / rows.group_size[:, None]
     sensor = np.array([*range(len(reference)), *rows.turning])[rows.group_sensor]
     sight = middle - reference[sensor, :3, 3]

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether noise explains the error that a fit leaves, judged without the fitted noise.
+"""Comparison of the error after a fit with the sensor's noise, without the fitted noise.
 
-The fitted noise is what the model leaves: it contains the errors of a tracker that was moved, of a
-compliant joint, of a sensor with a wrong scale. Two figures depend less on the model's errors:
-what the scatter of its frames leaves in their mean, which is the reading, and how far the errors
-of the joint solutions of one pose differ, which the sensor measures at one place. Where no samples
-show it, noise is no more than what an arm errs by that nobody has calibrated: nobody calibrates
-arms with such an instrument, and a model that does not hold leaves errors of any size.
+The fitted noise contains the errors that the model leaves: of a tracker that was moved, of a
+compliant joint, of a sensor with a wrong scale. Two figures depend less on the model: the standard
+error of a reading by the scatter of its samples, and the scatter of the errors of joint solutions
+of one pose, which the sensor measures at one place. If no samples show it, noise is no more than
+the error of an uncalibrated arm: nobody calibrates arms with a worse instrument, and a wrong model
+leaves errors of any size.
 """
 
 from __future__ import annotations
@@ -26,18 +26,19 @@ from remaster_ros.calibration.outliers import (
 from remaster_ros.calibration.priors import UNCALIBRATED_ERROR_M
 from remaster_ros.types import BoolArray, FloatArray, IntArray, Measurements
 
-# Errors that all solutions of a pose share belong to a sensor's noise as well: 0.5 mm beside
-# 0.23 mm in the source paper, which makes the whole 2.4 times the scatter within poses.
+# Largest ratio of the error to the noise within poses. Errors common to all solutions of a pose
+# belong to the noise too: 0.5 mm to 0.23 mm in the source paper, together 2.4 times the scatter.
 MOST = 2.5
-# A soft joint errs differently at each solution of a pose. Scatter within poses beyond this many
-# times what the sensor states is not the sensor's, and an arm that repeats itself has no more.
+# Largest ratio of the scatter within poses to the stated noise. A compliant joint has another
+# error at each solution of a pose; scatter above this ratio is neither the sensor's nor that of an
+# arm with usual repeatability.
 SCATTER = 5.0
-# The worst errors are left out of the comparison: single gross errors are named elsewhere.
+# Share of the worst errors that the comparison leaves out: gross errors are named elsewhere.
 WORST_SHARE = 0.05
 LARGEST_SPREAD = 2.0
-# Gross errors spoil a mean that is so many times the one without the worst.
+# Ratio of the mean error to that without the worst errors from which gross errors are named.
 SPOILT = 1.5
-# Observations that a sentence lists.
+# Number of observations that a sentence lists.
 LISTED = 5
 MEAN_LENGTH = float(np.sqrt(8.0 / np.pi))
 """Mean length of a vector of three independent standard normal numbers."""
@@ -45,29 +46,29 @@ MEAN_LENGTH = float(np.sqrt(8.0 / np.pi))
 
 @dataclass(frozen=True)
 class NoiseCheck:
-    """The error that a fit leaves at one sensor, and what noise explains of it."""
+    """Error after a fit at one sensor, and whether noise explains it."""
 
-    sensor: str  # Its name
+    sensor: str  # Name of the sensor
     # Mean 3-D error on the rows judged, without the worst twentieth and without gross errors, m
     error_m: float
-    # Standard deviation per axis of a reading (RMS) by the scatter of the samples that it is the
-    # mean of, m; None where no reading has one
+    # Standard deviation per axis of a reading (RMS) by the scatter of its samples, m; None if no
+    # reading has samples
     stated_m: float | None
     # Standard deviation per axis of the errors within poses, m; None where no pose has two
     within_m: float | None
-    poses: int  # That were judged. The mean of few may lie far from that of many.
-    # How many times larger noise makes the error on held-out rows, as few poses determine the
-    # parameters poorly; 1 on fitted rows
+    poses: int  # Number of poses judged; the mean of few may differ much from that of many
+    # Ratio of the error on held-out rows to the noise: few poses determine the parameters poorly;
+    # 1 on fitted rows
     spread: float = 1.0
-    # ``observation`` of every held-out row that is a single gross error: no fit leaves those out.
-    # None where so many are that a fit would refuse them: something changed there, or the model
-    # does not hold.
+    # ``observation`` of every held-out row with a single gross error: no fit leaves those out.
+    # Empty if there are so many that a fit would refuse them: something changed between fitted
+    # and held-out poses, or the model is wrong.
     gross: tuple[int, ...] = ()
     mean_m: float = 0.0  # Mean 3-D error on all rows judged, gross ones too, m
 
     @property
     def spoilt(self) -> str:
-        """What gross errors do to the held-out error, a sentence; '' where that is little."""
+        """Sentence on gross errors in the held-out rows; '' if their influence is small."""
         if not self.gross or self.mean_m <= SPOILT * self.error_m:
             return ''
         listed = ', '.join(map(str, self.gross[:LISTED]))
@@ -87,19 +88,22 @@ class NoiseCheck:
 
     @property
     def noise_m(self) -> float | None:
-        """Noise per axis that may be counted on, m; None where neither figure is known."""
+        """Reliable noise per axis, m; None if neither figure is known."""
         if self.stated_m is None or self.within_m is None:
             return self.stated_m if self.within_m is None else self.within_m
         return max(self.stated_m, min(self.within_m, SCATTER * self.stated_m))
 
     @property
     def noise_error_m(self) -> float | None:
-        """Mean 3-D error that this noise makes on the rows judged, m."""
+        """Mean 3-D error by the reliable noise on the rows judged, m.
+
+        None if the noise is unknown.
+        """
         return None if self.noise_m is None else MEAN_LENGTH * self.spread * self.noise_m
 
     @property
     def explained(self) -> bool | None:
-        """Whether noise explains the error; None where the noise is unknown."""
+        """Whether noise explains the error; None if the noise is unknown."""
         if self.is_of_no_instrument:
             return False
         if self.noise_error_m is None:
@@ -108,14 +112,17 @@ class NoiseCheck:
 
     @property
     def is_of_no_instrument(self) -> bool:
-        """Whether the error is more than any instrument's that its own samples do not show."""
+        """Whether the error is larger than any instrument's.
+
+        Last result: the sensor's samples do not show it.
+        """
         most = MEAN_LENGTH * self.spread * self._few * UNCALIBRATED_ERROR_M
         shown = self.stated_m is not None and self.stated_m >= UNCALIBRATED_ERROR_M
         return bool(self.error_m > most) and not shown
 
     @property
     def no_instrument(self) -> str:
-        """What that means, a sentence; '' of an error that is not so large."""
+        """Sentence on an error that no instrument has; '' for a smaller error."""
         if not self.is_of_no_instrument:
             return ''
         return (
@@ -129,7 +136,7 @@ class NoiseCheck:
 
     @property
     def _few(self) -> float:
-        """How much more the mean of few poses may be by chance."""
+        """Factor by which the mean of few poses may be larger by chance."""
         return float(1.0 + 1.0 / np.sqrt(self.poses))
 
 
@@ -140,12 +147,12 @@ def check_noise(
     left_out: IntArray,
     parameters: int,
 ) -> tuple[NoiseCheck, ...]:
-    """Compare what a fit leaves with the noise, sensor by sensor.
+    """Comparison of the error after a fit with the noise, for each sensor.
 
-    ``measurements``: n observations. Those held out are judged where the sensor has any, else
-    those fitted; ``sensor_names``: in index order; ``residuals``: measured minus modelled
-    positions, m, (n, 3); ``left_out``: ``observation`` of every row that was not fitted;
-    ``parameters``: how many were fitted, without those of the noise.
+    ``measurements``: n observations; held-out rows are judged if the sensor has any, else fitted
+    ones; ``sensor_names``: in index order; ``residuals``: measured minus modelled positions, m,
+    (n, 3); ``left_out``: ``observation`` of every row that was not fitted; ``parameters``: number
+    of fitted parameters, without those of the noise.
     """
     kept = ~np.isin(measurements.observation, left_out)
     spread = _spread(measurements.select(kept & ~measurements.is_validation), parameters)
@@ -176,7 +183,7 @@ def check_noise(
 
 
 def _gross(measurements: Measurements, errors: FloatArray, rows: BoolArray) -> tuple[int, ...]:
-    """Return the observations of the rows that are gross by the rule of the fit."""
+    """Observations of the rows that are gross by the rule of the fit."""
     if not rows.any():
         return ()
     gross = gross_probability(errors[rows] / robust_scale(errors[rows])) > CERTAIN
@@ -186,10 +193,9 @@ def _gross(measurements: Measurements, errors: FloatArray, rows: BoolArray) -> t
 
 
 def _spread(fitted: Measurements, parameters: int) -> float:
-    """Return how many times the noise the error is where the parameters were not fitted.
+    """Ratio of the error at poses that were not fitted to the noise, by a linear model.
 
-    That of a linear model with the noise of poses: three numbers for each pose of each sensor and
-    of each of its markers.
+    Each pose of each sensor and marker counts three numbers.
     """
     readings = np.unique(np.stack((fitted.pose, fitted.sensor, fitted.marker)), axis=1).shape[1]
     free = max(3 * readings - parameters - 1, 1)
@@ -197,7 +203,7 @@ def _spread(fitted: Measurements, parameters: int) -> float:
 
 
 def _stated(measurements: Measurements) -> float | None:
-    """Return the RMS of the standard deviations of the readings, each a mean of its samples."""
+    """RMS of the standard errors of the readings, by the scatter of their samples, m."""
     std = measurements.std / np.sqrt(np.maximum(measurements.samples, 1))[:, None]
     known = std[np.isfinite(std)]
     rms = float(np.sqrt(np.mean(known**2))) if len(known) else 0.0
@@ -206,9 +212,9 @@ def _stated(measurements: Measurements) -> float | None:
 
 
 def _within(measurements: Measurements, residuals: FloatArray, rows: BoolArray) -> float | None:
-    """Return the standard deviation per axis within poses, m, by the median over the rows.
+    """Standard deviation per axis of the errors within poses, m, by the median over the rows.
 
-    A sensor that was moved while one of the poses was visited does not count.
+    A sensor that was moved during a pose does not influence the median.
     """
     _, group = np.unique(
         np.stack((measurements.pose[rows], measurements.marker[rows])), axis=1, return_inverse=True
@@ -224,6 +230,6 @@ def _within(measurements: Measurements, residuals: FloatArray, rows: BoolArray) 
         return None
     apart = (residuals[rows] - mean[group])[several]
     count = size[group][several]
-    # The mean of few lies nearer to each of them than the true one does.
+    # The mean of few errors is nearer to each of them than the true mean.
     lengths = np.linalg.norm(apart, axis=1) * np.sqrt(count / (count - 1.0))
     return float(np.median(lengths)) / MEDIAN_LENGTH

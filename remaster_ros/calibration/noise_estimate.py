@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The noise of each sensor as a fit reports it: means and standard deviations over the draws.
+"""Noise of each sensor in the result of a fit: means and standard deviations over the draws.
 
-That of orientations is reported alike, under the names of `Posterior.noise_names`, in rad.
+Noise of orientations has the same form, under the names of `Posterior.noise_names`, in rad.
 """
 
 from __future__ import annotations
@@ -16,13 +16,12 @@ from remaster_ros.types import FloatArray
 
 @dataclass(frozen=True)
 class NoiseEstimate:
-    """The noise of one sensor per axis, m: posterior means, and the std of ``sigma_m``.
+    """Noise of one sensor per axis, m: posterior means, and the standard deviation of ``sigma_m``.
 
-    ``pose_sigma_m`` is None where no pose has two frames: ``sigma_m`` then holds both parts, or
-    ``frame_sigma_m`` does, the noise that the markers of a frame share; it is None where no frame
-    has two. Where
-    the noise along the line of sight differs, these are root mean squares over the three axes, and
-    ``directions`` has the noise 'along' and 'across'; otherwise it is empty.
+    ``pose_sigma_m`` is None if no pose has two frames: ``sigma_m`` then holds both parts, or
+    ``frame_sigma_m`` does, the noise common to the markers of a frame; it is None if no frame has
+    two markers. If the noise along the line of sight differs, these are root mean squares over the
+    three axes, and ``directions`` has the noise 'along' and 'across'; otherwise it is empty.
     """
 
     sigma_m: float
@@ -35,7 +34,7 @@ class NoiseEstimate:
 
 
 def noise_estimates(posterior: Posterior, by_channel: Noise) -> dict[str, NoiseEstimate]:
-    """Return the noise of every sensor from draws of that of the channels (chains, draws, …)."""
+    """Noise of every sensor from draws of the channels' noise (chains, draws, …)."""
     noise_model = posterior.noise_model
     by_sensor = noise_model.sensor_noise(by_channel)
     separate = {noise_model.channels[index].sensor for index in noise_model.separable}

@@ -1,16 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What measured orientations are good for: their errors, what they tell, and whether they agree.
+"""Measured orientations: their errors, their share in the offsets, and whether they agree.
 
-Where a sensor measures full poses. Eq. 17 of Van Wyk et al. compares the distances between
-joint solutions of a pose as measured and as modelled; here the angles between them are compared,
-which need neither registration nor the place of the body on the tool. Eq. 18 compares points after
-registration; here orientations are compared. How the body stands on the tool, R_T_B, is taken from
-the fitted rows, as its origin is: an offset of the last joint is taken up by it, one of the first
-by the registration.
+For sensors that measure full poses. Eq. 17 of Van Wyk et al. compares the distances between joint
+solutions of a pose as measured and as modelled; here the angles between them are compared, which
+need neither registration nor the position of the body on the tool. Eq. 18 compares points after
+registration; here orientations are compared. The orientation of the body on the tool, R_T_B, is
+taken from the fitted rows, as its origin is: it absorbs an offset of the last joint, and the
+registration one of the first.
 
-What they tell of the offsets is their part of the information at the mode. Two estimates of one
-truth, of the positions alone and of all, differ by no more than noise allows: their difference has
-the covariance of the one less that of the other (Hausman 1978, doi:10.2307/1913827).
+The share of the orientations in the offsets is their part of the information at the mode. Two
+estimates of one truth, of the positions alone and of all, differ by no more than noise allows:
+their difference has the covariance of the one less that of the other (Hausman 1978,
+doi:10.2307/1913827).
 """
 
 from __future__ import annotations
@@ -27,31 +28,31 @@ from remaster_ros.calibration.model import Model
 from remaster_ros.kinematics.transforms import mean_quaternion_xyzw
 from remaster_ros.types import FloatArray, IntArray, Measurements
 
-# Directions in which the orientations add less than this share of what the positions leave open
-# cannot be compared.
+# Smallest share of the remaining variance that the orientations remove, in a direction in which
+# both estimates can be compared.
 LEAST_ADDED = 0.01
-# Smallest information, of parameters scaled to 1, that is not rounding.
+# Smallest information, with parameters scaled to 1, above rounding.
 ROUNDING = 1e-12
 METRICS = ('relative_orientation', 'post_registration_orientation')
 
 
 @dataclass(frozen=True, eq=False)
-class TurnsTell:
-    """What the orientations tell of the offsets of k joints."""
+class OrientationInformation:
+    """Information of the orientations on the offsets of k joints."""
 
-    # Of the offsets by the positions alone, rad or m, (k,); 0 where held, infinite where those do
-    # not determine them
+    # Standard deviation of the offsets by the positions alone, rad or m, (k,); 0 if an offset is
+    # held, infinite if the positions do not determine it
     std_without: FloatArray
-    # By how much the orientations move the offsets, rad or m, (k,); 0 where held or where the
-    # positions alone determine nothing
+    # Change of the offsets by the orientations, rad or m, (k,); 0 if an offset is held or if the
+    # positions alone do not determine it
     shift: FloatArray
-    p_value: float  # Of so large a shift, or a larger one, by noise
+    p_value: float  # Probability of a shift as large by noise
 
 
-def what_turns_tell(mode: Mode) -> TurnsTell | None:
-    """Compare a fit with that of the positions alone, linear about its mode.
+def orientation_information(mode: Mode) -> OrientationInformation | None:
+    """Comparison of a fit with that of the positions alone, linear about its mode.
 
-    None where no orientations are fitted.
+    None if no orientations are fitted.
     """
     posterior = mode.linearisation.posterior
     if not posterior.rows.turning:
@@ -70,7 +71,7 @@ def what_turns_tell(mode: Mode) -> TurnsTell | None:
     scaled = gram[np.ix_(used, used)] / np.outer(scale, scale)
     if not np.all(scale > 0.0) or np.linalg.eigvalsh(scaled)[0] < ROUNDING:
         std[where] = np.inf
-        return TurnsTell(std, shift, 1.0)
+        return OrientationInformation(std, shift, 1.0)
     covariance = np.zeros((f, f))
     covariance[np.ix_(used, used)] = np.linalg.inv(scaled) / np.outer(scale, scale)
     std[where] = np.sqrt(np.diag(covariance)[joints])
@@ -84,7 +85,9 @@ def what_turns_tell(mode: Mode) -> TurnsTell | None:
     values, vectors = np.linalg.eigh(added)
     kept = values > LEAST_ADDED
     square = np.sum((vectors.T @ (inner @ shift[where]))[kept] ** 2 / values[kept])
-    return TurnsTell(std, shift, float(scipy.special.chdtrc(max(int(kept.sum()), 1), square)))
+    return OrientationInformation(
+        std, shift, float(scipy.special.chdtrc(max(int(kept.sum()), 1), square))
+    )
 
 
 class ToolOrientations(NamedTuple):
@@ -97,11 +100,13 @@ class ToolOrientations(NamedTuple):
 def tool_orientations(
     model: Model, measurements: Measurements, before: FloatArray, after: FloatArray
 ) -> ToolOrientations | None:
-    """Return how the sensors should see the tool; None where no orientation was measured.
+    """Modelled orientations of the tool in the sensors' frames.
 
-    ``model``: without an extension, whose effects are known as displacements of points alone; with
-    one the answer is None; ``measurements``: n observations; ``before, after``: pinned parameters
-    with offsets at zero and as estimated, (size,).
+    None if no orientation was measured.
+
+    ``model``: with an extension the result is None, as an extension displaces points but has no
+    rotations; ``measurements``: n observations; ``before, after``: pinned parameters with offsets
+    at zero and as estimated, (size,).
     """
     if measurements.orientation is None or model.extension is not None:
         return None
@@ -123,11 +128,11 @@ def orientation_accuracy(
     chosen: IntArray,
     pairs: IntArray,
 ) -> dict[str, Any]:
-    """Return both errors before and after; {} where the chosen rows have no orientation.
+    """Both errors before and after; {} if the chosen rows have no orientation.
 
-    ``measurements``: n observations; ``modelled``: of the same rows; ``fitted``: rows from which
-    R_T_B of every sensor and marker is taken; ``chosen``: rows that are judged; ``pairs``: joint
-    solutions of the same pose, (m, 2).
+    ``measurements``: n observations; ``modelled``: orientations of the same rows; ``fitted``: rows
+    that determine R_T_B of every sensor and marker; ``chosen``: rows that are judged; ``pairs``:
+    joint solutions of the same pose, (m, 2).
     """
     assert measurements.orientation is not None
     seen = np.all(np.isfinite(measurements.orientation), axis=1)
@@ -169,7 +174,7 @@ def _inverse_of(matrices: FloatArray) -> Rotation:
 
 
 def _summary(angles: FloatArray) -> dict[str, Any]:
-    """Return mean and 95 % interval of angles in rad as ``mean_deg`` and ``interval95_deg``."""
+    """Mean and 95 % interval of angles in rad as ``mean_deg`` and ``interval95_deg``."""
     low, high = np.rad2deg(np.quantile(angles, (0.025, 0.975)))
     return {
         'mean_deg': float(np.rad2deg(angles.mean())),

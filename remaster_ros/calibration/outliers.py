@@ -1,17 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Gross errors: rows that are far more likely to be mistakes than noise, named one by one.
+"""Gross errors: rows that are far more probably mistakes than noise, each named with its reason.
 
 A mixture: most rows have the noise of the others, a small share has an error many times as wide;
 share and width are found by expectation maximisation (Dempster, Laird and Rubin 1977). A row is
 compared with the other rows of its pose (the pose-common error), a whole pose with the other
-poses. What is gross with a probability of `CERTAIN` is left out.
+poses. A row that is gross with a probability of `CERTAIN` is left out.
 
 The standard deviations are robust: the larger of those by the median and by the 80 % quantile of
-the errors, so that errors with more than Gaussian tails, which real robots have, are kept.
-The mixture's limit then comes to lie between 6 and 7 of them: of Gaussian errors of known size it
-calls fewer than one in 5 million gross. Their size is not known: errors are measured by it as by
-an estimate with the degrees of freedom that rows and poses leave (`as_of_known_size`), or of
-24 clean sessions of ten single readings one would lose a good one.
+the errors, so that errors with more than Gaussian tails, which real robots have, are kept. The
+limit of the mixture is then between 6 and 7 standard deviations: of Gaussian errors of known size
+it calls fewer than one in 5 million gross. Their size is not known: the limit therefore counts the
+degrees of freedom of rows and poses (`as_of_known_size`), without which one of 24 clean sessions
+of ten single readings would lose a good row.
 """
 
 from __future__ import annotations
@@ -27,36 +27,36 @@ from remaster_ros.calibration.noise import MEDIAN_LENGTH, RESOLUTION_M
 from remaster_ros.errors import MisfitError
 from remaster_ros.types import BoolArray, FloatArray
 
-# A row is left out from this probability on.
+# Probability from which a row is left out.
 CERTAIN = 0.99
-# Prior of gross errors: their share as if so many of a hundred rows had been observed, and their
-# least width in standard deviations.
+# Prior of gross errors: their share, by a tenth of a row among a hundred, and their least width in
+# standard deviations.
 PRIOR_GROSS = 0.1
 PRIOR_ROWS = 100.0
 NARROWEST = 20.0
-# Where the share is larger, the model or the session is wrong.
+# Largest share of gross errors; above it the model or the session is wrong.
 LARGEST_SHARE = 0.1
 _QUANTILES = (0.5, 0.8)
 # The same quantiles of the length of a standard normal vector in three dimensions.
 _EXPECTED = np.array([MEDIAN_LENGTH, 2.1544437046])
-# The standard deviation by the 80 % quantile may be this many times that by the median; more than
-# a fifth of gross errors makes it larger.
+# Largest ratio of the standard deviation by the 80 % quantile to that by the median; a share of
+# gross errors above a fifth makes it larger.
 TAIL_LIMIT = 4.0
-# Fits of other rows, until the same stay out.
+# Largest number of refits until the same rows are left out.
 MOST_REFITS = 20
-# Of a sensor: its registration, its marker, a part of the offsets.
+# Number of unknowns of a sensor: its registration, its marker, a part of the offsets.
 UNKNOWNS = 10
-# With fewer rows the robust fit follows half of them closely, whatever they are, and their errors
-# cannot be compared with the others'.
+# Fewest rows of a judgement. With fewer the robust fit follows half of the rows closely, and the
+# errors of the halves cannot be compared.
 FEWEST_TO_JUDGE = 60
 
 
 @dataclass(frozen=True, eq=False)
 class Judgement:
-    """What `judge` found, row by row in the order of `Rows`."""
+    """Result of `judge` for each row, in the order of `Rows`."""
 
-    gross: BoolArray  # True where the row is to be left out, (n,)
-    why: tuple[str, ...]  # The reason with its numbers; '' where kept, n strings
+    gross: BoolArray  # True if the row is to be left out, (n,)
+    why: tuple[str, ...]  # Reason with its numbers, '' for a kept row; n strings
 
 
 def find_outliers(
@@ -66,29 +66,14 @@ def find_outliers(
     sensor_names: Sequence[str],
     gross: BoolArray | None = None,
 ) -> Judgement:
-    """Leave gross rows out and fit again until the same rows stay out.
+    """Gross rows, by repeated fits without them until the same rows are left out.
 
-    Where some look good once they are left out, and gross once they are not, they stay in: rows
-    are judged by the others.
-
-    Parameters
-    ----------
-    rows
-        All rows, good and bad.
-    refit
-        Fits the rows that are True, (n,), and returns the errors of all, m, (n, 3).
-    errors
-        Errors of a first, robust fit, m, (n, 3).
-    sensor_names
-        For the messages.
-    gross
-        Which rows are gross to begin with, (n,); None where it is not known of any.
-
-    Raises
-    ------
-    MisfitError
-        When more than a tenth of a sensor's rows would be left out, or too many are gross to
-        identify them.
+    If a row is good in a fit without it and gross in a fit with it, it is kept: rows are judged by
+    the others. ``rows``: all rows; ``refit``: fits the rows that are True, (n,), and returns the
+    errors of all, m, (n, 3); ``errors``: errors of a first, robust fit, m, (n, 3);
+    ``sensor_names``: for the messages; ``gross``: rows that are known to be gross, (n,), or None.
+    Raises MisfitError if more than a tenth of a sensor's rows would be left out, or too many are
+    gross to identify them.
     """
     _require_majority(rows, errors, sensor_names)
     gross = np.zeros(len(rows), dtype=bool) if gross is None else gross
@@ -107,7 +92,7 @@ def find_outliers(
 
 
 def judge(rows: Rows, errors: FloatArray, gross: BoolArray) -> Judgement:
-    """Judge every row by the rows not yet called gross."""
+    """Judgement of every row by the rows that are not gross yet."""
     group = rows.group_of_row
     sensor = rows.group_sensor[group]
     good = ~gross
@@ -115,7 +100,7 @@ def judge(rows: Rows, errors: FloatArray, gross: BoolArray) -> Judgement:
     total = rows.group_sum(errors * good[:, None])
     sigma, pose_sigma = robust_noise(rows, errors, good)
 
-    # The error that the pose has in common, by its other good rows.
+    # Error common to the rows of the pose, by the other good rows.
     others = count[group] - good
     mean = (total[group] - errors * good[:, None]) / np.maximum(others, 1.0)[:, None]
     variance, common = sigma[sensor] ** 2, pose_sigma[sensor] ** 2
@@ -140,7 +125,7 @@ def judge(rows: Rows, errors: FloatArray, gross: BoolArray) -> Judgement:
         )
     ]
 
-    # A pose whose rows agree with each other, and with no other pose.
+    # A pose is gross if its rows agree with each other and with no other pose.
     pose_mean = total / np.maximum(count, 1.0)[:, None]
     pose_spread = np.sqrt(
         pose_sigma[rows.group_sensor] ** 2 + sigma[rows.group_sensor] ** 2 / np.maximum(count, 1.0)
@@ -160,19 +145,16 @@ def judge(rows: Rows, errors: FloatArray, gross: BoolArray) -> Judgement:
                 f'whole pose is off by {pose_sigmas[index]:.0f} sigma; gross with probability '
                 f'{_percent(off[index])}'
             )
-    # A reading whose orientation is gross has no position to be relied on, nor the reverse.
+    # A reading with a gross orientation has no reliable position, and the reverse.
     return Judgement(rows.whole(gross_now), tuple(why))
 
 
 def as_of_known_size(sigmas: FloatArray, freedom: int) -> FloatArray:
-    """Return lengths as rare among errors of known size as these are among those of estimated.
+    """Lengths, in known standard deviations, as rare as the given ones in estimated ones, (n,).
 
     The square of a length of three-dimensional errors in estimated standard deviations is three
-    times F-distributed, in known ones chi-squared.
-
-    ``sigmas``: in estimated standard deviations, (n,); ``freedom``: degrees of freedom of the
-    estimate; with fewer than one it counts as one.
-    Returns in known standard deviations, (n,).
+    times F-distributed, in known ones chi-squared. ``freedom``: degrees of freedom of the
+    estimate, at least one.
     """
     rarity = fdtrc(3, max(freedom, 1), sigmas**2 / 3.0)
     known: FloatArray = np.sqrt(chdtri(3, np.maximum(rarity, np.finfo(float).tiny)))
@@ -180,10 +162,10 @@ def as_of_known_size(sigmas: FloatArray, freedom: int) -> FloatArray:
 
 
 def gross_probability(sigmas: FloatArray) -> FloatArray:
-    """Return how probable it is that each of three-dimensional errors is gross.
+    """Probability (n,) that each of three-dimensional errors is gross.
 
-    ``sigmas``: lengths of the errors in standard deviations of good ones, (n,).
-    Returns (n,), under a mixture of two Gaussians whose share and width fit these errors.
+    ``sigmas``: lengths of the errors in standard deviations of good errors, (n,). A mixture of two
+    Gaussians, whose share and width fit these errors.
     """
     square = sigmas**2
     share, excess = PRIOR_GROSS / PRIOR_ROWS, NARROWEST**2
@@ -206,9 +188,9 @@ def gross_probability(sigmas: FloatArray) -> FloatArray:
 
 
 def robust_noise(rows: Rows, errors: FloatArray, good: BoolArray) -> tuple[FloatArray, FloatArray]:
-    """Estimate sigma and pose_sigma of each sensor, m, (sensors,) each, unmoved by a few outliers.
+    """Sigma and pose_sigma of each sensor, m, (sensors,) each, robust against a few outliers.
 
-    Where poses have one row each all of the error counts as sigma.
+    If poses have one row each, all of the error counts as sigma.
     """
     group = rows.group_of_row
     count = rows.group_sum(good.astype(float))
@@ -232,12 +214,12 @@ def robust_noise(rows: Rows, errors: FloatArray, good: BoolArray) -> tuple[Float
 
 
 def robust_scale(lengths: FloatArray) -> float:
-    """Return the standard deviation per axis of three-dimensional errors of these lengths."""
+    """Standard deviation per axis of three-dimensional errors of these lengths, m."""
     return float(np.max(np.quantile(lengths, _QUANTILES) / _EXPECTED)) + RESOLUTION_M
 
 
 def _require_majority(rows: Rows, errors: FloatArray, sensor_names: Sequence[str]) -> None:
-    """Refuse data with so many gross errors that they cannot be identified."""
+    """Raises MisfitError if the data have too many gross errors to identify them."""
     names = _names(rows, sensor_names)
     for sensor, span in rows.spans:
         turned = span.start >= rows.points
@@ -256,25 +238,26 @@ def _require_majority(rows: Rows, errors: FloatArray, sensor_names: Sequence[str
 def _guard(rows: Rows, gross: BoolArray, sensor_names: Sequence[str]) -> None:
     names = _names(rows, sensor_names)
     for sensor, span in rows.spans:
-        out, of = int(gross[span].sum()), span.stop - span.start
-        if out > max(1.0, LARGEST_SHARE * of):
+        gross_count, count = int(gross[span].sum()), span.stop - span.start
+        if gross_count > max(1.0, LARGEST_SHARE * count):
             raise MisfitError(
-                f"sensor '{names[sensor]}': {out} of {of} observations are gross errors, "
+                f"sensor '{names[sensor]}': {gross_count} of {count} observations are gross "
+                'errors, '
                 'too many to leave out',
                 'look for mixed-up markers or a sensor that was moved',
             )
 
 
 def _names(rows: Rows, sensor_names: Sequence[str]) -> list[str]:
-    """Return the names of the sensors, then those of their orientations."""
+    """Names of the sensors, then of their orientations."""
     return [*sensor_names, *(f'{sensor_names[sensor]} (orientation)' for sensor in rows.turning)]
 
 
 def _size(error: float, turned: bool) -> str:
-    """Return an error in m, or one of an orientation in rad, as text."""
+    """Error in m, or of an orientation in rad, as text."""
     return f'{np.degrees(error):.2f} degrees' if turned else f'{error * 1e3:.1f} mm'
 
 
 def _percent(probability: float) -> str:
-    """Return a probability as text, never as 100 %."""
+    """Probability as text, never 100 %."""
     return f'{100.0 * probability:.1f} %' if probability < 0.999 else 'above 99.9 %'

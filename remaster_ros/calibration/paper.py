@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The source paper's estimator, exactly: equations 8 and 12 to 16 of Van Wyk et al.
+"""Exact estimator of the source paper: equations 8 and 12 to 16 of Van Wyk et al.
 
-It does not converge within its 2e5 steps, which one chain alone does not show. Therefore several
-chains run side by side, each from a three-point registration of its own, and R-hat shows it.
-
-Units inside are the paper's, mm and degrees, because its proposals are one number for both.
+The paper's chain does not converge within its 2e5 steps, which one chain alone does not show.
+Therefore several chains run at once, each from a three-point registration of its own, and R-hat
+shows it. Units inside are the paper's, mm and degrees, because its proposals are one number for
+both.
 """
 
 from __future__ import annotations
@@ -33,14 +33,14 @@ STEPS = 200_000
 BURN_IN_SHARE = 0.875
 HALF_WIDTH = 0.0125
 START_SIGMA_MM = 1.0
-# A triangle counts as non-collinear when its area is at least this share of its longest side
-# squared (0.43 for an equilateral one).
+# Smallest ratio of a triangle's area to the square of its longest side, from which its points are
+# not collinear (0.43 for an equilateral one).
 FLATTEST_TRIANGLE = 0.1
 
 
 @dataclass(frozen=True, eq=False)
 class PaperPosterior:
-    """Equation 15 for one or more sensors, for several chains at once.
+    """Equation 15 for one or more sensors and several chains.
 
     A state is, per sensor, x, y, z in mm and alpha, beta, gamma in degrees (Theta_1); the offsets
     of all joints in degrees (Theta_2); and sigma per sensor in mm.
@@ -56,7 +56,7 @@ class PaperPosterior:
 
     @classmethod
     def of(cls, problem: Problem, chains: int, rng: np.random.Generator) -> PaperPosterior:
-        """Assemble; each chain and sensor is registered by three points of its own."""
+        """Posterior of a problem; three random points register each sensor of each chain."""
         identity = np.tile(np.eye(4), (len(problem.sensor_names), 1, 1))
         rows = Rows.of(problem.measurements, problem.fitted, identity)
         measured = problem.measurements.position[rows.source]
@@ -75,13 +75,13 @@ class PaperPosterior:
         return self.T_N_R.shape[1]
 
     def start(self) -> FloatArray:
-        """Return the paper's first state for every chain, (chains, d): zeros, and sigma 1 mm."""
+        """First states of the chains, (chains, d): zeros, and sigma 1 mm, as in the paper."""
         chains = len(self.T_N_R)
         zeros = np.zeros((chains, 6 * self.sensors + len(self.chain)))
         return np.concatenate((zeros, np.full((chains, self.sensors), START_SIGMA_MM)), axis=1)
 
     def split(self, states: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return registrations T_N_R, offsets in rad and sigma in m of states (chains, ..., d)."""
+        """Registrations T_N_R, offsets in rad and sigma in m of states (chains, ..., d)."""
         turned = 6 * self.sensors
         theta_1 = states[..., :turned].reshape(*states.shape[:-1], self.sensors, 6)
         between = states.ndim - 2
@@ -92,7 +92,7 @@ class PaperPosterior:
         return correction @ initial, offsets, 1e-3 * states[..., -self.sensors :]
 
     def log_density(self, states: FloatArray) -> FloatArray:
-        """Return the logarithm of eq. 15 of states (chains, d), (chains,); -inf for sigma <= 0."""
+        """Logarithm (chains,) of eq. 15 at states (chains, d); -inf for sigma <= 0."""
         T_N_R, offsets, sigma = self.split(states)
         points = self.chain.positions(
             self.rows.q, self.markers[self.rows.marker], offsets[:, None, :]
@@ -118,12 +118,11 @@ def fit_paper(
     rng: np.random.Generator,
     progress: Callable[[float], None] | None = None,
 ) -> Sampled:
-    """Fit a problem as the paper does: markers at nominal, nothing left out, nothing held.
+    """Fit of a problem as in the paper: markers at nominal, no row left out, no parameter held.
 
-    All parameters move at once by U(-0.0125, 0.0125) mm and degrees (eq. 16).
-
-    ``problem``: what to fit; ``chains, steps``: how many chains, and how many steps of each in
-    all; ``progress``: called with the share done.
+    All parameters move at once by U(-0.0125, 0.0125) mm and degrees (eq. 16). ``chains, steps``:
+    number of chains, and of steps of each chain with the burn-in; ``progress``: called with the
+    share that is done.
     """
     measurements, identity = problem.measurements, problem.empty_model()
     target = PaperPosterior.of(problem, chains, rng)
@@ -183,7 +182,7 @@ def fit_paper(
 def _paper_natural(
     target: PaperPosterior, model: Model, states: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return natural parameters and sigma of the paper's states."""
+    """Natural parameters (..., size) and sigma of the paper's states."""
     T_N_R, offsets, sigma = target.split(states)
     shape = (*states.shape[:-1], model.size)
     x = np.broadcast_to(model.vector(np.zeros(model.joints), target.markers), shape).copy()
@@ -192,7 +191,7 @@ def _paper_natural(
 
 
 def _paper_gauge(gauge: Gauge, model: Model) -> Gauge:
-    """Return the gauge with what fixes its directions in the paper, where priors are flat."""
+    """Gauge with the parameters that fix its directions in the paper, with flat priors."""
     held = {f'{model.names[index]} = 0' for index in gauge.held}
     directions, why = [], list(gauge.why)
     for direction in gauge.directions:
@@ -209,7 +208,7 @@ def _paper_gauge(gauge: Gauge, model: Model) -> Gauge:
 
 
 def _taken_as_known(gauge: Gauge, model: Model, marker_std_m: FloatArray) -> FloatArray:
-    """Return the std of each offset that follows from that of the markers, rad, (k,)."""
+    """Standard deviation of each offset by that of the markers, rad, (k,)."""
     variance = np.zeros(model.joints)
     for direction in gauge.directions:
         entries = direction.combination
@@ -225,7 +224,7 @@ def _taken_as_known(gauge: Gauge, model: Model, marker_std_m: FloatArray) -> Flo
 
 
 def _three_points(points: FloatArray, sensor: str, rng: np.random.Generator) -> IntArray:
-    """Draw three points that do not lie on a line; their indices, (3,)."""
+    """Indices (3,) of three random points that are not on a line."""
     for _ in range(1000):
         if len(points) < 3:
             break
@@ -241,7 +240,7 @@ def _three_points(points: FloatArray, sensor: str, rng: np.random.Generator) -> 
 
 
 def _euler_zyx(angles: FloatArray) -> FloatArray:
-    """Return Rz(alpha) Ry(beta) Rx(gamma) for angles (..., 3), rad, (..., 3, 3).
+    """Rotations Rz(alpha) Ry(beta) Rx(gamma), (..., 3, 3), for angles (..., 3), rad.
 
     Written out, since every step of the chains needs it: a tenth of the time of SciPy's.
     """

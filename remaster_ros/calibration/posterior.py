@@ -1,13 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The exact log density of parameters and noise given the data.
+"""Exact log density of parameters and noise given the data.
 
 The noise is that of `noise`. Priors: flat in log sigma, which is the paper's p(sigma^2) ∝ sigma^-2
-d(sigma^2) (eq. 14), down to the resolution no sensor passes (`RESOLUTION_M`); pose_sigma / sigma
-half-Cauchy with scale 1, proper at zero and without a unit (Gelman 2006), and frame_sigma / sigma
-alike; registrations flat in
-the turn and shift of the pinned coordinates of `model`; inner joint offsets Gaussian about 0 with
-`priors.OFFSET_STD`, where nothing else is known; markers and base
-frames Gaussian where something is known of them.
+d(sigma^2) (eq. 14), down to the resolution that no sensor exceeds (`RESOLUTION_M`); pose_sigma /
+sigma and frame_sigma / sigma half-Cauchy with scale 1, proper at zero and without a unit (Gelman
+2006); registrations flat in the rotation and shift of the pinned coordinates of `model`; inner
+joint offsets Gaussian about 0 with `priors.OFFSET_STD`, if nothing else is known; markers and base
+frames Gaussian if something is known of them.
 """
 
 from __future__ import annotations
@@ -23,27 +22,26 @@ from remaster_ros.calibration.noise import RESOLUTION_M, Noise, NoiseModel
 from remaster_ros.calibration.priors import Prior
 from remaster_ros.types import BoolArray, FloatArray, IntArray
 
-# Forward kinematics of one block of draws; larger blocks fall out of the processor's cache.
+# Number of forward kinematics in one block of draws; larger blocks exceed the processor's cache.
 BLOCK_ROWS = 40_000
 
 
 @dataclass(frozen=True, eq=False)
 class Posterior:
-    """The density of the free parameters and the noise, given the optimization rows.
+    """Density of the free parameters and the noise, given the optimization rows.
 
-    A point is a flat vector (d,): the free pinned parameters, then the noise coordinates eta:
-    log sigma of every channel, and asinh(pose_sigma / sigma) >= 0 of the channels that have
-    one, then asinh(frame_sigma / sigma) likewise. These are as good as linear near zero and as a
-    logarithm far from it, so the posterior looks alike whether pose_sigma is nothing or nearly
-    all; their prior is sech.
+    A point is a flat vector (d,): the free pinned parameters, then the noise coordinates eta: log
+    sigma of every channel, and asinh(pose_sigma / sigma) >= 0 of the channels with a pose_sigma,
+    then asinh(frame_sigma / sigma) likewise. These are nearly linear near zero and logarithmic far
+    from it, so that the posterior has the same shape for any pose_sigma; their prior is sech.
     """
 
-    # What is fitted, and what is known beforehand
+    # Model that is fitted, and the prior knowledge
     model: Model
     priors: tuple[Prior, ...]
     free: IntArray  # Indices of the parameters that are not held, (f,)
     reference: FloatArray  # Pinned parameters; those not in ``free`` keep these values, (size,)
-    # The rows it is fitted to, and which of their errors have which variance
+    # Fitted rows with the variances of their errors
     noise_model: NoiseModel
 
     @classmethod
@@ -56,22 +54,24 @@ class Posterior:
         reference: FloatArray,
         split: Sequence[int] = (),
     ) -> Posterior:
-        """Assemble; ``split`` are the sensors with a noise along and another across their sight.
+        """Posterior of a model.
 
-        A channel of a sensor with several frames at some pose has a pose_sigma of its own, one
-        with several markers in some frame a frame_sigma.
+        ``split``: sensors with separate noise along and across their line of sight.
+
+        A channel of a sensor with several frames at some pose has a pose_sigma, one with several
+        markers in some frame a frame_sigma.
         """
         noise_model = NoiseModel.of(rows, model.reference, split)
         return cls(model, tuple(priors), free, reference, noise_model)
 
     @property
     def rows(self) -> Rows:
-        """The rows that it is fitted to."""
+        """Fitted rows."""
         return self.noise_model.rows
 
     @property
     def noise_names(self) -> tuple[str, ...]:
-        """What has a noise of its own: the sensors, then the orientations of those with any."""
+        """Names of the sensors, then of the orientations of those that measure them."""
         names = self.model.sensor_names
         return (*names, *(f'{names[sensor]}.orientation' for sensor in self.rows.turning))
 
@@ -81,7 +81,7 @@ class Posterior:
         return tuple(self.model.names[index] for index in self.free)
 
     def with_independent_rows(self) -> Posterior:
-        """Return the posterior under noise that is independent between all rows."""
+        """Posterior under noise that is independent between all rows."""
         return replace(self, noise_model=replace(self.noise_model, separable=(), framed=()))
 
     @property
@@ -91,24 +91,24 @@ class Posterior:
         return len(self.free) + len(noise.channels) + len(noise.shares)
 
     def parameters(self, points: FloatArray) -> FloatArray:
-        """Return the full pinned parameters (..., size of the model) of points (..., d)."""
+        """Pinned parameters (..., size of the model) of points (..., d)."""
         z = np.broadcast_to(self.reference, (*points.shape[:-1], self.model.size)).copy()
         z[..., self.free] = points[..., : len(self.free)]
         return z
 
     def noise(self, eta: FloatArray) -> Noise:
-        """Return the noise of each channel, m, of noise coordinates (..., e)."""
+        """Noise of each channel, m, of noise coordinates (..., e)."""
         count = len(self.noise_model.channels)
         sigma = np.exp(eta[..., :count])
         shared = sigma[..., self.noise_model.shares] * np.sinh(np.abs(eta[..., count:]))
         return self.noise_model.noise(sigma, shared)
 
     def variances(self, eta: FloatArray) -> FloatArray:
-        """Return the variance of each error group, m², (..., error groups)."""
+        """Variance of each error group, m², (..., error groups)."""
         return self.noise_model.variances(self.noise(eta))
 
     def log_noise_prior(self, eta: FloatArray) -> FloatArray:
-        """Return the log prior density of the noise coordinates (..., e), (...)."""
+        """Log prior density (...) of noise coordinates (..., e)."""
         count = len(self.noise_model.channels)
         # A half-normal wall at the resolution instead of a jump: as good as one pseudo-reading.
         wall = 0.5 * np.sum((RESOLUTION_M * np.exp(-eta[..., :count])) ** 2, axis=-1)
@@ -117,16 +117,12 @@ class Posterior:
         return -wall - np.sum(np.logaddexp(ratio, -ratio), axis=-1)
 
     def inside(self, points: FloatArray) -> BoolArray:
-        """Tell where no pose_sigma or frame_sigma is negative, (...), of points (..., d)."""
+        """Whether no pose_sigma or frame_sigma is negative, (...), of points (..., d)."""
         ratios = points[..., len(self.free) + len(self.noise_model.channels) :]
         return np.all(ratios >= 0.0, axis=-1)
 
     def log_density(self, points: FloatArray) -> FloatArray:
-        """Return the log posterior density up to a constant.
-
-        ``points``: (..., d).
-        Returns (...).
-        """
+        """Log posterior density (...) of points (..., d), up to a constant."""
         flat = points.reshape(-1, points.shape[-1])
         block = max(1, BLOCK_ROWS // len(self.rows))
         parts = [self._log_density(flat[i : i + block]) for i in range(0, len(flat), block)]

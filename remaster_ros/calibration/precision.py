@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How well a fit knows its offsets and its tool, the noise integrated out; and what more would do.
+"""Precision of the offsets and of the tool after a fit, and the number of data that would suffice.
 
 Given the noise the parameters are Gaussian (`laplace`). Their covariance is that over the draws of
 the noise: the mean of the covariances, and the covariance of the means. With few observations the
-noise itself is uncertain, and the standard deviation at its most probable value too small: judged
-by that one a collection would end early where the noise happens to look small.
+noise itself is uncertain, and the standard deviation at its most probable value is too small: by
+that value a collection would end early if the noise happens to look small.
 """
 
 from __future__ import annotations
@@ -21,22 +21,26 @@ from remaster_ros.calibration.proposal import NOISE_FREEDOM, StudentT
 from remaster_ros.types import BoolArray, FloatArray
 
 NOISE_DRAWS = 256
-"""Of the noise: standard deviations come out to about 1 %."""
+"""Number of draws of the noise, for standard deviations to about 1 %."""
 MOST_TIMES = 1e4
-"""More data than so many times those at hand are not asked for."""
+"""Largest factor on the data at hand that a collection asks for."""
 
 
 @dataclass(frozen=True, eq=False)
 class NoiseMixture:
-    """The posterior of the f free parameters as a mixture of Gaussians over draws of the noise."""
+    """Posterior of the f free parameters as a mixture of Gaussians over n draws of the noise."""
 
-    weight: FloatArray  # Sum 1, (n,)
+    weight: FloatArray  # With sum 1, (n,)
     mean: FloatArray  # Free pinned parameters, (n, f)
     covariance: FloatArray  # (n, f, f)
 
     @classmethod
     def of(cls, mode: Mode, rng: np.random.Generator) -> NoiseMixture:
-        """Weigh draws of the noise by its density with the parameters integrated out."""
+        """Mixture over draws of the noise.
+
+        The weights are the density of the noise with the parameters integrated out, over that of
+        the draws.
+        """
         # That density is the same for a negative ratio of the noises: no draw is mirrored.
         factor = np.asarray(np.linalg.cholesky(mode.eta_covariance))
         eta, drawn = StudentT(mode.eta, factor, NOISE_FREEDOM).sample(NOISE_DRAWS, rng)
@@ -48,37 +52,30 @@ class NoiseMixture:
     @property
     def total(self) -> FloatArray:
         """Covariance of the free parameters, (f, f)."""
-        apart = self.mean - self.weight @ self.mean
+        deviation = self.mean - self.weight @ self.mean
         within: FloatArray = np.einsum('n,nij->ij', self.weight, self.covariance)
-        return within + (apart * self.weight[:, None]).T @ apart
+        return within + (deviation * self.weight[:, None]).T @ deviation
 
 
 @dataclass(frozen=True, eq=False)
 class Precision:
-    """What a fit knows of its f free parameters."""
+    """Covariance of the f free parameters of a fit, with the figures of offsets and tool."""
 
-    # For each joint its place among the free parameters; -1 where it is not identifiable, (k,)
+    # Index of each joint among the free parameters, (k,); -1 if it is not identifiable
     joints: tuple[int, ...]
     covariance: FloatArray  # The noise integrated out, (f, f)
-    # Mean of J'J over the predicted markers that count, m² per unit, (f, f); None for none
+    # Mean of J'J over the counted predicted markers, m² per unit, (f, f); None without markers
     tool: FloatArray | None
     prior: FloatArray  # Information of the priors, (f, f)
-    freedom: int  # Numbers measured, less the free parameters
+    freedom: int  # Number of measured coordinates less that of free parameters
     per_radian: FloatArray  # Of `SerialChain`, (k,)
 
     @classmethod
     def of(cls, found: Estimate, counting: BoolArray, rng: np.random.Generator) -> Precision:
-        """Judge a fit.
+        """Precision of a fit.
 
-        Parameters
-        ----------
-        found
-            The fit.
-        counting
-            Which rows of the session's measurements, fitted or not, the tool's error counts at,
-            (n,).
-        rng
-            Of the draws of the noise.
+        ``counting``: rows of the session's measurements, fitted or not, at which the tool's error
+        counts, (n,); ``rng``: for the draws of the noise.
         """
         posterior, free = found.posterior, found.posterior.free
         place = {int(index): i for i, index in enumerate(free)}
@@ -106,13 +103,18 @@ class Precision:
 
     @property
     def joint_std(self) -> tuple[float | None, ...]:
-        """Standard deviation of each joint's offset, rad or m, k; None if not identifiable."""
+        """Standard deviation of each joint's offset, rad or m, k values.
+
+        None if not identifiable.
+        """
         std = np.sqrt(np.diag(self.covariance))
         return tuple(float(std[i]) if i >= 0 else None for i in self.joints)
 
     @property
     def joint_rms(self) -> float:
-        """Root mean square over the identifiable joints, rad; infinite where there is none.
+        """Root mean square of the standard deviations of identifiable joints, rad.
+
+        Infinite without any.
 
         That of a joint that slides is divided by `SerialChain.per_radian`.
         """
@@ -120,7 +122,10 @@ class Precision:
 
     @property
     def tool_rms(self) -> float:
-        """Root mean square of the 3-D error of the predicted markers, m; infinite without any."""
+        """Root mean square of the 3-D error of the predicted markers, m.
+
+        Infinite without markers.
+        """
         return self._tool_rms(self.covariance)
 
     def _joint_rms(self, covariance: FloatArray) -> float:
@@ -135,9 +140,9 @@ class Precision:
         return np.inf if self.tool is None else float(np.sqrt(np.sum(covariance * self.tool)))
 
     def shortfall(self, joint_std: float | None, tool_std: float | None) -> float:
-        """Return the largest ratio of a standard deviation to the one that is wanted; 0 for none.
+        """Largest ratio of a standard deviation to the wanted one; 0 if none is wanted.
 
-        ``joint_std, tool_std``: wanted `joint_rms`, rad, and `tool_rms`, m; None where it does not
+        ``joint_std, tool_std``: wanted `joint_rms`, rad, and `tool_rms`, m; None if it does not
         matter.
         """
         return self._shortfall(self.covariance, joint_std, tool_std)
@@ -150,10 +155,10 @@ class Precision:
         return max(joints, tool)
 
     def times_the_data(self, joint_std: float | None, tool_std: float | None) -> float:
-        """Return how many times the data of this kind reach what is wanted; 1 where these do.
+        """Factor on the data with which the wanted precision is reached; 1 if it is reached.
 
-        Infinite where no amount does. Further configurations are taken to tell as much as those
-        so far, on average.
+        Infinite if no amount of data reaches it. Further configurations are assumed to be as
+        informative as the present ones on average.
         """
         information = np.linalg.inv(self.covariance)
         data = information - self.prior

@@ -1,29 +1,29 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where a fit predicts each measurement, how sure it is of that, and how often it is right.
+"""Predicted positions of the measurements, with 95 % regions and the share of measurements inside.
 
 To first order the prediction is Gaussian, with the covariance Σ of the parameters' posterior
-carried through the model's derivative J, and the covariance R of the sensor's noise::
+propagated by the model's derivative J, and the covariance R of the sensor's noise::
 
-    C = J Σ J' + R,    R = σ_across² I + (σ_along² − σ_across²) s s'
+  C = J Σ J' + R,    R = σ_across² I + (σ_along² − σ_across²) s s'
 
 with s the direction of the line of sight, and variances that are means over the posterior. A
-measurement lies in the 95 % region where its squared Mahalanobis distance is below the quantile of
+measurement is in the 95 % region if its squared Mahalanobis distance is below the quantile of
 chi-squared with three degrees of freedom. C is multiplied by one factor, the largest of these:
 
 *1.*
 
-*For a noise that is uncertain.* Few poses determine badly what the rows of a pose share, and all
-errors are as large as that is: a mixture of Gaussians with the covariances τ² C, the posterior of
-τ² being that of the sensor's variance over its mean. As Student's t, it has longer tails than a
-Gaussian with the same covariance: 95 % of it lies below the q with mean F(q / τ²) = 0.95, F being
+*For a noise that is uncertain.* Few poses determine the noise common to the rows of a pose badly,
+and all errors scale with it: a mixture of Gaussians with the covariances τ² C, the posterior of τ²
+being that of the sensor's variance over its mean. As Student's t, it has longer tails than a
+Gaussian with the same covariance: 95 % of it is below the q with mean F(q / τ²) = 0.95, F being
 the distribution of chi-squared.
 
-*For a model that is never quite right.* Its errors on poses that it was fitted to are smaller than
-on others. 95 % of the fitted rows lie in their regions when their whole pose is left out
-(cross-validation; Vovk et al. 2005). Gross errors do not count. For a pose with the errors e, the
-rows' noise R and M = J Σ J' the errors left out and their covariance are, without another fit::
+*For a model with errors.* The errors on fitted poses are smaller than on others. 95 % of the
+fitted rows are in their regions when their whole pose is left out (cross-validation; Vovk et al.
+2005). Gross errors do not count. For a pose with the errors e, the rows' noise R and M = J Σ J',
+the errors without the pose and their covariance are, without another fit::
 
-    e_out = R (R − M)⁻¹ e,    C_out = R (R − M)⁻¹ R
+  e_out = R (R − M)⁻¹ e,    C_out = R (R − M)⁻¹ R
 
 Of three or four poses none can be left out, as each determines a registration.
 """
@@ -41,19 +41,19 @@ from remaster_ros.kinematics.transforms import apply, inverse
 from remaster_ros.types import BoolArray, FloatArray, IntArray, Measurements
 
 REGION = 0.95
-# Rows whose derivatives are at hand at a time.
+# Number of rows whose derivatives are in memory at a time.
 BLOCK_ROWS = 2_000
-# So many poses determine the factor, with so many rows of each.
+# Largest number of poses for the factor, and of rows of each.
 MOST_POSES = 1_000
 MOST_ROWS = 60
 POSES_AT_A_TIME = 50
-# Fewer say nothing of one in twenty.
+# Fewest rows for a quantile of 95 %.
 FEWEST_ROWS = 20
 
 
 @dataclass(frozen=True, eq=False)
 class Predictions:
-    """Of n rows, in the frame N of the row's sensor."""
+    """Predictions of n rows in the frame N of each row's sensor."""
 
     position: FloatArray  # m, (n, 3)
     covariance: FloatArray  # With the factor, m², (n, 3, 3)
@@ -63,23 +63,23 @@ class Predictions:
 
 @dataclass(frozen=True)
 class Coverage:
-    """How many measurements lie in their 95 % regions."""
+    """Number and share of measurements in their 95 % regions."""
 
     rows: int
     inside: int
-    share: float | None  # The latter of the former; None without rows
-    # Of the share, were all rows independent (Clopper & Pearson 1934); None without rows
+    share: float | None  # Number inside over number of rows; None without rows
+    # Interval of the share with independent rows (Clopper & Pearson 1934); None without rows
     interval95: tuple[float, float] | None
 
     @classmethod
     def of(cls, inside: BoolArray) -> Coverage:
-        """Count (n,)."""
+        """Coverage of rows inside or outside their regions, (n,)."""
         rows, count = len(inside), int(inside.sum())
         if rows == 0:
             return cls(0, 0, None, None)
         low, high = (
-            scipy.special.betaincinv(count + more, rows - count + 1 - more, quantile)
-            for more, quantile in ((0, 0.025), (1, 0.975))
+            scipy.special.betaincinv(count + failure, rows - count + 1 - failure, quantile)
+            for failure, quantile in ((0, 0.025), (1, 0.975))
         )
         interval = (float(low) if count else 0.0, float(high) if count < rows else 1.0)
         return cls(rows, count, count / rows, interval)
@@ -90,7 +90,7 @@ def predict(
     measurements: Measurements,
     widening: float | None = None,
 ) -> Predictions:
-    """Predict all rows of a session.
+    """Predictions of all rows of a session.
 
     Parameters
     ----------
@@ -99,7 +99,7 @@ def predict(
     measurements
         Those that were fitted, in the model's order of sensors and markers.
     widening
-        The factor on standard deviations; None where the fit and its poses determine it.
+        Factor on standard deviations; None to determine it from the fit and its poses.
     """
     model, draws = fit.predictive.model, fit.predictive.draws
     root = (draws - draws.mean(axis=0)) / np.sqrt(max(1, len(draws) - 1))
@@ -109,9 +109,9 @@ def predict(
     position = np.empty((len(measurements), 3))
     covariance = np.empty((len(measurements), 3, 3))
     for first, last in every.blocks(BLOCK_ROWS):
-        part = _Part.of(fit, every.of_groups(first, last), triangle)
+        part = _RowBlock.of(fit, every.of_groups(first, last), triangle)
         source = part.rows.source
-        found = part.spread @ np.swapaxes(part.spread, 1, 2) + part.own_noise + part.pose_noise
+        found = part.spread @ np.swapaxes(part.spread, 1, 2) + part.row_noise + part.pose_noise
         to_sensor = inverse(model.reference)[part.sensor]
         turn = to_sensor[:, :3, :3]
         position[source] = apply(to_sensor, part.place)
@@ -131,9 +131,9 @@ def predict(
 def _distance_of_uncertain_noise(
     fit: FitResult, measurements: Measurements, limit: float
 ) -> float:
-    """Return the squared distance that 95 % of errors of a noise as uncertain as its stay below.
+    """Squared distance that 95 % of errors with a noise as uncertain as this fit's do not exceed.
 
-    ``limit``: that of a known noise, from which on it is sought.
+    ``limit``: the distance with a known noise, from which the search begins.
     """
     rows = np.bincount(measurements.sensor, minlength=len(fit.predictive.model.sensor_names))
     along, across = np.moveaxis(fit.predictive.sigma[..., rows > 0, :] ** 2, -1, 0)
@@ -152,29 +152,29 @@ def _distance_of_uncertain_noise(
 
 
 def squared_distances(errors: FloatArray, covariance: FloatArray) -> FloatArray:
-    """Return squared Mahalanobis distances (n,) of errors (n, 3)."""
+    """Squared Mahalanobis distances (n,) of errors (n, 3)."""
     solved = np.linalg.solve(covariance, errors[..., None])[..., 0]
     distances: FloatArray = np.einsum('ni,ni->n', errors, solved)
     return distances
 
 
 @dataclass(frozen=True, eq=False)
-class _Part:
-    """Some rows with what their covariance is made of, in the references' base coordinates."""
+class _RowBlock:
+    """Rows with the parts of their covariance, in the references' base coordinates."""
 
-    # n rows, and the sensor of each, (n,)
+    # n rows, with the index of each row's sensor, (n,)
     rows: Rows
     sensor: IntArray
-    place: FloatArray  # Predicted, m, (n, 3)
-    spread: FloatArray  # A root of the covariance by the parameters, m, (n, 3, size)
-    # Covariance of the noise of one row, of what rows of a pose share, and of what rows of a frame
-    # share, m², (n, 3, 3)
-    own_noise: FloatArray
+    place: FloatArray  # Predicted position, m, (n, 3)
+    spread: FloatArray  # Root of the covariance by the parameters, m, (n, 3, size)
+    # Covariance of the noise of one row, of the noise common to the rows of a pose, and of that
+    # common to the rows of a frame, m², (n, 3, 3)
+    row_noise: FloatArray
     pose_noise: FloatArray
     frame_noise: FloatArray
 
     @classmethod
-    def of(cls, fit: FitResult, rows: Rows, triangle: FloatArray) -> _Part:
+    def of(cls, fit: FitResult, rows: Rows, triangle: FloatArray) -> _RowBlock:
         predictive = fit.predictive
         model = predictive.model
         sensor = rows.group_sensor[rows.group_of_row]
@@ -192,27 +192,27 @@ class _Part:
         parts = [covariance(variances) for variances in _variances(fit)]
         return cls(rows, sensor, place, spread, *parts)
 
-    def left_out(self, mine: IntArray) -> FloatArray:
-        """Return the squared distances of the rows of one pose, left out together."""
-        n, rows = len(mine), self.rows
-        group = rows.group_of_row[mine]
+    def left_out(self, pose_rows: IntArray) -> FloatArray:
+        """Squared distances of the rows of one pose, predicted without that pose."""
+        n, rows = len(pose_rows), self.rows
+        group = rows.group_of_row[pose_rows]
         # Rows of a pose share an error: their noise is one matrix of n × n blocks.
         same = (group[:, None] == group).astype(float)
-        noise = np.einsum('nm,nij->nimj', same, self.pose_noise[mine])
+        noise = np.einsum('nm,nij->nimj', same, self.pose_noise[pose_rows])
         if rows.frame is not None:
-            same = (rows.frame[mine][:, None] == rows.frame[mine]).astype(float)
-            noise += np.einsum('nm,nij->nimj', same, self.frame_noise[mine])
-        noise[np.arange(n), :, np.arange(n)] += self.own_noise[mine]
+            same = (rows.frame[pose_rows][:, None] == rows.frame[pose_rows]).astype(float)
+            noise += np.einsum('nm,nij->nimj', same, self.frame_noise[pose_rows])
+        noise[np.arange(n), :, np.arange(n)] += self.row_noise[pose_rows]
         R = noise.reshape(3 * n, 3 * n)
-        root = self.spread[mine].reshape(3 * n, -1)
-        error = (rows.measured - self.place)[mine].ravel()
+        root = self.spread[pose_rows].reshape(3 * n, -1)
+        error = (rows.measured - self.place)[pose_rows].ravel()
         out = R @ np.linalg.solve(R - root @ root.T, np.column_stack((error, R)))
         blocks = out[:, 1:].reshape(n, 3, n, 3)[np.arange(n), :, np.arange(n)]
         return squared_distances(out[:, 0].reshape(n, 3), blocks)
 
 
 def _variances(fit: FitResult) -> FloatArray:
-    """Return the noise of a row, shared by a pose and by a frame, m², (3, sensors, 2).
+    """Noise of a row, noise common to a pose, and noise common to a frame, m², (3, sensors, 2).
 
     Means of the posterior's variances; the last axis is along and across the line of sight.
     """
@@ -236,7 +236,7 @@ def _variances(fit: FitResult) -> FloatArray:
 def _left_out_distances(
     fit: FitResult, measurements: Measurements, triangle: FloatArray
 ) -> FloatArray:
-    """Return the squared distances of fitted rows, their whole pose left out of the fit."""
+    """Squared distances of fitted rows, each predicted without its whole pose."""
     gross = [observation for observation, _ in fit.left_out]
     fitted = ~measurements.is_validation & ~np.isin(measurements.observation, gross)
     poses = np.unique(measurements.pose[fitted])
@@ -247,10 +247,10 @@ def _left_out_distances(
             np.flatnonzero(fitted & (measurements.pose == pose))[:MOST_ROWS] for pose in few
         ]
         rows = fit.predictive.model.rows(measurements, np.concatenate(sources)).of_points
-        part = _Part.of(fit, rows, triangle)
+        part = _RowBlock.of(fit, rows, triangle)
         for source in sources:
             mine = np.flatnonzero(np.isin(rows.source, source))
             found = part.left_out(mine)
-            # Of a pose that alone determines a parameter rounding is left, which says nothing.
+            # If a pose alone determines a parameter, only rounding is left: it is not counted.
             distances.append(found[found >= 0.0])
     return np.concatenate(distances)

@@ -1,18 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How far off the arm is by what the posterior allows: section V-C of Van Wyk et al.
+"""Predicted error of the arm by the posterior: section V-C of Van Wyk et al.
 
-For draws of the posterior and configurations of the arm, the distance from the place of the marker
-by the applied model to its place by the draw, with and without the sensor's noise. The applied
+For draws of the posterior and configurations of the arm: the distance from the marker's position
+by the applied model to its position by the draw, with and without the sensor's noise. The applied
 model has offsets at zero (before) or the estimate (after). Two versions:
 
-*Invariant.* Both places in the sensor's frame, each by registrations and markers of its own: what
-a turn of joint 1 and of the registration, or of the last joint and of the marker, cancel does not
-count. At visited configurations this predicts what eq. 18 measures.
+*Invariant.* Both positions in the sensor's frame, each by its own registrations and markers:
+rotations of joint 1 that cancel with the registration, or of the last joint that cancel with the
+marker, do not count. At visited configurations this predicts the measure of eq. 18.
 
-*The paper's.* Both places in the robot base, only the offsets differ, the marker is that of the
+*The paper's.* Both positions in the robot base, only the offsets differ, the marker is that of the
 estimate. Offsets that are not identifiable count in full: nearly half of the paper's "Vernier"
-error is its offset of joint 1, which is a turn of the sensor. Where the fit holds such an offset
-at 0 it adds nothing; the paper's own chain lets it wander.
+error is its offset of joint 1, which is a rotation of the sensor. If the fit holds such an offset
+at 0 it adds nothing; in the paper's chain it wanders.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ from remaster_ros.calibration.model import Model
 from remaster_ros.types import FloatArray, IntArray, Measurements
 
 RANDOM_CONFIGURATIONS = 1000
-# Pairs of a configuration and a draw for each table: their means and quantiles are then good to
-# half a per cent. The paper takes 2000 draws for each configuration.
+# Number of pairs of a configuration and a draw for each table, for means and quantiles to half a
+# per cent. The paper takes 2000 draws for each configuration.
 PAIRS = 100_000
-# Of more visited rows this many are taken at random.
+# Largest number of visited rows; of more a random sample is taken.
 MOST_ROWS = 10_000
 _BLOCK_ROWS = 50
 
@@ -47,7 +47,7 @@ class Distances(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Predictive:
-    """What the distances are computed from."""
+    """Posterior as predictions use it: model, estimate, draws and noise."""
 
     model: Model  # Whose parameters were drawn
     after: FloatArray  # Pinned parameters of the estimate, (size,)
@@ -58,11 +58,11 @@ class Predictive:
 
     @cached_property
     def mean_offsets(self) -> FloatArray:
-        """The paper's estimate: the means of the draws, identifiable or not, rad, (k,)."""
+        """Means of the offsets over the draws, rad, (k,): the paper's estimate."""
         return self.model.offsets(self.draws).mean(axis=0)
 
     def without_extension(self) -> Predictive:
-        """Return the same without further effects, which are known at visited rows only."""
+        """Same posterior without effects, which are known at visited rows only."""
         core = self.model.core
         return replace(
             self,
@@ -75,10 +75,10 @@ class Predictive:
 def random_configurations(
     model: Model, seen: Measurements, count: int, rng: np.random.Generator
 ) -> Measurements:
-    """Return rows at joint configurations drawn uniformly within the joint limits.
+    """Rows at joint configurations drawn uniformly within the joint limits.
 
     Neither collisions nor lines of sight are checked: the whole workspace counts, as in the paper.
-    The sensors take turns, each with the marker it follows in ``seen``.
+    The rows go through the sensors in turn, each with its marker in ``seen``.
     """
     followed = [seen.marker[np.flatnonzero(seen.sensor == s)[0]] for s in np.unique(seen.sensor)]
     sensor = np.arange(count) % len(followed)
@@ -98,31 +98,31 @@ def random_configurations(
 
 
 class PredictedAccuracy(NamedTuple):
-    """Where the marker is at n configurations, and how far it is from there, after."""
+    """Marker positions at n configurations, and their errors with the estimate applied."""
 
-    place: FloatArray  # By the estimate, in the robot base, m, (n, 3)
+    place: FloatArray  # Position by the estimate, in the robot base, m, (n, 3)
     error: FloatArray  # Mean distance over the draws, without the sensor's noise, m, (n,)
 
 
 def predicted_accuracy(
     predictive: Predictive, seen: Measurements, count: int, rng: np.random.Generator
 ) -> PredictedAccuracy:
-    """Return the accuracy at random configurations, invariant; see `random_configurations`."""
-    bare = predictive.without_extension()
-    m = random_configurations(bare.model, seen, count, rng)
-    taken = rng.permutation(len(bare.draws))[: max(1, PAIRS // count)]
+    """Invariant accuracy at random configurations; see `random_configurations`."""
+    core = predictive.without_extension()
+    m = random_configurations(core.model, seen, count, rng)
+    taken = rng.permutation(len(core.draws))[: max(1, PAIRS // count)]
     places, errors = np.empty((count, 3)), np.empty(count)
     for block in np.array_split(np.arange(count), -(-count // _BLOCK_ROWS)):
-        rows = Rows.of(m, block, bare.model.reference)
-        place = bare.model.predict(bare.after, rows)
-        drawn = bare.model.predict(bare.draws[taken], rows)
+        rows = Rows.of(m, block, core.model.reference)
+        place = core.model.predict(core.after, rows)
+        drawn = core.model.predict(core.draws[taken], rows)
         places[rows.source] = place
         errors[rows.source] = np.linalg.norm(drawn - place, axis=-1).mean(axis=0)
     return PredictedAccuracy(places, errors)
 
 
 class ToolPlaces(NamedTuple):
-    """Places of the marker at one configuration, in the robot base, m (Fig. 5 of the paper)."""
+    """Marker positions at one configuration, in the robot base, m (Fig. 5 of the paper)."""
 
     # With offsets at zero and as estimated, (3,)
     before: FloatArray
@@ -135,26 +135,23 @@ class ToolPlaces(NamedTuple):
 def tool_places(
     predictive: Predictive, seen: Measurements, row: int, count: int, rng: np.random.Generator
 ) -> ToolPlaces:
-    """Return where the marker may be at the configuration of a row, the paper's version.
+    """Positions of the marker at the configuration of a row, by draws; the paper's version.
 
-    Parameters
-    ----------
-    count
-        Draws that are taken at most.
+    ``count``: largest number of draws.
     """
-    bare = predictive.without_extension()
-    model, taken = bare.model, rng.permutation(len(bare.draws))[:count]
+    core = predictive.without_extension()
+    model, taken = core.model, rng.permutation(len(core.draws))[:count]
     q, sensor = seen.q[row], seen.sensor[row]
-    marker = model.markers(model.natural(bare.after))[seen.marker[row]]
+    marker = model.markers(model.natural(core.after))[seen.marker[row]]
     offsets = np.concatenate(
         (
             np.zeros((1, model.joints)),
             predictive.mean_offsets[None],
-            model.offsets(bare.draws[taken]),
+            model.offsets(core.draws[taken]),
         )
     )
     before, after, *drawn = model.chain.positions(q, marker, offsets)
-    noise = rng.standard_normal((len(taken), 3)) * bare.sigma[taken, sensor, 1:]
+    noise = rng.standard_normal((len(taken), 3)) * core.sigma[taken, sensor, 1:]
     return ToolPlaces(before, after, np.array(drawn), np.array(drawn) + noise)
 
 
@@ -165,13 +162,11 @@ def theoretical_distances(
     chosen: IntArray,
     rng: np.random.Generator,
 ) -> tuple[Distances, Distances]:
-    """Return the distances of section V-C at rows of the measurements.
+    """Distances of section V-C at rows of the measurements: invariant version, and the paper's, m.
 
-    ``predictive``: the posterior; ``before``: pinned parameters with offsets at zero, (size,);
-    further ones are not looked at; ``measurements``: all rows of the session (those that an
-    extension was made for); ``chosen``: indices of the rows to take; of more than 10,000 as many
-    at random.
-    Returns invariant, paper: m.
+    ``before``: pinned parameters with offsets at zero, (size,), further entries are ignored;
+    ``measurements``: all rows of the session (those that the extension was made for); ``chosen``:
+    indices of the rows; of more than 10,000 a random sample is taken.
     """
     rows = rng.permutation(chosen)[:MOST_ROWS]
     draws, before = len(predictive.draws), before[: predictive.model.size]
@@ -195,7 +190,7 @@ def _block(
     taken: IntArray,
     rng: np.random.Generator,
 ) -> FloatArray:
-    """Return both versions of the four `Distances` of some rows and draws, (2, 4, pairs)."""
+    """Both versions of the four `Distances` of some rows and draws, m, (2, 4, pairs)."""
     model, draws = predictive.model, predictive.draws[taken]
     sensor = rows.group_sensor[rows.group_of_row]
     predicted = model.seen(predictive.after, rows)
@@ -218,12 +213,12 @@ def _block(
     distances: list[FloatArray] = []
     for *points, drawn in (in_sensor, in_base):
         noisy = drawn + noise
-        distances += [_apart(place, one) for one in points for place in (noisy, drawn)]
+        distances += [_distances_between(place, one) for one in points for place in (noisy, drawn)]
     return np.reshape(distances, (2, 4, -1))
 
 
-def _apart(places: FloatArray, others: FloatArray) -> FloatArray:
-    """Return the distances between points (..., 3), in one row, three times as fast as `norm`."""
+def _distances_between(places: FloatArray, others: FloatArray) -> FloatArray:
+    """Distances between points (..., 3), m, flattened; three times as fast as `norm`."""
     shift = places - others
     distances: FloatArray = np.sqrt(np.einsum('...i,...i->...', shift, shift))
     return distances.ravel()

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is known before the data: markers, base frames and offsets, Gaussian.
+"""Prior knowledge of markers, base frames and offsets, as Gaussian priors.
 
-Numpy in, numpy out; how they are read from a session or a file is in `session`.
+Numpy in, numpy out; `session` reads it from a session or a file.
 """
 
 from __future__ import annotations
@@ -18,42 +18,43 @@ from remaster_ros.kinematics.transforms import (
 )
 from remaster_ros.types import BasePrior, FloatArray
 
-# A prior std of 0 in a session means "as good as known": a micrometre, a microradian.
+# Standard deviation for a prior std of 0 in a session ("as good as known"), m or rad.
 TIGHTEST_PRIOR = 1e-6
-# A mastering is off by tenths of a degree. This prior keeps an offset that the data leave open
-# from running away; one that they determine to 0.05 degrees it moves by 1 in 10,000 of its size.
-# Of a joint that slides it is as much as that at `LEVER_M`, 22 mm: a switch or stop that sets such
-# a zero is rarely off by more than a turn of the motor, some millimetres.
+# Standard deviation of an offset's prior. Errors of a mastering are tenths of a degree. The prior
+# keeps an offset that the data do not determine near zero; an offset that they determine to
+# 0.05 degrees it moves by 1 in 10,000 of its size. For a joint that slides it is the arc at
+# `LEVER_M`, 22 mm: the switch or stop of such a zero is rarely off by more than a turn of the
+# motor, some millimetres.
 OFFSET_STD = np.radians(5.0)
-# A larger offset is that of a joint that has lost its mastering, or joints, signs or the robot
-# model are not those of the arm that was measured.
+# Largest plausible offset. A larger one means a joint that has lost its mastering, or joints,
+# signs or a robot model that are not those of the measured arm.
 LARGEST_OFFSET = OFFSET_STD
-# Error of an arm that nobody has calibrated, m: larger ones are not of its offsets.
+# Largest error of an uncalibrated arm, m; larger errors have other causes than offsets.
 UNCALIBRATED_ERROR_M = 5e-3
-# A marker where it was stated to be is that many times the stated std off in one of a million
-# sessions (square root of chi squared with three degrees of freedom).
+# Distance of a marker from its stated position, in stated standard deviations, that one of a
+# million sessions exceeds (square root of chi squared with three degrees of freedom).
 DISPLACED = 5.5
-# How far a drawing is off is no normal variable: most links are within its tolerance, and one is
-# many times beyond. With the tails of Student's t with four degrees of freedom, for which this is
-# the standard deviation over the scale, 95 % are within 1.96 standard deviations as of a normal
-# one. With 1 the intervals held 91.7 % of 300 offsets of arms with an elbow 0.1 to 1 mm off.
+# Standard deviation over scale of Student's t with four degrees of freedom, for deviations from a
+# drawing. These are not normal: most links are within the tolerance, and one is many times beyond.
+# 95 % of such a t are within 1.96 standard deviations, as of a normal variable. With 1 the
+# intervals held 91.7 % of 300 offsets of arms with an elbow 0.1 to 1 mm off.
 DRAWING_TAILS = 2.0**0.5
-# Standard deviation of a zero-offset's step beside effects, rad: a marker 1 m from the axis is
-# then 0.15 mm off the tangent, on which the effects were searched.
+# Standard deviation of a zero-offset's step in a fit with effects, rad: a marker 1 m from the
+# axis is then 0.15 mm off the tangent, on which the effects were searched.
 STEP_STD = np.radians(1.0)
 
 
 @dataclass(frozen=True, eq=False)
 class Prior:
-    """A Gaussian prior as a function of the natural parameters."""
+    """Gaussian prior as a function of the natural parameters."""
 
-    description: str  # How the report names it: 'the prior on marker sir, 0.5 mm per axis'
+    description: str  # Name in the report: 'the prior on marker sir, 0.5 mm per axis'
     # Natural parameters (..., size) to whitened residuals (..., m), standard normal a priori
     residual: Callable[[FloatArray], FloatArray]
 
 
 def marker_prior(model: Model, marker: int, nominal: FloatArray, std_m: float) -> Prior:
-    """Return what is known of a marker before: near its nominal place, std_m per axis."""
+    """Prior of a marker: near its nominal position, m, with standard deviation std_m per axis."""
     where = model.marker(marker)
     width = max(std_m, TIGHTEST_PRIOR)
     return Prior(
@@ -63,7 +64,7 @@ def marker_prior(model: Model, marker: int, nominal: FloatArray, std_m: float) -
 
 
 def offset_prior(model: Model, joint: int, mean: float, std: float) -> Prior:
-    """Return what is known of a joint's offset before, rad or m."""
+    """Prior of a joint's offset, rad or m."""
     width = max(std, TIGHTEST_PRIOR)
     shown = f'{1e3 * std:g} mm' if model.chain.slides[joint] else f'{np.degrees(std):g} deg'
     return Prior(
@@ -73,28 +74,28 @@ def offset_prior(model: Model, joint: int, mean: float, std: float) -> Prior:
 
 
 def plausible_offsets(model: Model, joints: Sequence[int]) -> Prior:
-    """Return what is known of any joint's offset: it is no more than some degrees.
+    """Prior of joint offsets of some degrees at most, `OFFSET_STD`.
 
-    Beside effects it is near the one that they were searched with.
+    With effects in the model: a prior near the offsets with which the effects were searched.
     """
-    which = list(joints)
-    effects, per_radian = model.extension, model.chain.per_radian[which]
+    indices = list(joints)
+    effects, per_radian = model.extension, model.chain.per_radian[indices]
     if effects is None or effects.joint_offsets is None:
         std = OFFSET_STD * per_radian
-        also = f' or {1e3 * std.min():.0f} mm' if model.chain.slides[which].any() else ''
+        also = f' or {1e3 * std.min():.0f} mm' if model.chain.slides[indices].any() else ''
         return Prior(
             f'the size of a mastering error, {np.degrees(OFFSET_STD):g} deg{also}',
-            lambda x: x[..., which] / std,
+            lambda x: x[..., indices] / std,
         )
-    searched, width = effects.joint_offsets[which], effects.step_std * per_radian
+    searched, width = effects.joint_offsets[indices], effects.step_std * per_radian
     return Prior(
         'the zero-offsets that the effects were searched with',
-        lambda x: (x[..., which] - searched) / width,
+        lambda x: (x[..., indices] - searched) / width,
     )
 
 
 def base_prior(model: Model, sensor: int, prior: BasePrior) -> Prior:
-    """Return what is known of a sensor's registration T_R_N before."""
+    """Prior of a sensor's registration T_R_N."""
     known = matrix_from_quaternion_xyzw(prior.rotation_xyzw)
     widths = max(prior.std_m, TIGHTEST_PRIOR), max(prior.std_rad, TIGHTEST_PRIOR)
 
@@ -110,10 +111,9 @@ def base_prior(model: Model, sensor: int, prior: BasePrior) -> Prior:
 def prior_rows(
     model: Model, priors: Sequence[Prior], z: FloatArray, *, natural: bool = False
 ) -> tuple[FloatArray, FloatArray]:
-    """Return residuals (m,) of all priors and their derivative (m, size) at z.
+    """Residuals (m,) of all priors, and their derivative (m, size) at z, by numerical differences.
 
-    Numerical differences: the priors are smooth, few, and written as plain functions. ``natural``
-    where z and the derivative are in natural, not in pinned coordinates.
+    ``natural``: whether z and the derivative are in natural instead of pinned coordinates.
     """
     # Priors are on the core; theta's is linear, so differences would only cost.
     step, core = 1e-6 * np.eye(model.core, model.size), model.core

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Frame registration from points known in two frames: three of them, or more by least squares."""
+"""Registration of two frames by points known in both: three points, or more by least squares."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from remaster_ros.kinematics.transforms import apply, transform
 from remaster_ros.types import FloatArray
 
 MINIMUM_POINTS = 3
-# Points whose spread across their best line is less than this share of that along it do not
-# determine the turn about the line.
+# Smallest ratio of the points' spread across their best line to that along it; below it they do
+# not determine the rotation about the line.
 MINIMUM_WIDTH = 0.02
-# Of so many points every three are tried for agreement.
+# Largest number of points of which every three are tried for agreement.
 TRIED_POINTS = 20
 
 
 def register_points(points_R: ArrayLike, points_N: ArrayLike) -> tuple[FloatArray, float]:
-    """Find where a sensor stands from the same points in the robot's and in the sensor's frame.
+    """Pose of a sensor in the robot base, from points known in both frames.
 
     Minimises the sum of squared distances |T_R_N p_N − p_R|² (Arun, Huang and Blostein 1987, by
     singular values, never a reflection).
@@ -43,9 +43,9 @@ def register_points(points_R: ArrayLike, points_N: ArrayLike) -> tuple[FloatArra
     Raises
     ------
     InputError
-        Arrays of other shapes, or numbers that are not finite.
+        If the arrays have other shapes, or numbers that are not finite.
     InsufficientDataError
-        Fewer than three points, or points (nearly) on one line.
+        If there are fewer than three points, or the points are (nearly) on one line.
     """
     points_R, points_N = np.asarray(points_R, dtype=float), np.asarray(points_N, dtype=float)
     if points_R.ndim != 2 or points_R.shape[1:] != (3,) or points_R.shape != points_N.shape:
@@ -76,29 +76,29 @@ def register_points(points_R: ArrayLike, points_N: ArrayLike) -> tuple[FloatArra
 def register_ransac(
     points_R: ArrayLike, points_N: ArrayLike, allowed_m: float
 ) -> tuple[FloatArray, NDArray[np.bool_]]:
-    """Register by the points that agree: single ones may be of a stray taken for the marker.
+    """Registration by the points that agree, without single points that are not of the marker.
 
-    A frame is computed from every three points; the one that most points agree with is refined by
-    all of them.
+    A frame is computed from every three points; the frame with most agreeing points is refined by
+    all of these.
 
     Parameters
     ----------
     points_R, points_N
         As of `register_points`.
     allowed_m
-        A point further than this from where the others have it does not agree, m.
+        Largest distance of an agreeing point from its position by the other points, m.
 
     Returns
     -------
     T_R_N : ndarray
         The sensor frame in R, (4, 4).
     agree : ndarray of bool
-        Which points were used, (n,).
+        Whether each point was used, (n,).
 
     Raises
     ------
     InputError, InsufficientDataError
-        As `register_points`; and where no three points, or less than most of them, agree.
+        As `register_points`; and if no three points, or no majority of the points, agree.
     """
     points_R, points_N = np.asarray(points_R, dtype=float), np.asarray(points_N, dtype=float)
     # Raises where the shapes are wrong or all of the points lie on a line.
@@ -125,13 +125,13 @@ def register_ransac(
     return register_points(points_R[best], points_N[best])[0], best
 
 
-def _require_width(points: FloatArray, whose: str) -> None:
-    """Refuse points on one line, or all in one place."""
+def _require_width(points: FloatArray, frame_name: str) -> None:
+    """Raises InsufficientDataError if the points are on one line or in one place."""
     spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False) / np.sqrt(len(points))
     length, width = spread[:2]
     if not width > MINIMUM_WIDTH * length:
         raise InsufficientDataError(
-            f"registration: the {whose}'s {len(points)} points lie on a line (spread "
+            f"registration: the {frame_name}'s {len(points)} points lie on a line (spread "
             f'{length * 1e3:.1f} mm along it, {width * 1e3:.2f} mm across); move one of them '
             'well off the line and measure again'
         )

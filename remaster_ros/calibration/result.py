@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a fit gives: the posterior's summary, and everything that follows from it."""
+"""Result of a fit: summary of the posterior, and the quantities that follow from it."""
 
 from __future__ import annotations
 
@@ -23,7 +23,10 @@ from remaster_ros.calibration.left_out import held_out_tests
 from remaster_ros.calibration.metropolis import Chains
 from remaster_ros.calibration.noise_check import NoiseCheck, check_noise
 from remaster_ros.calibration.noise_estimate import NoiseEstimate, noise_estimates
-from remaster_ros.calibration.orientation_accuracy import TurnsTell, what_turns_tell
+from remaster_ros.calibration.orientation_accuracy import (
+    OrientationInformation,
+    orientation_information,
+)
 from remaster_ros.calibration.posterior import Posterior
 from remaster_ros.calibration.predictive_accuracy import Predictive
 from remaster_ros.calibration.priors import DISPLACED, LARGEST_OFFSET
@@ -46,29 +49,29 @@ from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.transforms import matrix_to_rotation_vector
 from remaster_ros.types import BoolArray, FloatArray, IntArray, Measurements, Session
 
-# Standard deviations of the offsets that hold where the model leaves other errors out.
+# Standard deviations of the offsets with errors outside the model.
 #
-# What is left out is not only noise: it shifts the estimates. So smooth functions stand beside the
+# Such errors are not only noise: they shift the estimates. So smooth functions are added to the
 # model's columns (`smooth_functions`), each family with a Gaussian prior whose width is estimated:
-# a discrepancy as Kennedy and O'Hagan (2001, doi:10.1111/1467-9868.00294) have it. The variance of
-# an offset is then that of this larger model, plus the square of how far its estimate is from that
-# of the model itself. A sandwich or a bootstrap by pose is no remedy: it holds for where the wrong
-# model would end with more data of the same kind, not for the truth (figures: docs/statistics.md).
+# a discrepancy as in Kennedy and O'Hagan (2001, doi:10.1111/1467-9868.00294). The variance of an
+# offset is then that of this larger model, plus the square of the distance of its estimate from
+# that of the model itself. A sandwich or a bootstrap by pose is no remedy: it is valid for the
+# limit of the wrong model with more data of the same kind, not for the truth (figures:
+# docs/statistics.md).
 
 
-# Logarithms of the variances, in units of the noise's: where the search begins, the width of a
-# weak prior about it, and how far it may go.
+# Logarithms of the variances, in units of the noise's: start of the search, width of a weak prior
+# about the start, and range.
 START, PRIOR_STD = -3.0, 10.0
 RANGE = (-9.0, 6.0)
 NOISE_RANGE = (-3.0, 3.0)
 
 
 def robust_std(mode: Mode, measurements: Measurements) -> FloatArray:
-    """Return the standard deviation of each joint's offset with a discrepancy, rad, (k,).
+    """Standard deviation of each joint's offset with a discrepancy, rad, (k,).
 
-    0 for offsets that are held. Never below that of the model.
-
-    ``mode``: of the posterior of the rows fitted; ``measurements``: that the rows were taken from.
+    0 for offsets that are held; never below that of the model. ``mode``: of the posterior of the
+    fitted rows; ``measurements``: source of the rows.
     """
     posterior = mode.linearisation.posterior
     rows = spread_poses(posterior.rows)
@@ -94,7 +97,7 @@ def robust_std(mode: Mode, measurements: Measurements) -> FloatArray:
     prior = mode.linearisation.prior[:f, :f]
 
     def system(logs: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the precision of all parameters and their scale for the log variances."""
+        """Precision of all parameters, scaled, and the scale, for the log variances."""
         precision = gram / np.exp(logs[0])
         precision[:f, :f] += prior
         inner = np.arange(f, len(precision))
@@ -103,7 +106,7 @@ def robust_std(mode: Mode, measurements: Measurements) -> FloatArray:
         return precision / np.outer(scale, scale), scale
 
     def cost(logs: FloatArray) -> float:
-        """Return minus the log likelihood, the parameters integrated out."""
+        """Minus the log likelihood with the parameters integrated out."""
         scaled, scale = system(logs)
         root = cho_factor(scaled, lower=True)
         right = pull / scale / np.exp(logs[0])
@@ -127,7 +130,7 @@ def robust_std(mode: Mode, measurements: Measurements) -> FloatArray:
 
 
 def _unit(columns: FloatArray) -> FloatArray:
-    """Return columns (n, 3, c), but those of zeros, as (3 n, c) with a mean square of 1 a row."""
+    """Columns (n, 3, c) without those of zeros, as (3 n, c), with a mean square of 1 per row."""
     flat = columns.reshape(-1, columns.shape[2])
     length = np.linalg.norm(flat, axis=0)
     kept = length > 1e-9 * np.max(length)
@@ -141,22 +144,23 @@ UNKNOWN_STD = np.pi / np.sqrt(3.0)
 
 @dataclass(frozen=True, eq=False)
 class Orientations:
-    """What came of the orientations that were measured."""
+    """Result for measured orientations."""
 
-    # Why they are not fitted, a sentence; '' where they are, and the rest is empty otherwise
+    # Reason why orientations are not fitted, a sentence; the other fields are then empty. '' if
+    # they are fitted
     why_not: str
-    count: int = 0  # How many were fitted
-    # By sensor, rad where `NoiseEstimate` has m
+    count: int = 0  # Number of fitted orientations
+    # Noise by sensor, rad in place of the m of `NoiseEstimate`
     noise: Mapping[str, NoiseEstimate] = field(default_factory=dict)
-    # How each body stands on the tool, (3, 3), and its standard deviation about the axes of T,
-    # (3,); like the markers for offsets of 0 where they are not identifiable
+    # Orientation of each body on the tool, (3, 3), and its standard deviation about the axes of T,
+    # (3,); like the markers for offsets of 0 if these are not identifiable
     R_T_B: Mapping[str, FloatArray] = field(default_factory=dict)
     std_rad: Mapping[str, FloatArray] = field(default_factory=dict)
-    tell: TurnsTell | None = None  # What they tell of the offsets
+    information: OrientationInformation | None = None  # Information on the offsets
 
     def words(self, chain: SerialChain, std: FloatArray) -> str:
-        """Return what orientations did to offsets with these std (k,), a sentence."""
-        if self.why_not or self.tell is None:
+        """Effect of the orientations on offsets with standard deviations (k,), a sentence."""
+        if self.why_not or self.information is None:
             return self.why_not
         noises = ' and '.join(
             f'{np.degrees(np.sqrt(one.sigma_m**2 + (one.pose_sigma_m or 0.0) ** 2)):.3f} deg '
@@ -165,88 +169,92 @@ class Orientations:
         )
         text = f'{self.count} orientations are fitted, too; their noise is {noises} per axis'
         held = std <= 0.0
-        gain = np.where(held, 0.0, self.tell.std_without / np.where(held, 1.0, std))
+        gain = np.where(held, 0.0, self.information.std_without / np.where(held, 1.0, std))
         joint = int(np.argmax(gain))
         if not np.isfinite(gain[joint]):
             return f'{text}; the positions alone do not determine {chain.joint_names[joint]}'
         scale, unit = chain.shown_scale[joint], chain.shown_units[joint]
         return (
             f'{text}; {chain.joint_names[joint]} is known to {scale * std[joint]:.4f} {unit} with '
-            f'them, to {scale * self.tell.std_without[joint]:.4f} by the positions alone, if the '
+            f'them, to {scale * self.information.std_without[joint]:.4f} by the positions alone, '
+            'if the '
             'arm is exactly its drawing'
         )
 
 
 @dataclass(frozen=True, eq=False)
 class FitResult:
-    """The posterior of a session and what follows from it; k joints, p sampled parameters.
+    """Posterior of a session and the quantities that follow from it.
+
+    K joints, p sampled parameters.
 
     Attributes
     ----------
     session, chain
-        What was fitted, on which nominal robot.
+        Fitted session and nominal robot.
     joint_names
         k names.
     parameter_names
         p names: joints, ``registration.<sensor>.x`` … ``rz`` (corrections about the centroid of
         the sensor's data to a registration near the result, see `model`), ``marker.<name>.x``,
-        ``noise.<sensor>.sigma`` and ``.pose_sigma`` and
-        ``.frame_sigma`` where it has them. What is held fixed is not among them.
+        ``noise.<sensor>.sigma``, and ``.pose_sigma`` and ``.frame_sigma`` if the noise has them.
+        Fixed parameters are not included.
     draws
         (chains, draws, p); rad and m.
     trace
-        The chains from their first state, thinned where long, (chains, records, p).
+        Chains from their first state, thinned if long, (chains, records, p).
     joint_offset_draws
-        rad, (chains, draws, k); zeros where a joint is held by the gauge (paper mode holds none).
+        rad, (chains, draws, k); zeros if a joint is held by the gauge (paper mode holds none).
     joint_offsets, joint_offsets_std, joint_offsets_interval95
         Posterior mean and std, rad, (k,), and 95 % interval, rad, (k, 2). A joint that neither
-        data nor prior determine has mean 0, the std of a uniform turn, and the whole turn.
+        data nor prior determine has mean 0, the std of a uniform rotation, and the whole turn.
     identifiable
-        False where the data do not determine a joint's offset, (k,); true all the same where a
-        prior determines it nearly as well as the data determine the others.
+        False if the data do not determine a joint's offset, (k,); true all the same if a prior
+        determines it nearly as well as the data determine the others.
     why
-        What the data alone do not distinguish it from; '' where they do, k strings.
+        Parameters that the data alone cannot distinguish from the joint's offset; '' if the data
+        determine the offset, k strings.
     gauge
         Every combination of parameters that the data do not determine.
     T_R_N, T_R_N_std_m, T_R_N_std_rad
-        Registration of each sensor, (4, 4), with std of its translation and of its rotation
-        along and about the axes of R, (3,) each; like all of the rest for offsets of 0 where
-        they are not identifiable.
+        Registration of each sensor, (4, 4), with std of its translation and of its rotation along
+        and about the axes of R, (3,) each; like all further results for offsets of 0 if these are
+        not identifiable.
     marker_positions, marker_std_m
         Markers in T, m, (3,) each.
     noise
-        By sensor.
+        Noise by sensor.
     residuals_after
         Measured minus modelled position in N for every row of the session, m, (n, 3).
     compare
-        Returns the `comparison`: where there are further effects it is made when asked for.
+        Returns the `comparison`: with effects in the model it is computed on demand.
     left_out
         (observation, reason) of every gross error.
     noise_checks
-        Of every sensor: is what the fit leaves what noise explains?
+        For every sensor: whether noise explains the error after the fit.
     structure
-        What the residuals follow, and whether held-out poses differ; None where the sampler is
-        the paper's, or with an extension.
+        Structure of the residuals, and whether held-out poses differ; None with the paper's
+        sampler, or with an extension.
     widening
-        How many times the standard deviation and the interval of each joint's offset are those of
-        the model, because of errors that it leaves out, (k,); 1 where there are none.
+        Factor of errors outside the model on the standard deviation and the interval of each
+        joint's offset, (k,); 1 without such errors.
     theta_names
-        Of the extension's m parameters; empty without one.
+        Names of the extension's m parameters; empty without an extension.
     theta, theta_std
-        Their posterior mean and std, in their units, (m,).
+        Posterior mean and std of the extension's parameters, in their units, (m,).
     theta_draws
         (chains, draws, m).
     predictive
-        The posterior as predictions take it.
+        Posterior as predictions use it.
     found
-        The estimate whose posterior was sampled; None where the sampler is the paper's.
+        Estimate whose posterior was sampled; None with the paper's sampler.
     orientations
-        What came of measured orientations; None where none were measured.
+        Result for measured orientations; None if none were measured.
     """
 
     session: Session
-    # All its rows, ``sensor`` and ``marker`` counted among those that have any, as in `T_R_N` and
-    # `marker_positions`
+    # All rows of the session; ``sensor`` and ``marker`` are indices among those with rows, as in
+    # `T_R_N` and `marker_positions`
     measurements: Measurements
     chain: SerialChain
     joint_names: tuple[str, ...]
@@ -283,7 +291,7 @@ class FitResult:
 
     @property
     def comparison(self) -> Comparison:
-        """The same fit with all offsets held at zero beside this one."""
+        """Fit with all offsets held at zero, compared with this fit."""
         return self.compare()
 
     @property
@@ -293,7 +301,7 @@ class FitResult:
 
     @property
     def T_R_N_before(self) -> Mapping[str, FloatArray]:
-        """Registrations of the same fit with all offsets held at zero."""
+        """Registrations of the fit with all offsets held at zero."""
         return self.comparison.T_R_N_before
 
     @property
@@ -308,7 +316,7 @@ class FitResult:
 
     @property
     def orientations_in_words(self) -> str:
-        """What measured orientations did, a sentence; '' where there are none."""
+        """Effect of measured orientations, a sentence; '' without orientations."""
         if self.orientations is None:
             return ''
         std = np.where(self.identifiable, self.joint_offsets_std / self.widening, 0.0)
@@ -316,12 +324,12 @@ class FitResult:
 
     @property
     def other_errors(self) -> bool:
-        """Whether errors that are neither offsets nor noise are known to be left."""
+        """Whether errors remain that are neither offsets nor noise."""
         return errors_are_left(self.noise_checks, self.structure)
 
     @property
     def implausible(self) -> tuple[str, ...]:
-        """A line for each joint whose offset is identifiable and too large for a mastering."""
+        """Line for each joint whose offset is identifiable and too large for a mastering."""
         return tuple(
             f'{joint}: an offset of {amount} is more than a mastering is off by ({largest}); '
             'before it is used, check joint order, '
@@ -330,7 +338,7 @@ class FitResult:
         )
 
     def _too_large(self) -> list[tuple[str, str, str]]:
-        """Return the joints whose known offset is too large, with it and the limit as text."""
+        """Joints with too large an identifiable offset, with offset and limit as text."""
         limit, found = LARGEST_OFFSET * self.chain.per_radian, []
         for i in np.flatnonzero(self.identifiable & (np.abs(self.joint_offsets) > limit)).tolist():
             amount = self.chain.shown_offset(i, self.joint_offsets[i]).replace('deg', 'degrees')
@@ -340,7 +348,7 @@ class FitResult:
 
     @property
     def displaced_markers(self) -> tuple[str, ...]:
-        """A line for each marker that is not where it was stated to be, as well as it was."""
+        """Line for each marker that is not at its stated position within the stated accuracy."""
         if self.found is None:
             return ()
         problem, link = self.found.problem, self.session.tip_link
@@ -361,34 +369,34 @@ class FitResult:
 
 @dataclass(frozen=True, eq=False)
 class Sampled:
-    """What a sampler hands over to `build_result`."""
+    """Result of a sampler, for `build_result`."""
 
-    posterior: Posterior  # Whose parameters and noise were sampled
+    posterior: Posterior  # Sampled posterior of parameters and noise
     # Pinned parameters, (chains, draws, size), and noise coordinates, (chains, draws, e)
     z: FloatArray
     eta: FloatArray
-    z_mean: FloatArray  # Mean of z, joints that are not identifiable at 0, (size,)
+    z_mean: FloatArray  # Mean of z, with joints that are not identifiable at 0, (size,)
     moved: IntArray  # Indices of the sampled parameters, (m,)
-    # The chains, in natural units and in the order of `FitResult.parameter_names`, and which
-    # sampler it was
+    # Chains in natural units and in the order of `FitResult.parameter_names`, and the name of the
+    # sampler
     run: Chains
     name: str
-    precision: float | None  # That was asked for; None where a number of draws was
-    gauge: Gauge  # What the data do not determine
-    # Standard deviation, rad, of what the sampler took as known exactly and the session does not,
-    # in each joint's offset, (k,); it is added to that of the draws
+    precision: float | None  # Wanted precision; None if the number of draws was given
+    gauge: Gauge  # Combinations that the data do not determine
+    # Standard deviation of each joint's offset, rad, (k,), by quantities that the sampler holds
+    # fixed and the session does not know exactly; added to that of the draws
     taken_as_known: FloatArray
-    # Returns the pinned parameters of the fit with offsets at zero, (size,)
+    # Function to the pinned parameters of the fit with offsets at zero, (size,)
     z_before: Callable[[], FloatArray]
     left_out: tuple[tuple[int, str], ...]  # (row of the measurements, reason) of the gross errors
-    mode: Mode | None = None  # Of the posterior; None where it was not sought
-    # How c causes outside the model move the natural parameters, one standard deviation of each,
-    # (size, c); None where none are expected
+    mode: Mode | None = None  # Mode of the posterior; None if it was not computed
+    # Change of the natural parameters by c causes outside the model, one standard deviation each,
+    # (size, c); None if none are expected
     unmodelled: FloatArray | None = None
-    found: Estimate | None = None  # Whose posterior it is; None where it was not sought
+    found: Estimate | None = None  # Estimate with this posterior; None if it was not computed
 
     def widened(self, rng: np.random.Generator) -> Sampled:
-        """Return the same with the draws moved by causes outside the model."""
+        """Same draws with random contributions of causes outside the model."""
         if self.unmodelled is None:
             return self
         causes = rng.standard_normal((*self.z.shape[:-1], self.unmodelled.shape[1]))
@@ -400,9 +408,10 @@ class Sampled:
 def sampled_columns(
     posterior: Posterior, x: FloatArray, eta: FloatArray, moved: IntArray
 ) -> FloatArray:
-    """Return natural parameters x (..., size) and noise eta (..., e) as chains of a fit, (..., p).
+    """Columns (..., p) of a fit's chains by natural parameters x (..., size) and noise.
 
-    The moved parameters, every channel's sigma, and what their rows share where that is known.
+    The moved parameters, every channel's sigma, and its common parts if they are known; ``eta``:
+    noise coordinates, (..., e).
     """
     noise = posterior.noise(eta)
     shared = posterior.noise_model.shared(noise)
@@ -410,7 +419,7 @@ def sampled_columns(
 
 
 def _sampled_names(posterior: Posterior, moved: IntArray) -> tuple[str, ...]:
-    """Return the names of `sampled_columns`."""
+    """Names of the columns of `sampled_columns`."""
     model, noise_model = posterior.model, posterior.noise_model
     noises = [
         '.'.join(filter(None, ('noise', posterior.noise_names[channel.sensor], channel.direction)))
@@ -427,7 +436,7 @@ def _sampled_names(posterior: Posterior, moved: IntArray) -> tuple[str, ...]:
 def build_result(
     problem: Problem, sampled: Sampled, seconds: float, rng: np.random.Generator
 ) -> FitResult:
-    """Summarise the draws; ``seconds`` is how long they took, ``rng`` for section V-C."""
+    """Summary of the draws; ``seconds``: their computing time; ``rng``: for section V-C."""
     posterior, gauge, measurements = sampled.posterior, sampled.gauge, problem.measurements
     model = posterior.model
     # In pinned coordinates any value of a joint that is not identifiable fits as well as 0.
@@ -458,22 +467,24 @@ def build_result(
         left_out,
         parameters=len(sampled.moved) - 3 * len(model.bodies),
     )
-    structure, widening, tell = None, np.ones(model.joints), None
+    structure, widening, information = None, np.ones(model.joints), None
     if sampled.mode is not None and not model.has_causes:
         gross = np.concatenate([np.zeros(0, np.int64), *(check.gross for check in noise_checks)])
         of_points = sampled.mode.of_points
         held_out = held_out_tests(of_points, measurements, gross)
         structure = residual_structure(of_points, measurements)
         tests = (*structure.tests, *held_out)
-        tell = what_turns_tell(sampled.mode)
-        if tell is not None:
-            tests += (StructureTest('orientation', True, tell.p_value),)
+        information = orientation_information(sampled.mode)
+        if information is not None:
+            tests += (StructureTest('orientation', True, information.p_value),)
         structure = replace(structure, tests=tests)
         if errors_are_left(noise_checks, structure):
             robust = robust_std(of_points, measurements)
-            if tell is not None and any(test.driver == 'orientation' for test in structure.found):
-                # One of the two is wrong, and nothing tells which.
-                robust = np.hypot(robust, tell.shift)
+            if information is not None and any(
+                test.driver == 'orientation' for test in structure.found
+            ):
+                # Either positions or orientations are wrong; the data do not show which.
+                robust = np.hypot(robust, information.shift)
             widening = np.where(unfixed, 1.0, np.maximum(1.0, robust / std))
     identifiable, why = known_offsets(problem.chain, gauge.why, std_by_data, widening * std)
     noise = posterior.noise(sampled.eta)
@@ -490,7 +501,7 @@ def build_result(
     def by_sensor(values: FloatArray) -> dict[str, FloatArray]:
         return dict(zip(problem.sensor_names, values, strict=True))
 
-    # Its own generator: draws are the same whether or not it is asked for.
+    # A generator for the comparison alone: the draws do not depend on whether it is computed.
     (own_rng,) = rng.spawn(1)
 
     @cache
@@ -523,7 +534,7 @@ def build_result(
         marker_positions=by_marker(markers),
         marker_std_m=by_marker(model.markers(x_draws).std(axis=0, ddof=1)),
         noise={name: noises[name] for name in problem.sensor_names},
-        orientations=_orientations(posterior, sampled, tell, x_after, x_draws),
+        orientations=_orientations(posterior, sampled, information, x_after, x_draws),
         sampler=SamplerInfo.of(
             sampled.run,
             names,
@@ -550,11 +561,11 @@ def build_result(
 def _orientations(
     posterior: Posterior,
     sampled: Sampled,
-    tell: TurnsTell | None,
+    information: OrientationInformation | None,
     x: FloatArray,
     x_draws: FloatArray,
 ) -> Orientations | None:
-    """Return what came of the orientations at natural x (size,) and of draws (n, size)."""
+    """Result for the orientations, at natural x (size,) and of draws (n, size)."""
     model = posterior.model
     if not model.bodies:
         why_not = '' if sampled.found is None else sampled.found.without_turns
@@ -573,19 +584,19 @@ def _orientations(
         {sensor: noises[name] for sensor, name in names.items()},
         dict(zip(model.body_names, middle, strict=True)),
         dict(zip(model.body_names, turns.std(axis=0, ddof=1), strict=True)),
-        tell,
+        information,
     )
 
 
 def _offset_summary(
     draws: FloatArray, held: FloatArray, taken_as_known: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return mean (k,), std (k,) and 95 % interval (k, 2) of offsets (n, k), rad or m.
+    """Mean (k,), std (k,) and 95 % interval (k, 2) of offsets (n, k), rad or m.
 
-    Of joints that are not identifiable, where ``held`` is what counts as a radian and not 0, they
-    are 0 and those of the whole turn.
+    ``held``: 0 for identifiable joints, otherwise the offset that counts as a radian, (k,); these
+    joints have mean 0 and the std and interval of a whole turn.
     """
-    unfixed = held > 0.0
+    undetermined = held > 0.0
     mean = draws.mean(axis=0)
     std = np.hypot(draws.std(axis=0, ddof=1), taken_as_known)
     interval = np.quantile(draws, (0.025, 0.975), axis=0).T
@@ -593,7 +604,7 @@ def _offset_summary(
     half = np.hypot(interval - mean[:, None], 1.96 * taken_as_known[:, None])
     interval = mean[:, None] + half * (-1.0, 1.0)
     return (
-        np.where(unfixed, 0.0, mean),
-        np.where(unfixed, UNKNOWN_STD * held, std),
-        np.where(unfixed[:, None], np.outer(held, (-np.pi, np.pi)), interval),
+        np.where(undetermined, 0.0, mean),
+        np.where(undetermined, UNKNOWN_STD * held, std),
+        np.where(undetermined[:, None], np.outer(held, (-np.pi, np.pi)), interval),
     )

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which rows of a table do not fit the robot that the others fit, before it is fitted for good.
+"""Rows of a table that do not fit the robot, found before the final fit.
 
-A robust fit follows the majority; a row whose error would be gross in a fit (`outliers`) is named.
+A robust fit follows the majority; rows with an error that would be gross in a fit (`outliers`) are
+named.
 """
 
 from __future__ import annotations
@@ -26,27 +27,19 @@ from remaster_ros.types import BoolArray, FloatArray, Session
 
 @dataclass(frozen=True, eq=False)
 class RowsOff:
-    """How far each of the n rows of a session is from a robust fit."""
+    """Distance of each of the n rows of a session from a robust fit."""
 
-    error_m: FloatArray  # Distance of its point from the modelled one, m, (n,)
-    off: BoolArray  # Whether it does not fit, (n,)
-    too_many: bool  # Whether these are more than a fit leaves out as gross errors
+    error_m: FloatArray  # Distance of the row's point from the modelled one, m, (n,)
+    off: BoolArray  # Whether the row does not fit, (n,)
+    too_many: bool  # Whether more rows do not fit than a fit leaves out as gross errors
 
 
 def find_rows_off(session: Session, most: int) -> RowsOff:
-    """Compare every row, held-out ones as well, with a robust fit.
+    """Comparison of every row, held-out rows as well, with a robust fit.
 
-    Parameters
-    ----------
-    session
-        With its markers open: one that is firm at a wrong place would bend the fit.
-    most
-        Rows to fit at most, evenly spread over those to fit.
-
-    Raises
-    ------
-    InsufficientDataError
-        Too few rows or poses.
+    ``session``: with unknown marker positions, as a firm wrong position would bend the fit;
+    ``most``: largest number of fitted rows, evenly spread. Raises InsufficientDataError if there
+    are too few rows or poses.
     """
     problem = Problem.of(session)
     model, m = problem.empty_model(), problem.measurements
@@ -70,7 +63,7 @@ def find_rows_off(session: Session, most: int) -> RowsOff:
         scale = by_tail if (by_tail := robust_scale(mine)) < TAIL_LIMIT * scale else scale
         gross = gross_probability(mine / scale) > CERTAIN
         error[rows.source[span]], off[rows.source[span]] = mine, gross
-        # Of the rows to fit alone a fit judges, too.
+        # The final fit judges the rows to fit only.
         for judged in (gross, gross[~m.is_validation[rows.source[span]]]):
             too_many |= int(judged.sum()) > max(1.0, LARGEST_SHARE * len(judged))
     return RowsOff(error, off, too_many)

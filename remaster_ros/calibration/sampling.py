@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Draws from the exact posterior of a fit, by Metropolis-Hastings with one adapted proposal.
 
-Independent proposals of a Student t (`proposal`) that begins at the linearised posterior. Where
-this is the exact one on draws, as with any number of good observations, it is sampled; else the
-exact one is, with proposals moved to its mean and covariance. Where those do not reach it, the
-Gaussian about the mode stands, and the result states that nothing has sampled it.
+Independent proposals of a Student t (`proposal`) that begins at the linearised posterior. If its
+density equals the exact one on draws, as with any number of good observations, it is sampled;
+otherwise the exact density is sampled, with proposals adapted to its mean and covariance. If these
+do not reach it, the result is the Gaussian about the mode, and states that no sampler has
+confirmed it.
 """
 
 from __future__ import annotations
@@ -24,36 +25,36 @@ from remaster_ros.types import FloatArray
 Progress = Callable[[str, float], None]
 
 WARM_UP = 100
-# Monte Carlo error of every mean over its standard deviation, where nothing else is asked for:
-# 1 / 0.02² = 2500 effective draws, of the bulk and of the tails.
+# Default Monte Carlo error of every mean over its standard deviation: 1 / 0.02² = 2500 effective
+# draws, of the bulk and of the tails.
 PRECISION = 0.02
-# Chains of fewer draws tell little of their own convergence.
+# Fewest draws of a chain that show its convergence.
 FEWEST_DRAWS = 200
-# Draws of the Gaussian about the mode, per chain.
+# Number of draws of the Gaussian about the mode, per chain.
 GAUSSIAN_DRAWS = 800
-# All the chains together do not hold more numbers than this: 32 MB, a dozen times in all that is
+# Largest number of values in all chains together: 32 MB, and a dozen times that in all quantities
 # derived from them.
 LARGEST_CHAINS = 4_000_000
-# The exact density is evaluated so many times in all, counted in rows of the session, which take
-# some 0.2 µs each, so that any session ends: at 2,000 rows 50,000 times. An evaluation costs as
-# much as so many rows whatever their number. Where there are very many rows it takes longer.
+# Largest number of evaluated rows, some 0.2 µs each, so that sampling ends for any session: at
+# 2,000 rows 50,000 evaluations of the exact density. The fixed cost of an evaluation is counted in
+# rows; the fewest evaluations are made with any number of rows, which takes longer with very many.
 EVALUATED_ROWS = 100_000_000
 ROWS_OF_AN_EVALUATION = 100
 FEWEST_EVALUATIONS = 4000
-# Of them, for the rounds that adapt the proposal; a round has so many draws, or so many for each
-# dimension where that is more.
+# Share of the evaluations for the rounds that adapt the proposal, number of rounds, and draws of a
+# round: a fixed number, or a number for each dimension if that is more.
 ADAPTING = 0.25
 ROUNDS = 8
 ROUND_DRAWS, ROUND_DRAWS_PER_DIMENSION = 1000, 40
-# Draws worth this share of themselves are taken by more than half as proposals: good enough.
+# Effective share of the draws from which a proposal is good enough: more than half are accepted.
 GOOD_WEIGHTS = 0.5
-# With more parameters the Gaussian about the mode is taken: a Student t in so many dimensions
-# hardly ever hits the bulk.
+# Number of parameters above which the result is the Gaussian about the mode: draws of a Student t
+# in so many dimensions are hardly ever in the bulk.
 MANY_PARAMETERS = 60
-# Chains are given up that promise to take so many times the draws they may have.
+# Ratio of needed to allowed draws from which chains are given up.
 HOPELESS = 1.5
-# The linearised density may differ by this from the exact one on draws of it: of so many rows of
-# observations in all, fewest and most draws.
+# Largest difference of the linearised log density from the exact one, on draws; number of
+# evaluated rows for this check, with the fewest and most draws.
 DENSITY_ERROR_LIMIT = 0.05
 CHECKED_ROWS, FEWEST_CHECKED, MOST_CHECKED = 5_000_000, 20, 200
 LINEARISED = (
@@ -64,18 +65,18 @@ EXACT = 'independence Metropolis-Hastings on the exact density, adapted Student 
 
 
 class Sampling(NamedTuple):
-    """What `sample_posterior` returns."""
+    """Result of `sample_posterior`."""
 
     run: Chains  # Points as `Posterior` defines them
-    name: str  # Which sampler it was, for the report
+    name: str  # Name of the sampler, for the report
 
 
 def silent(stage: str, share: float) -> None:
-    """Report nothing."""
+    """No report of progress."""
 
 
 def unchanged(points: FloatArray) -> FloatArray:
-    """Return points as they are."""
+    """Points as they are."""
     return points
 
 
@@ -89,13 +90,13 @@ def sample_posterior(
     quantities: Callable[[FloatArray], FloatArray] = unchanged,
     report: Progress = silent,
 ) -> Sampling:
-    """Sample the exact posterior about its mode.
+    """Draws of the exact posterior about its mode.
 
-    ``mode``: of the posterior; ``chains``: number of chains, from dispersed starts; ``draws``:
-    draws of each chain; None to sample in batches until R-hat is at most 1.01 and the effective
-    draws of every quantity reach the precision; ``precision``: Monte Carlo error of each mean over
-    its standard deviation; ``quantities``: what the length is judged by: points (..., d) to
-    quantities (..., p); ``report``: called with the stage and the share of it that is done.
+    ``chains``: number of chains, from dispersed first states; ``draws``: draws of each chain, or
+    None to sample in batches until R-hat is at most 1.01 and the effective draws of every quantity
+    reach the precision; ``precision``: Monte Carlo error of each mean over its standard deviation;
+    ``quantities``: of points (..., d) to the quantities (..., p) that decide the length;
+    ``report``: called with the stage and the share of it that is done.
     """
     posterior = mode.linearisation.posterior
     if len(posterior.free) > MANY_PARAMETERS:
@@ -137,9 +138,9 @@ def sample_posterior(
 
 
 def gaussian_draws(mode: Mode, chains: int, rng: np.random.Generator) -> Chains:
-    """Draw from the Gaussian about the mode, which the posterior of many linear effects is.
+    """Draws of the Gaussian about the mode, which is the posterior of many linear effects.
 
-    Parameters as by the linearised posterior at the mode's noise, the noise by its own curvature.
+    Parameters by the linearised posterior at the mode's noise, the noise by its own curvature.
     """
     count = chains * GAUSSIAN_DRAWS
     parts = []
@@ -157,16 +158,16 @@ def gaussian_draws(mode: Mode, chains: int, rng: np.random.Generator) -> Chains:
 
 
 def _is_linear(proposal: AdaptedProposal, rng: np.random.Generator) -> bool:
-    """Return whether the linearised density is the exact one on draws of it."""
+    """Whether the linearised density equals the exact one on draws of it."""
     posterior = proposal.mode.linearisation.posterior
     count = int(np.clip(CHECKED_ROWS // len(posterior.rows), FEWEST_CHECKED, MOST_CHECKED))
     points, log_proposal = proposal.sample(4 * count, rng)
-    # Of the proposals those that the density would take: its tails are wider.
+    # Proposals that the linearised density would accept: the proposal's tails are wider.
     log_weight = proposal.linearised(points) - log_proposal
     kept = np.log(rng.random(len(points))) < log_weight - np.max(log_weight)
     points = points[kept][:count]
-    apart = posterior.log_density(points) - proposal.linearised(points)
-    return len(points) > 1 and float(np.ptp(apart)) < 2.0 * DENSITY_ERROR_LIMIT
+    difference = posterior.log_density(points) - proposal.linearised(points)
+    return len(points) > 1 and float(np.ptp(difference)) < 2.0 * DENSITY_ERROR_LIMIT
 
 
 def _adapted(
@@ -176,7 +177,7 @@ def _adapted(
     rng: np.random.Generator,
     report: Progress,
 ) -> tuple[AdaptedProposal, Weighted]:
-    """Return the best of several proposals, each adapted to draws of the one before it."""
+    """Best of several proposals, each adapted to draws of the one before."""
     count = max(ROUND_DRAWS, ROUND_DRAWS_PER_DIMENSION * proposal.dimension)
     rounds = int(np.clip(evaluations // count, 1, ROUNDS))
     best: tuple[AdaptedProposal, Weighted] | None = None
@@ -201,10 +202,12 @@ def _long_enough(
     worth: float,
     quantities: Callable[[FloatArray], FloatArray],
 ) -> Chains | None:
-    """Sample in batches until the chains have what is wanted; None where they will not.
+    """Chains, sampled in batches until they have the wanted effective draws.
 
-    ``more`` continues from a state: (start, draws, warm-up) to chains; ``worth`` is what share of
-    independent draws one is expected to be worth.
+    None if they will not.
+
+    ``more``: continues from a state, (start, draws, warm-up) to chains; ``worth``: expected
+    effective share of the draws.
     """
     first = int(np.clip(1.1 * wanted / (worth * len(start)), FEWEST_DRAWS, most))
     run = more(start, first, WARM_UP)
@@ -215,14 +218,14 @@ def _long_enough(
             figure(values)
             for figure in (convergence.r_hat, convergence.ess_bulk, convergence.ess_tail)
         )
-        # What never moves has no effective draws.
+        # A quantity that never moves has no effective draws.
         least = max(1.0, float(np.min(np.nan_to_num(np.minimum(bulk, tail)))))
         mixed = np.max(r_hat) <= R_HAT_LIMIT
         if mixed and (least >= wanted or (count >= most and least >= ESS_LIMIT)):
             return run._replace(figures=(r_hat, bulk, tail))
         if count >= most or count * min(wanted, ESS_LIMIT) / least > HOPELESS * most:
             return None
-        # A tenth more than the rate so far promises, but no more than three times as many.
+        # A tenth more than by the rate so far, but no more than three times as many.
         expected = 1.1 * count * wanted / least
         batch = int(np.clip(expected - count, count // 4, 3 * count))
         part = more(run.draws[:, -1], min(batch, most - count), 0)

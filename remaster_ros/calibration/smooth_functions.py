@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What errors that no model has may look like: smooth functions, as columns beside the model's.
+"""Smooth functions for errors outside the model, as columns next to the model's.
 
-Of the position in front of a sensor, of time, of each joint's own angle, of the time of its
-zero-offset; and a displacement of each link and a tilt of each axis, constant in the link's frame.
+Functions of the position in front of a sensor, of time, of each joint's own angle, of time for
+each zero-offset; and a displacement of each link and a tilt of each axis, constant in the link's
+frame.
 """
 
 from __future__ import annotations
@@ -21,22 +22,23 @@ from remaster_ros.types import FloatArray, IntArray
 # Degree of the polynomials of time, and number of harmonics of a joint's angle.
 TIME_DEGREE, HARMONICS = 3, 2
 POSITION_DEGREE = 2
-# Rows that are looked at; of larger sessions those of evenly spread poses.
+# Largest number of rows; of larger sessions the rows of evenly spread poses.
 MOST_ROWS = 10_000
 GOLDEN = 0.5 * (5.0**0.5 - 1.0)
 
 
 def evenly(count: int, share: float) -> IntArray:
-    """Return which of so many in a row make an even share of them, the first among them.
+    """Indices, from 0 to ``count``, of an even share of a sequence, with the first.
 
-    Where a multiple of the golden ratio's inverse ends: of every second or third one, such as
-    those of one of several markers in turn, it is the same share, as it is not of every k-th.
+    The choice follows multiples of the golden ratio's inverse: the share is the same among every
+    second or third element, such as rows of several markers in turn, unlike with every k-th
+    element.
     """
     return np.flatnonzero(np.arange(count) * GOLDEN % 1.0 < share)
 
 
 def spread_poses(rows: Rows) -> Rows:
-    """Return all rows, or of a large session those of evenly spread poses."""
+    """All rows, or of a large session the rows of evenly spread poses."""
     if len(rows) <= MOST_ROWS:
         return rows
     first = evenly(len(rows.group_start), MOST_ROWS / len(rows))
@@ -55,7 +57,7 @@ def spread_poses(rows: Rows) -> Rows:
 
 
 def whitened(mode: Mode, rows: Rows, families: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
-    """Return families of columns (n, 3, c) in units of the noise, 'errors' and 'model' as well."""
+    """Families of columns (n, 3, c) in units of the noise, with 'errors' and 'model'."""
     posterior = mode.linearisation.posterior
     model = posterior.model
     columns = {
@@ -70,9 +72,9 @@ def whitened(mode: Mode, rows: Rows, families: Mapping[str, FloatArray]) -> dict
 
 
 def of_position(rows: Rows, degree: int = POSITION_DEGREE) -> FloatArray:
-    """Return polynomials of the measured position up to the first or second degree.
+    """Polynomials of the measured position up to the first or second degree, without the constant.
 
-    Without the constant: (n, 3, 9 sensors) or (n, 3, 27 sensors), as `by_sensor` splits them.
+    (n, 3, 9 sensors) or (n, 3, 27 sensors), as `by_sensor` splits them.
     """
     measured = rows.measured
     place = np.empty_like(measured)
@@ -87,31 +89,33 @@ def of_position(rows: Rows, degree: int = POSITION_DEGREE) -> FloatArray:
 
 
 def of_time(rows: Rows, seconds: FloatArray, degree: int = TIME_DEGREE) -> FloatArray:
-    """Return polynomials of time, s, (n,), without the constant, (n, 3, 3 degree sensors)."""
+    """Polynomials of time, s, (n,), without the constant, (n, 3, 3 degree sensors)."""
     return _by_sensor(rows, _polynomials(seconds, degree))
 
 
 def of_joint_times(
     mode: Mode, rows: Rows, seconds: FloatArray, degree: int = TIME_DEGREE
 ) -> FloatArray:
-    """Return what zero-offsets do that change with time, s, (n,): (n, 3, degree k)."""
+    """Errors by zero-offsets that change with time, s, (n,): (n, 3, degree k)."""
     by_joints = mode.linearisation.posterior.model.inner_pose(mode.z, rows).by_joints
     functions = _polynomials(seconds, degree)
-    return np.concatenate([by_joints * one[:, None, None] for one in functions.T], axis=2)
+    return np.concatenate(
+        [by_joints * function[:, None, None] for function in functions.T], axis=2
+    )
 
 
 def _polynomials(seconds: FloatArray, degree: int) -> FloatArray:
-    """Return Legendre polynomials of time, s, (n,), over its range, from the first on, (n, d)."""
+    """Legendre polynomials of time, s, (n,), over its range, without the constant, (n, degree)."""
     early, late = seconds.min(), seconds.max()
     share = (2.0 * seconds - early - late) / max(late - early, 1e-9)
     return legendre.legvander(share, degree)[:, 1:]
 
 
 def of_joint_angles(mode: Mode, rows: Rows, harmonics: int = HARMONICS) -> FloatArray:
-    """Return what an error of each joint by its own angle does, (n, 3, 2 harmonics k).
+    """Errors by each joint's error as harmonics of its own angle, (n, 3, 2 harmonics k).
 
-    Of a joint that slides half a turn stands for the travel that was measured: a sine of its place
-    is then as smooth as one of an angle.
+    For a joint that slides half a turn is the measured travel: a sine of its position is then as
+    smooth as one of an angle.
     """
     model = mode.linearisation.posterior.model
     by_joints = model.inner_pose(mode.z, rows).by_joints
@@ -129,7 +133,7 @@ def of_joint_angles(mode: Mode, rows: Rows, harmonics: int = HARMONICS) -> Float
 
 
 def of_links(mode: Mode, rows: Rows) -> tuple[FloatArray, FloatArray]:
-    """Return what a displacement and what a tilt of each joint's frame does, (n, 3, 3 k) each."""
+    """Errors by a displacement and by a tilt of each joint's frame, (n, 3, 3 k) each."""
     model = mode.linearisation.posterior.model
     frames = model.chain.frames(rows.q, model.offsets(mode.z))
     pose = model.inner_pose(mode.z, rows)
@@ -145,13 +149,13 @@ def of_links(mode: Mode, rows: Rows) -> tuple[FloatArray, FloatArray]:
 
 
 def by_sensor(rows: Rows, columns: FloatArray) -> dict[int, FloatArray]:
-    """Split functions of position or time into those of each sensor, by its index."""
+    """Functions of position or time for each sensor, by its index."""
     parts = np.split(columns, len(rows.spans), axis=2)
     return {sensor: part for (sensor, _), part in zip(rows.spans, parts, strict=True)}
 
 
 def _by_sensor(rows: Rows, functions: FloatArray) -> FloatArray:
-    """Return functions (n, c) along each axis, each sensor's for itself, (n, 3, 3 c sensors)."""
+    """Functions (n, c) along each axis, separate for each sensor, (n, 3, 3 c sensors)."""
     columns = np.zeros((len(rows), 3, len(rows.spans), 3, functions.shape[1]))
     for place, (_, span) in enumerate(rows.spans):
         for axis in range(3):

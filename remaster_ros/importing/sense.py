@@ -24,7 +24,7 @@ from remaster_ros.calibration.mistakes import (
     UNKNOWN_MARKER_STD_M,
     Columns,
     find_mistakes,
-    in_a_sentence,
+    sentence_of_mistakes,
     shown_mm,
 )
 from remaster_ros.calibration.priors import DISPLACED, LARGEST_OFFSET, UNCALIBRATED_ERROR_M
@@ -130,11 +130,11 @@ def check_sense(
         return replace(by_marker, error_m=as_given.error_m)
     mistakes = find_mistakes(session)
     if mistakes.fitting:
-        sentence, options = in_a_sentence(mistakes, session, columns_of(rows, chain))
+        sentence, options = sentence_of_mistakes(mistakes, session, columns_of(rows, chain))
         return Sense(False, sentence, options, as_given.error_m)
     # Of an arm that fits, its zeros apart.
     largest = np.abs(as_given.joint_offsets / as_given.per_radian).max()
-    unmastered = as_given.left_m <= UNCALIBRATED_ERROR_M and largest < _LARGEST_UNMASTERED
+    unmastered = as_given.worst_error_m <= UNCALIBRATED_ERROR_M and largest < _LARGEST_UNMASTERED
     if as_given.gross and unmastered and not too_many and as_given.marker_shift_m < allowed:
         found = _unmastered(as_given, error_text, chain, never_mastered)
         return replace(found, rows_off=outlying, warning=_outlier_warning(outlying, rows))

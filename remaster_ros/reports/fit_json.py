@@ -292,7 +292,7 @@ def _geometry(result: FitResult, geometry: GeometryModel) -> dict[str, Any]:
 
 def _orientation(result: FitResult, found: Orientations) -> dict[str, Any]:
     """Key orientation of fit.json."""
-    tell = found.tell
+    information = found.information
     return {
         'fitted': not found.why_not,
         'count': found.count,
@@ -314,7 +314,7 @@ def _orientation(result: FitResult, found: Orientations) -> dict[str, Any]:
             }
             for name, R_T_B in found.R_T_B.items()
         },
-        'p_value': None if tell is None else tell.p_value,
+        'p_value': None if information is None else information.p_value,
         **_by_positions(result),
     }
 
@@ -322,11 +322,11 @@ def _orientation(result: FitResult, found: Orientations) -> dict[str, Any]:
 def _by_positions(result: FitResult) -> dict[str, dict[str, float | None]]:
     """Std of each offset from the positions alone, degrees, and mm for prismatic joints."""
     found: dict[str, dict[str, float | None]] = {'std_positions_deg': {}}
-    tell = None if result.orientations is None else result.orientations.tell
-    if tell is None:
+    information = None if result.orientations is None else result.orientations.information
+    if information is None:
         return found
     for joint in np.flatnonzero(result.identifiable).tolist():
-        std = float(result.chain.shown_scale[joint] * tell.std_without[joint])
+        std = float(result.chain.shown_scale[joint] * information.std_without[joint])
         by_joint = found.setdefault(f'std_positions_{result.chain.shown_units[joint]}', {})
         by_joint[result.joint_names[joint]] = std if np.isfinite(std) else None
     return found

@@ -16,7 +16,7 @@ import numpy as np
 from remaster_ros.calibration.dynamics import estimate_moving
 from remaster_ros.calibration.estimate import Estimate, estimate
 from remaster_ros.calibration.mistakes import sound_estimate
-from remaster_ros.calibration.one_arm import OffsetsApart, offsets_apart
+from remaster_ros.calibration.one_arm import OffsetDifferences, offset_differences
 from remaster_ros.errors import InputError, InsufficientDataError, MistakeFoundError
 from remaster_ros.session.observations import stacked
 from remaster_ros.types import Measurements, Session
@@ -145,7 +145,7 @@ def disagreements(sessions: Sequence[tuple[str, Session]]) -> tuple[list[str], l
             silent.append(f'{name} alone does not tell whether it is of the same arm: {error}')
     for name, other in found[1:]:
         first_name, first = found[0]
-        apart = offsets_apart(first, other)
+        apart = offset_differences(first, other)
         if apart is None:
             silent.append(
                 f'{first_name} and {name} determine no offset in common, which would tell '
@@ -166,7 +166,7 @@ def disagreements(sessions: Sequence[tuple[str, Session]]) -> tuple[list[str], l
     return differing, silent
 
 
-def _words(apart: OffsetsApart) -> str:
+def _words(apart: OffsetDifferences) -> str:
     """Return a difference of offsets as text."""
     return f'fitted one by one their zero-offsets differ, {apart.words}'
 

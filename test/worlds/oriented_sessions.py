@@ -217,8 +217,8 @@ def one_session(seed: int, kind: str, poses: int = 30, arm: str | None = None) -
     fit = fit_session(made.session, rng=rng, draws=1000)
     assert fit.orientations is not None
     assert not fit.orientations.why_not, fit.orientations
-    tell = fit.orientations.tell
-    assert tell is not None
+    information = fit.orientations.information
+    assert information is not None
     known = fit.identifiable
     low, high = fit.joint_offsets_interval95[known].T
     truth = made.joint_offsets[known]
@@ -226,8 +226,8 @@ def one_session(seed: int, kind: str, poses: int = 30, arm: str | None = None) -
         ((low < truth) & (truth < high)).tolist(),
         ((fit.joint_offsets[known] - truth) / fit.joint_offsets_std[known]).tolist(),
         np.degrees(fit.joint_offsets_std[known]).tolist(),
-        np.degrees(tell.std_without[known]).tolist(),
-        tell.p_value,
+        np.degrees(information.std_without[known]).tolist(),
+        information.p_value,
         len(fit.left_out),
     )
 

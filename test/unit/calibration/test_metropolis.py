@@ -11,7 +11,7 @@ from scipy import stats
 
 from remaster_ros.calibration.convergence import ess_bulk
 from remaster_ros.calibration.metropolis import (
-    _walk,
+    _states_of_chain,
     independence_sampler,
     random_walk_sampler,
 )
@@ -66,7 +66,7 @@ def test_walk_is_hastings_rule_step_by_step(share: float) -> None:
                 if not nowhere and uniform[step] < weight[step] - held:
                     here, held = step, weight[step]
                 path.append(here)
-            assert _walk(weight, uniform, current) == path
+            assert _states_of_chain(weight, uniform, current) == path
 
 
 def independent(density, proposal, start, draws: int, seed: int, warm_up: int = 0):
