@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the driver of a sensor gives; no ROS. `remaster_ros.nodes.sensor_markers` runs any of them.
+"""Interface of a sensor's driver, without ROS.
 
-A device is one folder beside this file with one class that derives from `StreamDriver` or from
+`remaster_ros.nodes.sensor_markers` runs any driver.
+
+A device is one folder next to this file with one class that derives from `StreamDriver` or from
 `TriggeredDriver`, and one line in `remaster_ros.sensors.registry`.
 """
 
@@ -32,57 +34,57 @@ class SensorParameters:
         high=3600.0,
     )
     further_markers: Mapping[str, int] = field(default_factory=dict)
-    """Of the cell file, no parameter of the node: further markers, and what the device knows each
-    by. Only for drivers that are `several_markers`."""
+    """From the cell file, not a parameter of the node: further markers, and each marker's number
+    at the device. Only for drivers with `several_markers`."""
 
 
 @dataclass(frozen=True)
 class SensorClock:
-    """The clock by which readings are stamped."""
+    """Clock of the readings' stamps."""
 
     # Time and waiting, s
     now: Callable[[], float] = time.time
     sleep: Callable[[float], None] = time.sleep
-    # Whether it runs at another speed than the wall clock and may stand still
+    # Whether the clock runs at another speed than the wall clock and may stop
     simulated: bool = False
 
 
 @dataclass(frozen=True)
 class SensorState:
-    """How a sensor is now."""
+    """Present state of a sensor."""
 
-    # It can measure a marker that is in view. A hidden marker does not make it unready: the next
-    # configuration may show the marker again.
+    # Whether the sensor can measure a visible marker. A hidden marker does not make it unready:
+    # the marker may be visible at the next configuration.
     ready: bool = True
-    trouble: str = ''  # What is wrong, with the remedy; ''
-    message: str = 'ok'  # What to show a person where nothing is wrong
+    trouble: str = ''  # Fault with its remedy; '' without a fault
+    message: str = 'ok'  # Message for a person if there is no fault
     level: str = 'ok'  # ``ok``, ``warn`` or ``error``
-    # Counts and settings for the search of a cause
+    # Counts and settings, for the search for a cause
     values: Mapping[str, Any] = field(default_factory=dict)
 
 
 class Driver(ABC):
-    """One device. The constructor refuses what waiting cannot mend; `open` connects.
+    """Driver of one device. The constructor refuses settings that can never work; `open` connects.
 
-    ``parameters``: an instance of `parameters_type`; ``clock``: gives the stamps of the readings.
+    ``parameters``: an instance of `parameters_type`; ``clock``: for the stamps of the readings.
     """
 
     parameters_type: ClassVar[type[SensorParameters]]
-    """The driver's frozen dataclass of parameters."""
+    """Frozen dataclass of the driver's parameters."""
     device: ClassVar[str]
-    """What it is, for messages."""
+    """Name of the device in messages."""
     several_markers: ClassVar[bool] = False
-    """Whether it measures several markers: in one frame, or one after another on request."""
+    """Whether the driver measures several markers, in one frame or one after another."""
     phase: str = 'connecting'
-    """``connecting`` until `open` has returned, then ``ready``; set by the node. `open` may set
-    another text while it takes long."""
+    """``connecting`` until `open` has returned, then ``ready``; set by the node. During a long
+    `open` the driver may set another text."""
 
     @abstractmethod
     def __init__(self, parameters: Any, clock: SensorClock) -> None: ...
 
     @property
     def connected(self) -> bool:
-        """Whether the device can still be reached after `open`; False has it opened again."""
+        """Whether the device can be reached after `open`; if False it is opened again."""
         return True
 
     @abstractmethod
@@ -94,37 +96,34 @@ class Driver(ABC):
         """Disconnect; may be repeated, and called while another thread reads or measures."""
 
     def state(self) -> SensorState:
-        """Return how the device is; called from any thread."""
+        """Present state of the device; called from any thread."""
         return SensorState()
 
 
 class StreamDriver(Driver):
-    """A device that sends readings by itself."""
+    """Driver of a device that sends readings by itself."""
 
     received_s: float = 0.0
-    """When what `read` returned last has come, by the driver's clock, s."""
+    """Time of arrival of the last reading that `read` returned, by the driver's clock, s."""
 
     @abstractmethod
     def read(self) -> MarkerReading | None:
-        """Return the next reading, stamped with its time of capture.
+        """Next reading, stamped with its time of capture.
 
-        Of several markers in one frame one after the other, with the same stamp.
-        Only measured positions: nothing occluded, predicted, filled in or held over. Waits some
-        tenths of a second at most, then returns None.
+        None if none arrives within tenths of a second.
 
-        Raises
-        ------
-        DeviceError
-            The device is lost; it is closed and opened again.
+        Several markers of one frame are returned one after another, with the same stamp. Only
+        measured positions are returned: never occluded, predicted, model-filled or repeated ones.
+        Raises DeviceError if the device is lost; the node then closes and opens it again.
         """
 
 
 class TriggeredDriver(Driver):
-    """A device that measures on request."""
+    """Driver of a device that measures on request."""
 
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
-        # Where the class is defined, not in front of an arm that stands and waits.
+        # The check is made when the class is defined, not while an arm waits for a reading.
         if cls.several_markers and cls.turn_to is TriggeredDriver.turn_to:
             raise TypeError(f'{cls.__name__} has several_markers, and no turn_to')
 
@@ -135,36 +134,36 @@ class TriggeredDriver(Driver):
         Parameters
         ----------
         expected
-            Where the marker should be, in the sensor's frame, m, (3,); None until the sensor is
-            registered and a pose has been announced.
+            Expected position of the marker in the sensor's frame, m, (3,); None until the sensor
+            is registered and a pose has been announced.
 
         Raises
         ------
         DeviceError
-            Why there is no reading, with the remedy. A moving target is refused.
+            If there is no reading, with reason and remedy. A moving target is refused.
         """
 
     def turn_to(self, marker: str, expected: FloatArray) -> None:
-        """Turn to the marker that is measured next, unless it is on it already.
+        """Turn to the marker that is measured next, unless the device points at it already.
 
-        Of drivers that are `several_markers` alone, before each `measure` once the sensor is
+        Only for drivers with `several_markers`, before each `measure` once the sensor is
         registered.
 
         Parameters
         ----------
         marker
-            One of `further_markers` of the parameters; '' for the one that the sensor follows.
+            One of the parameters' `further_markers`; '' for the marker that the sensor follows.
         expected
-            As of `measure`.
+            As in `measure`.
 
         Raises
         ------
         DeviceError
-            It was not found. Another one is not measured in its place.
+            If the marker was not found. No other marker is measured in its place.
         """
 
     def prepare(self, expected: FloatArray | None) -> None:
-        """Get ready for the request that follows; called when the arm has arrived.
+        """Prepare for the next request; called when the arm has arrived.
 
-        What it raises (`DeviceError`) is shown, and the request is made all the same.
+        A `DeviceError` raised here is shown, and the request is made all the same.
         """

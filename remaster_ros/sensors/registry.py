@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The registered sensors: one line a device."""
+"""Registered sensors: one line per device."""
 
 from __future__ import annotations
 
@@ -13,26 +13,23 @@ DRIVERS = {
     'laser_tracker_markers': 'laser_tracker.driver:LaserTrackerDriver',
     'topic_markers': 'topic.driver:TopicDriver',
 }
-"""What the names of a device's nodes begin with, and where its driver is in this folder."""
+"""First part of the names of a device's nodes -> path of its driver in this folder."""
 
 TOPIC = 'topic_markers'
-"""Reads a topic of a node that is not of this package."""
+"""Sensor that reads a topic of another package's node."""
 GENERIC = 'sensor_markers'
-"""The executable that runs any of them, by the name given to its node."""
+"""Executable that runs any sensor, by the name of its node."""
 
 
 def kind_of(node_name: str) -> str:
-    """Return the longest key of `DRIVERS` with which a node's name begins; '' for none."""
+    """Longest key of `DRIVERS` with which a node's name begins; '' for none."""
     return max((kind for kind in DRIVERS if node_name.startswith(kind)), key=len, default='')
 
 
 def load_driver(node_name: str) -> type[Driver]:
-    """Return the driver for the node of this name.
+    """Driver for the node of this name.
 
-    Raises
-    ------
-    InputError
-        The name begins with that of no registered sensor.
+    Raises InputError if no registered sensor's name begins the node's name.
     """
     kind = kind_of(node_name)
     if not kind:

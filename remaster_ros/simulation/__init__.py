@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The hidden world, and fake devices with the real wire formats."""
+"""Hidden world of the simulation, and fake devices with the wire formats of real ones."""

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How the fake arm moves: a second-order servo behind a trajectory, solved in closed form.
+"""Motion of the fake arm: a second-order servo that follows a trajectory, in closed form.
 
-The reported joint positions x follow a reference r by x'' + 2 ζ ω x' + ω² x = ω² r. Each piece
-of the reference is a polynomial, so x lags while moving, overshoots a little and settles. The
+The reported joint positions x follow a reference r by x'' + 2 ζ ω x' + ω² x = ω² r. Each piece of
+the reference is a polynomial, so x lags while moving, overshoots a little and settles. The
 solution is a polynomial plus a decaying oscillation: exact at any time, without integration, and
 therefore the same in every process that has read the trajectories.
 """
@@ -27,9 +27,10 @@ _DAMPED = NATURAL_FREQUENCY * np.sqrt(1 - DAMPING * DAMPING)
 
 @dataclass(frozen=True)
 class ServoPoint:
-    """A point of a trajectory: time from its start (s), position (rad) and velocity (rad/s).
+    """Point of a trajectory: time from the start (s), position (rad) and velocity (rad/s).
 
-    Without a velocity the controller interpolates linearly towards it, as the real one does.
+    Without a velocity the controller interpolates linearly towards the point, as the real one
+    does.
     """
 
     time_s: float
@@ -46,7 +47,7 @@ def spline(
 ) -> FloatArray:
     """Coefficients, lowest power first, (n, k), of the piece between two waypoints.
 
-    Cubic (Hermite) where the end has a velocity, else linear.
+    Cubic (Hermite) if the end has a velocity, else linear.
     """
     T, gap = duration, end - start
     if end_velocity is None:
@@ -59,29 +60,28 @@ def spline(
 def from_now(
     now_s: float, begins_s: float | None, points: Sequence[ServoPoint]
 ) -> tuple[list[ServoPoint], tuple[FloatArray, FloatArray] | None]:
-    """Return what is left of a trajectory with a stamp, and where its reference is now.
+    """Remaining part of a trajectory with a stamp, and its reference now (position, velocity).
 
-    As joint_trajectory_controller does: points whose time has passed are behind it, and it goes on
-    between the two around now. Without such a point it joins the first one to where the arm is.
-
-    ``begins_s``: the stamp, s; None for at once; ``points``: at times from there.
+    As in joint_trajectory_controller, points whose time has passed are dropped, and the reference
+    is between the two points around now. Without such a point it begins at the arm's position.
+    ``begins_s``: the stamp, s, None for now; ``points``: at times from the stamp.
     """
     since_s = 0.0 if begins_s is None else now_s - begins_s
-    left = [
+    remaining = [
         ServoPoint(point.time_s - since_s, point.q, point.velocity)
         for point in points
         if point.time_s > since_s
     ]
     behind = [point for point in points if point.time_s <= since_s]
-    if not behind or not left:
-        return left, None
+    if not behind or not remaining:
+        return remaining, None
     last, ahead = behind[-1], points[len(behind)]
     rest = np.zeros_like(last.q)
     start = rest if last.velocity is None else last.velocity
     piece = spline(last.q, start, ahead.q, ahead.velocity, ahead.time_s - last.time_s)
     powers = (since_s - last.time_s) ** np.arange(len(piece))
     slope = piece[1:] * np.arange(1, len(piece))[:, None]
-    return left, (powers @ piece, powers[: len(slope)] @ slope)
+    return remaining, (powers @ piece, powers[: len(slope)] @ slope)
 
 
 def _steady_response(reference: FloatArray) -> FloatArray:
@@ -130,9 +130,10 @@ class _Response:
 
 
 class Motion:
-    """The arm's reported joint positions over time, as commanded trajectories make them.
+    """Reported joint positions of the arm over time, by the commanded trajectories.
 
-    ``start_s``: world time of the beginning, s; ``q``: joint positions at rest then, rad, (k,).
+    ``start_s``: world time of the beginning, s; ``q``: joint positions at rest at that time, rad,
+    (k,).
     """
 
     def __init__(self, start_s: float, q: FloatArray) -> None:
@@ -145,13 +146,14 @@ class Motion:
         waypoints: Sequence[ServoPoint],
         reference_now: tuple[FloatArray, FloatArray] | None = None,
     ) -> None:
-        """From `start_s` on follow a trajectory; replaces what is under way.
+        """Follow a trajectory from `start_s` on, in the place of the present one.
 
-        ``reference_now``: where it leads at `start_s`, and how fast, (k,) each; None where it
-        begins where the arm is. The last waypoint is held. One piece of response is kept for each
-        piece of the reference.
+        ``reference_now``: position and velocity of the trajectory at `start_s`, (k,) each; None if
+        it begins at the arm's position.
+
+        The last waypoint is held. One piece of response is kept for each piece of the reference.
         """
-        # A later trajectory replaces what of the former has not happened yet.
+        # A later trajectory replaces the future of the former one.
         self._responses = [r for r in self._responses if r.start_s <= start_s] or [
             self._responses[0]
         ]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Draws effects to hide, of a given size: which joint, which direction, which sign."""
+"""Random hidden effects of a given size: joint, direction and sign."""
 
 from __future__ import annotations
 
@@ -21,27 +21,24 @@ from remaster_ros.simulation.truth import SessionTruth
 from remaster_ros.simulation.world_model import WorldModel
 
 RANDOM = 'random'
-# What a hidden effect leaves where no size is given, m.
+# Range of a hidden effect's size if none is given, m.
 USUAL_M = (0.2e-3, 0.6e-3)
 TRIES = 30
 
 
 @dataclass(frozen=True)
 class EffectSpec:
-    """What is to be hidden."""
+    """Request for a hidden effect."""
 
-    kind: str  # Of `KINDS`, or ``random`` for any of those that have a name
-    joint: int | None = None  # The joint that errs, 1-based; any where None
-    size_m: float | None = None  # What it leaves, see `WorldModel.size_m`; drawn where None
+    kind: str  # Key of `KINDS`, or ``random`` for any kind with a name
+    joint: int | None = None  # Number of the joint with the error, from 1; None for any joint
+    size_m: float | None = None  # Size by `WorldModel.size_m`; None for a random size
 
     @classmethod
     def parse(cls, text: str) -> EffectSpec:
-        """Read ``NAME[@JOINT][:SIZE_MM]``, such as ``backlash``, ``backlash@4:0.3``, ``random``.
+        """Request from ``NAME[@JOINT][:SIZE_MM]``: ``backlash``, ``backlash@4:0.3``, ``random``.
 
-        Raises
-        ------
-        InputError
-            Text that is no request.
+        Raises InputError if the text has another form.
         """
         match = re.fullmatch(r'([a-z_]+)(?:@(\d+))?(?::(\d*\.?\d+))?', text)
         if match is None or match[1] not in (RANDOM, *KINDS):
@@ -59,10 +56,10 @@ class EffectSpec:
 def hide(
     stage: WorldModel, requests: Sequence[EffectSpec], rng: np.random.Generator
 ) -> tuple[HiddenEffect, ...]:
-    """Draw the requested effects.
+    """Random effects for the requests.
 
-    Raises InputError: something that this arm cannot show on these visits, or at a joint that it
-    does not have.
+    Raises InputError if an effect cannot be seen with this arm on these visits, or is at a joint
+    that the arm does not have.
     """
     effects = []
     for request in requests:
@@ -87,7 +84,7 @@ def with_effects(
     requests: Sequence[EffectSpec],
     rng: np.random.Generator,
 ) -> SessionTruth:
-    """Return a truth in which so much more is wrong, as `hide` draws it."""
+    """Truth of a session with the effects of the requests, as `hide` draws them."""
     effects = hide(stage, requests, rng)
     sizes_m = tuple(stage.size_m(effect) for effect in effects)
     return replace(truth, effects=effects, effect_sizes_m=sizes_m)
@@ -96,20 +93,19 @@ def with_effects(
 def draw_effect(
     stage: WorldModel, kind: str, rng: np.random.Generator, size_m: float, joint: int | None = None
 ) -> HiddenEffect:
-    """Draw an effect of that kind of which so much is left (see `WorldModel.size_m`).
+    """Random effect of a kind, with the size `size_m` (see `WorldModel.size_m`).
 
-    Drawn again as long as it would have to be larger than is plausible: a joint that hardly moves
-    shows no eccentricity. Where no draw gets there, the most visible of them is taken.
-
-    Raises InputError: where all draws leave nothing, or none is about that joint, or those that
-    are would have to be larger than is plausible.
+    An effect that would have to be larger than plausible is drawn again: a joint that hardly moves
+    shows no eccentricity. If no draw is plausible, the most visible draw is used. Raises
+    InputError if all draws leave nothing, if none concerns the joint, or if those of the joint
+    would have to be larger than plausible.
     """
-    context = DrawContext(
+    drawn_from = DrawContext(
         rng, stage.arm.joints, stage.circumstances, stage.distance_m, tuple(stage.markers)
     )
     best, best_size = None, 0.0
     for _ in range(TRIES if joint is None else TRIES * stage.arm.joints):
-        drawn = KINDS[kind].draw(kind, context)
+        drawn = KINDS[kind].draw(kind, drawn_from)
         if joint is not None and drawn.joints != (joint,):
             continue
         effect = in_own_units(drawn, stage.circumstances.per_radian)
@@ -140,13 +136,13 @@ def draw_effect(
 
 
 def _balanced(stage: WorldModel, effect: HiddenEffect) -> HiddenEffect:
-    """Scale the joints that share in an effect so that each leaves as much as its drawn value.
+    """Effect whose joints each leave as much as their drawn value.
 
-    Otherwise one of two joints that give way could have no visible part in it.
+    Otherwise one of two compliant joints could have no visible part in the effect.
     """
-    alone = [
+    sizes = [
         stage.size_m(replace(effect, joints=(joint,), values=np.ones(1)))
         for joint in effect.joints
     ]
-    values = effect.values / np.maximum(alone, 1e-12)
+    values = effect.values / np.maximum(sizes, 1e-12)
     return replace(effect, values=values * np.max(effect.values) / np.max(values))

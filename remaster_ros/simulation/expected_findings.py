@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What discovery has to report of a hidden effect: its cause by name.
+"""Causes that discovery has to report for a hidden effect.
 
-This is the one module that uses both the names of hidden effects and those of discovery.json; only
-judges use it, after everything that estimates has ended.
+This is the only module with both the names of hidden effects and those of discovery.json; it is
+used only by judges, after all estimating programs have ended.
 """
 
 from __future__ import annotations
@@ -13,12 +13,11 @@ from typing import Any
 from remaster_ros.simulation.hidden_effects import KINDS, NAMED, UNNAMED, HiddenEffect
 
 Cause = tuple[str, tuple[int, ...], str]
-"""Name, joints, and the place and driver of what is hidden without a name; for a sensor its name.
-"""
+"""Name, joints, and further: place and driver of an effect without a name, or a sensor's name."""
 
 
 def causes(effect: HiddenEffect) -> list[Cause]:
-    """Return what has to be named: one cause for each joint that gives way, else one."""
+    """Causes that discovery has to name: one for each compliant joint, else one."""
     if effect.kind == 'joint_compliance':
         return [(effect.kind, (joint,), '') for joint in effect.joints]
     if effect.kind == 'joint_coupling':
@@ -38,18 +37,12 @@ def _without_name(effect: HiddenEffect) -> Cause:
 
 
 def named_cause(effect: Mapping[str, Any]) -> list[Cause]:
-    """Return what an effect of a discovery.json claims, one cause for each joint.
-
-    Parameters
-    ----------
-    effect
-        Of its list ``effects``.
-    """
+    """Causes in an entry of the list ``effects`` of a discovery.json, one for each joint."""
     name, joints = effect['name'], tuple(effect['joints'])
     if name not in NAMED:
         return [(name, joints, f'{effect["place"]} {effect["driver"]}')]
     if name != 'joint_coupling' and len(joints) > 1:
-        # One entry for several joints that err in the same way.
+        # One entry for several joints with the same kind of error.
         return [(name, (joint,), '') for joint in joints]
     sensor = ''
     if effect['place'] == 'sensor_frame':
@@ -58,21 +51,23 @@ def named_cause(effect: Mapping[str, Any]) -> list[Cause]:
 
 
 def answers(found: Cause, hidden: Cause, effect: HiddenEffect) -> bool:
-    """Return whether a cause found is the one hidden, which is a cause of the effect.
+    """Whether a found cause is the hidden one, which is a cause of the effect.
 
-    What is hidden without a name is found by any effect that is at its place and has its driver,
-    or that its kind names as an answer.
+    An effect without a name is found by any cause with the same place and driver, or with a name
+    that its kind accepts.
     """
-    name, joints, rest = found
+    name, joints, detail = found
     if joints != hidden[1]:
         return False
-    if name in KINDS[effect.kind].answers:
-        return name not in NAMED or rest in ('', effect.detail.get('sensor', ''))
-    return found == hidden or (name not in NAMED and hidden[0] == 'unnamed' and rest == hidden[2])
+    if name in KINDS[effect.kind].accepted:
+        return name not in NAMED or detail in ('', effect.detail.get('sensor', ''))
+    return found == hidden or (
+        name not in NAMED and hidden[0] == 'unnamed' and detail == hidden[2]
+    )
 
 
 def describe(cause: Cause) -> str:
-    """Return a cause in a few words."""
-    name, joints, rest = cause
+    """Cause in a few words."""
+    name, joints, detail = cause
     where = f'joint {", ".join(map(str, joints))}' if joints else ''
-    return ' '.join(part for part in (name, where, rest) if part)
+    return ' '.join(part for part in (name, where, detail) if part)

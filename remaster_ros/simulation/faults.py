@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Faults that are injected into the fakes: a file in the hidden World that a test writes.
+"""Faults for the fakes: a file in the hidden World, written by a test.
 
 ``faults.json`` maps a device (``robot`` or a sensor's name) to its faults, and each fault to its
-number: ``{"robot": {"slow": 3.0}, "mocap": {"frozen": 1}}``. The fakes look at it all the time, so
-a fault begins and ends with the file.
+number: ``{"robot": {"slow": 3.0}, "mocap": {"frozen": 1}}``. The fakes read it continuously, so
+that a fault begins and ends with the file.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ OF_TRACKER = {
 
 
 def inject(folder: Path, faults: Mapping[str, Numbers]) -> None:
-    """Replace the faults of the World in `folder`; with none, all end."""
+    """Write the faults of the World in `folder`, in place of the former ones; empty ends all."""
     for device, numbers in faults.items():
         known = OF_ROBOT if device == 'robot' else OF_OPTITRACK | OF_TRACKER
         for name in numbers:
@@ -93,7 +93,7 @@ def inject(folder: Path, faults: Mapping[str, Numbers]) -> None:
 
 
 class Faults:
-    """The faults of a World, as they are now."""
+    """Present faults of a World."""
 
     def __init__(self, folder: Path) -> None:
         self._path = folder / FILE
@@ -101,7 +101,7 @@ class Faults:
         self._faults: Mapping[str, Numbers] = {}
 
     def of(self, device: str) -> Numbers:
-        """Return the faults of a device."""
+        """Faults of a device."""
         try:
             changed = self._path.stat().st_mtime_ns
         except OSError:
@@ -111,6 +111,6 @@ class Faults:
         return self._faults.get(device, {})
 
 
-def is_out(period_s: float | None, t: float) -> bool:
-    """Whether something that fails every other period fails at time t; None never fails."""
+def in_outage(period_s: float | None, t: float) -> bool:
+    """Whether a device that fails every other period fails at time t; never with None."""
     return bool(period_s) and int(t / period_s) % 2 == 1  # type: ignore[operator]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The true arm of the fakes: the package's chain as `simulation.world_model` needs it."""
+"""True arm of the fakes: the package's chain in the form that `simulation.world_model` needs."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ from remaster_ros.types import FloatArray
 
 
 MOVES_KEPT = 16
-"""Effects are looked up for the present and the near past only."""
+"""Number of motions that are kept, for effects at present and in the near past."""
 
 
-class WrongArm:
-    """The true arm in front of the true sensors.
+class TrueArm:
+    """True arm in front of the true sensors.
 
-    ``chain``: the arm as drawn; ``truth``: what is wrong with it; ``start_s, q``: when and where
-    the arm stands at first, rad, (k,).
+    ``chain``: the arm as drawn; ``truth``: its deviations; ``start_s, q``: time and joint
+    positions at the beginning, rad, (k,).
     """
 
     def __init__(
@@ -51,7 +51,7 @@ class WrongArm:
         ]
 
     def move(self, start_s: float, start: FloatArray, end_s: float, end: FloatArray) -> None:
-        """Add a motion (rad, (k,)); it replaces what was still to come of the last one."""
+        """Add a motion (rad, (k,)), in place of the rest of the last one."""
         before = self.deviation(start_s)
         self._stops[-1] = start
         self._stops.append(end)
@@ -59,11 +59,11 @@ class WrongArm:
         self._moves.append((start_s, end_s, before, self._deviation()))
         del self._moves[:-MOVES_KEPT]
         if not self._truth.effects:
-            # Without effects the way to a stop does not matter; memory stays bounded.
+            # Without effects the earlier stops have no influence; memory stays bounded.
             del self._stops[:-2], self._times[:-2]
 
     def deviation(self, t: float) -> Deviation:
-        """What is wrong at a time, one row."""
+        """Deviation of arm and sensors at a time, one row."""
         move = next((m for m in reversed(self._moves) if m[0] <= t), self._moves[0])
         start_s, end_s, before, after = move
         share = 1.0 if t >= end_s else (t - start_s) / (end_s - start_s)
@@ -71,14 +71,14 @@ class WrongArm:
         return before.map(lambda a, b: a + smooth * (b - a), after)
 
     def marker_in_sensor(self, name: str, t: float, q: FloatArray, marker: str = '') -> FloatArray:
-        """What a sensor would measure without noise, in its frame N, m, (3,), for reported q."""
+        """Noise-free reading of a marker in the sensor's frame N, m, (3,), for reported q."""
         sensor, wrong = self._truth.sensors[name], self.deviation(t)
         marker = marker or sensor.marker
         state = self._arm.state(q + self._truth.joint_offsets + wrong.angle)
         return measured(state, name, sensor, marker, self._truth.markers[marker], wrong)[0]
 
     def _deviation(self) -> Deviation:
-        """Work out what is wrong at the last stop, with all that went before."""
+        """Deviation at the last stop, with the history of all stops."""
         times = np.array(self._times)
         visited = Round(
             q=np.array(self._stops),
@@ -95,25 +95,25 @@ class WrongArm:
 
 GRAVITY = (0.0, 0.0, -9.81)
 SECONDS_PER_CONFIGURATION = 10.0
-"""About what a configuration takes: motion, settling and measuring."""
+"""Approximate time of a configuration: motion, settling and measurement."""
 
 
 class ChainArm:
-    """An `Arm` made of a `SerialChain`."""
+    """`Arm` of a `SerialChain`."""
 
     def __init__(self, chain: SerialChain) -> None:
         self._chain = chain
         self.joints, self.slides = len(chain), chain.slides
 
     def state(self, q: FloatArray) -> ArmState:
-        """Where every joint is for true joint angles q, rad, (n, k)."""
+        """State of every joint for true joint angles q, rad, (n, k)."""
         chain = self._chain
         frames = chain.frames(q)
         tool = frames[:, -1] @ chain.T_fixed[-1]
         carriers = np.concatenate(
             (np.broadcast_to(np.eye(3), (len(q), 1, 3, 3)), frames[:, :-1, :3, :3]), axis=1
         )
-        # What slides has left the place where it was before its move.
+        # A joint that slides moves its origin.
         moved = np.where(chain.slides, q, 0.0)[..., None] * chain.axes_in_base(frames)
         return ArmState(
             origin=frames[..., :3, 3] - moved,
@@ -125,7 +125,7 @@ class ChainArm:
         )
 
     def gravity_torque(self, q: FloatArray) -> FloatArray:
-        """Torque with which gravity turns each joint its own way, N m, (n, k)."""
+        """Gravity's torque about each joint, in its positive direction, N m, (n, k)."""
         return self._chain.gravity_torque(q, GRAVITY)
 
     def base_moment(self, q: FloatArray) -> FloatArray:
@@ -147,28 +147,15 @@ class ChainArm:
         return moments
 
     def segments(self) -> FloatArray:
-        """From each joint to the next one, the last to the tool, m, (k + 1, 3)."""
+        """Vector from each joint to the next, from the last to the tool, m, (k + 1, 3)."""
         return self._chain.T_fixed[:, :3, 3]
 
 
 def tool_points(chain: SerialChain, truth: SessionTruth, q: FloatArray, marker: str) -> FloatArray:
-    """Return where a marker truly is at the stops of a tour, whatever a sensor makes of it.
+    """True positions of a marker at the stops of a tour, in the base's frame R, m, (m, 3).
 
-    Parameters
-    ----------
-    chain
-        The arm as drawn.
-    truth
-        What is wrong with it.
-    q
-        Reported joint angles, in the order of the tour, rad, (m, k).
-    marker
-        Its name.
-
-    Returns
-    -------
-    ndarray
-        In the base's frame R, m, (m, 3).
+    ``chain``: the arm as drawn; ``truth``: its deviations; ``q``: reported joint angles in the
+    order of the tour, rad, (m, k); ``marker``: name of the marker.
     """
     tour = model_of_tour(chain, truth, q)
     names = tuple(truth.sensors), tuple(truth.markers)
@@ -178,7 +165,7 @@ def tool_points(chain: SerialChain, truth: SessionTruth, q: FloatArray, marker: 
 
 
 def model_of_tour(chain: SerialChain, truth: SessionTruth, q: FloatArray) -> WorldModel:
-    """Return the true arm on its way through the configurations q, rad, (m, k), in that order."""
+    """True arm on a tour through the configurations q, rad, (m, k), in that order."""
     time_s = SECONDS_PER_CONFIGURATION * np.arange(len(q), dtype=float)
     visited = Round(q, q[0], time_s, truth.warming.at(truth.warming.start_s + time_s))
     return WorldModel(ChainArm(chain), visited, truth.sensors, truth.markers, truth.joint_offsets)

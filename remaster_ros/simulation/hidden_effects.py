@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a hidden world can hide: every effect written from its equation, on its own.
+"""Effects that a hidden world can have, each with its own equation.
 
-Nothing here is shared with the code that estimates (`discovery.effects`). An effect is linear in
-its values: `HiddenEffect.values` times what its rule adds to a `Deviation`. A rule reads the
+No code is shared with the estimation (`discovery.effects`). An effect is linear in its values:
+`HiddenEffect.values` times the contribution of its rule to a `Deviation`. A rule reads the
 `Circumstances` of every configuration. `NAMED` are the effects with a name, `UNNAMED` those
-without one. Compliance and thermal growth are drawn with the sign of physics.
+without. Compliance and thermal growth are drawn with the sign of physics.
 
-A joint that slides has metres for radians and, for a torque, the force along it; a radian of what
-is drawn counts as `SLIDE_M` there.
+A joint that slides has metres for radians and, for a torque, the force along it; a radian of the
+drawn values counts as `SLIDE_M` there.
 """
 
 from __future__ import annotations
@@ -24,54 +24,55 @@ from remaster_ros.types import FloatArray
 # A hidden effect: what it may depend on, what it changes, how it is drawn.
 
 ARC_MINUTE = np.deg2rad(1.0 / 60.0)
-# A joint that moved less than this, rad, keeps the flank of its gears that it had.
+# Smallest move of a joint, rad, that changes the flank of its gears.
 SLACK_RAD = 2e-4
-# An error of a slide is as large as that of an angle at this distance.
+# Distance, m, at which an error of an angle is as large as that of a slide.
 SLIDE_M = 0.25
 
 
 @dataclass(frozen=True, eq=False)
 class Circumstances:
-    """What effects may depend on at n configurations of k joints."""
+    """Quantities that effects may depend on, at n configurations of k joints."""
 
-    # Reported joint angles, and how far each joint came by its last move, rad or m, (n, k)
+    # Reported joint angles, and the last move of each joint, rad or m, (n, k)
     q: FloatArray
     move: FloatArray
-    # Direction of each joint's last move that was a move at all, -1, 0 or 1, (n, k)
+    # Direction of each joint's last move above `SLACK_RAD`, -1, 0 or 1, (n, k)
     approach: FloatArray
-    # Since the first measurement, (n,); the arm's temperature above its first, K, (n,)
+    # Time since the first measurement, s, (n,); the arm's temperature above its first, K, (n,)
     time_s: FloatArray
     warming_k: FloatArray
-    # Gravity's torque about each joint, or force along it, (n, k), and about the base, N m, (n, 3)
+    # Gravity's torque about each joint, or force along it, (n, k), and moment about the base, N m,
+    # (n, 3)
     torque: FloatArray
     base_moment: FloatArray
-    # Gravity's moment on what each joint carries, about its origin, in the frame before its turn,
-    # N m, (n, k, 3)
+    # Gravity's moment on the part that each joint carries, about the joint's origin, in the frame
+    # before the joint's rotation, N m, (n, k, 3)
     carried_moment: FloatArray
-    segments: FloatArray  # From each joint to the next, in the frame between, m, (k + 1, 3)
+    segments: FloatArray  # Vector from each joint to the next, in the frame between, m, (k + 1, 3)
     axes: FloatArray  # Axis of each joint in its own frame, (k, 3)
     tool: FloatArray  # Rotation of the tool, (n, 3, 3)
-    per_radian: FloatArray  # How much of each joint's unit counts as a radian, (k,)
+    per_radian: FloatArray  # Equivalent of a radian in each joint's unit, (k,)
 
 
 @dataclass(eq=False)
 class Deviation:
-    """How the true arm and sensors differ from their drawings at n configurations."""
+    """Deviation of the true arm and sensors from their drawings at n configurations."""
 
     sensors: tuple[str, ...]
     markers: tuple[str, ...]
     angle: FloatArray  # Added to the true joint angles, rad or m, (n, k)
     # Added to each segment, in the frame after its joint (0: the base), m, (n, k + 1, 3)
     shift: FloatArray
-    tilt: FloatArray  # Turns each joint's frame before its own turn, rad, (n, k, 3)
-    base: FloatArray  # Turns the base about its origin, axes of R, rad, (n, 3)
+    tilt: FloatArray  # Rotation of each joint's frame before the joint's own, rad, (n, k, 3)
+    base: FloatArray  # Rotation of the base about its origin, axes of R, rad, (n, 3)
     marker: FloatArray  # Added to each marker (c of them) in the tool frame, m, (n, c, 3)
-    # What each sensor (s of them) adds to a point p = (x, y, z) that it measures, in its frame N:
-    # beside, m, (n, s, 3); turn × p, rad, (n, s, 3); scale p, (n, s, 3); radial (x² + y²) (x, y,
-    # 0) about a center, 1/m², (n, s, 1), and m, (n, s, 2); along the line of sight a + b |p|² +
-    # c |p|³, in m, 1/m, 1/m², (n, s, 3); and z u² half where u = (x, y)/z along half is positive,
-    # (n, s, 2): the rays of one half of its view bend
-    beside: FloatArray
+    # Error of each of s sensors at a point p = (x, y, z) in its frame N: sensor_shift, m,
+    # (n, s, 3); turn × p, rad, (n, s, 3); scale p, (n, s, 3); radial (x² + y²) (x, y, 0) about a
+    # center, 1/m², (n, s, 1), and m, (n, s, 2); along the line of sight a + b |p|² + c |p|³, in m,
+    # 1/m, 1/m², (n, s, 3); and z u² half where u = (x, y)/z along half is positive, (n, s, 2):
+    # bent rays in one half of the view
+    sensor_shift: FloatArray
     turn: FloatArray
     scale: FloatArray
     radial: FloatArray
@@ -83,14 +84,14 @@ class Deviation:
     def none(
         cls, n: int, k: int, sensors: tuple[str, ...] = (), markers: tuple[str, ...] = ()
     ) -> Deviation:
-        """Return an arm and sensors as drawn."""
+        """Arm and sensors as drawn."""
         s = len(sensors)
         shapes = ((k,), (k + 1, 3), (k, 3), (3,), (len(markers), 3))
         per_sensor = ((s, 3), (s, 3), (s, 3), (s, 1), (s, 2), (s, 3), (s, 2))
         return cls(sensors, markers, *(np.zeros((n, *shape)) for shape in (*shapes, *per_sensor)))
 
     def map(self, change: Callable[..., FloatArray], *others: Deviation) -> Deviation:
-        """Apply a function to every array of this and other deviations."""
+        """Function applied to every array of this and other deviations."""
         names = [s.name for s in fields(self) if s.name not in ('sensors', 'markers')]
         changed: dict[str, Any] = {
             name: change(getattr(self, name), *(getattr(other, name) for other in others))
@@ -99,7 +100,7 @@ class Deviation:
         return replace(self, **changed)
 
     def measured(self, sensor: str, points: FloatArray) -> FloatArray:
-        """Return what a sensor makes of points p in its frame N, m, (n, 3)."""
+        """Readings of a sensor for points p in its frame N, m, (n, 3)."""
         s = self.sensors.index(sensor)
         across = points * (1.0, 1.0, 0.0)
         across[:, :2] -= self.center[:, s]
@@ -114,21 +115,21 @@ class Deviation:
         towards = np.sum(half * points[:, :2], axis=1, keepdims=True) / length
         bent = np.maximum(towards, 0.0) ** 2 / points[:, 2:]
         added[:, :2] += bent * half
-        return points + self.beside[:, s] + added
+        return points + self.sensor_shift[:, s] + added
 
 
 @dataclass(frozen=True, eq=False)
 class HiddenEffect:
-    """One effect of a certain size."""
+    """Effect with its size."""
 
-    kind: str  # Its name, a key of `NAMED` or `UNNAMED`
-    joints: tuple[int, ...]  # Numbers from 1: the joints whose angle, link or axis is wrong
-    values: FloatArray  # Its parameters in SI units, (m,); their meaning is in the rule's text
-    # What else the rule needs: an order, a direction, another joint, a sensor
+    kind: str  # Name, a key of `NAMED` or `UNNAMED`
+    joints: tuple[int, ...]  # Numbers, from 1, of the joints whose angle, link or axis is wrong
+    values: FloatArray  # Parameters in SI units, (m,), with the meaning in the rule's docstring
+    # Further arguments of the rule: an order, a direction, another joint, a sensor
     detail: Mapping[str, Any] = field(default_factory=dict)
 
     def scaled(self, factor: float) -> HiddenEffect:
-        """Return the same effect, so many times as large."""
+        """Same effect, larger by a factor."""
         return replace(self, values=factor * self.values)
 
     def __str__(self) -> str:
@@ -140,12 +141,12 @@ class HiddenEffect:
 
 @dataclass(frozen=True, eq=False)
 class DrawContext:
-    """What an effect is drawn from."""
+    """Source of randomness, arm, visits and sensors from which an effect is drawn."""
 
     rng: np.random.Generator
     joints: int
-    circumstances: Circumstances  # Of the visits
-    distance_m: Mapping[str, float]  # Sensor -> mean distance of what it measures, m
+    circumstances: Circumstances  # Circumstances of the visits
+    distance_m: Mapping[str, float]  # Sensor -> mean distance of its markers, m
     markers: tuple[str, ...]
 
     @property
@@ -154,25 +155,25 @@ class DrawContext:
         return tuple(self.distance_m)
 
     def joint(self, first: int = 1) -> tuple[int]:
-        """Draw a joint, 1-based."""
+        """Random joint number, from 1."""
         return (int(self.rng.integers(first, self.joints + 1)),)
 
     def sign(self) -> float:
-        """Draw -1 or 1."""
+        """Random sign, -1 or 1."""
         return float(self.rng.choice((-1.0, 1.0)))
 
     def direction(self, size: int) -> FloatArray:
-        """Draw a unit vector."""
+        """Random unit vector."""
         values = self.rng.standard_normal(size)
         return values / np.linalg.norm(values)
 
 
 Draw = Callable[[str, DrawContext], HiddenEffect]
-"""(kind, what to draw from) -> an effect."""
+"""Function of a kind and a context to a random effect."""
 
 
 def one_value(largest: float, first_joint: int = 1, positive: bool = False) -> Draw:
-    """Draw a joint and, unless physics has only the positive one, a sign."""
+    """Draw of a joint and a sign; no sign if physics has only the positive one."""
     return lambda kind, context: HiddenEffect(
         kind,
         context.joint(first_joint),
@@ -181,12 +182,12 @@ def one_value(largest: float, first_joint: int = 1, positive: bool = False) -> D
 
 
 def no_joint(largest: float) -> Draw:
-    """One value, whose sign is that of physics: nothing is left to draw."""
+    """Draw of an effect with one value and the sign of physics, without randomness."""
     return lambda kind, context: HiddenEffect(kind, (), np.array([largest]))
 
 
 def of_sensor(largest: float, size: int = 1, forms: tuple[str, ...] = ('',)) -> Draw:
-    """Draw a sensor, a form and a direction."""
+    """Draw of a sensor, a form and a direction."""
 
     def draw(kind: str, context: DrawContext) -> HiddenEffect:
         detail = {
@@ -199,7 +200,7 @@ def of_sensor(largest: float, size: int = 1, forms: tuple[str, ...] = ('',)) -> 
 
 
 def two_joints(largest: float, forms: tuple[str, ...] = ('',)) -> Draw:
-    """Draw the joint that errs and the one that it follows."""
+    """Draw of the joint with the error and of the joint that it follows."""
 
     def draw(kind: str, context: DrawContext) -> HiddenEffect:
         joint, by = (int(j) for j in 1 + context.rng.choice(context.joints, 2, replace=False))
@@ -211,7 +212,7 @@ def two_joints(largest: float, forms: tuple[str, ...] = ('',)) -> Draw:
 
 
 def at_some_time(draw: Draw) -> Draw:
-    """Draw also the moment from which on the effect is there."""
+    """Draw with a random moment from which the effect is present."""
 
     def timed(kind: str, context: DrawContext) -> HiddenEffect:
         effect = draw(kind, context)
@@ -222,23 +223,26 @@ def at_some_time(draw: Draw) -> Draw:
 
 
 Rule = Callable[[HiddenEffect, Deviation, Circumstances], None]
-"""Adds what an effect makes of the circumstances to a deviation."""
+"""Function that adds the contribution of an effect, in its circumstances, to a deviation."""
 
 
 @dataclass(frozen=True)
 class Part:
-    """A parameter under the name that discovery gives it."""
+    """Parameter of an effect under its name in discovery."""
 
-    # With ``{j}`` for the joint, ``{by}`` for the one that drives it, ``{order}`` for the order of
+    # Name with ``{j}`` for the joint, ``{by}`` for the driving joint, ``{order}`` for the order of
     # a wave, ``{sensor}`` for the sensor
     name: str
-    # The effect's values where this parameter is 1 and all others are 0
+    # Values of the effect with this parameter at 1 and all others at 0
     values: tuple[float, ...] = (1.0,)
-    # What the effect has to have in its detail
+    # Entries that the effect's detail has to have
     detail: Mapping[str, str] = field(default_factory=dict)
 
     def of(self, effect: HiddenEffect) -> dict[str, float]:
-        """Return name and true value, SI units, of an effect of one joint and one order."""
+        """Name and true value, SI units, for an effect of one joint and one order.
+
+        {} if it does not apply.
+        """
         if any(effect.detail.get(key) != value for key, value in self.detail.items()):
             return {}
         values = np.array(self.values)
@@ -253,38 +257,38 @@ class Part:
 
 @dataclass(frozen=True)
 class HiddenKind:
-    """A kind of effect."""
+    """Kind of effect."""
 
-    # Where it enters, and what drives it
+    # Place of the error in the arm, and quantity that drives it
     place: str
     driver: str
-    rule: Rule  # Its equation
-    # Draws one of about the largest size that is plausible; `WorldModel.of_size` makes it smaller
+    rule: Rule  # Equation of the effect
+    # Draw of about the largest plausible size; `WorldModel.of_size` makes it smaller
     draw: Draw
-    # What discovery should find; none where it has no parameters that could be compared one by one
+    # Parameters that discovery should find; empty if they cannot be compared one by one
     parts: tuple[Part, ...] = ()
-    # To which power its values have the unit of what drives, in a denominator: where a joint
-    # slides they are drawn smaller by it. None for what no joint that slides has
+    # Power of the driver's unit in the denominator of the values' unit: for a driving joint that
+    # slides the values are drawn smaller. None if a joint that slides cannot have the effect
     power: int | None = 0
-    answers: tuple[str, ...] = ()  # Names of discovery.json that name it too, beside its own
+    accepted: tuple[str, ...] = ()  # Further names in discovery.json that are correct
 
 
 def in_own_units(effect: HiddenEffect, per_radian: FloatArray) -> HiddenEffect | None:
-    """Return an effect as drawn, in rad, in the units of its joints; None where it has no form.
+    """Effect, drawn in rad, in the units of its joints; None if such joints cannot have it.
 
-    ``per_radian``: how much of each joint's unit counts as a radian, (k,).
+    ``per_radian``: equivalent of a radian in each joint's unit, (k,).
     """
     kind = KINDS[effect.kind]
     by = effect.detail.get('by')
-    own = per_radian[np.array(effect.joints, dtype=int) - 1]
-    driver = own if by is None else per_radian[by - 1]
-    if kind.place != 'joint_angle' or (np.all(own == 1.0) and np.all(driver == 1.0)):
+    scale = per_radian[np.array(effect.joints, dtype=int) - 1]
+    driver = scale if by is None else per_radian[by - 1]
+    if kind.place != 'joint_angle' or (np.all(scale == 1.0) and np.all(driver == 1.0)):
         return effect
     wave = effect.detail.get('form') == 'sin/cos'
     if kind.power is None or (wave and driver != 1.0):
         return None
     power = 0 if wave else kind.power
-    return replace(effect, values=effect.values * own * driver ** -float(power))
+    return replace(effect, values=effect.values * scale * driver ** -float(power))
 
 
 # Draws of effects that need more than a size and a sign.
@@ -367,7 +371,7 @@ def _about_mean_distance(largest: float) -> Draw:
     return draw
 
 
-# Parameters of more than one kind.
+# Parameters that several kinds have.
 WAVES = (Part('sin{order}_{j}', (1.0, 0.0)), Part('cos{order}_{j}', (0.0, 1.0)))
 
 
@@ -379,8 +383,7 @@ def _along_axes(name: str) -> tuple[Part, ...]:
 # Rules: true = drawn + what stands here. A rule has the name of its kind.
 
 NAMED: dict[str, HiddenKind] = {}
-# What has no name of its own: a search should still find where it lies, what drives it, or report
-# that structure is left there.
+# Effects without a name: discovery should find place and driver, or report remaining structure.
 UNNAMED: dict[str, HiddenKind] = {}
 
 
@@ -394,7 +397,7 @@ def _kind(
     name: str = '',
     power: int | None = 0,
 ) -> Callable[[Rule], Rule]:
-    """Put the kind of a rule into a table, by the rule's name or another one."""
+    """Decorator that enters the kind of a rule into a table, by the rule's name or another one."""
 
     def take(rule: Rule) -> Rule:
         table[name or rule.__name__] = HiddenKind(place, driver, rule, draw, parts, power, answers)
@@ -439,7 +442,7 @@ _named('joint_angle', 'joint_angle', _draw_gear, *WAVES, name='gear_periodic', p
 
 @_named('joint_angle', 'joint_angle', _draw_curve)
 def joint_error_curve(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """A sum of waves of many orders, none of them slow enough for an eccentricity."""
+    """δq = sum of waves of many orders, none of them slow enough for an eccentricity."""
     q = (c.q / c.per_radian)[:, e.joints[0] - 1]
     waves = sum(
         a * np.cos(order * q + phase)
@@ -457,13 +460,13 @@ def joint_error_curve(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
     Part('half_backlash_{j}', (2.0,)),
 )
 def backlash(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """δq = ½ B sign(the last move of that joint)."""
+    """δq = ½ B sign(last move of the joint)."""
     d.angle[:, e.joints[0] - 1] += 0.5 * e.values[0] * c.approach[:, e.joints[0] - 1]
 
 
 @_named('joint_angle', 'last_move', one_value(3e-3, positive=True), Part('settling_{j}'), power=1)
 def settling(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """δq = −s (q − q before the move): the arm has not come all the way yet."""
+    """δq = −s (q − q before the move): the arm has not reached its target yet."""
     d.angle[:, e.joints[0] - 1] -= e.values[0] * c.move[:, e.joints[0] - 1]
 
 
@@ -493,7 +496,7 @@ def joint_coupling(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
     *(Part(f'offset_{axis}_{{j}}', detail={'axis': axis}) for axis in 'xyz'),
 )
 def link_length(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """The next joint lies further along the link after joint j, or along an axis of it, m."""
+    """δ = shift of the next joint along the link after joint j, or along an axis of it, m."""
     j = e.joints[0]
     axis = e.detail.get('axis', 'along')
     along = c.segments[j] if axis == 'along' else np.eye(3)['xyz'.index(axis)]
@@ -502,25 +505,25 @@ def link_length(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
 
 @_named('link_rotation', 'constant', _draw_tilt, *_along_axes('tilt_{axis}_{{j}}'))
 def joint_axis_tilt(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """Joint j's frame is turned about its x, y, z before its own turn, rad."""
+    """Rotation of joint j's frame about its x, y, z before its own rotation, rad."""
     d.tilt[:, e.joints[0] - 1] += e.values
 
 
 @_named('marker', 'constant', _draw_marker)
 def marker_offset(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """The marker is not where the drawing has it, m along x, y, z of the tool."""
+    """Offset of the markers from the drawing, m along x, y, z of the tool."""
     d.marker += e.values
 
 
 @_named('link_translation', 'temperature', no_joint(2e-4), Part('growth'))
 def thermal_growth(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """Every segment grows by α ΔT of its length, 1/K."""
+    """Growth of every segment by α ΔT of its length, 1/K."""
     d.shift += e.values[0] * c.warming_k[:, None, None] * c.segments
 
 
 @_named('base_rotation', 'gravity_moment', no_joint(1e-4), Part('base_compliance'))
 def base_compliance(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """The base turns by so much per moment of weight about x and y, rad/(N m)."""
+    """Rotation of the base per moment of weight about x and y, rad/(N m)."""
     d.base[:, :2] += e.values[0] * c.base_moment[:, :2]
 
 
@@ -533,7 +536,7 @@ def base_compliance(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
     Part('lateral_compliance_{j}'),
 )
 def lateral_compliance(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """Joint j tips by so much per moment of weight across its axis, rad/(N m)."""
+    """Rotation of joint j per moment of weight across its axis, rad/(N m)."""
     j = e.joints[0] - 1
     across = np.eye(3) - np.outer(c.axes[j], c.axes[j])
     d.tilt[:, j] += e.values[0] * c.carried_moment[:, j] @ across
@@ -548,15 +551,15 @@ def _draw_rocking(kind: str, context: DrawContext) -> HiddenEffect:
 
 @_named('base_rotation', 'gravity_moment', _draw_rocking, Part('base_tipping'))
 def base_tipping(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """The base rocks by so much, rad, where the moment about an axis exceeds a value."""
+    """Rotation of the base, rad, from one side to the other if a moment exceeds a value."""
     leans = c.base_moment @ e.detail['axis'] > e.detail['moment']
     d.base += e.values[0] * np.where(leans, 0.5, -0.5)[:, None] * e.detail['axis']
 
 
 @_named('sensor_frame', 'time', of_sensor(1e-6, 3), *_along_axes('drift_{axis}_{{sensor}}'))
 def registration_drift(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """What the sensor measures wanders with this velocity, m/s, in its own frame."""
-    d.beside[:, d.sensors.index(e.detail['sensor'])] += c.time_s[:, None] * e.values
+    """Drift of the sensor's readings with this velocity, m/s, in its own frame."""
+    d.sensor_shift[:, d.sensors.index(e.detail['sensor'])] += c.time_s[:, None] * e.values
 
 
 @_named(
@@ -586,7 +589,7 @@ def sensor_distortion(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
     power=-1,
 )
 def foreign_torque(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """δq_j = s τ_i: joint j gives way to another joint's torque."""
+    """δq_j = s τ_i: joint j yields to another joint's torque."""
     d.angle[:, e.joints[0] - 1] += e.values[0] * c.torque[:, e.detail['by'] - 1]
 
 
@@ -600,7 +603,7 @@ def creeping_joint(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
     'joint_angle', 'time', at_some_time(one_value(15 * ARC_MINUTE, 2)), Part('joint_{j}_step')
 )
 def slipped_joint(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """δq_j = s from some moment on."""
+    """δq_j = s from a moment on."""
     d.angle[:, e.joints[0] - 1] += e.values[0] * _after(e, c)
 
 
@@ -618,28 +621,28 @@ def bent_coupling(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
 
 @_unnamed('marker', 'gravity', no_joint(3e-3))
 def sagging_tool(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """The marker's stem bends: δ = s (gravity's direction across the tool's z axis)."""
+    """δ = s (gravity's direction across the tool's z axis): the marker's stem bends."""
     down = np.swapaxes(c.tool, -1, -2) @ np.array([0.0, 0.0, -1.0])
     d.marker += e.values[0] * (down * (1.0, 1.0, 0.0))[:, None]
 
 
 @_unnamed('sensor_frame', 'time', at_some_time(_draw_bump))
 def bumped_sensor(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """From some moment on the sensor stands elsewhere: δp = v + w × p, values (v m, w rad)."""
+    """δp = v + w × p from a moment on, values (v m, w rad): the sensor was moved."""
     s, after = d.sensors.index(e.detail['sensor']), _after(e, c)[:, None]
-    d.beside[:, s] += after * e.values[:3]
+    d.sensor_shift[:, s] += after * e.values[:3]
     d.turn[:, s] += after * e.values[3:]
 
 
 @_unnamed('marker', 'time', at_some_time(_draw_marker_slip))
 def slipped_marker(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """From some moment on one marker sits elsewhere on the tool, m along its x, y, z."""
+    """Shift of one marker on the tool from a moment on, m along its x, y, z."""
     d.marker[:, d.markers.index(e.detail['marker'])] += _after(e, c)[:, None] * e.values
 
 
 @_unnamed('sensor_frame', 'position', _about_mean_distance(0.05), answers=('sensor_distortion',))
 def range_distortion(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """Along the line of sight k (|p|/D − 1)²: nothing near the mean distance D, as no scale is."""
+    """δ = k (|p|/D − 1)² along the line of sight: zero near the mean distance D."""
     s, k, mean = d.sensors.index(e.detail['sensor']), e.values[0], e.detail['distance_m']
     d.along[:, s, 0] += k
     d.scale[:, s] -= 2.0 * k / mean
@@ -654,7 +657,7 @@ def range_distortion(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
     answers=('sensor_distortion', 'sensor_scale'),
 )
 def spherical_distortion(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """δp = k ((|p|/D)² − 1) p: lengths are right at the mean distance D, and nowhere else."""
+    """δp = k ((|p|/D)² − 1) p: zero at the mean distance D only."""
     s = d.sensors.index(e.detail['sensor'])
     d.along[:, s, 2] += e.values[0] / e.detail['distance_m'] ** 2
     d.scale[:, s] -= e.values[0]
@@ -662,7 +665,7 @@ def spherical_distortion(e: HiddenEffect, d: Deviation, c: Circumstances) -> Non
 
 @_unnamed('sensor_frame', 'position', of_sensor(0.05, 2), answers=('sensor_distortion',))
 def one_sided_lens(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """δp = z u² k, u = (x, y)/z along k = values where that is positive, else nothing."""
+    """δp = z u² k, where u = (x, y)/z along k = values is positive, else zero."""
     d.half[:, d.sensors.index(e.detail['sensor'])] += e.values
 
 
@@ -701,26 +704,26 @@ KINDS = NAMED | UNNAMED
 
 
 def add_effect(effect: HiddenEffect, deviation: Deviation, c: Circumstances) -> None:
-    """Add what the rule of an effect makes of the circumstances to a deviation."""
+    """Add the contribution of an effect, in its circumstances, to a deviation."""
     KINDS[effect.kind].rule(effect, deviation, c)
 
 
 def true_parameters(effect: HiddenEffect) -> dict[str, float]:
-    """Return an effect's true parameters, SI units, under the names that discovery gives them.
+    """True parameters of an effect, SI units, under their names in discovery.
 
-    Empty where there is none to compare: a curve, a marker (of which only parts can be seen), and
-    cells without a name that are more than a line.
+    Empty if none can be compared: a curve, a marker (of which only parts can be seen), and effects
+    without a name that are more than a line.
     """
     return {
         name: value
-        for one in _each(effect)
+        for effect_part in _each(effect)
         for part in KINDS[effect.kind].parts
-        for name, value in part.of(one).items()
+        for name, value in part.of(effect_part).items()
     }
 
 
 def _each(effect: HiddenEffect) -> list[HiddenEffect]:
-    """Return the effect joint by joint, a wave order by order."""
+    """The effect separately for each joint, a wave separately for each order."""
     if len(effect.joints) > 1:
         return [
             replace(effect, joints=(joint,), values=np.array([value]))

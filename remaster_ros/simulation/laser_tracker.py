@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A fake laser tracker: the emScon protocol on a TCP port, with the world behind it."""
+"""Fake laser tracker: the emScon protocol on a TCP port, with the hidden world."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ REFLECTORS = {1: (1, 0.01905, 'CCR 1.5in'), 2: (1, 0.00635, 'CCR 0.5in')}
 
 
 class Setting(NamedTuple):
-    """The command that reads a setting, what is sent when it changes, the first values."""
+    """Command that reads a setting, event of its change, and initial values."""
 
     get: Command
     change: Change
@@ -74,22 +74,22 @@ SETTINGS = {
 
 @dataclass(frozen=True)
 class TrackerBehaviour:
-    """What can be set on the fake. World time in s, lengths in m."""
+    """Settings of the fake tracker; world time in s, lengths in m."""
 
-    # From switching on until it can be initialised (two hours on a real one)
+    # Time from switching on until it can be initialised (two hours on a real one)
     warm_up_s: float = 5.0
-    initialise_s: float = 2.0  # How long the initialisation takes
-    # Speed of turning to a position, and what each turn takes on top
+    initialise_s: float = 2.0  # Duration of the initialisation
+    # Speed of turning to a position, and additional time of each turn
     slew_rad_s: float = 1.0
     slew_settle_s: float = 0.3
-    # Of the search, at the reflector
+    # Pitch and speed of the search's spiral, at the reflector
     spiral_pitch_m: float = 0.02
     spiral_speed_m_s: float = 3.0
-    # From the first return of light to a lock with a valid absolute distance
+    # Time from the first return of light to a lock with a valid absolute distance
     acquire_s: float = 1.0
     search_failure_share: float = 0.02  # Share of searches that find nothing for no visible reason
-    tracking_speed_m_s: float = 4.0  # The beam loses a reflector that moves faster across it
-    # Share of the moves in which a joint turns further than that which break the beam (gimbal and
+    tracking_speed_m_s: float = 4.0  # Speed across the beam above which it loses the reflector
+    # Angle of a large move of a joint, and share of large moves that break the beam (gimbal and
     # reflector shake); the line of sight breaks others
     large_move_rad: float = 1.5
     large_move_break_share: float = 0.25
@@ -103,7 +103,7 @@ class TrackerBehaviour:
 
 
 def refusal(command: Command, values: tuple[Value, ...]) -> Status:
-    """Why a setting is refused, or `Status.ALL_OK`."""
+    """Status with the reason why a setting is refused, or `Status.ALL_OK`."""
     numbers = np.array(values, float)
     if not np.all(np.isfinite(numbers)):
         return Status.INVALID_INPUT_DATA
@@ -124,7 +124,8 @@ def refusal(command: Command, values: tuple[Value, ...]) -> Status:
         temperature, pressure, humidity = numbers
         inside = -20 <= temperature <= 60 and 500 <= pressure <= 1200 and 0 <= humidity <= 100
         return Status.ALL_OK if inside else Status.METEO_DATA_OUT_OF_RANGE
-    # What is left are the search and the stationary mode: radius and time, time and a flag.
+    # The remaining settings are the search and the stationary mode: radius and time, time and
+    # flag.
     return Status.ALL_OK if numbers[0] > 0 and numbers[1] >= 0 else Status.WRONG_PARAMETER
 
 
@@ -137,17 +138,17 @@ def refusal(command: Command, values: tuple[Value, ...]) -> Status:
 
 
 STEP_S = 0.1
-"""World time between two looks at the world."""
+"""World time between two steps of the instrument, s."""
 _SIGHT_EVERY_S = 0.5
 
 
 class Beam:
-    """Where the instrument points, and whether it is locked on the reflector.
+    """Direction of the instrument, and whether it is locked on the reflector.
 
-    ``world, sensor``: where the reflector truly is, and the tracker's name in the world; ``t``:
-    world time, s; ``aim``: where it points at first, in its own frame, m, (3,); None: at the
-    reflector; ``further``: further reflectors of the tool by name, with the numbers of the fault
-    ``hidden``; the first has the name '' and the number 1.
+    ``world, sensor``: the hidden world, and the tracker's name in it; ``t``: world time, s;
+    ``aim``: first aim in the tracker's frame, m, (3,), or None for the reflector; ``further``:
+    further reflectors of the tool by name, with their numbers for the fault ``hidden``; the first
+    has the name '' and the number 1.
     """
 
     def __init__(
@@ -163,7 +164,7 @@ class Beam:
         self._world, self._sensor, self._rng = world, sensor, rng
         self._behaviour = behaviour
         self._numbers = {'': 1, **(further or {})}
-        # The reflector that it is locked on.
+        # Name of the reflector that the beam is locked on.
         self._on = ''
         self.locked = False
         self.aim = self.reflector(t) if aim is None else np.asarray(aim, float)
@@ -172,17 +173,17 @@ class Beam:
         self._move_judged = False
 
     def reflector(self, t: float) -> FloatArray:
-        """True position of the reflector that it is on at time t, m, (3,)."""
+        """True position of the present reflector at time t, m, (3,)."""
         return self._world.marker_in_sensor(self._sensor, t, self._on)
 
     def sees(self, t: float) -> bool:
-        """Whether the line of sight to this reflector is free at time t."""
+        """Whether the line of sight to the present reflector is free at time t."""
         if self._world.faults(self._sensor).get('hidden') == self._numbers[self._on]:
             return False
         return self._world.line_of_sight(self._sensor, t, self._on)
 
     def find(self, target: FloatArray, largest_rad: float, t: float) -> bool:
-        """Find the reflector in sight nearest to a direction; False where none is so near."""
+        """Find the visible reflector nearest to a direction; False if none is within the angle."""
         before, near = self._on, {}
         for name in self._numbers:
             self._on = name
@@ -198,10 +199,10 @@ class Beam:
         self._swept_rad, self._move_judged = 0.0, False
 
     def follow(self, t: float) -> bool:
-        """Follow the reflector for a step that ends at time t; return whether it is kept."""
+        """Follow the reflector for a step that ends at time t; False if the beam loses it."""
         reflector, moving = self.reflector(t), self._world.is_moving(t)
         across_speed = angle_between(self.aim, reflector) * np.linalg.norm(reflector) / STEP_S
-        # The line of sight takes long to work out, and changes little while nothing moves.
+        # The line of sight takes long to compute, and changes little while the arm stands still.
         hidden = False
         if moving or t - self._sight_at > _SIGHT_EVERY_S:
             hidden, self._sight_at = not self.sees(t), t
@@ -213,7 +214,7 @@ class Beam:
         return self.locked
 
     def _shaken(self, t: float, moving: bool) -> bool:
-        """Whether a large move breaks the beam now; chance decides once for each move."""
+        """Whether a large move breaks the beam now; a random decision, once for each move."""
         if not moving:
             self._swept_rad, self._move_judged = 0.0, False
             return False
@@ -230,7 +231,7 @@ def angle_between(a: FloatArray, b: FloatArray) -> float:
 
 
 def covariance(position: FloatArray, behaviour: TrackerBehaviour) -> FloatArray:
-    """Covariance of a measured position, m², (3, 3): range and angles err on their own.
+    """Covariance of a measured position, m², (3, 3), with independent errors of range and angles.
 
     The limits of a data sheet are two standard deviations.
     """
@@ -248,7 +249,7 @@ def adm_result(
     unit_m: float,
     environment: tuple[float, float, float],
 ) -> Measurement:
-    """Return the packet of a measured position and its standard deviation (m, (3,) each).
+    """Packet of a measured position and its standard deviation (m, (3,) each).
 
     ``unit_m``: the client's unit of length, m; ``environment``: temperature (°C), pressure (mbar),
     relative humidity (%).
@@ -283,16 +284,16 @@ def adm_result(
 _LONGEST_CATCH_UP_S = 5.0
 
 Operation = Iterator[None]
-"""A command that takes time: advanced once a step until it ends."""
+"""Command that takes time, advanced once a step until its end."""
 
 
 class TrackerInstrument:
-    """The instrument without sockets, threads and clocks.
+    """Instrument without sockets, threads and clocks.
 
-    ``world``: where the reflector truly is; ``sensor``: the tracker's name in the world;
-    ``switched_on_s``: world time at which it was switched on, s; ``aim``: where it points at
-    first, in its own frame, m, (3,); None: where the reflector is, as a person who sets up the
-    instrument leaves it; ``further``: further reflectors of the tool, as of `Beam`.
+    ``world``: the hidden world; ``sensor``: the tracker's name in it; ``switched_on_s``: world
+    time of switching on, s; ``aim``: first aim in the tracker's frame, m, (3,), or None for the
+    reflector, as after set-up by a person; ``further``: further reflectors of the tool, as in
+    `Beam`.
     """
 
     def __init__(
@@ -330,11 +331,11 @@ class TrackerInstrument:
         return Readiness.READY if self.locked else Readiness.NOT_READY
 
     def greeting(self) -> list[Event]:
-        """Return the first packets for a client that connects."""
+        """First packets for a client that connects."""
         return [self._readiness_change()]
 
     def handle(self, request: Request) -> list[Event]:
-        """Take a command at the time of the last step; return what is sent at once."""
+        """Handle a command at the time of the last step; the immediate answers are returned."""
         command = request.command
         if command in SETTINGS:
             self._set(command, request.values)
@@ -348,7 +349,7 @@ class TrackerInstrument:
         return self._sent()
 
     def step(self, t: float) -> list[Event]:
-        """Go on to world time t; return what is sent meanwhile."""
+        """Advance to world time t; the packets sent meanwhile are returned."""
         self._time = max(self._time, t - _LONGEST_CATCH_UP_S)
         while t - self._time >= STEP_S:
             self._time += STEP_S
@@ -358,7 +359,7 @@ class TrackerInstrument:
         return self._sent()
 
     def abort(self) -> None:
-        """End what is under way, as when the client goes away."""
+        """End the present command, as when the client disconnects."""
         if self._operation is not None:
             self._operation = None
             self._out.append(self._readiness_change())
@@ -397,13 +398,13 @@ class TrackerInstrument:
             self._out.append(StatusChange(setting.change))
 
     def _convert_lengths(self, unit: int) -> None:
-        """Keep the search radius what it is when its unit changes."""
+        """Convert the search radius to a new unit."""
         radius, timeout = self._settings[Command.GET_SEARCH]
         scale = self._unit_m / LENGTH_UNITS_M[unit]
         self._settings[Command.GET_SEARCH] = (float(radius) * scale, timeout)
 
     def _answers(self, command: Command) -> list[tuple[Value, ...]]:
-        """Return the values of each reply to a query; none where it is no query."""
+        """Values of each reply to a query; empty if the command is no query."""
         if command in self._settings:
             return [self._settings[command]]
         if command is Command.GET_TRACKER_STATUS:
@@ -427,7 +428,7 @@ class TrackerInstrument:
             self._reply(command, status)
             return
         if command is Command.START_MEASUREMENT:
-            # Its result follows later.
+            # The result of a measurement follows later.
             self._reply(command)
         self._operation = self._start(command, values)
         self._out.append(self._readiness_change())
@@ -444,7 +445,7 @@ class TrackerInstrument:
         return self._search(command, target, float(np.linalg.norm(target)))
 
     def _why_not(self, command: Command, values: tuple[Value, ...]) -> Status:
-        """Why a command cannot begin now."""
+        """Status with the reason why a command cannot begin now, or `Status.ALL_OK`."""
         if self._operation is not None:
             return Status.SERVER_BUSY
         if self._time < self._warm_at:
@@ -491,9 +492,9 @@ class TrackerInstrument:
         self._beam.aim = target
 
     def _search(self, command: Command, target: FloatArray, distance: float) -> Operation:
-        """Turn to the target and wind a spiral about it.
+        """Turn to the target and search in a spiral about it.
 
-        A spiral of pitch p, run through at speed v, reaches the radius r after π r² / (p v).
+        A spiral of pitch p at speed v reaches the radius r after π r² / (p v).
         """
         b = self.behaviour
         search_radius, timeout_ms = self._settings[Command.GET_SEARCH]
@@ -559,15 +560,15 @@ _TAKES_TIME = (
 
 
 _POLL_WALL_S = 0.005
-"""How often the instrument goes on in time; this sets its latency, not its results."""
+"""Wall time between steps of the instrument, s; it determines the latency, not the results."""
 
 
 class FakeLaserTracker:
-    """A laser tracker that listens on a TCP port and runs in world time.
+    """Laser tracker that listens on a TCP port and runs in world time.
 
-    As with the real one, a single client at a time; a second one is refused with an error report.
-    The instrument is switched on when it is made; a client that leaves ends what it had begun.
-    ``sensor`` is its name in the world; port 0 takes a free one, see `address`; ``further`` are
+    As the real one, it serves a single client at a time and refuses a second one with an error
+    report. The instrument is switched on when it is made; when a client disconnects its command
+    ends. ``sensor``: name in the world; ``port``: 0 for a free one, see `address`; ``further``:
     further reflectors of the tool by name, with their numbers.
     """
 
@@ -608,7 +609,7 @@ class FakeLaserTracker:
 
     @property
     def address(self) -> tuple[str, int]:
-        """Host and port it listens on."""
+        """Host and port of the listening socket."""
         if self._listener is None:
             raise RuntimeError('the fake laser tracker has not been started')
         return self._listener.getsockname()[:2]
@@ -619,13 +620,7 @@ class FakeLaserTracker:
         return self._instrument.locked
 
     def start(self) -> None:
-        """Listen, and serve in a thread of its own.
-
-        Raises
-        ------
-        DeviceError
-            If the port cannot be used.
-        """
+        """Listen, and serve in a thread; raises DeviceError if the port cannot be used."""
         host, port = self._wanted
         try:
             self._listener = socket.create_server((host, port), backlog=4)
@@ -641,7 +636,7 @@ class FakeLaserTracker:
         self._thread.start()
 
     def close(self) -> None:
-        """Switch off: stop the thread, close every socket."""
+        """Switch off: stop the thread and close every socket."""
         self._closing.set()
         if self._thread is not None:
             self._thread.join()
@@ -665,7 +660,8 @@ class FakeLaserTracker:
                 self._apply(faults)
                 if 'stuck' not in faults:
                     self._send(self._instrument.step(self._instrument_time(faults)))
-                # The client first: one that has left makes room for a new one.
+                # The client is served first: a client that has disconnected makes room for a new
+                # one.
                 if self._client in ready and 'stuck' not in faults:
                     self._receive()
                 if self._listener in ready:
@@ -674,14 +670,14 @@ class FakeLaserTracker:
         self._drop_client()
 
     def _instrument_time(self, faults: Numbers) -> float:
-        """World time, which passes slowly for an instrument that is slow."""
+        """World time, slower for an instrument with the fault ``slow``."""
         now = self._world.now()
         passed, self._looked_at = now - self._looked_at, now
         self._lost_s += passed * (1.0 - 1.0 / faults.get('slow', 1.0))
         return now - self._lost_s
 
     def _apply(self, faults: Numbers) -> None:
-        """Apply the injected faults that concern the connection and the power."""
+        """Apply the injected faults of the connection and the power."""
         if 'off' in faults:
             self._drop_client()
         if 'renumbered' in faults and not self._restarted:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A fake OptiTrack server: NatNet over real UDP sockets, with the world behind it.
+"""Fake OptiTrack server: NatNet over real UDP sockets, with the hidden world.
 
 The command channel answers at once in wall time, and clients are dropped by wall time, as both
 concern the network; frames come at `rate_hz` in world time.
@@ -52,17 +52,17 @@ _GARBAGE_BYTES = 300
 
 
 class FrameFaults:
-    """Spoil frames on their way out."""
+    """Faults of the frames that are sent."""
 
     def __init__(self, rng: np.random.Generator) -> None:
         self._rng = rng
         self._frozen: tuple[LabeledMarker, ...] | None = None
         self._late: deque[Frame] = deque()
-        self._held: Frame | None = None
+        self._previous: Frame | None = None
         self._begins_at: Frame | None = None
 
     def spoil(self, frame: Frame, faults: Numbers) -> Iterator[Frame | bytes]:
-        """Return what is sent instead of a frame: frames, or bytes as they are."""
+        """Frames or raw bytes that are sent in place of a frame."""
         if 'frozen' not in faults:
             self._frozen = None
         elif self._frozen is None:
@@ -94,12 +94,12 @@ class FrameFaults:
             while self._late and frame.timestamp - self._late[0].timestamp >= faults['late']:
                 yield self._late.popleft()
         elif 'reordered' in faults:
-            if self._held is None:
-                self._held = frame
+            if self._previous is None:
+                self._previous = frame
             else:
                 yield frame
-                yield self._held
-                self._held = None
+                yield self._previous
+                self._previous = None
         else:
             yield frame
             if 'duplicate' in faults:
@@ -118,29 +118,29 @@ _HIDDEN = (
     OCCLUDED | MODEL_FILLED | HAS_MODEL,
     MODEL_FILLED | HAS_MODEL,
 )
-"""How a marker that no camera sees is streamed: the last position, or the model's guess."""
+"""Flags of a marker that no camera sees: at the last position, or at the model's guess."""
 
 
 @dataclass(frozen=True)
 class OptiTrackBehaviour:
-    """How the fake camera bar behaves; the defaults are an OptiTrack Trio."""
+    """Settings of the fake camera bar; the defaults are an OptiTrack Trio."""
 
-    # The tool's rigid body. Its member 1 is the calibration marker.
+    # Rigid body of the tool. Its member 1 is the calibration marker.
     rigid_body: str = 'tool'
     body_id: int = 1
     # Further markers of the world's sensor, by name, with their numbers in the body
     further: Mapping[str, int] = field(default_factory=dict)
-    # Members 2, 3, … where there are no further markers: offsets from the calibration marker along
-    # the sensor's axes, m. They move with it and do not turn with the tool: no program here uses
-    # the body's rotation.
+    # Members 2, 3, … if there are no further markers: offsets from the calibration marker along
+    # the sensor's axes, m. These members move with the marker and do not turn with the tool: no
+    # program here uses the body's rotation.
     companions: tuple[Vec3, ...] = ((0.06, 0.0, 0.0), (0.0, 0.05, 0.0), (0.04, 0.03, 0.02))
     # Reflections at fixed places in the sensor frame, m
     strays: tuple[Vec3, ...] = ((0.8, -0.5, 2.4), (-0.7, 0.4, 2.9))
     # Standard deviation of a position across the line of sight (sensor x, y) and along it (z)
     noise_across_m: float = 25e-6
     noise_along_m: float = 100e-6
-    # How often one of the markers that are followed is hidden, and for how long on average
-    # (exponential distributions), in world time
+    # Rate at which one of the followed markers is hidden, and mean duration (exponential
+    # distributions), in world time
     occlusions_per_s: float = 0.0
     occlusion_s: float = 0.3
     # Standard deviation per axis of the model's guess at a hidden marker
@@ -148,7 +148,7 @@ class OptiTrackBehaviour:
 
 
 class OptiTrackScene:
-    """Makes the frames of data of a fake camera bar.
+    """Frames of data of a fake camera bar.
 
     ``sensor``: the bar's name in the world.
     """
@@ -180,14 +180,14 @@ class OptiTrackScene:
         self._occlusion = (self._start_s, self._start_s)
         self._plan_occlusion(self._start_s)
         self._hidden_params: int | None = None
-        # Which of the markers that are followed is hidden, where not all are.
+        # Index of the followed marker that is hidden, if not all are.
         self._hidden_place = 0
         self._guess_error = np.zeros(3)
         self._last_seen = np.zeros_like(self._offsets)
 
     @property
     def model(self) -> ModelDefinition:
-        """The rigid body and its marker sets."""
+        """Rigid body and its marker sets."""
         behaviour = self._behaviour
         names = tuple(f'{behaviour.rigid_body}_{i + 1}' for i in range(len(self._offsets)))
         body = RigidBodyDescription(
@@ -206,7 +206,7 @@ class OptiTrackScene:
         )
 
     def frame(self, number: int, version: Version, t: float | None = None) -> Frame:
-        """Look at the world now, or as it was at time t, s.
+        """Frame of the world now, or at time t, s.
 
         ``version``: bitstream of the server: NatNet 2 has fewer flags and no residual.
         """
@@ -231,10 +231,10 @@ class OptiTrackScene:
                 params[place] = hidden_params
         faults = self._world.faults(self._sensor)
         if 'hidden' in faults:
-            place = self._place_of(faults['hidden'])
+            place = self._label_index(faults['hidden'])
             seen[place], params[place] = self._last_seen[place], OCCLUDED | HAS_MODEL
         if 'exchanged' in faults:
-            pair = [0, self._place_of(faults['exchanged'])]
+            pair = [0, self._label_index(faults['exchanged'])]
             seen[pair] = seen[pair[::-1]]
         self._last_seen = seen
 
@@ -269,11 +269,11 @@ class OptiTrackScene:
         )
 
     def ticks(self, t: float) -> int:
-        """Return the server's fine clock at world time t; as on a real host it began earlier."""
+        """Server's fine clock at world time t; it began earlier, as on a real host."""
         return round((t - self._start_s + 1000.0) * CLOCK_HZ)
 
     def _hidden(self, t: float, tracked: bool) -> int | None:
-        """Return the flags of the hidden marker; None while all are seen."""
+        """Flags of the hidden marker; None while all are visible."""
         start, end = self._occlusion
         if t >= end:
             self._plan_occlusion(end)
@@ -292,8 +292,8 @@ class OptiTrackScene:
             self._guess_error = self._rng.normal(0.0, self._behaviour.guess_error_m, 3)
         return self._hidden_params
 
-    def _place_of(self, number: float) -> int:
-        """Return where the marker of this number in the body is among the labels."""
+    def _label_index(self, number: float) -> int:
+        """Index among the labels of the marker with this number in the body."""
         return self._labels.index(self._behaviour.body_id << 16 | int(number))
 
     def _plan_occlusion(self, after_s: float) -> None:
@@ -306,13 +306,13 @@ class OptiTrackScene:
 
 
 def _tuples(points: FloatArray) -> tuple[Vec3, ...]:
-    """Turn an array of points, (n, 3), into plain tuples."""
+    """Points (n, 3) as plain tuples."""
     return tuple(map(tuple, points.tolist()))
 
 
 MAX_CLIENTS = 16
 PAUSED_S = 2.0
-"""A bar that is later than this was paused, s: the World goes ahead of a busy one by less."""
+"""Delay from which a bar was paused, s: the World is ahead of a busy bar by less."""
 _POLL_WALL_S = 0.1
 _REFUSED = natnet.Response(b'\x01\0\0\0')
 _UNRECOGNIZED = natnet.Notice(MessageId.UNRECOGNIZED_REQUEST)
@@ -324,22 +324,22 @@ Address = tuple[str, int]
 
 @dataclass
 class _Client:
-    """A unicast client: when its last datagram came (wall time), and its bitstream."""
+    """Unicast client: wall time of its last datagram, and its bitstream."""
 
     last_seen_s: float
     version: Version
 
 
 class FakeOptiTrackServer:
-    """An OptiTrack server that streams the calibration marker of a world.
+    """OptiTrack server that streams the calibration marker of a world.
 
-    ``sensor`` is the bar's name in the world; ``version`` that of the bitstream, such as ``(2,
-    10)`` or ``(4, 1)``. ``multicast`` streams to the group, ``unicast`` to every client that sends
-    CONNECT. ``rate_hz`` is of world time; ``host`` the address of the interface to serve;
-    `command_port` 0 takes a free one. ``unicast_port`` sends unicast frames to this port of a
-    client instead of the one that it sends from, and never drops it: old clients such as
-    ``natnetclient`` listen there and send nothing more. Any other that is silent for
-    ``client_timeout_s`` (wall time) is dropped.
+    ``sensor``: the bar's name in the world; ``version``: bitstream, such as ``(2, 10)`` or ``(4,
+    1)``; ``multicast`` streams to the group, ``unicast`` to every client that sends CONNECT;
+    ``rate_hz``: in world time; ``host``: address of the served interface; `command_port`: 0 for a
+    free one; ``unicast_port``: port of a client for unicast frames instead of the client's sending
+    port; such a client is never dropped: old clients such as ``natnetclient`` listen there and
+    send nothing more. Any other client that is silent for ``client_timeout_s`` (wall time) is
+    dropped.
     """
 
     def __init__(
@@ -389,23 +389,20 @@ class FakeOptiTrackServer:
 
     @property
     def command_port(self) -> int:
-        """The port that answers CONNECT, once started."""
+        """Port that answers CONNECT, once started."""
         assert self._command is not None, 'not started'
         return self._command.getsockname()[1]
 
     @property
     def clients(self) -> tuple[Address, ...]:
-        """The unicast clients."""
+        """Addresses of the unicast clients."""
         with self._lock:
             return tuple(self._clients)
 
     def start(self) -> None:
         """Open the sockets and begin to stream.
 
-        Raises
-        ------
-        DeviceError
-            If the command port is in use or the host is no address of this machine.
+        Raises DeviceError if the command port is in use or the host is no address of this machine.
         """
         self._command = open_socket(
             self._host,
@@ -449,11 +446,11 @@ class FakeOptiTrackServer:
         self.stop()
 
     def _stream(self) -> None:
-        """Send frames at the rate in world time, each as it was when it was due."""
+        """Send frames at the rate in world time, each with the world of its due time."""
         start_s = self._world.now()
         number = 0
         while not self._closing.is_set():
-            # The World waits for this bar; one that was paused does not make up for the pause.
+            # The World waits for this bar; after a pause the bar does not send the missed frames.
             latest = int((self._world.now() - start_s - PAUSED_S) * self._rate_hz)
             number = max(number + 1, latest)
             due_s = start_s + number / self._rate_hz
@@ -492,7 +489,7 @@ class FakeOptiTrackServer:
                 self._send(answer, address, self._version_of(address))
 
     def _answers(self, request: ClientRequest, address: Address) -> list[Message]:
-        """Act on a request; most have one answer, some have none."""
+        """Execute a request; most have one answer, some have none."""
         if request.id == MessageId.CONNECT:
             self._welcome(address, request.wanted_version)
             return [self._server_info()]
@@ -531,7 +528,7 @@ class FakeOptiTrackServer:
         )
 
     def _obey(self, command: str, address: Address) -> Message:
-        """Answer a REQUEST."""
+        """Answer to a REQUEST."""
         name, _, argument = command.partition(',')
         if name == 'FrameRate':
             return natnet.Response(np.float32(self._rate_hz).tobytes())
@@ -549,7 +546,7 @@ class FakeOptiTrackServer:
         return natnet.Response(f'Bitstream,{version}\0'.encode())
 
     def _can_stream(self, wanted: Version) -> bool:
-        """Servers from 4.0 on send older bitstreams to unicast clients that request them."""
+        """Whether a client gets this bitstream: servers from 4.0 on send older ones on request."""
         return self._version >= (4, 0) and (3, 0) <= wanted <= self._version
 
     def _version_of(self, address: Address) -> Version:

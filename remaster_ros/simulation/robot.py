@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A fake arm behind ros2_control: joint_trajectory_controller and joint_state_broadcaster.
+"""Fake arm behind ros2_control: joint_trajectory_controller and joint_state_broadcaster.
 
-It does what the real controller of Jazzy does with a trajectory: permutes by joint name, drops
-with a log line what it cannot follow, an empty trajectory too, and does not clamp to limits.
+As the real controller of Jazzy, it permutes a trajectory by joint name, drops a trajectory that it
+cannot follow with a log line, an empty one too, and does not clamp to limits.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from itertools import pairwise
 import numpy as np
 
 from remaster_ros.simulation.arm_motion import ServoPoint, from_now
-from remaster_ros.simulation.faults import Numbers, is_out
+from remaster_ros.simulation.faults import Numbers, in_outage
 from remaster_ros.simulation.world import World
 from remaster_ros.types import FloatArray
 
@@ -25,9 +25,9 @@ ENCODER_RAD = 2e-6
 
 
 class FakeArm:
-    """Follows trajectories in the hidden World and reports joint states.
+    """Arm that follows trajectories in the hidden World and reports joint states.
 
-    It is the only fake that moves the World. ``rng`` is the source of repeatability errors,
+    It is the only fake that moves the World. ``rng``: randomness of repeatability errors, of
     encoder noise and of the order of the reported joints.
     """
 
@@ -48,19 +48,10 @@ class FakeArm:
     def command(
         self, names: Sequence[str], points: Sequence[ServoPoint], start_s: float = 0.0
     ) -> str | None:
-        """Take a trajectory.
+        """Follow a trajectory.
 
-        Parameters
-        ----------
-        names, points
-            As in the message.
-        start_s
-            The header's stamp, s; 0 means now.
-
-        Returns
-        -------
-        str or None
-            Why the trajectory was dropped, for the log; None when it is followed.
+        ``names, points``: as in the message; ``start_s``: stamp of the header, s, 0 for now.
+        Returns the reason why the trajectory was dropped, for the log; None if the arm follows it.
         """
         now = self.world.now()
         faults = self.world.faults('robot')
@@ -68,13 +59,13 @@ class FakeArm:
         if reason is not None:
             return reason
         columns = [list(names).index(name) for name in self.names]
-        # The arm does not come back to quite the same place twice.
+        # Random error of a repeated position.
         per_radian = self.world.chain.per_radian
         if not start_s or start_s != self._begun_s:
             self._stray = self._rng.normal(0.0, REPEATABILITY_RAD, len(columns)) * per_radian
-        # The same all the way of one move, which may come in parts.
+        # The error is the same for all parts of one move.
         stray, self._begun_s = self._stray, start_s
-        # Faults: beside the target, or slowly.
+        # Faults: a wrong target, or a slow motion.
         slow, beside = faults.get('slow', 1.0), faults.get('elsewhere', 0.0) * per_radian
         waypoints = [
             ServoPoint(
@@ -118,9 +109,9 @@ class FakeArm:
         return None
 
     def joint_state(self) -> tuple[float, list[str], FloatArray, FloatArray] | None:
-        """Report now: time (s), names, positions, velocities, in its own order.
+        """Present report: time (s), joint names in the arm's own order, positions, velocities.
 
-        None where nothing is reported: a robot that is off, or a report that is lost.
+        None if nothing is reported: the robot is off, or a report is lost.
         """
         now, faults = self.world.now(), self.world.faults('robot')
         if not _is_stopped(faults):
@@ -129,7 +120,7 @@ class FakeArm:
             self._brake(now)
         self._reports += 1
         lost = 'lost' in faults and self._reports % int(faults['lost']) != 0
-        if lost or 'off' in faults or is_out(faults.get('intermittent'), now):
+        if lost or 'off' in faults or in_outage(faults.get('intermittent'), now):
             return None
         if 'repeated' in faults and self._last is not None:
             return self._last
@@ -157,16 +148,16 @@ class FakeArm:
 
     @property
     def reports_stop(self) -> bool:
-        """Whether its safety circuit reports that it stops the arm."""
+        """Whether the safety circuit reports that it stops the arm."""
         return 'estop_reported' in self.world.faults('robot')
 
     @property
     def copies(self) -> int:
-        """How often each report is sent."""
+        """Number of copies of each report."""
         return 2 if 'doubled' in self.world.faults('robot') else 1
 
     def _wrap(self, faults: Numbers) -> FloatArray:
-        """Return what a joint that is a turn off adds to the positions, rad, (k,)."""
+        """Error of the positions by a joint that is a turn off, rad, (k,)."""
         turn = np.zeros(len(self.names))
         if 'wrapped' in faults:
             turn[int(faults['wrapped']) - 1] = 2 * np.pi
@@ -176,7 +167,7 @@ class FakeArm:
         return turn
 
     def _brake(self, now: float) -> None:
-        """Stand still at once, as an emergency stop does."""
+        """Brake to a standstill at once, as an emergency stop does."""
         self._braked = True
         q, velocity = self.world.reported(now)
         braking_s = 0.15
@@ -189,8 +180,8 @@ def _is_stopped(faults: Numbers) -> bool:
 
 
 def _fault_reason(faults: Numbers, now: float) -> str:
-    """Why a faulty robot takes no command; '' if it does."""
+    """Reason why a faulty robot accepts no command; '' if it does."""
     for name in ('off', 'dropped', 'estop', 'estop_reported'):
         if name in faults:
             return f'fault injected: {name}'
-    return 'fault injected: intermittent' if is_out(faults.get('intermittent'), now) else ''
+    return 'fault injected: intermittent' if in_outage(faults.get('intermittent'), now) else ''

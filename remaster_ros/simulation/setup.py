@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Draw a hidden World around a cell, and find the one of this DDS domain."""
+"""Random hidden World for a cell, and the World of this DDS domain."""
 
 from __future__ import annotations
 
@@ -24,16 +24,13 @@ from remaster_ros.types import FloatArray
 
 PRACTICE_CANDIDATES = 14
 PLACEMENT_STD_M = 0.03
-"""How far a fake sensor stands from its place in config/fake_world.yaml."""
+"""Standard deviation of a fake sensor's position from that in config/fake_world.yaml, m."""
 
 
 def default_folder(namespace: str = '/') -> Path:
-    """Return the folder of the fakes of this user, DDS domain and ROS namespace.
+    """Folder of the fakes of this user, DDS domain and ROS namespace.
 
-    Parameters
-    ----------
-    namespace
-        Such as ``/left``: every cell of a domain has its own World.
+    ``namespace``: such as ``/left``; every cell of a domain has its own World.
     """
     domain = os.environ.get('ROS_DOMAIN_ID', '0')
     cell = namespace.rstrip('/').replace('/', '.')
@@ -41,15 +38,11 @@ def default_folder(namespace: str = '/') -> Path:
 
 
 def make_private_folder(folder: Path) -> None:
-    """Make a folder that only this user may read, or take over such a one.
+    """Make a folder that only this user may read, or use an existing one.
 
-    Its name can be guessed and the temporary directory is open to all: another user may have
-    put a folder or a link there, through which files elsewhere would be overwritten.
-
-    Raises
-    ------
-    InputError
-        There is something else of this name; see `require_private`.
+    The name can be guessed and the temporary directory is open to all: another user may have put a
+    folder or a link there, through which files elsewhere would be overwritten. Raises InputError
+    if something else has this name; see `require_private`.
     """
     try:
         folder.mkdir(mode=0o700)
@@ -63,7 +56,7 @@ def make_private_folder(folder: Path) -> None:
 
 
 def require_private(folder: Path) -> None:
-    """Raise `InputError` unless this is a folder, no link, of this user and for him alone."""
+    """Raises `InputError` unless the path is a folder, no link, private to this user."""
     try:
         found = folder.lstat()
     except OSError as error:
@@ -93,24 +86,23 @@ def make_world(
     hidden: Sequence[EffectSpec] = (),
     candidates: int = PRACTICE_CANDIDATES,
 ) -> World:
-    """Draw a hidden World for a cell; its time begins now.
+    """Random hidden World for a cell; its time begins now.
 
     Parameters
     ----------
     folder
-        Where to put it; a World that is there is replaced.
+        Folder of the World; an existing World there is replaced.
     cell
-        The arm, the markers and the names of the sensors; where the sensors really stand, and how
-        far the arm is off, comes from config/fake_world.yaml and the seed.
+        Arm, markers and names of the sensors; true places of the sensors and true offsets come
+        from config/fake_world.yaml and the seed.
     seed
-        Of everything drawn.
+        Seed of everything random.
     rate
         World time over wall time.
     hidden
-        What else is wrong with the arm or the sensors.
+        Hidden effects of the arm or the sensors.
     candidates
-        Candidate poses of each split that will be visited; how large a hidden effect is depends
-        on them.
+        Number of candidate poses of each split; the size of a hidden effect depends on them.
     """
     settings = yaml.safe_load(config_path('fake_world.yaml').read_text())
     chain = cell.chain()
@@ -162,7 +154,7 @@ def make_world(
 
 
 def _start(chain: SerialChain, angles: FloatArray) -> FloatArray:
-    """Return where a fake arm begins, (k,): at these angles, and what slides amid its way."""
+    """First positions of a fake arm, (k,): these angles, and the middle of a slide's range."""
     q = np.zeros(len(chain))
     known = min(len(chain), len(angles))
     q[:known] = angles[:known]
@@ -171,19 +163,10 @@ def _start(chain: SerialChain, angles: FloatArray) -> FloatArray:
 
 
 def open_world(folder: str, namespace: str = '/', timeout_s: float = 20.0) -> World:
-    """Open the World in `folder` ('' for the default one), waiting until it has been made.
+    """World in `folder` ('' for the default one), opened as soon as it has been made.
 
-    Parameters
-    ----------
-    folder, namespace
-        See `default_folder`.
-    timeout_s
-        How long to wait, wall time, s.
-
-    Raises
-    ------
-    InputError
-        If there is none after `timeout_s` of wall time.
+    ``folder, namespace``: see `default_folder`; ``timeout_s``: longest wait, wall time, s. Raises
+    InputError if there is none after `timeout_s`.
     """
     path = Path(folder) if folder else default_folder(namespace)
     deadline = time.monotonic() + timeout_s

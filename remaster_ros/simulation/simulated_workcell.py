@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A simulated session of a workcell, planned and measured as with the fake devices."""
+"""Simulated session of a workcell, planned and measured as with the fake devices."""
 
 from __future__ import annotations
 
@@ -42,12 +42,12 @@ def plan_tour(
     *,
     without_meshes: bool = True,
 ) -> Tour:
-    """Plan poses that face one sensor and that all of them see, for every split with a count.
+    """Tour of poses that face one sensor and are visible to all, for every split with a count.
 
     Parameters
     ----------
     chain, cell
-        The arm, and where it works.
+        Arm and workcell.
     places
         T_R_N of every sensor that has to see its marker, (4, 4); None for the cell's rough places.
     counts
@@ -55,13 +55,13 @@ def plan_tour(
     rng
         Source of randomness.
     without_meshes
-        Take capsules in place of meshes: a simulated arm can hurt no one, and its meshes may be on
-        another machine.
+        Whether capsules are used in place of meshes: a simulated arm can hurt no one, and its
+        meshes may be on another machine.
 
     Raises
     ------
     InputError
-        No way to solve for the joints of this robot, or no pose to fit that it can take.
+        If the inverse kinematics of this robot cannot be solved, or it can reach no pose to fit.
     """
     scene = cell.planning_scene(chain, without_meshes=without_meshes)
     sensors_R = scene.rough_R
@@ -82,7 +82,7 @@ def plan_tour(
 
 
 def visit(tour: Tour, chain: SerialChain) -> dict[str, list[FloatArray]]:
-    """Return each split's joint solutions, (m, k) per pose, in the order of the visits.
+    """Joint solutions, (m, k) per pose, of each split in the order of the visits.
 
     A simulated session goes from one split to the other, each nearest first.
     """
@@ -90,9 +90,9 @@ def visit(tour: Tour, chain: SerialChain) -> dict[str, list[FloatArray]]:
     q = np.clip(np.zeros(len(chain)), chain.lower, chain.upper)
     for split, plan in tour.plans.items():
         part = Tour(chain, {split: plan})
-        while (stop := part.next(q)) is not None:
-            visits[split].append(stop.solutions)
-            q = stop.solutions[-1]
+        while (visit_of_pose := part.next(q)) is not None:
+            visits[split].append(visit_of_pose.solutions)
+            q = visit_of_pose.solutions[-1]
     return visits
 
 
@@ -124,21 +124,21 @@ def simulate_session(
     effects: Sequence[EffectSpec] = (),
     effect_rng: np.random.Generator | None = None,
 ) -> tuple[Session, SessionTruth]:
-    """Visit the poses with a robot whose truth is drawn, and measure with noise.
+    """Session of a robot with random truth that visits the poses, with noise.
 
-    ``chain, urdf``: the nominal robot and the text it was read from; k joints; ``poses,
-    validation_poses``: for each pose its joint solutions in the order visited, rad, (m, k);
-    ``sensors``: by name; at every configuration each gives an observation of each of its markers,
-    from one frame; ``markers``: nominal positions in the tool frame, m, (3,); the true ones lie
-    ``marker_std_m`` away; ``joint_offsets``: the true zero-offsets, rad or m, (k,); where None
-    drawn from N(0, ``joint_offset_std``²), of a joint that slides times
-    `SerialChain.per_radian`; ``outlier_share``: share of the observations moved by
-    ``outlier_m`` in a random direction; ``warming``: of the arm, measured as well; None where no
-    temperature is measured; ``effects, effect_rng``: what else is wrong with the arm or the
-    sensors, and the source of its randomness.
-    Returns session, truth: The session has no more in it than a recorded one.
-    Raises InputError: solutions of the wrong shape, no poses, a sensor that follows no known
-    marker, or an effect that this arm cannot show.
+    ``chain, urdf``: nominal robot with k joints, and its URDF text; ``poses, validation_poses``:
+    for each pose its joint solutions in the order visited, rad, (m, k); ``sensors``: by name; at
+    every configuration each gives an observation of each of its markers, from one frame;
+    ``markers``: nominal positions in the tool frame, m, (3,); true positions have the standard
+    deviation ``marker_std_m``; ``joint_offsets``: true zero-offsets, rad or m, (k,), or None for
+    draws from N(0, ``joint_offset_std``²), times `SerialChain.per_radian` for a joint that slides;
+    ``outlier_share``: share of the observations shifted by ``outlier_m`` in a random direction;
+    ``warming``: of the arm, measured as well, or None if no temperature is measured; ``effects,
+    effect_rng``: effects of the arm or the sensors, and their source of randomness.
+
+    Returns the session, with no more in it than a recorded one, and its truth. Raises InputError
+    if solutions have a wrong shape, there are no poses, a sensor follows an unknown marker, or the
+    arm cannot show an effect.
     """
     for name, sensor in sensors.items():
         for marker in sensor.markers:
@@ -178,7 +178,7 @@ def simulate_session(
     gross = np.flatnonzero(rng.random(len(position)) < outlier_share)
     direction = rng.standard_normal((len(gross), 3))
     position[gross] += outlier_m * direction / np.linalg.norm(direction, axis=1, keepdims=True)
-    # Drawn last: sessions of sensors that have none of it stay as they were.
+    # Drawn last, so that sessions of sensors without these errors do not change.
     bodies = {
         sensor.marker: mount_body(rng)
         for sensor in sensors.values()
@@ -199,7 +199,7 @@ def simulate_session(
             true = model.tool_seen(truth.effects)[:, s] @ bodies[sensor.marker]
             orientation[first] = (turn * Rotation.from_matrix(true)).as_quat()
             if sensor.on_tool:
-                # It has measured the place of what stands in its own frame, which is turned.
+                # The sensor measures the position of its target in its own frame, which is turned.
                 position[first] = turn.apply(position[first])
 
     n, names = len(position), list(markers)
@@ -222,7 +222,7 @@ def simulate_session(
         q=q[row],
         from_q=came_from[row],
         position=position,
-        # Neither dwell statistics nor torques.
+        # A simulated session has neither dwell statistics nor torques.
         std=np.full((n, 3), np.nan),
         samples=np.full(n, -1, dtype=np.int64),
         temperature_c=(
@@ -251,14 +251,14 @@ def simulate_session(
 
 
 PLACEMENT_STD_M = 0.05
-"""How far a sensor stands from its place in the cell file, which is known only roughly."""
+"""Standard deviation of a sensor's position from its rough place in the cell file, m."""
 WARMING = Warming(kelvin=5.0, time_s=1200.0)
-"""The arm gets warmer while it works."""
+"""Warming of the arm during the session."""
 
 
 @dataclass(frozen=True, eq=False)
 class SimulatedRun:
-    """A session that has no more in it than a recorded one, what it was made from, its poses."""
+    """Session with no more in it than a recorded one, its truth, and its tour of poses."""
 
     session: Session
     truth: SessionTruth
@@ -283,40 +283,40 @@ def simulate_workcell(
     effects: Sequence[EffectSpec] = (),
     measuring: Callable[[], object] = lambda: None,
 ) -> SimulatedRun:
-    """Plan in a workcell, draw a truth, and measure.
+    """Session of a workcell: planned poses, random truth, simulated measurements.
 
     Parameters
     ----------
     cell, chain
-        The workcell and its arm, see `choose_robot`.
+        Workcell and its arm, see `choose_robot`.
     rng
         Source of all randomness.
     poses, validation_poses
-        Candidate poses; those that cannot be reached are dropped.
+        Number of candidate poses; poses that cannot be reached are dropped.
     sigma_m, pose_sigma_m
         Noise of every point, and error common to the solutions of a pose, m per axis.
     depth_sigma_m
-        Noise along the line of sight at 1 m, which grows with the square of the distance, m.
+        Noise along the line of sight at 1 m, m; it grows with the square of the distance.
     turn_sigma_rad, pose_turn_sigma_rad
-        The same two of orientations, rad per axis; without the first one none are measured. These
-        and the depth's are of the sensors that the cell says measure poses; of all where it says
-        so of none.
+        The same two of orientations, rad per axis; without the first none are measured. These and
+        the depth noise apply to the sensors that measure poses according to the cell; to all
+        sensors if the cell names none.
     on_tool
-        Whether the sensors are on the tool and measure what stands in their places; in any case
-        those that the cell has there.
+        Whether all sensors are on the tool and measure targets at their places; otherwise only
+        those that the cell has on the tool.
     outlier_share
         Share of the observations that are 20 mm off.
     joint_offset_std
-        Of the true zero-offsets, rad.
+        Standard deviation of the true zero-offsets, rad.
     effects
-        What else is wrong with the arm or the sensors.
+        Effects of the arm or the sensors.
     measuring
         Called when the planning has ended.
 
     Raises
     ------
     InputError
-        No way to solve for the joints of this robot, no pose that it can take, or sensors that
+        If the inverse kinematics of this robot cannot be solved, it can reach no pose, or a sensor
         cannot measure so.
     """
     moving = {name for name, sensor in cell.sensors.items() if on_tool or sensor.mounted_on}
@@ -333,7 +333,7 @@ def simulate_workcell(
             'the marker of a sensor on the tool is its own origin, and it has no other; choose '
             'such sensors (--sensors, in Python sensors)'
         )
-    # One stream each: other noise, for instance, leaves the poses and the offsets as they were.
+    # Separate random streams: other noise, for instance, does not change the poses and offsets.
     placement, planning, drawing, hiding = rng.spawn(4)
     middle = (0.0, 0.0, sum(cell.poses.height_m) / 2)
     sensors = {
@@ -381,12 +381,9 @@ def choose_robot(
     base_link: str | None = None,
     tip_link: str | None = None,
 ) -> SerialChain:
-    """Put another robot into the cell where one is named; return the chain.
+    """Chain of the cell's robot, or of another robot that replaces it in the cell.
 
-    Raises
-    ------
-    InputError
-        No such robot, or a URDF that is none.
+    Raises InputError if there is no such robot, or its URDF is invalid.
     """
     if robot is not None:
         shipped = config_path(f'robots/{robot}.urdf')
@@ -404,18 +401,15 @@ def choose_robot(
     if robot is not None and (
         len(chain) <= FREE_JOINTS or cell.held_joint not in chain.joint_names
     ):
-        # The cell's joint is another robot's: the inverse kinematics then choose by themselves.
+        # The redundant joint in the cell is another robot's: the inverse kinematics choose one.
         cell.held_joint = ''
     return chain
 
 
 def choose_sensors(cell: Workcell, chosen: tuple[str, ...] | None) -> None:
-    """Leave the chosen sensors in the cell; aim at the first of them if need be.
+    """Reduce the cell to the chosen sensors; if need be, poses face the first of them.
 
-    Raises
-    ------
-    InputError
-        The cell has no such sensor.
+    Raises InputError if the cell has no such sensor.
     """
     if chosen is None:
         return

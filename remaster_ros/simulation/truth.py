@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a simulated session is made from: one description for the fakes and the offline simulation.
+"""Truth of a simulated session: one description for the fakes and the offline simulation.
 
 No module that estimates or moves an arm may import it.
 """
@@ -30,7 +30,7 @@ ROLL_RAD = 0.2
 
 @dataclass(frozen=True)
 class Warming:
-    """An arm warms up by ``kelvin`` from ``start_s`` on, with time constant ``time_s``."""
+    """Warming of an arm by ``kelvin`` from ``start_s`` on, with time constant ``time_s``."""
 
     kelvin: float = 0.0
     time_s: float = 1.0
@@ -44,27 +44,27 @@ class Warming:
 
 @dataclass(frozen=True, eq=False)
 class SimulatedSensor:
-    """A sensor as it truly stands and errs."""
+    """True place and errors of a sensor."""
 
-    marker: str  # Name of the marker that it measures
-    T_R_N: FloatArray  # Its true frame in the robot base, (4, 4)
-    # Error of every point, error that all points at one pose share, and error that the markers of
-    # one frame share, m per axis. They hold for the offline simulation; a fake device has the
-    # errors of its own data sheet.
+    marker: str  # Name of the measured marker
+    T_R_N: FloatArray  # True frame of the sensor in the robot base, (4, 4)
+    # Error of every point, error common to all points at one pose, and error common to the markers
+    # of one frame, m per axis. They apply to the offline simulation; a fake device has the errors
+    # of its own data sheet.
     sigma_m: float = 0.1e-3
     pose_sigma_m: float = 0.2e-3
     # Largest angle between the tool's z axis and the line to the sensor at which a fake device
     # sees the marker (a retroreflector takes about 30 degrees, a sphere more)
     acceptance_rad: float = np.pi
-    # Further markers that it measures, with their numbers in the rigid body
+    # Further measured markers, with their numbers in the rigid body
     further: Mapping[str, int] = field(default_factory=dict)
     frame_sigma_m: float = 0.0
-    # Whether it measures its markers one after another, in frames of their own
+    # Whether the markers are measured one after another, in separate frames
     single_shot: bool = False
-    # What the offline simulation alone has. Noise along the line of sight at 1 m, which grows with
-    # the square of the distance, m. Noise of how the body at `marker` stands, as `sigma_m` and
-    # `pose_sigma_m`, rad per axis; None where positions alone are measured. Whether it is on the
-    # tool, its origin at `marker`, and what it measures stands in the frame N
+    # For the offline simulation only. Noise along the line of sight at 1 m, m, which grows with
+    # the square of the distance. Noise of the orientation of the body at `marker`, as `sigma_m`
+    # and `pose_sigma_m`, rad per axis; None if only positions are measured. Whether the sensor is
+    # on the tool with its origin at `marker`, and its target in the frame N
     depth_sigma_m: float = 0.0
     turn_sigma_rad: float | None = None
     pose_turn_sigma_rad: float = 0.0
@@ -72,60 +72,68 @@ class SimulatedSensor:
 
     @property
     def markers(self) -> tuple[str, ...]:
-        """Every marker that it measures, `marker` first."""
+        """Names of the measured markers, `marker` first."""
         return (self.marker, *self.further)
 
     def in_sensor(self, points_R: FloatArray) -> FloatArray:
-        """Map points (..., 3) of the robot base to the sensor's frame N, m."""
+        """Points (..., 3) of the robot base in the sensor's frame N, m."""
         return (points_R - self.T_R_N[:3, 3]) @ self.T_R_N[:3, :3]
 
 
 @dataclass(frozen=True, eq=False)
 class SessionTruth:
-    """What a session was made from: everything that an estimate of it is to find."""
+    """Truth of a session: every quantity that an estimate of it is to find."""
 
     joint_offsets: FloatArray  # True joint angle minus reported one, rad (m: slides), (k,)
     markers: Mapping[str, FloatArray]  # True positions in the tool frame, m, name -> (3,)
     sensors: Mapping[str, SimulatedSensor]
-    warming: Warming = Warming()  # How the arm, and the air around it, warms up
-    effects: tuple[HiddenEffect, ...] = ()  # What else is wrong with the arm or the sensors
-    # What each effect leaves after offsets, registration and marker are fitted: RMS of the 3-D
-    # error over all rows
+    warming: Warming = Warming()  # Warming of the arm and the air around it
+    effects: tuple[HiddenEffect, ...] = ()  # Effects of the arm or the sensors
+    # Size of each effect: RMS of the 3-D error over all rows after offsets, registration and
+    # marker are fitted
     effect_sizes_m: tuple[float, ...] = ()
     outliers: tuple[int, ...] = ()  # ``observation`` of every gross error
-    # How the body at a marker stands on the tool where it is measured, R_T_B, name -> (3, 3)
+    # Orientation on the tool of the body at each marker, if measured, R_T_B, name -> (3, 3)
     bodies: Mapping[str, FloatArray] = field(default_factory=dict)
 
     def without_noise(
         self, chain: SerialChain, sensor: str, q: FloatArray, marker: str = ''
     ) -> FloatArray:
-        """Where a sensor measures a marker without noise and effects, m, (..., 3).
+        """Positions of a marker in a sensor's frame N without noise and effects, m, (..., 3).
 
-        ``sensor``: name of the sensor, in whose frame N the positions are; ``q``: reported joint
-        angles, rad, (..., k); ``marker``: one of its markers; '' for the first.
+        ``sensor``: name of the sensor; ``q``: reported joint angles, rad, (..., k); ``marker``:
+        one of its markers, '' for the first.
         """
-        placed = self.sensors[sensor]
-        points_R = chain.positions(q, self.markers[marker or placed.marker], self.joint_offsets)
-        return placed.in_sensor(points_R)
+        true_sensor = self.sensors[sensor]
+        points_R = chain.positions(
+            q, self.markers[marker or true_sensor.marker], self.joint_offsets
+        )
+        return true_sensor.in_sensor(points_R)
 
 
 def place_sensor(
     near: ArrayLike, look_at: ArrayLike, std_m: float, rng: np.random.Generator
 ) -> FloatArray:
-    """Draw T_R_N of a sensor near a place (std per axis) that looks at a point of R, both in m."""
+    """Random T_R_N of a sensor near a place, looking at a point of R.
+
+    ``near, look_at``: m, in R; ``std_m``: standard deviation of the place per axis.
+    """
     position = np.asarray(near, float) + rng.normal(0.0, std_m, 3)
     turn = looking_at(position, look_at, rng.uniform(-ROLL_RAD, ROLL_RAD))
     return transform(turn, position)
 
 
 def mount_body(rng: np.random.Generator) -> FloatArray:
-    """Draw R_T_B (3, 3) of a camera, board or probe that looks along the tool's z axis, about."""
+    """Random R_T_B (3, 3) of a camera, board or probe.
+
+    It looks roughly along the tool's z axis.
+    """
     tilt = rng.uniform(-ROLL_RAD, ROLL_RAD, 2)
     return matrix_from_rpy((*tilt, rng.uniform(-np.pi, np.pi)))
 
 
 def truth_to_dict(truth: SessionTruth, chain: SerialChain, seed: int) -> dict[str, Any]:
-    """Return the content of truth.json (``remaster-truth/1``), in the units of fit.json."""
+    """Content of truth.json (``remaster-truth/1``), in the units of fit.json."""
     sensors = truth.sensors
     bodies = {
         name: {'rotation_xyzw': quaternion_xyzw(R_T_B).tolist()}
@@ -162,7 +170,7 @@ def truth_to_dict(truth: SessionTruth, chain: SerialChain, seed: int) -> dict[st
 
 
 def _noise_to_dict(sensor: SimulatedSensor) -> dict[str, float]:
-    """Return a sensor's noise, that of a camera or of orientations where it has one."""
+    """Noise of a sensor, with that of depth or of orientations if it has such noise."""
     noise = {'sigma_m': sensor.sigma_m, 'pose_sigma_m': sensor.pose_sigma_m}
     if sensor.depth_sigma_m:
         noise['depth_sigma_m'] = sensor.depth_sigma_m

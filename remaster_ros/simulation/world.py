@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The hidden World behind all fakes: the true arm, the true sensors, world time.
+"""Hidden World behind all fakes: the true arm, the true sensors, world time.
 
-The fakes run as separate processes. They share one World through a folder that no estimating
-code reads: ``world.json`` holds the truth and the clock, ``motion.jsonl`` the trajectories
-that the fake robot has begun, a line each. The arm's motion is a closed form of these (see
-`arm_motion`), so every process computes the same joint positions at the same world time. A killed
-fake reads the folder again and goes on.
+The fakes run as separate processes. They share one World through a folder that no estimating code
+reads: ``world.json`` holds the truth and the clock, ``motion.jsonl`` the trajectories that the
+fake robot has begun, a line each. The arm's motion is a closed form of these (see `arm_motion`),
+so every process computes the same joint positions at the same world time. A killed fake reads the
+folder again and continues.
 
-World time runs `rate` times as fast as the wall clock: a 3 s settle is 3 s of world time. It waits
-for who cannot keep up, see `world_clock`.
+World time runs `rate` times as fast as the wall clock: a settling time of 3 s is 3 s of world
+time. It waits for slow processes, see `world_clock`.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.session.files import write_atomically
 from remaster_ros.session.yaml_records import from_plain, to_plain
 from remaster_ros.simulation.arm_motion import Motion, ServoPoint
-from remaster_ros.simulation.faults import Faults, Numbers, is_out
-from remaster_ros.simulation.hidden_arm import WrongArm
+from remaster_ros.simulation.faults import Faults, Numbers, in_outage
+from remaster_ros.simulation.hidden_arm import TrueArm
 from remaster_ros.simulation.truth import SessionTruth, SimulatedSensor
 from remaster_ros.simulation.world_clock import WorldClock
 from remaster_ros.types import FloatArray
@@ -44,25 +44,25 @@ MOTION_FILE = 'motion.jsonl'
 
 @dataclass(frozen=True, eq=False)
 class WorldContent:
-    """What the file of a World holds."""
+    """Content of a World's file."""
 
-    truth: SessionTruth  # The arm, the markers and the sensors as they are
-    seed: int  # Of everything drawn
+    truth: SessionTruth  # True arm, markers and sensors
+    seed: int  # Seed of everything random
     rate: float  # World time over wall time
     # The nominal arm
     urdf: str
     base_link: str | None
     tip_link: str | None
     start_q: FloatArray  # Reported joint positions at the beginning, rad or m, (k,)
-    link_radius_m: float  # Of the links that can stand between sensor and marker
+    link_radius_m: float  # Radius of the links that can hide a marker from a sensor
 
 
 class World:
-    """The true arm in front of the true sensors.
+    """True arm in front of the true sensors.
 
-    Make one with `create` (the demo) or `open` (a fake); see the module's text. A fake sensor uses
-    `now`, `sleep_until`, `kept_up`, `faults`, `marker_in_sensor`, `line_of_sight`, `warming_k`,
-    `is_moving` and `joint_speed` alone, so that its tests need no arm.
+    Made by `create` (the demo) or `open` (a fake); see the module's docstring. A fake sensor uses
+    only `now`, `sleep_until`, `kept_up`, `faults`, `marker_in_sensor`, `line_of_sight`,
+    `warming_k`, `is_moving` and `joint_speed`, so that its tests need no arm.
     """
 
     def __init__(self, folder: Path, content: WorldContent) -> None:
@@ -73,7 +73,7 @@ class World:
         self._capsules = LinkCapsules(self.chain, content.link_radius_m)
         self.start_q = content.start_q
         self._motion = Motion(START_S, self.start_q)
-        self._wrong = WrongArm(self.chain, self.truth, START_S, self.start_q)
+        self._wrong = TrueArm(self.chain, self.truth, START_S, self.start_q)
         self._faults = Faults(folder)
         self._lines: TextIO | None = None
         self._torn = ''
@@ -83,20 +83,17 @@ class World:
 
     @classmethod
     def create(cls, folder: Path, content: WorldContent) -> World:
-        """Write a new World into `folder`."""
+        """New World, written into `folder`."""
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         (folder / MOTION_FILE).write_text('')
         WorldClock.create(folder, START_S, time.monotonic())
-        # At once, and last: other processes wait for this file, and then read it.
+        # Written atomically and last: other processes wait for this file, and then read it.
         write_atomically(folder / WORLD_FILE, json.dumps(to_plain(content)))
         return cls(folder, content)
 
     @classmethod
     def open(cls, folder: Path) -> World:
-        """Open the World that another process wrote.
-
-        Raises InputError: if there is none.
-        """
+        """World that another process wrote; raises InputError if there is none."""
         try:
             text = (folder / WORLD_FILE).read_text()
         except OSError as error:
@@ -106,7 +103,7 @@ class World:
         return cls(folder, from_plain(json.loads(text), WorldContent))
 
     def close(self) -> None:
-        """Close the file of motions, which any later use opens again."""
+        """Close the file of motions; any later use opens it again."""
         with self._lock:
             if self._lines is not None:
                 # The motions read so far are kept; reading goes on behind them.
@@ -125,7 +122,7 @@ class World:
         self.clock.sleep_until(t)
 
     def kept_up(self, sensor: str, t: float) -> None:
-        """Note that the fake of a sensor has done all that was due until world time t."""
+        """Record that the fake of a sensor has done everything due until world time t."""
         if sensor in self.truth.sensors:
             self.clock.kept_up(list(self.truth.sensors).index(sensor), t)
 
@@ -137,11 +134,11 @@ class World:
         waypoints: Sequence[ServoPoint],
         reference: tuple[FloatArray, FloatArray] | None = None,
     ) -> None:
-        """Send the arm along waypoints (reported joint positions); all processes read of it.
+        """Move the arm along waypoints (reported joint positions), for all processes.
 
-        ``reference``: as of `Motion.follow`.
+        ``reference``: as in `Motion.follow`.
         """
-        now = None if reference is None else [one.tolist() for one in reference]
+        now = None if reference is None else [part.tolist() for part in reference]
         with (self.folder / MOTION_FILE).open('a') as file:
             file.write(json.dumps([start_s, to_plain(list(waypoints)), now]) + '\n')
 
@@ -151,7 +148,7 @@ class World:
         return (self.folder / MOTION_FILE).stat().st_size > 0
 
     def _read_motions(self) -> None:
-        """Read the trajectories that have been added to the file since the last look."""
+        """Read the trajectories added to the file since the last call."""
         if self._lines is None:
             self._lines = (self.folder / MOTION_FILE).open()
             self._lines.seek(self._position)
@@ -166,13 +163,13 @@ class World:
                 self._motion.follow(start_s, waypoints, reference)
 
     def reported(self, t: float) -> tuple[FloatArray, FloatArray]:
-        """Joint positions (rad or m) and velocities (per s) as the encoders have them, (k,)."""
+        """Joint positions (rad or m) and velocities (per s) by the encoders, (k,)."""
         with self._lock:
             self._read_motions()
             return self._motion.at(t)
 
     def joint_speed(self, t: float) -> float:
-        """Largest joint speed at time t, rad/s; of a slide 0.25 m/s count as that."""
+        """Largest joint speed at time t, rad/s; 0.25 m/s of a slide count as 1 rad/s."""
         return float(np.max(np.abs(self.reported(t)[1]) / self.chain.per_radian))
 
     def is_moving(self, t: float) -> bool:
@@ -180,7 +177,7 @@ class World:
         return self.joint_speed(t) > 1e-4
 
     def faults(self, device: str) -> Numbers:
-        """Faults of the device now, see `remaster_ros.simulation.faults`."""
+        """Present faults of the device, see `remaster_ros.simulation.faults`."""
         return self._faults.of(device)
 
     # What sensors see
@@ -188,7 +185,7 @@ class World:
     def marker_in_sensor(self, sensor: str, t: float, marker: str = '') -> FloatArray:
         """True position of a marker, '' for the first, in the sensor's frame at time t, m, (3,).
 
-        The fault ``swapped`` is one of the first marker alone.
+        The fault ``swapped`` applies to the first marker only.
         """
         self._sensor(sensor)
         q = self.reported(t)[0]
@@ -196,7 +193,7 @@ class World:
             with self._lock:
                 marker_N = self._wrong.marker_in_sensor(sensor, t, q, marker)
         else:
-            # The same, several times as fast.
+            # Without effects the same position, computed several times as fast.
             marker_N = self.truth.without_noise(self.chain, sensor, q, marker)
         faults = self.faults(sensor)
         if not marker:
@@ -205,20 +202,20 @@ class World:
         return marker_N
 
     def warming_k(self, t: float) -> float:
-        """How much warmer than at the beginning it is at time t, K."""
+        """Temperature at time t above that of the beginning, K."""
         return float(self.truth.warming.at(np.array(t)))
 
     def line_of_sight(self, sensor: str, t: float, name: str = '') -> bool:
-        """Whether the sensor sees a marker, '' for the first, at time t: no link is between."""
-        placed, faults = self._sensor(sensor), self.faults(sensor)
-        if 'occluded' in faults or is_out(faults.get('intermittent'), t):
+        """Whether the sensor sees a marker, '' for the first, at time t, with no link between."""
+        true_sensor, faults = self._sensor(sensor), self.faults(sensor)
+        if 'occluded' in faults or in_outage(faults.get('intermittent'), t):
             return False
         q = self.reported(t)[0] + self.truth.joint_offsets
-        marker, origin = self.truth.markers[name or placed.marker], placed.T_R_N[:3, 3]
+        marker, origin = self.truth.markers[name or true_sensor.marker], true_sensor.T_R_N[:3, 3]
         T_R_T = self.chain.forward(q)
         line = origin - transforms.apply(T_R_T, marker)
         cosine = T_R_T[:3, 2] @ line / np.linalg.norm(line)
-        if cosine < np.cos(placed.acceptance_rad):
+        if cosine < np.cos(true_sensor.acceptance_rad):
             return False
         return not bool(self._capsules.hides(q, marker, origin))
 

@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""World time, shared by the processes of all fakes, which waits for who cannot keep up.
+"""World time, common to the processes of all fakes, which waits for slow processes.
 
-World time runs `rate` times as fast as the wall clock up to a limit, and stands there. The fake
-robot moves the limit on as the programs that are tested, and the fake sensors, have kept up: on a
-busy machine the world is slower, and nothing in it is late. Before the arm's first motion, while
-nodes start and plan, it runs no faster than the wall clock, since nothing happens in it. A file of
-a few numbers holds the line and the limit; every process computes the same time from it and from
-the machine's monotonic clock.
+World time runs `rate` times as fast as the wall clock up to a limit, and stops there. The fake
+robot raises the limit as the tested programs, and the fake sensors, have kept up: on a busy
+machine the world is slower, and nothing in it is late. Before the arm's first motion, while nodes
+start and plan, it runs no faster than the wall clock, since nothing happens in it. A file of a few
+numbers holds the line and the limit; every process computes the same time from this file and the
+machine's monotonic clock.
 
-A limit that is not renewed for `HELD_WALL_S` no longer holds: a fake robot that was killed or
-paused is a fault that a test injects, and the world goes on without it.
+A limit that is not renewed for `HELD_WALL_S` is void: a fake robot that was killed or paused is a
+fault injected by a test, and the world continues without it.
 """
 
 from __future__ import annotations
@@ -35,24 +35,24 @@ from pathlib import Path
 
 
 AHEAD_S, AHEAD_WALL_S = 0.15, 0.05
-"""World time may be ahead of a participant by so much, s, and by so much wall time at its rate:
-half of what the bridge allows an arm to lag (0.35 s and 0.1 s of wall time), since a command takes
-a while to get to the arm."""
+"""Largest lead of world time over a participant, s, and its part in wall time, s: half of the lag
+that the bridge allows an arm (0.35 s and 0.1 s of wall time), since a command takes some time to
+reach the arm."""
 LEAD_AHEAD_S = 0.1
-"""World time is ahead of a report that who leads the arm has not taken by no more than this, s,
-however fast it runs: a move begins so long after it was decided (`motion.pieces.AHEAD_S`), and the
-next piece of a move comes before the stop of the piece under way."""
+"""Largest lead of world time, s, over a report that the process leading the arm has not received,
+at any rate: a move begins this long after its decision (`motion.pieces.AHEAD_S`), and the next
+piece of a move comes before the stop of the present piece."""
 LEAD_PATIENCE_WALL_S = 20.0
-"""Who leads the arm and gives no sign for so long is waited for as others are, s of wall time."""
+"""Wall time without a sign, s, after which a process leading the arm is waited for like others."""
 PATIENCE_WALL_S = 120.0
-"""A process that runs and does nothing for so long is not waited for any more, s of wall time."""
+"""Wall time, s, after which world time no longer waits for a running process without progress."""
 LOOK_WALL_S = 0.1
-"""How often it is looked whether a process that is waited for still runs, s of wall time."""
+"""Wall time, s, between checks whether a process still runs."""
 
 
 @dataclass
 class _Participant:
-    """What a process has done: until which world time, and the wall time of its last sign."""
+    """Progress of a process: in world time, and the wall time of its last sign."""
 
     done_s: float
     came_wall: float
@@ -61,11 +61,11 @@ class _Participant:
 
 
 class Pace:
-    """Follow the participants of a World, and move the limit of its time.
+    """Participants of a World, and the limit of its time that follows from their progress.
 
-    Whoever has this owns the clock. What was taken is confirmed no more often than
+    The process with this object owns the clock. Progress is confirmed no more often than every
     ``confirmed_every_s``, s: the last reports before a silence may never be confirmed, and count
-    as taken.
+    as received.
     """
 
     def __init__(self, clock: WorldClock, confirmed_every_s: float = 0.0) -> None:
@@ -73,60 +73,60 @@ class Pace:
         self._ahead_s = AHEAD_S + AHEAD_WALL_S * clock.rate
         # Reports arrive and are taken in different threads.
         self._lock = threading.Lock()
-        # Stamp of each report not taken by all, and when it was published, s of world time. The
-        # stamps of a robot that is out of order may go back.
+        # Stamp of each report that not all have received, and world time of its publication, s.
+        # The stamps of a robot that is out of order may decrease.
         self._reports: deque[tuple[float, float]] = deque(maxlen=10_000)
-        self._took: dict[int, _Participant] = {}
-        # Which of them lead the arm.
+        self._received: dict[int, _Participant] = {}
+        # Process ids of those that lead the arm.
         self._leads: set[int] = set()
         self._fakes: dict[int, _Participant] = {}
 
     def published(self, stamp_s: float) -> None:
-        """Note that a report with this stamp leaves now."""
+        """Record that a report with this stamp is published now."""
         with self._lock:
             self._reports.append((stamp_s, self._clock.now()))
 
     def took(self, pid: int, stamp_s: float, *, leads: bool = False) -> None:
-        """Note that a process has taken all reports up to the one with this stamp.
+        """Record that a process has received all reports up to the one with this stamp.
 
-        A stamp of no report is a time of the World, until which it has done all. One that leads
-        the arm confirms each report, behind the command that it has sent by it.
+        If no report has the stamp, it is a world time until which the process has done everything.
+        A process that ``leads`` the arm confirms each report after the command that it has sent.
         """
         with self._lock:
             now = self._clock.now()
             known = [published_s for stamp, published_s in self._reports if stamp == stamp_s]
             known = known or [min(stamp_s, now)]
-            if pid in self._took:
-                known.append(self._took[pid].done_s)
-            self._took[pid] = _Participant(max(known), time.monotonic())
+            if pid in self._received:
+                known.append(self._received[pid].done_s)
+            self._received[pid] = _Participant(max(known), time.monotonic())
             if leads:
                 self._leads.add(pid)
 
     def go_on(self, most_s: float = math.inf) -> None:
-        """Let world time run as far as it may, and not past `most_s`."""
+        """Raise the limit of world time as far as the participants allow, up to `most_s`."""
         wall, now = time.monotonic(), self._clock.now()
         for pid, done_s in self._clock.slots().values():
             known = self._fakes.get(pid)
             if known is None or known.done_s != done_s:
                 self._fakes[pid] = _Participant(done_s, wall)
         with self._lock:
-            taken_s = min(_waited_for(self._took, wall), default=math.inf)
-            leads = {pid: self._took[pid] for pid in self._leads}
-            led_s = min(_waited_for(leads, wall, LEAD_PATIENCE_WALL_S), default=math.inf)
+            taken_s = min(_progress_of_running(self._received, wall), default=math.inf)
+            leads = {pid: self._received[pid] for pid in self._leads}
+            led_s = min(_progress_of_running(leads, wall, LEAD_PATIENCE_WALL_S), default=math.inf)
             taken_s += self._confirmed_every_s
             while self._reports and self._reports[0][1] <= min(taken_s, led_s):
                 self._reports.popleft()
             reports = [published_s for _, published_s in self._reports]
-        since = [one for one in reports if one > taken_s][:1]
-        since += _waited_for(self._fakes, wall)
-        untaken = [one + LEAD_AHEAD_S for one in reports if one > led_s][:1]
+        since = [published_s for published_s in reports if published_s > taken_s][:1]
+        since += _progress_of_running(self._fakes, wall)
+        untaken = [published_s + LEAD_AHEAD_S for published_s in reports if published_s > led_s][:1]
         self._clock.hold(min([*untaken, min([now, *since]) + self._ahead_s, most_s]))
 
 
-def _waited_for(
+def _progress_of_running(
     participants: dict[int, _Participant], wall: float, patience_s: float = PATIENCE_WALL_S
 ) -> Iterable[float]:
-    """Yield until when each process that is waited for has done what was due, s."""
+    """World time, s, of the progress of each running process with a sign within the patience."""
     for pid, p in participants.items():
         if wall - p.looked_wall > LOOK_WALL_S:
             p.runs, p.looked_wall = is_running(pid), wall
@@ -136,18 +136,18 @@ def _waited_for(
 
 CLOCK_FILE = 'clock'
 HELD_WALL_S = 3.0
-"""A limit that its owner does not renew holds so long, s of wall time."""
+"""Wall time, s, for which a limit is valid without renewal by its owner."""
 POLL_WALL_S = 2e-3
-"""How often a sleeper looks whether time stands, s of wall time."""
+"""Wall time, s, between checks of a sleeping process whether world time has stopped."""
 SLOTS = 16
-"""So many fakes may take part."""
+"""Largest number of fake sensors."""
 _VERSION, _LINE, _SLOT = struct.Struct('=Q'), struct.Struct('=dddd'), struct.Struct('=Qd')
 
 
 class WorldClock:
-    """See the module's text.
+    """Clock of a World, see the module's docstring.
 
-    ``folder``: of the World; `create` has written the file; ``rate``: world time over wall time.
+    ``folder``: folder of the World with the file by `create`; ``rate``: world time over wall time.
     """
 
     def __init__(self, folder: Path, rate: float) -> None:
@@ -162,7 +162,7 @@ class WorldClock:
         (folder / CLOCK_FILE).write_bytes(_VERSION.pack(0) + 2 * line + bytes(SLOTS * _SLOT.size))
 
     def now(self, wall_s: float | None = None) -> float:
-        """World time now, s, or when the monotonic clock has `wall_s`."""
+        """World time now, or at `wall_s` of the monotonic clock, s."""
         base_wall, base, limit, held_until = self._line()
         wall = time.monotonic() if wall_s is None else wall_s
         held = min(base + (min(wall, held_until) - base_wall) * self.rate, limit)
@@ -171,32 +171,32 @@ class WorldClock:
     def sleep_until(self, t: float) -> None:
         """Wait until world time t.
 
-        Not for a while: who is held up before such a wait begins would wait for a time that
-        comes after the limit, and the limit waits for him.
+        The argument is a time, not a duration: a process delayed before the wait would otherwise
+        wait for a time after the limit, and the limit waits for the process.
         """
-        while (left := t - self.now()) > 0.0:
-            # Where time stands what is left does not shrink.
-            time.sleep(max(left / self.rate, POLL_WALL_S))
+        while (remaining := t - self.now()) > 0.0:
+            # If world time has stopped, the remaining time does not decrease.
+            time.sleep(max(remaining / self.rate, POLL_WALL_S))
 
     def hold(self, limit_s: float) -> None:
-        """Let world time run up to `limit_s`, and no further before this is called again.
+        """Set the limit of world time to `limit_s`, until the next call.
 
-        For one process alone, the owner of the clock.
+        For one process only, the owner of the clock.
         """
         wall = time.monotonic()
         now = self.now(wall)
-        # Written beside the line in force: whoever is killed meanwhile leaves that one behind.
+        # Written next to the valid line: if the process is killed meanwhile, that line stays valid.
         (version,) = _VERSION.unpack_from(self._memory)
         line = wall, now, max(limit_s, now), wall + HELD_WALL_S
         _LINE.pack_into(self._memory, _line_at(version + 1), *line)
         _VERSION.pack_into(self._memory, 0, version + 1)
 
     def kept_up(self, slot: int, now_s: float) -> None:
-        """Note that this process, a fake sensor, has done all that was due until `now_s`."""
+        """Record that this process, a fake sensor, has done everything due until `now_s`."""
         _SLOT.pack_into(self._memory, _slot_at(slot), os.getpid(), now_s)
 
     def slots(self) -> dict[int, tuple[int, float]]:
-        """Return (process id, until when all is done, s) of each fake sensor that takes part."""
+        """(process id, world time of its progress, s) of each fake sensor that takes part."""
         found = {i: _SLOT.unpack_from(self._memory, _slot_at(i)) for i in range(SLOTS)}
         return {slot: (pid, done_s) for slot, (pid, done_s) in found.items() if pid}
 
@@ -217,7 +217,7 @@ def _slot_at(slot: int) -> int:
 
 
 def is_running(pid: int) -> bool:
-    """Whether a process of this machine lives and was not paused (SIGSTOP)."""
+    """Whether a process of this machine is alive and not paused (SIGSTOP)."""
     try:
         text = Path(f'/proc/{pid}/stat').read_text()
     except OSError:

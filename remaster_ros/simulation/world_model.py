@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What sensors measure of an arm with hidden effects, on one round of visits.
+"""Sensor readings of an arm with hidden effects, on one round of visits.
 
 Every hidden world uses this model: the fakes with the package's chain, the tests with pinocchio's.
-It also works out, by least squares of its own, how much of an effect is left when registration,
-zero-offsets and markers are fitted: that is the size of an effect in millimetres.
+By a least-squares fit of its own it also computes the error of an effect that remains after
+registration, zero-offsets and markers are fitted: the size of the effect in millimetres.
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ from remaster_ros.types import BoolArray, FloatArray
 
 @dataclass(frozen=True, eq=False)
 class ArmState:
-    """The arm at n configurations, everything in the base frame R."""
+    """State of the arm at n configurations, in the base frame R."""
 
-    origin: FloatArray  # Origin of every joint, before its own move, m, (n, k, 3)
-    # Rotation of each joint's frame before and after its own turn, (n, k, 3, 3)
+    origin: FloatArray  # Origin of every joint, before its own motion, m, (n, k, 3)
+    # Rotation of each joint's frame before and after the joint's own, (n, k, 3, 3)
     before: FloatArray
     after: FloatArray
     axis: FloatArray  # Unit axis of each joint, (n, k, 3)
-    # Of the tool frame, m, (n, 3) and (n, 3, 3)
+    # Origin of the tool frame, m, (n, 3), and its rotation, (n, 3, 3)
     tool_origin: FloatArray
     tool: FloatArray
 
@@ -46,13 +46,13 @@ class Arm(Protocol):
     """Kinematics and gravity of an arm of k joints as drawn."""
 
     joints: int
-    slides: BoolArray  # Which of them slide, (k,)
+    slides: BoolArray  # Whether each joint slides, (k,)
 
     def state(self, q: FloatArray) -> ArmState:
-        """Where every joint is for true joint angles q, rad, (n, k)."""
+        """State of every joint for true joint angles q, rad, (n, k)."""
 
     def gravity_torque(self, q: FloatArray) -> FloatArray:
-        """Torque with which gravity turns each joint its own way, N m, (n, k)."""
+        """Gravity's torque about each joint, in its positive direction, N m, (n, k)."""
 
     def base_moment(self, q: FloatArray) -> FloatArray:
         """Moment of the moving links' weight about the base's origin, N m, (n, 3)."""
@@ -61,7 +61,7 @@ class Arm(Protocol):
         """Gravity's moment on what each joint carries about its origin, in R, N m, (n, k, 3)."""
 
     def segments(self) -> FloatArray:
-        """From each joint to the next one, the last to the tool, m, (k + 1, 3).
+        """Vector from each joint to the next, from the last to the tool, m, (k + 1, 3).
 
         Segment j is fixed in the frame after joint j; segment 0, before joint 1, in the base.
         """
@@ -69,23 +69,23 @@ class Arm(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Round:
-    """The configurations visited, in that order."""
+    """Visited configurations in their order."""
 
-    q: FloatArray  # As the robot reported them, rad, (m, k)
-    home: FloatArray  # Where it came from first, rad, (k,)
-    time_s: FloatArray  # Since the beginning, (m,)
+    q: FloatArray  # Joint angles as reported by the robot, rad, (m, k)
+    home: FloatArray  # Joint angles before the first visit, rad, (k,)
+    time_s: FloatArray  # Time since the beginning, s, (m,)
     warming_k: FloatArray  # Temperature of the arm above that of the beginning, K, (m,)
 
     @cached_property
-    def came_from(self) -> FloatArray:
-        """Configuration before each, rad, (m, k)."""
+    def previous_q(self) -> FloatArray:
+        """Configuration before each visit, rad, (m, k)."""
         return np.concatenate((self.home[None], self.q[:-1]))
 
 
 def circumstances(arm: Arm, visited: Round, joint_offsets: FloatArray) -> Circumstances:
-    """Return what effects may depend on, per configuration."""
+    """Quantities that effects may depend on, per configuration."""
     q, per_radian = visited.q + joint_offsets, np.where(arm.slides, SLIDE_M, 1.0)
-    move = visited.q - visited.came_from
+    move = visited.q - visited.previous_q
     approach = np.zeros_like(q)
     last = np.zeros(arm.joints)
     for i, step in enumerate(move):
@@ -114,19 +114,20 @@ def deviation(
     sensors: tuple[str, ...],
     markers: tuple[str, ...],
 ) -> Deviation:
-    """Return what all the effects together do to sensors and markers of these names."""
+    """Deviation by all effects together, with sensors and markers of these names."""
     n, k = c.q.shape
-    together = Deviation.none(n, k, sensors, markers)
+    total = Deviation.none(n, k, sensors, markers)
     for effect in effects:
-        add_effect(effect, together, c)
-    return together
+        add_effect(effect, total, c)
+    return total
 
 
 def placed(state: ArmState, marker: FloatArray, wrong: Deviation | None) -> FloatArray:
-    """Where a marker of the tool frame (3,) or (n, 3) is in R, m, (n, 3).
+    """Positions of a marker of the tool frame (3,) or (n, 3) in R, m, (n, 3).
 
     Small motions within the chain are exact: T₁D₁T₂D₂p = (A₁D₁A₁⁻¹)(A₂D₂A₂⁻¹)A₂p with A₂ = T₁T₂,
-    so each moves what lies outside it, the outermost first, in the frames of the chain as drawn.
+    so each moves the part of the arm behind it, the outermost first, in the frames of the chain as
+    drawn.
     """
     markers = np.broadcast_to(marker, state.tool_origin.shape)
     point = state.tool_origin + np.einsum('nij,nj->ni', state.tool, markers)
@@ -148,9 +149,10 @@ def measured(
     position: FloatArray,
     wrong: Deviation | None,
 ) -> FloatArray:
-    """What the named sensor measures of a marker at a position of the tool frame (3,), m, (n, 3).
+    """Readings of a marker by a sensor, in the sensor's frame N, m, (n, 3).
 
-    In the sensor's frame N.
+    ``name``: of the sensor; ``marker``: name of the marker; ``position``: in the tool frame, m,
+    (3,); ``wrong``: deviation of arm and sensors, None without effects.
     """
     if wrong is None:
         return sensor.in_sensor(placed(state, position, None))
@@ -160,26 +162,26 @@ def measured(
 
 @dataclass(eq=False)
 class WorldModel:
-    """The true arm and sensors on one round."""
+    """True arm and sensors on one round of visits."""
 
-    arm: Arm  # As drawn
+    arm: Arm  # Arm as drawn
     visited: Round
     sensors: Mapping[str, SimulatedSensor]
-    # True positions in the tool frame where nothing is hidden, m, name -> (3,)
+    # True positions in the tool frame without effects, m, name -> (3,)
     markers: Mapping[str, FloatArray]
     joint_offsets: FloatArray  # True joint angle minus reported one, rad, (k,)
 
     @cached_property
     def circumstances(self) -> Circumstances:
-        """What effects may depend on, per configuration."""
+        """Quantities that effects may depend on, per configuration."""
         return circumstances(self.arm, self.visited, self.joint_offsets)
 
     def seen(self, effects: Sequence[HiddenEffect] = ()) -> FloatArray:
-        """What the sensors see without noise, each in its own frame N, m, (n, 3).
+        """Readings of the sensors without noise, each in its own frame N, m, (n, 3).
 
         Rows as they are recorded: at every configuration one of each marker of each sensor.
         """
-        state, wrong = self._reached(effects)
+        state, wrong = self._true_state(effects)
         points = [
             measured(state, name, sensor, marker, self.markers[marker], wrong)
             for name, sensor in self.sensors.items()
@@ -188,11 +190,11 @@ class WorldModel:
         return np.stack(points, axis=1).reshape(-1, 3)
 
     def tool_seen(self, effects: Sequence[HiddenEffect] = ()) -> FloatArray:
-        """How the tool stands before each sensor without noise, R_N_T, (n, sensors, 3, 3).
+        """Orientation of the tool in each sensor's frame without noise, R_N_T, (n, sensors, 3, 3).
 
-        Of what a sensor does by itself only a turn turns it; the rest moves points.
+        Of a sensor's own errors only its rotation turns the tool; the others move points.
         """
-        state, wrong = self._reached(effects)
+        state, wrong = self._true_state(effects)
         origin = placed(state, np.zeros(3), wrong)
         tool = np.stack([placed(state, axis, wrong) - origin for axis in np.eye(3)], axis=-1)
         seen = np.stack([x.T_R_N[:3, :3].T @ tool for x in self.sensors.values()], axis=1)
@@ -201,8 +203,8 @@ class WorldModel:
         turn = Rotation.from_rotvec(wrong.turn.reshape(-1, 3)).as_matrix()
         return np.asarray(turn.reshape(seen.shape) @ seen)
 
-    def _reached(self, effects: Sequence[HiddenEffect]) -> tuple[ArmState, Deviation | None]:
-        """Return where the arm truly is, and what else is wrong there."""
+    def _true_state(self, effects: Sequence[HiddenEffect]) -> tuple[ArmState, Deviation | None]:
+        """True state of the arm, and the deviation of arm and sensors."""
         q = self.visited.q + self.joint_offsets
         if not effects:
             return self.arm.state(q), None
@@ -212,17 +214,17 @@ class WorldModel:
 
     @cached_property
     def distance_m(self) -> dict[str, float]:
-        """Mean distance of what each sensor measures, m."""
+        """Mean distance of each sensor's markers, m."""
         seen_by = [name for name, sensor in self.sensors.items() for _ in sensor.markers]
         points = self._as_drawn.reshape(-1, len(seen_by), 3)
         length = np.linalg.norm(points, axis=2).mean(axis=0)
         return {
-            name: float(np.mean(length[[name == other for other in seen_by]]))
+            name: float(np.mean(length[[name == marker_sensor for marker_sensor in seen_by]]))
             for name in self.sensors
         }
 
     def response(self, effect: HiddenEffect) -> FloatArray:
-        """How far an effect moves what the sensors see, m, (n, 3)."""
+        """Change of the readings by an effect, m, (n, 3)."""
         return self.seen([effect]) - self._as_drawn
 
     @cached_property
@@ -231,7 +233,7 @@ class WorldModel:
 
     @cached_property
     def nuisance(self) -> FloatArray:
-        """Derivatives of what is seen by offsets, registrations, markers: m, (n, 3, p).
+        """Derivatives of the readings by offsets, registrations, markers: m, (n, 3, p).
 
         Offsets first (k), then six per sensor, last three per marker.
         """
@@ -257,7 +259,10 @@ class WorldModel:
         return np.stack(blocks, axis=1).reshape(-1, 3, blocks[0].shape[2])
 
     def left(self, response: FloatArray, *, fit_markers: bool = True) -> FloatArray:
-        """What of a response (n, 3) no registration, offsets and markers take up, m, (n, 3)."""
+        """Part of a response (n, 3) that remains after the fit, m, (n, 3).
+
+        The fit absorbs changes of registration and offsets, and of markers if ``fit_markers``.
+        """
         basis = self._basis if fit_markers else self._basis_without_markers
         flat = response.ravel()
         return (flat - basis @ (basis.T @ flat)).reshape(-1, 3)
@@ -272,22 +277,22 @@ class WorldModel:
         return _span(fixed.reshape(-1, fixed.shape[2]))
 
     def size_m(self, effect: HiddenEffect) -> float:
-        """What is left of an effect, RMS of the 3-D error over all rows, m.
+        """Size of an effect: RMS of the 3-D error over all rows that remains after the fit, m.
 
-        A wrong marker is measured against a marker that is held where it should be: if it were
-        fitted, nothing would be left.
+        A wrong marker is compared with a marker fixed at its nominal position: a fitted marker
+        would absorb it.
         """
-        left = self.left(self.response(effect), fit_markers=effect.kind != 'marker_offset')
-        return float(np.sqrt(np.mean(np.sum(left**2, axis=1))))
+        remainder = self.left(self.response(effect), fit_markers=effect.kind != 'marker_offset')
+        return float(np.sqrt(np.mean(np.sum(remainder**2, axis=1))))
 
     def of_size(self, effect: HiddenEffect, size_m: float) -> HiddenEffect:
-        """Scale an effect so that this is left of it."""
+        """Effect scaled to a size by `size_m`."""
         for _ in range(3):  # all but linear
             effect = effect.scaled(size_m / self.size_m(effect))
         return effect
 
 
 def _span(design: FloatArray) -> FloatArray:
-    """Return an orthonormal basis of what the columns of a design span, (3 n, rank)."""
+    """Orthonormal basis of the column space of a design, (3 n, rank)."""
     basis, singular, _ = np.linalg.svd(design, full_matrices=False)
     return basis[:, singular > 1e-9 * singular[0]]

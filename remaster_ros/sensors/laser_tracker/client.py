@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Client of a laser tracker by emScon: lock the reflector, measure it standing still.
+"""Client of a laser tracker by emScon: lock the reflector, measure it at standstill.
 
-A tracker follows the reflector with its beam. When the beam breaks it has to find the reflector
-again, by searching a spiral about the place it points to (`LaserTrackerClient.find_reflector`) or
-about given coordinates (`LaserTrackerClient.go_position`). Its absolute distance meter (ADM)
-refuses a target that moves.
+A tracker follows the reflector with its beam. When the beam breaks the tracker has to find the
+reflector again, by a spiral search about its present direction
+(`LaserTrackerClient.find_reflector`) or about given coordinates
+(`LaserTrackerClient.go_position`). Its absolute distance meter (ADM) refuses a target that moves.
 """
 
 from __future__ import annotations
@@ -69,18 +69,18 @@ SET_FOR_READINGS: tuple[tuple[Command, Command, tuple[Value, ...], str], ...] = 
         'measurement mode (stationary)',
     ),
 )
-"""What a reading depends on: the command that sets it, the one that reads it back, the values, and
-what they are."""
+"""Settings that a reading depends on: command to set each, command to read it back, values, and
+their name in words."""
 CHANGES_OF_READINGS = (Change.UNITS, Change.COORDINATE_SYSTEM_TYPE, Change.MEASUREMENT_MODE)
-"""Status changes after which these are read back."""
+"""Status changes after which these settings are read back."""
 
 
 class TrackerStatus(Enum):
-    """What the instrument last reported."""
+    """Last reported status of the instrument."""
 
     DISCONNECTED = 'disconnected'
     NOT_READY = 'not ready'
-    """Warming up, not initialised, or no reflector locked."""
+    """The instrument warms up, is not initialised, or has no reflector locked."""
     BUSY = 'busy'
     READY = 'ready'
     """A reflector is locked; it can be measured."""
@@ -88,9 +88,9 @@ class TrackerStatus(Enum):
 
 @dataclass(frozen=True)
 class LaserTrackerSettings:
-    """What the client sets on the instrument, and how long it waits.
+    """Settings of the instrument, and time-outs of the client.
 
-    Those made with `parameter` are parameters of the node as well.
+    Settings made with `parameter` are parameters of the node as well.
     """
 
     search_radius_m: float = parameter(
@@ -104,15 +104,12 @@ class LaserTrackerSettings:
     integration_s: float = parameter(
         1.0, 'averaging time of one measurement', unit='s', low=0.05, high=60.0
     )
-    connect_timeout_s: float = 5.0  # Of the TCP connection, in wall time
-    reply_timeout_s: float = 5.0  # Of a command that only sets or reads something
-    initialise_timeout_s: float = 300.0  # Of the initialisation, waiting for the warm-up included
+    connect_timeout_s: float = 5.0  # TCP connection, in wall time
+    reply_timeout_s: float = 5.0  # Command that only sets or reads something
+    initialise_timeout_s: float = 300.0  # Initialisation with the wait for the warm-up
 
     def __post_init__(self) -> None:
-        """Refuse what no instrument can do.
-
-        Raises InputError: naming the setting.
-        """
+        """Raises InputError, with the name of the setting, for a value out of range."""
         check_all('laser tracker', self)
         for name, value in vars(self).items():
             if name.endswith(('_s', '_m')) and not 0 < value < np.inf:
@@ -120,16 +117,18 @@ class LaserTrackerSettings:
 
 
 _LEAST_WALL_S = 2.0
-"""Simulated time may run many times as fast as the wall clock; networks do not."""
+"""Shortest time-out in wall time, s: simulated time may be much faster, networks are not."""
 _POLL_S = 0.02
 _HANG_UP_S = 1.0
 
 
 class LaserTrackerError(DeviceError):
-    """A laser tracker failed; the text names it, the command, the code in words, a remedy.
+    """Failure of a laser tracker.
 
-    Attributes: ``status``: result status of the instrument (a `Status` or a number unknown to us);
-    None where it did not answer or the connection is at fault.
+    The text has the instrument, the command, the code in words, a remedy.
+
+    Attributes: ``status``: result status of the instrument (a `Status` or an unknown number); None
+    if it did not answer or the connection failed.
     """
 
     def __init__(self, text: str, status: int | None = None) -> None:
@@ -139,7 +138,7 @@ class LaserTrackerError(DeviceError):
 
 @dataclass(frozen=True)
 class _Exchange:
-    """A command and the wait for its answer."""
+    """Command and the wait for its answer."""
 
     command: Command
     what: str
@@ -148,16 +147,17 @@ class _Exchange:
 
 
 class TrackerLink:
-    """Sends commands over TCP and waits for what belongs to them.
+    """TCP connection to the instrument: sends commands and waits for their answers.
 
-    The protocol has no sequence numbers: a reply that comes too late cannot be distinguished
-    from that to the next command. The connection is therefore closed where a reply is missing.
+    The protocol has no sequence numbers: a late reply cannot be distinguished from that to the
+    next command. The connection is therefore closed if a reply is missing.
 
     ``host, port``: address of the instrument; ``on_change``: called by the reading thread with the
     number of each status change; ``now``: clock of the time-outs, s; may run faster than the wall
     clock.
-    Attributes: ``counts``: how often each thing happened: ``connections``, ``bad_packets``,
-    ``unknown_packets``, ``unexpected_packets`` (no command was waiting for them).
+
+    Attributes: ``counts``: number of ``connections``, ``bad_packets``, ``unknown_packets``, and
+    ``unexpected_packets`` (for which no command was waiting).
     """
 
     def __init__(
@@ -176,27 +176,27 @@ class TrackerLink:
         self._thread: threading.Thread | None = None
         self._one_at_a_time = threading.Lock()
         self._news = threading.Condition()
-        # Guarded by _news:
+        # Fields guarded by _news:
         self._asking = ''
         self._inbox: deque[Reply | ErrorReport | Measurement] = deque(maxlen=100)
         self._lost = 'not connected'
-        # Of the reading thread alone:
+        # Fields of the reading thread only:
         self._last_report: int = Status.ALL_OK
 
     @property
     def connected(self) -> bool:
-        """Whether the connection stands, as far as this end can determine."""
+        """Whether the connection is open, as far as this end can determine."""
         return not self._lost
 
     def count(self, what: str, times: int = 1) -> None:
-        """Add to `counts`, from any thread."""
+        """Add to a number in `counts`, from any thread."""
         with self._news:
             self.counts[what] += times
 
     def open(self, timeout_s: float) -> None:
-        """Connect, within `timeout_s` of wall time; nothing happens where already connected.
+        """Connect within `timeout_s` of wall time, unless connected.
 
-        Raises LaserTrackerError: if the instrument cannot be reached.
+        Raises LaserTrackerError if the instrument cannot be reached.
         """
         if self.connected:
             return
@@ -234,7 +234,7 @@ class TrackerLink:
             connection, self._socket = self._socket, None
             thread, self._thread = self._thread, None
         if connection is not None and thread is not None:
-            # Shutting down wakes the reading thread, closing alone does not.
+            # Shutting the socket down wakes the reading thread; closing it does not.
             with contextlib.suppress(OSError):
                 connection.shutdown(socket.SHUT_RDWR)
             thread.join()
@@ -243,21 +243,20 @@ class TrackerLink:
     def ask(
         self, command: Command, *values: Value, timeout_s: float, what: str = ''
     ) -> tuple[Value, ...]:
-        """Send a command and return the values of its reply.
+        """Send a command; the values of its reply are returned.
 
-        ``timeout_s``: on the injected clock, s, but never less than 2 s of wall time; ``what``:
-        the command in words, for messages.
-        Raises LaserTrackerError: if the instrument refuses, is busy, does not answer or is not
-        connected.
+        ``timeout_s``: by the injected clock, s, but at least 2 s of wall time; ``what``: the
+        command in words, for messages. Raises LaserTrackerError if the instrument refuses, is
+        busy, does not answer or is not connected.
         """
         what = what or command.name.replace('_', ' ').lower()
         with self._exchange_of(command, what, timeout_s) as exchange:
             return self._reply(exchange, values)
 
     def measure(self, timeout_s: float) -> tuple[Measurement, float]:
-        """Measure once; return the result and the time in the middle of the integration, s.
+        """Measure once: result, and time in the middle of the integration, s.
 
-        Raises LaserTrackerError: as `ask` does.
+        Raises LaserTrackerError as `ask`.
         """
         with self._exchange_of(Command.START_MEASUREMENT, 'measurement', timeout_s) as exchange:
             self._reply(exchange, ())
@@ -267,11 +266,11 @@ class TrackerLink:
                 if isinstance(event, Measurement):
                     self._check(event.status, exchange.what)
                     return event, 0.5 * (started + self._now())
-                self._set_aside(event, exchange)
+                self._count_unexpected(event, exchange)
 
     @contextlib.contextmanager
     def _exchange_of(self, command: Command, what: str, timeout_s: float) -> Iterator[_Exchange]:
-        """Hold the instrument for one command and what it sends in answer."""
+        """Exchange of one command and its answers, with the instrument reserved."""
         if not self._one_at_a_time.acquire(blocking=False):
             raise LaserTrackerError(
                 f'{self.name}: busy with the {self._asking or "last command"} when asked for '
@@ -296,7 +295,7 @@ class TrackerLink:
         try:
             connection.sendall(encode(Request(exchange.command, values)))
         except OSError as error:
-            # The reading thread may have what the instrument reported before it closed.
+            # The reading thread may have received the reason before the instrument closed.
             if (thread := self._thread) is not None:
                 thread.join(_HANG_UP_S)
             self._lose(f'connection lost ({error})')
@@ -306,10 +305,10 @@ class TrackerLink:
             if isinstance(event, Reply) and event.command is exchange.command:
                 self._check(event.status, exchange.what)
                 return event.values
-            self._set_aside(event, exchange)
+            self._count_unexpected(event, exchange)
 
     def _next(self, exchange: _Exchange) -> Reply | ErrorReport | Measurement:
-        """Wait for the next packet that may belong to the exchange."""
+        """Next packet that may belong to the exchange."""
         with self._news:
             while not self._inbox:
                 if self._lost:
@@ -321,12 +320,17 @@ class TrackerLink:
                 return self._inbox.popleft()
         raise self._late_error(exchange)
 
-    def _set_aside(self, event: Reply | ErrorReport | Measurement, exchange: _Exchange) -> None:
-        """Drop and count a packet that the exchange has no use for; raise if it is its error."""
+    def _count_unexpected(
+        self, event: Reply | ErrorReport | Measurement, exchange: _Exchange
+    ) -> None:
+        """Count and drop a packet that does not belong to the exchange.
+
+        Raise if it is its error.
+        """
         if isinstance(event, ErrorReport) and event.command in (exchange.command, Command.UNKNOWN):
             self._check(event.status or Status.NO_STATIONARY_RESULT, exchange.what)
         self.count('unexpected_packets')
-        # An instrument that sends without end would otherwise block this thread for ever.
+        # An instrument that never stops sending would otherwise block this thread for ever.
         if exchange.is_late():
             raise self._late_error(exchange)
 
@@ -356,7 +360,7 @@ class TrackerLink:
             self._news.notify_all()
 
     def _read(self, connection: socket.socket) -> None:
-        """Read until the connection ends; the body of the thread."""
+        """Read until the connection ends; the function of the thread."""
         reader = PacketReader('client')
         self._last_report = Status.ALL_OK
         reason = ''
@@ -371,7 +375,7 @@ class TrackerLink:
         self._lose(reason)
 
     def _drain(self, reader: PacketReader) -> str:
-        """Handle every complete packet; return why the connection ended, or ''."""
+        """Handle every complete packet; reason why the connection ended, or ''."""
         while True:
             try:
                 event = reader.next_event()
@@ -403,7 +407,7 @@ class TrackerLink:
 
 
 _SLEW_S = 15.0
-"""Time-out of turning to a position, s: half a turn of a slow head."""
+"""Time-out of a turn to a position, s: half a turn of a slow head."""
 _RETRY_S = 0.5
 _WARM_UP_RETRY_S = 2.0
 
@@ -420,16 +424,16 @@ _STATUS_OF_READINESS: dict[Value, TrackerStatus] = {
 
 
 class LaserTrackerClient:
-    """A laser tracker behind emScon over TCP.
+    """Client of a laser tracker with emScon over TCP.
 
-    Every method raises `LaserTrackerError` (a `DeviceError`) when the instrument refuses, is busy,
+    Every method raises `LaserTrackerError` (a `DeviceError`) if the instrument refuses, is busy,
     cannot be reached or does not answer; its `status` distinguishes a refusal from a lost
-    connection. One command is under way at a time: a second one, from another thread, is refused
-    as busy. After a lost connection `connect` and `initialise` begin anew.
+    connection. One command is executed at a time: a second one, from another thread, is refused as
+    busy. After a lost connection `connect` and `initialise` begin again.
 
     ``host, port``: address of the instrument; emScon listens on 700; ``now, sleep``: clock and
-    waiting, s; give simulated ones where time runs faster. A time-out also needs two seconds of
-    wall time (or its own length, if shorter) to pass.
+    waiting, s; simulated ones if time runs faster. A time-out also needs two seconds of wall time
+    (or its own length, if shorter) to pass.
     """
 
     def __init__(
@@ -469,31 +473,31 @@ class LaserTrackerClient:
 
     @property
     def name(self) -> str:
-        """The instrument as messages call it."""
+        """Name of the instrument in messages."""
         return self._link.name
 
     @property
     def connected(self) -> bool:
-        """Whether the connection stands, as far as this end can determine."""
+        """Whether the connection is open, as far as this end can determine."""
         return self._link.connected
 
     @property
     def status(self) -> TrackerStatus:
-        """What the instrument last reported; `request_status` brings it up to date."""
+        """Last reported status of the instrument; `request_status` updates it."""
         return self._status if self.connected else TrackerStatus.DISCONNECTED
 
     @property
     def counts(self) -> Counter[str]:
-        """How often each thing happened, a copy.
+        """Numbers of events, a copy.
 
         ``connections``, ``measurements``, ``measurements_failed``, ``searches``,
-        ``searches_failed``, ``beam_breaks`` (it lost a locked reflector), ``bad_packets``,
+        ``searches_failed``, ``beam_breaks`` (losses of a locked reflector), ``bad_packets``,
         ``unknown_packets``, ``unexpected_packets``.
         """
         return self._link.counts.copy()
 
     def connect(self) -> None:
-        """Open the connection; nothing happens where it is open."""
+        """Open the connection, unless it is open."""
         self._settings_checked = False
         self._link.open(self.settings.connect_timeout_s)
         try:
@@ -503,18 +507,18 @@ class LaserTrackerClient:
             raise
 
     def close(self) -> None:
-        """Close the connection; a command under way in another thread fails."""
+        """Close the connection; a command of another thread fails."""
         self._link.close()
 
     def request_status(self) -> TrackerStatus:
-        """Request the status of the instrument."""
+        """Status of the instrument, requested now."""
         (readiness,) = self._ask(Command.GET_TRACKER_STATUS, what='status')
         # A number that is no `Readiness` must not permit a measurement.
         self._status = _STATUS_OF_READINESS.get(readiness, TrackerStatus.NOT_READY)
         return self._status
 
     def initialise(self) -> None:
-        """Initialise the instrument unless it is, and set everything a reading depends on.
+        """Initialise the instrument unless it is, and set everything that a reading depends on.
 
         Waits for the end of the warm-up. An instrument that is initialised already keeps its lock.
         """
@@ -533,7 +537,7 @@ class LaserTrackerClient:
         self.request_status()
 
     def set_search_radius(self, radius_m: float) -> None:
-        """Set how far (m) about the given place, or where it points, the instrument searches."""
+        """Set the radius of a search (m) about the given position or the present direction."""
         self.settings = replace(self.settings, search_radius_m=radius_m)
         self._set_search()
 
@@ -542,7 +546,7 @@ class LaserTrackerClient:
         self._ask(Command.SET_SEARCH, s.search_radius_m, round(s.search_timeout_s * 1e3))
 
     def find_reflector(self) -> None:
-        """Search about where the tracker points, as far as it read last or 3 m, and lock."""
+        """Search in the present direction, at the last measured distance or 3 m, and lock."""
         distance = self._distance_m or 3.0
         self._search(Command.FIND_REFLECTOR, distance, what='search for the reflector')
 
@@ -557,15 +561,14 @@ class LaserTrackerClient:
     ) -> int:
         """Lock the reflector if the beam is broken.
 
-        A busy instrument is waited for. Each attempt goes to the expected position, or, without
-        one, searches about the place the tracker points to. The lock may hold any reflector within
-        the search radius: compare the reading with what is expected.
+        The number of searches is returned, 0 if it was locked.
 
-        ``expected_position``: where the reflector should be, in the tracker's frame, m, (3,);
-        ``attempts``: how many searches may be made.
-        Returns searches made; 0 where the reflector was locked.
-        Raises LaserTrackerError: if the last attempt found nothing either (its status is that of
-        the search), or the connection is lost (at once; no status).
+        A busy instrument is waited for. Each attempt goes to the expected position, or, without
+        one, searches in the present direction. The locked reflector may be any within the search
+        radius: compare the reading with the expectation. ``expected_position``: in the tracker's
+        frame, m, (3,); ``attempts``: largest number of searches. Raises LaserTrackerError if the
+        last search failed too (with its status), or the connection is lost (at once; without a
+        status).
         """
         expected = None if expected_position is None else self._point(expected_position)
         failure: LaserTrackerError | None = None
@@ -585,8 +588,8 @@ class LaserTrackerClient:
     def measure(self, timeout_s: float | None = None) -> MarkerReading:
         """Measure the locked reflector once.
 
-        ``timeout_s``: None for the integration time and two reply time-outs.
-        Raises LaserTrackerError: `Status.MEASUREMENT_STATUS_NOT_READY` without a lock,
+        ``timeout_s``: None for the integration time and two reply time-outs. Raises
+        LaserTrackerError: `Status.MEASUREMENT_STATUS_NOT_READY` without a lock,
         `Status.SENSOR_NOT_STABLE` for a moving target, `Status.SERVER_BUSY`; or the result is not
         usable.
         """
@@ -602,7 +605,7 @@ class LaserTrackerClient:
                     f'{FARTHEST_M:g} m; measure again',
                     Status.NO_STATIONARY_RESULT,
                 )
-            # A change of the units or the frame meanwhile has changed the numbers.
+            # A change of units or frame during the measurement makes the numbers invalid.
             if not self._settings_checked:
                 self._check_settings()
         except LaserTrackerError:
@@ -621,12 +624,12 @@ class LaserTrackerClient:
     def _initialise(self) -> None:
         end = self._now() + self.settings.initialise_timeout_s
         while True:
-            left = end - self._now()
+            remaining = end - self._now()
             try:
-                self._ask(Command.INITIALIZE, what='initialisation', timeout_s=left)
+                self._ask(Command.INITIALIZE, what='initialisation', timeout_s=remaining)
                 return
             except LaserTrackerError as error:
-                if error.status != Status.ADM_START_UP_BUSY or left < _WARM_UP_RETRY_S:
+                if error.status != Status.ADM_START_UP_BUSY or remaining < _WARM_UP_RETRY_S:
                     raise
             self._sleep(_WARM_UP_RETRY_S)
 
@@ -645,7 +648,7 @@ class LaserTrackerClient:
             raise
 
     def _try_search(self, expected: FloatArray | None) -> LaserTrackerError | None:
-        """Search once; return the instrument's refusal, raise where the connection is lost."""
+        """Search once; the instrument's refusal is returned, a lost connection raised."""
         try:
             if expected is None:
                 self.find_reflector()
@@ -671,11 +674,11 @@ class LaserTrackerClient:
         return status
 
     def _check_settings(self) -> None:
-        """Read back what a reading depends on.
+        """Read back the settings that a reading depends on.
 
-        Raises LaserTrackerError: if it is not as we set it.
+        Raises LaserTrackerError if they differ.
         """
-        # Set first: a change that is reported during the check makes it count for nothing.
+        # Set before the check: a change reported during the check makes it invalid.
         self._settings_checked = True
         for _, command, expected, words in SET_FOR_READINGS:
             if self._ask(command) != expected:
@@ -687,7 +690,7 @@ class LaserTrackerClient:
                 )
 
     def _changed(self, change: int) -> None:
-        """Take note of a status change; runs in the reading thread."""
+        """Record a status change; called in the reading thread."""
         if change in CHANGES_OF_READINGS:
             self._settings_checked = False
         status = _STATUS_OF_CHANGE.get(change)

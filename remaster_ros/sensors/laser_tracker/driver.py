@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A laser tracker as the sensor of a node: one ADM measurement on request, the reflector kept.
+"""Laser tracker as the sensor of a node: one ADM measurement on request.
 
-The reflector is found again when the beam has broken. Once the tracker is registered, the search
-begins where the reflector should be and is narrow. A tracker measures one reflector at a time: of
-several it is turned to one after another while the arm stands.
+The reflector stays locked, and is searched again when the beam has broken. Once the tracker is
+registered, the search begins at the expected position and is narrow. A tracker measures one
+reflector at a time: it turns to several reflectors one after another while the arm stands still.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class Parameters(LaserTrackerSettings, SensorParameters):
 
 
 class LaserTrackerDriver(TriggeredDriver):
-    """See the module's text."""
+    """Driver of a laser tracker, see the module's docstring."""
 
     parameters_type = Parameters
     device = 'laser tracker'
@@ -63,19 +63,19 @@ class LaserTrackerDriver(TriggeredDriver):
             self.p.host, self.p.port, settings=settings, now=clock.now, sleep=clock.sleep
         )
         self._narrow = False
-        # Which reflector the beam is on; None where that is not known.
+        # Name of the reflector that the beam is locked on; None if unknown.
         self._on: str | None = None
-        # Those that were not found last time: they are not worth several searches any more.
+        # Reflectors that were not found the last time: one search is enough for these.
         self._missed: set[str] = set()
         self._temperature_c: float | None = None
 
     @property
     def connected(self) -> bool:
-        """Whether the connection stands."""
+        """Whether the connection is open."""
         return self.tracker.connected
 
     def open(self) -> None:
-        """Connect and initialise, which takes as long as the instrument warms up."""
+        """Connect and initialise, with the wait for the instrument's warm-up."""
         self._on = None
         self.tracker.connect()
         self.phase = 'initialising'
@@ -86,7 +86,7 @@ class LaserTrackerDriver(TriggeredDriver):
         self.tracker.close()
 
     def prepare(self, expected: FloatArray | None) -> None:
-        """Search once where the beam is broken."""
+        """Search once if the beam is broken."""
         if self.tracker.status is not TrackerStatus.READY:
             before, self._on = self._on, None
             searches = self._lock(expected)
@@ -94,7 +94,10 @@ class LaserTrackerDriver(TriggeredDriver):
             self._on = found if searches else before
 
     def turn_to(self, marker: str, expected: FloatArray) -> None:
-        """Search where the marker should be, unless the beam is on it; see `TriggeredDriver`."""
+        """Search at the expected position, unless the beam is on the marker.
+
+        See `TriggeredDriver`.
+        """
         if marker == self._on:
             return
         self._on = None
@@ -118,13 +121,13 @@ class LaserTrackerDriver(TriggeredDriver):
             self._narrow = True
 
     def _lock(self, expected: FloatArray | None) -> int:
-        """Lock the reflector if the beam is broken; return how many searches it took."""
+        """Lock the reflector if the beam is broken; number of searches."""
         if expected is not None:
             self._search_narrowly()
         return self.tracker.ensure_locked(expected, attempts=1)
 
     def measure(self, expected: FloatArray | None) -> MarkerReading:
-        """Measure the reflector that is where it should be; see `TriggeredDriver.measure`."""
+        """Measure the reflector at the expected position; see `TriggeredDriver.measure`."""
         failure: DeviceError | None = None
         for _ in range(self.p.attempts):
             try:
@@ -147,7 +150,7 @@ class LaserTrackerDriver(TriggeredDriver):
         raise failure
 
     def state(self) -> SensorState:
-        """Return the lock, what has been counted, and the last temperature."""
+        """Lock, counts, and last temperature."""
         values: dict[str, Any] = {'lock': self.tracker.status.value, **self.tracker.counts}
         if self._temperature_c is not None:
             values['temperature_c'] = self._temperature_c

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The Leica emScon subset that is used here: bytes to events and back, both directions, no I/O.
+"""Leica emScon subset of this package: bytes to events and back, both directions, without I/O.
 
 Every packet is ``int32 size`` (of the whole packet), ``uint32 type`` and a body, little-endian and
-packed. Commands and replies share type 0, so a reader is made for one side.
+packed. Commands and replies have type 0, so a reader is made for one side.
 """
 
 from __future__ import annotations
@@ -21,27 +21,28 @@ from typing import Any, Literal
 
 
 class DataType(IntEnum):
-    """What a packet is."""
+    """Type of a packet."""
 
     COMMAND = 0
-    """A command, or the reply to one."""
+    """Command or reply."""
     ERROR = 1
     SINGLE_RESULT = 2
     STATUS_CHANGE = 8
 
 
 class Command(IntEnum):
-    """A command with the layouts of its request and its reply.
+    """Command with the layouts of its request and its reply.
 
-    A member is ``code, request, reply``: `struct` formats (little-endian, packed) of what follows
-    the command in a request, and the status in a reply that succeeded. Truth values are ``i``.
+    A member is ``code, request, reply``: `struct` formats (little-endian, packed) of the values
+    after the command in a request, and after the status in a successful reply. Truth values are
+    ``i``.
     """
 
     request: Struct
     reply: Struct
 
     def __new__(cls, code: int, request: str = '', reply: str = '') -> Command:
-        """Make a member from its code and its two layouts."""
+        """Member of a code and two layouts."""
         member = int.__new__(cls, code)
         member._value_ = code
         member.request, member.reply = Struct('<' + request), Struct('<' + reply)
@@ -127,7 +128,7 @@ class Command(IntEnum):
 
 
 class Status(IntEnum):
-    """Result of a command (those that our commands can meet)."""
+    """Result of a command (values that our commands can return)."""
 
     ALL_OK = 0
     SERVER_BUSY = 1
@@ -208,7 +209,7 @@ _MEANING: dict[int, tuple[str, str]] = {
 
 
 def describe_status(status: int) -> str:
-    """Return the status as name, number, meaning and remedy, for one line of text."""
+    """Status as name, number, meaning and remedy, for one line of text."""
     try:
         name = Status(status).name.replace('_', ' ').lower()
     except ValueError:
@@ -220,7 +221,7 @@ def describe_status(status: int) -> str:
 
 
 class Change(IntEnum):
-    """What a status change reports (those that matter to us)."""
+    """Content of a status change (values that matter here)."""
 
     ENVIRONMENT = 2
     REFRACTION = 3
@@ -251,7 +252,7 @@ class Readiness(IntEnum):
 
 
 METRE, RADIAN, CELSIUS, MILLIBAR, RELATIVE_HUMIDITY = 0, 0, 0, 0, 0
-"""The units that are set, in the order of `Command.SET_UNITS`; 1 mbar = 1 hPa."""
+"""Units that the client sets, in the order of `Command.SET_UNITS`; 1 mbar = 1 hPa."""
 RIGHT_HANDED_CARTESIAN = 0
 STATIONARY = 0
 STANDARD_STATISTICS = 0
@@ -261,7 +262,7 @@ TRACKER_INITIALIZED = 5
 
 MIN_PACKET_SIZE = 12
 MAX_PACKET_SIZE = 4096
-"""Bytes; the largest packet known has 672. A larger size is damage, not data."""
+"""Largest size of a packet, bytes; the largest known has 672. A larger size means damaged data."""
 
 _HEADER = Struct('<iI')
 _CODE = Struct('<I')
@@ -274,11 +275,11 @@ Triple = tuple[float, float, float]
 
 
 class ProtocolError(Exception):
-    """The peer sent bytes that are not emScon; the text states what is wrong."""
+    """Bytes from the peer that are not emScon; the text states the error."""
 
 
 class NeedData(Enum):
-    """What `PacketReader.next_event` returns while the next packet is not complete."""
+    """Value of `PacketReader.next_event` while the next packet is not complete."""
 
     NEED_DATA = 'need data'
 
@@ -288,7 +289,7 @@ NEED_DATA = NeedData.NEED_DATA
 
 @dataclass(frozen=True)
 class Request:
-    """A command to the instrument with the values of its layout."""
+    """Command to the instrument with the values of its layout."""
 
     command: Command
     values: tuple[Value, ...] = ()
@@ -296,7 +297,7 @@ class Request:
 
 @dataclass(frozen=True)
 class Reply:
-    """The answer to a command; one that failed (`status` not 0) carries no values."""
+    """Answer to a command; a failed one (`status` not 0) has no values."""
 
     command: Command
     status: int = 0
@@ -305,7 +306,7 @@ class Reply:
 
 @dataclass(frozen=True)
 class ErrorReport:
-    """An error that comes later than the reply, or without a command."""
+    """Error that is reported after the reply, or without a command."""
 
     command: int
     status: int
@@ -313,7 +314,7 @@ class ErrorReport:
 
 @dataclass(frozen=True)
 class StatusChange:
-    """The instrument reports that something changed: a `Change`, or an unknown number."""
+    """Change reported by the instrument: a `Change`, or an unknown number."""
 
     change: int
 
@@ -340,7 +341,7 @@ class Measurement:
 
 @dataclass(frozen=True)
 class UnknownPacket:
-    """A whole packet of an unknown type or command; to be counted and dropped."""
+    """Whole packet of an unknown type or command, to be counted and dropped."""
 
     type: int
     body: bytes
@@ -348,7 +349,7 @@ class UnknownPacket:
 
 @dataclass(frozen=True)
 class ConnectionClosed:
-    """The peer closed the connection between two packets."""
+    """Close of the connection by the peer between two packets."""
 
 
 Event = (
@@ -357,15 +358,11 @@ Event = (
 
 
 def encode(event: Event) -> bytes:
-    """Return the packet of an event.
+    """Packet of an event.
 
-    A failed reply is filled with zeros to the size of one that succeeded, because clients unpack
-    the whole layout before they look at the status.
-
-    Raises
-    ------
-    ValueError
-        If the values do not fit the layout, or the event is no packet.
+    A failed reply is filled with zeros to the size of a successful one, because clients unpack the
+    whole layout before they check the status. Raises ValueError if the values do not fit the
+    layout, or the event is no packet.
     """
     try:
         type_, body = _type_and_body(event)
@@ -395,18 +392,18 @@ def _type_and_body(event: Event) -> tuple[int, bytes]:
 
 
 class PacketReader:
-    """Cuts a stream of bytes into events.
+    """Reader that cuts a stream of bytes into events.
 
-    Feed it with `receive_data` and call `next_event` until it returns `NEED_DATA`; memory is then
-    bounded by one packet and one read. ``side``: ``client`` reads what an instrument sends,
-    ``server`` what a client sends.
+    Feed bytes with `receive_data` and call `next_event` until it returns `NEED_DATA`; memory is
+    then bounded by one packet and one read. ``side``: ``client`` reads packets of an instrument,
+    ``server`` packets of a client.
     """
 
     def __init__(self, side: Literal['client', 'server']) -> None:
         self._decode_command = _decode_reply if side == 'client' else _decode_request
         self._buffer = bytearray()
         self._at_end = False
-        # The boundaries of packets are lost; the connection is of no further use.
+        # True once the boundaries of packets are lost: the connection cannot be used further.
         self.broken = False
 
     @property
@@ -415,21 +412,18 @@ class PacketReader:
         return bytes(self._buffer)
 
     def receive_data(self, data: bytes) -> None:
-        """Take bytes from the peer; empty ones mean that it closed the connection."""
+        """Add bytes from the peer; empty bytes mean that it closed the connection."""
         if data:
             self._buffer += data
         else:
             self._at_end = True
 
     def next_event(self) -> Event | NeedData:
-        """Return the next event, or `NEED_DATA`.
+        """Next event, or `NEED_DATA`.
 
-        Raises
-        ------
-        ProtocolError
-            If the packet does not fit its layout; it is dropped, and the next call goes on after
-            it. If the size of a packet is impossible, or the peer closed in the middle of one,
-            `broken` is set and every further call raises.
+        Raises ProtocolError if the packet does not fit its layout; it is dropped, and the next
+        call continues after it. If the size of a packet is impossible, or the peer closed within a
+        packet, `broken` is set and every further call raises.
         """
         buffer = self._buffer
         if len(buffer) < _HEADER.size:
@@ -506,7 +500,7 @@ def _decode_result(body: bytes) -> Measurement:
 
 
 def _flat(result: Measurement) -> Iterator[float]:
-    """Undo `_decode_result`: three numbers for what has one per coordinate."""
+    """Inverse of `_decode_result`: three numbers for a field with one number per coordinate."""
     for field in fields(result):
         value = getattr(result, field.name)
         yield from value if field.name in _TRIPLES else (value,)

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An OptiTrack client: sockets and one thread around the NatNet decoder; no ROS.
+"""OptiTrack client: sockets and one thread around the NatNet decoder, without ROS.
 
-Nothing that arrives can end the thread: what is foreign, damaged, late or not measured is counted
-with its reason and dropped. CONNECT is sent again whenever the stream falls silent
-or cannot be decoded, so that a restarted server, or one of another version, is followed.
+No datagram can end the thread: a foreign, damaged, late or not measured one is counted with its
+reason and dropped. CONNECT is sent again whenever the stream stops or cannot be decoded, so that
+the client follows a restarted server, or one of another version.
 """
 
 from __future__ import annotations
@@ -39,16 +39,16 @@ RETRY_S = 0.5
 KEEPALIVE_S = 1.0
 POLL_S = 0.1
 DATAGRAMS_PER_TURN = 1024
-"""Then the thread looks at its timers again, however fast the datagrams come."""
+"""Largest number of datagrams between two checks of the thread's timers."""
 DIGEST_S = 0.005
-"""So long a turn decodes and hands on; then the sockets are emptied again."""
+"""Longest time of decoding, s, before the sockets are emptied again."""
 MAX_BACKLOG_BYTES = 1 << 26
-"""What may wait to be decoded: twenty seconds of 1 kHz frames with 50 markers."""
+"""Largest backlog of datagrams: twenty seconds of 1 kHz frames with 50 markers."""
 MALFORMED_IN_A_ROW = 3
-"""Then the version has probably changed, and CONNECT is sent again."""
+"""Malformed datagrams in a row from which the version has probably changed; then CONNECT again."""
 NEGOTIATION_TRIES = 4
 MAX_DATAGRAM_BYTES = 1 << 16
-# What servers and other clients of a multicast group tell each other, and what has no place here.
+# Known messages, and those between servers and other clients of a multicast group.
 _KNOWN = frozenset(map(int, MessageId))
 _OF_OTHERS = frozenset(
     {MessageId.KEEPALIVE, MessageId.DISCOVERY, MessageId.ECHOREQUEST, MessageId.CONNECT}
@@ -57,7 +57,7 @@ _FRAME_ID = MessageId.FRAMEOFDATA.to_bytes(2, 'little')
 
 
 class NatNetClient(MarkerFollower):
-    """Follows the markers by NatNet 2.6 to 4.3, multicast or unicast; see `MarkerFollower`."""
+    """Client for NatNet 2.6 to 4.3, multicast or unicast; see `MarkerFollower`."""
 
     def __init__(
         self,
@@ -73,7 +73,7 @@ class NatNetClient(MarkerFollower):
         self._negotiation_tries = 0
         self._malformed_in_a_row = 0
         self._bitstream_changed = False
-        # Received and not yet decoded: datagram, arrival, sender, whether to the data socket.
+        # Datagrams not yet decoded: bytes, arrival, sender, whether received by the data socket.
         self._backlog: deque[tuple[bytes, float, Source, bool]] = deque()
         self._backlog_bytes = 0
         self._due = dict.fromkeys(('connect', 'model', 'keepalive', 'bitstream'), 0.0)
@@ -109,21 +109,21 @@ class NatNetClient(MarkerFollower):
                     selector.register(opened, selectors.EVENT_READ)
             while not self._stopping.is_set():
                 self._greet = self._release_silent_source() or self._greet
-                self._keep_in_touch(time.monotonic())
+                self._send_due_requests(time.monotonic())
                 for key, _ in selector.select(0.0 if self._backlog else POLL_S):
                     self._receive(key.fileobj)  # type: ignore[arg-type]
                 self._digest_backlog()
 
-    def _keep_in_touch(self, now: float) -> None:
+    def _send_due_requests(self, now: float) -> None:
         """Send the requests that are due."""
-        lost_touch = (
+        silent = (
             self._status.server is None
             or self._frame_at is None
             or now - self._frame_at > self._settings.silence_s
             or self._greet
         )
         negotiating = self._status.server is not None and self._status.version is None
-        if lost_touch and not negotiating and self._is_due('connect', now, RETRY_S):
+        if silent and not negotiating and self._is_due('connect', now, RETRY_S):
             self._send(natnet.encode_connect_request('remaster_ros'))
             if self._status.server is None:
                 self._note_closed_port()
@@ -137,7 +137,7 @@ class NatNetClient(MarkerFollower):
             self._send(natnet.join_datagram(MessageId.REQUEST_MODELDEF))
 
     def _is_unicast(self, server: ServerInfo) -> bool:
-        """Return whether the server streams unicast, by its own answer where it has one."""
+        """Whether the server streams unicast, by its own answer if it has one."""
         if server.connection is None:
             return self._settings.transport == 'unicast'
         return not server.connection.is_multicast
@@ -160,8 +160,8 @@ class NatNetClient(MarkerFollower):
     def _receive(self, source: socket.socket) -> None:
         """Empty a socket into the backlog.
 
-        The buffer of a socket is small; a thread that waited long for a processor must not lose
-        more while it decodes what has come.
+        The buffer of a socket is small: a thread that waited long for a processor must not lose
+        more while it decodes the received datagrams.
         """
         for _ in range(DATAGRAMS_PER_TURN):
             try:
@@ -193,22 +193,22 @@ class NatNetClient(MarkerFollower):
     def _digest(
         self, datagram: bytes, received_s: float, sender: Source, *, from_data_socket: bool
     ) -> None:
-        """Decode one datagram and act on it.
+        """Decode one datagram and process it.
 
-        Frames count from one source, answers from the command port alone: another program on
-        that computer could send another version or another marker.
+        Frames count from one source, answers from the command port only: another program on the
+        server's computer could send another version or another marker.
         """
         looks_like_frame = datagram[:2] == _FRAME_ID
-        answers = not from_data_socket and sender[1] == self._settings.command_port
-        if not (answers and not looks_like_frame) and self._is_refused(sender):
+        is_answer = not from_data_socket and sender[1] == self._settings.command_port
+        if not (is_answer and not looks_like_frame) and self._is_refused(sender):
             return
-        if not (answers or looks_like_frame or from_data_socket):
+        if not (is_answer or looks_like_frame or from_data_socket):
             self._gate.drop(Dropped.FOREIGN)
             return
         try:
             message_id, _payload = natnet.split_datagram(datagram)
             is_frame = message_id == MessageId.FRAMEOFDATA
-            if _is_of_no_use(message_id, from_data_socket):
+            if _is_of_others(message_id, from_data_socket):
                 return
             if from_data_socket and not is_frame:
                 raise ProtocolError(f'message {message_id} on the data port')
@@ -241,7 +241,7 @@ class NatNetClient(MarkerFollower):
             self._hand_on(sample)
 
     def _take_answer(self, message: Message) -> None:
-        """Act on what came back on the command channel."""
+        """Process an answer on the command channel."""
         if isinstance(message, ServerInfo):
             self._take_server(message)
         elif isinstance(message, ModelDefinition):
@@ -263,11 +263,11 @@ class NatNetClient(MarkerFollower):
         self._greet = False
         self._model_wanted = True
         self._negotiation_tries = 0
-        # A server that was greeted again may have forgotten what was negotiated.
+        # A server that was greeted again may have forgotten the negotiated version.
         self._status.version = None if self._settings.wanted_version else server.natnet_version
 
     def _negotiate(self, server: ServerInfo) -> None:
-        """Request the wanted bitstream; where that fails, the server's own is read."""
+        """Request the wanted bitstream; after several refusals the server's own is read."""
         wanted = self._settings.wanted_version
         if wanted is None or self._negotiation_tries >= NEGOTIATION_TRIES:
             self._status.version = server.natnet_version
@@ -276,7 +276,7 @@ class NatNetClient(MarkerFollower):
         self._send(natnet.encode_command_request(f'Bitstream,{natnet.format_version(wanted)}'))
 
     def _take_bitstream(self, answer: natnet.Response | None) -> None:
-        """Take the answer to the request of `_negotiate`; None where it was refused."""
+        """Process the answer to the request of `_negotiate`; None if it was refused."""
         if self._status.server is None or self._status.version is not None:
             return
         self._status.version = self._status.server.natnet_version
@@ -290,11 +290,11 @@ class NatNetClient(MarkerFollower):
             self._status.version = self._settings.wanted_version
 
 
-def _is_of_no_use(message_id: int, from_data_socket: bool) -> bool:
-    """Return whether a message is sound NatNet that a client does without: it is not malformed.
+def _is_of_others(message_id: int, from_data_socket: bool) -> bool:
+    """Whether a message is valid NatNet that a client does not need, and therefore not malformed.
 
-    On the data port, where a multicast server also sends its notes and answers to others, that is
-    all but frames.
+    On the data port, to which a multicast server also sends its notes and answers to others, these
+    are all messages but frames.
     """
     if from_data_socket:
         return message_id in _KNOWN and message_id != MessageId.FRAMEOFDATA

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An OptiTrack bar as the sensor of a node: the measured positions of the markers of a body.
+"""OptiTrack bar as the sensor of a node: measured positions of the markers of a rigid body.
 
 Occluded, model-filled and otherwise unmeasured frames never become a reading; they are counted
-with their reason in the state, which also states what is wrong when nothing comes.
+with their reason in the state, which also states the fault if no readings come.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from remaster_ros.sensors.optitrack.settings import NatNetSettings
 from remaster_ros.types import MarkerReading
 
 WAIT_S = 0.05
-"""A simulated world waits for this node, and goes on by 0.15 s and more meanwhile."""
+"""Longest wait for a reading, s: a simulated world waits for this node, at most 0.15 s ahead."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class Parameters(NatNetSettings, SensorParameters):
 
 
 class OptiTrackDriver(StreamDriver):
-    """See the module's text. The client begins at once: it greets the server until it answers."""
+    """Driver of an OptiTrack bar; its client greets the server from the start until it answers."""
 
     parameters_type = Parameters
     device = 'OptiTrack'
@@ -66,7 +66,7 @@ class OptiTrackDriver(StreamDriver):
         )
         self._samples: queue.SimpleQueue[MarkerSample] = queue.SimpleQueue()
         self._mapping = ClockMapping(simulated=clock.simulated)
-        # The markers of a frame have one time of capture.
+        # Time of capture of the last frame, common to its markers.
         self._frame: tuple[int, float, float] | None = None
         self._captured_s = 0.0
         by_package = p.client == 'natnetclient'
@@ -79,14 +79,14 @@ class OptiTrackDriver(StreamDriver):
         """Do nothing: the client of the constructor keeps trying by itself."""
 
     def read(self) -> MarkerReading | None:
-        """Return the next measured position; see `StreamDriver.read`."""
+        """Next measured position; see `StreamDriver.read`."""
         try:
             sample = self._samples.get(timeout=WAIT_S)
         except queue.Empty:
             return None
         self.received_s = sample.received_s
         if sample.received_s <= 0.0:
-            # By a simulated clock that has not begun, no time of capture can be given.
+            # A simulated clock that has not begun gives no time of capture.
             return None
         frame = (sample.frame_number, sample.timestamp_s, sample.received_s)
         if frame != self._frame:
@@ -97,7 +97,7 @@ class OptiTrackDriver(StreamDriver):
         return MarkerReading(self._captured_s, sample.position, marker=sample.marker)
 
     def state(self) -> SensorState:
-        """Return what the frames, and those that do not come, show."""
+        """State by the received and the missing frames."""
         status = self.client.status()
         diagnosis = self.client.diagnosis()
         values = {

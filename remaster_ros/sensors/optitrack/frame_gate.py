@@ -36,45 +36,44 @@ from remaster_ros.types import FARTHEST_M, FloatArray
 
 
 Source = tuple[str, int]
-"""An address and a port."""
+"""Address and port."""
 
 PROBATION_S = 0.2
-"""A source must have been the only one for so long: six frames at 30 Hz."""
+"""Time, s, for which a source must have been the only one: six frames at 30 Hz."""
 PROBATION_FRAMES = 3
 REFUSED_FOR_S = 30.0
-"""A source that sent beside the believed one is refused until it was silent for so long."""
+"""Silence, s, until which a source is refused that sent at the same time as the believed one."""
 REMEMBERED = 64
-"""Sources; a forger with a new port for every frame must not fill the memory."""
+"""Largest number of sources: a forger with a new port for every frame must not fill the memory."""
 
 
 class SourceVerdict(Enum):
-    """What to do with a frame."""
+    """Verdict on the source of a frame."""
 
     BELIEVED = 'believed'
     PROBATION = 'probation'
-    """No source has the lock yet; the frame counts towards it and gives no reading."""
+    """No source has the lock yet; the frame counts towards a lock and gives no reading."""
     FOREIGN = 'foreign'
 
 
 @dataclass
-class _Other:
-    """A source without the lock: when it first and last sent, s, and how many frames."""
+class _OtherSource:
+    """Source without the lock: times of its first and last frame, s, and number of frames."""
 
     first_s: float
     last_s: float
     frames: int = 1
-    beside: bool = False
-    """It sent while another source had the lock, so it is not that one under a new port."""
+    simultaneous: bool = False
+    """Whether it sent while another source had the lock, so that it is not that source with a new
+    port."""
 
 
 class SourceLock:
-    """Decide whose frames are believed.
+    """Decision which source's frames are believed.
 
-    Times are of one monotonic clock, s.
-
-    ``silence_s``: A source that sent no whole frame for longer counts as silent.
-    Attributes: ``source``: the source with the lock; None while there is none; ``taken``: how
-    often the lock was given to another source than before.
+    Times are of one monotonic clock, s. ``silence_s``: longest time without a whole frame before a
+    source counts as silent. Attributes: ``source``: source with the lock, or None; ``taken``:
+    number of changes of the lock to another source.
     """
 
     def __init__(self, silence_s: float) -> None:
@@ -84,14 +83,14 @@ class SourceLock:
         self.taken = 0
         self._last_frame_s = 0.0
         self._answered = False
-        self._others: dict[Source, _Other] = {}
+        self._others: dict[Source, _OtherSource] = {}
 
     def answer(self) -> None:
-        """Note that the command channel has answered: frames from now on may get the lock."""
+        """Record an answer of the command channel: later frames may get the lock."""
         self._answered = True
 
     def release_if_silent(self, now_s: float) -> bool:
-        """Free the lock after a silence of its holder; return whether it was freed now."""
+        """Release the lock after a silence of its source; True if it was released now."""
         if self.source is None or now_s - self._last_frame_s <= self._silence_s:
             return False
         self.source = None
@@ -99,26 +98,26 @@ class SourceLock:
         return True
 
     def is_refused(self, source: Source, now_s: float) -> bool:
-        """Return whether nothing of this source counts, decoded or not; note that it sent."""
+        """Whether all datagrams of this source are ignored; records that it sent."""
         if source == self.source:
             return False
         if self.source is not None:
             self._note(source, now_s)
             return True
         other = self._others.get(source)
-        if other is None or not other.beside or now_s - other.last_s > REFUSED_FOR_S:
+        if other is None or not other.simultaneous or now_s - other.last_s > REFUSED_FOR_S:
             return False
         other.last_s = now_s
         return True
 
     def judge(self, source: Source, now_s: float) -> SourceVerdict:
-        """Decide on a whole frame, and give the lock where it is due."""
+        """Verdict on a whole frame; its source gets the lock if it is due."""
         if self.is_refused(source, now_s):
             return SourceVerdict.FOREIGN
         if source == self.source:
             self._last_frame_s = now_s
             for other in self._others.values():
-                other.beside = other.beside or now_s - other.first_s > PROBATION_S
+                other.simultaneous = other.simultaneous or now_s - other.first_s > PROBATION_S
             return SourceVerdict.BELIEVED
         if source == self._last:
             self.source, self._last_frame_s = source, now_s
@@ -136,15 +135,16 @@ class SourceLock:
         return SourceVerdict.BELIEVED
 
     def rivals(self, now_s: float) -> tuple[Source, ...]:
-        """Return the refused sources that sent lately, while or after another had the lock."""
+        """Refused sources that sent lately, while or after another had the lock."""
         return tuple(
             source
             for source, other in list(self._others.items())
-            if (self.source is not None or other.beside) and now_s - other.last_s <= REFUSED_FOR_S
+            if (self.source is not None or other.simultaneous)
+            and now_s - other.last_s <= REFUSED_FOR_S
         )
 
     def contestants(self, now_s: float) -> tuple[Source, ...]:
-        """Return the sources of which one could get the lock, if there are several; else none."""
+        """Sources of which one could get the lock, if there are several; else none."""
         candidates = self._candidates(now_s) if self.source is None else []
         return tuple(candidates) if len(candidates) > 1 else ()
 
@@ -152,18 +152,18 @@ class SourceLock:
         return [
             source
             for source, other in list(self._others.items())
-            if not other.beside and now_s - other.last_s <= self._silence_s
+            if not other.simultaneous and now_s - other.last_s <= self._silence_s
         ]
 
-    def _note(self, source: Source, now_s: float) -> _Other:
+    def _note(self, source: Source, now_s: float) -> _OtherSource:
         known = self._others.get(source)
-        patience_s = REFUSED_FOR_S if known is not None and known.beside else self._silence_s
+        patience_s = REFUSED_FOR_S if known is not None and known.simultaneous else self._silence_s
         if known is None or now_s - known.last_s > patience_s:
             self._others.pop(source, None)
             if len(self._others) >= REMEMBERED:
-                oldest = min(self._others.items(), key=lambda o: (o[1].beside, o[1].last_s))
+                oldest = min(self._others.items(), key=lambda o: (o[1].simultaneous, o[1].last_s))
                 del self._others[oldest[0]]
-            known = self._others[source] = _Other(now_s, now_s)
+            known = self._others[source] = _OtherSource(now_s, now_s)
         else:
             known.last_s = now_s
             known.frames += 1
@@ -171,34 +171,35 @@ class SourceLock:
 
 
 def describe(source: Source) -> str:
-    """Write a source as address:port."""
+    """Source as address:port."""
     return f'{source[0]}:{source[1]}'
 
 
 REORDER_WINDOW = 16
-"""A frame number further back than this is a restarted stream, not a late datagram."""
+"""Largest step back of a late frame's number; a larger step means a restarted stream."""
 MOST_LOST = 10_000_000
-"""A frame number further ahead, half a day of frames, is another stream's or damaged."""
+"""Largest step forward of the frame number, half a day of frames; a larger step means another
+stream or damage."""
 RESTART_S = 1.0
-"""A frame time further back than this is a restarted stream too."""
+"""Largest step back of the frame time, s; a larger step means a restarted stream too."""
 MAX_AGE_S = 10.0
-"""A reading that claims to be older when it is sent has stamps of another clock."""
+"""Largest age of a reading when it is sent, s; a larger age means stamps of another clock."""
 FROZEN_FRAMES = 10
-"""So many readings in a row that are the same to the last bit are no measurements."""
+"""Number of successive readings, identical to the last bit, that are no measurements."""
 JUMP_MARGIN_M = 0.005
-"""Far above any noise; what a marker may move between frames beyond `max_speed_m_s`."""
+"""Movement between frames allowed in addition to `max_speed_m_s`, m; far above any noise."""
 
 
 class Dropped(StrEnum):
-    """Why a datagram or a frame gave no reading."""
+    """Reason why a datagram or a frame gave no reading."""
 
     FOREIGN = 'foreign'
-    """It came from an address that is not the configured server's, or from a port of it that is
-    not the believed one (`frame_source`)."""
+    """Datagram from an address that is not the configured server's, or from another port of the
+    server than the believed one (`frame_source`)."""
     PROBATION = 'probation'
-    """Its source is not believed yet: it must be the only one for a moment."""
+    """Frame of a source that is not believed yet: it must be the only source for a moment."""
     OVERRUN = 'overrun'
-    """This computer cannot keep up: too much waits to be decoded."""
+    """Backlog too large: this computer cannot keep up."""
     MALFORMED = 'malformed'
     UNRESOLVED = 'unresolved'
     """The bitstream version or the marker's id is not known (yet)."""
@@ -215,30 +216,30 @@ class Dropped(StrEnum):
     OCCLUDED = 'occluded'
     MODEL_FILLED = 'model_filled'
     FROZEN = 'frozen'
-    """The same to the last bit in one frame after the other: no measurement."""
+    """Position identical to the last bit in successive frames: no measurement."""
     JUMP = 'jump'
-    """Further from the last reading than the marker could have moved."""
+    """Position further from the last reading than the marker could have moved."""
     IMPLAUSIBLE = 'implausible'
-    """Further away, or longer on its way, than any bar's reading can be."""
+    """Distance or age larger than any bar's reading can have."""
     DISAGREEMENT = 'disagreement'
-    """A third-party client read something else from the same datagram."""
+    """A third-party client has read another position from the same datagram."""
 
 
 @dataclass(frozen=True)
 class MarkerChoice:
-    """Which labelled marker is the calibration marker."""
+    """Choice of the labelled marker that is the calibration marker."""
 
     rigid_body: str = ''  # Name of the rigid body in Motive; '' for the only one
     member: int = 1  # Number of the marker within that body, from 1
     # Id on the wire, ``asset id << 16 | member``; overrides the two above
     marker_id: int | None = None
-    # A single sphere that belongs to no rigid body: take the only marker in view, and nothing
-    # while there are two. Overrides the three above.
+    # A single sphere without a rigid body: the only marker in view is used, and none while there
+    # are two. Overrides the three above.
     lone_marker: bool = False
     max_speed_m_s: float = 5.0  # A reading that implies a faster move is dropped
 
     def __post_init__(self) -> None:
-        """Refuse values that can never match."""
+        """Raises InputError for values that can never match."""
         if not 1 <= self.member < 1 << 16:
             raise InputError(f'member: {self.member} is not 1 to 65535 (counted from 1)')
         if not self.max_speed_m_s > 0:
@@ -247,7 +248,7 @@ class MarkerChoice:
 
 @dataclass(frozen=True, eq=False)
 class MarkerSample:
-    """A measured position of the calibration marker."""
+    """Measured position of the calibration marker."""
 
     frame_number: int
     timestamp_s: float  # Time of the frame on the server, s since the stream started
@@ -261,23 +262,23 @@ class MarkerSample:
 
 @dataclass(kw_only=True)
 class GateCounts:
-    """What a gate has let through and dropped."""
+    """Counts of accepted and dropped frames of a gate."""
 
     # Count by reason; every reason is a key from the start
     dropped: dict[Dropped, int] = field(default_factory=lambda: dict.fromkeys(Dropped, 0))
-    # Frames seen, readings let through
+    # Number of frames, and of accepted readings
     frames: int = 0
     accepted: int = 0
-    lost: int = 0  # Frame numbers that never came
-    restarts: int = 0  # How often the frame numbers began again
-    last_reason: Dropped | None = None  # Why the latest frame was dropped; None if it was accepted
+    lost: int = 0  # Number of missing frame numbers
+    restarts: int = 0  # Number of restarts of the frame numbers
+    last_reason: Dropped | None = None  # Reason of the last frame's drop; None if it was accepted
     marker_id: int | None = None  # Id on the wire; None while unknown, and for a lone marker
-    problem: str = ''  # Why the marker cannot be identified, with the remedy; '' if it can
+    problem: str = ''  # Reason why the marker cannot be identified, with the remedy; '' if it can
     labels: tuple[int, ...] = ()  # The first labels of the last frame
 
 
 class MarkerGate:
-    """Lets through the readings of one marker and counts everything else with its reason."""
+    """Gate for the readings of one marker; every other frame is counted with its reason."""
 
     def __init__(self, choice: MarkerChoice, counts: GateCounts) -> None:
         self._choice = choice
@@ -285,18 +286,18 @@ class MarkerGate:
         self._last_number: int | None = None
         self._last_timestamp = -math.inf
         self._last_reading: MarkerSample | None = None
-        # Whether the stream has begun again since that reading.
+        # Whether the stream was restarted since the last reading.
         self._restarted = False
         self._repeats = 0
         self.forget_assets()
 
     @property
     def resolved(self) -> bool:
-        """Whether a frame can be searched for the marker."""
+        """Whether the marker's id is known, so that frames can be searched for it."""
         return self._choice.lone_marker or self.counts.marker_id is not None
 
     def forget_assets(self) -> None:
-        """Drop what is known of the server's rigid bodies."""
+        """Discard the server's rigid bodies."""
         self.counts.marker_id = None if self._choice.lone_marker else self._choice.marker_id
         self.counts.problem = '' if self.resolved else 'the server has not named its rigid bodies'
 
@@ -322,27 +323,27 @@ class MarkerGate:
             )
 
     def drop(self, reason: Dropped) -> None:
-        """Count something dropped before it became a frame."""
+        """Count a datagram dropped before it became a frame."""
         self.counts.dropped[reason] += 1
 
     def pass_over(self, reason: Dropped) -> None:
-        """Count a whole frame that is not looked at; it is compared with no other."""
+        """Count a whole frame that is not examined and compared with no other."""
         self.counts.frames += 1
         self.counts.dropped[reason] += 1
         self.counts.last_reason = reason
 
     def begin_source(self) -> None:
-        """Compare the frames to come with none before: they are another source's."""
+        """Compare later frames with none before: they are of another source."""
         self._last_number = None
         self._last_timestamp = -math.inf
         self._last_reading = None
         self._repeats = 0
 
     def admit(self, frame: Frame, received_s: float, ticks_per_s: int) -> MarkerSample | None:
-        """Return the reading in a frame, or None and count why.
+        """Reading in a frame, or None with the reason counted.
 
-        ``frame``: as decoded; ``received_s``: when it arrived, s; ``ticks_per_s``: frequency of
-        the frame's stamps; 0 before NatNet 3.
+        ``frame``: decoded; ``received_s``: time of arrival, s; ``ticks_per_s``: frequency of the
+        frame's stamps; 0 before NatNet 3.
         """
         self.counts.frames += 1
         found = self._order(frame) or self._find(frame)
@@ -359,14 +360,14 @@ class MarkerGate:
         return reading
 
     def disown(self, reason: Dropped) -> None:
-        """Take back the last reading, which turned out not to be one."""
+        """Withdraw the last reading, with a reason."""
         self.counts.accepted -= 1
         self.counts.dropped[reason] += 1
         self.counts.last_reason = reason
         self._last_reading = None
 
     def _order(self, frame: Frame) -> Dropped | None:
-        """Follow the frame numbers and the time."""
+        """Reason to drop a frame by its number or its time, or None."""
         if frame.params & NOT_LIVE:
             return Dropped.NOT_LIVE
         if self._last_number is not None:
@@ -389,7 +390,7 @@ class MarkerGate:
         return None
 
     def _find(self, frame: Frame) -> LabeledMarker | Dropped:
-        """Find the marker; never one that is occluded or filled in by the model."""
+        """The marker in a frame, or the reason why not; never occluded or model-filled."""
         self.counts.labels = tuple(marker.id for marker in frame.labeled_markers[:8])
         if self._choice.lone_marker:
             found = [m for m in frame.labeled_markers if not m.params & (OCCLUDED | MODEL_FILLED)]
@@ -413,13 +414,13 @@ class MarkerGate:
         if last is None:
             return None
         moved = float(np.linalg.norm(reading.position - last.position))
-        # A damaged frame number looks like a restart, which takes the marker nowhere: across one,
-        # where two times have nothing in common, that of arrival counts.
+        # A damaged frame number looks like a restart, during which the marker does not jump:
+        # across a restart, whose two times are unrelated, the times of arrival count.
         elapsed = reading.timestamp_s - last.timestamp_s
         if self._restarted:
             elapsed = reading.received_s - last.received_s
             if elapsed < 0.0:
-                # This clock was set back, too.
+                # The clock of arrival was set back, too.
                 return None
         if moved > JUMP_MARGIN_M + self._choice.max_speed_m_s * elapsed:
             return Dropped.JUMP
@@ -442,7 +443,7 @@ def _sample(
 ) -> MarkerSample:
     age_s = max(frame.software_latency, 0.0)
     if ticks_per_s:
-        # USB cameras have no clock of their own, and leave the exposure out.
+        # USB cameras have no clock and send no exposure time.
         begin = frame.mid_exposure or frame.data_received
         age_s = max(frame.transmitted - begin, 0) / ticks_per_s if begin else 0.0
     return MarkerSample(

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What both OptiTrack clients have in common: the thread, the markers, counts and diagnosis."""
+"""Common part of both OptiTrack clients: the thread, the markers, counts and diagnosis."""
 
 from __future__ import annotations
 
@@ -54,31 +54,31 @@ Fault = Literal[
 
 @dataclass(kw_only=True)
 class StreamStatus(GateCounts):
-    """The state of a client; its gate counts in it."""
+    """State of a client, with the counts of its gate."""
 
     # Resolved addresses of the server and of this machine's card towards it
     server_ip: str = ''
     interface: str = ''
-    server: ServerInfo | None = None  # Its answer to CONNECT; None while there is none
+    server: ServerInfo | None = None  # Answer to CONNECT; None while there is none
     version: Version | None = None  # Bitstream in use; None while unknown
-    port_closed: bool = False  # The computer is there, but nothing listens on the command port
-    send_error: str = ''  # Why the last request could not be sent; ''
+    port_closed: bool = False  # Whether the computer answers that no program listens on the port
+    send_error: str = ''  # Reason why the last request could not be sent; '' if it was sent
     # Addresses that sent something and are not the server (the first few)
     foreign: tuple[str, ...] = ()
-    last_malformed: str = ''  # What was wrong with the last datagram that could not be decoded; ''
+    last_malformed: str = ''  # Error of the last datagram that could not be decoded; '' if none
     silent_s: float | None = None  # Time since the last whole frame, s; None if there was none
     starved_s: float | None = None  # Time since the last reading, s; None if there was none
     source: str = ''  # Address and port whose frames are believed; '' while there is none
-    sources_taken: int = 0  # How often it was decided whose frames are believed
-    # Other ports of the server's address that sent lately, beside the believed one; refused
+    sources_taken: int = 0  # Number of decisions which source is believed
+    # Other ports of the server's address that sent lately, at the same time; refused
     rivals: tuple[str, ...] = ()
-    # Sources of which none is believed, as they send at the same time
+    # Sources of which none is believed, because they send at the same time
     contestants: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """What is wrong: its kind, and one line with the remedy."""
+    """Fault: its kind, and one line with the remedy."""
 
     fault: Fault
     message: str
@@ -88,7 +88,7 @@ HEALTHY = Diagnosis('none', '')
 
 
 def diagnose(status: StreamStatus, settings: NatNetSettings) -> Diagnosis:
-    """Return why readings are missing; `HEALTHY` if they are not."""
+    """Reason why readings are missing; `HEALTHY` if they are not."""
     if status.server is None:
         return _unanswered(status, settings)
     version = status.version or status.server.natnet_version
@@ -137,25 +137,29 @@ def _unanswered(status: StreamStatus, settings: NatNetSettings) -> Diagnosis:
 def _no_frames(
     status: StreamStatus, settings: NatNetSettings, server: ServerInfo, version: Version
 ) -> Diagnosis:
-    """Explain a server that answers but whose frames do not arrive (any more)."""
+    """Diagnosis of a server that answers but whose frames do not arrive (any more)."""
     multicast = settings.transport == 'multicast'
-    told = server.connection
-    if told is not None and told.is_multicast != multicast:
-        theirs = 'multicast' if told.is_multicast else 'unicast'
+    connection = server.connection
+    if connection is not None and connection.is_multicast != multicast:
+        theirs = 'multicast' if connection.is_multicast else 'unicast'
         return Diagnosis(
             'multicast',
             f'the server streams {theirs}: set transport to {theirs}, or change Motive',
         )
-    if told is not None and multicast and told.multicast_group != settings.multicast_group:
+    if (
+        connection is not None
+        and multicast
+        and connection.multicast_group != settings.multicast_group
+    ):
         return Diagnosis(
             'multicast',
-            f'the server streams to the group {told.multicast_group}, not to '
+            f'the server streams to the group {connection.multicast_group}, not to '
             f'{settings.multicast_group}: set multicast_group',
         )
-    if told is not None and multicast and told.data_port != settings.data_port:
+    if connection is not None and multicast and connection.data_port != settings.data_port:
         return Diagnosis(
             'port',
-            f'the server streams to UDP port {told.data_port}, not to {settings.data_port}: '
+            f'the server streams to UDP port {connection.data_port}, not to {settings.data_port}: '
             f'set data_port',
         )
     if status.last_malformed:
@@ -211,7 +215,7 @@ def _refused(status: StreamStatus) -> str:
 
 
 def warning(status: StreamStatus) -> str:
-    """Return which other programs send while readings come; '' if none does."""
+    """Other programs that send frames while readings come; '' if none does."""
     others = [*status.rivals, *status.foreign]
     if not others or not status.source:
         return ''
@@ -222,7 +226,7 @@ def warning(status: StreamStatus) -> str:
 
 
 def _no_marker(status: StreamStatus) -> Diagnosis:
-    """Explain whole frames without a usable marker."""
+    """Diagnosis of whole frames without a usable marker."""
     name = 'the marker' if status.marker_id is None else f'marker {_label(status.marker_id)}'
     reason = status.last_reason
     if reason == Dropped.NOT_PRESENT:
@@ -250,7 +254,7 @@ def _no_marker(status: StreamStatus) -> Diagnosis:
 
 
 def _label(marker_id: int) -> str:
-    """Write an id as asset:member."""
+    """Id as asset:member."""
     return f'{marker_id >> 16}:{marker_id & 0xFFFF}'
 
 
@@ -260,14 +264,14 @@ _log = logging.getLogger('remaster_ros')
 
 
 class MarkerFollower(ABC):
-    """Follows the markers of one rigid body of an OptiTrack server in a thread of its own.
+    """Client that follows the markers of one rigid body of an OptiTrack server, in its own thread.
 
-    Each marker is judged by itself: one that is hidden, filled in by the model or jumps is NaN
-    in a frame of which others are seen. Where none is, there is no reading at all.
+    Each marker is judged separately: one that is hidden, model-filled or jumps is NaN in a frame
+    with other visible markers. If none is visible there is no reading at all.
 
-    ``settings``: how to reach the server, and which markers to follow; ``on_sample``: called in
-    the thread with every reading, those of a frame one after the other. What it raises is logged;
-    ``clock``: gives the time at which a datagram arrived, s.
+    ``settings``: address of the server, and choice of the markers; ``on_sample``: called in the
+    thread with every reading, those of a frame one after another; its exceptions are logged;
+    ``clock``: for the time of arrival of a datagram, s.
     """
 
     def __init__(
@@ -296,7 +300,7 @@ class MarkerFollower(ABC):
     def start(self) -> None:
         """Open the sockets and begin; the client keeps trying until `stop`.
 
-        Raises DeviceError: if a socket cannot be opened.
+        Raises DeviceError if a socket cannot be opened.
         """
         settings = self._settings
         self._status.server_ip = resolve(settings.server)
@@ -326,7 +330,7 @@ class MarkerFollower(ABC):
         self.stop()
 
     def status(self) -> StreamStatus:
-        """Return a snapshot of counts and of what the server has answered."""
+        """Snapshot of the counts and the server's answers."""
         now = time.monotonic()
         return replace(
             self._status,
@@ -340,16 +344,16 @@ class MarkerFollower(ABC):
         )
 
     def further_counts(self) -> dict[str, GateCounts]:
-        """Return the counts of each further marker, by name."""
+        """Counts of each further marker, by name."""
         return {name: gate.counts for name, gate in self._further.items()}
 
     def diagnosis(self) -> Diagnosis:
-        """Return what is wrong when readings are missing, and the remedy."""
+        """Fault and remedy if readings are missing."""
         return diagnose(self.status(), self._settings)
 
     @abstractmethod
     def _open(self) -> None:
-        """Open what `_run` needs; raise `DeviceError`, and leave nothing open then."""
+        """Open the sockets of `_run`; raises `DeviceError`, with nothing left open."""
 
     @abstractmethod
     def _run(self) -> None:
@@ -360,7 +364,7 @@ class MarkerFollower(ABC):
         """Close what is open."""
 
     def _is_foreign(self, address: str) -> bool:
-        """Count and remember a sender that is not the server."""
+        """Whether the sender is not the server; counted and remembered."""
         if address == self._status.server_ip:
             return False
         self._gate.drop(Dropped.FOREIGN)
@@ -369,14 +373,14 @@ class MarkerFollower(ABC):
         return True
 
     def _is_refused(self, source: Source) -> bool:
-        """Count what comes from a port of the server that is not the believed one."""
+        """Whether the source is a port of the server that is not believed; counted."""
         if not self._lock.is_refused(source, time.monotonic()):
             return False
         self._gate.drop(Dropped.FOREIGN)
         return True
 
     def _release_silent_source(self) -> bool:
-        """Free the lock after a silence; the server must answer before it is given again."""
+        """Release the lock after a silence; the server must answer before the next lock."""
         holder = self._lock.source
         if holder is None or not self._lock.release_if_silent(time.monotonic()):
             return False
@@ -388,7 +392,7 @@ class MarkerFollower(ABC):
         return True
 
     def _note_closed_port(self) -> None:
-        """Find out whether the server's computer is there without its command port."""
+        """Record whether the server's computer is running without its command port."""
         self._status.port_closed = port_is_closed(
             self._status.server_ip, self._settings.command_port, encode_echo_request(0)
         )
@@ -405,7 +409,7 @@ class MarkerFollower(ABC):
     def _take_whole_frame(
         self, frame: Frame, received_s: float, source: Source
     ) -> list[MarkerSample]:
-        """Account for a frame that decoded to its end, and find its readings."""
+        """Readings of a completely decoded frame, which is counted."""
         now = time.monotonic()
         before = self._lock.source
         verdict = self._lock.judge(source, now)
@@ -428,13 +432,13 @@ class MarkerFollower(ABC):
         seen = next(filter(None, found.values()), None)
         if seen is None:
             return []
-        # A message for every marker: whoever listens to several topics then knows, by the stamps
-        # alone, that nothing of a frame is still to come.
+        # A message for every marker: a listener to several topics then knows by the stamps alone
+        # that a frame is complete.
         hidden = replace(seen, position=np.full(3, np.nan))
         return [replace(sample or hidden, marker=name) for name, sample in found.items()]
 
     def _begin_source(self, source: Source) -> None:
-        """Report whose frames are believed from now on."""
+        """Report the source whose frames are believed from now on."""
         before, self._believed_before = self._believed_before, source
         if before is not None and before != source:
             for gate in (self._gate, *self._further.values()):

@@ -2,8 +2,8 @@
 """NatNet, OptiTrack's streaming protocol: datagrams to events and back; no sockets.
 
 A client decodes with `decode_message` and encodes with the ``encode_…_request`` functions; a
-server decodes with `decode_request` and encodes with `encode_message` and its kin. One exception
-comes out of bad bytes: `ProtocolError`.
+server decodes with `decode_request` and encodes with `encode_message` and related functions.
+Invalid bytes raise one exception, `ProtocolError`.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ Quaternion = tuple[float, float, float, float]
 """x, y, z, w."""
 
 OLDEST_VERSION: Version = (2, 6)
-"""The first bitstream with the flags that distinguish a measured marker from a guessed one."""
+"""First bitstream with the flags that distinguish a measured marker from a model-filled one."""
 NEWEST_VERSION: Version = (4, 3)
-"""The last described layout; 4.4 and later 4.x are read as this one and fail where they differ."""
+"""Last known layout; 4.4 and later 4.x are read with this layout and fail if they differ."""
 
 MAX_TEXT_BYTES = 256
 """Longest text on the wire, its final NUL included."""
@@ -45,11 +45,11 @@ _I32 = Struct('<i')
 
 
 class ProtocolError(Exception):
-    """Bytes that are not as NatNet defines them; the message states where."""
+    """Bytes that are not NatNet; the message states the position."""
 
 
 def require_supported(version: Version) -> None:
-    """Raise `ProtocolError` for a bitstream version that this decoder cannot read."""
+    """Raises `ProtocolError` for a bitstream version that this decoder cannot read."""
     if not (OLDEST_VERSION <= version < (5, 0)):
         raise ProtocolError(
             f'NatNet {version[0]}.{version[1]} is unknown here: 2.6 to 4.3 can be read'
@@ -57,7 +57,7 @@ def require_supported(version: Version) -> None:
 
 
 class Reader:
-    """A cursor over the bytes of one datagram that refuses to run past the end.
+    """Cursor over the bytes of one datagram that refuses to go beyond the end.
 
     ``data``: the datagram's payload.
     """
@@ -70,8 +70,8 @@ class Reader:
         self.end = len(data)
 
     @property
-    def left(self) -> int:
-        """Bytes between the cursor and the end."""
+    def remaining_bytes(self) -> int:
+        """Number of bytes between the cursor and the end."""
         return self.end - self.offset
 
     def unpack(self, layout: Struct) -> tuple[Any, ...]:
@@ -90,8 +90,10 @@ class Reader:
         """Read an i32 count of items that take at least `item_bytes` each."""
         start = self.offset
         (count,) = self.unpack(_I32)
-        if count < 0 or count * item_bytes > self.left:
-            raise ProtocolError(f'a count of {count} at byte {start} with {self.left} bytes left')
+        if count < 0 or count * item_bytes > self.remaining_bytes:
+            raise ProtocolError(
+                f'a count of {count} at byte {start} with {self.remaining_bytes} bytes left'
+            )
         return count
 
     def text(self) -> bytes:
@@ -104,17 +106,24 @@ class Reader:
         return self._data[start:stop]
 
     def skip(self, size: int) -> None:
-        """Step over `size` bytes."""
+        """Skip `size` bytes."""
         stop = self.offset + size
         if not self.offset <= stop <= self.end:
-            raise ProtocolError(f'{size} bytes wanted at byte {self.offset}, {self.left} left')
+            raise ProtocolError(
+                f'{size} bytes wanted at byte {self.offset}, {self.remaining_bytes} left'
+            )
         self.offset = stop
 
     @contextmanager
     def bounded(self, size: int) -> Iterator[None]:
-        """Let the next `size` bytes be the end; stand behind them afterwards."""
-        if not 0 <= size <= self.left:
-            raise ProtocolError(f'{size} bytes wanted at byte {self.offset}, {self.left} left')
+        """Context with the end after the next `size` bytes.
+
+        The cursor is behind them afterwards.
+        """
+        if not 0 <= size <= self.remaining_bytes:
+            raise ProtocolError(
+                f'{size} bytes wanted at byte {self.offset}, {self.remaining_bytes} left'
+            )
         end, self.end = self.end, self.offset + size
         yield
         self.offset, self.end = self.end, end
@@ -131,28 +140,28 @@ _COUNT_AND_SIZE = Struct('<2i')
 
 
 class Codec(ABC):
-    """Reads, writes and steps over one item."""
+    """Reader and writer of one kind of item."""
 
-    least: int  # The fewest bytes that an item takes
+    least: int  # Fewest bytes of an item
 
     @abstractmethod
     def read(self, reader: Reader) -> Any:
-        """Read an item; `ProtocolError` where the bytes are not one."""
+        """Read an item; raises `ProtocolError` for invalid bytes."""
 
     @abstractmethod
     def skip(self, reader: Reader) -> None:
-        """Step over an item, whose counts are checked and whose numbers are not looked at."""
+        """Skip an item; its counts are checked, its numbers are not."""
 
     @abstractmethod
     def write(self, item: Any) -> bytes:
-        """Write an item; `ValueError` or `struct.error` where it does not fit."""
+        """Bytes of an item; raises `ValueError` or `struct.error` if it does not fit."""
 
     def read_many(self, reader: Reader, count: int) -> tuple[Any, ...]:
-        """Read items that follow one another."""
+        """Read consecutive items."""
         return tuple([self.read(reader) for _ in range(count)])
 
     def skip_many(self, reader: Reader, count: int) -> None:
-        """Step over items that follow one another."""
+        """Skip consecutive items."""
         for _ in range(count):
             self.skip(reader)
 
@@ -162,14 +171,14 @@ def _same(item: Any) -> Any:
 
 
 def _stepped_over(*_: Any) -> None:
-    """Build what is written and stepped over, and never kept."""
+    """No value, for items that are written and skipped, but never kept."""
 
 
 class Row(Codec):
     """Numbers of a fixed layout.
 
-    ``layout``: `struct` format, without the byte order; ``build``: makes the items of rows of
-    numbers; ``flatten``: undoes it, for one item.
+    ``layout``: `struct` format, without the byte order; ``build``: from rows of numbers to items;
+    ``flatten``: from one item to its numbers.
     """
 
     def __init__(
@@ -187,7 +196,7 @@ class Row(Codec):
         return self._build([reader.unpack(self.layout)])[0]
 
     def skip(self, reader: Reader) -> None:
-        """Step over one row."""
+        """Skip one row."""
         reader.skip(self.least)
 
     def write(self, item: Any) -> bytes:
@@ -199,17 +208,17 @@ class Row(Codec):
         return tuple(self._build(reader.rows(self.layout, count)))
 
     def skip_many(self, reader: Reader, count: int) -> None:
-        """Step over rows at once."""
+        """Skip rows at once."""
         reader.skip(self.least * count)
 
 
 def number(layout: str) -> Row:
-    """Return the codec of a single number."""
+    """Codec of a single number."""
     return Row(layout, lambda rows: list(chain.from_iterable(rows)), lambda value: (value,))
 
 
 class _Text(Codec):
-    """UTF-8 text up to its NUL; bytes that are no UTF-8 become U+FFFD."""
+    """UTF-8 text up to its NUL; bytes that are not UTF-8 become U+FFFD."""
 
     least = 1
 
@@ -236,10 +245,10 @@ QUATERNION = Row('4f')
 
 
 class Record(Codec):
-    """Items of different kinds that follow one another.
+    """Consecutive items of different kinds.
 
-    ``build``: makes the record of the items; ``parts``: their codecs; ``flatten``: undoes `build`;
-    a named tuple is its own items.
+    ``build``: from the items to the record; ``parts``: codecs of the items; ``flatten``: from the
+    record to the items; a named tuple is its own items.
     """
 
     def __init__(
@@ -256,7 +265,7 @@ class Record(Codec):
         return self._build(*[part.read(reader) for part in self._parts])
 
     def skip(self, reader: Reader) -> None:
-        """Step over the items."""
+        """Skip the items."""
         for part in self._parts:
             part.skip(reader)
 
@@ -267,7 +276,7 @@ class Record(Codec):
 
 
 class Columns(Codec):
-    """A count, then so many items of the first kind, so many of the second, and so on.
+    """Count, then that number of items of the first kind, of the second kind, and so on.
 
     Read as a tuple of columns.
     """
@@ -284,7 +293,7 @@ class Columns(Codec):
         return tuple([kind.read_many(reader, count) for kind in self._kinds])
 
     def skip(self, reader: Reader) -> None:
-        """Step over the columns."""
+        """Skip the columns."""
         count = reader.count(self._least_row)
         for kind in self._kinds:
             kind.skip_many(reader, count)
@@ -296,7 +305,7 @@ class Columns(Codec):
 
 
 class List(Codec):
-    """A count and so many items of one kind."""
+    """Count and that number of items of one kind."""
 
     least = _COUNT.size
 
@@ -308,7 +317,7 @@ class List(Codec):
         return self.kind.read_many(reader, reader.count(self.kind.least))
 
     def skip(self, reader: Reader) -> None:
-        """Step over the items."""
+        """Skip the items."""
         self.kind.skip_many(reader, reader.count(self.kind.least))
 
     def write(self, item: Sequence[Any]) -> bytes:
@@ -317,18 +326,20 @@ class List(Codec):
 
 
 class SizedList(List):
-    """A count, the size in bytes of all items, and the items.
+    """Count, size in bytes of all items, and the items.
 
-    What a newer server adds behind items that are stepped over is so as well. Those that are read
-    have a fixed layout and must fill the size: another one shows that theirs is not the known one.
+    Additions of a newer server after skipped items are skipped as well. Items that are read have a
+    fixed layout and must fill the size: another size means another layout.
     """
 
     least = _COUNT_AND_SIZE.size
 
     def _head(self, reader: Reader) -> tuple[int, int]:
         count, size = reader.unpack(_COUNT_AND_SIZE)
-        if count < 0 or not count * self.kind.least <= size <= reader.left:
-            raise ProtocolError(f'a section of {count} items in {size} bytes, {reader.left} left')
+        if count < 0 or not count * self.kind.least <= size <= reader.remaining_bytes:
+            raise ProtocolError(
+                f'a section of {count} items in {size} bytes, {reader.remaining_bytes} left'
+            )
         return count, size
 
     def read(self, reader: Reader) -> tuple[Any, ...]:
@@ -341,7 +352,7 @@ class SizedList(List):
         return self.kind.read_many(reader, count)
 
     def skip(self, reader: Reader) -> None:
-        """Step over the items at once."""
+        """Skip the items at once."""
         reader.skip(self._head(reader)[1])
 
     def write(self, item: Sequence[Any]) -> bytes:
@@ -358,7 +369,7 @@ class SizedList(List):
 
 OCCLUDED = 1 << 0
 MEASURED = 1 << 1
-"""Solved from the cameras' rays (the point cloud)."""
+"""Position solved from the cameras' rays (the point cloud)."""
 MODEL_FILLED = 1 << 2
 """Position inferred from the asset's other markers."""
 HAS_MODEL = 1 << 3
@@ -372,13 +383,13 @@ BITSTREAM_CHANGED = 1 << 3
 
 
 class LabeledMarker(NamedTuple):
-    """One entry of the labelled list, which holds every marker, the strays too."""
+    """Entry of the labelled list, which holds every marker, strays too."""
 
     # ``asset id << 16 | member`` (member from 1) for a marker of an asset; arbitrary otherwise
     id: int
-    position: Vec3  # m, (3,). Not measured where `params` has `OCCLUDED` or `MODEL_FILLED`.
+    position: Vec3  # m, (3,). Not measured if `params` has `OCCLUDED` or `MODEL_FILLED`.
     size: float  # Diameter, m
-    params: int  # The flags above; NatNet 2 has the first three only
+    params: int  # Flags above; NatNet 2 has the first three only
     residual: float | None = None  # Metres per ray; None before NatNet 3
 
 
@@ -390,7 +401,7 @@ class RigidBody(NamedTuple):
     orientation_xyzw: Quaternion
     mean_error: float
     params: int
-    # Position, id and size of each of its markers; only NatNet 2 sends these
+    # Position, id and size of each marker of the body; only NatNet 2 sends these
     markers: tuple[tuple[Vec3, int, float], ...] = ()
 
 
@@ -402,12 +413,12 @@ class Frame:
     timestamp: float  # Seconds since Motive, or the recording, started
     labeled_markers: tuple[LabeledMarker, ...] = ()
     software_latency: float = 0.0  # Seconds, before 3.0 only
-    # Server clock ticks (3.0+); `mid_exposure` is 0 where the cameras have no such clock
+    # Server clock ticks (3.0+); `mid_exposure` is 0 if the cameras have no such clock
     mid_exposure: int = 0
     data_received: int = 0
     transmitted: int = 0
     params: int = 0  # `RECORDING`, `MODEL_LIST_CHANGED`, `NOT_LIVE`, `BITSTREAM_CHANGED`
-    # Written by a server and stepped over by a client, each as it lies on the wire
+    # Written by a server and skipped by a client, each in its wire format
     rigid_bodies: tuple[RigidBody, ...] = ()
     # Names and positions, m; the set called ``all`` repeats the others
     marker_sets: tuple[tuple[str, tuple[Vec3, ...]], ...] = ()
@@ -422,13 +433,12 @@ class Frame:
 
 
 def decode_frame(payload: bytes, version: Version) -> Frame:
-    """Decode the labelled markers and the times of a FRAMEOFDATA datagram, to its end tag.
+    """Labelled markers and times of a FRAMEOFDATA datagram, decoded to its end tag.
 
-    ``payload``: the bytes behind the 4-byte header; ``version``: the server's bitstream version.
-    Everything else is stepped over: every count is checked, but its numbers are not looked at.
-    Raises ProtocolError: if the version is unknown, the bytes end early or late, a count does not
-    fit, or a number that must be finite is not. Positions of occluded markers claim nothing and
-    may be anything.
+    ``payload``: bytes after the 4-byte header; ``version``: the server's bitstream version. All
+    other sections are skipped: every count is checked, but not the numbers. Raises ProtocolError
+    if the version is unknown, the bytes end early or late, a count does not fit, or a number that
+    must be finite is not. Positions of occluded markers may be anything.
     """
     require_supported(version)
     layout = _layout(min(version, NEWEST_VERSION))
@@ -441,19 +451,19 @@ def decode_frame(payload: bytes, version: Version) -> Frame:
             codec.skip(reader)
     *rest, tag = reader.unpack(layout.rest)
     frame.update(zip(layout.rest_names, rest))
-    if tag != 0 or reader.left:
+    if tag != 0 or reader.remaining_bytes:
         raise ProtocolError(
             f'frame {frame["number"]} does not end where it should '
-            f'(tag {tag}, {reader.left} bytes left)'
+            f'(tag {tag}, {reader.remaining_bytes} bytes left)'
         )
     _require_finite((frame['timestamp'], frame.get('software_latency', 0.0)), 'time')
     return Frame(**frame)
 
 
 def encode_frame(frame: Frame, version: Version) -> bytes:
-    """Encode the payload of a FRAMEOFDATA message; what the version does not have is left out.
+    """Payload of a FRAMEOFDATA message, without sections that the version does not have.
 
-    Raises ProtocolError: if the version is unknown; ValueError, struct.error: if a value does not
+    Raises ProtocolError if the version is unknown; ValueError, struct.error if a value does not
     fit its field.
     """
     require_supported(version)
@@ -464,7 +474,7 @@ def encode_frame(frame: Frame, version: Version) -> bytes:
 
 
 class _Layout(NamedTuple):
-    """A frame of one version: its sections in order, then numbers; all named as in `Frame`."""
+    """Layout of a frame in one version: sections in order, then numbers, named as in `Frame`."""
 
     sections: dict[str, Codec]
     rest_names: tuple[str, ...]
@@ -473,7 +483,7 @@ class _Layout(NamedTuple):
 
 @cache
 def _layout(version: Version) -> _Layout:
-    """Describe the frame of a version."""
+    """Layout of a frame in a version."""
     since_3, since_4_1 = version >= (3, 0), version >= (4, 1)
     section = SizedList if since_4_1 else List
     body = _BODY_3 if since_3 else _BODY_2
@@ -508,8 +518,8 @@ def _require_finite(values: Iterable[float], what: str) -> None:
 
 
 def _labeled(rows: list[tuple], *, has_residual: bool) -> list[LabeledMarker]:
-    """Build the labelled markers; the sum of all numbers shows whether one is not finite."""
-    # The named tuple's own constructor would take as long as all the rest of a frame.
+    """Labelled markers of rows; the sum of all numbers shows whether one is not finite."""
+    # The named tuple's own constructor would take as long as decoding the rest of the frame.
     make = tuple.__new__
     if has_residual:
         markers = [
@@ -562,17 +572,17 @@ _IDENTITY: Quaternion = (0.0, 0.0, 0.0, 1.0)
 
 
 class MarkerSetDescription(NamedTuple):
-    """A marker set and the names of its markers."""
+    """Marker set with the names of its markers."""
 
     name: str
     marker_names: tuple[str, ...]
 
 
 class RigidBodyDescription(NamedTuple):
-    """A rigid body."""
+    """Description of a rigid body."""
 
     name: str
-    id: int  # The id in the frames; its marker number m is the labelled marker ``id << 16 | m``
+    id: int  # Id in the frames; the body's marker number m is the labelled marker ``id << 16 | m``
     parent_id: int = -1  # -1 for none
     # Pose relative to the parent, m and x, y, z, w (the rotation is sent since 4.2)
     offset: Vec3 = (0.0, 0.0, 0.0)
@@ -584,7 +594,7 @@ class RigidBodyDescription(NamedTuple):
 
 
 class OtherDescription(NamedTuple):
-    """A skeleton, force plate, device, camera or asset: only what names it is kept."""
+    """Skeleton, force plate, device, camera or asset, of which only kind, name and id are kept."""
 
     kind: int  # The wire's type number, `SKELETON` to `ASSET`, or one unknown here
     name: str
@@ -596,18 +606,18 @@ Description = MarkerSetDescription | RigidBodyDescription | OtherDescription
 
 @dataclass(frozen=True)
 class ModelDefinition:
-    """Everything the server streams, in its order."""
+    """Description of everything that the server streams, in its order."""
 
     descriptions: tuple[Description, ...] = ()
 
     @property
     def rigid_bodies(self) -> tuple[RigidBodyDescription, ...]:
-        """The rigid bodies that are no part of a skeleton."""
+        """Rigid bodies that are no part of a skeleton."""
         return tuple(d for d in self.descriptions if isinstance(d, RigidBodyDescription))
 
     @property
     def labelled_assets(self) -> dict[str, int]:
-        """Ids by name of what labels markers: rigid bodies and (4.1+) trained marker sets."""
+        """Ids by name of rigid bodies and (4.1+) trained marker sets."""
         named = {
             d.name: d.id
             for d in self.descriptions
@@ -617,12 +627,11 @@ class ModelDefinition:
 
 
 def decode_model_definition(payload: bytes, version: Version) -> ModelDefinition:
-    """Decode the payload of a MODELDEF datagram.
+    """Content of the payload of a MODELDEF datagram.
 
-    Bytes behind the last description, and from 4.1 on behind each, are skipped: servers newer
-    than this decoder put new fields there.
-
-    Raises ProtocolError: if the version is unknown, the bytes end early or a count does not fit.
+    Bytes after the last description, and from 4.1 on after each, are skipped: newer servers put
+    new fields there. Raises ProtocolError if the version is unknown, the bytes end early or a
+    count does not fit.
     """
     require_supported(version)
     reader = Reader(payload)
@@ -631,9 +640,9 @@ def decode_model_definition(payload: bytes, version: Version) -> ModelDefinition
 
 
 def encode_model_definition(definition: ModelDefinition, version: Version) -> bytes:
-    """Encode the payload of a MODELDEF message.
+    """Payload of a MODELDEF message.
 
-    Raises ProtocolError: if the version is unknown; ValueError: if a name is too long, or a
+    Raises ProtocolError if the version is unknown; ValueError if a name is too long, or a
     description is of a kind whose details are not kept.
     """
     require_supported(version)
@@ -670,7 +679,7 @@ _KINDS: dict[type, int] = {
 
 @cache
 def _codecs(version: Version) -> dict[int, Codec]:
-    """Return how each kind of description lies in its bytes in a version."""
+    """Codec of each kind of description in a version."""
     body = _rigid_body(version)
     codecs: dict[int, Codec] = {
         MARKER_SET: Record(MarkerSetDescription, TEXT, List(TEXT)),
@@ -702,7 +711,7 @@ def _codecs(version: Version) -> dict[int, Codec]:
 
 
 def _rigid_body(version: Version) -> Record:
-    """Return how a rigid body lies in its bytes: the fields were added one after the other."""
+    """Codec of a rigid body's description in a version, which added fields one after another."""
     has_rotation, has_markers = version >= (4, 2), version >= (3, 0)
     columns: list[Codec] = [VEC3, I32]
     if version >= (4, 0):
@@ -763,7 +772,7 @@ class MessageId(IntEnum):
 
 @dataclass(frozen=True)
 class Connection:
-    """How a server of NatNet 3.0 or newer streams."""
+    """Connection settings of a server of NatNet 3.0 or newer."""
 
     clock_frequency: int  # Ticks per second of the three stamps of a frame
     data_port: int
@@ -773,46 +782,46 @@ class Connection:
 
 @dataclass(frozen=True)
 class ServerInfo:
-    """The answer to CONNECT."""
+    """Answer to CONNECT."""
 
     name: str
     app_version: tuple[int, int, int, int]
-    natnet_version: Version  # The bitstream version that governs decoding
+    natnet_version: Version  # Bitstream version that determines the decoding
     connection: Connection | None = None  # None before NatNet 3.0
 
 
 @dataclass(frozen=True)
 class Response:
-    """The answer to a REQUEST; its meaning depends on the request."""
+    """Answer to a REQUEST; its meaning depends on the request."""
 
     payload: bytes
 
     @property
     def code(self) -> int | None:
-        """The answer as an integer, 0 for success; None if it is a text."""
+        """Answer as an integer, 0 for success; None if it is a text."""
         return I32.read(Reader(self.payload)) if len(self.payload) == 4 else None
 
     @property
     def value(self) -> float | None:
-        """The answer as a number, such as the frame rate; None if it is a text."""
+        """Answer as a number, such as the frame rate; None if it is a text."""
         return F32.read(Reader(self.payload)) if len(self.payload) == 4 else None
 
     @property
     def text(self) -> str:
-        """The answer as a text, such as ``Bitstream,4.1``."""
+        """Answer as a text, such as ``Bitstream,4.1``."""
         return _text(self.payload)
 
 
 @dataclass(frozen=True)
 class MessageString:
-    """A line of text from the server."""
+    """Line of text from the server."""
 
     text: str
 
 
 @dataclass(frozen=True)
 class EchoResponse:
-    """The client's clock as it was sent, and the server's ticks when it arrived."""
+    """Client's clock as sent, and the server's ticks at its arrival."""
 
     client_clock: int
     server_clock: int
@@ -820,7 +829,7 @@ class EchoResponse:
 
 @dataclass(frozen=True)
 class Notice:
-    """A message without content: UNRECOGNIZED_REQUEST, or a disconnection by the server."""
+    """Message without content: UNRECOGNIZED_REQUEST, or a disconnection by the server."""
 
     id: MessageId
 
@@ -830,19 +839,19 @@ Message = ServerInfo | Response | ModelDefinition | Frame | MessageString | Echo
 
 @dataclass(frozen=True)
 class ClientRequest:
-    """What a client sent."""
+    """Request of a client."""
 
-    id: int  # A `MessageId`, or the number of one that is unknown here
-    text: str = ''  # The command of a REQUEST
-    # The bitstream that a CONNECT requests; None for the server's own
+    id: int  # A `MessageId`, or an unknown number
+    text: str = ''  # Command of a REQUEST
+    # Bitstream that a CONNECT requests; None for the server's own
     wanted_version: Version | None = None
-    clock: int = 0  # The client's clock of an ECHOREQUEST
+    clock: int = 0  # Client's clock in an ECHOREQUEST
 
 
 def split_datagram(datagram: bytes) -> tuple[int, bytes]:
-    """Return the message id and the payload; bytes behind the payload are ignored.
+    """Message id and payload of a datagram; bytes after the payload are ignored.
 
-    Raises ProtocolError: if the datagram is shorter than its header states.
+    Raises ProtocolError if the datagram is shorter than its header states.
     """
     if len(datagram) < _HEADER.size:
         raise ProtocolError(f'a datagram of {len(datagram)} bytes has no header')
@@ -855,9 +864,9 @@ def split_datagram(datagram: bytes) -> tuple[int, bytes]:
 
 
 def join_datagram(message_id: int, payload: bytes = b'') -> bytes:
-    """Put the header in front of a payload.
+    """Datagram of a header and a payload.
 
-    Raises ValueError: if the payload is longer than a datagram can carry.
+    Raises ValueError if the payload is longer than a datagram can be.
     """
     if len(payload) > MAX_PAYLOAD_BYTES:
         raise ValueError(f'a payload of {len(payload)} bytes is over {MAX_PAYLOAD_BYTES}')
@@ -865,11 +874,11 @@ def join_datagram(message_id: int, payload: bytes = b'') -> bytes:
 
 
 def decode_message(datagram: bytes, version: Version | None) -> Message:
-    """Decode what a server sent, of a frame what `decode_frame` does.
+    """Message of a server; a frame as by `decode_frame`.
 
-    ``datagram``: as received; ``version``: the server's bitstream version; None while it is
-    unknown, when frames and model definitions cannot be read.
-    Raises ProtocolError: for anything that is not a whole, valid message from a server.
+    ``datagram``: as received; ``version``: the server's bitstream version, or None while it is
+    unknown, when frames and model definitions cannot be read. Raises ProtocolError if the datagram
+    is not a whole, valid message of a server.
     """
     message_id, payload = split_datagram(datagram)
     match message_id:
@@ -893,10 +902,10 @@ def decode_message(datagram: bytes, version: Version | None) -> Message:
 
 
 def encode_message(message: Message, version: Version) -> bytes:
-    """Encode what a server sends, header included.
+    """Datagram of a server's message, with header.
 
-    Raises ProtocolError: if a frame or model definition is to be encoded for an unknown version;
-    ValueError, struct.error: if a value does not fit its field.
+    Raises ProtocolError if the version of a frame or model definition is unknown; ValueError,
+    struct.error if a value does not fit its field.
     """
     if isinstance(message, Frame):
         return join_datagram(MessageId.FRAMEOFDATA, encode_frame(message, version))
@@ -915,9 +924,11 @@ def encode_message(message: Message, version: Version) -> bytes:
 
 
 def decode_request(datagram: bytes) -> ClientRequest:
-    """Decode what a client sent; the length in its header is ignored, as clients get it wrong.
+    """Request in a client's datagram.
 
-    Raises ProtocolError: if there is no header, or an ECHOREQUEST without a clock.
+    The length in its header is ignored, as clients get it wrong.
+
+    Raises ProtocolError if there is no header, or an ECHOREQUEST has no clock.
     """
     if len(datagram) < _HEADER.size:
         raise ProtocolError(f'a datagram of {len(datagram)} bytes has no header')
@@ -932,10 +943,10 @@ def decode_request(datagram: bytes) -> ClientRequest:
 
 
 def encode_connect_request(name: str, wanted_version: Version | None = None) -> bytes:
-    """Encode CONNECT in its full form, which servers of every version accept.
+    """CONNECT in its full form, which servers of every version accept.
 
-    ``name``: of this program; ``wanted_version``: the bitstream to be streamed to this client
-    (unicast, servers from 4.0); None for the server's own.
+    ``name``: name of this program; ``wanted_version``: bitstream for this client (unicast, servers
+    from 4.0); None for the server's own.
     """
     major, minor = wanted_version or (0, 0)
     sender = _SENDER.pack(name.encode()[:255], 1, 0, 0, 0, *NEWEST_VERSION, 0, 0)
@@ -946,19 +957,19 @@ def encode_connect_request(name: str, wanted_version: Version | None = None) -> 
 
 
 def encode_command_request(command: str) -> bytes:
-    """Encode REQUEST with a command such as ``FrameRate`` or ``Bitstream,4.1``."""
+    """REQUEST with a command such as ``FrameRate`` or ``Bitstream,4.1``."""
     return join_datagram(MessageId.REQUEST, TEXT.write(command))
 
 
 def encode_echo_request(clock: int) -> bytes:
-    """Encode ECHOREQUEST with the client's clock, any unsigned 64-bit number."""
+    """ECHOREQUEST with the client's clock, any unsigned 64-bit number."""
     return join_datagram(MessageId.ECHOREQUEST, _CLOCK.write(clock))
 
 
 def parse_version(text: str) -> Version:
-    """Read ``4.1`` (or ``4.1.0.0``).
+    """Version in a text such as ``4.1`` (or ``4.1.0.0``).
 
-    Raises ValueError: if it is not two or more whole numbers with dots between.
+    Raises ValueError if the text is not two or more whole numbers with dots between.
     """
     parts = text.split('.')
     if len(parts) < 2 or not all(part.isdecimal() and part.isascii() for part in parts):
@@ -967,7 +978,7 @@ def parse_version(text: str) -> Version:
 
 
 def format_version(version: Version) -> str:
-    """Write a version as ``4.1``."""
+    """Version as text, such as ``4.1``."""
     return f'{version[0]}.{version[1]}'
 
 
@@ -982,7 +993,7 @@ def _text(payload: bytes) -> str:
 
 
 def _wanted_version(payload: bytes) -> Version | None:
-    """Find the wanted bitstream in the full form of CONNECT; shorter forms name none."""
+    """Wanted bitstream in the full form of CONNECT; None in shorter forms."""
     if len(payload) < _SENDER.size + _OPTIONS.size:
         return None
     _subscribed, major, minor, _build, _revision = _OPTIONS.unpack_from(payload, _SENDER.size)

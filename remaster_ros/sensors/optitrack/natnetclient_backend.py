@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The backend ``client: natnetclient``: PyPI ``natnetclient``, guarded.
+"""Backend ``client: natnetclient``: PyPI ``natnetclient`` with checks.
 
 That package (LGPL, 2018) reads NatNet 2.6 to 2.10 from a server on the same computer that sends
 its frames unicast to a fixed port. It checks no datagram, keeps markers that are no longer sent
-and waits a minute where nothing comes. So it runs here without its own thread: each datagram is
+and waits a minute if no datagram comes. So it runs here without its own thread: each datagram is
 first checked by our decoder, then read by ``natnetclient`` with its memory cleared, and a reading
-counts only if both agree on it.
+counts only if both agree.
 """
 
 from __future__ import annotations
@@ -34,19 +34,18 @@ from remaster_ros.sensors.optitrack.settings import NatNetSettings, open_socket
 
 NEWEST_READ = (2, 10)
 READS = 'NatNet 2.6 to 2.10 in unicast only, one marker, from a server on this computer'
-"""What is left of NatNet with it, for people."""
+"""Part of NatNet that this backend supports, for people."""
 POLL_S = 0.2
 FAILURES_IN_A_ROW = 3
-"""Then the server's model has probably changed, and natnetclient begins anew."""
+"""Failures from which the server's model has probably changed: natnetclient begins again."""
 
 
 class NatNetClientBackend(MarkerFollower):
-    """Follows one marker through PyPI ``natnetclient``; same interface as `NatNetClient`.
+    """Client for one marker by PyPI ``natnetclient``; same interface as `NatNetClient`.
 
     ``settings``: `transport` must be ``unicast``; frames are expected on `data_port` of this
-    computer; ``on_sample, clock``: as for `NatNetClient`.
-    Raises InputError: if ``natnetclient`` is not installed, or the settings need what it cannot
-    do.
+    computer; ``on_sample, clock``: as for `NatNetClient`. Raises InputError if ``natnetclient`` is
+    not installed, or does not support the settings.
     """
 
     def __init__(
@@ -65,7 +64,7 @@ class NatNetClientBackend(MarkerFollower):
                 f'client: natnetclient reads {READS}, but {refused}: set client to builtin, which '
                 'reads NatNet 2.6 to 4.3, multicast and unicast'
             )
-        # It puts underscores for the blanks of a name.
+        # natnetclient replaces the blanks of a name by underscores.
         name = settings.marker.rigid_body.replace(' ', '_')
         marker = dataclasses.replace(settings.marker, rigid_body=name)
         super().__init__(dataclasses.replace(settings, marker=marker), on_sample, clock)
@@ -73,11 +72,11 @@ class NatNetClientBackend(MarkerFollower):
         self._refusal = ''
 
     def diagnosis(self) -> Diagnosis:
-        """Return what is wrong when readings are missing, and the remedy."""
+        """Fault and remedy if readings are missing."""
         return Diagnosis('version', self._refusal) if self._refusal else super().diagnosis()
 
     def _open(self) -> None:
-        # It binds the server's own address; better to find out before it leaves sockets behind.
+        # natnetclient binds the server's own address; this check fails before it opens sockets.
         open_socket(
             self._status.server_ip,
             self._settings.data_port,
@@ -87,7 +86,7 @@ class NatNetClientBackend(MarkerFollower):
         ).close()
 
     def _close(self) -> None:
-        """Do nothing: `_run` closes what it opens."""
+        """Do nothing: `_run` closes its own sockets."""
 
     def _run(self) -> None:
         while not self._stopping.is_set():
@@ -107,7 +106,10 @@ class NatNetClientBackend(MarkerFollower):
             self._stopping.wait(POLL_S)
 
     def _greet(self) -> bool:
-        """Ask the server's version with our own decoder; refuse what natnetclient cannot read."""
+        """Request the server's version with our decoder.
+
+        Refuse versions that natnetclient cannot read.
+        """
         request = natnet.encode_connect_request('remaster_ros')
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as command:
             command.settimeout(POLL_S)
@@ -132,7 +134,7 @@ class NatNetClientBackend(MarkerFollower):
         return not self._refusal
 
     def _follow(self, client: Any) -> None:
-        """Read frames until the stream falls silent or natnetclient no longer understands it."""
+        """Read frames until the stream stops or natnetclient cannot read it any more."""
         self._name_assets({name: body.id for name, body in client.rigid_bodies.items()})
         source = client.data_sock._sock
         source.settimeout(POLL_S)
@@ -166,11 +168,11 @@ class NatNetClientBackend(MarkerFollower):
             for sample in samples:
                 self._compare(sample, theirs)
 
-    def _compare(self, sample: MarkerSample, theirs: tuple[LabeledMarker, ...] | None) -> None:
-        """Hand the reading on if natnetclient has it too: same frame, place and flags."""
-        if theirs is not None and any(
+    def _compare(self, sample: MarkerSample, markers: tuple[LabeledMarker, ...] | None) -> None:
+        """Pass the reading on if natnetclient has the same one: same frame, position and flags."""
+        if markers is not None and any(
             marker.position == tuple(sample.position) and not marker.params
-            for marker in theirs
+            for marker in markers
             if self._status.marker_id in (None, marker.id)
         ):
             self._hand_on(sample)
@@ -179,7 +181,7 @@ class NatNetClientBackend(MarkerFollower):
 
 
 def _quiet_client() -> Any:
-    """Return natnetclient's client class without its thread and its minute-long first wait."""
+    """Client class of natnetclient without its thread and its first wait of a minute."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter('ignore', SyntaxWarning)
@@ -207,14 +209,14 @@ def _quiet_client() -> Any:
 
 
 class _Packet:
-    """What natnetclient takes from its sockets."""
+    """Result of a socket as natnetclient expects it."""
 
     def __init__(self, datagram: bytes) -> None:
         self._packet = datagram
 
 
 def _read(client: Any, datagram: bytes) -> tuple[LabeledMarker, ...] | None:
-    """Let natnetclient read a datagram; its labelled markers, or None where it fails."""
+    """Labelled markers of a datagram by natnetclient, or None if it fails."""
     client.labeled_markers.clear()
     try:
         client.parse(datagram)

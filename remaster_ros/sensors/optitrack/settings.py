@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How to reach an OptiTrack server, and which marker to follow."""
+"""Settings of an OptiTrack client: address of the server, and choice of the markers."""
 
 from __future__ import annotations
 
@@ -21,14 +21,12 @@ from remaster_ros.sensors.optitrack.natnet import (
 )
 
 RECEIVE_BUFFER_BYTES = 1 << 22
-"""A second of 1 kHz frames with 50 markers; Linux gives as much as net.core.rmem_max allows."""
+"""Receive buffer for a second of 1 kHz frames with 50 markers; Linux limits it by
+net.core.rmem_max."""
 
 
 def resolve(host: str) -> str:
-    """Return the IPv4 address of a host.
-
-    Raises DeviceError: if the name is unknown.
-    """
+    """IPv4 address of a host; raises DeviceError if the name is unknown."""
     try:
         return socket.gethostbyname(host)
     except (OSError, UnicodeError) as error:
@@ -39,7 +37,7 @@ def resolve(host: str) -> str:
 
 
 def interface_towards(server_ip: str, port: int) -> str:
-    """Return this machine's address from which packets reach the server; `DeviceError`."""
+    """Address of this machine from which packets reach the server; raises `DeviceError`."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
             probe.connect((server_ip, port))
@@ -54,19 +52,11 @@ def interface_towards(server_ip: str, port: int) -> str:
 def open_socket(
     address: str, port: int, *, purpose: str, remedy: str, shared: bool = False
 ) -> socket.socket:
-    """Open a non-blocking UDP socket bound to an address and port.
+    """Non-blocking UDP socket bound to an address and port.
 
-    Parameters
-    ----------
-    purpose, remedy
-        For the error message: what the port is for, and which parameter to change.
-    shared
-        Whether other programs may listen on the same port (multicast).
-
-    Raises
-    ------
-    DeviceError
-        If the port is in use, or the address is not one of this machine.
+    ``purpose, remedy``: purpose of the port and parameter to change, for the error message;
+    ``shared``: whether other programs may listen on the same port (multicast). Raises DeviceError
+    if the port is in use, or the address is not one of this machine.
     """
     opened = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     try:
@@ -94,12 +84,11 @@ def open_socket(
 
 
 def open_multicast_socket(group: str, port: int, interface: str) -> socket.socket:
-    """Open the data socket of a multicast client.
+    """Data socket of a multicast client.
 
-    Linux delivers a group's packets to sockets bound to the group's address (or to any), and
-    none to a socket bound to the interface's own address.
-
-    Raises DeviceError: if the port is in use, or the interface cannot join the group.
+    Linux delivers a group's packets to sockets bound to the group's address (or to any), and none
+    to a socket bound to the interface's own address. Raises DeviceError if the port is in use, or
+    the interface cannot join the group.
     """
     opened = open_socket(
         group, port, purpose='NatNet data', remedy='set data_port as in Motive', shared=True
@@ -117,9 +106,9 @@ def open_multicast_socket(group: str, port: int, interface: str) -> socket.socke
 
 
 def port_is_closed(server_ip: str, port: int, request: bytes) -> bool:
-    """Return whether the host is there but nothing listens on the port.
+    """Whether the host answers that no program listens on the port.
 
-    Only a connected socket reports the "port unreachable" that such a host sends back.
+    Only a connected socket reports the "port unreachable" of such a host.
     """
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.settimeout(0.2)
@@ -138,10 +127,9 @@ def port_is_closed(server_ip: str, port: int, request: bytes) -> bool:
 class NatNetSettings:
     """Settings of a client; those made with `parameter` are parameters of the node as well.
 
-    Group and data port matter for multicast only (the data port for ``client: natnetclient``
-    too). A `bitstream` can be requested from servers of 4.0 or newer, in unicast.
-
-    Raises InputError: naming the setting that cannot work.
+    Group and data port matter for multicast only (the data port for ``client: natnetclient`` too).
+    A `bitstream` can be requested from servers of 4.0 or newer, in unicast. Raises InputError,
+    with the name of the setting, for a value that cannot work.
     """
 
     server: str = parameter('127.0.0.1', 'the computer that runs Motive')
@@ -157,14 +145,14 @@ class NatNetSettings:
     )
     data_port: int = parameter(natnet.DEFAULT_DATA_PORT, 'as set in Motive', low=1, high=65535)
     bitstream: str = parameter('', "NatNet version to ask for; empty takes the server's own")
-    marker: MarkerChoice = field(default_factory=MarkerChoice)  # Which marker to follow
-    # Further markers of the same rigid body to follow: their numbers in it by name
+    marker: MarkerChoice = field(default_factory=MarkerChoice)  # Marker that the client follows
+    # Further markers of the same rigid body: name -> number in the body
     further_markers: Mapping[str, int] = field(default_factory=dict)
-    # Without a frame for this long the stream counts as stopped, s (wall clock)
+    # Time without a frame after which the stream counts as stopped, s (wall clock)
     silence_s: float = 1.0
 
     def __post_init__(self) -> None:
-        """Refuse what can never work."""
+        """Raises InputError for values that can never work."""
         check_all('OptiTrack', self)
         require_group(self.multicast_group)
         if not self.silence_s > 0:
@@ -180,9 +168,10 @@ class NatNetSettings:
                 raise InputError(f'bitstream: {error}') from error
 
     def choices(self) -> dict[str, MarkerChoice]:
-        """Return which markers to follow: that of `marker` as '', and the further ones by name.
+        """Choices of the followed markers: that of `marker` as '', and the further ones by name.
 
-        Raises InputError: two of them are the same marker, or a lone marker has none beside it.
+        Raises InputError if two of them are the same marker, or a lone marker is combined with
+        others.
         """
         first = self.marker
         found = {'': first}
@@ -208,12 +197,12 @@ class NatNetSettings:
 
     @property
     def wanted_version(self) -> Version | None:
-        """The bitstream to request, None for the server's own."""
+        """Bitstream to request, None for the server's own."""
         return natnet.parse_version(self.bitstream) if self.bitstream else None
 
 
 def require_group(group: str) -> None:
-    """Raise `InputError` unless it is an IPv4 multicast group."""
+    """Raises `InputError` unless the text is an IPv4 multicast group."""
     try:
         is_group = IPv4Address(group).is_multicast
     except AddressValueError:

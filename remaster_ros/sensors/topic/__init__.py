@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A topic of a node that is not of this package: mocap drivers, tag detectors, trackers."""
+"""Topic of another package's node: mocap drivers, tag detectors, trackers."""

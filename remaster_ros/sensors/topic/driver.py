@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A topic as a sensor: the positions that a node which is not of this package publishes.
+"""Topic as a sensor: positions that a node of another package publishes.
 
-That node sends no heartbeat. Whether it works, and how well, is judged from its messages: how many
-come, how old they are, whether the marker stands still in them.
+That node sends no heartbeat. Its state is judged from its messages: their rate, their age, and
+whether the marker stands still in them.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ from remaster_ros.types import FloatArray, MarkerReading
 
 
 class Sighting(NamedTuple):
-    """What a message holds of the marker."""
+    """Content of a message about the marker."""
 
-    stamp_s: float  # Of its header, s; 0 where the node that sent it has set none
+    stamp_s: float  # Stamp of the header, s; 0 if the sending node has set none
     frame: str
-    # m, (3,); None where the message has the marker without a measured place, or not at all
+    # m, (3,); None if the message has no marker, or no measured position of the marker
     position: FloatArray | None
-    # Unit quaternion x, y, z, w, (4,); None where the message has none, or one of another length,
-    # as drivers send that do not measure it
+    # Unit quaternion x, y, z, w, (4,); None if the message has none, or one of another length, as
+    # drivers without measured orientations send
     orientation: FloatArray | None = None
 
 
@@ -41,7 +41,7 @@ def _sighting(message: Any, place: Any, turn: Any = None) -> Sighting:
     position = None
     if place is not None:
         measured = np.array([place.x, place.y, place.z], dtype=float)
-        # What is out of sight is sent as no number, or as exactly the origin.
+        # Drivers send a marker that is out of sight as NaN, or as exactly the origin.
         position = measured if np.all(np.isfinite(measured)) and np.any(measured) else None
     return Sighting(
         stamp.sec + 1e-9 * stamp.nanosec,
@@ -52,9 +52,9 @@ def _sighting(message: Any, place: Any, turn: Any = None) -> Sighting:
 
 
 def _marker(message: Any, marker: str) -> Any:
-    for one in message.markers:
-        if marker in (one.marker_name, str(one.marker_index)):
-            return one.translation
+    for entry in message.markers:
+        if marker in (entry.marker_name, str(entry.marker_index)):
+            return entry.translation
     return None
 
 
@@ -70,24 +70,24 @@ READERS: dict[str, Callable[[Any, str], Sighting]] = {
     ),
     MARKERS: lambda message, marker: _sighting(message, _marker(message, marker)),
 }
-"""Message type -> what reads it; the second argument is the name or the number of the marker."""
+"""Message type -> its reader; the second argument is the name or the number of the marker."""
 
 
 WAIT_S = 0.05
-"""A simulated world waits for this node, and goes on by 0.15 s and more meanwhile."""
+"""Longest wait for a reading, s: a simulated world waits for this node, at most 0.15 s ahead."""
 SILENT_S = 1.0
-"""Without a message for so long, wall time, nothing comes any more."""
+"""Time without a message, s of wall time, after which the topic counts as silent."""
 JUDGED = 200
-"""Messages that rate and stillness are judged by, at most,"""
+"""Largest number of messages for rate and standard deviation."""
 JUDGED_S = 1.0
 RATED_S = 3.0
-"""and how far back they go for stillness and for the rate, by their stamps. Messages that come
-less often than every second, but not so seldom that they seem to have ended, have a rate too."""
+"""Largest age of these messages, s by their stamps, for the standard deviation (`JUDGED_S`) and the
+rate (`RATED_S`): messages at intervals above a second have a rate too."""
 EARLY_S = 0.1
-"""A stamp further in the future is of another clock. A simulated clock advances in steps, and a
-message may come before the step: there it may be as early as it may be late."""
+"""Largest lead of a stamp, s; a larger one means another clock. A simulated clock advances in
+steps, and a message may come before the step: there the lead may be as large as the age."""
 FROZEN = 10
-"""So many messages with the same position to the last bit are no measurements."""
+"""Number of successive positions, identical to the last bit, that are no measurements."""
 
 
 @dataclass(frozen=True)
@@ -117,7 +117,7 @@ class Parameters(SensorParameters):
 
 
 class TopicDriver(StreamDriver):
-    """See the module's text. The node subscribes, and hands each message to `take`."""
+    """Driver for a topic; the node subscribes and passes each message to `take`."""
 
     parameters_type = Parameters
     device = 'topic'
@@ -145,24 +145,24 @@ class TopicDriver(StreamDriver):
         publishers: Callable[[], Sequence[tuple[str, str]]],
         on_tool: bool = False,
     ) -> None:
-        """Learn what is subscribed to.
+        """Set the topic that the node subscribes to.
 
         Parameters
         ----------
         topic, message_type
             As in the cell file.
         marker
-            Its name in the cell.
+            Name of the marker in the cell.
         publishers
-            Gives node and message type of each publisher of the topic now.
+            Returns node and message type of each present publisher of the topic.
         on_tool
-            Whether the sensor is: then a place without an orientation tells nothing.
+            Whether the sensor is on the tool: a position without an orientation is then of no use.
         """
         self.topic, self._type, self._marker = topic, message_type, self.p.select or marker
         self._publishers, self._on_tool = publishers, on_tool
 
     def open(self) -> None:
-        """Refuse a topic that no node publishes, or with messages of another type."""
+        """Raises DeviceError if no node publishes the topic, or with another message type."""
         if problem := self._unpublished():
             raise DeviceError(problem)
 
@@ -182,7 +182,7 @@ class TopicDriver(StreamDriver):
         )
 
     def take(self, message: Any) -> None:
-        """Take a message; called from any thread."""
+        """Process a message; called from any thread."""
         found, now = READERS[self._type](message, self._marker), self._clock.now()
         arrival = self.p.stamps == 'arrival' or found.stamp_s == 0.0
         stamp_s = now if arrival else found.stamp_s
@@ -201,7 +201,7 @@ class TopicDriver(StreamDriver):
         self._readings.put((reading, now))
 
     def _refused(self, found: Sighting, stamp_s: float) -> tuple[str, str]:
-        """Return why a message is left out, in a word and as a sentence; '' where it is not."""
+        """Reason why a message is left out, as a word and as a sentence; '' if it is not."""
         if found.frame != self._frame:
             return 'other_frame', (
                 f'{self.topic} was in frame {self._frame!r} and is in {found.frame!r} now; one '
@@ -219,12 +219,12 @@ class TopicDriver(StreamDriver):
                 'tool tells nothing; have its driver publish it'
             )
         if stamp_s <= self._stamp_s:
-            # The last measurement once more, or out of order: counted, and no trouble.
+            # A repeated measurement, or one out of order, is counted and no fault.
             return 'repeated', ''
         return '', ''
 
     def read(self) -> MarkerReading | None:
-        """Return the next position; see `StreamDriver.read`."""
+        """Next position; see `StreamDriver.read`."""
         try:
             reading, self.received_s = self._readings.get(timeout=WAIT_S)
         except queue.Empty:
@@ -232,9 +232,9 @@ class TopicDriver(StreamDriver):
         return reading
 
     def state(self) -> SensorState:
-        """Return what the messages show."""
+        """State by the received messages."""
         with self._lock:
-            came, counts = self._came_wall, dict(self._counts)
+            last_wall, counts = self._came_wall, dict(self._counts)
             trouble, hidden, age_s = self._trouble, self._hidden, self._age_s
             still, rated = (
                 [r for r in self._recent if r.stamp_s > self._stamp_s - back_s]
@@ -243,12 +243,13 @@ class TopicDriver(StreamDriver):
             same = [r.position for r in list(self._recent)[-FROZEN:]]
         ready, level = True, 'ok'
         rate_hz, std_m = _rate_hz(rated), _std_m(still)
-        silent_s = np.inf if came is None else time.monotonic() - came
+        silent_s = np.inf if last_wall is None else time.monotonic() - last_wall
         if silent_s > SILENT_S:
             trouble = self._unpublished()
-            # A detector that sends only what it sees: the next configuration may show it again.
+            # A detector that sends only visible markers may see the marker at the next
+            # configuration.
             ready = hidden = not (trouble or self.p.always_sends)
-            ago = 'yet' if came is None else f'for {silent_s:.1f} s'
+            ago = 'yet' if last_wall is None else f'for {silent_s:.1f} s'
             remedy = 'is the marker in view?'
             if not hidden:
                 remedy = (
@@ -287,14 +288,17 @@ class TopicDriver(StreamDriver):
 
 
 def _rate_hz(recent: Sequence[MarkerReading]) -> float | None:
-    """Return how often messages come, by the median: the marker may have been hidden meanwhile."""
+    """Rate of the messages, Hz, by the median interval; None for fewer than two.
+
+    The median excludes intervals in which the marker was hidden.
+    """
     if len(recent) < 2:
         return None
     return float(1.0 / np.median(np.diff([reading.stamp_s for reading in recent])))
 
 
 def _std_m(recent: Sequence[MarkerReading]) -> float | None:
-    """Return the largest standard deviation of an axis: how still the marker stands."""
+    """Largest standard deviation of an axis, m: a measure of the marker's stillness."""
     if len(recent) < 2:
         return None
     return float(np.max(np.std([r.position for r in recent], axis=0, ddof=1)))

@@ -13,7 +13,7 @@ from worlds.optitrack_world import eventually
 
 from remaster_ros.sensors.optitrack import client as natnet_client
 from remaster_ros.sensors.optitrack import natnet
-from remaster_ros.sensors.optitrack.client import NatNetClient, _is_of_no_use
+from remaster_ros.sensors.optitrack.client import NatNetClient, _is_of_others
 from remaster_ros.sensors.optitrack.frame_gate import Dropped, MarkerChoice
 from remaster_ros.sensors.optitrack.natnet import (
     BITSTREAM_CHANGED,
@@ -141,8 +141,8 @@ def test_a_servers_own_messages_are_not_malformed(peer_and_client):
 @pytest.mark.parametrize('message_id', list(natnet.MessageId))
 def test_on_the_data_port_only_frames_and_strangers_matter(message_id):
     is_frame = message_id == natnet.MessageId.FRAMEOFDATA
-    assert _is_of_no_use(int(message_id), from_data_socket=True) is not is_frame
-    assert not _is_of_no_use(77, from_data_socket=True)
+    assert _is_of_others(int(message_id), from_data_socket=True) is not is_frame
+    assert not _is_of_others(77, from_data_socket=True)
 
 
 def test_another_address_is_counted_and_never_believed(peer_and_client):

@@ -13,7 +13,7 @@ from remaster_ros.session.workcell import read_cell
 from remaster_ros.session.yaml_records import from_plain, to_plain
 from remaster_ros.simulation.arm_motion import ServoPoint
 from remaster_ros.simulation.effect_sampling import RANDOM, EffectSpec, hide
-from remaster_ros.simulation.hidden_arm import ChainArm, WrongArm
+from remaster_ros.simulation.hidden_arm import ChainArm, TrueArm
 from remaster_ros.simulation.hidden_effects import NAMED, UNNAMED, HiddenEffect
 from remaster_ros.simulation.setup import make_world
 from remaster_ros.simulation.truth import SessionTruth, SimulatedSensor, Warming
@@ -46,7 +46,7 @@ def test_over_time_the_arm_errs_as_on_the_stage(stage, kind):
     print(f'seed {SEED}')
     effects = hide(stage, [EffectSpec(kind, size_m=0.5e-3)], np.random.default_rng(SEED))
     truth = SessionTruth(stage.joint_offsets, stage.markers, stage.sensors, WARMING, effects)
-    arm = WrongArm(CHAIN, truth, 0.0, stage.visited.home)
+    arm = TrueArm(CHAIN, truth, 0.0, stage.visited.home)
     expected = stage.seen(effects)
     here = stage.visited.home
     for i, (time_s, q) in enumerate(zip(stage.visited.time_s, stage.visited.q)):
@@ -63,7 +63,7 @@ def test_while_it_moves_the_error_passes_over(stage):
     scale = HiddenEffect('encoder_scale', (2,), np.array([1e-3]))
     start, end = np.zeros(7), np.full(7, 1.0)
     truth = SessionTruth(np.zeros(7), stage.markers, stage.sensors, WARMING, (scale,))
-    arm = WrongArm(CHAIN, truth, 0.0, start)
+    arm = TrueArm(CHAIN, truth, 0.0, start)
     arm.move(10.0, start, 20.0, end)
     angles = [arm.deviation(t).angle[0, 1] for t in (0.0, 10.0, 12.0, 15.0, 18.0, 20.0, 99.0)]
     assert angles[0] == angles[1] == 0.0
