@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What becomes of a measured configuration: pairing, plausibility, references."""
+"""Processing of a measured configuration: pairing, plausibility, references."""

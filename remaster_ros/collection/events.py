@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the nodes act on: one record, typed and versioned, as JSON on ``remaster/events``.
+"""Messages between the nodes: one record, typed and versioned, as JSON on ``remaster/events``.
 
 A record carries either the *state* of a node (twice a second and at each change, so that a node
-which starts late has it at once) or an *event* of a configuration. An event names the pose by the
+that starts late has it at once) or an *event* of a configuration. An event names the pose by the
 stamp of its announcement and the solution by its index there.
 
-A field without which an arm could move wrongly has no default: a record that lacks it is refused.
-Unknown fields are ignored, so that fields can be added. A change of what
-a field means, or a field that is taken away, needs another `VERSION`.
+A field without which an arm could move wrongly has no default: a record without it is refused.
+Unknown fields are ignored, so that fields can be added. A change of a field's meaning, or the
+removal of a field, needs another `VERSION`.
 """
 
 from __future__ import annotations
@@ -21,33 +21,33 @@ from remaster_ros.errors import InputError
 
 
 class Body(msgspec.Struct, frozen=True, tag_field='kind'):
-    """What a record carries; ``kind`` names its type."""
+    """Content of a record; ``kind`` names its type."""
 
-    sender: ClassVar[str] = ''  # The name of the only node that may publish it; '' for any
+    sender: ClassVar[str] = ''  # Name of the only node that may publish the record; '' for any
 
 
 class OptimizerState(Body, frozen=True, kw_only=True, tag='optimizer'):
     """State of the optimizer."""
 
     sender: ClassVar[str] = 'optimizer'
-    plan: str  # The plan whose session it has looked at, '' for none
-    # Whether the precision that the cell file states is reached: no more poses to fit are visited
-    # then
+    plan: str  # Plan of the session that the optimizer has fitted, '' for none
+    # Whether the precision stated in the cell file is reached: no more poses to fit are then
+    # visited
     enough: bool
-    precision: str = ''  # What is known, and what more would cost, as text
+    precision: str = ''  # Precision so far, and cost of the wanted precision, as text
 
 
 VERSION = 1
 
 SHORT = 8
-"""So many digits of a checksum are shown to people."""
+"""Number of digits of a checksum in messages for people."""
 
 Index = Annotated[int, msgspec.Meta(ge=0)]
 Outcome = Literal['recorded', 'partial', 'rejected']
 
 
 class Alive(Body, frozen=True, tag='alive'):
-    """State of a node of which the others need nothing else."""
+    """State of a node from which other nodes need nothing else."""
 
 
 class PlannerState(Body, frozen=True, kw_only=True, tag='planner'):
@@ -57,27 +57,23 @@ class PlannerState(Body, frozen=True, kw_only=True, tag='planner'):
     # ``running`` while the arm may move; ``held`` (by a full disk), ``idle``, ``paused``,
     # ``stopped``, ``complete`` or ``failed``
     state: str
-    run: str  # Token of the run under way, '' for none. Each /remaster/collect begins another one.
-    planned: int = 0  # Configurations to fit that were planned; 0 before
-    # The plan whose complete collection is gone on with, which its recorder's session is opened
-    # again for; ''
+    run: str  # Token of the present run, '' for none. Each /remaster/collect begins another run.
+    planned: int = 0  # Number of planned configurations to fit; 0 before
+    # Plan whose complete collection is continued, so that its recorder's session is opened again;
+    # ''
     further: str = ''
 
     def goes_further(self, plan: str) -> bool:
-        """Whether a run is under way behind the complete collection of a plan."""
+        """Whether the present run continues the complete collection of a plan."""
         return self.state == 'running' and self.further == plan != ''
 
     def run_held(self, before: str) -> str:
-        """Return the token that recorder and bridge hold after this state.
+        """Token that recorder and bridge hold after this state, '' for none.
 
-        They keep it in memory and publish it: by that a planner which is started again finds
+        Both nodes keep the token in memory and publish it: a restarted planner finds by the token
         whether its run still lives. A pause or a stop ends the run; a planner that was just
-        started and has not decided yet (``idle``) does not.
-
-        Parameters
-        ----------
-        before
-            The token held so far, '' for none.
+        started and has not decided yet (``idle``) does not. ``before``: token held so far, '' for
+        none.
         """
         if self.state in ('running', 'held'):
             return self.run or before
@@ -88,29 +84,29 @@ class BridgeState(Body, frozen=True, kw_only=True, tag='bridge'):
     """State of the bridge."""
 
     sender: ClassVar[str] = 'robot_bridge'
-    halted: str  # Why the arm is halted until a person clears it; ''
+    halted: str  # Reason of a halt until a person clears it; '' without a halt
     pose: str = ''  # Stamp of the pose whose solutions the bridge has, '' for none
     run: str = ''  # Token of the last run that the bridge has seen running
-    # Why nothing moves in this run before a person calls /remaster/collect, and that; ''
+    # Reason why the arm waits for /remaster/collect in this run, with that remedy; ''
     asks_for_collect: str = ''
-    # Time since the last usable joint_states, None for never, s; what is wrong with them
+    # Time since the last usable joint_states, None for never, s; their fault
     joints_age_s: float | None = None
     joints_trouble: str = ''
-    # SHA-256 of the compensation.json by which it corrects what it commands; '' for none
+    # SHA-256 of the compensation.json that corrects the commands; '' for none
     correction: str = ''
 
 
 NO_FREE_PATH = 'no_free_path'
-"""Outcome of a configuration that the arm cannot get to without hitting something."""
+"""Outcome of a configuration that the arm cannot reach without a collision."""
 
 
 class Decided(msgspec.Struct, frozen=True):
-    """What became of the configurations of a plan, as the session's journal has it."""
+    """Outcomes of the configurations of a plan, as in the session's journal."""
 
-    pose: int | None = None  # The last one of which any has an outcome; None before the first
-    solutions: tuple[int, ...] = ()  # Those of it that have one, by the planner's own numbers
-    # How many configurations came to which end: an `Outcome`, ``failed`` or ``no_free_path``.
-    # Those for a registration are not among them, and visits to references are counted apart.
+    pose: int | None = None  # Last pose with an outcome; None before the first
+    solutions: tuple[int, ...] = ()  # Solutions of the pose with an outcome, by planner's number
+    # Number of configurations by outcome: an `Outcome`, ``failed`` or ``no_free_path``, without
+    # those of a registration; visits to references are counted separately.
     outcomes: dict[str, int] = msgspec.field(default_factory=dict)
     references: int = 0
 
@@ -119,11 +115,11 @@ class RecorderState(Body, frozen=True, kw_only=True, tag='recorder'):
     """State of the recorder."""
 
     sender: ClassVar[str] = 'recorder'
-    # What the arm has to wait for (room on the disk, a required sensor), and why; ''
+    # Condition that the arm has to wait for (room on the disk, a required sensor) and reason; ''
     waiting_for: str
     state: str = 'waiting'  # ``waiting``, ``measuring`` or ``closed``
-    exit_status: str = ''  # Of a session that is closed; ''
-    # The folder, how many rows it has, and the plan that they belong to
+    exit_status: str = ''  # Exit status of a closed session; ''
+    # Folder of the session, number of its rows, and their plan
     session: str = ''
     observations: int = 0
     plan: str = ''
@@ -131,14 +127,14 @@ class RecorderState(Body, frozen=True, kw_only=True, tag='recorder'):
     pose: str = ''
     run: str = ''
     decided: Decided = Decided()
-    registration: str = ''  # How far the first registration of the sensors is, as text
+    registration: str = ''  # Progress of the first registration of the sensors, as text
     registered: bool = False  # Whether every sensor that the arm waits for is registered
-    require: str = 'all'  # Which sensors the arm waits for: ``all``, ``any`` or the name of one
+    require: str = 'all'  # Sensors that the arm waits for: ``all``, ``any`` or the name of one
     # Time since the last reading of each sensor, s; None for never
     read_age_s: dict[str, float | None] = msgspec.field(default_factory=dict)
-    changed: str = ''  # What has changed at the reference configurations; ''
-    # Token of the run that this change has paused; None for none, '' for one that a recorder which
-    # was started again has not learned yet
+    changed: str = ''  # Change at the reference configurations, as text; ''
+    # Token of the run that this change has paused; None for none, '' for one that a restarted
+    # recorder does not know yet
     changed_run: str | None = None
 
 
@@ -146,40 +142,45 @@ class SensorReport(Body, frozen=True, kw_only=True, tag='sensor'):
     """State of a sensor's node."""
 
     sensor: str  # The sensor's name in the cell
-    ready: bool  # Whether it can measure a marker that it sees
-    trouble: str = ''  # What is wrong, with the remedy; ''
-    message: str = ''  # What the node shows to people
-    # The sensor does not see its marker: no reading comes before the arm has moved on
+    ready: bool  # Whether the sensor can measure a visible marker
+    trouble: str = ''  # Fault with its remedy; ''
+    message: str = ''  # Message of the node for people
+    # Whether the marker is hidden from the sensor: no reading comes before the arm has moved on
     hidden: bool = False
 
 
 class TourPlanned(Body, frozen=True, tag='planned'):
-    """The planner has planned the collection; described as text."""
+    """Event: the planner has planned the collection; described as text."""
 
     sender: ClassVar[str] = 'pose_planner'
     description: str
 
 
 class PoseAnnounced(Body, frozen=True, kw_only=True, tag='pose'):
-    """The planner announces a pose, whose solutions follow on ``remaster/joint_solutions``."""
+    """Event: the planner announces a pose.
+
+    Its solutions follow on ``remaster/joint_solutions``.
+    """
 
     sender: ClassVar[str] = 'pose_planner'
-    # Of the messages that belong to this announcement; the same pose announced again has another
-    # one
+    # Stamp of the messages of this announcement; a repeated pose has another stamp
     stamp: str
-    # As in the session
+    # Pose and split as in the session
     pose: int
     split: str
     # The planner's own numbers of the joint solutions, in the order published
     ids: tuple[Index, ...]
-    # Those that no free path leads to; where there are no others, no solutions follow
+    # Solutions without a free path; if there are no others, no solutions follow
     unreached: tuple[Index, ...] = ()
-    plan: str = ''  # The plan that all are numbered by
-    last: bool = False  # Whether it is the last reference of a round
+    plan: str = ''  # Plan of these numbers
+    last: bool = False  # Whether the pose is the last reference of a round
 
 
 class SolutionCommanded(Body, frozen=True, kw_only=True, tag='commanded'):
-    """The bridge sends the arm to a solution, this long after it last settled, wall time."""
+    """Event: the bridge sends the arm to a solution.
+
+    ``since_settled_wall_s``: wall time since the arm last settled, s.
+    """
 
     sender: ClassVar[str] = 'robot_bridge'
     stamp: str
@@ -188,7 +189,7 @@ class SolutionCommanded(Body, frozen=True, kw_only=True, tag='commanded'):
 
 
 class SolutionSettled(Body, frozen=True, kw_only=True, tag='settled'):
-    """The arm stands at a solution, after so much time of motion and of settling."""
+    """Event: the arm stands at a solution, after this time of motion and of settling."""
 
     sender: ClassVar[str] = 'robot_bridge'
     stamp: str
@@ -198,7 +199,7 @@ class SolutionSettled(Body, frozen=True, kw_only=True, tag='settled'):
 
 
 class SolutionFailed(Body, frozen=True, kw_only=True, tag='failed'):
-    """The bridge does not get the arm to a solution."""
+    """Event: the bridge cannot move the arm to a solution."""
 
     sender: ClassVar[str] = 'robot_bridge'
     stamp: str
@@ -207,7 +208,7 @@ class SolutionFailed(Body, frozen=True, kw_only=True, tag='failed'):
 
 
 class ArmStopped(Body, frozen=True, kw_only=True, tag='stopped'):
-    """The bridge has stopped the arm on its way."""
+    """Event: the bridge has stopped the arm during a motion."""
 
     sender: ClassVar[str] = 'robot_bridge'
     stamp: str
@@ -215,7 +216,7 @@ class ArmStopped(Body, frozen=True, kw_only=True, tag='stopped'):
 
 
 class ArmHalted(Body, frozen=True, kw_only=True, tag='halted'):
-    """The bridge has halted the arm until a person clears the halt."""
+    """Event: the bridge has halted the arm until a person clears the halt."""
 
     sender: ClassVar[str] = 'robot_bridge'
     stamp: str
@@ -223,36 +224,39 @@ class ArmHalted(Body, frozen=True, kw_only=True, tag='halted'):
 
 
 class HaltCleared(Body, frozen=True, kw_only=True, tag='halt_cleared'):
-    """A person has cleared the halt."""
+    """Event: a person has cleared the halt."""
 
     sender: ClassVar[str] = 'robot_bridge'
     stamp: str
 
 
 class ConfigurationEnded(Body, frozen=True, kw_only=True, tag='configuration'):
-    """The recorder has written down what became of a configuration; the arm may go on."""
+    """Event: the recorder has recorded the outcome of a configuration; the arm may go on."""
 
     sender: ClassVar[str] = 'recorder'
     stamp: str
     solution: Index
-    # What became of it, and why where it is not ``recorded``
+    # Outcome, with the reason if it is not ``recorded``
     result: Outcome
     reason: str = ''
     registered: bool = False  # Whether every sensor that the arm waits for is registered
-    # From settling to the last reading; None where nothing was read, s
+    # Time from settling to the last reading, s; None if nothing was read
     measuring_s: float | None = None
 
 
 class SetupChanged(Body, frozen=True, kw_only=True, tag='changed'):
-    """The references show that something has moved."""
+    """Event: the references show that something has moved."""
 
     sender: ClassVar[str] = 'recorder'
-    stops: bool  # Whether the collection pauses until a person has looked
-    text: str = ''  # What has moved, and by how much
+    stops: bool  # Whether the collection pauses until a person has checked the change
+    text: str = ''  # The change and its size
 
 
 class ReadByHand(Body, frozen=True, kw_only=True, tag='by_hand'):
-    """The recorder reads where a person has driven the arm: joints, rad, and since when, s."""
+    """Event: the recorder reads at a configuration to which a person has driven the arm.
+
+    ``q``: joints, rad; ``stamp_s``: time since which the arm stands there, s.
+    """
 
     sender: ClassVar[str] = 'recorder'
     stamp_s: float
@@ -260,18 +264,18 @@ class ReadByHand(Body, frozen=True, kw_only=True, tag='by_hand'):
 
 
 class RecorderBegan(Body, frozen=True, kw_only=True, tag='began'):
-    """In a bag: its recorder was started (again) here, with no reading under way."""
+    """Event in a bag: its recorder was started (again) here, with no reading in progress."""
 
     sender: ClassVar[str] = 'recorder'
-    # Its parameters, and its cell as JSON: with them the bag gives the same rows again
+    # Parameters of the recorder, and its cell as JSON: with both the bag gives the same rows again
     parameters: dict[str, bool | int | float | str] = msgspec.field(default_factory=dict)
     cell: str = ''
-    # It is the same process as before, which has opened a closed session again
+    # Whether the same process as before has opened a closed session again
     continued: bool = False
 
 
 class ShotMeasured(Body, frozen=True, tag='measured'):
-    """A single-shot sensor has measured; search and integration took so much wall time."""
+    """Event: a single-shot sensor has measured, with the wall time of search and integration."""
 
     instrument_wall_s: float
 
@@ -296,33 +300,29 @@ STATES = get_args(State)
 
 
 class ArmModel(msgspec.Struct, frozen=True, kw_only=True):
-    """Which arm and surroundings a node computes with."""
+    """Arm and surroundings that a node computes with."""
 
-    # Checksums of the URDF's content, and of what motions depend on in the cell file
+    # Checksums of the URDF's content, and of the part of the cell file that motions depend on
     urdf: str
     cell: str
-    # Where the node has read them
+    # Paths of both files
     urdf_file: str = ''
     cell_file: str = ''
 
     def difference(self, own: str, other: ArmModel, name: str) -> str:
-        """Return how the model of another node differs, '' where it does not.
+        """Difference to the model of another node, a sentence; '' if there is none.
 
-        Parameters
-        ----------
-        own, name
-            This node's name, and the other's.
-        other
-            The other's model.
+        ``own, name``: names of this node and of the other node; ``other``: model of the other
+        node.
         """
         found = [
-            f'{own} has the {what} {file} (checksum {mine[:SHORT]}) and {name} has '
-            f'{other_file} ({its[:SHORT]})'
-            for what, mine, its, file, other_file in (
+            f'{own} has the {what} {file} (checksum {checksum[:SHORT]}) and {name} has '
+            f'{other_file} ({other_checksum[:SHORT]})'
+            for what, checksum, other_checksum, file, other_file in (
                 ('URDF', self.urdf, other.urdf, self.urdf_file, other.urdf_file),
                 ('cell file', self.cell, other.cell, self.cell_file, other.cell_file),
             )
-            if mine != its
+            if checksum != other_checksum
         ]
         if not found:
             return ''
@@ -330,15 +330,15 @@ class ArmModel(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class EventRecord(msgspec.Struct, frozen=True, kw_only=True):
-    """A state or an event, and which node published it when."""
+    """State or event, with its node and time."""
 
-    node: str  # The node with its namespace, such as ``/left/recorder``
+    node: str  # Name of the node with its namespace, such as ``/left/recorder``
     body: State | Event
-    # Identifies this start of the node; how long it has been running, s
+    # Identifier of this start of the node; running time, s
     started: str = ''
     uptime_s: float = 0.0
     stamp_ns: int = 0  # Time of the node's clock, ns
-    # Which arm the node computes with; None where it computes with none
+    # Arm that the node computes with; None if it needs none
     model: ArmModel | None = None
     version: int = VERSION
 
@@ -348,17 +348,15 @@ class _Version(msgspec.Struct):
 
 
 def encode(record: EventRecord) -> str:
-    """Return a record as JSON."""
+    """Record as JSON."""
     return _ENCODER.encode(record).decode()
 
 
 def decode(text: str) -> EventRecord:
-    """Return the record in a message.
+    """Record in a message.
 
-    Raises
-    ------
-    InputError
-        It is no JSON, of another version, not complete, or from a node that cannot have sent it.
+    Raises InputError if the text is no JSON, has another version, is not complete, or is from a
+    node that may not publish the record.
     """
     try:
         version = _VERSION.decode(text).version

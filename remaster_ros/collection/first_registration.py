@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""First registration of the sensors: by three points each, refined by those that follow."""
+"""First registration of the sensors: by three points each, refined by the points that follow."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.transforms import apply
 from remaster_ros.types import FloatArray
 
-# Poses: the markers of one frame lie too close to each other to register a sensor by.
+# Number of poses: the markers of one frame are too close to each other to register a sensor.
 POINTS = 3
 SEARCHED_POINTS = 5
-"""Of so many points, the first ones, every marker is tried that they may be."""
+"""Number of first points for which every possible marker is tried."""
 CLEARLY_WORSE = 3.0
-"""Another choice of markers is out of the question where its points agree so many times worse
-than the best, or than a tenth of what is allowed: an arm that is not calibrated is off by that."""
+"""Ratio of the points' RMS with another choice of markers to that with the best choice, or to a
+tenth of the allowed distance (the error of an uncalibrated arm), from which it is excluded."""
 
 
 class FirstRegistration:
-    """Collect points of each sensor; from the third pose on they give T_R_N.
+    """Points of each sensor, which give T_R_N from the third pose on.
 
     Parameters
     ----------
@@ -35,19 +35,19 @@ class FirstRegistration:
     markers
         Marker positions in the tool frame, m, (3,), by name.
     sensors
-        Their names.
+        Names of the sensors.
     allowed_m
-        A point that is off by more is not used, m.
+        Largest deviation of a point that is used, m.
     searched
-        Sensors that find one of several markers by a search, and these markers: before the
-        registration it is not known which of them a reading is of.
+        Sensors that find one of several markers by a search, with these markers: before the
+        registration the marker of a reading is not known.
 
     Attributes
     ----------
     T_R_N
-        What is registered: sensor -> (4, 4).
+        Registrations: sensor -> (4, 4).
     troubles
-        Why the points of a sensor register nothing: sensor -> message.
+        Reason why the points of a sensor give no registration: sensor -> message.
     """
 
     def __init__(
@@ -60,15 +60,15 @@ class FirstRegistration:
     ) -> None:
         self._chain, self._markers, self._allowed_m = chain, markers, allowed_m
         self._searched = searched
-        # Where the robot has the marker, or each of those that it may be, (m, 3), and the reading.
+        # Positions by the robot of each marker that a point may be of, (m, 3), and its reading.
         self._points: dict[str, list[tuple[FloatArray, FloatArray]]] = {n: [] for n in sensors}
-        # Where the arm stood: the same for the markers of a frame.
+        # Configurations of the arm, one for all markers of a frame.
         self._stops: dict[str, set[bytes]] = {name: set() for name in self._points}
         self.T_R_N: dict[str, FloatArray] = {}
         self.troubles: dict[str, str] = {}
 
     def add(self, readings: Iterable[PairedReading]) -> list[str]:
-        """Take readings at registration poses; return the sensors registered anew by them."""
+        """Add readings at registration poses; names of sensors registered (again) by them."""
         registered: list[str] = []
         taken: dict[str, None] = {}
         for reading in readings:
@@ -95,7 +95,7 @@ class FirstRegistration:
         return registered
 
     def _frame(self, options: Sequence[FloatArray], measured: FloatArray) -> FloatArray:
-        """Return T_R_N by the choice of markers that agrees best; `InsufficientDataError`."""
+        """T_R_N by the choice of markers that agrees best; raises `InsufficientDataError`."""
         failure: InsufficientDataError | None = None
         found = []
         for choice in itertools.product(*options):
@@ -124,6 +124,6 @@ class FirstRegistration:
         return T_R_N
 
     def describe(self) -> str:
-        """Return how far the registration is, as text."""
+        """Progress of the registration, as text."""
         parts = [f'{name}: point {len(stops)} of {POINTS}' for name, stops in self._stops.items()]
         return '; '.join([*parts, *self.troubles.values()])

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Residuals while a session is measured: how far the markers are from where the model has them.
+"""Residuals during the measurement of a session: distances of the markers from the model.
 
-A look beside the session, not a part of it: every reading since the arm has settled counts as it
-came, and the registration is that of least squares over all configurations so far. What is
-recorded is decided by the recorder, and what is fitted by the fit.
+These residuals are for display and not a part of the session: every reading since the arm has
+settled counts as received, and the registration is by least squares over all configurations so
+far. The recorder decides on the recorded rows, and the fit on the fitted ones.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from remaster_ros.kinematics.transforms import apply
 from remaster_ros.types import FloatArray
 
 FEWEST = 5
-"""Points before residuals are stated: three of them fit any registration well."""
+"""Fewest points for residuals: three points fit any registration well."""
 MOST = 2000
-"""Points of a sensor that are kept; the first ones are dropped beyond."""
+"""Largest number of points of a sensor; of more the first ones are dropped."""
 
 
 class LiveResiduals:
-    """Pairs where the arm has settled with the mean of what each sensor reads there.
+    """Pairs of a settled configuration and the mean of each sensor's readings there.
 
     Parameters
     ----------
@@ -42,29 +42,29 @@ class LiveResiduals:
         self._markers = {name: dict(places) for name, places in markers.items()}
         self._offsets: FloatArray | None = None
         self._q: FloatArray | None = None
-        # Of each sensor and marker the sum of the readings, and their number.
+        # Sum of the readings of each sensor and marker, and their number.
         self._sums = {(name, marker): np.zeros(4) for name in markers for marker in markers[name]}
-        # Configuration, marker, where it was read.
+        # Configuration, marker, and mean reading.
         self._pairs: dict[str, list[tuple[FloatArray, str, FloatArray]]] = {
             name: [] for name in markers
         }
-        # How many of them, the first ones, are of the registration.
+        # Number of first pairs that are of the registration.
         self._registering = dict.fromkeys(markers, 0)
         self._found: dict[str, tuple[FloatArray, FloatArray]] = {}
 
     def settled(self, q: FloatArray) -> None:
-        """Begin at a configuration, rad, (k,); readings before this do not count."""
+        """Begin at a configuration, rad, (k,); earlier readings do not count."""
         self._q = q
         for total in self._sums.values():
             total[:] = 0.0
 
     def reading(self, sensor: str, marker: str, position_N: FloatArray) -> None:
-        """Take a reading of a marker in the sensor's frame, m, (3,); NaN while it is hidden."""
+        """Add a reading of a marker in the sensor's frame, m, (3,); NaN while it is hidden."""
         if self._q is not None and np.all(np.isfinite(position_N)):
             self._sums[sensor, marker] += [*position_N, 1.0]
 
     def ended(self, *, recorded: bool, registering: bool = False) -> None:
-        """End a configuration, of the registration or not; it counts where it was recorded."""
+        """End a configuration, of the registration or not; it counts if it was recorded."""
         if self._q is not None and recorded:
             for (name, marker), total in self._sums.items():
                 if total[3]:
@@ -77,12 +77,12 @@ class LiveResiduals:
         self._q = None
 
     def use_offsets(self, joint_offsets: FloatArray) -> None:
-        """State residuals of the arm with these zero-offsets from now on, rad, (k,)."""
+        """Use these zero-offsets for the residuals from now on, rad, (k,)."""
         self._offsets = joint_offsets
         self._found.clear()
 
     def use_markers(self, markers: Mapping[str, FloatArray]) -> None:
-        """Take markers as they were fitted from now on, marker -> m, (3,)."""
+        """Use these fitted markers from now on, marker -> m, (3,)."""
         for places in self._markers.values():
             places.update({name: markers[name] for name in places if name in markers})
         self._found.clear()
@@ -93,15 +93,15 @@ class LiveResiduals:
         return self._offsets is not None
 
     def norms_m(self, sensor: str) -> FloatArray:
-        """Return the length of each residual, m, (n,); n = 0 for too few."""
+        """Length of each residual, m, (n,); n = 0 for too few."""
         return self._fitted(sensor)[0]
 
     def of_registration(self, sensor: str) -> int:
-        """Return the number of residuals of registration poses, which come first."""
+        """Number of residuals of registration poses, which come first."""
         return self._registering[sensor]
 
     def points_R(self, sensor: str) -> FloatArray:
-        """Return the measured points in the robot base, m, (n, 3); n = 0 for too few."""
+        """Measured points in the robot base, m, (n, 3); n = 0 for too few."""
         return self._fitted(sensor)[1]
 
     def _fitted(self, sensor: str) -> tuple[FloatArray, FloatArray]:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From ROS messages to arrays, by their fields alone: of rclpy's messages and of rosbags'."""
+"""Arrays from ROS messages, by field names only: for rclpy's messages and for those of rosbags."""
 
 from __future__ import annotations
 
@@ -13,33 +13,30 @@ from remaster_ros.types import FloatArray
 
 
 def seconds(stamp: Any) -> float:
-    """Return a stamp or duration (builtin_interfaces/Time, /Duration) in seconds."""
+    """Stamp or duration (builtin_interfaces/Time, /Duration) in seconds."""
     return stamp.sec + 1e-9 * stamp.nanosec
 
 
 def stamp_key(stamp: Any) -> str:
-    """Return a stamp as exact text, the name of a pose in events."""
+    """Stamp as exact text, the name of a pose in events."""
     return f'{stamp.sec}.{stamp.nanosec:09d}'
 
 
 def temperature_topic(marker_topic: str) -> str:
-    """Return where a sensor that has a thermometer publishes it: beside its marker."""
+    """Topic of a sensor's thermometer, next to that of its marker."""
     place, slash, _ = marker_topic.rpartition('/')
     return f'{place}{slash}temperature'
 
 
 class JointOrder:
-    """Take joint positions by name from messages that have them in any order.
+    """Joint positions by name, from messages with any order of joints.
 
-    Parameters
-    ----------
-    names
-        The wanted order.
+    ``names``: wanted order.
     """
 
     def __init__(self, names: Sequence[str]) -> None:
         self.names = tuple(names)
-        # None before the first: a message without names is none of the arm's.
+        # None before the first message: a message without names is not the arm's.
         self._seen: tuple[str, ...] | None = None
         self._columns: list[int] = []
 
@@ -49,12 +46,9 @@ class JointOrder:
         return names == self._seen or not set(self.names).isdisjoint(names)
 
     def positions(self, message: Any) -> FloatArray:
-        """Return the positions in the wanted order, rad, (k,).
+        """Positions in the wanted order, rad, (k,).
 
-        Raises
-        ------
-        InputError
-            If a joint is missing or named more than once; names it.
+        Raises InputError, with its name, if a joint is missing or named more than once.
         """
         names = tuple(message.name)
         if names != self._seen:
@@ -74,29 +68,22 @@ class JointOrder:
 
 
 WANTED = 'wanted/'
-"""Before the name of a joint in remaster/settled: where it was wanted, before a correction."""
+"""Prefix of joint names in remaster/settled for wanted positions, before a correction."""
 
 
 def wanted_of(message: Any, joint_names: Sequence[str]) -> FloatArray | None:
-    """Return what was wanted where an arm has settled, rad, (k,); None without a correction.
+    """Wanted positions of a settled arm, before a correction, rad, (k,).
 
-    Raises
-    ------
-    InputError
-        As `JointOrder.positions`.
+    None without a correction.
+
+    Raises InputError as `JointOrder.positions`.
     """
     order = JointOrder([f'{WANTED}{name}' for name in joint_names])
     return order.positions(message) if order.concerns(message) else None
 
 
 def refuse_repeated(wanted: Sequence[str], given: Sequence[str], topic: str) -> None:
-    """Refuse a message in which a wanted joint stands twice: which value is right is not known.
-
-    Raises
-    ------
-    InputError
-        Names the joints.
-    """
+    """Raises InputError, with the names, if a message names a wanted joint twice."""
     repeated = [name for name in wanted if list(given).count(name) > 1]
     if repeated:
         raise InputError(
@@ -106,12 +93,12 @@ def refuse_repeated(wanted: Sequence[str], given: Sequence[str], topic: str) -> 
 
 
 CORRECTED = {'on': 'corrected/', 'off': 'uncorrected/'}
-"""Before the names of all joints in remaster/joint_solutions: whether what is commanded has to be
-corrected. In the names, so that a bridge that does not heed it finds none of its joints."""
+"""Prefixes of all joint names in remaster/joint_solutions, by whether commands are corrected. The
+prefix is in the names, so that a bridge that ignores it finds none of its joints."""
 
 
 def correction_asked(message: Any) -> str:
-    """Return whether joint solutions are asked for with a correction ``on`` or ``off``; ''."""
+    """Correction that joint solutions require: ``on``, ``off``, or '' for any."""
     for state, prefix in CORRECTED.items():
         if message.joint_names and all(name.startswith(prefix) for name in message.joint_names):
             return state
@@ -119,18 +106,10 @@ def correction_asked(message: Any) -> str:
 
 
 def solutions_of(message: Any, joint_names: Sequence[str]) -> FloatArray:
-    """Return the joint solutions in remaster/joint_solutions, rad, (m, k); m = 0 for a stop.
+    """Joint solutions in remaster/joint_solutions, rad, (m, k); m = 0 for a stop.
 
-    Parameters
-    ----------
-    joint_names
-        The wanted order of joints.
-
-    Raises
-    ------
-    InputError
-        The solutions are for other joints or name one twice, or a point has not one position
-        for each.
+    ``joint_names``: wanted order of joints. Raises InputError if the solutions are for other
+    joints or name one twice, or a point does not have one position for each joint.
     """
     prefix = CORRECTED.get(correction_asked(message), '')
     given = [name.removeprefix(prefix) for name in message.joint_names]
@@ -147,11 +126,11 @@ def solutions_of(message: Any, joint_names: Sequence[str]) -> FloatArray:
 
 
 LENGTH_TOLERANCE = 1e-3
-"""By so much the length of a quaternion may differ from 1: some drivers send single precision."""
+"""Largest difference of a quaternion's length from 1: some drivers send single precision."""
 
 
 def unit_quaternion(turn: Any) -> FloatArray | None:
-    """Return a geometry_msgs/Quaternion as x, y, z, w of length 1, (4,); None where it is none."""
+    """Quaternion of a message as x, y, z, w of length 1, (4,); None for another length."""
     xyzw = np.array([turn.x, turn.y, turn.z, turn.w], dtype=float)
     length = np.linalg.norm(xyzw)
     return xyzw / length if abs(length - 1.0) < LENGTH_TOLERANCE else None

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A settled configuration + joint states + marker readings -> observations, or the reason why not.
+"""Observations from a settled configuration, joint states and marker readings, or reasons why not.
 
-Everything is decided on the messages' own time stamps and never on their time of arrival, so a
-bag replayed at any speed gives the same observations.
+All decisions use the messages' own time stamps and never their time of arrival, so that a bag
+replayed at any speed gives the same observations.
 """
 
 from __future__ import annotations
@@ -27,25 +27,25 @@ from remaster_ros.types import FloatArray, MarkerReading
 
 
 RESOLUTION_M = 1e-6
-"""Of a 32-bit coordinate at 16 m, m: no scatter is smaller."""
+"""Resolution of a 32-bit coordinate at 16 m, m: the smallest possible scatter."""
 MOST_DROPPED = 0.1
-"""Share of the frames. Where one frame in a hundred is damaged, more than a tenth of 30 are in one
-reading of 4,000: more frames than these are of another marker, or of one that moves."""
+"""Largest share of dropped frames. With one damaged frame in a hundred, more than a tenth of 30
+are damaged in one reading of 4,000: a larger share is of another or a moving marker."""
 
 
 def of_the_marker(positions: FloatArray) -> NDArray[np.bool_]:
-    """Return which frames are of a marker that stands still, (n,).
+    """Whether each frame is of the marker at standstill, (n,).
 
     Parameters
     ----------
     positions
-        Of the frames, m, (n, 3).
+        Positions in the frames, m, (n, 3).
 
     Notes
     -----
-    Left out is what is further from the median point than c times the median distance from it. For
-    normal noise c = 7.5 + 1000 / n² leaves out a frame in about one reading of 1,000 where the
-    noise is along one axis alone, and more rarely where it is along three (simulated, n from 5 to
+    A frame is dropped if its distance from the median point is more than c times the median
+    distance. For normal noise c = 7.5 + 1000 / n² drops a frame in about one reading of 1,000 if
+    the noise is along one axis only, and more rarely if it is along three (simulated, n from 5 to
     500; few frames have an uncertain median distance).
     """
     distance = np.linalg.norm(positions - np.median(positions, axis=0), axis=1)
@@ -55,13 +55,13 @@ def of_the_marker(positions: FloatArray) -> NDArray[np.bool_]:
 
 
 def are_too_many(dropped: int, frames: int) -> bool:
-    """Return whether so many of the frames are left out that the others are in doubt, too."""
+    """Whether so many frames are dropped that the remaining ones are in doubt."""
     return dropped > max(1.0, MOST_DROPPED * frames)
 
 
 @dataclass(frozen=True)
 class SensorRules:
-    """How one sensor's reading is taken."""
+    """Rules for the reading of one sensor."""
 
     # Names as in the session
     sensor: str
@@ -70,28 +70,28 @@ class SensorRules:
     # False for a stream that is averaged over the dwell
     single_shot: bool = False
     dwell_s: float = 0.5  # Length of the average after the arm has settled, s (streams)
-    # While the dwell has fewer, it is prolonged, up to the time-out: a marker that was hidden for
-    # a moment costs a moment and not the configuration (streams)
+    # Fewest samples of a dwell (streams): a dwell with fewer is prolonged, up to the time-out, so
+    # that a marker hidden for a moment does not cost the configuration
     min_samples: int = 5
-    # A larger standard deviation on any axis over the dwell is no still marker, m (streams)
+    # Largest standard deviation on any axis over the dwell of a marker at standstill, m (streams)
     max_std_m: float = 0.5e-3
-    # How long after the dwell (stream) or settling (single shot) a reading may stay out, s
+    # Longest wait for a reading after the dwell (stream) or settling (single shot), s
     timeout_s: float = 2.0
-    # Further markers: of a stream in the same frames; else measured one by one, with a message
-    # (NaN) where that failed
+    # Further markers: of a stream in the same frames; otherwise measured one by one, with a
+    # message (NaN) after a failure
     further: tuple[str, ...] = ()
-    # True for a camera on the tool, which measures the pose of what stands
+    # True for a camera on the tool, which measures the pose of a fixed target
     on_tool: bool = False
 
     @property
     def allowed_s(self) -> float:
-        """How long after the settling a reading may stay out, s."""
+        """Longest wait for a reading after the settling, s."""
         return (0.0 if self.single_shot else self.dwell_s) + self.timeout_s
 
 
 @dataclass(frozen=True)
 class PairedReading:
-    """One sensor's accepted reading of a marker at one configuration."""
+    """Accepted reading of a marker by one sensor at one configuration."""
 
     sensor: str
     marker: str
@@ -100,14 +100,17 @@ class PairedReading:
     # Mean marker position and sample standard deviation (None for a single shot), m, (3,)
     position: FloatArray
     std: FloatArray | None = None
-    samples: int = 1  # Samples in the mean
-    # Of the measured body, mean as x, y, z, w, (4,); None where no sample has one
+    samples: int = 1  # Number of samples in the mean
+    # Mean orientation of the measured body as x, y, z, w, (4,); None if no sample has one
     orientation: FloatArray | None = None
-    # Frames of the dwell that are not in the mean: too far from the others
+    # Number of frames of the dwell that are not in the mean, too far from the others
     dropped: int = 0
 
-    def turned_round(self) -> PairedReading:
-        """Return it with the pose of the sensor in what it measures, and back; `std` stays."""
+    def inverted(self) -> PairedReading:
+        """Reading with the inverse pose: of the sensor in its target, or the reverse.
+
+        `std` stays.
+        """
         assert self.orientation is not None
         position, turn = inverse_poses(self.position, self.orientation)
         return replace(self, position=position, orientation=turn)
@@ -115,10 +118,10 @@ class PairedReading:
 
 @dataclass(frozen=True)
 class Rejection:
-    """Why a sensor, or one of its markers, has no observation at a configuration."""
+    """Reason why a sensor, or one of its markers, has no observation at a configuration."""
 
     sensor: str
-    # A name to count by: ``moving``, ``unseen``, ``clock``, ``stale``, ``too_few``, ``unsteady``,
+    # Name for counts: ``moving``, ``unseen``, ``clock``, ``stale``, ``too_few``, ``unsteady``,
     # ``scattered``, ``frozen``, ``swapped``, ``device``, ``absent`` or ``not_waited``; of a single
     # marker also ``hidden``
     reason: str
@@ -126,38 +129,38 @@ class Rejection:
 
 
 LONGEST_GAP_S = 5.0
-"""Without a report of the joints for so long it is unknown whether the arm stood still, s."""
+"""Longest time without a report of the joints, s, with the arm assumed at standstill."""
 
 CLOCK_BACK_S = 0.1
-"""A report that is older than the last one by more than this comes from a clock set back, s."""
+"""Largest step back of a report's stamp, s; a larger one means a clock that was set back."""
 
 
 class Pairing:
-    """Collect what belongs to one settled configuration and decide on each sensor.
+    """Messages of one settled configuration, and the decision on each sensor.
 
     Parameters
     ----------
     settled_stamp_s
-        When the arm was judged settled, s. Nothing captured before it is ever used.
+        Time when the arm was judged settled, s. Earlier captures are never used.
     q_settled
-        Reported joint positions then, rad or m, (k,).
+        Reported joint positions at that time, rad or m, (k,).
     sensors
-        The rules, one per sensor.
+        Rules, one per sensor.
     motion_tolerance
-        A report further than this from `q_settled` on any joint means the arm moved, rad.
+        Largest difference of a report from `q_settled` on any joint at standstill, rad.
     require
-        What the arm waits for: ``all`` sensors, ``any`` of them, or one by its name. A sensor
-        that is not required and has no reading by then is left out.
+        Sensors that the arm waits for: ``all``, ``any`` of them, or one by its name. A sensor that
+        is not required and has no reading by then is left out.
     units
-        Those of the joints.
+        Units of the joints.
     patient
-        Whether nothing is late before `end_as_recorded`: how long a sensor was silent is in no
-        message.
+        Whether no sensor is late before `end_as_recorded`: the messages do not show how long a
+        sensor was silent.
 
     Attributes
     ----------
     decided
-        What was decided of each sensor. One of its markers is enough.
+        Decision on each sensor. A reading of one of its markers is enough.
     further
         Readings of further markers in the same frames, of sensors that have a reading.
     left_out
@@ -193,23 +196,23 @@ class Pairing:
         self._readings: dict[str, list[MarkerReading]] = {name: [] for name in self.rules}
 
     def add_joint_state(self, stamp_s: float, q: FloatArray) -> None:
-        """Take a report of the joint positions, rad, (k,), in the order of their arrival."""
+        """Add a report of the joint positions, rad, (k,), in the order of arrival."""
         if self._joints and stamp_s < self._now_s - CLOCK_BACK_S:
             detail = f'the clock of joint_states went back by {self._now_s - stamp_s:.1f} s'
-            self._reject_rest('clock', detail)
+            self._reject_undecided('clock', detail)
         elif stamp_s > self._now_s:
             self._now_s = stamp_s
             self._joints.append((stamp_s, np.asarray(q, float)))
             self._decide()
 
     def add_reading(self, sensor: str, reading: MarkerReading) -> None:
-        """Take one marker reading; older than the settling, or of an unknown sensor: ignored."""
+        """Add one marker reading, unless it is older than the settling or of an unknown sensor."""
         if sensor in self._readings and reading.stamp_s > self.settled_stamp_s:
             self._readings[sensor].append(reading)
             self._decide()
 
     def fail(self, sensor: str, detail: str) -> None:
-        """Note that the device itself reported that there is no measurement."""
+        """Record that the device itself reported that there is no measurement."""
         self._set(Rejection(sensor, 'device', detail))
 
     def give_up(
@@ -220,20 +223,20 @@ class Pairing:
     ) -> None:
         """Reject every sensor whose time is over at `now_s`.
 
-        A cut cable shows only when the heartbeat is over, and simulated time may run faster than
-        that: a required sensor is not rejected before a message of its node has come
-        again; if the node turns out to be absent, the whole time without messages is excused.
+        A cut cable shows only when the heartbeat is over, and simulated time may run faster: a
+        required sensor is not rejected before another message of its node has come; if the node
+        turns out to be absent, the whole time without messages is excused.
 
         Parameters
         ----------
         now_s
             Stamp of the latest joint state, s.
         absent
-            Sensors that are not there at all now: a required one is waited for, and the time is
-            not counted; another one is left out.
+            Sensors that are absent now: a required one is waited for, and the time is not counted;
+            another one is left out.
         message_counts
-            How many messages each sensor's node has sent (`Liveness.reports`); without it, or for
-            a sensor that is not in it, a time without messages is not counted.
+            Number of messages of each sensor's node (`Liveness.reports`); without it, or for a
+            sensor that is not in it, a time without messages is not counted.
         """
         passed = max(now_s - self._looked_s, 0.0)
         self._looked_s = now_s
@@ -258,13 +261,9 @@ class Pairing:
     def end_as_recorded(self, result: str, reason: str) -> None:
         """Decide on every sensor now, at the point where the recorder of a bag had decided.
 
-        By its messages some are not decided: their time was over, or their nodes were absent, or
-        their devices answered that there is no measurement.
-
-        Parameters
-        ----------
-        result, reason
-            What the recorder published (`events.ConfigurationEnded`).
+        Some sensors are not decided by their messages: their time was over, their nodes were
+        absent, or their devices answered that there is no measurement. ``result, reason``: as
+        published by the recorder (`events.ConfigurationEnded`).
         """
         for name, rules in self.rules.items():
             if name in self.decided:
@@ -280,7 +279,7 @@ class Pairing:
     def _add_silence(
         self, counts: Mapping[str, int], passed_s: float, absent: Collection[str]
     ) -> None:
-        """Add up how long each sensor's node has sent nothing, as far as not excused yet."""
+        """Add to the time, not excused yet, without messages of each sensor's node."""
         for name in self.rules:
             same = name in counts and counts[name] == self._message_counts.get(name)
             silent = same and name not in absent
@@ -288,7 +287,7 @@ class Pairing:
         self._message_counts = dict(counts)
 
     def has_reading(self, sensor: str) -> bool:
-        """Whether anything of a sensor has come."""
+        """Whether any reading of a sensor has arrived."""
         return bool(self._readings[sensor])
 
     def is_required(self, sensor: str) -> bool:
@@ -306,10 +305,10 @@ class Pairing:
 
     def finish(self) -> None:
         """Leave out the sensors that the arm did not wait for."""
-        self._reject_rest('not_waited', f'the arm waits for {self.require}')
+        self._reject_undecided('not_waited', f'the arm waits for {self.require}')
 
     def waited_s(self) -> dict[str, float]:
-        """How long the arm stood for each sensor, s: from one decision to the next."""
+        """Waiting time of the arm for each sensor, s: from one decision to the next."""
         waited, since = dict.fromkeys(self.rules, 0.0), self.settled_stamp_s
         for name, at in sorted(self._decided_s.items(), key=lambda item: item[1]):
             waited[name], since = at - since, at
@@ -320,12 +319,12 @@ class Pairing:
             self.decided[item.sensor] = item
             self._decided_s[item.sensor] = self._now_s
 
-    def _reject_rest(self, reason: str, detail: str) -> None:
+    def _reject_undecided(self, reason: str, detail: str) -> None:
         for name in self.rules:
             self._set(Rejection(name, reason, detail))
 
     def _allowed_s(self, rules: SensorRules) -> float:
-        """How long after the settling a sensor may stay out, s."""
+        """Longest wait for a sensor after the settling, s."""
         return np.inf if self._patient else rules.allowed_s + self._excused_s[rules.sensor]
 
     def _late(self, rules: SensorRules, allowed: float) -> Rejection:
@@ -340,7 +339,7 @@ class Pairing:
     def _decide(self) -> None:
         for name, rules in self.rules.items():
             used = None if name in self.decided else self._used(rules)
-            # Only a joint state after the end shows that the arm stood still to the end.
+            # Only a joint state after the end of the dwell shows standstill until the end.
             if used and self._joints and self._joints[-1][0] >= used[0]:
                 self._settle(rules, *used)
 
@@ -363,7 +362,7 @@ class Pairing:
         ]
 
     def _by_marker(self, rules: SensorRules) -> dict[str, list[MarkerReading]]:
-        """Return the readings of each of a sensor's markers."""
+        """Readings of each of a sensor's markers."""
         readings = self._readings[rules.sensor]
         if not rules.further:
             return {rules.marker: readings}
@@ -375,10 +374,10 @@ class Pairing:
     def _used(
         self, rules: SensorRules, *, waits: bool = True
     ) -> tuple[float, dict[str, list[MarkerReading]]] | None:
-        """Return the end of a measurement and each marker's readings in it; None while it lasts.
+        """End of a measurement and each marker's readings in it; None while it lasts.
 
-        Markers with too few readings up to the end are left out, unless all are. Where nothing
-        is waited for any more, one of which nothing has come is hidden.
+        Markers with too few readings up to the end are left out, unless all have too few. With
+        ``waits`` False a marker without a reading is hidden.
         """
         if not self._readings[rules.sensor]:
             return None
@@ -398,14 +397,14 @@ class Pairing:
             return {name: part for name, part in used.items() if len(part) >= rules.min_samples}
 
         end = self.settled_stamp_s + rules.dwell_s
-        # The dwell is over for a marker once something later than its end has come: every frame
-        # has a message of every marker, also of one that is hidden.
+        # The dwell is over for a marker once a later message has arrived: every frame has a
+        # message of every marker, hidden or not.
         over = [bool(part) and part[-1].stamp_s > end for part in parts.values()]
         if not any(over) or (waits and not all(over)):
             return None
         if used := within(end):
             return end, used
-        # A damaged stamp is in no order.
+        # A damaged stamp has no order.
         enough = [
             sorted(reading.stamp_s for reading in part)[rules.min_samples - 1]
             for part in seen.values()
@@ -414,7 +413,7 @@ class Pairing:
         end = min(enough, default=np.inf)
         if end > self.settled_stamp_s + self._allowed_s(rules):
             return None
-        # Others of the same frame may still come.
+        # Other markers of the same frame may still arrive.
         complete = all(part and part[-1].stamp_s >= end for part in parts.values())
         return (end, within(end)) if complete or not waits else None
 
@@ -425,7 +424,7 @@ class Pairing:
             end = used[0].stamp_s
         stamps = np.array([stamp for stamp, _ in self._joints])
         q = np.array([joints for _, joints in self._joints])
-        # The first report at or after the end is part of the proof of stillness, not of the mean.
+        # The first report at or after the end proves standstill and is not in the mean.
         until = int(np.searchsorted(stamps, end)) + 1
         moved = np.max(np.abs(q[:until] - self.q_settled), axis=0)
         if not self._units.largest(moved) <= self.motion_tolerance:
@@ -463,7 +462,7 @@ class Pairing:
         return PairedReading(rules.sensor, marker, end, q_mean, mean, std, count, turn, dropped)
 
     def _moved_text(self, moved: FloatArray) -> str:
-        """Return which way of a joint, (k,), is too far."""
+        """Text with the joint, of movements (k,), that moved too far."""
         joint, allowed = self._units.farthest(moved), self.motion_tolerance
         if self._units.slide(joint):
             allowed *= self._units.per_radian[joint]
@@ -472,5 +471,5 @@ class Pairing:
 
 
 def _seen(readings: list[MarkerReading]) -> list[MarkerReading]:
-    """Return those in which the marker was seen."""
+    """Readings with a visible marker."""
     return [reading for reading in readings if reading.seen]

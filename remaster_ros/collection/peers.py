@@ -1,10 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The other nodes of a cell, by their records: their last states, and whether they mean one arm.
+"""Other nodes of a cell by their records: their last states, and whether all compute with one arm.
 
-Times are wall time and arguments.
-
-Two cell files with the joints of the same names (two types of one maker's arms) fit each other in
-every message, and nothing but their checksums tells them apart.
+Times are wall time and arguments. Two cell files with the same joint names (two types of one
+maker's arms) fit each other in every message: only their checksums differ.
 """
 
 from __future__ import annotations
@@ -25,45 +23,40 @@ from remaster_ros.motion.preflight import Facts, SensorFacts
 
 NEVER_S = float('inf')
 SILENT_S = 3.0
-"""A node without a record for so long (wall time) was ended, s: what it had counts no more."""
+"""Time without a record, s of wall time, after which a node has ended and its state is void."""
 
 
 class PeerModels:
-    """The arms that the other nodes compute with.
+    """Arms that the other nodes compute with.
 
-    Parameters
-    ----------
-    node
-        This node's name with its namespace.
-    model
-        The arm that it computes with.
+    ``node``: name of this node with its namespace; ``model``: arm that it computes with.
     """
 
     def __init__(self, node: str, model: ArmModel) -> None:
         self._node, self._model = node, model
-        # When each node was last heard, wall time, s, and how its arm differs.
+        # Wall time of each node's last record, s, and the difference of its arm.
         self._peers: dict[str, tuple[float, str]] = {}
 
     def take(self, record: EventRecord, now: float) -> None:
-        """Take the record of any node; wall time, s."""
+        """Process the record of any node; wall time, s."""
         if record.node == self._node:
             return
         if record.model is not None:
             own, other = (name.rpartition('/')[2] for name in (self._node, record.node))
             self._peers[record.node] = now, self._model.difference(own, record.model, other)
         elif isinstance(record.body, PlannerState):
-            # Whoever sends an arm somewhere must name it.
+            # A node that moves an arm must name it.
             why = f'the records of {record.node} do not tell which arm it plans for: run all nodes'
             self._peers[record.node] = now, f'{why} with the same version of remaster_ros'
 
     def trouble(self, now: float) -> str:
-        """Return which node computes with another arm, ''."""
+        """Sentence on a node that computes with another arm; ''."""
         troubles = (text for seen, text in self._peers.values() if now - seen <= SILENT_S)
         return next(filter(None, troubles), '')
 
 
 class RequiredSensors:
-    """The sensors of a cell that the arm waits for.
+    """Sensors of a cell that the arm waits for.
 
     Parameters
     ----------
@@ -75,12 +68,12 @@ class RequiredSensors:
     Raises
     ------
     InputError
-        `require` is none of these.
+        If `require` is none of these.
 
     Attributes
     ----------
     names
-        The sensors that the arm waits for, or for one of them.
+        Sensors that the arm waits for, or for one of which it waits.
     any_of_them
         Whether one of them is enough.
     """
@@ -96,12 +89,9 @@ class RequiredSensors:
         self.any_of_them = require == 'any'
 
     def missing(self, absent: Mapping[str, str]) -> str:
-        """Return which sensors have to come back before the arm goes on, and why; ''.
+        """Sensors that have to come back before the arm continues, with reasons; ''.
 
-        Parameters
-        ----------
-        absent
-            The sensors that are not there, and why.
+        ``absent``: absent sensors and reasons.
         """
         gone = [name for name in self.names if name in absent]
         if not gone or (self.any_of_them and len(gone) < len(self.names)):
@@ -109,13 +99,16 @@ class RequiredSensors:
         return '; '.join(f'{name}: {absent[name]}' for name in gone)
 
     def are_among(self, found: Collection[str]) -> bool:
-        """Whether what the arm waits for is among these sensors."""
+        """Whether the sensors that the arm waits for are among these."""
         known = [name in found for name in self.names]
         return any(known) if self.any_of_them else all(known)
 
 
 class Heard(NamedTuple):
-    """A node's last state: what it was, when it came, s, and which start of the node sent it."""
+    """Last state of a node, with its wall time of arrival, s.
+
+    Last result: the start of the node that sent it.
+    """
 
     body: BridgeState | RecorderState
     wall: float
@@ -123,22 +116,19 @@ class Heard(NamedTuple):
 
 
 class Peers:
-    """The last states of bridge, recorder and sensors.
+    """Last states of bridge, recorder and sensors.
 
-    Parameters
-    ----------
-    sensors
-        All sensors of the cell.
+    ``sensors``: all sensors of the cell.
     """
 
     def __init__(self, sensors: Iterable[str]) -> None:
         self._names = tuple(sensors)
         self._heard: dict[str, Heard] = {}
-        # Of each sensor, and when it came, s.
+        # Report of each sensor, and wall time of its arrival, s.
         self._reports: dict[str, tuple[SensorReport, float]] = {}
 
     def take(self, record: EventRecord, now: float) -> None:
-        """Take what a node published; anything but these states is ignored."""
+        """Process a record of a node; only these states count."""
         match record.body:
             case BridgeState() | RecorderState() as body:
                 self._heard[body.sender] = Heard(body, now, record.started)
@@ -146,40 +136,34 @@ class Peers:
                 self._reports[report.sensor] = report, now
 
     def heard(self, node: str) -> Heard | None:
-        """Return what came last of ``robot_bridge`` or ``recorder``; None before the first."""
+        """Last state of ``robot_bridge`` or ``recorder``; None before the first."""
         return self._heard.get(node)
 
     @property
     def bridge(self) -> BridgeState | None:
-        """Its last state; None before the first."""
+        """Last state of the bridge; None before the first."""
         heard = self._heard.get(BridgeState.sender)
         return heard.body if heard and isinstance(heard.body, BridgeState) else None
 
     @property
     def recorder(self) -> RecorderState | None:
-        """Its last state; None before the first."""
+        """Last state of the recorder; None before the first."""
         heard = self._heard.get(RecorderState.sender)
         return heard.body if heard and isinstance(heard.body, RecorderState) else None
 
     def required(self) -> RequiredSensors:
-        """Return the sensors that the arm waits for, as the recorder is set.
+        """Sensors that the arm waits for, by the recorder's settings.
 
-        Raises
-        ------
-        InputError
-            The recorder waits for a sensor that this cell does not have.
+        Raises InputError if the recorder waits for a sensor that this cell does not have.
         """
         recorder = self.recorder
         return RequiredSensors(self._names, 'all' if recorder is None else recorder.require)
 
     def facts(self, now: float, *, seen_before: bool) -> Facts:
-        """Return what the preflight judges now; `InputError` as `required`.
+        """Present facts for the preflight; raises `InputError` as `required`.
 
-        Parameters
-        ----------
-        seen_before
-            The sensors have seen their markers in this session, and the arm may stand where
-            they do not: a collection that is resumed.
+        ``seen_before``: whether the sensors have seen their markers in this session, so that the
+        arm may stand where they do not: in a collection that is resumed.
         """
         required, bridge = self.required(), self.bridge or BridgeState(halted='')
         return Facts(

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Is a reading this marker, measured now? Against the robot's own motion, before it is recorded.
+"""Plausibility of a reading against the robot's own motion, before it is recorded.
 
-A stray that is taken for the marker (swapped) stands still or moves in a way of its own: seen from
-the tool, it is not where the marker is. A frozen instrument repeats its last reading wherever the
-arm goes. Neither can be recognised by the reading alone.
+A stray that is taken for the marker (swapped) stands still or moves differently: seen from the
+tool, it is not at the marker's position. A frozen instrument repeats its last reading at any
+configuration of the arm. Neither can be recognised by one reading.
 """
 
 from __future__ import annotations
@@ -19,29 +19,29 @@ from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.types import FloatArray
 
 LEARNING = 6
-"""Readings of a sensor after which its usual deviation is known."""
+"""Number of readings of a sensor after which its usual deviation is known."""
 UNUSUAL = 6.0
-"""So many times the usual deviation is another marker."""
+"""Ratio of a deviation to the usual one from which the reading is of another marker."""
 SMALLEST_M = 0.01
-"""No smaller deviation counts as another marker, m: offsets bend the field of deviations."""
+"""Smallest deviation that counts as another marker, m: offsets bend the field of deviations."""
 DISTANCE_M = 5e-3
-"""No smaller difference of two markers' distance counts as another marker, m."""
+"""Smallest difference of two markers' distance that counts as another marker, m."""
 UNUSUAL_PLACES = 8.0
-"""Nor one below so many times what the markers' places are known to."""
+"""Smallest such difference in standard deviations of the markers' positions."""
 MOVED_M = 1e-3
-"""A marker that should have moved further than this cannot have the same reading, m."""
+"""Expected movement of a marker, m, from which an identical reading is implausible."""
 TURNED_RAD = 0.01
-"""Nor one of an arm whose joints have turned by more: all solutions of a pose have their marker at
-one place of the model, and none of the real arm at the same one to the last bit. A slide by 0.25 m
-for each radian."""
+"""Movement of a joint, rad, from which an identical reading is implausible: all solutions of a
+pose have their marker at one position of the model, but never of the real arm to the last bit. For
+a slide 0.25 m count as a radian."""
 
 
 class Plausibility:
-    """Compare readings with where the robot's model has the marker.
+    """Comparison of readings with the marker's position by the robot's model.
 
-    The model is off by what the calibration is to find: millimetres to a few centimetres. A
-    reading further off than `max_deviation_m`, or than six times what is usual for its sensor,
-    is of something else.
+    The model is off by the errors that the calibration is to find: millimetres to a few
+    centimetres. A reading further off than `max_deviation_m`, or than six times the usual
+    deviation of its sensor, is of something else.
 
     Parameters
     ----------
@@ -50,9 +50,9 @@ class Plausibility:
     markers
         Nominal marker positions in the tool frame, m, (3,) each.
     max_deviation_m
-        Beyond this no marker is what it should be, m.
+        Largest plausible deviation of a marker, m.
     marker_std_m
-        How well the markers' positions are known, per axis, m.
+        Standard deviation of the markers' positions, per axis, m.
     """
 
     def __init__(
@@ -75,37 +75,33 @@ class Plausibility:
         *,
         anywhere: bool = False,
     ) -> list[PairedReading | Rejection]:
-        """Judge the markers of one frame, each as `judge` does, and their distances.
+        """Judgement of the markers of one frame, each as by `judge`, and of their distances.
 
-        Those are known wherever arm and sensor stand. Where one of them is wrong, markers were
-        taken for others or a stray for one of them; which, the distances cannot tell (of two that
-        were exchanged, their own distance is right). So none of the frame is taken.
+        The distances are known for any place of arm and sensor. If a distance is wrong, markers
+        were exchanged or a stray was taken for one of them; the distances cannot tell which marker
+        is wrong (the distance of two exchanged markers is right). So no reading of the frame is
+        used.
         """
-        for one, other in itertools.combinations(readings, 2):
-            nominal = np.subtract(self._markers[one.marker], self._markers[other.marker])
-            wanted, found = map(np.linalg.norm, (nominal, one.position - other.position))
+        for first, second in itertools.combinations(readings, 2):
+            nominal = np.subtract(self._markers[first.marker], self._markers[second.marker])
+            wanted, found = map(np.linalg.norm, (nominal, first.position - second.position))
             if not abs(found - wanted) <= self._distance_m:
                 detail = (
-                    f'{one.marker} and {other.marker} are {1e3 * found:.0f} mm apart, by the cell '
+                    f'{first.marker} and {second.marker} are {1e3 * found:.0f} mm apart, by the '
+                    'cell '
                     f'file {1e3 * wanted:.0f} mm: are their numbers in the rigid body right?'
                 )
-                return [Rejection(one.sensor, 'swapped', detail)]
+                return [Rejection(first.sensor, 'swapped', detail)]
         return [self.judge(reading, T_R_N, anywhere=anywhere) for reading in readings]
 
     def judge(
         self, reading: PairedReading, T_R_N: FloatArray | None, *, anywhere: bool = False
     ) -> PairedReading | Rejection:
-        """Return the reading, or why it is none.
+        """The reading, or the reason why it is not plausible.
 
-        Parameters
-        ----------
-        reading
-            As paired.
-        T_R_N
-            The sensor in the robot base, (4, 4); None before it is registered.
-        anywhere
-            At a reference, where a deviation shows that something was moved: anything up to
-            `max_deviation_m` is taken.
+        ``T_R_N``: sensor in the robot base, (4, 4), None before it is registered; ``anywhere``: at
+        a reference, where a deviation shows a change, any deviation up to `max_deviation_m` is
+        plausible.
         """
         name = reading.sensor
         marker_R = self._place(reading)
@@ -134,7 +130,7 @@ class Plausibility:
         return reading
 
     def _place(self, reading: PairedReading) -> FloatArray:
-        """Where the robot's model has the marker, in R, m, (3,)."""
+        """Position of the marker by the robot's model, in R, m, (3,)."""
         return self._chain.positions(reading.q, np.asarray(self._markers[reading.marker], float))
 
     def _allowed_m(self, sensor: str) -> float:

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Has anything changed since the references were first measured? What, when and by how much.
+"""Changes of the set-up since the references were first measured: cause, time and size.
 
-The references are measured twice at the beginning: how far the two rounds lie apart is what arm
-and sensor together repeat to, the noise that every later difference is held against. Each later
-round is held against them by F tests; the probabilities of a false alarm of all rounds of a
-session, however many, add up to what is stated (alpha spending: round r spends 6 / (π r)² of it).
-Only for a round that differs a cause is looked for.
+The references are measured twice at the beginning: the difference of the two rounds is the
+repeatability of arm and sensor, the noise for all later differences. Each later round is compared
+with the first ones by F tests; the probabilities of a false alarm of all rounds of a session add
+up to the stated one (alpha spending: round r spends 6 / (π r)² of it). A cause is searched only
+for a round that differs.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ from remaster_ros.types import FloatArray, IntArray, Session
 def changes(
     session: Session, chain: SerialChain, T_R_N: Mapping[str, FloatArray]
 ) -> tuple[int, list[SetupChange]]:
-    """Return how many rounds of the references there are, and what has changed by them.
+    """Number of rounds of the references, and the changes that they show.
 
-    Each change is returned once, as the last round that shows it has it.
+    Each change is returned once, as found by the last round that shows it.
     """
     m = session.references
     if m is None:
@@ -61,9 +61,9 @@ def replay(
     others: Sequence[int],
     T_R_N: Mapping[str, FloatArray],
 ) -> list[SetupChange]:
-    """Judge the references of a recorded session; return what was found, round by round.
+    """Changes found by the references of a recorded session, round by round.
 
-    ``readings``: in the order measured; ``others``: numbers of the configurations that are no
+    ``readings``: in the order measured; ``others``: numbers of the configurations that are not
     references, in any order.
     """
     other = np.sort(np.asarray(others, dtype=int))
@@ -83,31 +83,31 @@ def replay(
 
 @dataclass(frozen=True, kw_only=True)
 class ReferenceReading(PairedReading):
-    """A reading at a reference; `configuration` is the configuration's number in the session."""
+    """Reading at a reference; `configuration` is the configuration's number in the session."""
 
     configuration: int
 
 
 @dataclass(frozen=True)
 class SetupChange:
-    """What has changed."""
+    """Change of the set-up."""
 
     # ``sensor``, ``base``, ``marker``, ``tool``, ``joint``, or ``unexplained`` (no one cause) or
     # ``unsteady`` (the references do not repeat from the first)
     kind: str
-    subject: str  # For people
-    drifts: bool  # Whether it grows with time; else it came at once
+    subject: str  # Name of the changed part, for people
+    drifts: bool  # True if the change grows with time, False if it came at once
     size_m: float  # Largest displacement of a marker at a reference
-    turn_rad: float | None  # Of the sensor, base, tool or joint; None where nothing turns: a slide
-    # Configurations that it happened between: the last one that was as at first (None where it was
-    # so from the first) and the first one that was not
+    turn_rad: float | None  # Rotation of sensor, base, tool or joint; None without one: a slide
+    # Configurations before and after the change: the last unchanged one (None if changed from the
+    # first) and the first changed one
     after: int | None
     before: int
-    p_value: float  # Of the round that showed it
+    p_value: float  # p-value of the round that showed the change
     look_alikes: tuple[str, ...] = ()  # Other subjects that explain the same readings
 
     def describe(self) -> str:
-        """Return it in a sentence."""
+        """Sentence on the change."""
         turn = ''
         if self.turn_rad is not None:
             turn = f' and turned by {np.rad2deg(self.turn_rad) * 60:.1f} arc minutes'
@@ -132,23 +132,23 @@ class ReferenceRound:
 
     @property
     def configurations(self) -> list[int]:
-        """Numbers in the session of what was measured."""
+        """Numbers of the measured configurations in the session."""
         return [row.configuration for row in self.rows.values()]
 
 
 FALSE_ALARM = 0.01
-"""Probability that a session in which nothing changes has any alarm."""
+"""Probability of any alarm in a session without a change."""
 STOP_M = 0.5e-3
-"""A change of this size stops a collection by default."""
+"""Default size of a change that stops a collection, m."""
 LEAST_STD_M = 2e-6
-"""No sensor and no arm repeat better than this."""
+"""Best repeatability of sensor and arm, m."""
 FEWEST_FREEDOMS = 6
-"""With fewer repeated numbers a sensor's noise is not known."""
+"""Fewest degrees of freedom for a sensor's noise."""
 LOOKS_ALIKE = 6.0
-"""Causes whose information criteria differ by less than this (odds of 20) look the same."""
+"""Difference of information criteria (odds of 20) below which two causes look the same."""
 UNEXPLAINED_P = 1e-4
 UNEXPLAINED_SHARE = 0.05
-"""What a cause leaves of the displacements is the straight line's share of it, up to here."""
+"""Largest share of the displacements that a cause may leave, as the error of linearisation."""
 
 
 Noise = tuple[float, int]
@@ -158,13 +158,12 @@ Displacements = Mapping[tuple[int, tuple[int, str]], FloatArray]
 
 
 class ReferenceWatch:
-    """Judge round after round of the references.
+    """Judgement of each round of the references.
 
-    ``chain``: the arm as drawn: what it moves between two visits, by less than its repeatability;
-    ``markers``: nominal positions in the tool frame, m, (3,); ``stop_m``: two first rounds that
-    lie further apart than this show nothing of later changes, m.
-    Attributes: ``change``: the last one found since the beginning or `accept`; None where nothing
-    has changed.
+    ``chain``: the arm as drawn, for its own part of the displacement between two visits, within
+    its repeatability; ``markers``: nominal positions in the tool frame, m, (3,); ``stop_m``:
+    largest difference of the first two rounds that can show later changes, m. Attributes:
+    ``change``: last change found since the beginning or `accept`; None without a change.
     """
 
     def __init__(
@@ -177,8 +176,8 @@ class ReferenceWatch:
         self._chain, self._stop_m, self._false_alarm = chain, stop_m, false_alarm
         self._markers = {name: np.asarray(place, float) for name, place in markers.items()}
         self._references: list[FloatArray] = []
-        # One marker of each sensor: those of a frame share their errors, and each is off by what
-        # is unknown of its place.
+        # One marker of each sensor: markers of a frame have common errors, and each has the error
+        # of its own nominal position.
         self._followed: dict[str, str] = {}
         self._rounds: list[ReferenceRound] = []
         self._open = False
@@ -189,11 +188,11 @@ class ReferenceWatch:
 
     @property
     def rounds(self) -> int:
-        """How many rounds have begun."""
+        """Number of rounds that have begun."""
         return len(self._rounds)
 
     def add(self, reading: ReferenceReading) -> None:
-        """Take a reading; one at a reference that this round has already begins the next round.
+        """Add a reading; a second one at a reference in this round begins the next round.
 
         Only the marker that a sensor has measured first counts.
         """
@@ -208,7 +207,7 @@ class ReferenceWatch:
         self._rounds[-1].rows[key] = reading
 
     def begins_round(self, reading: ReferenceReading) -> bool:
-        """Return whether `add` would take a reading for the first of another round."""
+        """Whether `add` would begin another round with a reading."""
         if self._followed.get(reading.sensor, reading.marker) != reading.marker:
             return False
         return not self._open or self._key(reading) in self._rounds[-1].rows
@@ -221,19 +220,19 @@ class ReferenceWatch:
         return len(self._references) if known is None else known, reading.sensor
 
     def end_round(self) -> None:
-        """Take what comes next for another round: the arm went elsewhere in between."""
+        """End the round: the arm goes elsewhere before the next reading."""
         self._open = False
 
     def accept(self) -> None:
-        """Take the next round for how things are from now on: a person has seen to the change."""
+        """Use the next round as the new normal state: a person has checked the change."""
         if self.change is not None and self.change.kind == 'unsteady':
-            # What they repeat to is still to be found.
+            # Repeatability is still to be found.
             self._rounds = []
         self._begin, self._open, self.change = len(self._rounds), False, None
         self._begins.add(self._begin)
 
     def judge(self, T_R_N: Mapping[str, FloatArray]) -> SetupChange | None:
-        """Judge the last round, once; return what has changed, None where nothing has.
+        """Change shown by the last round, judged once; None without a change.
 
         ``T_R_N``: sensor -> its frame in R, (4, 4); a first registration is good enough, since
         only differences count. A sensor without one is not judged.
@@ -242,7 +241,7 @@ class ReferenceWatch:
         if number < 0 or self._rounds[number].judged:
             return self.change
         off = {
-            (i, key): self._off(row, T_R_N[row.sensor])
+            (i, key): self._displacement(row, T_R_N[row.sensor])
             for i, one in enumerate(self._rounds)
             for key, row in one.rows.items()
             if row.sensor in T_R_N
@@ -266,11 +265,11 @@ class ReferenceWatch:
     # Noise
 
     def _noise(self, sensor: str, off: Displacements) -> Noise | None:
-        """Return the noise of a sensor; None where it is not known yet.
+        """Noise of a sensor; None if it is not known yet.
 
-        From the differences of successive rounds in which nothing was found: of the first two, and
-        of later ones as they come. A slow drift makes hardly any, so it is not taken for noise.
-        No less than the mean over a dwell has by its own scatter.
+        By the differences of successive rounds without an alarm: of the first two, and of later
+        ones as they come. A slow drift hardly changes these, so that it is not taken for noise. At
+        least the standard error of a mean over a dwell by its own scatter.
         """
         quiet = [r.judged and not r.alarmed for r in self._rounds]
         steps = [
@@ -296,7 +295,7 @@ class ReferenceWatch:
         return float(np.sqrt(variance)), first + int((apart.size - first) * 2 / 3)
 
     def _unsteady(self, noise: Mapping[str, Noise]) -> SetupChange | None:
-        """Return that the first two rounds lie so far apart that nothing is seen by them."""
+        """Change ``unsteady`` if the first two rounds differ too much to show later changes."""
         if not noise:
             return None
         sensor, (std, _) = max(noise.items(), key=lambda item: item[1][0])
@@ -314,8 +313,8 @@ class ReferenceWatch:
         )
         return self.change
 
-    def _off(self, row: ReferenceReading, T_R_N: FloatArray) -> FloatArray:
-        """Return measured minus nominal marker position in R, m, (3,): less the arm's own part."""
+    def _displacement(self, row: ReferenceReading, T_R_N: FloatArray) -> FloatArray:
+        """Measured minus nominal marker position in R, m, (3,), without the arm's own part."""
         nominal = self._chain.positions(row.q, self._markers[row.marker])
         return np.asarray(transforms.apply(T_R_N, row.position) - nominal)
 
@@ -330,11 +329,11 @@ class ReferenceWatch:
         noise: Mapping[str, Noise],
         off: Displacements,
     ) -> float:
-        """Return the p-value that a round is as the first ones were.
+        """p-value of the hypothesis that a round equals the first ones.
 
         The smallest of several tests, times their number (Bonferroni), half of it for each kind:
-        all differences of a sensor, whatever they look like; and what each cause explains of all
-        of them, which finds a change in one direction far sooner.
+        all differences of a sensor, of any form; and the part of all differences that each cause
+        explains, which finds a change in one direction much sooner.
         """
         first = [self._begin] if self._begin else [0, 1]
         places, stds, scaled = [], [], []
@@ -371,7 +370,7 @@ class ReferenceWatch:
         displacements: Displacements,
         p_value: float,
     ) -> SetupChange:
-        """Find the cause, and when it came, that explain the rounds best (by BIC)."""
+        """Change with the cause and the time that explain the rounds best (by BIC)."""
         rounds = range(self._begin, number + 1)
         keys = [
             key
@@ -407,7 +406,7 @@ class ReferenceWatch:
                 flat = x.reshape(-1, x.shape[-1])
                 theta, _, rank, _ = np.linalg.lstsq(flat, y.ravel(), rcond=None)
                 left = float(np.sum((y.ravel() - flat @ theta) ** 2))
-                # Student's: the noise that differences are counted in is an estimate itself.
+                # A Student t, because the noise is an estimate itself.
                 score = (known + data) * np.log1p(left / known) + rank * np.log(data)
                 score += LOOKS_ALIKE if step is None else 0.0
                 fits.append((score, left, theta, cause, step))
@@ -447,7 +446,7 @@ class ReferenceWatch:
 
 
 def _centered(values: FloatArray, group: IntArray) -> FloatArray:
-    """Return values (n, ...) less the mean of their group, (n,): where each began is unknown."""
+    """Values (n, ...) less the mean of their group, (n,), as the first value is unknown."""
     count = np.bincount(group)
     total = np.zeros((len(count), *values.shape[1:]))
     np.add.at(total, group, values)
@@ -459,35 +458,35 @@ def _centered(values: FloatArray, group: IntArray) -> FloatArray:
 
 
 GROWN = 1.5
-"""A change that was reported is reported again where it has grown so many times."""
+"""Factor of growth from which a reported change is reported again."""
 PAUSED = 'paused'
-"""In place of a run that was paused, and whose token was lost with the recorder."""
+"""Token in place of that of a paused run that was lost with the recorder."""
 
 
 class SetupChanges:
-    """Follow the references of a session, and remember what a person has not seen to yet.
+    """Changes of a session's references, and those that no person has checked yet.
 
     Parameters
     ----------
     chain, markers
         As for `ReferenceWatch`.
     stop_m
-        A change larger than this stops the collection, m; 0 for none.
+        Size of a change that stops the collection, m; 0 for none.
 
     Attributes
     ----------
     change
-        What has changed since the beginning, or since a person has seen to the last change.
+        Change since the beginning, or since a person has checked the last change.
     stopped_run
-        The planner's run that a change has stopped, and that no person has seen to yet; '' for
-        one that is not known, None where nothing has stopped.
+        Planner's run that a change has stopped and no person has checked yet; '' for an unknown
+        run, None if none was stopped.
     """
 
     def __init__(
         self, chain: SerialChain, markers: Mapping[str, FloatArray], stop_m: float
     ) -> None:
-        # Loaded now, and not with the first test, at the third round: that would take seconds on a
-        # busy computer, while an arm and all that watches it wait for this process.
+        # Imported now, and not with the first test at the third round: the import may take seconds
+        # on a busy computer, while an arm and the nodes that watch it wait for this process.
         import scipy.stats  # noqa: F401
 
         self._stop_m = stop_m
@@ -498,17 +497,17 @@ class SetupChanges:
 
     @property
     def rounds(self) -> int:
-        """How many rounds have begun."""
+        """Number of rounds that have begun."""
         return self._watch.rounds
 
     @property
     def stops(self) -> bool:
-        """Whether the change is large enough to stop for."""
+        """Whether the change is large enough to stop the collection."""
         change = self.change
         return change is not None and bool(self._stop_m) and change.size_m > self._stop_m
 
     def describe(self) -> str:
-        """Return what has changed and what to do, in a line; '' where nothing has."""
+        """The change and the remedy, in a line; '' without a change."""
         if self.change is None:
             return ''
         text = self.change.describe()
@@ -525,7 +524,7 @@ class SetupChanges:
         log: Iterable[tuple[str, int, Sequence[PairedReading]]],
         T_R_N: Mapping[str, FloatArray],
     ) -> None:
-        """Take up what a recorder before this one has logged (`SessionJournal.watched`)."""
+        """Restore the state of an earlier recorder from its log (`SessionJournal.watched`)."""
         for kind, configuration, readings in log:
             if kind == 'reference':
                 self.read(configuration, readings, T_R_N)
@@ -544,12 +543,9 @@ class SetupChanges:
         T_R_N: Mapping[str, FloatArray],
         last: bool = False,
     ) -> bool:
-        """Take the readings at a reference; return whether something new is to be reported.
+        """Process the readings at a reference; returns whether there is something new to report.
 
-        Parameters
-        ----------
-        last
-            Whether it is the last one of its round.
+        ``last``: whether it is the last reference of its round.
         """
         new = False
         for reading in readings:
@@ -560,13 +556,13 @@ class SetupChanges:
         return self.judge(T_R_N) or new if last else new
 
     def leave(self, T_R_N: Mapping[str, FloatArray]) -> bool:
-        """Take it that the arm goes elsewhere; return as `read`."""
+        """Process that the arm goes elsewhere; returns as `read`."""
         new = self.judge(T_R_N)
         self._watch.end_round()
         return new
 
     def judge(self, T_R_N: Mapping[str, FloatArray]) -> bool:
-        """Judge the round so far, once; return as `read`."""
+        """Judge the round so far, once; returns as `read`."""
         self.change = self._watch.judge(T_R_N)
         if self.change is None or self.change is self._reported:
             return False
@@ -577,12 +573,9 @@ class SetupChanges:
         return new or self.stops
 
     def report(self, run: str) -> SetupChanged | None:
-        """Return the event of the change, if there is one; a large change stops the run.
+        """Event of the change, if there is one; a large change stops the run.
 
-        Parameters
-        ----------
-        run
-            Token of the run under way, '' for none.
+        ``run``: token of the present run, '' for none.
         """
         if self.change is None:
             return None
@@ -591,21 +584,16 @@ class SetupChanges:
         return SetupChanged(stops=self.stops, text=self.describe())
 
     def accept(self) -> None:
-        """Take it that a person has seen to the change: the next round is a new beginning."""
+        """Record that a person has checked the change: the next round is a new beginning."""
         self._watch.accept()
         self.change = self._reported = self.stopped_run = None
 
     def follow(self, state: str, run: str) -> bool:
-        """Take what the planner does; return whether a person has seen to the change.
+        """Process the planner's state; returns whether a person has checked the change.
 
-        A person has where another run has begun, as /remaster/collect does. A recorder that was
-        started again has no record of which run was stopped: the one that it finds running is,
-        and after a pause none.
-
-        Parameters
-        ----------
-        state, run
-            The planner's state and the token of its run, '' for none.
+        A person has if another run has begun, as by /remaster/collect. A restarted recorder does
+        not know which run was stopped: it is the run found running, and after a pause none.
+        ``state, run``: the planner's state and the token of its run, '' for none.
         """
         if self.stopped_run == '':
             self.stopped_run = run if state == 'running' else PAUSED * (state == 'paused')

@@ -1,19 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""When enough is known to end a collection, and what more it would cost.
+"""End of a collection by its precision, and the cost of a higher precision.
 
-After every few configurations the session so far is fitted, to the posterior's mode and no draws,
-and the standard deviations are held against those that are wanted. The looks are at fixed numbers
-of configurations, so that they follow from the session alone: an optimizer that is started again
-comes to the same.
+After every few configurations the session so far is fitted, to the posterior's mode without draws,
+and the standard deviations are compared with the wanted ones. The looks are at fixed numbers of
+configurations, so that they follow from the session alone: a restarted optimizer comes to the same
+decision.
 
 A goal counts as reached only
 
 - with twice as many degrees of freedom as parameters, and the poses and repeats that a search for
-  causes needs (`planning.pose_design.Floors`): a fit of few observations is now and then far too
-  sure of itself, and those are the fits that a rule would stop at;
-- while the residuals show no structure (`calibration.residual_structure`): where the model is
-  wrong its standard deviations are too small. That test is looked at again and again, and spends
-  its error rate (`calibration.group_sequential`).
+causes needs (`planning.pose_design.Floors`): a fit of few observations sometimes states far too
+small a standard deviation, and a rule would stop at exactly such a fit;
+- while the residuals show no structure (`calibration.residual_structure`): with a wrong model the
+standard deviations are too small. This test is made at many looks, and spends its error rate
+(`calibration.group_sequential`).
 """
 
 from __future__ import annotations
@@ -37,11 +37,11 @@ from remaster_ros.types import IntArray, Priors, Session
 
 FREEDOM_PER_PARAMETER = 2
 ERROR_RATE = 0.005
-"""Of all looks at the residuals together: structure claimed where there is none. The p-values are
-not exact with two dozen readings and an estimated noise: with 1 % spent it was claimed in 14 of
-1,000 sessions."""
+"""Probability of falsely claimed structure, over all looks at the residuals. The p-values are not
+exact with two dozen readings and an estimated noise: with 1 % spent structure was claimed in 14 of
+1,000 sessions without any."""
 MOST_TESTS = 20
-"""Looks that test: more of them spend power, and find nothing sooner that matters."""
+"""Largest number of looks with a test: more looks reduce the power without an earlier finding."""
 
 
 @dataclass(frozen=True)
@@ -52,11 +52,11 @@ class StoppingGoal:
     joint_std_rad: float | None = None
     # Root mean square of the 3-D error of the predicted markers in the box, m
     tool_std_m: float | None = None
-    box: ToolBox | None = None  # None for wherever the tool was measured
+    box: ToolBox | None = None  # None for all measured positions of the tool
 
     @classmethod
     def of(cls, poses: PoseSettings) -> StoppingGoal:
-        """Return the goal of a cell file; an empty one if an optimal design's is not stated."""
+        """Goal of a cell file; an empty one if an optimal design's goal is not stated."""
         stated = (poses.joint_std_deg, poses.tool_std_m)
         matters = (poses.tool_share < 1.0, poses.tool_share > 0.0)
         if poses.design == OPTIMAL and None in compress(stated, matters):
@@ -67,19 +67,19 @@ class StoppingGoal:
 
     @property
     def stated(self) -> bool:
-        """Whether anything is to be reached."""
+        """Whether there is any goal."""
         return self.joint_std_rad is not None or self.tool_std_m is not None
 
 
 @dataclass(frozen=True, eq=False)
 class Look:
-    """What is known after so many configurations."""
+    """Result of a fit after some configurations."""
 
-    configurations: int  # To fit, that were measured by then
-    # From the first reading of the session to the last one by then, s; NaN where nothing is known
-    # of the times
+    configurations: int  # Number of measured configurations to fit
+    # Time from the first to the last reading of these, s; NaN if the times are unknown
     elapsed_s: float
-    # Of each joint, rad or m; None where it is not identifiable. Empty where there is no fit.
+    # Standard deviation of each joint's offset, rad or m; None if it is not identifiable. Empty
+    # without a fit.
     joint_std: Mapping[str, float | None] = field(default_factory=dict)
     # As in `StoppingGoal`, rad and m; infinite where unknown
     joint_rms: float = np.inf
@@ -87,32 +87,32 @@ class Look:
     # Degrees of freedom, and free parameters
     freedom: int = 0
     parameters: int = 0
-    structure: tuple[StructureTest, ...] = ()  # What the residuals show by now, the clearest first
-    lacking: str = ''  # Why this is not enough; '' where it is, or where nothing is to be reached
-    # How many further configurations to fit the goal takes: 0 where it is reached, None where no
-    # number does or none is known
+    structure: tuple[StructureTest, ...] = ()  # Structure of the residuals, clearest first
+    lacking: str = ''  # Reason why this is not enough; '' if it is, or without a goal
+    # Number of further configurations to fit for the goal: 0 if it is reached, None if no number
+    # suffices or none is known
     more: int | None = None
-    more_s: float = np.nan  # How long they take at the pace so far, s; NaN where unknown
-    sliding: tuple[str, ...] = ()  # The joints that slide
+    more_s: float = np.nan  # Their time at the pace so far, s; NaN if unknown
+    sliding: tuple[str, ...] = ()  # Names of the joints that slide
 
 
 @dataclass(frozen=True)
 class StoppingRule:
-    """Looks at a session under way."""
+    """Rule that decides by looks at the present session."""
 
-    goal: StoppingGoal  # What is to be reached
-    planned: int  # Configurations to fit that are planned
+    goal: StoppingGoal  # Wanted precision
+    planned: int  # Number of planned configurations to fit
     every: int  # Configurations between two looks
     floors: Floors = field(default_factory=Floors)  # Least poses and repeats
-    priors: Priors | None = None  # What is known before a fit, in place of what the session states
+    priors: Priors | None = None  # Priors of the fit, in place of those of the session
 
     @property
     def counts(self) -> tuple[int, ...]:
-        """After how many configurations it looks."""
+        """Numbers of configurations after which the rule looks."""
         return (*range(self.every, self.planned, self.every), self.planned)
 
     def limit(self, count: int) -> float:
-        """Return below which p-value a look finds structure; 0 where it does not test."""
+        """p-value below which a look finds structure; 0 if it makes no test."""
         step = -(-len(self.counts) // MOST_TESTS)
         tested = self.counts[::-1][::step][::-1]
         if count not in tested:
@@ -123,18 +123,11 @@ class StoppingRule:
     def look(
         self, session: Session, count: int, before: Look | None, rng: np.random.Generator
     ) -> Look:
-        """Fit the first `count` configurations and judge them.
+        """Fit of the first `count` configurations, and its judgement.
 
-        Parameters
-        ----------
-        session
-            With at least as many configurations to fit.
-        count
-            One of `counts`.
-        before
-            The look before this one: structure that was found stays found.
-        rng
-            Of the draws of the noise.
+        ``session``: with at least as many configurations to fit; ``count``: one of `counts`;
+        ``before``: previous look, whose structure stays found; ``rng``: for the draws of the
+        noise.
         """
         part, elapsed_s, pace_s = so_far(session, count)
         try:
@@ -152,7 +145,10 @@ class StoppingRule:
         pace_s: float,
         rng: np.random.Generator,
     ) -> Look:
-        """Judge a fit of `count` configurations, each of which has taken `pace_s`; see `look`."""
+        """Judgement of a fit of `count` configurations, each of which took `pace_s`.
+
+        See `look`.
+        """
         goal, measurements = self.goal, found.problem.measurements
         counting = np.ones(len(measurements), bool)
         if goal.box is not None:
@@ -184,11 +180,11 @@ class StoppingRule:
         )
 
     def is_enough(self, look: Look) -> bool:
-        """Tell whether the collection may end after this look."""
+        """Whether the collection may end after this look."""
         return self.goal.stated and not look.lacking
 
     def describe(self, look: Look) -> str:
-        """Return what a look has found, and what more would cost, for people."""
+        """Result of a look, and the cost of the goal, for people."""
         counted = f' ({1e3 * np.radians(LEVER_M):.2f} mm count as one)' * bool(look.sliding)
         known = (
             f'std of the offsets {np.degrees(look.joint_rms):.4f} deg{counted}, error of the '
@@ -208,7 +204,7 @@ class StoppingRule:
         return f'{after}: {look.lacking}; {self._cost(look)}'
 
     def _cost(self, look: Look) -> str:
-        """Return what the goal costs beyond a look, for people."""
+        """Cost of the goal after a look, for people."""
         if look.more is None:
             return 'not known what it costs'
         time = '' if np.isnan(look.more_s) else f', {look.more_s / 60:.1f} min'
@@ -244,7 +240,7 @@ class StoppingRule:
             )
         if precision.freedom < needed:
             return f'{precision.freedom} degrees of freedom, needed are {needed}'
-        pose = _one_each(found)
+        pose = _poses_of_configurations(found)
         if not self.floors.hold(pose):
             return (
                 f'a search for causes needs {self.floors.poses} poses, {self.floors.repeated} of '
@@ -255,8 +251,8 @@ class StoppingRule:
         return ''
 
 
-def _one_each(found: Estimate) -> IntArray:
-    """Return the pose of each configuration that was fitted."""
+def _poses_of_configurations(found: Estimate) -> IntArray:
+    """Pose of each fitted configuration."""
     measurements = found.problem.measurements
     kept = found.kept
     first = np.unique(measurements.configuration[kept], return_index=True)[1]
@@ -264,20 +260,20 @@ def _one_each(found: Estimate) -> IntArray:
 
 
 def configurations(session: Session) -> int:
-    """Return how many configurations to fit a session has."""
+    """Number of configurations to fit in a session."""
     measurements = session.measurements
     return len(np.unique(measurements.configuration[~measurements.is_validation]))
 
 
 def so_far(session: Session, count: int) -> tuple[Session, float, float]:
-    """Return a session up to its configuration number `count` to fit, with times.
+    """Session up to its configuration number `count` to fit, with times.
 
-    The session has what was held out by then as well. The times are from the first reading to the
-    last one, s, NaN where nothing is known of it, and per configuration of any kind, s.
+    It has the held-out rows up to then as well. The times are from the first reading to the last
+    one, s, NaN if unknown, and per configuration of any kind, s.
     """
     given = session.measurements
     fitted = np.flatnonzero(~given.is_validation)
-    # Rows stand in the order of their measurement.
+    # Rows are in the order of their measurement.
     first = np.sort(np.unique(given.configuration[fitted], return_index=True)[1])
     last = fitted[-1] + 1 if count >= len(first) else fitted[first[count]]
     part = session.select(np.arange(last))

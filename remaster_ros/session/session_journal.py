@@ -279,7 +279,7 @@ class SessionJournal:
     def _columns(self, reading: PairedReading) -> dict[str, Any]:
         """Return the columns of a reading, without the number of dropped frames."""
         if reading.sensor in self._header.on_tool:
-            reading = reading.turned_round()
+            reading = reading.inverted()
         values = vars(replace(reading, stamp_s=reading.stamp_s + self._shift_s))
         return {name: value for name, value in values.items() if name != 'dropped'}
 

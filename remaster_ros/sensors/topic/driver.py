@@ -81,8 +81,8 @@ JUDGED = 200
 """Largest number of messages for rate and standard deviation."""
 JUDGED_S = 1.0
 RATED_S = 3.0
-"""Largest age of these messages, s by their stamps, for the standard deviation (`JUDGED_S`) and the
-rate (`RATED_S`): messages at intervals above a second have a rate too."""
+"""Largest age of these messages, s by their stamps, for the standard deviation (`JUDGED_S`) and
+the rate (`RATED_S`): messages at intervals above a second have a rate too."""
 EARLY_S = 0.1
 """Largest lead of a stamp, s; a larger one means another clock. A simulated clock advances in
 steps, and a message may come before the step: there the lead may be as large as the age."""
