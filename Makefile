@@ -77,7 +77,7 @@ FULL_bench_speed := --full
 FULL_bench_scaling := --sizes 50 173 1000 10000 100000
 FULL_bench_peers := --seeds 10
 FULL_bench_compensation := --results build/commanded.jsonl
-FULL_paper_tables := --out docs/paper.md
+FULL_paper_tables := --out benchmarks/PAPER.md
 bench: $(VENV)/bench-installed
 	@mkdir -p build
 	@$(foreach name,$(BENCH),echo "== $(name)" && OMP_NUM_THREADS=1 $(BIN)/python \

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The paper's Tables I to VIII beside ours: writes docs/paper.md.
+"""The paper's Tables I to VIII beside ours: writes benchmarks/PAPER.md.
 
 Its two experiments are simulated from its own Tables I and II: 36 poses with 173 configurations to
 fit, 32 with 156 to validate, the offsets of Table I as the truth, the registration corrections of
@@ -7,7 +7,7 @@ Table II, noise of its sigma. Twice: with noise that is independent for each poi
 of it common to all solutions of a pose. The product fits all four; the paper's own chain
 (`--sampler paper`) runs on the two with common noise.
 
-    OMP_NUM_THREADS=1 python benchmarks/paper_tables.py [--steps 200000] [--out docs/paper.md]
+    OMP_NUM_THREADS=1 python benchmarks/paper_tables.py [--steps 200000] [--out benchmarks/PAPER.md]
 """
 
 from __future__ import annotations

@@ -11,7 +11,7 @@ from worlds.paper_experiment import OPTIMIZATION, VALIDATION, choose_poses
 from worlds.paper_published import ERRORS
 
 SEED = 2
-PAGE = Path(__file__).resolve().parents[2] / 'docs' / 'paper.md'
+PAGE = Path(__file__).resolve().parents[2] / 'benchmarks' / 'PAPER.md'
 CELL = re.compile(r'([\d.]+) \[([\d.]+), ([\d.]+)\]')
 
 
