@@ -7,7 +7,7 @@ Table II, noise of its sigma. Twice: with noise that is independent for each poi
 of it common to all solutions of a pose. The product fits all four; the paper's own chain
 (`--sampler paper`) runs on the two with common noise.
 
-    OMP_NUM_THREADS=1 python benchmarks/paper_tables.py [--steps 200000] [--out benchmarks/PAPER.md]
+    OMP_NUM_THREADS=1 python benchmarks/paper_tables.py [--steps N] [--out benchmarks/PAPER.md]
 """
 
 from __future__ import annotations
