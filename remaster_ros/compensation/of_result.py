@@ -367,7 +367,7 @@ def slots_of(cell: Cell, chain: SerialChain) -> Iterator[tuple[Slot, FloatArray]
     if cell.changes is not None:
         # The arm is as it was after the change.
         if not cell.ends:
-            yield from placed(cell.changes, chain)
+            yield from slots_of(cell.changes, chain)
     elif cell.model_change is not None:
         change = cell.model_change
         yield Slot('geometry', change.joint), np.concatenate((change.shifts, change.turns), 1).T

@@ -8,7 +8,7 @@ import pytest
 from worlds.changing_sessions import changing_session
 from worlds.hidden_sessions import Recipe
 
-from remaster_ros.compensation.of_result import everything
+from remaster_ros.compensation.of_result import arm_of_effects
 from remaster_ros.discovery.discover import discover_session
 
 WITHIN = 0.05
@@ -49,7 +49,7 @@ def test_what_ended_is_not_loaded_and_what_began_is() -> None:
         hidden = changing_session(recipe, 0.5, ends=ends)
         found = discover_session(hidden.session, rng=np.random.default_rng(0))
         cells = [cell for group in found.groups for cell in group]
-        terms = everything(found.fit, cells, found.residuals).model.joint_terms
+        terms = arm_of_effects(found.fit, cells, found.residuals).model.joint_terms
         assert [term.function.driver for term in terms] == ([] if ends else ['gravity_torque'])
 
 
