@@ -119,7 +119,9 @@ class Pace:
             reports = [published_s for _, published_s in self._reports]
         since = [published_s for published_s in reports if published_s > taken_s][:1]
         since += _progress_of_running(self._fakes, wall)
-        untaken = [published_s + LEAD_AHEAD_S for published_s in reports if published_s > led_s][:1]
+        untaken = [published_s + LEAD_AHEAD_S for published_s in reports if published_s > led_s][
+            :1
+        ]
         self._clock.hold(min([*untaken, min([now, *since]) + self._ahead_s, most_s]))
 
 
@@ -185,7 +187,8 @@ class WorldClock:
         """
         wall = time.monotonic()
         now = self.now(wall)
-        # Written next to the valid line: if the process is killed meanwhile, that line stays valid.
+        # Written next to the valid line: if the process is killed meanwhile, that line stays
+        # valid.
         (version,) = _VERSION.unpack_from(self._memory)
         line = wall, now, max(limit_s, now), wall + HELD_WALL_S
         _LINE.pack_into(self._memory, _line_at(version + 1), *line)
