@@ -404,9 +404,10 @@ def mode_at_offsets(mode: Mode, joint_offsets: FloatArray) -> Mode:
 
 
 def _judged_at(mode: Mode, gauge: Gauge, priors: Sequence[Prior]) -> Gauge:
-    """Gauge with the directions that are badly determined at the mode, if any offset is.
+    """Gauge found again at the mode if an offset is badly determined, else the given gauge.
 
-    The start at which it was found may lie far along such a direction.
+    The given gauge was found at the start, which may lie far from the mode along such a direction.
+    It is kept if the new one would hold other parameters.
     """
     posterior = mode.linearisation.posterior
     std = np.sqrt(np.diag(mode.covariance))

@@ -74,5 +74,10 @@ def p_value_limits(shares: tuple[float, ...], error_rate: float) -> tuple[float,
 def _above(
     limit: float, grid: FloatArray, density: FloatArray, place: float, width: float, step: float
 ) -> float:
-    """Probability above a limit, minus the part of the error rate to be spent."""
+    """Probability of an alarm at this look less ``step``, the error rate to be spent at it.
+
+    ``limit``: of the statistic; ``grid, density``: values of statistic times share before this
+    look, and their probabilities without earlier alarms; ``place``: share of all data; ``width``:
+    standard deviation of the increase.
+    """
     return float(density @ scipy.special.ndtr((grid - limit * place) / width)) - step

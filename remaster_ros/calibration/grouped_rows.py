@@ -318,10 +318,12 @@ class Rows:
 
     @cached_property
     def _rows_of_frames(self) -> csr_array:
+        """Matrix (frames, n) with 1 for each row of a frame."""
         return _members(self.frame_start, len(self))
 
     @cached_property
     def _frames_of_groups(self) -> csr_array:
+        """Matrix (groups, frames) with 1 for each frame of a group."""
         return _members(self.first_frame, len(self.frame_start))
 
 

@@ -160,7 +160,12 @@ def left_out_distances(fitted: Contrasts, covariance: FloatArray) -> dict[int, F
 
 
 def _variance(gram: FloatArray, size: int, covariance: FloatArray) -> float:
-    """Variance of the noise from ``size`` numbers, corrected for the fitted parameters."""
+    """Variance of the noise: sum of squares over degrees of freedom.
+
+    ``gram``: Gram matrix of [columns | errors] of ``size`` numbers, (f + 1, f + 1);
+    ``covariance``: of the fitted parameters in units of the noise, (f, f), whose share of the
+    degrees of freedom is subtracted.
+    """
     freedom = size - np.sum(gram[:-1, :-1] * covariance)
     return float(gram[-1, -1] / max(freedom, 1.0))
 

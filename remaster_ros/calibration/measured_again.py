@@ -23,7 +23,10 @@ class MeasuredAgain:
 
     @classmethod
     def of(cls, measurements: Measurements) -> MeasuredAgain:
-        """Count of configurations with joint angles within `SAME_RAD` of a fitted one."""
+        """Counts for a session.
+
+        Angles within `SAME_RAD` of a fitted one count as fitted as well.
+        """
         first = np.unique(measurements.configuration, return_index=True)[1]
         q, held_out = measurements.q[first], measurements.is_validation[first]
         if not held_out.any() or held_out.all():

@@ -165,11 +165,13 @@ def orientation_accuracy(
 
 
 def _measured(measurements: Measurements, rows: IntArray) -> Rotation:
+    """Measured orientations of some rows."""
     assert measurements.orientation is not None
     return Rotation.from_quat(measurements.orientation[rows])
 
 
 def _inverse_of(matrices: FloatArray) -> Rotation:
+    """Inverse rotations of matrices (n, 3, 3)."""
     return Rotation.from_matrix(matrices).inv()
 
 

@@ -325,7 +325,11 @@ class ArmModel:
         return State(drivers, angles, before, frames, frame @ origins[..., k, :, :])
 
     def _origins(self, warming: FloatArray) -> FloatArray:
-        """Joint origins with shifts and turns, (k + 1, 4, 4) or (n, k + 1, 4, 4)."""
+        """Joint origins and tool with their shifts and turns, (k + 1, 4, 4).
+
+        ``warming``: temperature above the reference, K, (n,); if the arm grows with it the result
+        is (n, k + 1, 4, 4).
+        """
         shifts, turns = self.geometry.shifts, self.geometry.turns
         if self.growth.is_any:
             shifts = shifts + warming[:, None, None] * self.growth.shifts

@@ -260,5 +260,6 @@ def _is_name(value: Any) -> bool:
 
 
 def _text(value: Any) -> str:
+    """Value as text with single blanks; '' for a text that stands for no value."""
     text = ' '.join(str(value).split())
     return '' if text.lower() in _EMPTY else text
