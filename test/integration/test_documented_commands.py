@@ -81,8 +81,8 @@ def test_every_option_that_the_page_on_import_names_is_there() -> None:
 
 
 @pytest.fixture(scope='module')
-def own(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a folder with what the pages take for the reader's own."""
+def readers_files(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder with the files that the pages assume the reader to have."""
     folder = tmp_path_factory.mktemp('own')
     arm = measured(rows=24)
     names, degrees, mm = [f'P{i}' for i in range(24)], np.rad2deg(arm.q).T, 1e3 * arm.points.T
@@ -95,7 +95,7 @@ def own(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def run(page: Path, own: Path, here: Path, capsys: pytest.CaptureFixture[str]) -> int:
+def run(page: Path, readers_files: Path, here: Path, capsys: pytest.CaptureFixture[str]) -> int:
     """Run the commands of a page that can be run here; return how many."""
     (here / 'docs').symlink_to(ROOT / 'docs')
     count = 0
@@ -103,7 +103,7 @@ def run(page: Path, own: Path, here: Path, capsys: pytest.CaptureFixture[str]) -
         if not command.is_run:
             continue
         for word in reads(command):
-            supply(word, own, here)
+            supply(word, readers_files, here)
         capsys.readouterr()
         status = main(small(command))
         shown = capsys.readouterr().err
@@ -118,13 +118,13 @@ def run(page: Path, own: Path, here: Path, capsys: pytest.CaptureFixture[str]) -
     return count
 
 
-def supply(word: str, own: Path, here: Path) -> None:
+def supply(word: str, readers_files: Path, here: Path) -> None:
     """Put a file or folder that a page reads and has not made into the scratch folder."""
     name, target = Path(word).parts[0], here / Path(word).parts[0]
     if target.exists() or word.startswith('-'):
         return
-    if (own / name).exists():
-        shutil.copy(own / name, target)
+    if (readers_files / name).exists():
+        shutil.copy(readers_files / name, target)
     elif name in ('my_session', 'session', 'other_session', 's1', 's2', 'saggy'):
         # A cause so small that it has look-alikes, which `plan --separate` needs.
         options = '--poses 24 --validation 12 --effect joint_compliance@2:0.15 --quiet'
@@ -132,15 +132,15 @@ def supply(word: str, own: Path, here: Path) -> None:
         seed = '5' if name in ('other_session', 's2') else '0'
         assert main(['simulate', name, '--seed', seed, *options.split()]) == 0
     elif name == 'my_fit':
-        supply('my_session', own, here)
+        supply('my_session', readers_files, here)
         assert main(['fit', 'my_session', '--out', name, '--no-figures', '--quiet']) == 0
     elif name in ('causes', 'discovery.json'):
-        supply('s1', own, here)
+        supply('s1', readers_files, here)
         assert main(['discover', 's1', '--out', 'causes', '--no-figures', '--quiet']) == 0
         shutil.copy('causes/discovery.json', 'discovery.json')
         # The cell is of the same arm, also where the page has made one of another.
         (here / 'my_cell.yaml').unlink(missing_ok=True)
-        supply('my_cell.yaml', own, here)
+        supply('my_cell.yaml', readers_files, here)
     elif name == 'poses.csv':
         # The columns of a reader's own table, and the arm that it is of.
         size = '--sensors mocap --poses 24 --validation 0 --orientation-noise-deg 0.02 --on-tool'
@@ -168,10 +168,10 @@ def without_numbers(line: str) -> str:
 )
 def test_the_commands_of_a_page_work_one_after_the_other(
     page: Path,
-    own: Path,
+    readers_files: Path,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    assert run(page, own, tmp_path, capsys) > 0
+    assert run(page, readers_files, tmp_path, capsys) > 0

@@ -99,7 +99,9 @@ def _of_all_joints(world: HiddenWorld, kind: str, value: float, **detail: object
     return 1e3 * float(np.linalg.norm(sizes))
 
 
-def _one(world: HiddenWorld, kind: str, value: float, *joints: int, **detail: object) -> float:
+def effect_size_mm(
+    world: HiddenWorld, kind: str, value: float, *joints: int, **detail: object
+) -> float:
     values = np.array([value] * max(1, len(joints) * (kind == 'joint_compliance')))
     return 1e3 * world.size_m(HiddenEffect(kind, joints, values, detail))
 
@@ -122,8 +124,8 @@ def test_sizes_are_those_known_of_this_arm(iiwa: HiddenWorld) -> None:
             0.16,
         ),
         'backlash': (_of_all_joints(iiwa, 'backlash', ARC_MINUTE), 0.12),
-        'upper arm': (_one(iiwa, 'link_length', 0.3e-3, 2), 0.28),
-        'forearm': (_one(iiwa, 'link_length', 0.3e-3, 4), 0.24),
+        'upper arm': (effect_size_mm(iiwa, 'link_length', 0.3e-3, 2), 0.28),
+        'forearm': (effect_size_mm(iiwa, 'link_length', 0.3e-3, 4), 0.24),
         'drift': (1e3 * np.sqrt(np.mean(np.sum(left**2, axis=1))) * 3.5 / hours, 0.10),
     }
     marker = HiddenEffect('marker_offset', (), np.array([0.3e-3, 0.0, 0.0]))
@@ -137,14 +139,14 @@ def test_sizes_are_those_known_of_this_arm(iiwa: HiddenWorld) -> None:
     assert 1.80 / 2 < 1e3 * iiwa.size_m(compliance) < 1.80 * 2
     only_mocap = world('iiwa7', np.random.default_rng(3), sensors=('mocap',))
     for form, value, reference in (('all', 1e-3, 0.38), ('depth', 2e-3, 0.46)):
-        mm = _one(only_mocap, 'sensor_scale', value, sensor='mocap', form=form)
+        mm = effect_size_mm(only_mocap, 'sensor_scale', value, sensor='mocap', form=form)
         assert reference / 2.5 < mm < reference * 2.5
-    mm = _one(only_mocap, 'sensor_distortion', 0.02, sensor='mocap')
+    mm = effect_size_mm(only_mocap, 'sensor_distortion', 0.02, sensor='mocap')
     assert 0.23 / 2.5 < mm < 0.23 * 2.5
 
 
 def test_a_tool_of_other_length_is_the_registration(iiwa: HiddenWorld) -> None:
-    assert _one(iiwa, 'link_length', 0.3e-3, 7) < 0.04
+    assert effect_size_mm(iiwa, 'link_length', 0.3e-3, 7) < 0.04
 
 
 def test_an_arm_that_gives_way_comes_down(iiwa: HiddenWorld) -> None:

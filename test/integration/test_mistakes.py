@@ -96,7 +96,7 @@ def session_of(name: str, seed: int) -> Session:
     return simulated(robot, seed, int(markers))
 
 
-def left(session: Session) -> float:
+def fit_error_m(session: Session) -> float:
     """What an estimate leaves, m."""
     found = sound_estimate(session)
     noise = found.posterior.noise(found.mode.eta)
@@ -106,7 +106,7 @@ def left(session: Session) -> float:
 def named(session: Session, option: str, plain_m: float) -> bool | None:
     """Whether the mistake is named; None where the session fits as well with it as without."""
     try:
-        return None if left(session) < 2.0 * plain_m else False
+        return None if fit_error_m(session) < 2.0 * plain_m else False
     except MistakeFoundError as error:
         print(error, error.options)
         told = f'{error} {error.options}'
@@ -137,7 +137,7 @@ def test_the_mistake_is_named(name: str, kind: str) -> None:
     session = session_of(name, 11)
     spoilt = SPOILS[kind](session, np.random.default_rng(11))
     assert spoilt is not None
-    assert named(*spoilt, left(session))
+    assert named(*spoilt, fit_error_m(session))
 
 
 @pytest.mark.parametrize('name', ['irb120 1', 'panda 1', 'five joints', *REAL])
@@ -179,7 +179,7 @@ def test_the_command_that_is_told_mends_the_session(name, kind, verb, tmp_path) 
     assert command[0] == 'remaster'
     remaster(*command[1:], '--quiet')
     again = read_session(command[command.index('--out') + 1])
-    assert left(again) < 2.0 * left(session)
+    assert fit_error_m(again) < 2.0 * fit_error_m(session)
     assert again.sensors == session.sensors
     if kind == 'sign':
         np.testing.assert_allclose(again.measurements.q, session.measurements.q, atol=1e-9)
@@ -218,7 +218,7 @@ def test_of_all_kinds_on_many_arms_nineteen_of_twenty_are_named() -> None:
     for name in (*arms, *REAL, 'ur10_iso_cubes'):
         for seed in range(3):
             session = session_of(name, 100 + seed)
-            plain_m = left(session)
+            plain_m = fit_error_m(session)
             for kind, spoil in SPOILS.items():
                 spoilt = spoil(session, np.random.default_rng(seed))
                 right = None if spoilt is None else named(*spoilt, plain_m)

@@ -22,7 +22,7 @@ CASES = ROOT.parent / 'shared' / 'cases'
 MORE = ('does not explain', 'More than noise', 'other errors dominate', 'does not have')
 
 
-def told(session: Path, folder: Path) -> tuple[str, dict, dict, dict]:
+def results_of(session: Path, folder: Path) -> tuple[str, dict, dict, dict]:
     """Fit, discover and report; return all that was printed, and the three results."""
     printed = ''
     for verb, *more in (
@@ -55,7 +55,7 @@ def test_a_table_of_pure_noise_is_not_said_to_be_more(tmp_path: Path) -> None:
     session = tmp_path / 'session'
     urdf = CASES / 'kr6.urdf'
     remaster('import', *tables, '--urdf', urdf, '--out', session)
-    text, fit, found, answer = told(session, tmp_path)
+    text, fit, found, answer = results_of(session, tmp_path)
     assert found['verdict'] == 'none'
     assert not any(words in text for words in MORE)
     assert fit['explained_by_noise']['sensor']['explained'] is None
@@ -79,7 +79,7 @@ def test_a_table_of_pure_noise_is_not_said_to_be_more(tmp_path: Path) -> None:
 def test_simulated_noise_is_noise(robot: str, seed: int, tmp_path: Path) -> None:
     options = ('--robot', robot, '--sensors', 'mocap', '--pose-noise-mm', 0, '--seed', seed)
     session = simulated(tmp_path / 'session', '--poses', 20, '--validation', 10, *options)
-    text, fit, found, answer = told(session, tmp_path)
+    text, fit, found, answer = results_of(session, tmp_path)
     assert found['verdict'] == 'none'
     assert not any(words in text for words in MORE)
     assert fit['judgement']['findings'] == []
@@ -102,7 +102,7 @@ def test_a_few_readings_paired_wrongly_do_not_decide_and_are_told(tmp_path: Path
     options = ('--poses', 22, '--validation', 12, '--seed', 7)
     session = read_session(simulated(tmp_path / 'clean', *options))
     write_session(tmp_path / 'session', paired_wrongly(session, 0.05))
-    text, fit, found, answer = told(tmp_path / 'session', tmp_path)
+    text, fit, found, answer = results_of(tmp_path / 'session', tmp_path)
     gain = found['gain']
     assert gain['held_out_rms_after_m'] > 50 * gain['noise_floor_m']
     assert gain['held_out_kept_after_m'] < 1.5 * gain['noise_floor_m']
@@ -123,7 +123,7 @@ def test_backlash_is_no_slip(tmp_path: Path) -> None:
     """Its form is a step, over the side of approach: the zero-offsets hold all the time."""
     options = ('--poses', 30, '--validation', 15, '--sensors', 'mocap', '--seed', 5)
     session = simulated(tmp_path / 'session', *options, '--effect', 'backlash@4:0.5')
-    text, _, found, answer = told(session, tmp_path)
+    text, _, found, answer = results_of(session, tmp_path)
     (effect,) = found['effects']
     assert (effect['name'], effect['form'], effect['moment_s']) == ('backlash', 'step', None)
     assert answer['action'] == 'set'

@@ -60,18 +60,18 @@ class Oracle:
         others
             What may explain it instead, each of any size.
         """
-        left = self._left(self.world.response(effect)[..., None])[:, 0]
+        left = self._remainder(self.world.response(effect)[..., None])[:, 0]
         if others:
             rivals = np.stack([self.world.response(other) for other in others], axis=-1)
-            rivals = self._left(rivals)
+            rivals = self._remainder(rivals)
             rivals = rivals / np.maximum(np.linalg.norm(rivals, axis=0), 1e-30)
             left = left - rivals @ np.linalg.lstsq(rivals, left, rcond=1e-9)[0]
         return float(left @ left)
 
     def chi_square(self, effect: HiddenEffect, errors: FloatArray) -> float:
         """Likelihood-ratio statistic of an effect of one value, for errors (n, 3) of all rows."""
-        left = self._left(self.world.response(effect)[..., None])[:, 0]
-        return float((left @ self._left(errors[..., None])[:, 0]) ** 2 / (left @ left))
+        left = self._remainder(self.world.response(effect)[..., None])[:, 0]
+        return float((left @ self._remainder(errors[..., None])[:, 0]) ** 2 / (left @ left))
 
     def size_for_power(
         self, effect: HiddenEffect, power: float = 0.9, false_alarms: float = 0.02
@@ -93,7 +93,7 @@ class Oracle:
             [solve_triangular(f, used[:, a], lower=True) for a, f in enumerate(self._factors)]
         )
 
-    def _left(self, columns: FloatArray) -> FloatArray:
+    def _remainder(self, columns: FloatArray) -> FloatArray:
         """Whiten (n, 3, p) and take out what the nuisance can take up."""
         white = self._whitened(columns)
         white = np.concatenate((white, np.zeros((3 * len(self.world.markers), white.shape[1]))))

@@ -159,14 +159,14 @@ class FclJudge:
         for _ in range(_SAMPLED):
             poses = self._place(low + rng.random(len(low)) * (high - low))
             self._move(poses)
-            touching += [self._apart(i, j) <= 0.0 for i, j in pairs]
+            touching += [self._body_distance(i, j) <= 0.0 for i, j in pairs]
         return [pair for pair, n in zip(pairs, touching) if n < _SAMPLED]
 
     def _move(self, poses: FloatArray) -> None:
         for thing, T in zip(self._objects, poses):
             thing.setTransform(self._fcl.Transform(T[:3, :3], T[:3, 3]))
 
-    def _apart(self, i: int, j: int) -> float:
+    def _body_distance(self, i: int, j: int) -> float:
         return float(
             self._fcl.distance(
                 self._objects[i],
@@ -204,7 +204,7 @@ class FclJudge:
         for n in np.argsort(bounds):
             if bounds[n] >= least:
                 break
-            least = min(least, self._apart(*self._pairs[n]))
+            least = min(least, self._body_distance(*self._pairs[n]))
         return least
 
 
@@ -272,7 +272,7 @@ class BulletJudge:
         touching = np.zeros(len(self._pairs))
         for _ in range(_SAMPLED):
             self._set(rng.uniform(*self._limits.T))
-            touching += [self._own(i, j, 0.0) <= 0.0 for i, j in self._pairs]
+            touching += [self._self_distance(i, j, 0.0) <= 0.0 for i, j in self._pairs]
         self._pairs = [pair for pair, n in zip(self._pairs, touching) if n < _SAMPLED]
 
     def _has_shape(self, link: int) -> bool:
@@ -282,7 +282,7 @@ class BulletJudge:
         for joint, value in zip(self._joints, q):
             self._b.resetJointState(self._arm, joint, float(value))
 
-    def _own(self, i: int, j: int, within: float) -> float:
+    def _self_distance(self, i: int, j: int, within: float) -> float:
         found = self._b.getClosestPoints(self._arm, self._arm, within, i, j)
         return min((point[8] for point in found), default=LOOK_M)
 
@@ -308,7 +308,7 @@ class BulletJudge:
         self._set(q)
         least = LOOK_M
         for i, j in self._pairs:
-            least = min(least, self._own(i, j, least))
+            least = min(least, self._self_distance(i, j, least))
         for thing in self._things:
             for link in self._moving:
                 if self._carrier[link] == self._first and thing == self._things[-1]:

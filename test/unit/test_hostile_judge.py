@@ -29,18 +29,18 @@ def move(way, duration_s, at_s=0.0, start=HOME, velocity=STILL, **options):
                    **options)  # fmt: skip
 
 
-def one(joint, angle):
+def joint_change(joint, angle):
     return angle * (np.arange(7) == joint)
 
 
 def test_the_cubic_from_rest_to_rest_is_half_as_fast_again_as_its_mean(body):
-    judged = Judge(body, Rules(0.3)).judge(move(one(0, 0.6), 2.0))
+    judged = Judge(body, Rules(0.3)).judge(move(joint_change(0, 0.6), 2.0))
     assert judged.kind == 'move'
     assert judged.urdf_share == pytest.approx(1.5 * 0.3 / body.velocity[0], rel=1e-3)
     assert judged.speed_ratio == pytest.approx(judged.urdf_share / 0.3)
     assert judged.acceleration == pytest.approx(6 * 0.6 / 2.0**2, rel=1e-6)
     assert not judged.wrong(Rules(0.3))
-    fast = Judge(body, Rules(0.3)).judge(move(one(0, 0.6), 1.0))
+    fast = Judge(body, Rules(0.3)).judge(move(joint_change(0, 0.6), 1.0))
     assert any('joint speed' in text for text in fast.wrong(Rules(0.3)))
 
 
@@ -61,20 +61,22 @@ def test_cartesian_speed_is_that_of_the_fastest_point(body):
     """About joint 1 it is the distance from its axis times the angular speed."""
     points = body.points(HOME)
     radius = np.max(np.hypot(points[:, 0], points[:, 1]))
-    fastest, surface = body.speeds(HOME, one(0, 0.5))
+    fastest, surface = body.speeds(HOME, joint_change(0, 0.5))
     assert fastest == pytest.approx(0.5 * radius, rel=1e-9)
     assert fastest <= surface <= 0.5 * (radius + 0.075)
-    judged = Judge(body, Rules(1.0, cartesian_m_s=0.1)).judge(move(one(0, 0.6), 1.0))
+    judged = Judge(body, Rules(1.0, cartesian_m_s=0.1)).judge(move(joint_change(0, 0.6), 1.0))
     assert any('m/s' in text for text in judged.wrong(Rules(1.0, cartesian_m_s=0.1)))
 
 
 def test_outside_is_found_on_the_way_too_and_not_held_against_a_start_outside(body):
     rules = Rules(1.0)
-    there = HOME + one(1, body.upper[1] - HOME[1] - 0.01)
-    overshooting = move(one(1, 0.005), 1.0, start=there, velocity=one(1, 0.5))
+    there = HOME + joint_change(1, body.upper[1] - HOME[1] - 0.01)
+    overshooting = move(joint_change(1, 0.005), 1.0, start=there, velocity=joint_change(1, 0.5))
     assert 'outside' in ' '.join(Judge(body, rules).judge(overshooting).wrong(rules))
-    outside = HOME + one(1, body.upper[1] - HOME[1] + 0.05)
-    assert not Judge(body, rules).judge(move(one(1, -0.2), 2.0, start=outside)).wrong(rules)
+    outside = HOME + joint_change(1, body.upper[1] - HOME[1] + 0.05)
+    assert (
+        not Judge(body, rules).judge(move(joint_change(1, -0.2), 2.0, start=outside)).wrong(rules)
+    )
     nothing = move(np.full(7, np.nan), 2.0)
     assert Judge(body, rules).judge(nothing).wrong(rules)
 
@@ -91,9 +93,9 @@ def test_outside_is_found_on_the_way_too_and_not_held_against_a_start_outside(bo
 )
 def test_a_stop_ends_ahead_on_the_admitted_path(body, end, words):
     judge, rules = Judge(body, Rules(1.0)), Rules(1.0)
-    way = one(0, 1.0) + one(4, 0.5)
+    way = joint_change(0, 1.0) + joint_change(4, 0.5)
     judge.judge(move(way, 4.0, at_s=10.0))
-    goal = HOME + (0.4 * way + one(2, 0.02) if end is None else end * way)
+    goal = HOME + (0.4 * way + joint_change(2, 0.02) if end is None else end * way)
     here = HOME + 0.3 * way
     judged = judge.judge(move(goal - here, 1.0, at_s=11.0, start=here))
     assert judged.kind == 'stop'
@@ -103,23 +105,26 @@ def test_a_stop_ends_ahead_on_the_admitted_path(body, end, words):
 
 def test_what_follows_a_stop_is_a_move_once_the_stop_has_ended(body):
     judge = Judge(body, Rules(1.0))
-    judge.judge(move(one(0, 1.0), 4.0, at_s=10.0))
-    judge.judge(move(one(0, 0.1), 0.5, at_s=11.0, start=HOME + one(0, 0.3)))
-    here = HOME + one(0, 0.4)
-    assert judge.judge(move(one(2, 0.5), 4.0, at_s=11.2, start=here)).kind == 'stop'
+    judge.judge(move(joint_change(0, 1.0), 4.0, at_s=10.0))
+    judge.judge(move(joint_change(0, 0.1), 0.5, at_s=11.0, start=HOME + joint_change(0, 0.3)))
+    here = HOME + joint_change(0, 0.4)
+    assert judge.judge(move(joint_change(2, 0.5), 4.0, at_s=11.2, start=here)).kind == 'stop'
     judge.forget()
-    judge.judge(move(one(0, 1.0), 4.0, at_s=10.0))
-    judge.judge(move(one(0, 0.1), 0.5, at_s=11.0, start=HOME + one(0, 0.3)))
-    assert judge.judge(move(one(2, 0.5), 4.0, at_s=11.6, start=here)).kind == 'move'
-    assert judge.judge(move(one(2, 0.1), 0.5, at_s=17.0, start=here), running=False).kind == 'stop'
+    judge.judge(move(joint_change(0, 1.0), 4.0, at_s=10.0))
+    judge.judge(move(joint_change(0, 0.1), 0.5, at_s=11.0, start=HOME + joint_change(0, 0.3)))
+    assert judge.judge(move(joint_change(2, 0.5), 4.0, at_s=11.6, start=here)).kind == 'move'
+    assert (
+        judge.judge(move(joint_change(2, 0.1), 0.5, at_s=17.0, start=here), running=False).kind
+        == 'stop'
+    )
 
 
 def test_a_way_round_is_no_way_back(body):
     """A stop on the second leg of an admitted path with a corner."""
-    corner, end = HOME + one(0, 0.5), HOME + one(0, 0.5) + one(1, 0.3)
+    corner, end = HOME + joint_change(0, 0.5), HOME + joint_change(0, 0.5) + joint_change(1, 0.3)
     path = Command(0.0, np.array([2.0, 4.0]), np.array([corner, end]), np.zeros((2, 7)), None,
                    HOME, STILL)  # fmt: skip
-    here = corner + one(1, 0.1) * np.linspace(0.0, 1.0, 9)[:, None]
+    here = corner + joint_change(1, 0.1) * np.linspace(0.0, 1.0, 9)[:, None]
     assert max(along(path, here).values()) < 1e-12
     cut = HOME + np.linspace(0.0, 1.0, 9)[:, None] * (end - HOME)
     assert along(path, cut)['off_path_rad'] > 0.1
@@ -128,7 +133,7 @@ def test_a_way_round_is_no_way_back(body):
 @pytest.mark.parametrize('exact', [True, False])
 def test_the_arm_follows_and_brakes(exact):
     arm = HostileArm(HOME, 0.0, exact=exact)
-    arm.take(0.0, np.array([2.0]), np.array([HOME + one(0, 0.6)]), np.zeros((1, 7)))
+    arm.take(0.0, np.array([2.0]), np.array([HOME + joint_change(0, 0.6)]), np.zeros((1, 7)))
     arm.advance(1.0)
     assert arm.q[0] == pytest.approx(0.3, abs=1e-3 if exact else 0.04)
     assert arm.speed() == pytest.approx(0.45, rel=0.01)
@@ -148,7 +153,7 @@ def test_the_arm_follows_and_brakes(exact):
 
 def test_in_open_loop_a_command_begins_where_the_last_one_leads():
     arm = HostileArm(HOME, 0.0, open_loop=True)
-    arm.take(0.0, np.array([2.0]), np.array([HOME + one(0, 0.6)]), np.zeros((1, 7)))
+    arm.take(0.0, np.array([2.0]), np.array([HOME + joint_change(0, 0.6)]), np.zeros((1, 7)))
     command = arm.take(1.0, np.array([1.0]), np.array([HOME]), np.zeros((1, 7)))
     assert command.start_q[0] == pytest.approx(0.3)
     assert arm.q[0] < 0.29

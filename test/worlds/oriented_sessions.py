@@ -182,7 +182,7 @@ def _by_camera(T_C_B: FloatArray, rng: np.random.Generator) -> FloatArray:
     return transform(turn, T_C_B[:3, 3] + step[:3])
 
 
-class Held(NamedTuple):
+class FittedSession(NamedTuple):
     """Of one session: which 95 % intervals of determined offsets hold the truth, and its errors.
 
     Attributes
@@ -207,7 +207,7 @@ class Held(NamedTuple):
     gross: int
 
 
-def one_session(seed: int, kind: str, poses: int = 30, arm: str | None = None) -> Held:
+def one_session(seed: int, kind: str, poses: int = 30, arm: str | None = None) -> FittedSession:
     """Make a session with this seed, fit it, and look which intervals hold."""
     rng = np.random.default_rng(seed)
     common = rng.choice((0.0, 1.0, 3.0))
@@ -222,7 +222,7 @@ def one_session(seed: int, kind: str, poses: int = 30, arm: str | None = None) -
     known = fit.identifiable
     low, high = fit.joint_offsets_interval95[known].T
     truth = made.joint_offsets[known]
-    return Held(
+    return FittedSession(
         ((low < truth) & (truth < high)).tolist(),
         ((fit.joint_offsets[known] - truth) / fit.joint_offsets_std[known]).tolist(),
         np.degrees(fit.joint_offsets_std[known]).tolist(),

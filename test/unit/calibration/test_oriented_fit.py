@@ -24,7 +24,7 @@ SLIDING = {
 }
 
 
-def held(seed_and_kind):
+def result_of_session(seed_and_kind):
     """Return what one session showed; at module level, for other processes."""
     seed, kind = seed_and_kind
     return one_session(seed, kind)
@@ -85,7 +85,7 @@ def test_intervals_of_an_arm_that_slides_hold_as_often_as_they_say(arm, sessions
 def test_intervals_hold_as_often_as_they_say(kind, sessions):
     print(f'session seeds 9000 to {9000 + sessions - 1}')
     jobs = [(seed, kind) for seed in range(9000, 9000 + sessions)]
-    found = list(in_parallel(held, jobs, 2 if sessions > 4 else 1))
+    found = list(in_parallel(result_of_session, jobs, 2 if sessions > 4 else 1))
     inside = np.concatenate([one.inside for one in found])
     # The offsets of one session hang together: as if they were half as many.
     count = len(inside) // 2
