@@ -232,4 +232,13 @@ def one_session(seed: int, kind: str, poses: int = 30, arm: str | None = None) -
     )
 
 
-__all__ = ['KINDS', 'Held', 'Made', 'Problem', 'estimate', 'make_session', 'one_session', 'pixels']
+__all__ = [
+    'KINDS',
+    'FittedSession',
+    'Made',
+    'Problem',
+    'estimate',
+    'make_session',
+    'one_session',
+    'pixels',
+]
