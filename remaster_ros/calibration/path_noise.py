@@ -43,6 +43,9 @@ RANGE_SHARE = (1e-3, 0.9995)
 # Frames of a run: a matrix of so many is factored in a tenth of a second. Runs count as
 # independent.
 MOST_FRAMES = 1_200
+# Frames by which share and lengths are estimated: a minute's, hundreds of matrices of a hundredth
+# of a second.
+MOST_SEARCHED = 600
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,7 +171,7 @@ def path_noise(
     left = np.concatenate((columns, errors[..., None]), axis=2)
     joined = np.add.reduceat(left, first, axis=0) / weight[..., None]
     # Long recordings: the lengths of a part of them are those of all.
-    some = slice(0, MOST_FRAMES)
+    some = slice(0, MOST_SEARCHED)
     joined, at = joined[some], source[first][some]
     position, turn = before.position[at], before.turn[at]
     f, p = len(joined), prior.shape[0]

@@ -2,10 +2,12 @@
 """Rows of a moving arm from recordings in a world with dynamics of its own."""
 
 from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from worlds.moving_bags import CELL, imported, recorded, standing, write_bag
+from worlds.moving_bags import CELL, CHAIN, imported, recorded, standing, write_bag
 from worlds.moving_world import Dynamics, Errors, without_dynamics
 
 from remaster_ros.calibration.dynamics import clocks_of, estimate_moving
@@ -14,6 +16,7 @@ from remaster_ros.calibration.fit import fit_session
 from remaster_ros.calibration.mistakes import UNKNOWN_MARKER_STD_M
 from remaster_ros.cli.main import main
 from remaster_ros.errors import InputError
+from remaster_ros.importing import bags
 from remaster_ros.importing.joint_motion import JointMotion
 from remaster_ros.importing.standstills import Stream
 from remaster_ros.reports.fit_json import read_fit
@@ -161,6 +164,45 @@ def test_a_bag_becomes_a_session(kind, recording, tmp_path, capsys):
     assert list(session.sensors) == ['bar']
     assert len(session.markers) == 4
     assert session.clock_offset_s['bar'] == pytest.approx(recording.delay_s, abs=2e-3)
+
+
+def test_markers_of_one_message_are_of_one_sensor(recording, monkeypatch):
+    """As mocap4r2 publishes them."""
+    recording = recording[1]
+
+    def messages(path, seen):
+        seen |= {'/joint_states': bags.JOINT_STATE, '/markers': 'mocap4r2_msgs/msg/Markers'}
+        for t, q in zip(recording.joint_stamps, recording.joints, strict=True):
+            state = SimpleNamespace(
+                header=header(t), name=[f'joint_{i}' for i in range(1, 8)], position=q
+            )
+            yield '/joint_states', bags.JOINT_STATE, state, t
+        for t, frame in zip(recording.frame_stamps, recording.points, strict=True):
+            markers = [
+                SimpleNamespace(
+                    marker_name='',
+                    marker_index=i,
+                    translation=SimpleNamespace(**dict(zip('xyz', place, strict=True))),
+                )
+                for i, place in enumerate(frame, start=1)
+            ]
+            message = SimpleNamespace(header=header(t), markers=markers)
+            yield '/markers', 'mocap4r2_msgs/msg/Markers', message, t
+
+    def header(t):
+        stamp = SimpleNamespace(sec=int(t), nanosec=round(1e9 * (t % 1.0)))
+        return SimpleNamespace(stamp=stamp)
+
+    monkeypatch.setattr(bags, '_messages', messages)
+    _, streams, columns = bags.read_streams(Path('bag'), CHAIN, point_topics=('/markers',))
+    assert [(one.sensor, one.marker) for one in streams] == [
+        ('markers', str(i)) for i in range(1, 5)
+    ]
+    assert columns['/markers/1'] == 'marker 1 of sensor markers, m'
+    np.testing.assert_array_equal(streams[2].stream.values, recording.points[:, 2])
+    names = {f'/markers/{i}': ('bar', f'ball_{i}') for i in range(1, 5)}
+    _, streams, _ = bags.read_streams(Path('bag'), CHAIN, point_topics=('/markers',), names=names)
+    assert streams[0].marker == 'ball_1'
 
 
 def test_moving_frames_agree_with_the_standstills_between_them(tmp_path, capsys):
