@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from importlib import import_module
+from typing import Any
 
 from remaster_ros.discovery.effects.base import Effect
 
@@ -54,6 +55,10 @@ class _Effects(dict[str, Effect]):
 
     def __missing__(self, name: str) -> Effect:
         return MOTION[name]
+
+    def get(self, name: str, default: Any = None) -> Any:
+        """Return an effect of either kind."""
+        return super().get(name, MOTION.get(name, default))
 
 
 MOTION = {effect.name: effect for effect in map(_effect, OF_MOTION)}

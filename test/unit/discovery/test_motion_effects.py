@@ -118,6 +118,9 @@ def test_each_has_words_and_columns_of_any_rows(name, scene):
 
 def test_they_are_tried_on_no_arm_that_stood_still(scene):
     assert not {*MOTION} & {*EFFECTS}
+    # Pages find equation and source of either kind.
+    assert EFFECTS.get('joint_lag') is EFFECTS['joint_lag'] is MOTION['joint_lag']
+    assert EFFECTS.get('none') is None
     assert {*effects_of(True)} - {*effects_of(False)} == {*MOTION}
     still = replace(
         scene, measurements=replace(scene.measurements, velocity=None, acceleration=None)
