@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What motion adds to the errors of an arm: parameters that every fit of a moving session has.
+"""Contributions of motion to the errors of an arm: parameters of every fit of a moving session.
 
 With q̇ and q̈ of a row, J_j the derivative of the marker by joint j, and t its time::
 
@@ -11,9 +11,9 @@ With q̇ and q̈ of a row, J_j the derivative of the marker by joint j, and t it
     tool                - a_x m_x along each axis of the tool, a the marker's acceleration: a mode
                         far above what the motion excites, m = 1 / (2 π f)²
 
-Sizes of real machines as Gaussian priors about 0. A lag that all joints have is one of the clock:
-the mean of the lags, each weighted with the square of the speed that its joint gives the markers,
-is 0. Offsets are then stated with what motion leaves unknown of them.
+Sizes of real machines are Gaussian priors about 0. A lag of all joints is one of the clock: the
+mean of the lags, each weighted with the square of the speed that its joint gives the markers, is
+0. The standard deviations of the offsets then contain the uncertainty of these parameters.
 """
 
 from __future__ import annotations
@@ -31,28 +31,28 @@ from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.transforms import apply
 from remaster_ros.types import FloatArray, IntArray, Measurements
 
-# Time whose frames a row is the mean of, s: a dozen of a camera of 120 Hz, within which sensor and
-# arm err alike.
+# Time of the frames of a row, s: a dozen frames of a camera of 120 Hz, within which the errors of
+# sensor and arm are nearly equal.
 ROW_S = 0.1
-# Travels of a joint in which its friction turns round, rad: of gears, which slip at once, and of
+# Travels of a joint within which its friction reverses, rad: of gears, which slip at once, and of
 # seals and grease.
 TRAVELS_RAD = (1e-4, 1e-3)
 # Parts of a row in which friction is followed.
 PARTS = 8
-# Rows that are farther apart are no neighbours, s.
+# Longest time between neighbouring rows, s.
 LONGEST_GAP_S = 1.6 * ROW_S
 # Standard deviations of the priors. A clock is found to less than a millisecond when a recording
 # is imported; crystals differ by parts in 1e5.
 CLOCK_STD_S, DRIFT_STD = 5e-3, 1e-4
 # Reports of one controller are of times that differ by less than a few of its cycles, s.
 LAG_STD_S = 3e-3
-# Their weighted mean is 0 by definition, s.
+# Standard deviation of the lags' weighted mean, which is 0 by definition, s.
 MEAN_LAG_STD_S = 1e-6
 # Play and wind-up of friction, some hundredths of a degree, rad.
 WINDUP_STD_RAD = 5e-4
 # Gearboxes of 3 kN m/rad and stiffer, rad/(N m).
 SOFTNESS_STD = 3e-4
-# Frames of a sensor that show correlations.
+# Fewest frames of a sensor that show correlations.
 FEWEST_FRAMES = 40
 # A tool's mode of 7 Hz and above, s².
 MODE_STD_S2 = 5e-4
@@ -70,14 +70,14 @@ class MotionColumns:
 
     @classmethod
     def of(cls, chain: SerialChain, m: Measurements, offsets: FloatArray) -> MotionColumns:
-        """Return those of measurements that have velocities."""
+        """Functions of the motion of measurements with velocities."""
         assert m.velocity is not None
         assert m.acceleration is not None
         rates = np.nan_to_num(m.velocity), np.nan_to_num(m.acceleration)
         return cls(chain, m.q + offsets, *rates, m.stamp_s)
 
     def at(self, rows: IntArray) -> MotionColumns:
-        """Return the same of some rows, by their indices in this one."""
+        """Functions of some rows, by their indices."""
         return _PartOfMotion(
             self.chain,
             self.q[rows],
@@ -94,12 +94,15 @@ class MotionColumns:
         return MovingLinks.of(self.chain, self.q, self.velocity, self.acceleration)
 
     def jacobian(self, places: FloatArray) -> FloatArray:
-        """Return the derivative of markers at places of the tool by the joints, (n, 3, k)."""
+        """Derivative of markers at positions in the tool frame by the joints, (n, 3, k)."""
         return self.chain.position_jacobian(self.q, places)
 
     @cached_property
     def friction(self) -> tuple[FloatArray, FloatArray]:
-        """Share of each joint's friction, -1 to 1, if it turns round soon, and late less soon."""
+        """Share of each joint's friction, -1 to 1, for the short travel.
+
+        Last result: its change by the long travel.
+        """
         soon, late = (
             friction_share(self.seconds, self.q, self.velocity, self.acceleration, travel)
             for travel in (np.outer(TRAVELS_RAD, self.chain.per_radian))
@@ -112,9 +115,9 @@ class MotionColumns:
         return self.links.inertial_torque()
 
     def swing(self, places: FloatArray) -> FloatArray:
-        """Return what a mode along each axis of the tool displaces, m per s², (n, 3, 3).
+        """Displacement by a mode along each axis of the tool, m per s², (n, 3, 3).
 
-        ``places``: of the markers in the tool frame, m, (n, 3).
+        ``places``: positions of the markers in the tool frame, m, (n, 3).
         """
         tool = self.links.frames[:, -1] @ self.chain.T_fixed[-1]
         moved = self.links.point_acceleration(apply(tool, places))
@@ -124,14 +127,14 @@ class MotionColumns:
 
 @dataclass(frozen=True, eq=False)
 class _PartOfMotion(MotionColumns):
-    """Some rows, whose friction comes from the path of all."""
+    """Functions of some rows, with the friction along the path of all rows."""
 
     whole: MotionColumns
     rows: IntArray
 
     @cached_property
     def friction(self) -> tuple[FloatArray, FloatArray]:
-        """As of the whole."""
+        """Friction of these rows, as computed for all."""
         soon, late = self.whole.friction
         return soon[self.rows], late[self.rows]
 
@@ -143,11 +146,11 @@ def friction_share(
     acceleration: FloatArray,
     travel: FloatArray,
 ) -> FloatArray:
-    """Return the share of its full torque that friction has, the mean over each row, (n, k).
+    """Share of its full torque that friction has, the mean over each row, (n, k).
 
-    Friction that slips turns round within a travel, (k,), of the joint after each reversal: of
-    Dahl's model (1968, Aerospace Corp. TOR-0158) the share approaches the sign of the speed
-    exponentially. It is followed along rows that are neighbours in time, and begins at that sign.
+    After each reversal friction reverses within a travel, (k,), of the joint: in Dahl's model
+    (1968, Aerospace Corp. TOR-0158) the share approaches the sign of the speed exponentially. It
+    is followed along neighbouring rows, and begins at that sign.
     """
     moments, first, which = np.unique(seconds, return_index=True, return_inverse=True)
     q, velocity, acceleration = q[first], velocity[first], acceleration[first]
@@ -176,9 +179,9 @@ def friction_share(
 def dynamic_extension(
     chain: SerialChain, m: Measurements, sensor_names: tuple[str, ...], markers: FloatArray
 ) -> Extension:
-    """Return the parameters of motion for all rows of the measurements.
+    """Extension with the parameters of motion, for all rows of the measurements.
 
-    ``markers``: nominal places in the tool frame, m, (markers, 3).
+    ``markers``: nominal positions in the tool frame, m, (markers, 3).
     """
     k = len(chain)
     columns = MotionColumns.of(chain, m, np.zeros(k))
@@ -249,9 +252,9 @@ def dynamic_extension(
 
 
 def estimate_moving(problem: Problem) -> Estimate:
-    """Find the mode with the parameters of motion, under noise that is correlated along the path.
+    """Mode with the parameters of motion, under noise that is correlated along the path.
 
-    Errors as of `estimate`.
+    Raises as `estimate`.
     """
     extension = dynamic_extension(
         problem.chain, problem.measurements, problem.sensor_names, problem.markers
@@ -267,15 +270,15 @@ def estimate_moving(problem: Problem) -> Estimate:
 
 
 def estimate_beside(moving: Estimate, problem: Problem) -> Estimate:
-    """Return the estimate without parameters of motion, under the noise that remains with them.
+    """Estimate without parameters of motion, under the noise that remains with them.
 
-    What motion adds is left in its errors. ``moving``: of `estimate_moving`.
+    Its errors contain the contributions of motion. ``moving``: of `estimate_moving`.
     """
     return estimate(replace(problem, path_noise=moving.problem.path_noise))
 
 
 def noise_along_path(found: Estimate) -> PathNoise | None:
-    """Return the correlations of a fit's errors along the path; None of too few frames."""
+    """Correlations of a fit's errors along the path; None if there are too few frames."""
     posterior, model, mode = found.posterior, found.model, found.mode
     rows, free = posterior.rows.of_points, posterior.free
     errors = rows.target - model.predict(mode.z, rows)
@@ -303,7 +306,7 @@ def noise_along_path(found: Estimate) -> PathNoise | None:
 
 
 def moving_words(found: Estimate) -> str:
-    """Return the errors that are left, and what is found of the clocks, a sentence."""
+    """Sentence with the remaining errors and the offsets of the clocks."""
     posterior = found.posterior
     errors = posterior.rows.target - found.model.predict(found.mode.z, posterior.rows)
     length = 1e3 * float(np.median(np.linalg.norm(errors[: posterior.rows.points], axis=1)))
@@ -314,9 +317,9 @@ def moving_words(found: Estimate) -> str:
 
 
 def clocks_of(found: Estimate) -> dict[str, tuple[float, float]]:
-    """Return how late the stamps of each sensor are beside the joints', and its std, s.
+    """Delay of each sensor's stamps to those of the joints, and its standard deviation, s.
 
-    Of sensors that measured while the arm moved; {} of a fit without parameters of motion.
+    {} for a fit without parameters of motion.
     """
     extension, model = found.model.extension, found.model
     if extension is None or not extension.of_motion:

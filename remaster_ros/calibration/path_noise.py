@@ -1,21 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
 """Errors along a path: a Gaussian process over the tool's pose, common to a sensor's markers.
 
-What a sensor errs by at one place it errs by a tenth of a second later, too, and when the arm
-comes by again. The errors of frames a and b of a sensor are correlated by::
+The errors of a sensor at one pose are nearly the same a tenth of a second later, and when the arm
+returns to the pose. The errors of frames a and b of a sensor have the correlation::
 
-    (1 - s) [a = b] + s M(d),    d² = |p_a - p_b|² / l_m² + angle(a, b)² / l_rad²
+  (1 - s) [a = b] + s M(d),    d² = |p_a - p_b|² / l_m² + angle(a, b)² / l_rad²
 
-with M of Matérn's family, of order 1/2, 3/2, 5/2 or without end (Stein 1999, Interpolation of
-Spatial Data), p and angle of the nominal tool. The order, the share s of the process and its two
-lengths maximise the restricted likelihood (REML, Patterson and Thompson 1971, Biometrika 58) of
-the frames' means about a fit; the deviations of single markers from them have a share and lengths
-of their own, in the same proportion.
+with M of Matérn's family, of order 1/2, 3/2, 5/2 or infinite (Stein 1999, Interpolation of Spatial
+Data), p and angle of the nominal tool. The order, the share s of the process and its two lengths
+maximise the restricted likelihood (REML, Patterson and Thompson 1971, Biometrika 58) of the
+frames' means about a fit; the deviations of single markers from these means have a share and
+lengths of their own, in the same proportion.
 
 The rows are then decorrelated: the means of the frames, and the deviations of each marker, are
-multiplied by the inverse of the Cholesky factor of these correlations, and by the share of the
-standard deviation that is scatter about their mean. All else of the noise is as in `noise`, on
-rows that are independent. That the lengths and shares are estimated is not counted.
+multiplied by the inverse Cholesky factor of these correlations, and by the share of the standard
+deviation that is scatter about their mean. The rest of the noise is as in `noise`, on independent
+rows. The uncertainty of the lengths and shares is not counted.
 """
 
 from __future__ import annotations
@@ -31,16 +31,16 @@ from scipy.linalg import cho_factor, solve_triangular
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.types import FloatArray, IntArray, Measurements
 
-# Lengths at which the search begins, and how far it goes.
+# Start and range of the lengths in the search.
 START_M, START_RAD = 0.1, 0.5
 RANGE_M, RANGE_RAD = (0.01, 1.0), (0.05, 5.0)
-# Standard deviation of their logarithms about it, of a weak prior.
+# Standard deviation of the lengths' logarithms about the start, of a weak prior.
 LOG_LENGTH_STD = 1.0
-# Orders of Matérn's family; without end it is the squared exponential.
+# Orders of Matérn's family; the infinite one is the squared exponential.
 ORDERS = (0.5, 1.5, 2.5, np.inf)
-# Of the share of the process.
+# Range of the share of the process.
 RANGE_SHARE = (1e-3, 0.9995)
-# Frames of a run: a matrix of so many is factored in a tenth of a second. Runs count as
+# Largest number of frames of a run, whose matrix is factored in a tenth of a second. Runs count as
 # independent.
 MOST_FRAMES = 1_200
 # Frames by which share and lengths are estimated: a minute's, hundreds of matrices of a hundredth
@@ -64,11 +64,11 @@ class PathNoise:
     order: IntArray  # Of Matérn's family, an index into `ORDERS`
 
     def of_frames(self, sensor: int, rows: IntArray) -> FloatArray:
-        """Return the correlations of frames, each by one of its rows, (f, f)."""
+        """Correlations of frames, each by one of its rows, (f, f)."""
         return self._correlations(sensor, rows, float(self.share[sensor]), 1.0)
 
     def of_markers(self, sensor: int, rows: IntArray) -> FloatArray:
-        """Return those of the deviations of one marker in some rows, (r, r)."""
+        """Correlations of the deviations of one marker in some rows, (r, r)."""
         share, scale = float(self.marker_share[sensor]), float(self.marker_scale[sensor])
         return self._correlations(sensor, rows, share, scale)
 
@@ -99,7 +99,7 @@ class Decorrelation:
         frame_size: IntArray,
         frames: slice,
     ) -> Decorrelation:
-        """Factor the correlations of a sensor's frames.
+        """Factors of the correlations of a sensor's frames.
 
         ``source``, ``marker``: of all rows, (n,); ``frame_start``, ``frame_size``: of all frames;
         ``frames``: those of the sensor.
@@ -132,23 +132,23 @@ def path_noise(
     before: PathNoise | None,
     sensors: int,
 ) -> PathNoise:
-    """Return the noise with that of one sensor estimated from a fit.
+    """Path noise of a session with that of one sensor added, estimated from a fit.
 
     Parameters
     ----------
     chain, m
-        The nominal arm, and all rows of the session.
+        Nominal arm, and all rows of the session.
     sensor, sensors
-        Which of how many.
+        Index of the sensor, and number of sensors.
     rows
-        Of the sensor, sorted by frames: index in the measurements, (n,), number of the frame from
-        0 on, (n,), marker, (n,).
+        Rows of the sensor, sorted by frames: index in the measurements, (n,), number of the frame
+        from 0 on, (n,), marker, (n,).
     errors, columns
-        Of these rows, m, (n, 3), and the derivative by the fit's parameters, (n, 3, p).
+        Errors of these rows, m, (n, 3), and their derivative by the fit's parameters, (n, 3, p).
     prior
-        Precision of these times the variance of a frame's mean, (p, p).
+        Precision of the parameters times the variance of a frame's mean, (p, p).
     before
-        With the sensors before.
+        Path noise with the earlier sensors; None for the first.
     """
     source, frame, marker = rows
     if before is None:
@@ -178,7 +178,7 @@ def path_noise(
     flat = joined.reshape(f, -1)
 
     def cost(logs: FloatArray, order: int) -> float:
-        """Return minus the log restricted likelihood, the variance profiled out."""
+        """Minus the log restricted likelihood, with the variance at its maximum."""
         share, length_m, length_rad = _natural(logs)
         d = _distance(position, turn, length_m, length_rad)
         factor = np.linalg.cholesky(_correlations(d, share, order))
@@ -225,7 +225,7 @@ def path_noise(
 
 
 def _minimised(cost: Callable[[FloatArray], float], start: FloatArray) -> tuple[float, FloatArray]:
-    """Return the least cost near a start, and where it is."""
+    """Least cost near a start, and its position."""
     simplex = start + np.concatenate((np.zeros((1, len(start))), 0.7 * np.eye(len(start))))
     found = scipy.optimize.minimize(
         cost,
@@ -244,24 +244,24 @@ def _natural(logs: FloatArray) -> tuple[float, float, float]:
 
 
 def _of_markers(
-    apart: FloatArray,
+    deviations: FloatArray,
     frame: IntArray,
     marker: IntArray,
     frames: int,
     distance: FloatArray,
     order: int,
 ) -> tuple[float, float]:
-    """Return share and scale of the process in the deviations of single markers, by likelihood.
+    """Share and scale of the process in the deviations of single markers, by likelihood.
 
-    ``apart``: m, (n, 3), of the rows of the first ``frames`` frames and others; ``distance``:
-    between these frames, (f, f).
+    ``deviations``: deviations, m, (n, 3), of the rows of the first ``frames`` frames and others;
+    ``distance``: between these frames, (f, f).
     """
     series: dict[bytes, tuple[IntArray, list[FloatArray]]] = {}
     for one in np.unique(marker):
-        mine = (marker == one) & (frame < frames)
-        if mine.sum() > frames // 2:
-            at = frame[mine]
-            series.setdefault(at.tobytes(), (at, []))[1].append(apart[mine])
+        of_marker = (marker == one) & (frame < frames)
+        if of_marker.sum() > frames // 2:
+            at = frame[of_marker]
+            series.setdefault(at.tobytes(), (at, []))[1].append(deviations[of_marker])
     if len(np.unique(marker)) < 2 or not series:
         return 0.0, 1.0
 
@@ -292,7 +292,7 @@ def _natural_of_markers(logs: FloatArray) -> tuple[float, float]:
 def _distance(
     position: FloatArray, turn: FloatArray, length_m: float, length_rad: float
 ) -> FloatArray:
-    """Return the distances of poses in lengths of the process, (f, f)."""
+    """Distances of poses in lengths of the process, (f, f)."""
     # A rotation by a small angle moves the columns of its matrix by sqrt(2) times it in all.
     place = np.concatenate((position / length_m, turn / (np.sqrt(2.0) * length_rad)), axis=1)
     square = np.sum(place**2, axis=1)
@@ -301,7 +301,7 @@ def _distance(
 
 
 def _correlations(distance: FloatArray, share: float, order: int) -> FloatArray:
-    """Return correlations by distances in lengths of the process, (f, f)."""
+    """Correlations by distances in lengths of the process, (f, f)."""
     d = np.sqrt(2.0 * min(ORDERS[order], 2.5)) * distance
     if ORDERS[order] == np.inf:
         process = np.exp(-0.5 * distance**2)
@@ -317,9 +317,9 @@ def _correlations(distance: FloatArray, share: float, order: int) -> FloatArray:
 
 
 def _inverse_factor(correlations: FloatArray) -> FloatArray:
-    """Return what decorrelates errors, in proportion to their scatter about their mean.
+    """Matrix that decorrelates errors, in proportion to their scatter about their mean.
 
-    The mean of a slow process over a path is no scatter: a registration takes it up.
+    The mean of a slow process over a path is no scatter: a registration absorbs it.
     """
     factor = np.linalg.cholesky(correlations)
     inverse = solve_triangular(factor, np.eye(len(factor)), lower=True, check_finite=False)
@@ -327,5 +327,5 @@ def _inverse_factor(correlations: FloatArray) -> FloatArray:
 
 
 def scatterless(correlations: FloatArray) -> float:
-    """Return the share of the variance that all errors have in common."""
+    """Share of the variance that is common to all errors."""
     return min(float(np.mean(correlations)), 0.999)

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Joint positions, velocities and accelerations at any time, from a stream of joint states.
 
-Smoothing splines (cubic: Reinsch 1967, Numer. Math. 10) of each stretch without a gap, as smooth
-as leaves residuals of the size of the reports' noise: of encoders, their resolution, and stamps.
+Smoothing splines (cubic: Reinsch 1967, Numer. Math. 10) of each stretch without a gap; the
+smoothing leaves residuals of the size of the reports' noise: of encoders, their resolution, and
+stamps.
 """
 
 from __future__ import annotations
@@ -16,20 +17,20 @@ from remaster_ros.errors import InputError
 from remaster_ros.importing.standstills import Stream
 from remaster_ros.types import BoolArray, FloatArray
 
-# Joint states at a lower rate do not tell accelerations: an arm changes its speed within 0.1 s.
+# Lowest rate of joint states that shows accelerations: an arm changes its speed within 0.1 s.
 LEAST_RATE_HZ = 40.0
-# Reports that are farther apart are of two stretches, s; or so many usual steps.
+# Longest gap within a stretch, s, or in usual steps.
 LONGEST_GAP_S, LONGEST_GAP_STEPS = 0.1, 5.0
-# Shorter stretches tell no acceleration, s.
+# Shortest stretch that shows accelerations, s.
 SHORTEST_S = 0.5
-# Of a spline by a smoothing time h its equivalent kernel (Silverman 1984, Ann. Stat. 12) averages
-# over some 3 h. An arm's speed changes more slowly than this, s.
+# Longest smoothing time h, s: the equivalent kernel of the spline (Silverman 1984, Ann. Stat. 12)
+# averages over some 3 h, and an arm's speed changes more slowly.
 LONGEST_SMOOTHING_S = 0.04
-# Smoothing times that are tried, in proportion.
+# Ratio of successive smoothing times that are tried.
 SMOOTHING_STEP = 1.4
-# Reports by which the smoothing is chosen.
+# Largest number of reports for the choice of the smoothing.
 MOST_TRIED = 3_000
-# Scores of smoothing times that count as alike, in proportion.
+# Ratio of scores below which two smoothing times count as equal.
 ALIKE = 1.03
 
 
@@ -45,9 +46,9 @@ class JointMotion:
 
     @classmethod
     def of(cls, joints: Stream, where: str) -> JointMotion:
-        """Fit splines to joint states, rad; `where` is for messages.
+        """Splines of joint states, rad; ``where``: for messages.
 
-        Raises InputError if the reports are too rare, or never last long enough.
+        Raises InputError if the reports are too rare, or no stretch is long enough.
         """
         stamps, values = _increasing(joints)
         if len(stamps) < 2:
@@ -87,34 +88,36 @@ class JointMotion:
         )
 
     def stretch(self, times: FloatArray) -> FloatArray:
-        """Return the stretch that each time is in, (n,); -1 for none."""
+        """Index of the stretch of each time, (n,); -1 outside all."""
         index = np.searchsorted(self.begin, times, side='right') - 1
         inside = (index >= 0) & (times <= self.end[np.maximum(index, 0)])
         return np.where(inside, index, -1)
 
     def at(self, times: FloatArray, derivative: int = 0) -> FloatArray:
-        """Return joint positions, or their derivatives by time, (n, k); NaN outside."""
+        """Joint positions, or their derivatives by time, (n, k); NaN outside all stretches."""
         stretch = self.stretch(times)
         result = np.full((len(times), len(self.noise)), np.nan)
         for index, splines in enumerate(self.splines):
-            mine = stretch == index
-            if mine.any():
-                result[mine] = np.stack([s(times[mine], derivative) for s in splines], axis=1)
+            in_stretch = stretch == index
+            if in_stretch.any():
+                result[in_stretch] = np.stack(
+                    [s(times[in_stretch], derivative) for s in splines], axis=1
+                )
         return result
 
 
 def _increasing(joints: Stream) -> tuple[FloatArray, FloatArray]:
-    """Return the reports whose stamps increase: the first of equal ones."""
+    """Reports with increasing stamps: of equal stamps the first."""
     kept: BoolArray = np.diff(joints.stamps, prepend=-np.inf) > 1e-6
     return joints.stamps[kept], joints.values[kept]
 
 
 def _smoothing(stamps: FloatArray, values: FloatArray, step: float) -> tuple[float, float]:
-    """Return the smoothing time of a joint, s, and the standard deviation of its reports, rad.
+    """Smoothing time of a joint, s, and the standard deviation of its reports, rad.
 
-    The longest one whose residuals are as small as of any, once what a report moves its own spline
-    by is taken off (generalised cross-validation, Craven & Wahba 1979, Numer. Math. 31): the rest
-    is noise. By the part of the record in which the joint moves most.
+    The longest smoothing time with the least score of generalised cross-validation (Craven & Wahba
+    1979, Numer. Math. 31), within a tolerance; the residuals are then noise. By the part of the
+    record in which the joint moves most.
     """
     moved = np.abs(np.diff(values, prepend=values[0]))
     middle = int(np.argmax(np.convolve(moved, np.ones(min(MOST_TRIED, len(moved))), 'same')))

@@ -1,17 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A session of an arm that moved while it was measured: rows of 0.1 s, in segments of 0.5 s.
+"""Session of an arm that moved while it was measured: rows of 0.1 s, in segments of 0.5 s.
 
 A row is a configuration on the path: joint positions, velocities and accelerations at the middle
-of its frames, by splines of the joint states, and where the marker was then: the mean of what the
-frames are off the robot's own prediction for each of their times, which the bend of the path
-within the row does not move. A segment stands where other sessions have a pose: its rows share an
-error of the sensor and of the arm.
+of its frames, by splines of the joint states, and the marker's position there: the mean of the
+frames' deviations from the robot's own prediction for their times, so that the path's curvature
+within the row has no effect. A segment takes the place of a pose: its rows have a common error of
+the sensor and of the arm.
 
-*Clocks.* The marker's stamps and those of the joint states are of two computers, tens of
-milliseconds apart. In that time an arm moves by a centimetre, which no tangent follows: the offset
-is found here, by Gauss-Newton steps of robust fits with the offset as one more parameter, from
-where the speeds of marker and tool are most alike; what it is off by is an effect of `discover`
-and a parameter of `fit` like others.
+*Clocks.* The stamps of marker and joint states are of two computers, tens of milliseconds apart.
+In that time an arm moves by a centimetre, which no tangent follows: the offset is found here, by
+Gauss-Newton steps of robust fits with the offset as a parameter, from the offset with which the
+speeds of marker and tool are most alike; the remaining offset is an effect of `discover` and a
+parameter of `fit`.
 """
 
 from __future__ import annotations
@@ -44,8 +44,8 @@ from remaster_ros.types import (
 )
 
 BLOCK_S = ROW_S
-# Rows of a segment: an arm at 0.25 m/s goes on by 0.1 m in 0.5 s, the reach of errors that depend
-# on where it is.
+# Rows of a segment: an arm at 0.25 m/s moves 0.1 m in 0.5 s, the range of errors that depend on
+# its position.
 SEGMENT_ROWS = 5
 # A sensor with fewer frames in a second measures single points.
 LEAST_FRAMES_HZ = 10.0
@@ -53,20 +53,21 @@ LEAST_FRAMES_HZ = 10.0
 LEAST_FRAMES = 0.5
 # An arm whose joints are all slower than this stands still, rad/s.
 STILL_RAD_S = 0.02
-# Fewer rows of a sensor are no motion to measure by: 6 s.
+# Fewest rows of a sensor, 6 s of motion.
 FEWEST_ROWS = 60
-# Offsets of the clocks that are looked at by the speeds, s; steps and smoothing of these, s.
+# Largest offset of the clocks in the search by speeds, s; steps and smoothing of the speeds, s.
 FARTHEST_CLOCK_S, SPEED_STEP_S, SPEED_SMOOTHING_S = 3.0, 0.005, 0.05
-# Correlation of the speeds of marker and tool below which these tell nothing of the clocks.
+# Smallest correlation of the speeds of marker and tool that shows the offset of the clocks.
 LEAST_ALIKE = 0.5
-# The offset of the clocks is found when steps are shorter, s.
+# Length of a step below which the offset of the clocks is found, s.
 CLOCK_SETTLED_S = 2e-5
 MOST_CLOCK_STEPS = 12
-# A longer step may lead to where the tangent no longer holds, s.
+# Longest step, s: beyond it the tangent is not valid.
 LONGEST_CLOCK_STEP_S = 0.05
-# Rows of a robust fit that looks for the clocks.
+# Largest number of rows of a robust fit for the clocks.
 MOST_FITTED = 1_500
-# A frame so many robust standard deviations off the others of its row is of another marker.
+# Distance of a frame from the others of its row, in robust standard deviations, from which it is
+# of another marker.
 GROSS = 8.0
 
 
@@ -81,7 +82,7 @@ class MarkerStream:
 
 @dataclass(frozen=True)
 class MovingOptions:
-    """What is said of the session."""
+    """The user's statements on the session."""
 
     # Marker -> nominal position in the tool frame, m; others are unknown
     places: Mapping[str, FloatArray] = field(default_factory=dict)
@@ -94,7 +95,7 @@ class MovingOptions:
 
 
 class _Guess(NamedTuple):
-    """A robust fit: where the sensors should see the markers."""
+    """Robust fit, for the predicted positions of the markers."""
 
     joint_offsets: FloatArray  # rad, (k,)
     markers: FloatArray  # In T, m, (markers, 3)
@@ -111,12 +112,14 @@ class _Frames:
 
     @classmethod
     def of(cls, streams: Sequence[MarkerStream], markers: Sequence[str]) -> _Frames:
-        """Join the streams of a sensor by their stamps."""
-        stamps = np.unique(np.concatenate([one.stream.stamps for one in streams]))
+        """Frames of a sensor from its markers' streams, joined by stamps."""
+        stamps = np.unique(np.concatenate([stream.stream.stamps for stream in streams]))
         positions = np.full((len(stamps), len(streams), 3), np.nan)
-        for index, one in enumerate(streams):
-            positions[np.searchsorted(stamps, one.stream.stamps), index] = one.stream.values
-        return cls(stamps, positions, np.array([markers.index(one.marker) for one in streams]))
+        for index, stream in enumerate(streams):
+            positions[np.searchsorted(stamps, stream.stream.stamps), index] = stream.stream.values
+        return cls(
+            stamps, positions, np.array([markers.index(stream.marker) for stream in streams])
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,7 +154,7 @@ class _Recording:
         self.dropped = 0
 
     def blocks(self, sensor: int, clock_s: float, guess: _Guess | None) -> _Block:
-        """Return the rows of a sensor whose stamps are moved by an offset."""
+        """Rows of a sensor whose stamps are shifted by an offset, s."""
         frames, motion = self.frames[list(self.frames)[sensor]], self.motion
         times = frames.stamps + clock_s
         inside = motion.stretch(times) >= 0
@@ -197,7 +200,7 @@ class _Recording:
         )
 
     def _seen(self, q: FloatArray, markers: IntArray, sensor: int, guess: _Guess) -> FloatArray:
-        """Return where a sensor should see markers, m, (n, m, 3)."""
+        """Predicted positions of markers in a sensor's frame, m, (n, m, 3)."""
         points = self.chain.positions(
             q[:, None, :], guess.markers[markers], guess.joint_offsets[None, None, :]
         )
@@ -206,9 +209,9 @@ class _Recording:
     def session(
         self, clocks_s: FloatArray, guess: _Guess | None, rng: np.random.Generator | None = None
     ) -> Session:
-        """Return the session with the sensors' stamps moved by offsets, (sensors,).
+        """Session with the sensors' stamps shifted by offsets, s, (sensors,).
 
-        With a generator some segments are held out.
+        ``rng``: draws the held-out segments; None for none.
         """
         self.dropped = 0
         names = list(self.frames)
@@ -294,22 +297,22 @@ def moving_session(
     options: MovingOptions,
     rng: np.random.Generator,
 ) -> tuple[Session, list[str]]:
-    """Return the session of each continuous motion in a recording, and how it was made.
+    """Session of each continuous motion in a recording, and sentences on how it was made.
 
     Parameters
     ----------
     where
-        Names the recording in messages.
+        Name of the recording in messages.
     joints
         Joint positions, rad, (n, k), by their stamps.
     streams
-        What the sensors measured, at least one.
+        Measurements of the sensors, at least one.
     chain, urdf
-        The nominal arm.
+        Nominal arm.
     options
-        What the user said.
+        The user's statements.
     rng
-        Chooses the segments that are held out.
+        Draws the held-out segments.
 
     Returns
     -------
@@ -319,8 +322,7 @@ def moving_session(
     Raises
     ------
     InputError
-        Joint states that are too rare, a sensor that saw hardly any motion, or an arm with a joint
-        that slides.
+        If joint states are too rare, a sensor saw hardly any motion, or a joint of the arm slides.
     """
     for joint in np.flatnonzero(chain.slides)[:1]:
         raise InputError(
@@ -380,19 +382,19 @@ def moving_session(
 
 
 def _rate_hz(stream: Stream) -> float:
-    """Return how many values a stream usually has in a second; 0 of fewer than two."""
+    """Usual number of values in a second; 0 for fewer than two values."""
     steps = np.diff(stream.stamps)
     steps = steps[steps > 0.0]
     return float(1.0 / np.median(steps)) if len(steps) else 0.0
 
 
 def _late(seconds: float) -> str:
-    """Return how late stamps are, in words."""
+    """Delay of stamps in words."""
     return f'{1e3 * abs(seconds):.2f} ms {"late" if seconds >= 0.0 else "early"}'
 
 
 def _segments(number: IntArray) -> IntArray:
-    """Return the segment of each block, by the numbers of the blocks (b,), rising."""
+    """Segment of each block, by the rising numbers of the blocks (b,)."""
     runs = np.split(np.arange(len(number)), np.flatnonzero(np.diff(number) > 1) + 1)
     segment, count = np.zeros(len(number), np.int64), 0
     for run in runs:
@@ -405,9 +407,9 @@ def _segments(number: IntArray) -> IntArray:
 def _means(
     values: FloatArray, block: IntArray, blocks: int
 ) -> tuple[FloatArray, FloatArray, IntArray]:
-    """Return mean and standard deviation of each block, (b, m, 3), and samples, (b, m).
+    """Mean and standard deviation of each block, (b, m, 3), and number of samples, (b, m).
 
-    Of values (f, m, 3), NaN where none, in blocks (f,).
+    ``values``: (f, m, 3), NaN for a marker that was not visible; ``block``: of each frame, (f,).
     """
     seen = np.isfinite(values[..., 0])
     first = np.searchsorted(block, np.arange(blocks))
@@ -424,7 +426,7 @@ def _means(
 
 
 def _joined(parts: Sequence[Measurements]) -> Measurements:
-    """Return the rows of all sensors in the order of time, numbered."""
+    """Rows of all sensors in the order of time, numbered."""
     columns = {
         name: None
         if getattr(parts[0], name) is None
@@ -443,9 +445,9 @@ def _clock_by_speeds(
     options: MovingOptions,
     markers: Sequence[str],
 ) -> float:
-    """Return the offset of the clocks with which speeds of marker and tool are most alike, s.
+    """Offset of the clocks with the largest correlation of speeds of marker and tool, s.
 
-    0 where they never are.
+    0 if all are small.
     """
     grid = np.arange(motion.begin[0], motion.end[-1], SPEED_STEP_S)
     name = markers[frames.markers[0]]
@@ -481,12 +483,12 @@ def _clock_by_speeds(
 
 
 def _robust_fit(session: Session) -> tuple[_Guess, FloatArray]:
-    """Return a robust fit of a session, and how far each sensor's clock is off beside it, s."""
+    """Robust fit of a session, and the remaining offset of each sensor's clock, s."""
     problem = Problem.of(session)
     measurements, rows = problem.measurements, problem.fitted
     chosen = rows[np.linspace(0, len(rows) - 1, min(len(rows), MOST_FITTED)).astype(np.int64)]
     empty = problem.empty_model()
-    # Offsets of degrees move no clock, and the first search has far to go.
+    # Offsets of degrees do not affect the clocks, and would slow the first search down.
     priors = problem.marker_priors(empty) + problem.plausibility(
         empty, np.arange(len(problem.chain))
     )

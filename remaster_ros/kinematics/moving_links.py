@@ -31,9 +31,9 @@ class MovingLinks:
     def of(
         cls, chain: SerialChain, q: FloatArray, velocity: FloatArray, acceleration: FloatArray
     ) -> MovingLinks:
-        """Return the motion at joint positions, velocities and accelerations, (n, k) each.
+        """Motion at joint positions, velocities and accelerations, (n, k) each.
 
-        rad, rad/s and rad/s²; in m, m/s and m/s² of joints that slide.
+        rad, rad/s and rad/s²; m, m/s and m/s² for joints that slide.
         """
         frames = chain.frames(q)
         axes, origins = chain.axes_in_base(frames), frames[..., :3, 3]
@@ -55,7 +55,7 @@ class MovingLinks:
         return cls(chain, frames, spin, turned, moved)
 
     def point_acceleration(self, points: FloatArray, link: int = -1) -> FloatArray:
-        """Return the acceleration of points (n, 3) of R that are fixed to a link, m/s², (n, 3)."""
+        """Acceleration of points (n, 3) of R that are fixed to a link, m/s², (n, 3)."""
         arm = points - self.frames[:, link, :3, 3]
         omega, alpha = self.angular_velocity[:, link], self.angular_acceleration[:, link]
         turning = np.cross(alpha, arm) + np.cross(omega, np.cross(omega, arm))
@@ -63,10 +63,10 @@ class MovingLinks:
         return result
 
     def inertial_torque(self) -> FloatArray:
-        """Return the torque of the links' inertia about each joint, N m, (n, k).
+        """Torque of the links' inertia about each joint, N m, (n, k).
 
         Positive if it drives the joint in its positive direction, as `SerialChain.gravity_torque`:
-        the motor applies the negative. Of a joint that slides the force along it, N.
+        the motor applies the negative. For a joint that slides it is the force along the joint, N.
         """
         chain = self.chain
         centers = apply(self.frames, chain.centers_of_mass)
