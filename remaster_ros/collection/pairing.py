@@ -296,7 +296,7 @@ class Pairing:
 
     @property
     def complete(self) -> bool:
-        """Whether the arm need not wait any longer."""
+        """Whether all sensors are decided, or those that the arm waits for."""
         if len(self.decided) == len(self.rules):
             return True
         if self.require == 'any':
@@ -304,7 +304,7 @@ class Pairing:
         return self.require in self.decided
 
     def finish(self) -> None:
-        """Leave out the sensors that the arm did not wait for."""
+        """Reject undecided sensors, for which the arm did not wait, as ``not_waited``."""
         self._reject_undecided('not_waited', f'the arm waits for {self.require}')
 
     def waited_s(self) -> dict[str, float]:
@@ -462,7 +462,7 @@ class Pairing:
         return PairedReading(rules.sensor, marker, end, q_mean, mean, std, count, turn, dropped)
 
     def _moved_text(self, moved: FloatArray) -> str:
-        """Text with the joint, of movements (k,), that moved too far."""
+        """Text with the largest of the joint movements (k,) and the allowed one."""
         joint, allowed = self._units.farthest(moved), self.motion_tolerance
         if self._units.slide(joint):
             allowed *= self._units.per_radian[joint]

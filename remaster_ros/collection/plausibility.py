@@ -134,6 +134,7 @@ class Plausibility:
         return self._chain.positions(reading.q, np.asarray(self._markers[reading.marker], float))
 
     def _allowed_m(self, sensor: str) -> float:
+        """Largest plausible deviation of a sensor's reading, m, by its usual ones if known."""
         usual = self._usual.get(sensor, ())
         if len(usual) < LEARNING:
             return self._max_deviation_m

@@ -689,7 +689,7 @@ def _draw_lagging(kind: str, context: DrawContext) -> HiddenEffect:
 
 @_unnamed('link_translation', 'temperature', _draw_lagging, answers=('thermal_growth',))
 def lagging_growth(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """Every segment grows by α of its length per K of a temperature that follows, 1/K."""
+    """Growth of every segment by α of its length per K of a delayed temperature, 1/K."""
     # The thermometer's temperature is a line between two configurations.
     tau, slow = e.detail['lag_s'], np.zeros(len(c.time_s))
     for i in range(1, len(slow)):

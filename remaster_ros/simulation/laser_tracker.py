@@ -435,6 +435,7 @@ class TrackerInstrument:
         self._advance()
 
     def _start(self, command: Command, values: tuple[Value, ...]) -> Operation:
+        """Operation of a command that takes time."""
         if command is Command.START_MEASUREMENT:
             return self._measure()
         if command is Command.INITIALIZE:

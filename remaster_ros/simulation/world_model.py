@@ -204,7 +204,7 @@ class WorldModel:
         return np.asarray(turn.reshape(seen.shape) @ seen)
 
     def _true_state(self, effects: Sequence[HiddenEffect]) -> tuple[ArmState, Deviation | None]:
-        """True state of the arm, and the deviation of arm and sensors."""
+        """True state of the arm, and the deviation of arm and sensors; None without effects."""
         q = self.visited.q + self.joint_offsets
         if not effects:
             return self.arm.state(q), None

@@ -651,6 +651,10 @@ def encode_model_definition(definition: ModelDefinition, version: Version) -> by
 
 
 def _read(reader: Reader, version: Version) -> Description:
+    """Description at the reader's position.
+
+    Raises ProtocolError for an unknown kind before 4.1.
+    """
     kind = I32.read(reader)
     codec = _codecs(min(version, NEWEST_VERSION)).get(kind)
     if version < (4, 1):
