@@ -198,10 +198,10 @@ def dynamic_extension(
 
     seconds = m.stamp_s - m.stamp_s.mean()
     for sensor, name in enumerate(sensor_names):
-        mine: IntArray = (m.sensor == sensor).astype(np.int64)
+        selection: IntArray = (m.sensor == sensor).astype(np.int64)
         for what, unit, size, factor in (
-            ('clock', 's', CLOCK_STD_S, mine),
-            ('clock_drift', 's/s', DRIFT_STD, mine * seconds),
+            ('clock', 's', CLOCK_STD_S, selection),
+            ('clock_drift', 's/s', DRIFT_STD, selection * seconds),
         ):
             where = named(f'{what}_{name}', unit, size)
             terms += [

@@ -186,14 +186,14 @@ class Rows:
         flat = values.reshape(len(self), -1)
         size = self.frame_size[:, None].astype(flat.dtype)
         means = self.frame_sum(flat) / size
-        apart = flat - np.repeat(means, self.frame_size, axis=0)
+        differences = flat - np.repeat(means, self.frame_size, axis=0)
         for one in self.decorrelation:
             for frames, factor, markers in one.runs:
                 means[frames] = factor.astype(flat.dtype) @ means[frames]
                 for rows, own in markers:
-                    apart[rows] = own.astype(flat.dtype) @ apart[rows]
-        apart += np.repeat(means, self.frame_size, axis=0)
-        return apart.reshape(values.shape)
+                    differences[rows] = own.astype(flat.dtype) @ differences[rows]
+        differences += np.repeat(means, self.frame_size, axis=0)
+        return differences.reshape(values.shape)
 
     def __len__(self) -> int:
         """Number of rows."""

@@ -132,11 +132,11 @@ def with_bodies(
     bodies, turns = [], []
     which = np.stack((measurements.sensor[seen], measurements.marker[seen]), axis=1)
     for sensor, marker in np.unique(which, axis=0).tolist():
-        mine = np.all(which == (sensor, marker), axis=1)
-        count = int(mine.sum())
+        selection = np.all(which == (sensor, marker), axis=1)
+        count = int(selection.sum())
         if count < FEWEST_TURNS:
             continue
-        middle, away = _median_rotation(R_T_B[mine])
+        middle, away = _median_rotation(R_T_B[selection])
         if away > LARGEST_TURN:
             name = model.sensor_names[sensor]
             why = (
@@ -200,15 +200,15 @@ def referenced(
 def _require_right_hand(model: Model, rows: Rows, predicted: FloatArray) -> None:
     """Raise MisfitError for points that agree with the robot only when mirrored."""
     for sensor, span in rows.spans:
-        here, there = rows.target[span], predicted[span]
-        here, there = here - here.mean(axis=0), there - there.mean(axis=0)
-        left, singular, right = np.linalg.svd(there.T @ here)
-        # The sum of squares that the best turn, and the best turn of the mirrored points, leave.
-        apart = np.sum(here**2) + np.sum(there**2)
+        measured, modelled = rows.target[span], predicted[span]
+        measured, modelled = measured - measured.mean(axis=0), modelled - modelled.mean(axis=0)
+        left, singular, right = np.linalg.svd(modelled.T @ measured)
+        # Sum of squares after the best rotation, and after that of the mirrored points.
+        total_square = np.sum(measured**2) + np.sum(modelled**2)
         sign = np.linalg.det(left @ right) * np.array([1.0, -1.0])
-        squares = apart - 2.0 * (singular[0] + singular[1] + sign * singular[2])
-        proper, mirrored = np.sqrt(np.maximum(squares, 0.0) / len(here))
-        extent = np.sqrt(np.mean(np.sum(there**2, axis=1)))
+        squares = total_square - 2.0 * (singular[0] + singular[1] + sign * singular[2])
+        proper, mirrored = np.sqrt(np.maximum(squares, 0.0) / len(measured))
+        extent = np.sqrt(np.mean(np.sum(modelled**2, axis=1)))
         if proper > LEAST_MIRRORED * extent and mirrored < MIRRORED * proper:
             raise MisfitError(
                 f"sensor '{model.sensor_names[sensor]}': its points are mirrored: they agree with "
@@ -254,14 +254,14 @@ def _linear_markers(
     sensors, markers = int(sensor.max()) + 1, len(nominal)
     design = np.zeros((len(measured), 3, 12 * sensors + 3 * markers))
     for index in range(sensors):
-        mine, start = sensor == index, 12 * index
-        centred = measured[mine] - measured[mine].mean(axis=0)
+        selection, start = sensor == index, 12 * index
+        centred = measured[selection] - measured[selection].mean(axis=0)
         turned = np.einsum('ab,nc->nabc', -np.eye(3), centred)
-        design[mine, :, start : start + 9] = turned.reshape(-1, 3, 9)
-        design[mine, :, start + 9 : start + 12] = -np.eye(3)
+        design[selection, :, start : start + 9] = turned.reshape(-1, 3, 9)
+        design[selection, :, start + 9 : start + 12] = -np.eye(3)
     for index in range(markers):
-        mine, start = marker == index, 12 * sensors + 3 * index
-        design[mine, :, start : start + 3] = tool[mine, :3, :3]
+        selection, start = marker == index, 12 * sensors + 3 * index
+        design[selection, :, start : start + 3] = tool[selection, :3, :3]
     # Unknown marker = nominal + shift, the shift known to be small.
     target = -apply(tool, nominal[marker])
     root = np.ones(len(measured))

@@ -244,8 +244,8 @@ def _noise_guess(posterior: Posterior) -> FloatArray:
         return float(np.arcsinh(np.sqrt(max(more, 0.0) / share) / sigma))
 
     for index in range(len(noise.channels)):
-        mine = noise.channel_of == index
-        rows, frames, poses = (mine & (kind == name) for name in ('rows', 'frames', 'poses'))
+        selection = noise.channel_of == index
+        rows, frames, poses = (selection & (kind == name) for name in ('rows', 'frames', 'poses'))
         smallest = next(part for part in (rows, frames, poses) if part.any())
         below = frames if frames.any() else poses
         variance = sums[smallest].sum() / noise.freedom[smallest].sum()

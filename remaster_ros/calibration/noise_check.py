@@ -158,11 +158,11 @@ def check_noise(
     spread = _spread(measurements.select(kept & ~measurements.is_validation), parameters)
     checks = []
     for index, name in enumerate(sensor_names):
-        mine = kept & (measurements.sensor == index)
-        if not mine.any():
+        selection = kept & (measurements.sensor == index)
+        if not selection.any():
             continue
-        held_out = mine & measurements.is_validation
-        judged = held_out if held_out.any() else mine
+        held_out = selection & measurements.is_validation
+        judged = held_out if held_out.any() else selection
         errors = np.linalg.norm(residuals, axis=1)
         lengths = np.sort(errors[judged])
         gross = _gross(measurements, errors, held_out)
@@ -171,8 +171,8 @@ def check_noise(
             NoiseCheck(
                 name,
                 float(lengths[:most].mean()),
-                _stated(measurements.select(mine)),
-                _within(measurements, residuals, mine),
+                _stated(measurements.select(selection)),
+                _within(measurements, residuals, selection),
                 len(np.unique(measurements.pose[judged])),
                 spread if held_out.any() else 1.0,
                 gross,
@@ -228,8 +228,8 @@ def _within(measurements: Measurements, residuals: FloatArray, rows: BoolArray) 
     several = size[group] > 1
     if not several.any():
         return None
-    apart = (residuals[rows] - mean[group])[several]
+    differences = (residuals[rows] - mean[group])[several]
     count = size[group][several]
     # The mean of few errors is nearer to each of them than the true mean.
-    lengths = np.linalg.norm(apart, axis=1) * np.sqrt(count / (count - 1.0))
+    lengths = np.linalg.norm(differences, axis=1) * np.sqrt(count / (count - 1.0))
     return float(np.median(lengths)) / MEDIAN_LENGTH

@@ -142,8 +142,8 @@ def orientation_accuracy(
     for side, R_N_T in modelled._asdict().items():
         absolute: list[FloatArray] = []
         for which in np.unique(body[:, chosen], axis=1).T:
-            mine = seen & np.all(body == which[:, None], axis=0)
-            known, judged = fitted[mine[fitted]], chosen[mine[chosen]]
+            selection = seen & np.all(body == which[:, None], axis=0)
+            known, judged = fitted[selection[fitted]], chosen[selection[chosen]]
             if len(known) == 0 or len(judged) == 0:
                 continue
             turns = _inverse_of(R_N_T[known]) * _measured(measurements, known)

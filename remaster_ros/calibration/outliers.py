@@ -133,9 +133,9 @@ def judge(rows: Rows, errors: FloatArray, gross: BoolArray) -> Judgement:
     pose_sigmas = np.linalg.norm(pose_mean, axis=1) / pose_spread
     off = np.zeros(len(count))
     for index, _ in rows.spans:
-        mine = (rows.group_sensor == index) & (count > 1)
-        freedom = 3 * int(mine.sum()) - UNKNOWNS
-        off[mine] = gross_probability(as_of_known_size(pose_sigmas[mine], freedom))
+        selection = (rows.group_sensor == index) & (count > 1)
+        freedom = 3 * int(selection.sum()) - UNKNOWNS
+        off[selection] = gross_probability(as_of_known_size(pose_sigmas[selection], freedom))
     for index in np.flatnonzero(off > CERTAIN).tolist():
         start = int(rows.group_start[index])
         for row in range(start, start + rows.group_size[index]):

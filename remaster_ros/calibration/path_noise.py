@@ -115,8 +115,10 @@ class Decorrelation:
             own = []
             if noise.marker_share[sensor] > RANGE_SHARE[0]:
                 for one in np.unique(marker[rows]):
-                    mine = rows[marker[rows] == one]
-                    own.append((mine, _inverse_factor(noise.of_markers(sensor, source[mine]))))
+                    selection = rows[marker[rows] == one]
+                    own.append(
+                        (selection, _inverse_factor(noise.of_markers(sensor, source[selection])))
+                    )
             runs.append((slice(first, last), means, tuple(own)))
         return cls(tuple(runs))
 
@@ -296,8 +298,8 @@ def _distance(
     # A rotation by a small angle moves the columns of its matrix by sqrt(2) times it in all.
     place = np.concatenate((position / length_m, turn / (np.sqrt(2.0) * length_rad)), axis=1)
     square = np.sum(place**2, axis=1)
-    apart = square[:, None] + square - 2.0 * place @ place.T
-    return np.sqrt(np.maximum(apart, 0.0))
+    square_distance = square[:, None] + square - 2.0 * place @ place.T
+    return np.sqrt(np.maximum(square_distance, 0.0))
 
 
 def _correlations(distance: FloatArray, share: float, order: int) -> FloatArray:

@@ -249,8 +249,8 @@ def _left_out_distances(
         rows = fit.predictive.model.rows(measurements, np.concatenate(sources)).of_points
         part = _RowBlock.of(fit, rows, triangle)
         for source in sources:
-            mine = np.flatnonzero(np.isin(rows.source, source))
-            found = part.left_out(mine)
+            selection = np.flatnonzero(np.isin(rows.source, source))
+            found = part.left_out(selection)
             # If a pose alone determines a parameter, only rounding is left: it is not counted.
             distances.append(found[found >= 0.0])
     return np.concatenate(distances)

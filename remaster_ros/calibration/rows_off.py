@@ -56,13 +56,13 @@ def find_rows_off(session: Session, most: int) -> RowsOff:
     length = np.linalg.norm(rows.target - start.predict(z, rows), axis=1)
     error, off, too_many = np.zeros(len(m)), np.zeros(len(m), bool), False
     for _, span in rows.spans:
-        mine = length[span]
-        scale = float(np.median(mine)) / MEDIAN_LENGTH + RESOLUTION_M
+        selection = length[span]
+        scale = float(np.median(selection)) / MEDIAN_LENGTH + RESOLUTION_M
         # Wider tails are the arm's own; beyond this limit a fifth of the rows is off, which makes
         # the standard deviation by the tail that of the gross errors.
-        scale = by_tail if (by_tail := robust_scale(mine)) < TAIL_LIMIT * scale else scale
-        gross = gross_probability(mine / scale) > CERTAIN
-        error[rows.source[span]], off[rows.source[span]] = mine, gross
+        scale = by_tail if (by_tail := robust_scale(selection)) < TAIL_LIMIT * scale else scale
+        gross = gross_probability(selection / scale) > CERTAIN
+        error[rows.source[span]], off[rows.source[span]] = selection, gross
         # The final fit judges the rows to fit only.
         for judged in (gross, gross[~m.is_validation[rows.source[span]]]):
             too_many |= int(judged.sum()) > max(1.0, LARGEST_SHARE * len(judged))

@@ -12,7 +12,7 @@ from __future__ import annotations
 from enum import Enum
 
 from remaster_ros.collection.events import BridgeState, RecorderState
-from remaster_ros.collection.peers import Heard, Peers
+from remaster_ros.collection.peers import LastState, Peers
 
 ANNOUNCE_WALL_S = 5.0
 """First time after which an announcement counts as missed, s."""
@@ -86,7 +86,7 @@ class Announcements:
         missed_wall = self._announced_wall + self._wait_wall
         return Lack.LATE if any(state.wall > missed_wall for _, state in lacking) else Lack.NOTHING
 
-    def _heard(self) -> list[tuple[str, Heard]]:
+    def _heard(self) -> list[tuple[str, LastState]]:
         """Return the last states of bridge and recorder, as far as received."""
         states = [(node, self._peers.heard(node)) for node in PEERS]
         return [(node, heard) for node, heard in states if heard is not None]

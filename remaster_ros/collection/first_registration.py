@@ -114,8 +114,10 @@ class FirstRegistration:
         count, rms, T_R_N = found[0]
         limit_m = CLEARLY_WORSE * max(rms, 0.1 * self._allowed_m)
         for other_count, other_rms, other in found[1:]:
-            apart = np.linalg.norm(apply(T_R_N, measured) - apply(other, measured), axis=1).max()
-            if other_count == count and other_rms < limit_m and apart > self._allowed_m:
+            largest_m = np.linalg.norm(
+                apply(T_R_N, measured) - apply(other, measured), axis=1
+            ).max()
+            if other_count == count and other_rms < limit_m and largest_m > self._allowed_m:
                 raise InsufficientDataError(
                     f'registration: which of the reflectors was found at {len(measured)} poses '
                     f'cannot be told apart (they agree within {1e3 * rms:.1f} and '

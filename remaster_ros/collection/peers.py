@@ -104,7 +104,7 @@ class RequiredSensors:
         return any(known) if self.any_of_them else all(known)
 
 
-class Heard(NamedTuple):
+class LastState(NamedTuple):
     """Last state of a node, with its wall time of arrival, s.
 
     Last result: the start of the node that sent it.
@@ -123,7 +123,7 @@ class Peers:
 
     def __init__(self, sensors: Iterable[str]) -> None:
         self._names = tuple(sensors)
-        self._heard: dict[str, Heard] = {}
+        self._heard: dict[str, LastState] = {}
         # Report of each sensor, and wall time of its arrival, s.
         self._reports: dict[str, tuple[SensorReport, float]] = {}
 
@@ -131,11 +131,11 @@ class Peers:
         """Process a record of a node; only these states count."""
         match record.body:
             case BridgeState() | RecorderState() as body:
-                self._heard[body.sender] = Heard(body, now, record.started)
+                self._heard[body.sender] = LastState(body, now, record.started)
             case SensorReport() as report:
                 self._reports[report.sensor] = report, now
 
-    def heard(self, node: str) -> Heard | None:
+    def heard(self, node: str) -> LastState | None:
         """Last state of ``robot_bridge`` or ``recorder``; None before the first."""
         return self._heard.get(node)
 

@@ -283,16 +283,16 @@ class ReferenceWatch:
             for key in self._rounds[i].rows
             if key[1] == sensor and (i - 1, key) in off
         ]
-        apart = np.array([off[i, key] - off[i - 1, key] for i, key in pairs])
-        if apart.size < FEWEST_FREEDOMS:
+        differences = np.array([off[i, key] - off[i - 1, key] for i, key in pairs])
+        if differences.size < FEWEST_FREEDOMS:
             return None
         read = [self._rounds[j].rows[key] for i, key in pairs for j in (i - 1, i)]
         own = [np.mean(row.std**2) / max(row.samples, 1) for row in read if row.std is not None]
         least = float(np.mean(own)) if own else 0.0
-        variance = max(float(np.mean(apart**2)) / 2.0, least, LEAST_STD_M**2)
+        variance = max(float(np.mean(differences**2)) / 2.0, least, LEAST_STD_M**2)
         # Successive differences share readings: each further one counts two thirds.
         first = 3 * sum(i == 1 for i, _ in pairs)
-        return float(np.sqrt(variance)), first + int((apart.size - first) * 2 / 3)
+        return float(np.sqrt(variance)), first + int((differences.size - first) * 2 / 3)
 
     def _unsteady(self, noise: Mapping[str, Noise]) -> SetupChange | None:
         """Change ``unsteady`` if the first two rounds differ too much to show later changes."""
@@ -348,9 +348,9 @@ class ReferenceWatch:
         std, z = np.array(stds), np.array(scaled)
         whole, single = [], []
         for sensor, (_, freedoms) in noise.items():
-            mine = z[[place.sensor == sensor for place in places]]
-            if len(mine):
-                whole.append(scipy.stats.f.sf(np.mean(mine**2), mine.size, freedoms))
+            selection = z[[place.sensor == sensor for place in places]]
+            if len(selection):
+                whole.append(scipy.stats.f.sf(np.mean(selection**2), selection.size, freedoms))
         freedoms = min(freedoms for _, freedoms in noise.values())
         for cause in causes(self._chain, places):
             signal = (cause.jacobian / std[:, None, None]).reshape(z.size, -1)

@@ -490,12 +490,12 @@ class ArmModel:
         by_joint = self.chain.velocities(state.frames, points)
         parts = [by_joint]
         for name in self.T_R_N:
-            mine = np.zeros((n, 3, 6))
+            selection = np.zeros((n, 3, 6))
             if name == sensor:
                 # A shift of the sensor moves the arm by the opposite in its frame.
-                mine[:, :, :3] = -np.eye(3)
-                mine[:, :, 3:] = -_displacements(np.eye(3)[None], points)
-            parts.append(mine)
+                selection[:, :, :3] = -np.eye(3)
+                selection[:, :, 3:] = -_displacements(np.eye(3)[None], points)
+            parts.append(selection)
         for name in self.markers:
             parts.append(state.tool[:, :3, :3] * (name == marker))
         for term in self.joint_terms:

@@ -155,17 +155,17 @@ def seen(model: ArmModel, measured: Measured) -> CheckResiduals:
     sensors, markers = list(dict.fromkeys(measured.sensor)), list(dict.fromkeys(measured.marker))
     frames, T_R_N = [], {}
     for marker in markers:
-        mine = np.array([one == marker for one in measured.marker])
-        points[mine] = apply(state.tool[mine], model.markers[marker])
+        selection = np.array([one == marker for one in measured.marker])
+        points[selection] = apply(state.tool[selection], model.markers[marker])
     for sensor in sensors:
-        mine = np.array([one == sensor for one in measured.sensor])
+        selection = np.array([one == sensor for one in measured.sensor])
         for marker in markers:
-            both = mine & [one == marker for one in measured.marker]
+            both = selection & [one == marker for one in measured.marker]
             derivative[both] = model.derivative(state, sensor, marker)[both]
-        T_R_N[sensor], _ = register_points(points[mine], measured.position[mine])
-        errors[mine] = apply(T_R_N[sensor], measured.position[mine]) - points[mine]
+        T_R_N[sensor], _ = register_points(points[selection], measured.position[selection])
+        errors[selection] = apply(T_R_N[sensor], measured.position[selection]) - points[selection]
         frame = np.zeros((n, 3, 6))
-        frame[mine] = rigid_motions(points[mine])
+        frame[selection] = rigid_motions(points[selection])
         frames.append(frame)
     rigid = np.concatenate(frames, axis=2).reshape(3 * n, -1)
     basis = np.linalg.svd(rigid, full_matrices=False)
@@ -592,9 +592,9 @@ def _moved(
     """RMS displacement of the markers by the sensors' registration, m, and whether they moved."""
     shift = np.zeros_like(measured.position)
     for sensor, T in last.T_R_N.items():
-        mine = np.array([one == sensor for one in measured.sensor])
-        place = measured.position[mine]
-        shift[mine] = apply(T, place) - apply(before.get(sensor, T), place)
+        selection = np.array([one == sensor for one in measured.sensor])
+        place = measured.position[selection]
+        shift[selection] = apply(T, place) - apply(before.get(sensor, T), place)
     squares, size = float(np.sum(shift**2)), float(np.sqrt(np.mean(np.sum(shift**2, axis=1))))
     # Two fits of six numbers a sensor each, and a noise that is estimated from so many checks.
     count = 6.0 * len(last.T_R_N)

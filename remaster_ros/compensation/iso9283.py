@@ -67,9 +67,11 @@ def iso_figures(model: ArmModel, measured: Measured, wanted: FloatArray | None) 
     """
     pairs = list(zip(measured.sensor, measured.marker, strict=True))
     most = max(dict.fromkeys(pairs), key=pairs.count)
-    mine = np.array([pair == most for pair in pairs])
-    q, position = measured.q[mine], measured.position[mine]
-    commanded = q if wanted is None else np.where(np.isnan(wanted[mine]), q, wanted[mine])
+    selection = np.array([pair == most for pair in pairs])
+    q, position = measured.q[selection], measured.position[selection]
+    commanded = (
+        q if wanted is None else np.where(np.isnan(wanted[selection]), q, wanted[selection])
+    )
     places: list[FloatArray] = []
     visits: list[list[list[int]]] = []
     last = -1

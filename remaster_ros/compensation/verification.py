@@ -159,16 +159,18 @@ class _ProjectedRows:
         tool = self.model.chain.forward(self.wanted)[:, :3, :3]
         columns = []
         for sensor in dict.fromkeys(sensors):
-            mine = np.array([one == sensor for one in sensors])
-            T, _ = register_points(nominal[mine], visits.position[rows][mine])
-            measured[mine] = apply(T, visits.position[rows][mine])
+            selection = np.array([one == sensor for one in sensors])
+            T, _ = register_points(nominal[selection], visits.position[rows][selection])
+            measured[selection] = apply(T, visits.position[rows][selection])
             frame = np.zeros((len(rows), 3, 6))
-            frame[mine, :, :3] = np.eye(3)
-            frame[mine, :, 3:] = np.cross(np.eye(3), nominal[mine][:, None, :]).swapaxes(1, 2)
+            frame[selection, :, :3] = np.eye(3)
+            frame[selection, :, 3:] = np.cross(np.eye(3), nominal[selection][:, None, :]).swapaxes(
+                1, 2
+            )
             columns.append(frame)
         for marker in dict.fromkeys(self.markers):
-            mine = np.array([one == marker for one in self.markers])
-            columns.append(tool * mine[:, None, None])
+            selection = np.array([one == marker for one in self.markers])
+            columns.append(tool * selection[:, None, None])
         self.nominal, self.measured = nominal, measured.ravel()
         free = np.concatenate(columns, axis=2).reshape(3 * len(rows), -1)
         left, sizes, _ = np.linalg.svd(free)
@@ -201,8 +203,8 @@ class _ProjectedRows:
         sensor, state = next(iter(self.model.T_R_N)), self.model.state(q)
         found = np.zeros((len(q), 3, len(self.model.parameter_names)))
         for marker in dict.fromkeys(self.markers):
-            mine = np.array([one == marker for one in self.markers])
-            found[mine] = self.model.derivative(state, sensor, marker)[mine]
+            selection = np.array([one == marker for one in self.markers])
+            found[selection] = self.model.derivative(state, sensor, marker)[selection]
         return found
 
     def error(self) -> Mean:
@@ -377,9 +379,9 @@ def _toggle(compensator: Compensator, visits: Visits) -> tuple[Estimate | None, 
     side = _ProjectedRows(compensator, visits, on)
     turned = np.empty((len(pairs), 3))
     for sensor in dict.fromkeys(visits.sensor[row] for row in on):
-        mine = np.array([visits.sensor[row] == sensor for row in on])
-        T, _ = register_points(side.nominal[mine], visits.position[on][mine])
-        turned[mine] = (visits.position[on] - visits.position[off])[mine] @ T[:3, :3].T
+        selection = np.array([visits.sensor[row] == sensor for row in on])
+        T, _ = register_points(side.nominal[selection], visits.position[on][selection])
+        turned[selection] = (visits.position[on] - visits.position[off])[selection] @ T[:3, :3].T
     difference, before = turned.ravel(), side.at['not_in_use']
     unsure_off = side.unsure(side.commands['not_in_use'])
     states = {}

@@ -420,8 +420,8 @@ def _means(
     samples = total(seen.astype(float))
     with np.errstate(invalid='ignore', divide='ignore'):
         mean = total(np.where(seen[..., None], values, 0.0)) / samples[..., None]
-        apart = np.where(seen[..., None], values - mean[block], 0.0)
-        std = np.sqrt(total(apart**2) / (samples[..., None] - 1.0))
+        differences = np.where(seen[..., None], values - mean[block], 0.0)
+        std = np.sqrt(total(differences**2) / (samples[..., None] - 1.0))
     return mean, np.where(samples[..., None] > 1, std, np.nan), samples.astype(np.int64)
 
 

@@ -82,7 +82,9 @@ def with_orientation(rows: RawRows, chain: SerialChain, options: SessionOptions)
     found.sort(key=lambda one: one[0])
     error, words, xyzw = found[0]
     others = [
-        other for apart, _, other in found[1:] if apart < max(2.0 * error, error + OTHER_RAD)
+        other
+        for differences, _, other in found[1:]
+        if differences < max(2.0 * error, error + OTHER_RAD)
     ]
     if (
         min(

@@ -49,8 +49,8 @@ def summary_of(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
             names = tuple(one['joint'] for one in row['fit']['joints'])
             arms[row['fit']['robot'], names].append(row)
     joints = [
-        _joint(robot, name, index, mine, FALSE / len(names))
-        for (robot, names), mine in arms.items()
+        _joint(robot, name, index, selection, FALSE / len(names))
+        for (robot, names), selection in arms.items()
         for index, name in enumerate(names)
     ]
     lines = [', '.join(f'{count} {status}' for status, count in counts.items())]

@@ -217,14 +217,14 @@ def errors_by_configuration(result: FitResult) -> Figure:
             chosen = chosen[evenly(len(chosen), SCATTER_POINTS)]
         legend = [legend_entry('_', BEFORE, 'before'), legend_entry('_', AFTER, 'after')]
         for sensor, name in enumerate(result.session.sensor_names):
-            mine = chosen[m.sensor[chosen] == sensor]
-            if not len(mine):
+            selection = chosen[m.sensor[chosen] == sensor]
+            if not len(selection):
                 continue
             marker = SENSOR_MARKERS[sensor % len(SENSOR_MARKERS)]
             for errors, color in ((before, BEFORE), (after, AFTER)):
                 ax.plot(
-                    m.configuration[mine],
-                    errors[mine],
+                    m.configuration[selection],
+                    errors[selection],
                     marker,
                     color=color,
                     markersize=3.2,
@@ -909,13 +909,13 @@ def over_session(subject: Subject) -> Figure:
     shown = evenly(len(m), SCATTER_POINTS)
     entries = [legend_entry('_', BEFORE, 'today'), legend_entry('_', AFTER, 'after')]
     for sensor, name in enumerate(inputs.session.sensor_names):
-        mine = shown[m.sensor[shown] == sensor]
-        if not len(mine):
+        selection = shown[m.sensor[shown] == sensor]
+        if not len(selection):
             continue
         marker = SENSOR_MARKERS[sensor % len(SENSOR_MARKERS)]
         for errors, color in ((inputs.before_mm, BEFORE), (answer.final_mm, AFTER)):
             for held_out in (False, True):
-                rows = mine[m.is_validation[mine] == held_out]
+                rows = selection[m.is_validation[selection] == held_out]
                 ax.plot(
                     x[rows],
                     np.maximum(errors[rows], 1e-4),

@@ -187,10 +187,10 @@ def simulate_session(
     orientation = np.full((len(position), 4), np.nan)
     for s, sensor in enumerate(sensors.values()):
         if sensor.depth_sigma_m:
-            mine = np.tile(np.equal(seen_by, s), len(q))
-            distance = np.linalg.norm(position[mine], axis=1, keepdims=True)
+            selection = np.tile(np.equal(seen_by, s), len(q))
+            distance = np.linalg.norm(position[selection], axis=1, keepdims=True)
             error = sensor.depth_sigma_m * rng.standard_normal((len(distance), 1))
-            position[mine] += error * distance * position[mine]
+            position[selection] += error * distance * position[selection]
         if sensor.turn_sigma_rad is not None:
             first = slice(seen_by.index(s), None, len(seen_by))
             common = sensor.pose_turn_sigma_rad * rng.standard_normal((len(solutions), 3))
