@@ -327,7 +327,9 @@ class Walk:
         # The same with a variance for each free form: one smoothness for all may fit none of them.
         self.by_form = by_form(data, self.families)
         # What may change in mid-session.
-        self._changing = [*{c.changes.key: c.changes for c in cells if c.changes}.values()]
+        changes = [cell for cell in cells if cell.changes is not None]
+        cells = [cell for cell in cells if cell.changes is None]
+        self._changing = [*{c.changes.key: c.changes for c in changes if c.changes}.values()]
         of_background = {member.key for one in self.families for member in one.members}
         singles = [cell for cell in cells if cell.penalty is None or cell.key not in of_background]
         tried = {cell.key for cell in singles}
@@ -355,10 +357,48 @@ class Walk:
             for index, first in enumerate((self.bare, self.empty)):
                 self.chains.append(self._chain(first, hot=index > 0))
                 progress(0.5 * (index + 1))
-        if self._refined():
+        changed = self._with_changes(changes) if start is None else []
+        if self._refined() or changed:
+            first = max([*(one.best for one in self.chains), *changed], key=lambda one: one.value)
+            self.chains.append(self._chain(first, hot=False))
+        if changed and self._refined():
             best = max((chain.best for chain in self.chains), key=lambda one: one.value)
             self.chains.append(self._chain(best, hot=False))
         self._weigh()
+
+    def _with_changes(self, changes: Sequence[Cell]) -> list[Evaluated]:
+        """Add the changes that a best model may have; return it with the best of them.
+
+        Beside the model and in the place of each of its blocks, also without a wander: that
+        follows whatever changes. Changes are many and hardly ever there: their columns are worked
+        on once and not in every round.
+        """
+        blocks, found = candidates(self.data, changes), []
+        for best in [chain.best for chain in self.chains] if blocks else []:
+            mine = [self.pool.blocks[block] for block, _ in best.model]
+            levels = tuple((i, level) for i, (_, level) in enumerate(best.model))
+            pool = Pool(self.data, [*mine, *blocks])
+            steady = [one for one in best.families if one.members[0].name != SENSOR_WANDER.name]
+            for families in [best.families, steady][: 1 + (len(steady) < len(best.families))]:
+                std = {one.cell: best.std[one.cell] for one in families}
+                state = State.of(Surface(pool, best.noise, std), levels)
+                gains = state.gains[len(mine) :]
+                gain = gains.max(axis=1)
+                for position in range(len(mine)):
+                    other = state.without(position)
+                    there = other.gains[len(mine) :].max(axis=1) + other.value - state.value
+                    gain = np.maximum(gain, there)
+                likely = [blocks[i] for i in np.flatnonzero(gain > -NEEDED).tolist()]
+                self.pool.extend([one for one in likely if one.cell.key not in self.pool.place])
+                if not likely:
+                    continue
+                index, level = np.unravel_index(np.argmax(gains), gains.shape)
+                added = self.pool.place.get(blocks[index].cell.key)
+                if added is not None:
+                    model = tuple(sorted((*best.model, (added, int(level)))))
+                    one = evaluated(self.pool, families, model, best)
+                    found += [] if one is None else [one]
+        return found
 
     def _refined(self) -> bool:
         """Add candidates near those of the best model; return whether there are any.

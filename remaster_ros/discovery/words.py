@@ -37,6 +37,8 @@ EARLIEST_S, LATEST_S = 1e9, 4.1e9
 # Below it a p-value's figures tell nobody more.
 LEAST_P_VALUE = 1e-4
 
+# Times of a session are told in minutes from here on, those of clocks in milliseconds, s.
+LONG_S = 30.0
 # A probability by a finite number of models visited is not stated beyond this.
 MOST_STATED = 0.99
 
@@ -44,6 +46,8 @@ MOST_STATED = 0.99
 def shown(value: float, std: float, unit: str) -> tuple[str, str, str]:
     """Return value, standard deviation and unit of a parameter as people read them."""
     words, times = SHOWN_UNITS.get(unit, (unit, 1.0))
+    if unit == 's' and abs(value) >= LONG_S:
+        words, times = 'min', 1.0 / 60.0
     return *rounded(times * value, times * std, '+'), words
 
 
