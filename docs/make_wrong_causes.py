@@ -26,7 +26,7 @@ from worlds.hidden_tours import world  # noqa: E402
 from worlds.hidden_world import Noise  # noqa: E402
 
 from remaster_ros.discovery.discover import Discovery, discover_session  # noqa: E402
-from remaster_ros.discovery.effects.base import Cell  # noqa: E402
+from remaster_ros.discovery.effects.base import Candidate  # noqa: E402
 from remaster_ros.discovery.effects.registry import EFFECTS  # noqa: E402
 from remaster_ros.discovery.residuals import Residuals  # noqa: E402
 from remaster_ros.simulation.hidden_effects import HiddenEffect  # noqa: E402
@@ -58,24 +58,24 @@ def ours(found: Discovery) -> str:
 
 
 def greedy(data: Residuals) -> str:
-    """Name the cell with the largest correlation, sine and cosine counting as one."""
+    """Name the candidate with the largest correlation, sine and cosine counting as one."""
     base, errors = _flat(data)
     left = errors - base @ (base.T @ errors)
     best, name, tried, freedom = 0.0, '', 0, len(left) - base.shape[1]
     for effect in EFFECTS.values():
         if effect.name in ('marker_offset', 'joint_error_curve') or effect.needs(data.context):
             continue
-        for cell in effect.cells(data.context):
-            if cell.size > 2:
+        for candidate in effect.candidates(data.context):
+            if candidate.size > 2:
                 continue
-            columns = _columns(data, cell, base)
+            columns = _columns(data, candidate, base)
             explained = np.linalg.norm(np.linalg.qr(columns)[0].T @ left)
             tried += 1
             if explained > best:
-                p_value = _p_value(explained**2, left @ left, cell.size, freedom)
-                best, name = float(explained), _named(cell.name, cell.joints)
-                if cell.name == 'unnamed':
-                    name += f' ({cell.place} by {cell.driver})'
+                p_value = _p_value(explained**2, left @ left, candidate.size, freedom)
+                best, name = float(explained), _named(candidate.name, candidate.joints)
+                if candidate.name == 'unnamed':
+                    name += f' ({candidate.place} by {candidate.driver})'
     return name if p_value * tried < SIGNIFICANCE else 'nothing'
 
 
@@ -88,19 +88,19 @@ def _p_value(explained: float, total: float, size: int, freedom: int) -> float:
 def full_dh(data: Residuals) -> str:
     """Fit all of the geometry; name the link parameter with the largest t."""
     base, errors = _flat(data)
-    cells = [
-        cell
+    candidates = [
+        candidate
         for name in ('link_length', 'joint_axis_tilt')
-        for cell in EFFECTS[name].cells(data.context)
-        if cell.size == 1
+        for candidate in EFFECTS[name].candidates(data.context)
+        if candidate.size == 1
     ]
-    kept: list[Cell] = []
+    kept: list[Candidate] = []
     columns = np.zeros((len(base), 0))
-    for cell in cells:
-        new = _columns(data, cell, base)
+    for candidate in candidates:
+        new = _columns(data, candidate, base)
         rest = new - columns @ np.linalg.lstsq(columns, new, rcond=None)[0] if kept else new
         if np.linalg.norm(rest) > 1e-2:
-            kept.append(cell)
+            kept.append(candidate)
             columns = np.concatenate((columns, new), axis=1)
     left = errors - base @ (base.T @ errors)
     inverse = np.linalg.inv(columns.T @ columns)
@@ -118,8 +118,8 @@ def _flat(data: Residuals) -> tuple[np.ndarray, np.ndarray]:
     return base, data.errors.ravel()
 
 
-def _columns(data: Residuals, cell: Cell, base: np.ndarray) -> np.ndarray:
-    columns = data.columns([cell]).reshape(3 * len(data), -1)
+def _columns(data: Residuals, candidate: Candidate, base: np.ndarray) -> np.ndarray:
+    columns = data.columns([candidate]).reshape(3 * len(data), -1)
     left = columns - base @ (base.T @ columns)
     norm, before = np.linalg.norm(left, axis=0), np.linalg.norm(columns, axis=0)
     # What is absorbed is rounding: it explains nothing.

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Calibrated arm from a fit and the cells of a discovery.
+"""Calibrated arm from a fit and the candidates of a discovery.
 
-Where a cell of `discovery.effects` goes in the model follows from its place, driver and form, not
-from its name: a new effect is corrected as well if its place, driver and form are among these.
+Where a candidate of `discovery.effects` goes in the model follows from its place, driver and form,
+not from its name: a new effect is corrected as well if its place, driver and form are among these.
 Effects that do not belong to the arm, or that depend on quantities that no controller knows (the
 time, the approach direction), are listed with a remedy.
 """
@@ -30,7 +30,7 @@ from remaster_ros.compensation.arm_model import (
     JointTerm,
 )
 from remaster_ros.compensation.export import check_first
-from remaster_ros.discovery.effects.base import Cell
+from remaster_ros.discovery.effects.base import Candidate
 from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.discovery.effects.splines import DEGREE, Curve
 from remaster_ros.discovery.geometry_model import GeometryModel
@@ -164,40 +164,42 @@ def arm_of_geometry(
     return _described(geometry_fit, geometry.members, theta, None, widening)
 
 
-def arm_of_effects(fit: FitResult, cells: Sequence[Cell], data: Residuals) -> CorrectedArm:
+def arm_of_effects(
+    fit: FitResult, candidates: Sequence[Candidate], data: Residuals
+) -> CorrectedArm:
     """Arm of a sampled model with effects; its predictions are not widened.
 
     Parameters
     ----------
     fit
-        Fit with the cells' parameters as ``theta``.
-    cells
-        Cells of the model, in that order.
+        Fit with the candidates' parameters as ``theta``.
+    candidates
+        Candidates of the model, in that order.
     data
         Residuals in which the effects were sought.
     """
-    return _described(fit, cells, fit.theta, data, 1.0)
+    return _described(fit, candidates, fit.theta, data, 1.0)
 
 
 def _described(
     fit: FitResult,
-    cells: Sequence[Cell],
+    candidates: Sequence[Candidate],
     theta: FloatArray,
     data: Residuals | None,
     widening: float,
 ) -> CorrectedArm:
-    """Arm of a fit with cells and their parameters `theta`."""
+    """Arm of a fit with candidates and their parameters `theta`."""
     chain = fit.chain
     slots: dict[Slot, int] = {}
     maps: list[tuple[Slot, slice, FloatArray]] = []
-    uncorrected: list[tuple[Cell, slice]] = []
+    uncorrected: list[tuple[Candidate, slice]] = []
     start = 0
-    for cell in cells:
-        parameters = slice(start, start + cell.size)
-        start += cell.size
-        found = None if cell.of_measurement else list(slots_of(cell, chain))
+    for candidate in candidates:
+        parameters = slice(start, start + candidate.size)
+        start += candidate.size
+        found = None if candidate.of_measurement else list(slots_of(candidate, chain))
         if not found:
-            uncorrected.append((cell, parameters))
+            uncorrected.append((candidate, parameters))
             continue
         for slot, matrix in found:
             slots.setdefault(slot, len(matrix))
@@ -219,7 +221,7 @@ def _described(
     root = np.asarray(np.linalg.qr(every, 'r'))
     fitted = measurements.q[~measurements.is_validation]
     model = replace(model, root=root, joint_offsets=mean)
-    if cells and fit.found is not None:
+    if candidates and fit.found is not None:
         # What has no place in the arm bends nothing of it: backlash no less than a sensor's scale.
         model = _as_predicted(
             model, fit, fit.found.problem, [parameters for _, parameters in uncorrected]
@@ -359,86 +361,91 @@ def _temperatures(measurements: Measurements) -> tuple[float, float]:
     return float(first), float(fitted.mean() if len(fitted) else given.mean())
 
 
-def slots_of(cell: Cell, chain: SerialChain) -> Iterator[tuple[Slot, FloatArray]]:
-    """Yield the slots of a cell in an `ArmModel`; nothing if the model has no place for the cell.
+def slots_of(candidate: Candidate, chain: SerialChain) -> Iterator[tuple[Slot, FloatArray]]:
+    """Yield the slots of a candidate in an `ArmModel`; nothing if it has no place there.
 
-    Each slot comes with the matrix from the cell's m parameters to its coefficients.
+    Each slot comes with the matrix from the candidate's m parameters to its coefficients.
     """
-    if cell.changes is not None:
+    if candidate.changes is not None:
         # The arm is as it was after the change.
-        if not cell.ends:
-            yield from slots_of(cell.changes, chain)
-    elif cell.model_change is not None:
-        change = cell.model_change
+        if not candidate.ends:
+            yield from slots_of(candidate.changes, chain)
+    elif candidate.model_change is not None:
+        change = candidate.model_change
         yield Slot('geometry', change.joint), np.concatenate((change.shifts, change.turns), 1).T
-    elif cell.place == 'joint_angle':
-        joint = cell.joints[0] - 1
-        for function, matrix in _functions(cell, joint):
-            yield Slot('joint', joint, cell.name, function), matrix
-    elif cell.place in ('link_translation', 'link_rotation') and cell.form == 'linear':
-        yield from _of_links(cell, chain)
-    elif cell.place == 'base_rotation' and not cell.happened:
-        yield from _of_base(cell)
+    elif candidate.place == 'joint_angle':
+        joint = candidate.joints[0] - 1
+        for function, matrix in _functions(candidate, joint):
+            yield Slot('joint', joint, candidate.name, function), matrix
+    elif candidate.place in ('link_translation', 'link_rotation') and candidate.form == 'linear':
+        yield from _of_links(candidate, chain)
+    elif candidate.place == 'base_rotation' and not candidate.happened:
+        yield from _of_base(candidate)
 
 
-def _of_links(cell: Cell, chain: SerialChain) -> Iterator[tuple[Slot, FloatArray]]:
-    """Yield slots and matrices of a cell of a link."""
-    zeros = np.zeros((3, cell.size))
-    if cell.driver == 'gravity_moment' and cell.size == 1:
-        yield Slot('lateral', cell.joints[0] - 1), np.ones((1, 1))
-    if cell.driver != 'temperature':
+def _of_links(candidate: Candidate, chain: SerialChain) -> Iterator[tuple[Slot, FloatArray]]:
+    """Yield slots and matrices of a candidate of a link."""
+    zeros = np.zeros((3, candidate.size))
+    if candidate.driver == 'gravity_moment' and candidate.size == 1:
+        yield Slot('lateral', candidate.joints[0] - 1), np.ones((1, 1))
+    if candidate.driver != 'temperature':
         return
-    if cell.size == 1:
+    if candidate.size == 1:
         # A length that grows, of one link or of all.
-        for link in cell.joints or range(len(chain) + 1):
+        for link in candidate.joints or range(len(chain) + 1):
             vector = chain.T_fixed[link][:3, 3]
             yield Slot('growth', link), np.concatenate((vector, np.zeros(3)))[:, None]
-    elif cell.size == 3 and cell.place == 'link_translation':
-        yield Slot('growth', cell.joints[0]), np.concatenate((np.eye(3), zeros))
-    elif cell.size == 3:
-        link = cell.joints[0]
+    elif candidate.size == 3 and candidate.place == 'link_translation':
+        yield Slot('growth', candidate.joints[0]), np.concatenate((np.eye(3), zeros))
+    elif candidate.size == 3:
+        link = candidate.joints[0]
         yield Slot('growth', link), np.concatenate((zeros, chain.T_fixed[link][:3, :3].T))
 
 
-def _of_base(cell: Cell) -> Iterator[tuple[Slot, FloatArray]]:
-    """Yield slots and matrices of a cell of the base."""
-    if cell.driver == 'gravity_moment' and cell.form == 'linear':
+def _of_base(candidate: Candidate) -> Iterator[tuple[Slot, FloatArray]]:
+    """Yield slots and matrices of a candidate of the base."""
+    if candidate.driver == 'gravity_moment' and candidate.form == 'linear':
         axes = {'isotropic': np.ones((3, 1)), 'by axis': np.eye(3)[:, :2]}
-        if cell.variant in axes:
+        if candidate.variant in axes:
             function = Function('gravity_moment', 'linear')
-            yield Slot('base', -1, cell.name, function), axes[cell.variant]
+            yield Slot('base', -1, candidate.name, function), axes[candidate.variant]
         return
     # Of each feature a parameter for every axis of R, next to each other.
-    for function, matrix in _functions(replace(cell, parameters=cell.parameters[::3]), 0):
+    for function, matrix in _functions(
+        replace(candidate, parameters=candidate.parameters[::3]), 0
+    ):
         if len(matrix) == 1:
             every: FloatArray = np.kron(matrix, np.eye(3)).astype(float)
-            yield Slot('base', -1, cell.name, function), every
+            yield Slot('base', -1, candidate.name, function), every
 
 
-def _functions(cell: Cell, joint: int) -> Iterator[tuple[Function, FloatArray]]:
-    """Yield functions and matrices of a cell; ``joint`` is for a driver that names none."""
-    if cell.happened:
+def _functions(candidate: Candidate, joint: int) -> Iterator[tuple[Function, FloatArray]]:
+    """Yield functions and matrices of a candidate; ``joint`` is for a driver that names none."""
+    if candidate.happened:
         # The arm is as it was after what happened.
-        if cell.form == 'step':
-            yield Function('none', 'constant'), np.ones((1, cell.size))
+        if candidate.form == 'step':
+            yield Function('none', 'constant'), np.ones((1, candidate.size))
         return
-    stem, _, given = cell.driver.partition('_of_joint_')
+    stem, _, given = candidate.driver.partition('_of_joint_')
     driver = _DRIVERS.get(stem)
     if driver is None:
         return
     driver_joint = -1 if driver == 'temperature' else int(given) - 1 if given else joint
-    if cell.form in ('linear', 'quadratic') and cell.size == 1:
-        form: Form = 'quadratic' if cell.form == 'quadratic' else 'linear'
+    if candidate.form in ('linear', 'quadratic') and candidate.size == 1:
+        form: Form = 'quadratic' if candidate.form == 'quadratic' else 'linear'
         yield Function(driver, form, driver_joint), np.ones((1, 1))
-    elif cell.form == 'sin/cos':
-        orders = [int(part) for part in cell.variant.split('+')] if cell.variant else [1]
-        if cell.size == 2 * len(orders):
+    elif candidate.form == 'sin/cos':
+        orders = [int(part) for part in candidate.variant.split('+')] if candidate.variant else [1]
+        if candidate.size == 2 * len(orders):
             # Sine and cosine of each order, in this order.
             for i, order in enumerate(orders):
-                yield Function(driver, 'sin', driver_joint, order), np.eye(cell.size)[[2 * i]]
-                yield Function(driver, 'cos', driver_joint, order), np.eye(cell.size)[[2 * i + 1]]
-    elif cell.curve is not None and cell.size == len(cell.curve.places):
-        yield _splines(cell.curve, driver, driver_joint)
+                yield Function(driver, 'sin', driver_joint, order), np.eye(candidate.size)[[2 * i]]
+                yield (
+                    Function(driver, 'cos', driver_joint, order),
+                    np.eye(candidate.size)[[2 * i + 1]],
+                )
+    elif candidate.curve is not None and candidate.size == len(candidate.curve.places):
+        yield _splines(candidate.curve, driver, driver_joint)
 
 
 def _splines(curve: Curve, driver: Driver, joint: int) -> tuple[Function, FloatArray]:
@@ -461,16 +468,20 @@ _NOT_TOLD = (
 
 
 def _not_corrected(
-    cells: Sequence[tuple[Cell, slice]], theta: FloatArray, data: Residuals
+    candidates: Sequence[tuple[Candidate, slice]], theta: FloatArray, data: Residuals
 ) -> Iterator[NotCorrected]:
-    """Yield the effects that are not corrected; cells of one effect at the same joints are one."""
+    """Yield the effects that are not corrected, one for the candidates of the same joints."""
     by_effect: dict[tuple[str, tuple[int, ...], bool], FloatArray] = {}
     remedies = {}
-    for cell, where in cells:
-        key = (cell.name, cell.joints, cell.of_measurement or cell.place == 'marker')
-        displacement = data.columns([cell]) @ theta[where]
+    for candidate, where in candidates:
+        key = (
+            candidate.name,
+            candidate.joints,
+            candidate.of_measurement or candidate.place == 'marker',
+        )
+        displacement = data.columns([candidate]) @ theta[where]
         by_effect[key] = by_effect[key] + displacement if key in by_effect else displacement
-        remedies[key] = EFFECTS[cell.name].remedy_of(cell)
+        remedies[key] = EFFECTS[candidate.name].remedy_of(candidate)
     for (name, joints, of_measurement), displacement in by_effect.items():
         size = float(np.sqrt(np.mean(np.sum(displacement**2, axis=-1))))
         if round(1e3 * size, 3) == 0.0:

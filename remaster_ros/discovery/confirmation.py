@@ -30,7 +30,7 @@ from remaster_ros.calibration.identifiability import WEAK_ANGLE
 from remaster_ros.calibration.noise import Noise
 from remaster_ros.calibration.priors import STEP_STD
 from remaster_ros.discovery.discover import Discovery
-from remaster_ros.discovery.effects.base import Cell, Design
+from remaster_ros.discovery.effects.base import Candidate, Design
 from remaster_ros.discovery.effects.context import Context
 from remaster_ros.discovery.effects.drivers import Driver, driver_named
 from remaster_ros.discovery.effects.registry import EFFECTS
@@ -51,8 +51,8 @@ Answer = Literal['confirmed', 'changed', 'absent', 'open']
 CHOICES: tuple[Choice, ...] = ('shared', 'own', 'absent')
 # Of each zero-offset, then of each cause.
 Choices = tuple[Choice, ...]
-# A cell with the precision of the prior on its parameters.
-_Weighted = tuple[Cell, FloatArray]
+# A candidate with the precision of the prior on its parameters.
+_Weighted = tuple[Candidate, FloatArray]
 
 # A size of its own halves the evidence at least where the other session halves what it can be.
 HALVED = float(np.log(2.0))
@@ -249,12 +249,16 @@ class _Measured:
 
     @classmethod
     def of(
-        cls, data: Residuals, noise: Noise, cells: Sequence[Cell], alone: Sequence[_Weighted]
+        cls,
+        data: Residuals,
+        noise: Noise,
+        candidates: Sequence[Candidate],
+        alone: Sequence[_Weighted],
     ) -> _Measured:
-        """Take what rows know of cells, where others settle."""
+        """Take what rows know of candidates, where others settle."""
         natural = data.full_jacobian[data.rows.source]
-        further = data.columns([cell for cell, _ in alone])
-        parts = natural, data.columns(cells), data.errors[:, :, None], further
+        further = data.columns([candidate for candidate, _ in alone])
+        parts = natural, data.columns(candidates), data.errors[:, :, None], further
         columns = np.concatenate(parts, axis=2)
         grams = data.noise_model.gram(lambda _, where: columns[where], columns.shape[2])
         total = np.tensordot(1.0 / data.noise_model.variances(noise), grams, axes=1)
@@ -304,15 +308,15 @@ class _Fitted:
 
 @dataclass(frozen=True, eq=False)
 class _Both:
-    """Both sessions with the cells of the arm's errors on their rows.
+    """Both sessions with the candidates of the arm's errors on their rows.
 
     As found and as wide as both need them, and which make each cause; what each session knows;
     precision of the prior on their m parameters, (m, m); the other session fitted without causes;
     which zero-offsets this one determines, (k,).
     """
 
-    found: tuple[Cell, ...]
-    cells: tuple[Cell, ...]
+    found: tuple[Candidate, ...]
+    candidates: tuple[Candidate, ...]
     groups: tuple[tuple[int, ...], ...]
     here: _Measured
     there: _Measured
@@ -326,26 +330,26 @@ class _Both:
     def of(cls, discovery: Discovery, fit: Estimate, rng: np.random.Generator) -> _Both:
         mine, theirs = discovery.residuals, Residuals.of(fit)
         theirs = theirs.only(draw_rows(fit.problem.measurements, fit.kept, rng))
-        named = [cell for group in discovery.groups for cell in group]
-        names = {name for cell in named for name in cell.parameters}
-        others = [c for c in discovery.solution.cells if not names & set(c.parameters)]
-        causes = [cell for cell in named if not cell.happened]
-        found = causes + [cell for cell in others if not cell.of_measurement]
+        named = [candidate for group in discovery.groups for candidate in group]
+        names = {name for candidate in named for name in candidate.parameters}
+        others = [c for c in discovery.solution.candidates if not names & set(c.parameters)]
+        causes = [candidate for candidate in named if not candidate.happened]
+        found = causes + [candidate for candidate in others if not candidate.of_measurement]
         once = [c for c in named if c.happened] + [c for c in others if c.of_measurement]
-        cells = [widened(cell, mine.part, theirs.part) for cell in found]
-        noise, alone = _by_itself(theirs, cells[: len(causes)])
-        priors = [_prior(discovery, *pair) for pair in zip(found, cells, strict=True)]
-        of_once = [(cell, _prior(discovery, cell, cell)) for cell in once]
+        candidates = [widened(candidate, mine.part, theirs.part) for candidate in found]
+        noise, alone = _by_itself(theirs, candidates[: len(causes)])
+        priors = [_prior(discovery, *pair) for pair in zip(found, candidates, strict=True)]
+        of_once = [(candidate, _prior(discovery, candidate, candidate)) for candidate in once]
         return cls(
             tuple(found),
-            tuple(cells),
+            tuple(candidates),
             tuple(
-                tuple(causes.index(cell) for cell in group if cell in causes)
+                tuple(causes.index(candidate) for candidate in group if candidate in causes)
                 for group in discovery.groups
             ),
-            _Measured.of(mine, discovery.solution.noise, cells, of_once),
-            _Measured.of(theirs, noise, cells, alone),
-            np.reshape(block_diag(*priors), [sum(cell.size for cell in cells)] * 2),
+            _Measured.of(mine, discovery.solution.noise, candidates, of_once),
+            _Measured.of(theirs, noise, candidates, alone),
+            np.reshape(block_diag(*priors), [sum(candidate.size for candidate in candidates)] * 2),
             fit,
             np.asarray(discovery.fit.identifiable),
         )
@@ -356,8 +360,8 @@ class _Both:
         return self.fit.model.joints
 
     def where(self, group: Sequence[int]) -> IntArray:
-        """Return where the parameters of some cells are among the m."""
-        edges = np.cumsum([0, *(cell.size for cell in self.cells)])
+        """Return where the parameters of some candidates are among the m."""
+        edges = np.cumsum([0, *(candidate.size for candidate in self.candidates)])
         parts = [np.arange(edges[i], edges[i + 1]) for i in group]
         return np.concatenate([np.zeros(0, np.int64), *parts])
 
@@ -469,7 +473,7 @@ class _Both:
         rows: BoolArray | None = None,
         joint_offsets: FloatArray | None = None,
     ) -> float:
-        """Return the RMS error of the other session with some cells absent, or as found here.
+        """Return the RMS error of the other session with some candidates absent, or as found here.
 
         All else, and what this session does not tell, is fitted to it. Of its validation rows, or
         the fitted ones without any; of those in ``rows`` (all rows,), where there are such.
@@ -480,8 +484,8 @@ class _Both:
             held[:k] = joint_offsets - there.data.context.joint_offsets
         found = self.alone.values[self.here.size :][: len(self.precision)]
         told = np.diag(self._spread) < HALF**2 * np.diag(np.linalg.inv(self.precision))
-        for cells, values in ((absent, 0.0 * found), (frozen, found)):
-            where = self.where(cells)
+        for candidates, values in ((absent, 0.0 * found), (frozen, found)):
+            where = self.where(candidates)
             where = where[told[where]]
             held[size + where] = values[where]
         free, fixed = np.isnan(held), ~np.isnan(held)
@@ -490,7 +494,7 @@ class _Both:
         held[free] = _solved(H[np.ix_(free, free)], h)
         data = there.data
         left = data.full_errors - data.full_jacobian @ held[:size]
-        left -= data.displaced(self.cells, held[size:])
+        left -= data.displaced(self.candidates, held[size:])
         judged = data.context.measurements.is_validation
         if not judged.any():
             judged = np.isin(np.arange(len(judged)), data.rows.source)
@@ -531,14 +535,16 @@ class _Both:
         """Compare the parameters of a cause: as they are, or a curve at its places."""
         rows: list[Compared] = []
         for i in group:
-            cell, wide, where = self.found[i], self.cells[i], self.where([i])
-            names, heights = list(cell.parameters), np.eye(wide.size)
-            if cell.curve is not None and wide.curve is not None:
-                driver = _driver(self.here.data.context, cell)
+            candidate, wide, where = self.found[i], self.candidates[i], self.where([i])
+            names, heights = list(candidate.parameters), np.eye(wide.size)
+            if candidate.curve is not None and wide.curve is not None:
+                driver = _driver(self.here.data.context, candidate)
                 there = driver.value(self.there.data.part)
-                places = cell.curve.places
-                seen = cell.curve.seen(places, 0.5) & cell.curve.among(there).seen(places, 0.5)
-                axes = cell.size // len(places)
+                places = candidate.curve.places
+                seen = candidate.curve.seen(places, 0.5) & candidate.curve.among(there).seen(
+                    places, 0.5
+                )
+                axes = candidate.size // len(places)
                 names = [n for n, both in zip(names, np.repeat(seen, axes), strict=True) if both]
                 if len(names) < 2 * axes:
                     # Of one place nothing is left less the mean.
@@ -548,7 +554,7 @@ class _Both:
             both = np.append(self.here.size + where, own.there[self.there.size + where])
             twice = block_diag(heights, heights)
             covariance = twice @ own.covariance(both) @ twice.T
-            rows += _compared(names, cell.unit, twice @ own.values[both], covariance)
+            rows += _compared(names, candidate.unit, twice @ own.values[both], covariance)
         return tuple(rows)
 
 
@@ -577,26 +583,26 @@ def answer_of(evidence: Mapping[Choice, float]) -> Answer:
     return 'confirmed'
 
 
-def _by_itself(data: Residuals, causes: Sequence[Cell]) -> tuple[Noise, list[_Weighted]]:
+def _by_itself(data: Residuals, causes: Sequence[Candidate]) -> tuple[Noise, list[_Weighted]]:
     """Return a session's noise beside causes and all kinds of errors, and its measuring's."""
     others = [
-        cell
+        candidate
         for effect in EFFECTS.values()
         if not effect.moves_the_fit and not effect.needs(data.context)
-        for cell in effect.cells(data.context)
+        for candidate in effect.candidates(data.context)
     ]
-    each = [Family.of(data, f'cause {i}', [cell]) for i, cell in enumerate(causes)]
+    each = [Family.of(data, f'cause {i}', [candidate]) for i, candidate in enumerate(causes)]
     every = kinds(data, others, causes)
-    found = solve(data, [one.cell for one in each if one is not None])
+    found = solve(data, [one.candidate for one in each if one is not None])
     if found is None:
         return data.noise, []
     # Of few rows all kinds together would explain the noise as well.
-    whole = solve(data, [*found.cells, *(one.cell for one in every)], found)
+    whole = solve(data, [*found.candidates, *(one.candidate for one in every)], found)
     if whole is None or whole.log_evidence < found.log_evidence + NAMED:
         return found.noise, []
     weights = whole.weight_precisions()
     return whole.noise, [
-        (family.cell, weights[family.cell] * np.eye(family.cell.size))
+        (family.candidate, weights[family.candidate] * np.eye(family.candidate.size))
         for family in every
         if family.members[0].of_measurement
     ]
@@ -620,49 +626,55 @@ def _solved(matrix: FloatArray, right: FloatArray) -> FloatArray:
     return (unit * cho_solve(factor, (unit * right.T).T, check_finite=False).T).T
 
 
-def _prior(discovery: Discovery, cell: Cell, wide: Cell) -> FloatArray:
-    """Return the precision of a cell's parameters, (m, m): of their size here, or smoothness."""
+def _prior(discovery: Discovery, candidate: Candidate, wide: Candidate) -> FloatArray:
+    """Return the precision of a candidate's parameters, (m, m): by size here, or smoothness."""
     solution, fit = discovery.solution, discovery.fit
-    is_cause = any(cell in group for group in discovery.groups)
-    if cell in solution.cells and (cell.penalty is not None or not is_cause):
-        index = solution.cells.index(cell)
+    is_cause = any(candidate in group for group in discovery.groups)
+    if candidate in solution.candidates and (candidate.penalty is not None or not is_cause):
+        index = solution.candidates.index(candidate)
         ridge = solution.ridge[solution.slices()[index]]
         if wide.penalty is None:
             return np.diag(ridge)
         return solution.smoothness[index] * wide.penalty + ridge[0] * np.eye(wide.size)
-    chosen = [fit.theta_names.index(name) for name in cell.parameters]
-    return np.eye(cell.size) / float(np.mean(fit.theta[chosen] ** 2 + fit.theta_std[chosen] ** 2))
+    chosen = [fit.theta_names.index(name) for name in candidate.parameters]
+    return np.eye(candidate.size) / float(
+        np.mean(fit.theta[chosen] ** 2 + fit.theta_std[chosen] ** 2)
+    )
 
 
-def _driver(context: Context, cell: Cell) -> Driver:
-    driver = driver_named(context, cell.driver, cell.joints[-1] if cell.joints else 0)
+def _driver(context: Context, candidate: Candidate) -> Driver:
+    driver = driver_named(
+        context, candidate.driver, candidate.joints[-1] if candidate.joints else 0
+    )
     assert driver is not None
     return driver
 
 
-def widened(cell: Cell, mine: Context, theirs: Context) -> Cell:
-    """Return a cell whose free form reaches over both sessions, with its mean zero over this."""
-    if cell.curve is None or cell.place != 'joint_angle':
-        return cell
-    driver = _driver(mine, cell)
+def widened(candidate: Candidate, mine: Context, theirs: Context) -> Candidate:
+    """Return a candidate whose free form reaches over both sessions, of mean zero over this."""
+    if candidate.curve is None or candidate.place != 'joint_angle':
+        return candidate
+    driver = _driver(mine, candidate)
     values = np.concatenate([driver.value(mine), driver.value(theirs)])
-    curve = Curve.of(values, 0.0, cell.curve.step, not np.isnan(cell.curve.start))
+    curve = Curve.of(values, 0.0, candidate.curve.step, not np.isnan(candidate.curve.start))
     curve = replace(curve, weights=curve.splines(driver.value(mine)).mean(axis=0))
-    names = tuple(f'{cell.parameters[0]} {place:+.4f}' for place in curve.places)
-    columns = partial(_free, joint=cell.joints[0], driver=driver, curve=curve)
-    return replace(cell, columns=columns, parameters=names, penalty=curve.penalty, curve=curve)
+    names = tuple(f'{candidate.parameters[0]} {place:+.4f}' for place in curve.places)
+    columns = partial(_free, joint=candidate.joints[0], driver=driver, curve=curve)
+    return replace(
+        candidate, columns=columns, parameters=names, penalty=curve.penalty, curve=curve
+    )
 
 
 def _free(context: Context, joint: int, driver: Driver, curve: Curve) -> Design:
     return Design(joint - 1, curve.columns(driver.value(context)))
 
 
-def _seen(cell: Cell, mine: Context) -> Callable[[Context], BoolArray]:
-    """Return what tells in which rows of another session a cell's driver was seen here."""
-    driver = driver_named(mine, cell.driver, cell.joints[-1] if cell.joints else 0)
+def _seen(candidate: Candidate, mine: Context) -> Callable[[Context], BoolArray]:
+    """Return what tells in which rows of another session a candidate's driver was seen here."""
+    driver = driver_named(mine, candidate.driver, candidate.joints[-1] if candidate.joints else 0)
     if driver is not None:
-        if cell.curve is not None:
-            curve = cell.curve
+        if candidate.curve is not None:
+            curve = candidate.curve
             return lambda context: curve.seen(driver.value(context))
         values = driver.value(mine)
         if driver.is_angle and mine.turns_over(driver.joint):
@@ -670,8 +682,8 @@ def _seen(cell: Cell, mine: Context) -> Callable[[Context], BoolArray]:
             values = in_turn(values, start)
             return lambda context: _between(in_turn(driver.value(context), start), values)
         return lambda context: _between(driver.value(context), values)
-    if cell.driver == 'position' and cell.form != 'linear':
-        sensor = mine.sensor_names.index(cell.subject)
+    if candidate.driver == 'position' and candidate.form != 'linear':
+        sensor = mine.sensor_names.index(candidate.subject)
         box = mine.in_sensor[mine.seen_by(sensor)]
         return lambda context: (
             np.all([_between(context.in_sensor[:, i], box[:, i]) for i in range(3)], axis=0)

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.special import ndtri_exp
 
 from remaster_ros.discovery.discover import Discovery
-from remaster_ros.discovery.effects.base import Cell
+from remaster_ros.discovery.effects.base import Candidate
 from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.discovery.evidence import solve
 from remaster_ros.discovery.walk import NEEDED
@@ -99,15 +99,15 @@ def _decision(found: Discovery, cause: Named, look_alike: Named) -> Decision:
     return Decision(cause, look_alike, answer, difference, sigma_of(difference))
 
 
-def _rest(found: Discovery, *causes: Named) -> tuple[Cell, ...]:
+def _rest(found: Discovery, *causes: Named) -> tuple[Candidate, ...]:
     """Return the other causes, and the background without the kinds of these."""
-    named = [cell for group in found.groups for cell in group]
+    named = [candidate for group in found.groups for candidate in group]
     kinds = {cause.name for cause in causes}
-    have = {name for cell in named for name in cell.parameters}
+    have = {name for candidate in named for name in candidate.parameters}
     return (
-        *(cell for cell in named if not any(_belongs(cell, one) for one in causes)),
+        *(candidate for candidate in named if not any(_belongs(candidate, one) for one in causes)),
         *(
-            family.cell
+            family.candidate
             for family in found.background
             if kinds.isdisjoint(member.name for member in family.members)
             and have.isdisjoint(family.parameters)
@@ -115,9 +115,11 @@ def _rest(found: Discovery, *causes: Named) -> tuple[Cell, ...]:
     )
 
 
-def _belongs(cell: Cell, cause: Named) -> bool:
+def _belongs(candidate: Candidate, cause: Named) -> bool:
     parts = [(joint,) for joint in cause.joints]
-    return cell.name == cause.name and (cell.joints == cause.joints or cell.joints in parts)
+    return candidate.name == cause.name and (
+        candidate.joints == cause.joints or candidate.joints in parts
+    )
 
 
 def _without(found: Discovery, *causes: Named) -> float:
@@ -128,14 +130,14 @@ def _without(found: Discovery, *causes: Named) -> float:
 
 def _evidence(found: Discovery, cause: Named, other: Named) -> float | None:
     """Return the log evidence with a cause in place of another; None where it cannot be fitted."""
-    every, rest = _cells(found), _rest(found, cause, other)
-    named = [cell for group in found.groups for cell in group]
-    present = tuple(cell for cell in named if _belongs(cell, cause))
-    whole = {joint for cell in present for joint in cell.joints} == {*cause.joints}
+    every, rest = _candidates(found), _rest(found, cause, other)
+    named = [candidate for group in found.groups for candidate in group]
+    present = tuple(candidate for candidate in named if _belongs(candidate, cause))
+    whole = {joint for candidate in present for joint in candidate.joints} == {*cause.joints}
     sets = [present] if present and whole else _variants(every, cause)
     best = None
-    for cells in sets:
-        fit = solve(found.residuals, (*rest, *cells), found.solution)
+    for candidates in sets:
+        fit = solve(found.residuals, (*rest, *candidates), found.solution)
         if fit is None or fit.unphysical():
             continue
         if best is None or fit.log_evidence > best:
@@ -143,24 +145,26 @@ def _evidence(found: Discovery, cause: Named, other: Named) -> float | None:
     return best
 
 
-def _variants(every: Sequence[Cell], cause: Named) -> list[tuple[Cell, ...]]:
-    """Return the sets of cells that a cause can be: one cell, or one for each of its joints."""
-    mine = [cell for cell in every if cell.name == cause.name]
-    one: list[tuple[Cell, ...]] = [(cell,) for cell in mine if cell.joints == cause.joints]
+def _variants(every: Sequence[Candidate], cause: Named) -> list[tuple[Candidate, ...]]:
+    """Return the sets of candidates that a cause can be: each of its joints; else one a joint."""
+    mine = [candidate for candidate in every if candidate.name == cause.name]
+    one: list[tuple[Candidate, ...]] = [
+        (candidate,) for candidate in mine if candidate.joints == cause.joints
+    ]
     each = [
         [c for c in mine if c.joints == (joint,) and EFFECTS[c.name].in_family(c)][:1]
         for joint in cause.joints
     ]
     if one or not all(each):
         return one
-    return [tuple(cell for cells in each for cell in cells)]
+    return [tuple(candidate for candidates in each for candidate in candidates)]
 
 
-def _cells(found: Discovery) -> list[Cell]:
+def _candidates(found: Discovery) -> list[Candidate]:
     context = found.residuals.context
     return [
-        cell
+        candidate
         for effect in EFFECTS.values()
         if not effect.needs(context) and not effect.moves_the_fit and not effect.costly
-        for cell in effect.cells(context)
+        for candidate in effect.candidates(context)
     ]

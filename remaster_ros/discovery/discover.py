@@ -22,7 +22,7 @@ from remaster_ros.calibration.mistakes import sound_estimate
 from remaster_ros.calibration.outliers import find_outliers
 from remaster_ros.calibration.result import FitResult
 from remaster_ros.calibration.sampling import Progress, silent
-from remaster_ros.discovery.effects.base import Cell
+from remaster_ros.discovery.effects.base import Candidate
 from remaster_ros.discovery.effects.moments import changed
 from remaster_ros.discovery.effects.registry import EFFECTS, effects_of
 from remaster_ros.discovery.evidence import solve
@@ -79,7 +79,7 @@ class Discovery:
     untestable
         Name of an effect -> why this session cannot show it.
     groups
-        The cells of each effect that was searched for, in the order of ``effects``.
+        The candidates of each effect that was searched for, in the order of ``effects``.
     background
         Kinds of errors beside the causes in the best model.
     empty, solution
@@ -122,7 +122,7 @@ class Discovery:
     outliers: tuple[tuple[int, str], ...]
     untestable: Mapping[str, str]
     offsets_before: tuple[FloatArray, FloatArray]
-    groups: tuple[tuple[Cell, ...], ...]
+    groups: tuple[tuple[Candidate, ...], ...]
     background: tuple[Family, ...]
     empty: Solution
     solution: Solution
@@ -197,17 +197,20 @@ def discover_session(
         for name, effect in effects_tried.items()
         if (why := effect.needs(residuals.context))
     }
-    cells = [
-        cell
+    candidates = [
+        candidate
         for name, effect in effects_tried.items()
         if name not in untestable and not effect.moves_the_fit
-        for cell in effect.cells(residuals.context)
+        for candidate in effect.candidates(residuals.context)
     ]
-    cells += changed(residuals.context, [(cell, EFFECTS[cell.name].changes) for cell in cells])
+    candidates += changed(
+        residuals.context,
+        [(candidate, EFFECTS[candidate.name].changes) for candidate in candidates],
+    )
 
     def walked(data: Residuals, start: Walk | None) -> Walk:
         first = None if start is None else start.models[0]
-        return Walk(data, cells, rng, partial(report, 'searching causes'), first)
+        return Walk(data, candidates, rng, partial(report, 'searching causes'), first)
 
     walk = walked(residuals, None)
     data = _judged(found, residuals, walk.best, pool)
@@ -222,7 +225,7 @@ def discover_session(
     # Its columns are most of the memory.
     del walk
     sampled = partial(_sampled, session, before, rng=rng, report=report, clock=clock)
-    named = [cell for group in groups for cell in group]
+    named = [candidate for group in groups for candidate in group]
     try:
         fit, gain, if_drawn = sampled(found, data, models, named)
     except InsufficientDataError as error:
@@ -250,7 +253,7 @@ def discover_session(
     ]
     causes.sort(key=lambda cause: -cause[0].size_m)
     effects, groups = zip(*causes, strict=True) if causes else ((), ())
-    named = [cell for group in groups for cell in group]
+    named = [candidate for group in groups for candidate in group]
     moved = moved_markers(found, data, solution.noise, named)
     effects += tuple(effect.sampled(fit) for effect in moved)
     empty = solve(data, ())
@@ -267,14 +270,14 @@ def discover_session(
         verdict = 'undetermined'
     report('fitting what can be loaded', 0.0)
     measured = [
-        cell
+        candidate
         for effect, group in zip(effects, groups, strict=False)
         if effect.is_taken_out
-        for cell in group
+        for candidate in group
     ]
     alone = fit
     # Kinds that nobody named are in no file with zero-offsets either.
-    if not {*solution.cells} <= {*measured}:
+    if not {*solution.candidates} <= {*measured}:
         errors = solve(data, measured) if measured else None
         alone = fit_session(
             session,
@@ -346,7 +349,7 @@ def _sampled(
     found: Estimate,
     data: Residuals,
     models: Sequence[tuple[Solution, float]],
-    named: Sequence[Cell],
+    named: Sequence[Candidate],
     *,
     rng: np.random.Generator,
     report: Progress,
@@ -359,7 +362,7 @@ def _sampled(
     solution = models[0][0]
     unmodelled = Unmodelled.of(found, data, solution)
     moves = [unmodelled.by_models(models[1:])]
-    if solution.cells:
+    if solution.candidates:
         moves.append(unmodelled.by_open_offsets())
     if_drawn = unmodelled.std_of_offsets(moves)
     moves.append(unmodelled.by_drawing(named))
@@ -370,7 +373,7 @@ def _sampled(
         # Priors that let moved markers go.
         priors=None if found is before else found.problem.priors,
         precision=PRECISION,
-        extension=extension_of(data, solution, found) if solution.cells else None,
+        extension=extension_of(data, solution, found) if solution.candidates else None,
         unmodelled=np.concatenate(moves, axis=1),
         found=found,
         progress=lambda _, share: report('sampling the extended model', share),
@@ -415,15 +418,15 @@ def _left_by_moment(data: Residuals, solution: Solution) -> list[FloatArray]:
     """
     left = [data.left(solution)]
     reach = DATED_TO * float(np.ptp(data.context.elapsed_s))
-    for cell, where in zip(solution.cells, solution.slices(), strict=True):
+    for candidate, where in zip(solution.candidates, solution.slices(), strict=True):
         others = [
             other
             for other in at_other_moments(
-                cell, data.context, cell.moment - reach, cell.moment + reach
+                candidate, data.context, candidate.moment - reach, candidate.moment + reach
             )
-            if other.variant == cell.variant
+            if other.variant == candidate.variant
         ]
         for other in (others[0], others[-1]) if others else ():
-            moved = data.columns([cell]) - data.columns([other])
+            moved = data.columns([candidate]) - data.columns([other])
             left.append(left[0] + moved @ solution.parameters[where])
     return left

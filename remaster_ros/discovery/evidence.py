@@ -1,4 +1,4 @@
-"""How well a set of cells explains the residuals: parameters, noise, smoothness, evidence.
+"""How well a set of candidates explains the residuals: parameters, noise, smoothness, evidence.
 
 With w_s the weight (inverse variance) of error group s of the noise model, everything follows
 from the Gram matrices G_s of the columns in each group, whatever the number of rows::
@@ -8,7 +8,7 @@ from the Gram matrices G_s of the columns in each group, whatever the number of 
 
 (Patterson & Thompson 1971; Harville 1977). Noise and smoothness maximise L, by Newton's method
 with the average of observed and expected information, which follows from the factor of H (Gilmour,
-Thompson & Cullis 1995, Biometrics 51). Two sets of cells are compared by L in which every
+Thompson & Cullis 1995, Biometrics 51). Two sets of candidates are compared by L in which every
 unpenalised parameter pays ½ log N (Schwarz 1978) and every penalised one has its proper Gaussian
 prior. What is implausibly large costs more: Λ holds the prior of the unpenalised parameters, too,
 a Gaussian about 0 as wide as the largest plausible value.
@@ -28,7 +28,7 @@ from scipy.linalg.lapack import dpotrf, dpotri
 
 from remaster_ros.calibration.noise import RESOLUTION_M, Noise, NoiseModel
 from remaster_ros.discovery import packed
-from remaster_ros.discovery.effects.base import LARGEST_M, RANDOM, Cell
+from remaster_ros.discovery.effects.base import LARGEST_M, RANDOM, Candidate
 from remaster_ros.discovery.residuals import Residuals, units
 from remaster_ros.discovery.solution import Covariances, Solution
 from remaster_ros.types import FloatArray
@@ -51,23 +51,23 @@ SHORTEST = 1e-3
 _LARGE = 18.0
 
 
-def log_prior_one_by_one(cells: Sequence[Cell]) -> float:
-    """Return the log prior probability of cells among all that are tried."""
-    return -float(sum(np.log(cell.drawn_from) for cell in cells))
+def log_prior_one_by_one(candidates: Sequence[Candidate]) -> float:
+    """Return the log prior probability of candidates among all that are tried."""
+    return -float(sum(np.log(candidate.drawn_from) for candidate in candidates))
 
 
 def solve(
-    data: Residuals, cells: Sequence[Cell], start: Solution | None = None
+    data: Residuals, candidates: Sequence[Candidate], start: Solution | None = None
 ) -> Solution | None:
-    """Fit a set of cells; None where one of them adds nothing to the others.
+    """Fit a set of candidates; None where one of them adds nothing to the others.
 
     It may be empty. The search for noise and smoothness begins at those of another fit, if given.
     """
-    system = System.of(data, cells)
+    system = System.of(data, candidates)
     if system is None or not system.visible():
         return None
     try:
-        return system.solution(start, log_prior_one_by_one(cells))
+        return system.solution(start, log_prior_one_by_one(candidates))
     except np.linalg.LinAlgError:
         # The columns agree up to rounding: they cannot be distinguished.
         return None
@@ -75,7 +75,7 @@ def solve(
 
 @dataclass(eq=False)
 class System:
-    """The mixed-model equations of one set of cells, in scaled columns.
+    """The mixed-model equations of one set of candidates, in scaled columns.
 
     The Gram matrices are `packed`, (groups, length of size + 1).
     """
@@ -83,52 +83,60 @@ class System:
     model: NoiseModel
     grams: FloatArray
     guess: Noise
-    cells: tuple[Cell, ...]
+    candidates: tuple[Candidate, ...]
     base_precision: FloatArray
     unit: FloatArray
     ridge: FloatArray
 
     @classmethod
-    def of(cls, data: Residuals, cells: Sequence[Cell]) -> System | None:
-        """Assemble the equations of some cells; None if one of them displaces no marker."""
+    def of(cls, data: Residuals, candidates: Sequence[Candidate]) -> System | None:
+        """Assemble the equations of some candidates; None if one of them displaces no marker."""
         # Penalised ones last: one Cholesky factor holds all determinants.
-        cells = tuple(sorted(cells, key=lambda cell: cell.penalty is not None))
-        norms, grams = data.gram_matrices(cells)
+        candidates = tuple(sorted(candidates, key=lambda candidate: candidate.penalty is not None))
+        norms, grams = data.gram_matrices(candidates)
         p = data.base.shape[2]
-        free = np.array([c.penalty is None for c in cells for _ in c.parameters], dtype=bool)
+        free = np.array([c.penalty is None for c in candidates for _ in c.parameters], dtype=bool)
         if np.any(norms[p:-1][free] == 0.0):
             return None
-        scale = units(cells, norms[p:-1])
-        largest = np.array([cell.largest or np.nan for cell in cells for _ in cell.parameters])
+        scale = units(candidates, norms[p:-1])
+        largest = np.array(
+            [candidate.largest or np.nan for candidate in candidates for _ in candidate.parameters]
+        )
         typical = LARGEST_M * np.sqrt(len(data)) / scale
         std = np.where(np.isnan(largest), typical, largest)
         # Heights of a curve and weights of a kind have a plausible size, weights of kernels none.
         sized = np.array(
             [
-                cell.penalty is None or cell.curve is not None or cell.form == RANDOM
-                for cell in cells
-                for _ in cell.parameters
+                candidate.penalty is None
+                or candidate.curve is not None
+                or candidate.form == RANDOM
+                for candidate in candidates
+                for _ in candidate.parameters
             ],
             dtype=bool,
         )
         ridge = np.concatenate((np.zeros(p), np.where(sized, (std * scale) ** -2.0, 0.0)))
         unit = np.concatenate((np.ones(p), scale))
-        return cls(data.noise_model, grams, data.noise, cells, data.base_precision, unit, ridge)
+        return cls(
+            data.noise_model, grams, data.noise, candidates, data.base_precision, unit, ridge
+        )
 
     def __post_init__(self) -> None:
         self.p = len(self.base_precision)
         self.size = len(self.unit)
-        edges = self.p + np.cumsum([0, *(cell.size for cell in self.cells)])
+        edges = self.p + np.cumsum([0, *(candidate.size for candidate in self.candidates)])
         self.where = [slice(int(a), int(b)) for a, b in itertools.pairwise(edges)]
-        self.penalised = [i for i, cell in enumerate(self.cells) if cell.penalty is not None]
+        self.penalised = [
+            i for i, candidate in enumerate(self.candidates) if candidate.penalty is not None
+        ]
         # Of each the penalty, of order one in the scaled columns so that the factors start near
-        # right, and for the determinant its spectrum and the ridge, the same for all of a cell.
+        # right, and for the determinant its spectrum and the ridge, the same for all of it.
         self.penalties, self.spectra, self.ridges = [], [], []
         for i in self.penalised:
-            cell, u = self.cells[i], self.unit[self.where[i].start]
-            assert cell.penalty is not None
-            self.penalties.append(cell.penalty / u**2)
-            self.spectra.append(cell.roughness / u**2)
+            candidate, u = self.candidates[i], self.unit[self.where[i].start]
+            assert candidate.penalty is not None
+            self.penalties.append(candidate.penalty / u**2)
+            self.spectra.append(candidate.roughness / u**2)
             self.ridges.append(float(self.ridge[self.where[i].start]))
         # Base first, then unpenalised, then penalised.
         self.unpenalised = self.where[self.penalised[0]].start if self.penalised else self.size
@@ -173,14 +181,16 @@ class System:
     def most_likely(self, start: Mapping[object, float], noise: Noise | None) -> FloatArray:
         """Return the noise and smoothness, as logarithms, that maximise L.
 
-        ``start``: smoothness of cells by key, and noise, to begin at.
+        ``start``: smoothness of candidates by key, and noise, to begin at.
         """
         return self._most_likely(*self._start(start, self.guess if noise is None else noise))
 
     def factors(self, eta: FloatArray) -> dict[object, float]:
-        """Return the smoothness of each penalised cell, by key."""
+        """Return the smoothness of each penalised candidate, by key."""
         values = np.exp(eta[len(self.entering) :])
-        return {self.cells[i].key: float(v) for i, v in zip(self.penalised, values, strict=True)}
+        return {
+            self.candidates[i].key: float(v) for i, v in zip(self.penalised, values, strict=True)
+        }
 
     def estimate(self, eta: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return mean (size,) and covariance (size, size) of base and parameters."""
@@ -265,7 +275,7 @@ class System:
         return self._last[1]
 
     def solution(self, start: Solution | None, prior: float) -> Solution:
-        """Return the fit at the maximum of L, with the log prior of its cells."""
+        """Return the fit at the maximum of L, with the log prior of its candidates."""
         known = {} if start is None else start.factors()
         noise = self.guess if start is None else start.noise
         eta = self._most_likely(*self._start(known, noise))
@@ -273,10 +283,10 @@ class System:
         total, cholesky, beta = self._solved(eta)
         evidence = self._evidence(total, cholesky.root, weights, factors, beta)
         beta = beta / self.unit
-        smoothness = np.full(len(self.cells), np.nan)
+        smoothness = np.full(len(self.candidates), np.nan)
         smoothness[self.penalised] = factors
         return Solution(
-            self.cells,
+            self.candidates,
             beta[self.p :],
             beta[: self.p],
             self.noise(eta),
@@ -361,7 +371,7 @@ class System:
             )
         )
         factors = [
-            known[key] if (key := self.cells[i].key) in known else self._typical(which, noise)
+            known[key] if (key := self.candidates[i].key) in known else self._typical(which, noise)
             for which, i in enumerate(self.penalised)
         ]
         smooth = np.log(factors)
@@ -369,7 +379,7 @@ class System:
         bound = np.full(len(self.entering), np.log(RESOLUTION_M))
         low = np.concatenate((bound, smooth - _LARGE))
         high = np.concatenate((np.full(len(bound), np.log(0.1)), smooth + _LARGE))
-        least = np.array([self.cells[i].least for i in self.penalised])
+        least = np.array([self.candidates[i].least for i in self.penalised])
         with np.errstate(divide='ignore'):
             high[len(bound) :] = np.minimum(high[len(bound) :], -2.0 * np.log(least))
         low = np.minimum(low, high)

@@ -1,4 +1,4 @@
-"""The chosen cells as causes: grouped by name, compared with look-alikes, in sentences."""
+"""The chosen candidates as causes: grouped by name, compared with look-alikes, in sentences."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from scipy.special import expit
 
 from remaster_ros.calibration.gauge_words import the
 from remaster_ros.calibration.result import FitResult
-from remaster_ros.discovery.effects.base import Cell
+from remaster_ros.discovery.effects.base import Candidate
 from remaster_ros.discovery.effects.context import Context
 from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.discovery.residuals import Residuals
@@ -87,7 +87,7 @@ class FoundEffect:
     share: float | None = None
     # A look-alike that measurements could distinguish explains the data as well
     tied: bool = False
-    # What each of its cells amounts to, in arc minutes and millimetres with uncertainty
+    # What each of its candidates amounts to, in arc minutes and millimetres with uncertainty
     sizes: tuple[str, ...] = ()
     remedy: str = ''  # What to do about it
     title: str = ''  # A heading for people, such as 'Link length of joint 2'
@@ -100,11 +100,11 @@ class FoundEffect:
     probability: float | None = None
 
     def sampled(
-        self, result: FitResult, group: Sequence[Cell] = (), data: Residuals | None = None
+        self, result: FitResult, group: Sequence[Candidate] = (), data: Residuals | None = None
     ) -> FoundEffect:
         """Return the effect with its parameters as the extended model's posterior has them.
 
-        With its cells and the rows that they were fitted to, its sizes as well.
+        With its candidates and the rows that they were fitted to, its sizes as well.
         """
         found = self
         index = {name: i for i, name in enumerate(result.theta_names)}
@@ -117,10 +117,10 @@ class FoundEffect:
         )
         if data is not None and group:
             draws = result.theta_draws.reshape(-1, len(index))
-            wheres = [[index[name] for name in cell.parameters] for cell in group]
+            wheres = [[index[name] for name in candidate.parameters] for candidate in group]
             sizes = tuple(
-                EFFECTS[cell.name].size(data.part, cell, draws[:, where])
-                for cell, where in zip(group, wheres, strict=True)
+                EFFECTS[candidate.name].size(data.part, candidate, draws[:, where])
+                for candidate, where in zip(group, wheres, strict=True)
             )
             size_m = _size(data, group, [result.theta[where] for where in wheres])
             found = replace(found, sizes=sizes, size_m=size_m)
@@ -134,13 +134,14 @@ class FoundEffect:
         )
         return replace(found, cause=f'{found.cause} {doubt}', remedy=_later(found.remedy))
 
-    def _clear_sizes(self, group: Sequence[Cell]) -> tuple[str, ...]:
+    def _clear_sizes(self, group: Sequence[Candidate]) -> tuple[str, ...]:
         """Return the sizes that are more than their uncertainty, and how many others there are."""
         sigmas = {one.name: abs(one.value) / one.std for one in self.parameters if one.std > 0.0}
         clear = tuple(
             size
-            for size, cell in zip(self.sizes, group, strict=False)
-            if max((sigmas.get(name, np.inf) for name in cell.parameters), default=np.inf) >= CLEAR
+            for size, candidate in zip(self.sizes, group, strict=False)
+            if max((sigmas.get(name, np.inf) for name in candidate.parameters), default=np.inf)
+            >= CLEAR
         )
         others = len(self.sizes) - len(clear)
         if not clear or not others:
@@ -186,8 +187,8 @@ def with_sizes(cause: str, sizes: Sequence[str]) -> str:
 
 def describe(
     walk: Walk, progress: Callable[[float], None]
-) -> tuple[tuple[tuple[Cell, ...], ...], tuple[FoundEffect, ...]]:
-    """Return the cells of the best model grouped to causes, and the causes, the largest first."""
+) -> tuple[tuple[tuple[Candidate, ...], ...], tuple[FoundEffect, ...]]:
+    """Return the candidates of the best model by causes, and the causes, the largest first."""
     data, solution = walk.data, walk.best
     groups = [group for group in grouped(walk.claimed) if not _may_be_memory(walk, group)]
     groups.sort(key=lambda group: -size_of(data, solution, group))
@@ -199,7 +200,7 @@ def describe(
     return tuple(groups), tuple(effects)
 
 
-def _may_be_memory(walk: Walk, group: tuple[Cell, ...]) -> bool:
+def _may_be_memory(walk: Walk, group: tuple[Candidate, ...]) -> bool:
     """Return whether a cause is no more likely than not by the readings that are independent.
 
     Noise that remembers looks like whatever changes as slowly.
@@ -209,29 +210,37 @@ def _may_be_memory(walk: Walk, group: tuple[Cell, ...]) -> bool:
     return is_cause and share < 1.0 and walk.log_gain(group, share) < 0.0
 
 
-def grouped(cells: Sequence[Cell]) -> list[tuple[Cell, ...]]:
-    """Return the cells of each cause together, in the order of their first."""
-    groups: dict[tuple[str, ...], list[Cell]] = {}
-    for cell in cells:
-        key: tuple[str, ...] = (cell.name, cell.driver, cell.form, cell.subject)
-        cause_per = EFFECTS[cell.name].cause_per
+def grouped(candidates: Sequence[Candidate]) -> list[tuple[Candidate, ...]]:
+    """Return the candidates of each cause together, in the order of their first."""
+    groups: dict[tuple[str, ...], list[Candidate]] = {}
+    for candidate in candidates:
+        key: tuple[str, ...] = (
+            candidate.name,
+            candidate.driver,
+            candidate.form,
+            candidate.subject,
+        )
+        cause_per = EFFECTS[candidate.name].cause_per
         if cause_per != 'effect':
-            key += (str(cell.joints), cell.label if cause_per == 'variant' else '')
-        if cell.changes is not None:
-            key += (f'{cell.moment} {cell.ends}',)
-        groups.setdefault(key, []).append(cell)
+            key += (str(candidate.joints), candidate.label if cause_per == 'variant' else '')
+        if candidate.changes is not None:
+            key += (f'{candidate.moment} {candidate.ends}',)
+        groups.setdefault(key, []).append(candidate)
     return [tuple(group) for group in groups.values()]
 
 
-def _described(walk: Walk, group: tuple[Cell, ...], share: float) -> FoundEffect:
+def _described(walk: Walk, group: tuple[Candidate, ...], share: float) -> FoundEffect:
     data, solution, first = walk.data, walk.best, group[0]
-    wheres = dict(zip(solution.cells, solution.slices(), strict=True))
+    wheres = dict(zip(solution.candidates, solution.slices(), strict=True))
     variance = np.diag(solution.covariance)
     parameters = tuple(
-        Parameter(name, float(value), float(np.sqrt(square)), cell.unit)
-        for cell in group
+        Parameter(name, float(value), float(np.sqrt(square)), candidate.unit)
+        for candidate in group
         for name, value, square in zip(
-            cell.parameters, solution.parameters[wheres[cell]], variance[wheres[cell]], strict=True
+            candidate.parameters,
+            solution.parameters[wheres[candidate]],
+            variance[wheres[candidate]],
+            strict=True,
         )
     )
     if first.happened:
@@ -242,7 +251,7 @@ def _described(walk: Walk, group: tuple[Cell, ...], share: float) -> FoundEffect
         parameters += (Parameter('moment', first.moment, std, 's'),)
     gain = walk.log_gain(group)
     alike = _look_alikes(walk, group, gain)
-    probability = max(walk.probability_of(cell) for cell in group)
+    probability = max(walk.probability_of(candidate) for candidate in group)
     if walk.independent_share < 1.0 and EFFECTS[first.name].is_cause:
         probability = min(probability, float(expit(walk.log_gain(group, walk.independent_share))))
     # No measurement distinguishes names of the same displacement: it is there under any of them.
@@ -262,7 +271,7 @@ def _described(walk: Walk, group: tuple[Cell, ...], share: float) -> FoundEffect
         share=share,
         remedy=EFFECTS[first.name].remedy_of(first) if first.changes is None else CHANGED,
         title=titled(first, _joints(group)),
-        in_robot_model=all(cell.model_change is not None for cell in group),
+        in_robot_model=all(candidate.model_change is not None for candidate in group),
         of_measurement=first.of_measurement,
         moment_s=first.moment if first.happened else None,
         tied=any(
@@ -285,42 +294,42 @@ def _also_called(alike: Sequence[LookAlike]) -> str:
     )
 
 
-def _joints(group: Sequence[Cell]) -> tuple[int, ...]:
-    if len({cell.joints for cell in group}) == 1:
+def _joints(group: Sequence[Candidate]) -> tuple[int, ...]:
+    if len({candidate.joints for candidate in group}) == 1:
         return group[0].joints
-    return tuple(sorted({joint for cell in group for joint in cell.joints}))
+    return tuple(sorted({joint for candidate in group for joint in candidate.joints}))
 
 
-def _look_alikes(walk: Walk, group: tuple[Cell, ...], gain: float) -> tuple[LookAlike, ...]:
+def _look_alikes(walk: Walk, group: tuple[Candidate, ...], gain: float) -> tuple[LookAlike, ...]:
     """Return the other causes that models have in the place of a group, the likeliest first."""
-    cell, own = group[0], max(walk.probability_of(cell) for cell in group)
+    candidate, own = group[0], max(walk.probability_of(candidate) for candidate in group)
     best: dict[tuple[str, tuple[int, ...]], LookAlike] = {}
     for other, chance in walk.instead_of(group).items():
         key = (other.name, other.joints)
-        if chance < MENTIONED or key == (cell.name, _joints(group)):
+        if chance < MENTIONED or key == (candidate.name, _joints(group)):
             continue
         if key in best and (best[key].probability or 0.0) >= chance:
             continue
-        same = len(group) == 1 and _same(walk.data, cell, other)
+        same = len(group) == 1 and _same(walk.data, candidate, other)
         best[key] = LookAlike(
             *key,
             float(gain + np.log(chance / max(own, MENTIONED))),
-            separate_by(cell, other, same),
+            separate_by(candidate, other, same),
             same,
-            len(group) == 1 and cell.is_shape_of(other),
+            len(group) == 1 and candidate.is_shape_of(other),
             titled(other, other.joints),
             chance,
         )
     return tuple(sorted(best.values(), key=lambda alike: -(alike.probability or 0.0)))
 
 
-def _same(data: Residuals, cell: Cell, other: Cell) -> bool:
-    """Return whether two cells displace the marker alike in every row."""
-    if cell.size != other.size or cell.driver != other.driver:
+def _same(data: Residuals, candidate: Candidate, other: Candidate) -> bool:
+    """Return whether two candidates displace the marker alike in every row."""
+    if candidate.size != other.size or candidate.driver != other.driver:
         return False
     base = data.base.reshape(3 * len(data), -1)
     spaces = []
-    for columns in (data.columns([cell]), data.columns([other])):
+    for columns in (data.columns([candidate]), data.columns([other])):
         flat = columns.reshape(3 * len(data), -1)
         norm = np.linalg.norm(flat, axis=0)
         if not norm.all():
@@ -356,20 +365,24 @@ class SearchRecord:
     less_likely: tuple[LessLikely, ...]
 
     @classmethod
-    def of(cls, walk: Walk, named: Sequence[tuple[Cell, ...]]) -> SearchRecord:
+    def of(cls, walk: Walk, named: Sequence[tuple[Candidate, ...]]) -> SearchRecord:
         """Return the record of a walk in which these causes are named."""
-        taken = {at_any_time(cell) for group in named for cell in group}
-        cells = {identity(cell): cell for model in walk.models for cell in walk.present(model)}
+        taken = {at_any_time(candidate) for group in named for candidate in group}
+        candidates = {
+            identity(candidate): candidate
+            for model in walk.models
+            for candidate in walk.present(model)
+        }
         less = [
             LessLikely(
-                EFFECTS[cell.name].reported_as or cell.name,
-                cell.joints,
-                titled(cell, cell.joints),
+                EFFECTS[candidate.name].reported_as or candidate.name,
+                candidate.joints,
+                titled(candidate, candidate.joints),
                 walk.probability[key],
             )
-            for key, cell in cells.items()
-            if at_any_time(cell) not in taken
-            and EFFECTS[cell.name].is_cause
+            for key, candidate in candidates.items()
+            if at_any_time(candidate) not in taken
+            and EFFECTS[candidate.name].is_cause
             and walk.probability[key] >= LISTED_FROM
         ]
         less.sort(key=lambda one: -one.probability)
@@ -388,22 +401,22 @@ CHANGED = (
 """What to do about a cause that begins or changes in mid-session."""
 
 
-def size_of(data: Residuals, solution: Solution, group: Sequence[Cell]) -> float:
+def size_of(data: Residuals, solution: Solution, group: Sequence[Candidate]) -> float:
     """Return the RMS of a cause's displacement after absorption by the offsets model, m."""
-    wheres = dict(zip(solution.cells, solution.slices(), strict=True))
-    return _size(data, group, [solution.parameters[wheres[cell]] for cell in group])
+    wheres = dict(zip(solution.candidates, solution.slices(), strict=True))
+    return _size(data, group, [solution.parameters[wheres[candidate]] for candidate in group])
 
 
-def _size(data: Residuals, group: Sequence[Cell], parameters: Sequence[FloatArray]) -> float:
+def _size(data: Residuals, group: Sequence[Candidate], parameters: Sequence[FloatArray]) -> float:
     shift = np.zeros((len(data), 3))
-    for cell, values in zip(group, parameters, strict=True):
-        shift += data.columns([cell]) @ values
+    for candidate, values in zip(group, parameters, strict=True):
+        shift += data.columns([candidate]) @ values
     flat, base = shift.ravel(), data.base.reshape(3 * len(data), -1)
     left = flat - base @ (base.T @ flat)
     return float(np.sqrt(np.sum(left**2) / len(data)))
 
 
-def separate_by(cell: Cell, other: Cell, same: bool) -> str:
+def separate_by(candidate: Candidate, other: Candidate, same: bool) -> str:
     """Return which measurements distinguish two causes."""
     if same:
         return (
@@ -412,12 +425,12 @@ def separate_by(cell: Cell, other: Cell, same: bool) -> str:
         )
     texts = [
         EFFECTS[c.name].separate_by.format(driver=c.driver.replace('_', ' '))
-        for c in (cell, other)
+        for c in (candidate, other)
     ]
     return '; and '.join(dict.fromkeys(texts))
 
 
-def in_words(group: Sequence[Cell], context: Context) -> str:
+def in_words(group: Sequence[Candidate], context: Context) -> str:
     """Return the sentence for a technician, with what the session leaves open."""
     first = group[0]
     joints = _joints(group)
@@ -450,22 +463,24 @@ def in_words(group: Sequence[Cell], context: Context) -> str:
     return sentence
 
 
-def _when(cell: Cell, context: Context) -> str:
-    """Return when a cell's step was: by the clock, since the first row, and in configurations."""
-    if np.isnan(cell.moment):
+def _when(candidate: Candidate, context: Context) -> str:
+    """Return when a step was: by the clock, since the first row, and between configurations."""
+    if np.isnan(candidate.moment):
         return ''
-    configuration, after = context.measurements.configuration, context.elapsed_s > cell.moment
+    configuration, after = context.measurements.configuration, context.elapsed_s > candidate.moment
     before = configuration[~after][np.argmax(context.elapsed_s[~after])]
     behind = configuration[after][np.argmin(context.elapsed_s[after])]
-    stamp = cell.moment + float(context.measurements.stamp_s[0] - context.elapsed_s[0])
+    stamp = candidate.moment + float(context.measurements.stamp_s[0] - context.elapsed_s[0])
     clock = f'at {words}, ' if (words := clock_time(stamp)) else ''
     return (
-        f'{clock}{cell.moment / 60.0:.1f} min after the first reading, '
+        f'{clock}{candidate.moment / 60.0:.1f} min after the first reading, '
         f'between configurations {before} and {behind},'
     )
 
 
-def shares(data: Residuals, groups: Sequence[tuple[Cell, ...]], solution: Solution) -> list[float]:
+def shares(
+    data: Residuals, groups: Sequence[tuple[Candidate, ...]], solution: Solution
+) -> list[float]:
     """Return the share of the gain in mean square that is lost without each cause.
 
     Everything else is fitted again, with noise and variances as they are. Two causes that imitate
@@ -488,8 +503,8 @@ def shares(data: Residuals, groups: Sequence[tuple[Cell, ...]], solution: Soluti
 class _Parts:
     """What fits of some of the causes leave of some rows.
 
-    The equations of base and cells; products of what they displace in the rows to judge, and of
-    the errors there, m²; places of the base columns, and those of each cause.
+    The equations of base and candidates; products of what they displace in the rows to judge, and
+    of the errors there, m²; places of the base columns, and those of each cause.
     """
 
     H: FloatArray
@@ -502,13 +517,13 @@ class _Parts:
     def of(
         cls,
         data: Residuals,
-        groups: Sequence[tuple[Cell, ...]],
+        groups: Sequence[tuple[Candidate, ...]],
         solution: Solution,
         rows: BoolArray,
     ) -> _Parts:
         """Assemble; rows are those to judge by, (all rows,)."""
-        p, cells = data.base.shape[2], solution.cells
-        joined = (data.base, data.columns(cells), data.errors[:, :, None])
+        p, candidates = data.base.shape[2], solution.candidates
+        joined = (data.base, data.columns(candidates), data.errors[:, :, None])
         white = data.noise_model.whitened(np.concatenate(joined, axis=2), solution.noise)
         flat = white.reshape(3 * len(data), -1)
         H = flat.T @ flat
@@ -519,15 +534,17 @@ class _Parts:
         gram = np.zeros((len(pull) + 1, len(pull) + 1))
         for block, context in data.context.blocks():
             mine = rows[block]
-            columns = [cell.columns(context).displacement(context) for cell in cells]
+            columns = [
+                candidate.columns(context).displacement(context) for candidate in candidates
+            ]
             seen = (data.full_base[block], *columns, data.full_errors[block][:, :, None])
             flat = np.concatenate(seen, axis=2)[mine].reshape(-1, len(gram))
             gram += flat.T @ flat
         places = {
-            cell: p + np.arange(where.start, where.stop)
-            for cell, where in zip(cells, solution.slices(), strict=True)
+            candidate: p + np.arange(where.start, where.stop)
+            for candidate, where in zip(candidates, solution.slices(), strict=True)
         }
-        where = [np.concatenate([places[cell] for cell in group]) for group in groups]
+        where = [np.concatenate([places[candidate] for candidate in group]) for group in groups]
         return cls(H, pull, gram, np.arange(p), where)
 
     def left(self, causes: set[int]) -> float:

@@ -27,7 +27,7 @@ from remaster_ros.calibration.laplace import Mode
 from remaster_ros.calibration.priors import TIGHTEST_PRIOR, prior_rows
 from remaster_ros.calibration.result import FitResult
 from remaster_ros.discovery.effects import joint_axis_tilt, link_length
-from remaster_ros.discovery.effects.base import Cell
+from remaster_ros.discovery.effects.base import Candidate
 from remaster_ros.discovery.effects.context import Context
 from remaster_ros.discovery.evidence import solve
 from remaster_ros.discovery.random_effects import Family, by_members
@@ -53,7 +53,7 @@ class GeometryModel:
 
     # Of the drawing: RMS displacement of the marker by each length and each tilt, m
     tolerance_m: float
-    members: tuple[Cell, ...]  # Their cells; ``variant`` is the axis
+    members: tuple[Candidate, ...]  # Their candidates; ``variant`` is the axis
     # Standard deviation of each before it is measured, as RMS displacement of the marker, m, (m,)
     std_m: FloatArray
     # What one such standard deviation of each does to each zero-offset of the fit that takes the
@@ -118,7 +118,7 @@ class GeometryModel:
         moved: FloatArray = np.hypot(std, np.linalg.norm(self.offset_moves, axis=1))
         return moved
 
-    def largest_imitation(self, joint: int) -> tuple[Cell, float]:
+    def largest_imitation(self, joint: int) -> tuple[Candidate, float]:
         """Return which length or tilt of the tolerance moves a joint's offset most, and by what.
 
         Parameters
@@ -128,7 +128,7 @@ class GeometryModel:
 
         Returns
         -------
-        Cell, float
+        Candidate, float
             The length or tilt, and the change of the offset, rad or m.
         """
         moves = np.abs(self.offset_moves[joint]) * (self.tolerance_m / self.std_m)
@@ -137,7 +137,7 @@ class GeometryModel:
 
 
 @one_thread
-def geometry_model(found: Estimate, causes: Sequence[Cell] = ()) -> GeometryModel | None:
+def geometry_model(found: Estimate, causes: Sequence[Candidate] = ()) -> GeometryModel | None:
     """Fit all lengths and tilts beside the zero-offsets; None where they cannot be fitted.
 
     Parameters
@@ -159,13 +159,13 @@ def geometry_model(found: Estimate, causes: Sequence[Cell] = ()) -> GeometryMode
         for members in (_lengths(data.context), _tilts(data.context))
         if (family := Family.of(data, members[0].name, members, tolerance_m)) is not None
     ]
-    cells = [*(family.cell for family in families), *causes]
-    solution = solve(data, cells) if families else None
+    candidates = [*(family.candidate for family in families), *causes]
+    solution = solve(data, candidates) if families else None
     if drawing is None or solution is None:
         return None
-    factors = dict(zip(solution.cells, solution.smoothness, strict=True))
+    factors = dict(zip(solution.candidates, solution.smoothness, strict=True))
     std_m = np.concatenate(
-        [np.full(len(one.members), factors[one.cell] ** -0.5) for one in families]
+        [np.full(len(one.members), factors[one.candidate] ** -0.5) for one in families]
     )
     members = tuple(member for one in families for member in one.members)
     solution = by_members(solution, families)
@@ -176,7 +176,7 @@ def geometry_model(found: Estimate, causes: Sequence[Cell] = ()) -> GeometryMode
     model = mode.linearisation.posterior.model
     x = model.natural(mode.z)
     # Errors of the measurement come behind all members.
-    loaded = _loaded(found, solution.cells, model.theta(x), causes)
+    loaded = _loaded(found, solution.candidates, model.theta(x), causes)
     if loaded is None:
         return None
     return GeometryModel(
@@ -193,7 +193,10 @@ def geometry_model(found: Estimate, causes: Sequence[Cell] = ()) -> GeometryMode
 
 
 def _loaded(
-    found: Estimate, cells: Sequence[Cell], theta: FloatArray, causes: Sequence[Cell]
+    found: Estimate,
+    candidates: Sequence[Candidate],
+    theta: FloatArray,
+    causes: Sequence[Candidate],
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray] | None:
     """Return shifts, turns, zero-offsets and the errors of all rows on an arm with some lengths.
 
@@ -202,12 +205,12 @@ def _loaded(
     chain = found.problem.chain
     shifts, turns = np.zeros((2, len(chain), 3))
     at = 0
-    for cell in cells:
-        values = theta[at : at + cell.size]
-        at += cell.size
-        if cell.model_change is not None:
-            shifts[cell.model_change.joint] += values @ cell.model_change.shifts
-            turns[cell.model_change.joint] += values @ cell.model_change.turns
+    for candidate in candidates:
+        values = theta[at : at + candidate.size]
+        at += candidate.size
+        if candidate.model_change is not None:
+            shifts[candidate.model_change.joint] += values @ candidate.model_change.shifts
+            turns[candidate.model_change.joint] += values @ candidate.model_change.turns
     try:
         moved = estimate(replace(found.problem, chain=_moved(chain, shifts, turns)))
     except InsufficientDataError:
@@ -223,7 +226,7 @@ def mean_length(errors: FloatArray) -> float:
     return float(np.linalg.norm(errors, axis=1).mean()) if len(errors) else float('nan')
 
 
-def _fitted(found: Estimate, causes: Sequence[Cell]) -> Estimate | None:
+def _fitted(found: Estimate, causes: Sequence[Candidate]) -> Estimate | None:
     """Return the fit with some causes beside it; None where they cannot be fitted."""
     if not causes:
         return found
@@ -260,20 +263,22 @@ def _without_open_offsets(found: Estimate) -> Estimate:
     return estimate(replace(found.problem, priors=held))
 
 
-def _lengths(context: Context) -> list[Cell]:
+def _lengths(context: Context) -> list[Candidate]:
     # A link's own direction is one more where it is none of the axes of its frame.
-    cells = list(link_length.cells(context))
-    per_link = {joint: [c for c in cells if c.joints == (joint,)] for joint in context.links()}
+    candidates = list(link_length.candidates(context))
+    per_link = {
+        joint: [c for c in candidates if c.joints == (joint,)] for joint in context.links()
+    }
     return [
-        cell
+        candidate
         for own in per_link.values()
-        for cell in own
-        if cell.variant != 'along' or len(own) <= len('xyz')
+        for candidate in own
+        if candidate.variant != 'along' or len(own) <= len('xyz')
     ]
 
 
-def _tilts(context: Context) -> list[Cell]:
-    return [cell for cell in joint_axis_tilt.cells(context) if cell.size == 1]
+def _tilts(context: Context) -> list[Candidate]:
+    return [candidate for candidate in joint_axis_tilt.candidates(context) if candidate.size == 1]
 
 
 def _offset_moves(found: Estimate, data: Residuals, families: Sequence[Family]) -> FloatArray:
@@ -282,7 +287,7 @@ def _offset_moves(found: Estimate, data: Residuals, families: Sequence[Family]) 
     known = data.full_jacobian[data.rows.source][:, :, free]
     x = found.model.natural(found.mode.z)
     rows = prior_rows(found.model, found.posterior.priors, x, natural=True)[1][:, free]
-    both = np.concatenate((known, data.columns([one.cell for one in families])), axis=2)
+    both = np.concatenate((known, data.columns([one.candidate for one in families])), axis=2)
     white = data.noise_model.whitened(both, data.noise).reshape(3 * len(data), -1)
     moved = np.zeros((found.model.size, white.shape[1] - len(free)))
     # The fit of the offsets to errors of that size.

@@ -12,7 +12,7 @@ from remaster_ros.calibration.comparison import predicted_rows
 from remaster_ros.calibration.estimate import Estimate
 from remaster_ros.calibration.gauge_words import listed
 from remaster_ros.calibration.result import FitResult
-from remaster_ros.discovery.effects.base import Cell
+from remaster_ros.discovery.effects.base import Candidate
 from remaster_ros.discovery.explain import FoundEffect, size_of
 from remaster_ros.discovery.gain import Gain
 from remaster_ros.discovery.residuals import Residuals
@@ -118,12 +118,12 @@ def nameless(data: Residuals, solution: Solution, p_value: float) -> Unexplained
 
     Of the model of all kinds of errors, by members; a p-value of gaining as much by chance.
     """
-    kinds: dict[str, list[Cell]] = {}
-    for cell in solution.cells:
-        kinds.setdefault(cell.name, []).append(cell)
-    sizes = {name: size_of(data, solution, cells) for name, cells in kinds.items()}
+    kinds: dict[str, list[Candidate]] = {}
+    for candidate in solution.candidates:
+        kinds.setdefault(candidate.name, []).append(candidate)
+    sizes = {name: size_of(data, solution, candidates) for name, candidates in kinds.items()}
     order = sorted(sizes, key=lambda name: -sizes[name])
-    first, size = kinds[order[0]][0], size_of(data, solution, solution.cells)
+    first, size = kinds[order[0]][0], size_of(data, solution, solution.candidates)
     words = [
         f'{name.replace("_", " ")} ({1e3 * sizes[name]:.3f} mm)' for name in order[:MOST_LISTED]
     ]

@@ -16,7 +16,7 @@ from scipy.special import expit
 from remaster_ros.calibration.estimate import Estimate
 from remaster_ros.calibration.gauge_words import the
 from remaster_ros.calibration.noise import Noise
-from remaster_ros.discovery.effects.base import Cell
+from remaster_ros.discovery.effects.base import Candidate
 from remaster_ros.discovery.effects.marker_offset import EFFECT as MARKER_OFFSET
 from remaster_ros.discovery.effects.sizes import number
 from remaster_ros.discovery.explain import FoundEffect, Parameter
@@ -38,7 +38,7 @@ HIDDEN = 0.1
 
 
 def moved_markers(
-    found: Estimate, data: Residuals, noise: Noise, causes: Sequence[Cell]
+    found: Estimate, data: Residuals, noise: Noise, causes: Sequence[Candidate]
 ) -> tuple[FoundEffect, ...]:
     """Return an effect for every marker that the fit moved beyond its stated accuracy.
 

@@ -333,14 +333,16 @@ def errors_by_place(
     explain more of the means of the poses than noise would, beside all that was found? Half a lens
     that is bent, too little for a cause of its own, shows so.
     """
-    rows, cells = data.rows, solution.cells
-    parts = [data.base, data.columns(cells), data.errors[:, :, None], of_position(rows)]
+    rows, candidates = data.rows, solution.candidates
+    parts = [data.base, data.columns(candidates), data.errors[:, :, None], of_position(rows)]
     white = data.noise_model.whitened(np.concatenate(parts, axis=2), solution.noise)
     fitted = parts[0].shape[2] + parts[1].shape[2]
     model, errors, places = np.split(white, [fitted, fitted + 1], axis=2)
     left = rows.group_sum(data.left(solution)) / rows.group_size[:, None]
     noise_m = data.noise_model.sensor_noise(solution.noise).total
-    located = {cell.subject for cell in cells if cell.name == SENSOR_FIELD.name}
+    located = {
+        candidate.subject for candidate in candidates if candidate.name == SENSOR_FIELD.name
+    }
     families = np.split(places, len(rows.spans), axis=2)
     for (sensor, _), family in zip(rows.spans, families, strict=True):
         name = data.context.sensor_names[sensor]
@@ -381,7 +383,7 @@ def compared_held_out(
     source = of_spread_poses(measurements, source)
 
     def contrasts(part: Residuals) -> Contrasts:
-        columns = part.base, part.columns(solution.cells), part.left(solution)[:, :, None]
+        columns = part.base, part.columns(solution.candidates), part.left(solution)[:, :, None]
         white = part.noise_model.whitened(np.concatenate(columns, axis=2), solution.noise)
         return Contrasts.of(part.rows, measurements, white)
 

@@ -20,7 +20,7 @@ from functools import partial
 
 import numpy as np
 
-from remaster_ros.discovery.effects.base import RANDOM, Cell, Design
+from remaster_ros.discovery.effects.base import RANDOM, Candidate, Design
 from remaster_ros.discovery.effects.context import Context
 from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.discovery.residuals import Residuals
@@ -38,8 +38,8 @@ LEAST_SHARE = 1e-7
 class Family:
     """All members of one kind of error."""
 
-    cell: Cell  # Of the weights of all members, m, with a penalty of one
-    members: tuple[Cell, ...]  # The cells that displace a marker
+    candidate: Candidate  # Of the weights of all members, m, with a penalty of one
+    members: tuple[Candidate, ...]  # The candidates that displace a marker
     # Parameters of each member, in its unit, from its weights, (member's size, weights)
     maps: tuple[FloatArray, ...]
     # Factor from the smoothness of the family to that of each penalised member, and from the
@@ -57,14 +57,14 @@ class Family:
         cls,
         data: Residuals,
         name: str,
-        members: Sequence[Cell],
+        members: Sequence[Candidate],
         least: float = 0.0,
-        alike: Sequence[Cell] = (),
+        alike: Sequence[Candidate] = (),
     ) -> Family | None:
-        """Make the family of some cells; None where none of them displaces a marker.
+        """Make the family of some candidates; None where none of them displaces a marker.
 
-        Its weights have a standard deviation of no less than ``least``, m. ``alike``: cells whose
-        joints move the marker as much as theirs count to; the members by default.
+        Its weights have a standard deviation of no less than ``least``, m. ``alike``: candidates
+        whose joints move the marker as much as theirs count to; the members by default.
         """
         seen, maps, scales, largest = [], [], [], []
         lever = _lever(data, alike or members)
@@ -97,7 +97,7 @@ class Family:
         if not seen:
             return None
         count = sum(one.shape[1] for one in maps)
-        cell = Cell(
+        candidate = Candidate(
             name=name,
             place=seen[0].place,
             driver=seen[0].driver,
@@ -110,17 +110,17 @@ class Family:
             least=least,
             largest=max(largest),
         )
-        return cls(cell, tuple(seen), tuple(maps), tuple(scales))
+        return cls(candidate, tuple(seen), tuple(maps), tuple(scales))
 
 
-def _lever(data: Residuals, members: Sequence[Cell]) -> float:
-    """Return the RMS displacement of the marker by a radian of the joints of some cells, m."""
+def _lever(data: Residuals, members: Sequence[Candidate]) -> float:
+    """Return the RMS displacement of the marker by a radian of the candidates' joints, m."""
     joints = sorted({member.joints[0] - 1 for member in members if member.place == 'joint_angle'})
     jacobian = (data.part.jacobian * data.part.chain.per_radian)[:, :, joints]
     return float(np.sqrt(np.sum(jacobian**2) / max(1, len(jacobian) * len(joints))))
 
 
-def _columns(context: Context, members: Sequence[Cell], maps: Sequence[FloatArray]) -> Design:
+def _columns(context: Context, members: Sequence[Candidate], maps: Sequence[FloatArray]) -> Design:
     parts = [
         member.columns(context).displacement(context) @ one
         for member, one in zip(members, maps, strict=True)
@@ -128,28 +128,30 @@ def _columns(context: Context, members: Sequence[Cell], maps: Sequence[FloatArra
     return Design(None, np.concatenate(parts, axis=2))
 
 
-def kinds(data: Residuals, cells: Sequence[Cell], apart: Sequence[Cell] = ()) -> list[Family]:
-    """Return a family for each effect of some cells, without members that are found by themselves.
+def kinds(
+    data: Residuals, candidates: Sequence[Candidate], apart: Sequence[Candidate] = ()
+) -> list[Family]:
+    """Return a family for each effect of some candidates, without members found by themselves.
 
     Of a joint with several variants those of `Effect.in_family` are members, and of two with a
     parameter in common the larger. What is drawn from thousands (orders of a gear, moments of a
     step, what has no name) is no family: with one variance each would be lost among the others.
     """
-    taken = {name for cell in apart for name in cell.parameters}
-    taken_places = {(cell.name, cell.joints, cell.subject) for cell in apart}
-    members: dict[str, list[Cell]] = {}
-    for cell in sorted(cells, key=lambda cell: -cell.size):
-        effect = EFFECTS[cell.name]
+    taken = {name for candidate in apart for name in candidate.parameters}
+    taken_places = {(candidate.name, candidate.joints, candidate.subject) for candidate in apart}
+    members: dict[str, list[Candidate]] = {}
+    for candidate in sorted(candidates, key=lambda candidate: -candidate.size):
+        effect = EFFECTS[candidate.name]
         if (
             effect.many
-            or cell.changes is not None
-            or not effect.in_family(cell)
-            or taken & set(cell.parameters)
+            or candidate.changes is not None
+            or not effect.in_family(candidate)
+            or taken & set(candidate.parameters)
         ):
             continue
-        if (cell.name, cell.joints, cell.subject) not in taken_places:
-            members.setdefault(cell.name, []).append(cell)
-            taken |= set(cell.parameters)
+        if (candidate.name, candidate.joints, candidate.subject) not in taken_places:
+            members.setdefault(candidate.name, []).append(candidate)
+            taken |= set(candidate.parameters)
     families = (Family.of(data, f'every {name}', mine) for name, mine in members.items())
     return [family for family in families if family is not None]
 
@@ -159,30 +161,30 @@ def by_members(solution: Solution, families: Sequence[Family]) -> Solution:
 
     The same fit: each member has the prior that the family gives it.
     """
-    known = {family.cell: family for family in families}
-    cells: list[Cell] = []
+    known = {family.candidate: family for family in families}
+    candidates: list[Candidate] = []
     maps: list[FloatArray] = []
     smoothness: list[float] = []
     ridge: list[FloatArray] = []
     precisions = solution.weight_precisions()
-    for cell, where, factor in zip(
-        solution.cells, solution.slices(), solution.smoothness, strict=True
+    for candidate, where, factor in zip(
+        solution.candidates, solution.slices(), solution.smoothness, strict=True
     ):
-        family = known.get(cell)
+        family = known.get(candidate)
         if family is None:
-            cells.append(cell)
-            maps.append(np.eye(cell.size))
+            candidates.append(candidate)
+            maps.append(np.eye(candidate.size))
             smoothness.append(factor)
             ridge.append(solution.ridge[where])
             continue
-        cells += family.members
+        candidates += family.members
         maps += family.maps
         for member, scale in zip(family.members, family.scales, strict=True):
             if member.penalty is None:
                 smoothness.append(np.nan)
-                ridge.append(precisions[cell] * scale)
+                ridge.append(precisions[candidate] * scale)
             else:
-                smoothness.append(float(precisions[cell] * scale[0]))
+                smoothness.append(float(precisions[candidate] * scale[0]))
                 ridge.append(np.zeros(member.size))
     together = _diagonal(maps)
     p = len(solution.base)
@@ -194,7 +196,7 @@ def by_members(solution: Solution, families: Sequence[Family]) -> Solution:
 
     return replace(
         solution,
-        cells=tuple(cells),
+        candidates=tuple(candidates),
         parameters=together @ solution.parameters,
         smoothness=np.array(smoothness),
         ridge=np.concatenate(ridge) if ridge else np.zeros(0),

@@ -24,7 +24,7 @@ from remaster_ros.calibration.outliers import robust_noise
 from remaster_ros.calibration.path_noise import PathNoise
 from remaster_ros.calibration.priors import STEP_STD
 from remaster_ros.discovery import packed
-from remaster_ros.discovery.effects.base import Cell
+from remaster_ros.discovery.effects.base import Candidate
 from remaster_ros.discovery.effects.context import BLOCK_ROWS, Context
 from remaster_ros.linear_algebra import svd
 from remaster_ros.types import FloatArray, IntArray
@@ -39,11 +39,11 @@ KEPT_GRAMS = 4
 
 
 class Fit(Protocol):
-    """Cells with their parameters (m,), and the step of the base columns (p,) beside them."""
+    """Candidates with their parameters (m,), and the step of the base columns (p,) beside them."""
 
     @property
-    def cells(self) -> tuple[Cell, ...]:
-        """The cells."""
+    def candidates(self) -> tuple[Candidate, ...]:
+        """The candidates."""
 
     @property
     def parameters(self) -> FloatArray:
@@ -174,8 +174,8 @@ class Residuals:
         return self.context.at(self.rows.source)
 
     @cached_property
-    def _displacements(self) -> dict[Cell, FloatArray]:
-        """What `columns` has computed so far: a search fits the same few cells again and again."""
+    def _displacements(self) -> dict[Candidate, FloatArray]:
+        """What `columns` has computed so far: a search fits the same few again and again."""
         return {}
 
     @cached_property
@@ -189,64 +189,70 @@ class Residuals:
         """Number of poses."""
         return int(self.pose_of_row.max()) + 1
 
-    def columns(self, cells: Sequence[Cell]) -> FloatArray:
+    def columns(self, candidates: Sequence[Candidate]) -> FloatArray:
         """Return what a unit of each parameter displaces in the rows worked on, (n, 3, c)."""
         kept = self._displacements
-        for cell in cells:
-            if cell not in kept:
-                kept[cell] = cell.columns(self.part).displacement(self.part)
-        parts = [kept[cell] for cell in cells]
+        for candidate in candidates:
+            if candidate not in kept:
+                kept[candidate] = candidate.columns(self.part).displacement(self.part)
+        parts = [kept[candidate] for candidate in candidates]
         joined = np.concatenate([np.zeros((len(self), 3, 0)), *parts], axis=2)
         while len(kept) > 1 and sum(values.nbytes for values in kept.values()) > KEPT_BYTES:
             del kept[next(iter(kept))]
         return joined
 
     @cached_property
-    def _grams(self) -> list[tuple[tuple[Cell, ...], FloatArray, FloatArray]]:
-        """The last sets of `gram_matrices`, each in the order base, errors, cells.
+    def _grams(self) -> list[tuple[tuple[Candidate, ...], FloatArray, FloatArray]]:
+        """The last sets of `gram_matrices`, each in the order base, errors, candidates.
 
-        A search fits parts of them, and them with a cell more.
+        A search fits parts of them, and them with a candidate more.
         """
         return [((), *self._grams_of((), np.empty((1, 0)), 0))]
 
-    def gram_matrices(self, cells: Sequence[Cell]) -> tuple[FloatArray, FloatArray]:
-        """Return norms and Gram matrices of the base columns, of cells, and of the errors.
+    def gram_matrices(self, candidates: Sequence[Candidate]) -> tuple[FloatArray, FloatArray]:
+        """Return norms and Gram matrices of the base columns, of candidates, and of the errors.
 
         Norms over all rows, (p + c + 1,); `packed` matrices of each error group of the noise
-        model, with the columns of cells in their units (`units`), (groups, length), to read.
+        model, with the columns of candidates in their units (`units`), (groups, length), to read.
         """
-        wanted = set(cells)
+        wanted = set(candidates)
         known, norms, grams = max(
-            self._grams, key=lambda one: sum(cell.size for cell in one[0] if cell in wanted)
+            self._grams,
+            key=lambda one: sum(candidate.size for candidate in one[0] if candidate in wanted),
         )
         if not wanted <= set(known):
-            part = [cell for cell in known if cell in wanted]
+            part = [candidate for candidate in known if candidate in wanted]
             chosen = self._positions(known, part)
-            known = (*part, *(cell for cell in cells if cell not in part))
+            known = (*part, *(candidate for candidate in candidates if candidate not in part))
             norms, grams = self._grams_of(known, packed.picked(grams, chosen), len(chosen))
             self._grams.insert(0, (known, norms, grams))
             sizes = np.cumsum([kept.nbytes for _, _, kept in self._grams])
             del self._grams[max(1, min(KEPT_GRAMS, int(np.sum(sizes < KEPT_BYTES)))) :]
         p = self.base.shape[2]
-        order = np.append(np.delete(self._positions(known, cells), p), p)
+        order = np.append(np.delete(self._positions(known, candidates), p), p)
         return norms[order], packed.picked(grams, order)
 
-    def _positions(self, known: Sequence[Cell], cells: Sequence[Cell]) -> IntArray:
-        """Return where base, errors and some cells are among the columns of a set of `_grams`."""
+    def _positions(self, known: Sequence[Candidate], candidates: Sequence[Candidate]) -> IntArray:
+        """Return where base, errors and candidates are among the columns of a set of `_grams`."""
         count = self.base.shape[2] + 1
-        first = dict(zip(known, np.cumsum([count, *(cell.size for cell in known)]), strict=False))
-        parts = [np.arange(first[cell], first[cell] + cell.size) for cell in cells]
+        first = dict(
+            zip(known, np.cumsum([count, *(candidate.size for candidate in known)]), strict=False)
+        )
+        parts = [
+            np.arange(first[candidate], first[candidate] + candidate.size)
+            for candidate in candidates
+        ]
         return np.concatenate([np.arange(count), *parts])
 
     def _grams_of(
-        self, cells: Sequence[Cell], first: FloatArray, known: int
+        self, candidates: Sequence[Candidate], first: FloatArray, known: int
     ) -> tuple[FloatArray, FloatArray]:
-        """Return norms and Gram matrices of base, errors and cells; of so many columns known."""
+        """Return norms and Gram matrices of base, errors, candidates; of so many columns known."""
         p = self.base.shape[2]
-        columns = self.base, self.errors[:, :, None], self.columns(cells)
+        columns = self.base, self.errors[:, :, None], self.columns(candidates)
         joined = np.concatenate(columns, axis=2)
         norms = np.sqrt(np.einsum('nim,nim->m', joined, joined))
-        joined[:, :, p + 1 :] /= units(cells, norms[p + 1 :])
+        joined[:, :, p + 1 :] /= units(candidates, norms[p + 1 :])
         # Matrices of a thousand columns are most of what a search holds: none is there twice.
         model, done = self.noise_model, packed.length(known)
         grams = np.zeros((len(model.error_groups), packed.length(len(norms))))
@@ -260,38 +266,40 @@ class Residuals:
         grams.setflags(write=False)
         return norms, grams
 
-    def displaced(self, cells: Sequence[Cell], parameters: FloatArray) -> FloatArray:
-        """Return what cells with these parameters displace in every row, m, (all rows, 3)."""
+    def displaced(self, candidates: Sequence[Candidate], parameters: FloatArray) -> FloatArray:
+        """Return what candidates with these parameters displace in every row, m, (all rows, 3)."""
         shift = np.zeros((len(self.context), 3))
         for where, context in self.context.blocks():
             start = 0
-            for cell in cells:
-                columns = cell.columns(context).displacement(context)
-                shift[where] += columns @ parameters[start : start + cell.size]
-                start += cell.size
+            for candidate in candidates:
+                columns = candidate.columns(context).displacement(context)
+                shift[where] += columns @ parameters[start : start + candidate.size]
+                start += candidate.size
         return shift
 
     def unexplained(self, fit: Fit) -> FloatArray:
         """Return what a fit leaves of the errors in every row of the session, m, (all rows, 3)."""
         left: FloatArray = self.full_errors - self.full_base @ fit.base
-        return left - self.displaced(fit.cells, fit.parameters)
+        return left - self.displaced(fit.candidates, fit.parameters)
 
     def left(self, fit: Fit) -> FloatArray:
         """Return the same in the rows worked on, m, (n, 3)."""
-        explained: FloatArray = self.base @ fit.base + self.columns(fit.cells) @ fit.parameters
+        explained: FloatArray = (
+            self.base @ fit.base + self.columns(fit.candidates) @ fit.parameters
+        )
         return self.errors - explained
 
 
-def units(cells: Sequence[Cell], norms: FloatArray) -> FloatArray:
-    """Return the units of the columns of cells, in which a fit has them, (c,).
+def units(candidates: Sequence[Candidate], norms: FloatArray) -> FloatArray:
+    """Return the units of the columns of candidates, in which a fit has them, (c,).
 
     The norms of columns; where they are 0, 1. The penalty compares neighbours: one unit for all of
-    a cell's splines, also for those at the edge, where no row has more than a rounding error.
+    a candidate's splines, also for those at the edge, where no row has more than a rounding error.
     """
     unit = norms.copy()
-    edges = np.cumsum([0, *(cell.size for cell in cells)])
-    for cell, (first, last) in zip(cells, itertools.pairwise(edges), strict=True):
-        if cell.penalty is not None:
+    edges = np.cumsum([0, *(candidate.size for candidate in candidates)])
+    for candidate, (first, last) in zip(candidates, itertools.pairwise(edges), strict=True):
+        if candidate.penalty is not None:
             unit[first:last] = np.max(unit[first:last])
     return np.where(unit > 0.0, unit, 1.0)
 

@@ -1,4 +1,4 @@
-"""A set of cells fitted to the residuals."""
+"""A set of candidates fitted to the residuals."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from functools import cached_property
 import numpy as np
 
 from remaster_ros.calibration.noise import Noise
-from remaster_ros.discovery.effects.base import Cell
+from remaster_ros.discovery.effects.base import Candidate
 from remaster_ros.types import FloatArray
 
 
@@ -30,17 +30,17 @@ class Covariances:
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """A set of cells fitted to the residuals."""
+    """A set of candidates fitted to the residuals."""
 
-    cells: tuple[Cell, ...]  # The set; of a fit those with a penalty are last
-    parameters: FloatArray  # Of all the cells in order, SI, (m,)
+    candidates: tuple[Candidate, ...]  # The set; of a fit those with a penalty are last
+    parameters: FloatArray  # Of all the candidates in order, SI, (m,)
     base: FloatArray  # Of the offsets model's columns, (p,)
     noise: Noise  # Re-estimated
-    # Precision factor of each penalised cell, in order of the cells (NaN for the others)
+    # Precision factor of each penalised candidate, in order of the candidates (NaN for the others)
     smoothness: FloatArray
     ridge: FloatArray  # Prior precision of each unpenalised parameter (0 for the others), (m,)
     covariances: Covariances  # Of base and parameters, in this order
-    log_evidence: float  # With the prior probability of the cells
+    log_evidence: float  # With the prior probability of the candidates
 
     @property
     def full_covariance(self) -> FloatArray:
@@ -53,35 +53,39 @@ class Solution:
         return self.full_covariance[len(self.base) :, len(self.base) :]
 
     def slices(self) -> list[slice]:
-        """Return where each cell's parameters are."""
-        edges = np.cumsum([0, *(cell.size for cell in self.cells)])
+        """Return where each candidate's parameters are."""
+        edges = np.cumsum([0, *(candidate.size for candidate in self.candidates)])
         return [slice(int(a), int(b)) for a, b in itertools.pairwise(edges)]
 
     def factors(self) -> dict[object, float]:
-        """Return the precision factor of each penalised cell, by the cell's key."""
+        """Return the precision factor of each penalised candidate, by the candidate's key."""
         return {
-            cell.key: float(factor)
-            for cell, factor in zip(self.cells, self.smoothness, strict=True)
+            candidate.key: float(factor)
+            for candidate, factor in zip(self.candidates, self.smoothness, strict=True)
             if np.isfinite(factor)
         }
 
-    def weight_precisions(self) -> dict[Cell, float]:
-        """Return the prior precision that all weights of a cell have; of those of a kind alone."""
+    def weight_precisions(self) -> dict[Candidate, float]:
+        """Return the prior precision of all weights of each candidate that is a kind."""
         first = [where.start for where in self.slices()]
-        return dict(zip(self.cells, self.smoothness + self.ridge[first], strict=True))
+        return dict(zip(self.candidates, self.smoothness + self.ridge[first], strict=True))
 
     def unphysical(self) -> set[int]:
-        """Return the indices of the cells with a parameter of the sign that physics excludes."""
+        """Return the indices of candidates with a parameter of a sign that physics excludes."""
         return {
             index
-            for index, (cell, where) in enumerate(zip(self.cells, self.slices(), strict=True))
-            if np.any(cell.sign * self.parameters[where] < 0.0)
+            for index, (candidate, where) in enumerate(
+                zip(self.candidates, self.slices(), strict=True)
+            )
+            if np.any(candidate.sign * self.parameters[where] < 0.0)
         }
 
     def prior_precision(self) -> FloatArray:
         """Return the precision of the Gaussian prior on the parameters, (m, m)."""
         precision = np.diag(self.ridge)
-        for cell, factor, where in zip(self.cells, self.smoothness, self.slices(), strict=True):
-            if cell.penalty is not None:
-                precision[where, where] += factor * cell.penalty
+        for candidate, factor, where in zip(
+            self.candidates, self.smoothness, self.slices(), strict=True
+        ):
+            if candidate.penalty is not None:
+                precision[where, where] += factor * candidate.penalty
         return precision

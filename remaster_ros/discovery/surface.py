@@ -30,7 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from remaster_ros.calibration.noise import Noise
-from remaster_ros.discovery.effects.base import LARGEST_M, Cell, Design
+from remaster_ros.discovery.effects.base import LARGEST_M, Candidate, Design
 from remaster_ros.discovery.effects.context import Context
 from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.discovery.residuals import Residuals
@@ -62,8 +62,8 @@ Model = tuple[tuple[int, int], ...]
 class Block:
     """A candidate with weights that displace the marker by a metre RMS over the rows worked on."""
 
-    cell: Cell
-    map: FloatArray  # Parameters of the cell from the weights, (parameters, weights)
+    candidate: Candidate
+    map: FloatArray  # Parameters of the candidate from the weights, (parameters, weights)
     # Prior precision of each parameter, or factor of the penalty, for weights of precision 1
     scale: FloatArray
     allowed: BoolArray  # Which levels are plausible, (levels,)
@@ -76,31 +76,31 @@ class Block:
     @property
     def log_prior(self) -> float:
         """Log prior odds that it is in a model, at one of its levels, if its kind is there."""
-        return -float(np.log(self.cell.drawn_from * self.allowed.sum()))
+        return -float(np.log(self.candidate.drawn_from * self.allowed.sum()))
 
     @property
     def sign(self) -> int:
         """Sign of its weight that physics allows; 0 for both."""
-        return self.cell.sign if self.size == 1 else 0
+        return self.candidate.sign if self.size == 1 else 0
 
     def displacement(self, context: Context) -> FloatArray:
         """Return the displacement of the marker by a unit of each weight, m, (n, 3, weights)."""
-        moved: FloatArray = self.cell.columns(context).displacement(context) @ self.map
+        moved: FloatArray = self.candidate.columns(context).displacement(context) @ self.map
         return moved
 
     @cached_property
-    def _weights(self) -> dict[int, Cell]:
+    def _weights(self) -> dict[int, Candidate]:
         return {}
 
-    def weights(self, level: int) -> Cell:
-        """Return a cell of its weights, with the prior of a level."""
+    def weights(self, level: int) -> Candidate:
+        """Return a candidate of its weights, with the prior of a level."""
         if level not in self._weights:
-            self._weights[level] = Cell(
-                name=self.cell.name,
-                place=self.cell.place,
-                driver=self.cell.driver,
-                form=self.cell.form,
-                parameters=tuple(f'{self.cell.key}#{i}' for i in range(self.size)),
+            self._weights[level] = Candidate(
+                name=self.candidate.name,
+                place=self.candidate.place,
+                driver=self.candidate.driver,
+                form=self.candidate.form,
+                parameters=tuple(f'{self.candidate.key}#{i}' for i in range(self.size)),
                 unit='m',
                 columns=lambda context: Design(None, self.displacement(context)),
                 largest=float(LEVELS_M[level]),
@@ -108,21 +108,21 @@ class Block:
         return self._weights[level]
 
 
-def candidates(data: Residuals, cells: Sequence[Cell]) -> list[Block]:
-    """Return the blocks of all cells that displace a marker."""
+def blocks_of(data: Residuals, candidates: Sequence[Candidate]) -> list[Block]:
+    """Return the blocks of all candidates that displace a marker."""
     blocks, n = [], len(data)
-    for cell in cells:
-        if not cell.size:
+    for candidate in candidates:
+        if not candidate.size:
             continue
-        moved = cell.columns(data.part).displacement(data.part)
-        if cell.penalty is None:
+        moved = candidate.columns(data.part).displacement(data.part)
+        if candidate.penalty is None:
             unit = np.sqrt(np.sum(moved**2, axis=(0, 1)) / n)
             if np.any(unit < NOTHING):
                 continue
             mapping, scale = np.diag(1.0 / unit), unit**2
-            largest = float((cell.largest or np.inf) * unit.max())
+            largest = float((candidate.largest or np.inf) * unit.max())
         else:
-            values, vectors = np.linalg.eigh(cell.penalty)
+            values, vectors = np.linalg.eigh(candidate.penalty)
             root = vectors / np.sqrt(np.maximum(values, np.finfo(float).eps * values[-1]))
             share = np.sum((moved @ root) ** 2, axis=(0, 1)) / n
             if share.sum() < NOTHING**2:
@@ -130,21 +130,21 @@ def candidates(data: Residuals, cells: Sequence[Cell]) -> list[Block]:
             seen = share > LEAST_SHARE * share.max()
             total = share[seen].sum()
             mapping, scale = root[:, seen] / np.sqrt(total), np.array([total])
-            largest = _largest(data, cell)
+            largest = _largest(data, candidate)
         allowed = min(largest, LARGEST_M) >= LEVELS_M
         # Near the axis of its joint a marker would let degrees be as likely as minutes.
         if allowed.any():
-            blocks.append(Block(cell, mapping, scale, allowed))
+            blocks.append(Block(candidate, mapping, scale, allowed))
     return blocks
 
 
-def _largest(data: Residuals, cell: Cell) -> float:
+def _largest(data: Residuals, candidate: Candidate) -> float:
     """Return the RMS displacement by the plausible size of a joint curve, m; else infinity."""
-    at = cell.columns(data.part).at
-    if at is None or cell.largest is None:
+    at = candidate.columns(data.part).at
+    if at is None or candidate.largest is None:
         return np.inf
     lever = np.sqrt(np.sum(data.part.jacobian[:, :, at] ** 2) / len(data))
-    return float(cell.largest * lever)
+    return float(candidate.largest * lever)
 
 
 class Pool:
@@ -177,22 +177,22 @@ class Pool:
         self.sign = np.array([block.sign for block in self.blocks])
         # Errors of one kind come together; what has no name is no kind, and happens once.
         names = [
-            str(block.cell.key)
-            if EFFECTS[block.cell.name].cause_per == 'variant'
-            else block.cell.name
+            str(block.candidate.key)
+            if EFFECTS[block.candidate.name].cause_per == 'variant'
+            else block.candidate.name
             for block in self.blocks
         ]
         self.kind: IntArray = np.unique(names, return_inverse=True)[1]
         users: dict[str, set[int]] = {}
         for index, block in enumerate(self.blocks):
-            for name in block.cell.parameters:
+            for name in block.candidate.parameters:
                 users.setdefault(name, set()).add(index)
         # Blocks with a parameter in common are one cause twice: never in one model.
         self.excluded = [
-            np.array(sorted(set().union(*(users[name] for name in block.cell.parameters))))
+            np.array(sorted(set().union(*(users[name] for name in block.candidate.parameters))))
             for block in self.blocks
         ]
-        self.place = {block.cell.key: index for index, block in enumerate(self.blocks)}
+        self.place = {block.candidate.key: index for index, block in enumerate(self.blocks)}
 
     def prior(self, model: Model) -> float:
         """Return the log prior odds of a model."""
@@ -210,7 +210,7 @@ class Surface:
     matrix is diagonal: their prior is the same in all directions.
     """
 
-    def __init__(self, pool: Pool, noise: Noise, background: Mapping[Cell, float]) -> None:
+    def __init__(self, pool: Pool, noise: Noise, background: Mapping[Candidate, float]) -> None:
         self.pool, data = pool, pool.data
         n = 3 * len(data)
         std = np.concatenate([np.zeros(0), *(np.full(c.size, s) for c, s in background.items())])

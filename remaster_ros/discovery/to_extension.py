@@ -1,4 +1,4 @@
-"""From chosen cells to an `Extension` of the model that is sampled."""
+"""From chosen candidates to an `Extension` of the model that is sampled."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import numpy as np
 from remaster_ros.calibration.estimate import Estimate
 from remaster_ros.calibration.extension import Extension, Start, Term
 from remaster_ros.calibration.priors import STEP_STD
-from remaster_ros.discovery.effects.base import Cell
+from remaster_ros.discovery.effects.base import Candidate
 from remaster_ros.discovery.effects.context import Context
 from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.discovery.solution import Solution
@@ -15,19 +15,21 @@ from remaster_ros.types import FloatArray
 
 
 def extension_of(residuals: Residuals, solution: Solution, found: Estimate) -> Extension:
-    """Return the cells of a solution as further parameters, linearised where it has them."""
+    """Return the candidates of a solution as further parameters, linearised where it has them."""
     terms = []
     displacement0 = np.zeros((len(residuals.context), 3))
-    for cell, where in zip(solution.cells, solution.slices(), strict=True):
-        term = Term(where, *_columns(cell, residuals.context))
+    for candidate, where in zip(solution.candidates, solution.slices(), strict=True):
+        term = Term(where, *_columns(candidate, residuals.context))
         if term.at is None:
             displacement0 += term.values @ solution.parameters[where]
         terms.append(term)
     model = found.model
     x = model.natural(found.mode.z)
     x[found.posterior.free] += natural_steps(residuals, found, solution.base)
-    names = tuple(name for cell in solution.cells for name in cell.parameters)
-    units = tuple(cell.unit for cell in solution.cells for _ in cell.parameters)
+    names = tuple(name for candidate in solution.candidates for name in candidate.parameters)
+    units = tuple(
+        candidate.unit for candidate in solution.candidates for _ in candidate.parameters
+    )
     extension = Extension(
         names,
         units,
@@ -77,7 +79,7 @@ def offsets_of(found: Estimate) -> tuple[FloatArray, FloatArray]:
     return found.model.offsets(found.mode.z), std
 
 
-def _columns(cell: Cell, context: Context) -> tuple[int | None, FloatArray]:
-    """Return joint and values of a cell's columns in every row of a session."""
-    blocks = [cell.columns(block) for _, block in context.blocks()]
+def _columns(candidate: Candidate, context: Context) -> tuple[int | None, FloatArray]:
+    """Return joint and values of a candidate's columns in every row of a session."""
+    blocks = [candidate.columns(block) for _, block in context.blocks()]
     return blocks[0].at, np.concatenate([block.values for block in blocks])

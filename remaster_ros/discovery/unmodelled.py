@@ -2,8 +2,9 @@
 """Movement of zero-offsets and causes by errors that are not in the model that is sampled.
 
 Each source gives columns of one standard deviation, (size + m, c), of all natural parameters of
-the offsets model and the m parameters of a solution's cells: other models of the walk, lengths and
-tilts within the tolerance of a drawing, zero-offsets that the prior on steps alone holds.
+the offsets model and the m parameters of a solution's candidates: other models of the walk,
+lengths and tilts within the tolerance of a drawing, zero-offsets that only the prior on steps
+holds.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import numpy as np
 
 from remaster_ros.calibration.estimate import Estimate
 from remaster_ros.calibration.priors import DRAWING_TAILS, OFFSET_STD, STEP_STD, prior_rows
-from remaster_ros.discovery.effects.base import Cell
+from remaster_ros.discovery.effects.base import Candidate
 from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.discovery.random_effects import kinds
 from remaster_ros.discovery.residuals import Residuals
@@ -39,13 +40,13 @@ class Unmodelled:
     solution: Solution
     white: FloatArray  # Columns in units of the noise, (3n, P)
     root: FloatArray  # Of the covariance, (P, P)
-    where: IntArray  # Places of the P among natural parameters and those of the cells
+    where: IntArray  # Places of the P among natural parameters and those of the candidates
 
     @classmethod
     def of(cls, found: Estimate, data: Residuals, solution: Solution) -> Unmodelled:
         """Assemble the equations of a solution."""
         free, size = found.posterior.free, found.model.size
-        own = data.columns(solution.cells)
+        own = data.columns(solution.candidates)
         columns = np.concatenate((data.full_jacobian[data.rows.source][:, :, free], own), axis=2)
         x = found.model.natural(found.mode.z)
         rows = prior_rows(found.model, found.posterior.priors, x, natural=True)[1][:, free]
@@ -59,7 +60,7 @@ class Unmodelled:
 
     @property
     def size(self) -> int:
-        """Number of natural parameters and of those of the cells."""
+        """Number of natural parameters and of those of the candidates."""
         return int(self.found.model.size + len(self.solution.parameters))
 
     def by_models(self, models: Sequence[tuple[Solution, float]]) -> FloatArray:
@@ -81,7 +82,7 @@ class Unmodelled:
             moves[:, column] *= np.sqrt(share)
         return moves
 
-    def by_drawing(self, named: Sequence[Cell]) -> FloatArray:
+    def by_drawing(self, named: Sequence[Candidate]) -> FloatArray:
         """Return the movement by lengths and tilts without a name, off their drawing.
 
         No session proves that an arm is its drawing. As random effects of its tolerance beside
@@ -90,19 +91,19 @@ class Unmodelled:
         not to be counts as little. Of those that the model has, what their prior lacks of the
         tolerance.
         """
-        cells = [
-            cell
+        candidates = [
+            candidate
             for effect in EFFECTS.values()
             if effect.place in ('link_translation', 'link_rotation')
             if not effect.needs(self.data.context)
-            for cell in effect.cells(self.data.context)
-            if cell.model_change is not None
+            for candidate in effect.candidates(self.data.context)
+            if candidate.model_change is not None
         ]
         tolerance = DRAWING_TAILS * self.found.problem.priors.geometry_tolerance_m
         diagonal = np.diag(self.solution.prior_precision())
         precision = dict(zip(_names(self.solution), diagonal, strict=True))
         shifts = [np.zeros((len(self.data), 3, 0))]
-        for family in kinds(self.data, cells, named):
+        for family in kinds(self.data, candidates, named):
             for member, mapping, scale in zip(
                 family.members, family.maps, family.scales, strict=True
             ):
@@ -157,4 +158,4 @@ class Unmodelled:
 
 
 def _names(solution: Solution) -> list[str]:
-    return [name for cell in solution.cells for name in cell.parameters]
+    return [name for candidate in solution.candidates for name in candidate.parameters]

@@ -22,7 +22,7 @@ import numpy as np
 from scipy.special import log_expit, logsumexp
 
 from remaster_ros.calibration.noise import Noise
-from remaster_ros.discovery.effects.base import Cell
+from remaster_ros.discovery.effects.base import Candidate
 from remaster_ros.discovery.effects.context import Context
 from remaster_ros.discovery.effects.moments import changed_at, gaps
 from remaster_ros.discovery.effects.registry import EFFECTS
@@ -40,7 +40,7 @@ from remaster_ros.discovery.surface import (
     State,
     Surface,
     Walker,
-    candidates,
+    blocks_of,
 )
 from remaster_ros.discovery.thinning import FEWEST_TO_SEARCH
 from remaster_ros.types import FloatArray, IntArray
@@ -78,49 +78,59 @@ Identity = tuple[str, tuple[int, ...], str, str, str, str]
 """What makes a cause: name, joints, place, driver, subject, and if it begins or ends."""
 
 
-def identity(cell: Cell) -> Identity:
+def identity(candidate: Candidate) -> Identity:
     """Return which cause a candidate is, at whatever moment, order or axis."""
-    change = '' if cell.changes is None else 'ends' if cell.ends else 'begins'
-    return cell.name, cell.joints, cell.place, cell.driver, cell.subject, change
+    change = '' if candidate.changes is None else 'ends' if candidate.ends else 'begins'
+    return (
+        candidate.name,
+        candidate.joints,
+        candidate.place,
+        candidate.driver,
+        candidate.subject,
+        change,
+    )
 
 
-def at_any_time(cell: Cell) -> Identity:
+def at_any_time(candidate: Candidate) -> Identity:
     """Return which cause a candidate is, whether it changes in mid-session or not."""
-    return *identity(cell)[:-1], 'at any time'
+    return *identity(candidate)[:-1], 'at any time'
 
 
-def _claims(cell: Cell) -> Identity:
+def _claims(candidate: Candidate) -> Identity:
     """Return what has to be in a model for a cause to be there.
 
     What is there from the start is there in a model, too, in which it comes or goes near an end.
     """
-    return at_any_time(cell) if cell.changes is None else identity(cell)
+    return at_any_time(candidate) if candidate.changes is None else identity(candidate)
 
 
-def at_other_moments(cell: Cell, context: Context, low: float, high: float) -> list[Cell]:
-    """Return what happened in the place of a cell in the gaps between two moments, s."""
-    between, changes = EFFECTS[cell.name].between, EFFECTS[cell.name].changes
-    if cell.changes is not None and changes is not None:
+def at_other_moments(
+    candidate: Candidate, context: Context, low: float, high: float
+) -> list[Candidate]:
+    """Return what happened in the place of a candidate in the gaps between two moments, s."""
+    between, changes = EFFECTS[candidate.name].between, EFFECTS[candidate.name].changes
+    if candidate.changes is not None and changes is not None:
         found = [
             one
             for gap in gaps(context, low, high)
-            for one in changed_at(cell.changes, changes, gap)
+            for one in changed_at(candidate.changes, changes, gap)
         ]
-        return [one for one in found if one.ends == cell.ends]
-    if not cell.happened or between is None:
+        return [one for one in found if one.ends == candidate.ends]
+    if not candidate.happened or between is None:
         return []
     return [
-        replace(other, drawn_from=cell.drawn_from)
+        replace(other, drawn_from=candidate.drawn_from)
         for other in between(context, low, high)
-        if (other.place, other.joints, other.subject) == (cell.place, cell.joints, cell.subject)
+        if (other.place, other.joints, other.subject)
+        == (candidate.place, candidate.joints, candidate.subject)
     ]
 
 
 def p_value(log_evidence_gain: float) -> float:
     """Return the largest probability that anything gains so much where nothing is there.
 
-    Cells of K kinds are tried. With the prior probability 1/K of its kind and 1/c of one of c
-    cells of it, the sum of all Bayes factors has the expectation 1 where nothing is there; by
+    Candidates of K kinds are tried. With the prior probability 1/K of its kind and 1/c of one of c
+    candidates of it, the sum of all Bayes factors has the expectation 1 where nothing is there; by
     Markov's inequality the best raises the log evidence by g with a probability of at most
     K exp(-g).
     """
@@ -134,36 +144,39 @@ class Evaluated:
     data: Residuals
     model: Model
     value: float  # Log posterior
-    cells: tuple[Cell, ...]  # Weights of its blocks and of the kinds of the background
+    candidates: tuple[Candidate, ...]  # Weights of its blocks and of the kinds of the background
     eta: FloatArray  # Noise and variances, as `System` has them
     noise: Noise
     factors: Mapping[object, float]  # Precision of the weights of each kind, by key
     families: tuple[Family, ...]  # Kinds of the background
-    blocks: tuple[tuple[Cell, int], ...]  # Candidates that are its blocks, with their levels
+    blocks: tuple[tuple[Candidate, int], ...]  # Candidates that are its blocks, with their levels
 
     @cached_property
     def estimate(self) -> tuple[FloatArray, FloatArray]:
         """Mean and covariance of base coefficients and all weights."""
-        system = System.of(self.data, self.cells)
+        system = System.of(self.data, self.candidates)
         assert system is not None
         return system.estimate(self.eta)
 
     @cached_property
-    def std(self) -> dict[Cell, float]:
+    def std(self) -> dict[Candidate, float]:
         """Prior standard deviation of the weights of each kind of the background, m."""
         return {
-            one.cell: (self.factors[one.cell.key] + (one.cell.largest or np.inf) ** -2.0) ** -0.5
+            one.candidate: (
+                self.factors[one.candidate.key] + (one.candidate.largest or np.inf) ** -2.0
+            )
+            ** -0.5
             for one in self.families
         }
 
     @cached_property
-    def where(self) -> dict[Cell, slice]:
-        """Where the weights of each cell are."""
+    def where(self) -> dict[Candidate, slice]:
+        """Where the weights of each candidate are."""
         p = self.data.base.shape[2]
-        edges = p + np.cumsum([0, *(cell.size for cell in self.cells)])
+        edges = p + np.cumsum([0, *(candidate.size for candidate in self.candidates)])
         return {
-            cell: slice(int(a), int(b))
-            for cell, a, b in zip(self.cells, edges[:-1], edges[1:], strict=True)
+            candidate: slice(int(a), int(b))
+            for candidate, a, b in zip(self.candidates, edges[:-1], edges[1:], strict=True)
         }
 
     def log_factor(self, where: IntArray, std: FloatArray) -> float:
@@ -178,16 +191,16 @@ class Evaluated:
 
     def log_factor_of_kind(self, family: Family) -> float:
         """Return the log Bayes factor for a kind of the background."""
-        part = self.where[family.cell]
-        std = np.full(family.cell.size, self.std[family.cell])
+        part = self.where[family.candidate]
+        std = np.full(family.candidate.size, self.std[family.candidate])
         return self.log_factor(np.arange(part.start, part.stop), std)
 
     @cached_property
-    def members(self) -> list[tuple[Family, Cell, IntArray, FloatArray]]:
-        """Members of the background: kind, cell, places of the weights, and its map from these."""
+    def members(self) -> list[tuple[Family, Candidate, IntArray, FloatArray]]:
+        """Members of the background: kind, candidate, places of its weights, map from these."""
         found = []
         for family in self.families:
-            start = self.where[family.cell].start
+            start = self.where[family.candidate].start
             for member, mapping in zip(family.members, family.maps, strict=True):
                 stop = start + mapping.shape[1]
                 found.append((family, member, np.arange(start, stop), mapping))
@@ -195,15 +208,15 @@ class Evaluated:
         return found
 
     @cached_property
-    def by_itself(self) -> dict[Cell, float]:
+    def by_itself(self) -> dict[Candidate, float]:
         """Log Bayes factor of each member of the background by itself."""
         return {
-            member: self.log_factor(where, np.full(len(where), self.std[family.cell]))
+            member: self.log_factor(where, np.full(len(where), self.std[family.candidate]))
             for family, member, where, _ in self.members
         }
 
     @cached_property
-    def standing_out(self) -> dict[Cell, float]:
+    def standing_out(self) -> dict[Candidate, float]:
         """Probability of each member of the background that it is there, given the model.
 
         The kind has to be there, and among its m causes this one, at odds of 1 to m - 1.
@@ -211,7 +224,7 @@ class Evaluated:
         found = {}
         for family in self.families:
             mine = [one for one in self.members if one[0] is family]
-            causes: dict[Identity, list[tuple[Cell, IntArray]]] = {}
+            causes: dict[Identity, list[tuple[Candidate, IntArray]]] = {}
             for _, member, where, _ in mine:
                 causes.setdefault(identity(member), []).append((member, where))
             price = np.log(KIND_ODDS / len(LEVELS_M))
@@ -219,7 +232,7 @@ class Evaluated:
             count = max(len(causes), max(member.drawn_from for member in family.members))
             for parts in causes.values():
                 where = np.concatenate([part for _, part in parts])
-                factor = self.log_factor(where, np.full(len(where), self.std[family.cell]))
+                factor = self.log_factor(where, np.full(len(where), self.std[family.candidate]))
                 chance = np.exp(kind + log_expit(factor - np.log(count)))
                 for member, _ in parts:
                     found[member] = float(chance)
@@ -233,8 +246,8 @@ def evaluated(
 
     None if its columns cannot be distinguished.
     """
-    cells = [pool.blocks[block].weights(level) for block, level in model]
-    system = System.of(pool.data, [*cells, *(family.cell for family in families)])
+    candidates = [pool.blocks[block].weights(level) for block, level in model]
+    system = System.of(pool.data, [*candidates, *(family.candidate for family in families)])
     if system is None:
         return None
     try:
@@ -245,24 +258,29 @@ def evaluated(
     except np.linalg.LinAlgError:
         return None
     return Evaluated(
-        pool.data, model, float(value), system.cells, eta, system.noise(eta),
+        pool.data, model, float(value), system.candidates, eta, system.noise(eta),
         system.factors(eta), tuple(families),
-        tuple((pool.blocks[block].cell, level) for block, level in model),
+        tuple((pool.blocks[block].candidate, level) for block, level in model),
     )  # fmt: skip
 
 
-def background(data: Residuals, cells: Sequence[Cell]) -> list[Family]:
+def _has_few_poses(data: Residuals) -> bool:
+    """Return whether the rows worked on have fewer poses than `FEWEST_TO_SEARCH`."""
+    poses = np.unique(data.context.measurements.pose[data.rows.source])
+    return len(poses) < FEWEST_TO_SEARCH
+
+
+def background(data: Residuals, candidates: Sequence[Candidate]) -> list[Family]:
     """Return the kinds of errors that may be beside the causes.
 
     Of few poses none: these tell of no variance more than that of the noise.
     """
-    poses = np.unique(data.context.measurements.pose[data.rows.source])
-    if len(poses) < FEWEST_TO_SEARCH:
+    if _has_few_poses(data):
         return []
     # What comes alone is no kind: a variance of its own would be a cause without its price.
     return [
         family
-        for family in kinds(data, cells)
+        for family in kinds(data, candidates)
         if family.members[0].penalty is not None
         or len({identity(member) for member in family.members}) > 1
     ]
@@ -279,7 +297,7 @@ def by_form(data: Residuals, families: Sequence[Family]) -> list[Family]:
             name = ' '.join(map(str, member.key))
             one = Family.of(data, name, [member], alike=family.members)
             assert one is not None
-            found.append(replace(one, cell=replace(one.cell, variant=ALONE)))
+            found.append(replace(one, candidate=replace(one.candidate, variant=ALONE)))
     return found
 
 
@@ -289,7 +307,7 @@ def log_price(families: Sequence[Family]) -> float:
     A kind pays what the first block of a kind does, and a free form with a variance of its own
     what a block pays.
     """
-    forms = [one.members[0] for one in families if one.cell.variant == ALONE]
+    forms = [one.members[0] for one in families if one.candidate.variant == ALONE]
     each = -sum(np.log(form.drawn_from * len(LEVELS_M)) for form in forms)
     paid = {one.members[0].name for one in families if one.members[0].model_change is None}
     return float(each + len(paid) * np.log(KIND_ODDS))
@@ -317,29 +335,36 @@ class Walk:
     def __init__(
         self,
         data: Residuals,
-        cells: Sequence[Cell],
+        candidates: Sequence[Candidate],
         rng: np.random.Generator,
         progress: Callable[[float], None] = lambda share: None,
         start: Evaluated | None = None,
     ) -> None:
         self.data, self.rng = data, rng
-        self.families = background(data, cells)
+        self.families = background(data, candidates)
         # The same with a variance for each free form: one smoothness for all may fit none of them.
         self.by_form = by_form(data, self.families)
-        # What may change in mid-session.
-        changes = [cell for cell in cells if cell.changes is not None]
-        cells = [cell for cell in cells if cell.changes is None]
+        # What may change in mid-session. Of few poses one alone may lie before a moment.
+        changes = [candidate for candidate in candidates if candidate.changes is not None]
+        changes = [] if _has_few_poses(data) else changes
+        candidates = [candidate for candidate in candidates if candidate.changes is None]
         self._changing = [*{c.changes.key: c.changes for c in changes if c.changes}.values()]
         of_background = {member.key for one in self.families for member in one.members}
-        singles = [cell for cell in cells if cell.penalty is None or cell.key not in of_background]
-        tried = {cell.key for cell in singles}
-        dated: dict[object, Cell] = {}
-        for cell, _ in () if start is None else start.blocks:
+        singles = [
+            candidate
+            for candidate in candidates
+            if candidate.penalty is None or candidate.key not in of_background
+        ]
+        tried = {candidate.key for candidate in singles}
+        dated: dict[object, Candidate] = {}
+        for candidate, _ in () if start is None else start.blocks:
             # Rows that were not worked on before may tell of another moment.
             reach = DATED_TO * float(np.ptp(data.context.elapsed_s))
-            others = at_other_moments(cell, data.part, cell.moment - reach, cell.moment + reach)
-            dated |= {one.key: one for one in (cell, *others) if one.key not in tried}
-        self.pool = Pool(data, candidates(data, [*singles, *dated.values()]))
+            others = at_other_moments(
+                candidate, data.part, candidate.moment - reach, candidate.moment + reach
+            )
+            dated |= {one.key: one for one in (candidate, *others) if one.key not in tried}
+        self.pool = Pool(data, blocks_of(data, [*singles, *dated.values()]))
         self._known: dict[Model, Evaluated | None] = {}
         # Models whose kinds of the background have been chosen anew.
         self._wholes: dict[Model, Evaluated | None] = {}
@@ -366,21 +391,21 @@ class Walk:
             self.chains.append(self._chain(best, hot=False))
         self._weigh()
 
-    def _with_changes(self, changes: Sequence[Cell]) -> list[Evaluated]:
+    def _with_changes(self, changes: Sequence[Candidate]) -> list[Evaluated]:
         """Add the changes that a best model may have; return it with the best of them.
 
         Beside the model and in the place of each of its blocks, also without a wander: that
         follows whatever changes. Changes are many and hardly ever there: their columns are worked
         on once and not in every round.
         """
-        blocks, found = candidates(self.data, changes), []
+        blocks, found = blocks_of(self.data, changes), []
         for best in [chain.best for chain in self.chains] if blocks else []:
             mine = [self.pool.blocks[block] for block, _ in best.model]
             levels = tuple((i, level) for i, (_, level) in enumerate(best.model))
             pool = Pool(self.data, [*mine, *blocks])
             steady = [one for one in best.families if one.members[0].name != SENSOR_WANDER.name]
             for families in [best.families, steady][: 1 + (len(steady) < len(best.families))]:
-                std = {one.cell: best.std[one.cell] for one in families}
+                std = {one.candidate: best.std[one.candidate] for one in families}
                 state = State.of(Surface(pool, best.noise, std), levels)
                 gains = state.gains[len(mine) :]
                 gain = gains.max(axis=1)
@@ -389,11 +414,13 @@ class Walk:
                     there = other.gains[len(mine) :].max(axis=1) + other.value - state.value
                     gain = np.maximum(gain, there)
                 likely = [blocks[i] for i in np.flatnonzero(gain > -NEEDED).tolist()]
-                self.pool.extend([one for one in likely if one.cell.key not in self.pool.place])
+                self.pool.extend(
+                    [one for one in likely if one.candidate.key not in self.pool.place]
+                )
                 if not likely:
                     continue
                 index, level = np.unravel_index(np.argmax(gains), gains.shape)
-                added = self.pool.place.get(blocks[index].cell.key)
+                added = self.pool.place.get(blocks[index].candidate.key)
                 if added is not None:
                     model = tuple(sorted((*best.model, (added, int(level)))))
                     one = evaluated(self.pool, families, model, best)
@@ -406,58 +433,61 @@ class Walk:
         At other moments, and of what has a place that no parameter is.
         """
         best = max((chain.best for chain in self.chains), key=lambda one: one.value)
-        context, tried = self.data.part, [block.cell for block in self.pool.blocks]
+        context, tried = self.data.part, [block.candidate for block in self.pool.blocks]
         added = False
         for position, (block, _) in enumerate(best.model):
-            cell = self.pool.blocks[block].cell
-            if not cell.happened:
-                finer = EFFECTS[cell.name].finer
-                nearby = [] if finer is None else [*finer(context, cell)]
+            candidate = self.pool.blocks[block].candidate
+            if not candidate.happened:
+                finer = EFFECTS[candidate.name].finer
+                nearby = [] if finer is None else [*finer(context, candidate)]
                 nearby = [one for one in nearby if one.key not in self.pool.place]
-                self.pool.extend(candidates(self.data, nearby))
+                self.pool.extend(blocks_of(self.data, nearby))
                 added = added or bool(nearby)
                 continue
-            moments = np.unique([one.moment for one in tried if one.name == cell.name])
-            low = np.max(moments[moments < cell.moment], initial=-np.inf)
-            high = np.min(moments[moments > cell.moment], initial=np.inf)
+            moments = np.unique([one.moment for one in tried if one.name == candidate.name])
+            low = np.max(moments[moments < candidate.moment], initial=-np.inf)
+            high = np.min(moments[moments > candidate.moment], initial=np.inf)
             nearby = [
                 other
-                for other in at_other_moments(cell, context, float(low), float(high))
+                for other in at_other_moments(candidate, context, float(low), float(high))
                 if other.key not in self.pool.place
             ]
             first = len(self.pool.blocks)
-            self.pool.extend(candidates(self.data, nearby))
+            self.pool.extend(blocks_of(self.data, nearby))
             surface = Surface(self.pool, best.noise, best.std)
             rest = State.of(surface, best.model[:position] + best.model[position + 1 :])
             near = [block, *range(first, len(self.pool.blocks))]
-            spread = self._spread_of_moments(rest, cell)
+            spread = self._spread_of_moments(rest, candidate)
             for i in near:
                 one = self.pool.blocks[i]
-                self.pool.blocks[i] = replace(one, cell=replace(one.cell, moment_std=spread))
+                self.pool.blocks[i] = replace(
+                    one, candidate=replace(one.candidate, moment_std=spread)
+                )
             self._known.clear()
             self._wholes.clear()
             added = added or len(near) > 1
         happened = [
-            one for block, _ in best.model if (one := self.pool.blocks[block].cell).happened
+            one for block, _ in best.model if (one := self.pool.blocks[block].candidate).happened
         ]
         near_these = {
             one.key: one
-            for cell in happened
-            for one in self._changes_near(cell.moment)
+            for candidate in happened
+            for one in self._changes_near(candidate.moment)
             if one.key not in self.pool.place
         }
-        self.pool.extend(candidates(self.data, [*near_these.values()]))
+        self.pool.extend(blocks_of(self.data, [*near_these.values()]))
         return added or bool(near_these)
 
-    def _spread_of_moments(self, rest: State, cell: Cell) -> float:
+    def _spread_of_moments(self, rest: State, candidate: Candidate) -> float:
         """Return the standard deviation of the moment of a cause beside a model, s.
 
         Over all moments that were tried, each for the time that is nearest to it.
         """
         same = [
-            (one.cell.moment, rest.gains[index].max())
+            (one.candidate.moment, rest.gains[index].max())
             for index, one in enumerate(self.pool.blocks)
-            if identity(one.cell) == identity(cell) and one.cell.variant == cell.variant
+            if identity(one.candidate) == identity(candidate)
+            and one.candidate.variant == candidate.variant
         ]
         at, gain = np.array(sorted(same)).T
         weight = np.exp(gain - gain.max())
@@ -466,7 +496,7 @@ class Walk:
         middle = at[np.argmax(gain)]
         return float(np.sqrt(np.average((at - middle) ** 2, weights=weight)))
 
-    def _changes_near(self, moment: float) -> list[Cell]:
+    def _changes_near(self, moment: float) -> list[Candidate]:
         """Return the changes of all causes in the gaps nearest to a moment.
 
         What comes at one moment looks like several steps there; the moments that are tried of each
@@ -477,18 +507,18 @@ class Walk:
         nearest = found[np.argsort(np.abs(found.mean(axis=1) - moment))[:NEAREST]]
         return [
             one
-            for cell in self._changing
-            if (changes := EFFECTS[cell.name].changes) is not None
+            for candidate in self._changing
+            if (changes := EFFECTS[candidate.name].changes) is not None
             for gap in nearest
-            for one in changed_at(cell, changes, gap)
+            for one in changed_at(candidate, changes, gap)
         ]
 
     def _again(self, start: Evaluated) -> Evaluated:
         """Return the model of an earlier walk on these rows."""
         place, levels = self.pool.place, {}
-        for cell, level in start.blocks:
-            if cell.key in place:
-                levels[place[cell.key]] = level
+        for candidate, level in start.blocks:
+            if candidate.key in place:
+                levels[place[candidate.key]] = level
         again = self._whole(tuple(sorted(levels.items())), start)
         return self.empty if again is None else again
 
@@ -524,10 +554,12 @@ class Walk:
         for index in range(ROUNDS):
             noise, std = current.noise, current.std
             if before is not None and index == 0:
-                known = {cell.key: value for cell, value in before.std.items()}
+                known = {candidate.key: value for candidate, value in before.std.items()}
                 every = (*self.families, *self.by_form)
                 noise = before.noise
-                std = {f.cell: known[f.cell.key] for f in every if f.cell.key in known}
+                std = {
+                    f.candidate: known[f.candidate.key] for f in every if f.candidate.key in known
+                }
             surface = Surface(self.pool, noise, std)
             walker = Walker(State.of(surface, current.model), self.rng)
             self._run(walker, hot)
@@ -586,7 +618,9 @@ class Walk:
     def _swapped(self, found: Evaluated) -> Evaluated | None:
         """Return a model with the members that stand out of the background as its blocks."""
         have = {
-            name for block, _ in found.model for name in self.pool.blocks[block].cell.parameters
+            name
+            for block, _ in found.model
+            for name in self.pool.blocks[block].candidate.parameters
         }
         more = []
         for _, member, where, mapping in found.members:
@@ -639,9 +673,9 @@ class Walk:
         """
         data, best, m = self.data, self.best, self.data.part.measurements
         left = data.left(best)
-        for cell, where in zip(best.cells, best.slices(), strict=True):
-            if cell.name == SENSOR_WANDER.name:
-                left = left + data.columns([cell]) @ best.parameters[where]
+        for candidate, where in zip(best.candidates, best.slices(), strict=True):
+            if candidate.name == SENSOR_WANDER.name:
+                left = left + data.columns([candidate]) @ best.parameters[where]
         order = np.lexsort((data.part.elapsed_s, data.part.marker, data.part.sensor))
         one, other = order[:-1], order[1:]
         follows = (
@@ -657,16 +691,16 @@ class Walk:
         r = float(np.sum(left[one] * left[other]) / np.sqrt(squares))
         return 1.0 if r < 2.0 / np.sqrt(3.0 * len(one)) else (1.0 - r) / (1.0 + r)
 
-    def log_gain(self, causes: Sequence[Cell], share: float = 1.0) -> float:
+    def log_gain(self, causes: Sequence[Candidate], share: float = 1.0) -> float:
         """Return what the log posterior of the best model would lose without some causes of it.
 
         ``share``: of the readings that are independent.
         """
-        best, mine = self.models[0], {identity(cell) for cell in causes}
+        best, mine = self.models[0], {identity(candidate) for candidate in causes}
         wheres, stds, price = [], [], 0.0
         for block, level in best.model:
             one = self.pool.blocks[block]
-            if identity(one.cell) in mine:
+            if identity(one.candidate) in mine:
                 part = best.where[one.weights(level)]
                 wheres.append(np.arange(part.start, part.stop))
                 stds.append(np.full(one.size, LEVELS_M[level]))
@@ -674,13 +708,13 @@ class Walk:
         for family, member, where, _ in best.members:
             if identity(member) in mine:
                 wheres.append(where)
-                stds.append(np.full(len(where), best.std[family.cell]))
+                stds.append(np.full(len(where), best.std[family.candidate]))
                 price -= np.log(member.drawn_from) if not price else 0.0
         return share * best.log_factor(np.concatenate(wheres), np.concatenate(stds)) + float(price)
 
     @cached_property
     def solutions(self) -> list[tuple[Solution, float]]:
-        """All models by the parameters of their cells, each with its share."""
+        """All models by the parameters of their candidates, each with its share."""
         shares = self.share.tolist()
         return [
             (self.solution(one), share) for one, share in zip(self.models, shares, strict=True)
@@ -707,65 +741,67 @@ class Walk:
                     found[other.key] = best.value + other.value - state.value
         return found
 
-    def probability_of(self, cell: Cell) -> float:
+    def probability_of(self, candidate: Candidate) -> float:
         """Return the probability that a cause is there, at any moment or order."""
-        return self.probability.get(_claims(cell), 0.0)
+        return self.probability.get(_claims(candidate), 0.0)
 
     @cached_property
-    def claimed(self) -> list[Cell]:
+    def claimed(self) -> list[Candidate]:
         """Causes of the best model that are there, or of which one of several look-alikes is.
 
-        As cells of `best`.
+        As candidates of `best`.
         """
         found = []
         best = self.models[0]
         named = self.named(best)
-        blocks = {identity(self.pool.blocks[block].cell) for block, _ in best.model}
-        for cell in named:
-            if any(self._is_part(cell, form) for form in named):
+        blocks = {identity(self.pool.blocks[block].candidate) for block, _ in best.model}
+        for candidate in named:
+            if any(self._is_part(candidate, form) for form in named):
                 continue
-            if identity(cell) in blocks and cell in best.standing_out:
+            if identity(candidate) in blocks and candidate in best.standing_out:
                 # The same cause by another axis or direction, which the background has.
                 continue
-            if cell in best.standing_out and best.by_itself[cell] < 0.0:
-                mine = [one for one in named if identity(one) == identity(cell)]
-                if cell is not max(mine, key=lambda one: best.by_itself.get(one, np.inf)):
+            if candidate in best.standing_out and best.by_itself[candidate] < 0.0:
+                mine = [one for one in named if identity(one) == identity(candidate)]
+                if candidate is not max(mine, key=lambda one: best.by_itself.get(one, np.inf)):
                     continue
-            chance = self.probability_of(cell)
-            if chance >= 0.5 or chance + sum(self.instead_of([cell]).values()) >= 0.5:
+            chance = self.probability_of(candidate)
+            if chance >= 0.5 or chance + sum(self.instead_of([candidate]).values()) >= 0.5:
                 # A member may be a part of a block.
                 found += [
                     one
-                    for one in self.best.cells
-                    if one not in found and {*one.parameters}.issuperset(cell.parameters)
+                    for one in self.best.candidates
+                    if one not in found and {*one.parameters}.issuperset(candidate.parameters)
                 ]
         return found
 
-    def _is_part(self, cell: Cell, form: Cell) -> bool:
+    def _is_part(self, candidate: Candidate, form: Candidate) -> bool:
         """Return whether one of thousands of shapes is a part of a free form that is there."""
-        if not (EFFECTS[cell.name].many and cell.is_shape_of(form)):
+        if not (EFFECTS[candidate.name].many and candidate.is_shape_of(form)):
             return False
-        both = [self.data.columns([one]).reshape(3 * len(self.data), -1) for one in (cell, form)]
+        both = [
+            self.data.columns([one]).reshape(3 * len(self.data), -1) for one in (candidate, form)
+        ]
         rest = both[0] - both[1] @ np.linalg.lstsq(both[1], both[0], rcond=None)[0]
         return bool(np.sum(rest**2) < (1.0 - PART_OF_A_CURVE) * np.sum(both[0] ** 2))
 
-    def instead_of(self, group: Sequence[Cell]) -> dict[Cell, float]:
+    def instead_of(self, group: Sequence[Candidate]) -> dict[Candidate, float]:
         """Return what models have in the place of some causes of the best one, by probability.
 
         Of models that have none of them: what is not in the best model.
         """
-        mine = {_claims(cell) for cell in group}
-        best = {identity(cell) for cell in self.named(self.models[0])}
+        mine = {_claims(candidate) for candidate in group}
+        best = {identity(candidate) for candidate in self.named(self.models[0])}
         found: dict[Identity, float] = {}
-        cells: dict[Identity, Cell] = {}
+        candidates: dict[Identity, Candidate] = {}
         for model, share in zip(self.models, self.share, strict=True):
-            named = {identity(cell): cell for cell in self.named(model)}
+            named = {identity(candidate): candidate for candidate in self.named(model)}
             if mine & {*named, *map(at_any_time, named.values())}:
                 continue
             for key in named.keys() - best:
-                cells.setdefault(key, named[key])
+                candidates.setdefault(key, named[key])
                 found[key] = found.get(key, 0.0) + float(share)
-        return {cells[key]: chance for key, chance in found.items()}
+        return {candidates[key]: chance for key, chance in found.items()}
 
     @cached_property
     def probability(self) -> dict[Identity, float]:
@@ -773,17 +809,17 @@ class Walk:
         found: dict[Identity, float] = {}
         for model, share in zip(self.models, self.share, strict=True):
             present: dict[Identity, float] = {}
-            for cell, chance in self.present(model).items():
-                for key in (identity(cell), at_any_time(cell)):
+            for candidate, chance in self.present(model).items():
+                for key in (identity(candidate), at_any_time(candidate)):
                     present[key] = max(chance, present.get(key, 0.0))
             for key, chance in present.items():
                 found[key] = found.get(key, 0.0) + float(share) * chance
         return found
 
-    def present(self, model: Evaluated) -> dict[Cell, float]:
+    def present(self, model: Evaluated) -> dict[Candidate, float]:
         """Return the candidates of a model with the probability that each is there, given it."""
-        blocks = {self.pool.blocks[block].cell: 1.0 for block, _ in model.model}
-        have = {name for cell in blocks for name in cell.parameters}
+        blocks = {self.pool.blocks[block].candidate: 1.0 for block, _ in model.model}
+        have = {name for candidate in blocks for name in candidate.parameters}
         out = {
             member: chance
             for member, chance in model.standing_out.items()
@@ -791,23 +827,23 @@ class Walk:
         }
         return blocks | out
 
-    def named(self, model: Evaluated) -> list[Cell]:
+    def named(self, model: Evaluated) -> list[Candidate]:
         """Return the candidates that are rather there than not, given a model."""
-        return [cell for cell, chance in self.present(model).items() if chance >= 0.5]
+        return [candidate for candidate, chance in self.present(model).items() if chance >= 0.5]
 
     def solution(self, model: Evaluated) -> Solution:
-        """Return a model by the parameters of its cells, blocks and background together.
+        """Return a model by the parameters of its candidates, blocks and background together.
 
         A cause that is a member of the background, too, has the sum of both: its size is not
         shrunk by the variance of its kind.
         """
         p = self.data.base.shape[2]
         mean, covariance = model.estimate
-        parts: list[tuple[Cell, slice, FloatArray, FloatArray, float]] = []
+        parts: list[tuple[Candidate, slice, FloatArray, FloatArray, float]] = []
         for block, level in model.model:
             one = self.pool.blocks[block]
             where = model.where[one.weights(level)]
-            parts.append((one.cell, where, one.map, one.scale, LEVELS_M[level] ** -2.0))
+            parts.append((one.candidate, where, one.map, one.scale, LEVELS_M[level] ** -2.0))
         scales = {
             member: scale
             for family in model.families
@@ -815,25 +851,27 @@ class Walk:
         }
         for family, member, places, mapping in model.members:
             where = slice(int(places[0]), int(places[-1]) + 1)
-            parts.append((member, where, mapping, scales[member], model.std[family.cell] ** -2.0))
+            parts.append(
+                (member, where, mapping, scales[member], model.std[family.candidate] ** -2.0)
+            )
         # A member may be a part of a block: both are parameters of the larger.
-        cells: list[Cell] = []
-        for cell, *_ in sorted(parts, key=lambda part: -part[0].size):
-            if not any(set(one.parameters).issuperset(cell.parameters) for one in cells):
-                cells.append(cell)
-        cells.sort(key=lambda cell: cell.penalty is not None)
-        names = [name for cell in cells for name in cell.parameters]
+        candidates: list[Candidate] = []
+        for candidate, *_ in sorted(parts, key=lambda part: -part[0].size):
+            if not any(set(one.parameters).issuperset(candidate.parameters) for one in candidates):
+                candidates.append(candidate)
+        candidates.sort(key=lambda candidate: candidate.penalty is not None)
+        names = [name for candidate in candidates for name in candidate.parameters]
         row = {name: p + i for i, name in enumerate(names)}
         to = np.zeros((p + len(names), len(mean)))
         to[:p, :p] = np.eye(p)
         variance = np.zeros(len(names))
-        for cell, where, mapping, scale, precision in parts:
-            rows = np.array([row[name] for name in cell.parameters])
+        for candidate, where, mapping, scale, precision in parts:
+            rows = np.array([row[name] for name in candidate.parameters])
             to[rows, where] += mapping
             variance[rows - p] += 1.0 / (precision * scale)
         every = to @ mean
-        edges = np.cumsum([0, *(cell.size for cell in cells)])
-        smooth = np.array([cell.penalty is not None for cell in cells], dtype=bool)
+        edges = np.cumsum([0, *(candidate.size for candidate in candidates)])
+        smooth = np.array([candidate.penalty is not None for candidate in candidates], dtype=bool)
         ridge = np.where(np.repeat(smooth, np.diff(edges)), 0.0, 1.0 / variance)
         smoothness = np.where(smooth, 1.0 / variance[edges[:-1]], np.nan)
 
@@ -842,7 +880,7 @@ class Walk:
             return full, full
 
         return Solution(
-            tuple(cells),
+            tuple(candidates),
             every[p:],
             every[:p],
             model.noise,

@@ -8,7 +8,7 @@ from datetime import UTC, datetime
 import numpy as np
 
 from remaster_ros.calibration.gauge_words import listed, the
-from remaster_ros.discovery.effects.base import Cell
+from remaster_ros.discovery.effects.base import Candidate
 from remaster_ros.discovery.effects.sizes import rounded
 from remaster_ros.discovery.effects.unnamed import EFFECT as NO_NAME
 
@@ -79,37 +79,37 @@ def clock_time(stamp_s: float) -> str:
     return f'{datetime.fromtimestamp(stamp_s, UTC):%H:%M:%S UTC on %Y-%m-%d}'
 
 
-def titled(cell: Cell, joints: Sequence[int]) -> str:
+def titled(candidate: Candidate, joints: Sequence[int]) -> str:
     """Return a heading: 'Link length of joint 2', 'Joint 3 slipped', 'The sensor mocap moved'.
 
-    ``cell``: the first of a cause; ``joints``: of the whole cause.
+    ``candidate``: the first of a cause; ``joints``: of the whole cause.
     """
-    kind = KIND_OF_SUBJECT.get(cell.place, '')
+    kind = KIND_OF_SUBJECT.get(candidate.place, '')
     joint = joint_words(joints[:1]) if joints else ''
-    if cell.happened and cell.changes is None:
+    if candidate.happened and candidate.changes is None:
         words = {
             'joint_angle': f'{joint} slipped',
-            'marker': f'{the(kind, cell.subject)} moved',
-            'sensor_frame': f'{the(kind, cell.subject)} moved',
-        }.get(cell.place, 'the base moved, or all sensors together')
-    elif cell.name == NO_NAME.name:
-        whose = joint or (the(kind, cell.subject) if cell.subject else '')
-        driver = cell.driver.replace('_', ' ')
-        words = place_words(cell) + (f' of {whose}' if whose else '')
+            'marker': f'{the(kind, candidate.subject)} moved',
+            'sensor_frame': f'{the(kind, candidate.subject)} moved',
+        }.get(candidate.place, 'the base moved, or all sensors together')
+    elif candidate.name == NO_NAME.name:
+        whose = joint or (the(kind, candidate.subject) if candidate.subject else '')
+        driver = candidate.driver.replace('_', ' ')
+        words = place_words(candidate) + (f' of {whose}' if whose else '')
         words += f': an error that follows {driver}'
     else:
-        words = called(cell.name, joints)
-        if cell.subject.lower() not in ('', kind):
-            words += f' of {cell.subject}'
-    if cell.changes is not None:
-        minutes = f'{cell.moment / 60.0:.1f} min'
-        words += f', until {minutes}' if cell.ends else f', from {minutes} on'
+        words = called(candidate.name, joints)
+        if candidate.subject.lower() not in ('', kind):
+            words += f' of {candidate.subject}'
+    if candidate.changes is not None:
+        minutes = f'{candidate.moment / 60.0:.1f} min'
+        words += f', until {minutes}' if candidate.ends else f', from {minutes} on'
     return words[:1].upper() + words[1:]
 
 
-def place_words(cell: Cell) -> str:
+def place_words(candidate: Candidate) -> str:
     """Return where an error enters: 'joint angle', 'joint position' of one that slides."""
-    return 'joint position' if cell.slide else cell.place.replace('_', ' ')
+    return 'joint position' if candidate.slide else candidate.place.replace('_', ' ')
 
 
 def sentence_case(title: str) -> str:

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from remaster_ros.discovery.effects.base import LARGEST_M, Cell
+from remaster_ros.discovery.effects.base import LARGEST_M, Candidate
 from remaster_ros.discovery.effects.context import Context
 from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.planning.design_information import DesignInformation, ExtraColumns
@@ -67,33 +67,33 @@ class FoundCause:
 class Rivals:
     """A cause of a stated size, and a look-alike of any size."""
 
-    cause: tuple[Cell, ...]
+    cause: tuple[Candidate, ...]
     size: FloatArray  # Parameters of the cause, in their units, (m,)
-    look_alike: tuple[Cell, ...]
+    look_alike: tuple[Candidate, ...]
 
     @property
     def depends_on_approach(self) -> bool:
         """Whether the two causes differ by the approach direction."""
         return any(
-            name in cell.driver
-            for cell in (*self.cause, *self.look_alike)
+            name in candidate.driver
+            for candidate in (*self.cause, *self.look_alike)
             for name in APPROACH_DRIVERS
         )
 
     @property
     def nested(self) -> bool:
         """Whether all parameters of the look-alike are also parameters of the cause."""
-        names = {name for cell in self.cause for name in cell.parameters}
-        return all(name in names for cell in self.look_alike for name in cell.parameters)
+        names = {name for candidate in self.cause for name in candidate.parameters}
+        return all(name in names for candidate in self.look_alike for name in candidate.parameters)
 
     def columns(self, context: Context) -> ExtraColumns:
         """Return the amplitude of the cause and the parameters of the look-alike as columns."""
         std = []
-        for cell in self.look_alike:
-            largest = cell.largest
-            shift = cell.columns(context).displacement(context)
-            std.append(np.full(cell.size, largest) if largest else LARGEST_M / _rms(shift))
-        names = [name for cell in self.look_alike for name in cell.parameters]
+        for candidate in self.look_alike:
+            largest = candidate.largest
+            shift = candidate.columns(context).displacement(context)
+            std.append(np.full(candidate.size, largest) if largest else LARGEST_M / _rms(shift))
+        names = [name for candidate in self.look_alike for name in candidate.parameters]
         return ExtraColumns(
             (AMPLITUDE, *names),
             partial(self._displacement, context),
@@ -123,47 +123,51 @@ def rivals_of(
     context: Context, cause: FoundCause, look_alike: tuple[str, tuple[int, ...]]
 ) -> Rivals | None:
     """Return the pair of a cause and a look-alike; None if the context lacks data for one."""
-    found = _found_cells(context, cause)
-    other = _largest_cell(context, *look_alike)
+    found = _found_candidates(context, cause)
+    other = _largest_candidate(context, *look_alike)
     if not found or other is None:
         return None
-    size = [cause.sizes[name] for cell in found for name in cell.parameters]
+    size = [cause.sizes[name] for candidate in found for name in candidate.parameters]
     return Rivals(found, np.array(size), (other,))
 
 
-def _found_cells(context: Context, cause: FoundCause) -> tuple[Cell, ...]:
+def _found_candidates(context: Context, cause: FoundCause) -> tuple[Candidate, ...]:
     """Return the candidates that have all parameters of a cause between them; () if none."""
-    found: list[Cell] = []
+    found: list[Candidate] = []
     missing = {name for name in cause.sizes if name != 'moment'}
-    cells = [
-        cell
-        for cell in _cells(context, cause.name)
-        if {*cell.parameters} <= missing and cause.driver in ('', cell.driver)
+    candidates = [
+        candidate
+        for candidate in _candidates(context, cause.name)
+        if {*candidate.parameters} <= missing and cause.driver in ('', candidate.driver)
     ]
-    for cell in sorted(cells, key=lambda cell: -cell.size):
-        if {*cell.parameters} <= missing:
-            found.append(cell)
-            missing -= {*cell.parameters}
+    for candidate in sorted(candidates, key=lambda candidate: -candidate.size):
+        if {*candidate.parameters} <= missing:
+            found.append(candidate)
+            missing -= {*candidate.parameters}
     return () if missing else tuple(found)
 
 
-def _largest_cell(context: Context, name: str, joints: tuple[int, ...]) -> Cell | None:
+def _largest_candidate(context: Context, name: str, joints: tuple[int, ...]) -> Candidate | None:
     """Return the variant of an effect with the most parameters; None if there is none."""
-    cells = [cell for cell in _cells(context, name) if cell.joints == joints]
-    return max(cells, key=lambda cell: (cell.size, -cell.drawn_from), default=None)
+    candidates = [
+        candidate for candidate in _candidates(context, name) if candidate.joints == joints
+    ]
+    return max(
+        candidates, key=lambda candidate: (candidate.size, -candidate.drawn_from), default=None
+    )
 
 
-def _cells(context: Context, name: str) -> list[Cell]:
+def _candidates(context: Context, name: str) -> list[Candidate]:
     """Return all candidates of a named effect that this context has data for."""
     effect = EFFECTS.get(name)
     if effect is None or name == 'unnamed' or effect.needs(context):
         return []
-    return [cell for cell in effect.cells(context) if np.isnan(cell.moment)]
+    return [candidate for candidate in effect.candidates(context) if np.isnan(candidate.moment)]
 
 
-def _shifts(context: Context, cells: Sequence[Cell]) -> FloatArray:
+def _shifts(context: Context, candidates: Sequence[Candidate]) -> FloatArray:
     """Return the displacements per unit of the parameters of candidates, m, (n, 3, m)."""
-    return np.concatenate([c.columns(context).displacement(context) for c in cells], axis=2)
+    return np.concatenate([c.columns(context).displacement(context) for c in candidates], axis=2)
 
 
 def _rms(shift: FloatArray) -> FloatArray:

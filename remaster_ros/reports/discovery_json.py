@@ -240,7 +240,7 @@ def compensation_of(discovery: Discovery, widening: float) -> CorrectedArm:
     drawn = discovery.geometry
     geometry = None if drawn is None else arm_of_geometry(alone, drawn, rows)
     notes = []
-    if discovery.solution.cells:
+    if discovery.solution.candidates:
         notes.append(
             'zero-offsets alone: the model with everything that was found predicts held-out poses '
             'no better'
@@ -258,13 +258,13 @@ def holds_everything(discovery: Discovery) -> bool:
     every = _held_out_mean(discovery, errors_to_load(discovery)['everything'])
     better = bool(np.isnan(alone)) or round(every, 3) < round(alone, 3)
     can_be_commanded = _arm_with_effects(discovery).model.largest_slope() < 1.0
-    return better and can_be_commanded and bool(discovery.solution.cells)
+    return better and can_be_commanded and bool(discovery.solution.candidates)
 
 
 @lru_cache(maxsize=1)
 def _arm_with_effects(discovery: Discovery) -> CorrectedArm:
     """Arm with all effects that can be corrected."""
-    return arm_of_effects(discovery.fit, discovery.solution.cells, discovery.residuals)
+    return arm_of_effects(discovery.fit, discovery.solution.candidates, discovery.residuals)
 
 
 @lru_cache(maxsize=1)
@@ -274,7 +274,7 @@ def errors_to_load(discovery: Discovery) -> dict[str, FloatArray]:
     Each is computed with the text of the file, written or not. Errors of the measurement that the
     file does not contain are taken out: the certain ones, and for compensation.json all.
     """
-    alone, fit, cells = discovery.alone, discovery.fit, discovery.solution.cells
+    alone, fit, candidates = discovery.alone, discovery.fit, discovery.solution.candidates
     session, rows = alone.session, discovery.residuals.context.measurements
     # The fit of offsets alone contains no further parameters than certain errors of measuring.
     measured = without_errors_of_measuring(alone, slice(None))
@@ -289,8 +289,8 @@ def errors_to_load(discovery: Discovery) -> dict[str, FloatArray]:
     if described.model.largest_slope() < 1.0:
         text = correction_text(described, session, 'discover', '').encode()
         of_measuring = np.repeat(
-            np.array([cell.of_measurement for cell in cells], dtype=bool),
-            [cell.size for cell in cells],
+            np.array([candidate.of_measurement for candidate in candidates], dtype=bool),
+            [candidate.size for candidate in candidates],
         )
         model = of_text(text, Path(COMPENSATION_FILE)).model
         position = without_errors_of_measuring(fit, of_measuring)

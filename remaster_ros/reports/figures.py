@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
     from remaster_ros.calibration.result import FitResult
     from remaster_ros.discovery.discover import Discovery
-    from remaster_ros.discovery.effects.base import Cell
+    from remaster_ros.discovery.effects.base import Candidate
     from remaster_ros.discovery.effects.context import Context
     from remaster_ros.discovery.explain import FoundEffect
     from remaster_ros.reports.answer import Answer, Inputs
@@ -618,23 +618,23 @@ def _binned(ax: Axes, x: FloatArray, y: FloatArray, color: str) -> None:
 def causes(discovery: Discovery) -> Figure:
     """Draw each cause: residuals without it against its driver, and the fit with its band."""
     panels = [
-        cell
+        candidate
         for group in discovery.groups
-        for cell in group
-        if cell.place == 'joint_angle' or (cell.happened and cell.changes is None)
+        for candidate in group
+        if candidate.place == 'joint_angle' or (candidate.happened and candidate.changes is None)
     ]
     constant = [
         effect
         for effect, group in zip(discovery.effects, discovery.groups, strict=False)
-        if not any(cell in panels for cell in group)
+        if not any(candidate in panels for candidate in group)
     ]
     panels = panels[: 2 * MOST_CAUSES]
     count = len(panels) + bool(constant)
     lines = -(-count // 2)
     figure = Figure(figsize=(WIDTH_IN, 2.2 * lines + 0.2), layout='constrained')
     axes = list(figure.subplots(lines, 2 if count > 1 else 1, squeeze=False).flat)
-    for cell, ax in zip(panels, axes, strict=False):
-        (_cause if cell.place == 'joint_angle' else _step)(ax, discovery, cell)
+    for candidate, ax in zip(panels, axes, strict=False):
+        (_cause if candidate.place == 'joint_angle' else _step)(ax, discovery, candidate)
     if constant:
         _sizes(axes[len(panels)], discovery, constant)
     for spare in axes[count:]:
@@ -658,19 +658,19 @@ def _sizes(ax: Axes, discovery: Discovery, effects: Sequence[FoundEffect]) -> No
     ax.set_title('Causes without a curve')
 
 
-def _estimate(discovery: Discovery, cell: Cell) -> FloatArray:
-    """Parameters of a cause in the whole model, in which they may belong to a larger cell."""
+def _estimate(discovery: Discovery, candidate: Candidate) -> FloatArray:
+    """Parameters of a cause in the whole model, in which they may belong to a larger candidate."""
     solution = discovery.solution
-    names = [name for one in solution.cells for name in one.parameters]
-    return solution.parameters[[names.index(name) for name in cell.parameters]]
+    names = [name for one in solution.candidates for name in one.parameters]
+    return solution.parameters[[names.index(name) for name in candidate.parameters]]
 
 
-def _step(ax: Axes, discovery: Discovery, cell: Cell) -> None:
+def _step(ax: Axes, discovery: Discovery, candidate: Candidate) -> None:
     """Draw a jump of a sensor, marker or base over time, along its direction, mm."""
     data, solution = discovery.residuals, discovery.solution
     context = data.part
-    columns = cell.columns(context).displacement(context)
-    jump = columns @ _estimate(discovery, cell)
+    columns = candidate.columns(context).displacement(context)
+    jump = columns @ _estimate(discovery, candidate)
     moved = np.linalg.norm(jump, axis=1) > 0.0
     # Before the moment all columns are zero: the rows that move later have the sensor and marker.
     affected = np.isin(context.sensor, context.sensor[moved]) & np.isin(
@@ -683,9 +683,9 @@ def _step(ax: Axes, discovery: Discovery, cell: Cell) -> None:
     ax.plot(minutes[affected], along[affected], '.', color=BEFORE, markersize=3, alpha=0.6)
     index = {name: i for i, name in enumerate(discovery.fit.theta_names)}
     draws = discovery.fit.theta_draws.reshape(-1, len(index))
-    chosen = draws[:, [index[name] for name in cell.parameters]]
+    chosen = draws[:, [index[name] for name in candidate.parameters]]
     levels = 1e3 * np.einsum('nij,i->nj', columns[moved], way).mean(axis=0) @ chosen.T
-    edge = cell.moment / 60.0
+    edge = candidate.moment / 60.0
     low, high = minutes[affected].min(), minutes[affected].max()
     ax.plot([low, edge], [0.0, 0.0], color=AFTER, linewidth=1.3)
     level, width = float(levels.mean()), 2.0 * float(levels.std())
@@ -694,23 +694,25 @@ def _step(ax: Axes, discovery: Discovery, cell: Cell) -> None:
     ax.axvline(edge, color=INK, linewidth=0.8, ls=(0, (4, 2)))
     ax.set_xlabel('minutes after the first reading')
     ax.set_ylabel('along the jump (mm)')
-    ax.set_title(f'{cell.subject or "base"}: jump after {edge:.1f} min')
+    ax.set_title(f'{candidate.subject or "base"}: jump after {edge:.1f} min')
 
 
-def _driver(context: Context, cell: Cell, features: FloatArray) -> tuple[str, FloatArray, float]:
+def _driver(
+    context: Context, candidate: Candidate, features: FloatArray
+) -> tuple[str, FloatArray, float]:
     """Label and values (n,) of a cause's driver, and the driver's value for one shown unit.
 
     A driver of several numbers is drawn by the feature of the cause's first parameter.
     """
-    driver = driver_named(context, cell.driver, cell.joints[-1])
+    driver = driver_named(context, candidate.driver, candidate.joints[-1])
     if driver is None:
-        name = cell.driver.replace('_', ' ')
-        return f'{name} (per unit of {cell.parameters[0]})', features[:, 0], 1.0
+        name = candidate.driver.replace('_', ' ')
+        return f'{name} (per unit of {candidate.parameters[0]})', features[:, 0], 1.0
     unit = f' ({driver.shown_unit})' if driver.shown_unit else ''
     return f'{driver.label}{unit}', driver.value(context), driver.per_shown
 
 
-def _cause(ax: Axes, discovery: Discovery, cell: Cell) -> None:
+def _cause(ax: Axes, discovery: Discovery, candidate: Candidate) -> None:
     """Draw one cause at a joint's angle, in arc minutes, or in mm for a prismatic joint."""
     data, solution = discovery.residuals, discovery.solution
     whole = len(data.context) <= MOST_DRAWN
@@ -718,25 +720,25 @@ def _cause(ax: Axes, discovery: Discovery, cell: Cell) -> None:
     remaining = data.unexplained(solution) if whole else data.left(solution)
     # A change is drawn at the rows after its moment, or before if it ends there.
     present = np.ones(len(context), dtype=bool)
-    if cell.changes is not None:
-        present = (context.elapsed_s > cell.moment) != cell.ends
+    if candidate.changes is not None:
+        present = (context.elapsed_s > candidate.moment) != candidate.ends
     fitted = present.copy()
     if whole:
         fitted &= np.isin(np.arange(len(context)), data.rows.source)
     shown_unit_value, unit = (
-        (1e-3, 'mm') if context.slides(cell.joints[0]) else (ARC_MINUTE, 'arc minutes')
+        (1e-3, 'mm') if context.slides(candidate.joints[0]) else (ARC_MINUTE, 'arc minutes')
     )
-    parameters = _estimate(discovery, cell) / shown_unit_value
+    parameters = _estimate(discovery, candidate) / shown_unit_value
     index = {name: i for i, name in enumerate(discovery.fit.theta_names)}
-    chosen = [index[name] for name in cell.parameters]
+    chosen = [index[name] for name in candidate.parameters]
     draws = discovery.fit.theta_draws[..., chosen].reshape(-1, len(chosen)) / shown_unit_value
     mean = draws.mean(axis=0)
     draws = draws[:: max(1, len(draws) // 400)]
-    columns = cell.columns(context)
+    columns = candidate.columns(context)
     assert columns.at is not None
     values = columns.values
-    label, x, per_shown = _driver(context, cell, values)
-    if cell.form == 'sin/cos':
+    label, x, per_shown = _driver(context, candidate, values)
+    if candidate.form == 'sin/cos':
         # Its mean is a zero-offset.
         values = values - values[fitted].mean(axis=0)
     effect = values @ mean
@@ -747,26 +749,26 @@ def _cause(ax: Axes, discovery: Discovery, cell: Cell) -> None:
     angle = np.sum(motion * remaining, axis=1)[far] / square[far] / shown_unit_value
     shown = slice(None, None, max(1, int(far.sum()) // CAUSE_POINTS))
     points = (values[far] @ parameters + angle)[shown]
-    if cell.driver.startswith('approach'):
+    if candidate.driver.startswith('approach'):
         band = 2.0 * (values @ draws.T).std(axis=1)
         _sides(ax, x[present], effect[present], band[present], (x[far][shown], points))
     else:
         order = np.flatnonzero(present)[np.argsort(x[present])]
         at, line = x[order], effect[order]
-        if cell.curve is not None:
+        if candidate.curve is not None:
             # Everywhere, so that the band opens where nothing was measured; the line is not there.
-            x, at = cell.curve.in_turn(x), cell.curve.grid()
-            values = cell.curve.columns(at)
-            line = np.where(cell.curve.seen(at, NEAR), values @ mean, np.nan)
+            x, at = candidate.curve.in_turn(x), candidate.curve.grid()
+            values = candidate.curve.columns(at)
+            line = np.where(candidate.curve.seen(at, NEAR), values @ mean, np.nan)
         else:
             values = values[order]
             # No straight line where nothing was measured.
-            widest = WIDE_GAP if cell.form == 'sin/cos' else EMPTY
+            widest = WIDE_GAP if candidate.form == 'sin/cos' else EMPTY
             gap = np.diff(at, prepend=at[0]) > widest * np.ptp(at)
             line = np.where(gap, np.nan, line)
         spread = 2.0 * (values @ draws.T).std(axis=1)
         middle = values @ mean
-        if cell.curve is None:
+        if candidate.curve is None:
             # Nor a straight band: a curve's own is known everywhere.
             holes = np.flatnonzero(gap)
             _at_places(ax, at / per_shown, middle, spread, holes)
@@ -778,19 +780,19 @@ def _cause(ax: Axes, discovery: Discovery, cell: Cell) -> None:
         low, high = middle - spread, middle + spread
         ax.fill_between(around / per_shown, low, high, color=AFTER, alpha=0.25, linewidth=0)
         # What jumps has no slope between two readings.
-        jumps = cell.happened and cell.changes is None
+        jumps = candidate.happened and candidate.changes is None
         drawn = 'steps-mid' if jumps else 'default'
         ax.plot(at / per_shown, line, color=AFTER, linewidth=1.3, drawstyle=drawn)
     limit = np.quantile(np.abs(points), 0.99)
     ax.set_ylim(-1.2 * limit, 1.2 * limit)
     ax.set_xlabel(label)
     ax.set_ylabel(unit)
-    slipped = cell.happened and cell.changes is None
-    name = 'slip' if slipped else cell.name.replace('_', ' ')
-    if cell.changes is not None:
-        minutes = f'{cell.moment / 60.0:.1f} min'
-        name += f', until {minutes}' if cell.ends else f', from {minutes} on'
-    ax.set_title(f'joint {cell.joints[0]}: {name}')
+    slipped = candidate.happened and candidate.changes is None
+    name = 'slip' if slipped else candidate.name.replace('_', ' ')
+    if candidate.changes is not None:
+        minutes = f'{candidate.moment / 60.0:.1f} min'
+        name += f', until {minutes}' if candidate.ends else f', from {minutes} on'
+    ax.set_title(f'joint {candidate.joints[0]}: {name}')
 
 
 def _at_places(

@@ -213,8 +213,8 @@ def test_a_marker_near_an_axis_turns_no_joint_by_degrees():
     assert 0.1e-3 < np.sqrt(np.mean(np.sum(shift**2, axis=1))) < 0.3e-3
     session = replace(session, measurements=replace(m, position=m.position + shift))
     found = remaster_ros.discover(session)
-    fit, cells = found.fit, found.solution.cells
-    model = arm_of_effects(fit, cells, found.residuals).model
+    fit, candidates = found.fit, found.solution.candidates
+    model = arm_of_effects(fit, candidates, found.residuals).model
     change = model.added_angles(model.drivers(m.q, model.warming(len(m.q), None)))
     assert np.abs(change - change.mean(axis=0)).max() < np.radians(2.0)
     assert model.largest_slope() < 0.15

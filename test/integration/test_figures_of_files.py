@@ -95,20 +95,20 @@ def by_pinocchio(session, urdf, position, fitted):
     return np.linalg.norm(position - predicted(done.x), axis=1)
 
 
-def taken_out(found, fit, cells, chosen):
+def taken_out(found, fit, candidates, chosen):
     """Return the measured positions less what some cells of a fit do."""
     problem, model, z = fit.found.problem, fit.predictive.model, fit.predictive.after.copy()
     whole, start = predicted_rows(problem, model, z), model.core
-    for cell in cells:
-        if chosen(cell):
-            z[start : start + cell.size] = 0.0
-        start += cell.size
+    for candidate in candidates:
+        if chosen(candidate):
+            z[start : start + candidate.size] = 0.0
+        start += candidate.size
     return fit.session.measurements.position - whole + predicted_rows(problem, model, z)
 
 
 def certain(found):
     groups = zip(found.effects, found.groups, strict=False)
-    return {cell for effect, group in groups if effect.is_taken_out for cell in group}
+    return {candidate for effect, group in groups if effect.is_taken_out for candidate in group}
 
 
 def test_figures_of_robot_models_are_those_of_their_files(result):
@@ -118,10 +118,10 @@ def test_figures_of_robot_models_are_those_of_their_files(result):
     fitted = ~m.is_validation & ~np.isin(m.observation, left_out)
     # Nothing that no file holds is in the fit of the offsets that are loaded alone.
     extension = found.alone.theta_names
-    assert {*extension} <= {name for cell in certain(found) for name in cell.parameters}
+    assert {*extension} <= {name for candidate in certain(found) for name in candidate.parameters}
     position = m.position
     if extension:
-        position = taken_out(found, found.alone, tuple(certain(found)), lambda cell: True)
+        position = taken_out(found, found.alone, tuple(certain(found)), lambda candidate: True)
     checked = 0
     for row in content['loadable']:
         if row['file'].endswith('.urdf'):
@@ -145,8 +145,8 @@ def test_the_figure_of_the_compensation_is_that_of_the_file(result):
     spec.loader.exec_module(module)
     arm = module.Arm(json.loads(path.read_text(encoding='utf-8')))
     (sensor,), (marker,) = arm.data['base_frame'], arm.data['tool']
-    cells = found.solution.cells
-    position = taken_out(found, found.fit, cells, lambda cell: cell.of_measurement)
+    candidates = found.solution.candidates
+    position = taken_out(found, found.fit, candidates, lambda candidate: candidate.of_measurement)
     command = Compensator(read_compensation(path).model).command(session.measurements.q)
     errors = []
     for q, q_command, point in zip(session.measurements.q, command, position, strict=True):
@@ -172,8 +172,8 @@ def test_the_compensation_predicts_its_session_as_the_discovery_does(result):
     (sensor,), (marker,) = file.model.T_R_N, file.model.markers
     seen = file.model.in_sensor(file.model.state(m.q), sensor, marker)
     expected = taken_out(
-        found, found.fit, found.solution.cells,
-        lambda cell: cell.of_measurement or not [*slots_of(cell, CHAIN)],
+        found, found.fit, found.solution.candidates,
+        lambda candidate: candidate.of_measurement or not [*slots_of(candidate, CHAIN)],
     ) - found.fit.residuals_after  # fmt: skip
     apart = np.linalg.norm(seen - expected, axis=1)
     # The fit has lengths and the like to first order.

@@ -191,14 +191,14 @@ def test_true_values_have_the_names_that_discovery_gives_them(
     kind: str, iiwa: HiddenWorld, context: Context
 ) -> None:
     """A value without a name, or with another, would not be compared with its estimate."""
-    cells = EFFECTS[kind].cells(context)
+    candidates = EFFECTS[kind].candidates(context)
     effect = draw_effect(iiwa, kind, np.random.default_rng(11), 0.3e-3)
     true = true_parameters(effect)
     if kind in ('joint_error_curve', 'marker_offset'):
         assert not true, 'hidden_judge compares these two by their displacements'
         return
     assert true
-    assert set(true) <= {name for cell in cells for name in cell.parameters}
+    assert set(true) <= {name for candidate in candidates for name in candidate.parameters}
     for name in true:
         part = part_of(name)
         assert part is not None, f'no part of the kind is called {name}'

@@ -162,7 +162,7 @@ def test_what_needs_a_turn_is_not_tried_at_a_slide():
         np.array([[-0.1, 0.0, 0.02]]),
         np.eye(4)[None],
     )
-    cells = {name: list(effect.cells(context)) for name, effect in EFFECTS.items()}
+    cells = {name: list(effect.candidates(context)) for name, effect in EFFECTS.items()}
     for name in ('encoder_eccentricity', 'gear_periodic'):
         assert {joint for cell in cells[name] for joint in cell.joints} == {2, 3, 4, 5, 6, 7}
     for cell in chain.from_iterable(cells.values()):

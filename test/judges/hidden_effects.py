@@ -281,9 +281,9 @@ def _curve_deviation(effect: HiddenEffect, discovery: Any) -> float:
     context, solution = discovery.residuals.context, discovery.solution
     q = context.measurements.q[:, effect.joints[0] - 1]
     estimated = np.zeros(len(q))
-    for cell, where in zip(solution.cells, solution.slices(), strict=True):
-        if (cell.name, cell.joints) == (effect.kind, effect.joints):
-            estimated += cell.columns(context).values @ discovery.fit.theta[where]
+    for candidate, where in zip(solution.candidates, solution.slices(), strict=True):
+        if (candidate.name, candidate.joints) == (effect.kind, effect.joints):
+            estimated += candidate.columns(context).values @ discovery.fit.theta[where]
     waves = zip(effect.detail['orders'], effect.detail['amplitudes'], effect.detail['phases'])
     true = effect.values[0] * sum(a * np.cos(order * q + phase) for order, a, phase in waves)
     return float(np.std(_detrended(q, estimated - true)) / np.std(_detrended(q, true)))

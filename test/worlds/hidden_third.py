@@ -81,12 +81,16 @@ def predictions_elsewhere(found: Discovery, third: Session) -> Predictions:
         # By their place: two cells without a name may call their parameters alike.
         solution = found.solution
         named = {name for group in found.groups for one in group for name in one.parameters}
-        for cell, where in zip(solution.cells, solution.slices(), strict=True):
-            if cell.driver == 'time' and cell.of_measurement and not named & {*cell.parameters}:
+        for candidate, where in zip(solution.candidates, solution.slices(), strict=True):
+            if (
+                candidate.driver == 'time'
+                and candidate.of_measurement
+                and not named & {*candidate.parameters}
+            ):
                 # Errors that follow each other belong to the readings, not to the poses; a drift
                 # without a name beside a wander is a part of it.
                 continue
-            columns = cell.columns(context)
+            columns = candidate.columns(context)
             terms.append(Term(where, columns.at, columns.values))
             if columns.at is None:
                 displacement0 += columns.values @ model.extension.theta0[where]

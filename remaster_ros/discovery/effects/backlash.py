@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from remaster_ros.discovery.effects.base import Cell, Effect, needs_approach
+from remaster_ros.discovery.effects.base import Candidate, Effect, needs_approach
 from remaster_ros.discovery.effects.context import Context
 from remaster_ros.discovery.effects.moments import switched
 from remaster_ros.discovery.effects.sizes import of_joint
 from remaster_ros.types import FloatArray
 
 
-def cells(context: Context) -> Iterator[Cell]:
-    """One cell per joint: δq_j = b_j sign(q_j - from_q_j)."""
+def candidates(context: Context) -> Iterator[Candidate]:
+    """One candidate per joint: δq_j = b_j sign(q_j - from_q_j)."""
     return EFFECT.at_joints(
         context,
         context.moving,
@@ -22,8 +22,8 @@ def cells(context: Context) -> Iterator[Cell]:
     )
 
 
-def _play(context: Context, cell: Cell, draws: FloatArray) -> str:
-    joint = cell.joints[0]
+def _play(context: Context, candidate: Candidate, draws: FloatArray) -> str:
+    joint = candidate.joints[0]
     return f'joint {joint} stops {of_joint(context, joint, 2.0 * draws[:, 0])} apart, side by side'
 
 
@@ -45,7 +45,7 @@ EFFECT = Effect(
     slide_remedy='Approach every pose from the same side, and have the play of the drive '
     'adjusted.',
     size=_play,
-    cells=cells,
+    candidates=candidates,
     changes=switched,
     needs=needs_approach,
 )

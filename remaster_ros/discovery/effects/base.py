@@ -1,4 +1,4 @@
-"""A cell: where an error enters, what drives it, in which form; and a named effect made of such.
+"""Candidate: where an error enters, what drives it, in which form; and a named effect of such.
 
 The true joint angle is the reported one plus the zero-offset plus effects at the place
 ``joint_angle``. Everything else displaces the marker. Of a joint that slides the angle is its
@@ -33,7 +33,7 @@ AT_A_SLIDE = {
     'rad/rad': ('m/m', 1.0),
     'rad/(N m)': ('m/N', LEVER_M**2),
 }
-# Form of a cell that is all members of a kind of error.
+# Form of a candidate that is all members of a kind of error.
 RANDOM = 'random'
 NO_TIMES = 'the session has no times (times: none), only the order of its rows'
 
@@ -68,7 +68,7 @@ class ModelChange:
 
 
 @dataclass(frozen=True, eq=False)
-class Cell:
+class Candidate:
     """One candidate cause: a place, a driver and a form, with its parameters."""
 
     name: str  # Of the named effect; 'unnamed' for the rest
@@ -81,11 +81,11 @@ class Cell:
     unit: str
     columns: Callable[[Context], Design]  # What a unit of each does
     joints: tuple[int, ...] = ()  # 1-based; () where none
-    # How many cells like it are tried: its prior probability is that of its kind over this
+    # How many candidates like it are tried: its prior probability is that of its kind over this
     drawn_from: int = 1
     # For free forms: precision of the parameters, (m, m), up to the smoothness; None else
     penalty: FloatArray | None = None
-    # Distinguishes cells of the same name and joints: the order of a harmonic, an axis
+    # Distinguishes candidates of the same name and joints: the order of a harmonic, an axis
     variant: str = ''
     # The sensor or marker it is about; '' where it is about joints or the whole arm
     subject: str = ''
@@ -102,13 +102,13 @@ class Cell:
     curve: Curve | None = None
     # The same as a change of the robot model, where it is one; None else
     model_change: ModelChange | None = None
-    # Of a penalised cell: standard deviation of the weights at a penalty of 1 that its smoothness
-    # does not go below, in ``unit``; 0 for none
+    # Of a penalised candidate: standard deviation of the weights at a penalty of 1 that its
+    # smoothness does not go below, in ``unit``; 0 for none
     least: float = 0.0
     slide: bool = False  # It is about the place of a joint that slides
-    # The cell of which it is a change at its moment, which begins then or ends then; None for what
-    # is there in all of the session
-    changes: Cell | None = None
+    # The candidate of which it is a change at its moment, which begins then or ends then; None for
+    # what is there in all of the session
+    changes: Candidate | None = None
     ends: bool = False
 
     @property
@@ -132,7 +132,7 @@ class Cell:
             self.place == 'marker' and self.driver == 'constant'
         )
 
-    def is_shape_of(self, form: Cell) -> bool:
+    def is_shape_of(self, form: Candidate) -> bool:
         """Return whether it is one of the shapes that a free form can have."""
         return (
             form.penalty is not None
@@ -149,7 +149,7 @@ class Cell:
 
     @cached_property
     def key(self) -> tuple[str, tuple[int, ...], str, str, str, str]:
-        """What distinguishes this cell from all others."""
+        """What distinguishes this candidate from all others."""
         return self.name, self.joints, self.place, self.driver, self.form, self.label
 
     @cached_property
@@ -161,9 +161,11 @@ class Cell:
 
 
 class Changes(Protocol):
-    """Columns of a cell that is there only after some moment in a gap (2,), s, or before it."""
+    """Columns of a candidate that is there only after a moment in a gap (2,), s, or before it."""
 
-    def __call__(self, context: Context, cell: Cell, gap: FloatArray, ends: bool) -> Design:
+    def __call__(
+        self, context: Context, candidate: Candidate, gap: FloatArray, ends: bool
+    ) -> Design:
         """Return the columns."""
         ...
 
@@ -173,7 +175,7 @@ class Effect:
     """A physical cause with a name: everything that the program needs to find and explain it."""
 
     name: str  # As in discovery.json
-    # Of its cells
+    # Of its candidates
     place: Place
     driver: str
     form: str
@@ -189,25 +191,25 @@ class Effect:
     sentence: str
     separate_by: str  # Which measurements distinguish it from others
     remedy: str  # What to do about it: a sentence for whoever answers for the arm
-    # What a cell amounts to, for a sentence: of context, cell and draws of its parameters (draws,
-    # m); see `sizes`
-    size: Callable[[Context, Cell, FloatArray], str]
-    cells: Callable[[Context], Iterable[Cell]]  # All of its cells for a context
+    # What a candidate amounts to, for a sentence: of context, candidate and draws of its
+    # parameters (draws, m); see `sizes`
+    size: Callable[[Context, Candidate, FloatArray], str]
+    candidates: Callable[[Context], Iterable[Candidate]]  # All of its candidates for a context
     # Returns why a context cannot show it; '' where it can
     needs: Callable[[Context], str] = field(default=lambda context: '')
-    # Which of its cells are members of its kind: one for each joint, not every variant
-    in_family: Callable[[Cell], bool] = field(default=lambda cell: True)
-    # How cells make causes: all cells of an ``effect`` are one cause, those of the same
+    # Which of its candidates are members of its kind: one for each joint, not every variant
+    in_family: Callable[[Candidate], bool] = field(default=lambda candidate: True)
+    # How candidates make causes: all candidates of an ``effect`` are one cause, those of the same
     # ``joints``, or those of the same joints and ``variant``
     cause_per: Literal['effect', 'joints', 'variant'] = 'effect'
-    costly: bool = False  # It has too many cells to be tried again and again
-    many: bool = False  # Its cells are drawn from thousands: they are no kind of one variance
+    costly: bool = False  # It has too many candidates to be tried again and again
+    many: bool = False  # Its candidates are drawn from thousands: they are no kind of one variance
     # The offsets model absorbs it: it is judged by how far that fit moved the markers
     # (`marker_offsets`), not by the residuals
     moves_the_fit: bool = False
-    # Its cells' second joint is the one that drives; the sentence is about the first
+    # Its candidates' second joint is the one that drives; the sentence is about the first
     driven_by_joint: bool = False
-    sign: int = 0  # Of its parameters, as of `Cell`
+    sign: int = 0  # Of its parameters, as of `Candidate`
     # Name in discovery.json, where it is another: 'unnamed' for what has no name of its own
     reported_as: str = ''
     # False for structure that is located without a cause: it is reported as unexplained
@@ -215,31 +217,33 @@ class Effect:
     # In place of sentence and remedy where it is about joints that slide; '' where these are right
     slide_sentence: str = ''
     slide_remedy: str = ''
-    # For what happened at one moment: its cells in all gaps between rows that reach between two
-    # moments, s since the first row
-    between: Callable[[Context, float, float], Iterable[Cell]] | None = None
-    # For what has a place or size that no parameter is: its cells near one of them
-    finer: Callable[[Context, Cell], Iterable[Cell]] | None = None
-    # Columns of a change of its cells at a moment; None for what is the same in all of a session
+    # For what happened at one moment: its candidates in all gaps between rows that reach between
+    # two moments, s since the first row
+    between: Callable[[Context, float, float], Iterable[Candidate]] | None = None
+    # For what has a place or size that no parameter is: its candidates near one of them
+    finer: Callable[[Context, Candidate], Iterable[Candidate]] | None = None
+    # Columns of a change of its candidates at a moment; None for what is the same all the time
     changes: Changes | None = None
 
-    def cell(
+    def candidate(
         self, columns: Callable[[Context], Design], parameters: Iterable[str], **more: Any
-    ) -> Cell:
-        """Return a cell of this effect; ``more`` are further arguments of `Cell`."""
+    ) -> Candidate:
+        """Return a candidate of this effect; ``more`` are further arguments of `Candidate`."""
         names = ('name', 'place', 'driver', 'form', 'unit', 'sign')
         own = {name: getattr(self, name) for name in names}
         own['largest'] = self.plausible[1] if self.plausible else None
-        return Cell(columns=columns, parameters=tuple(parameters), **{**own, **more})
+        return Candidate(columns=columns, parameters=tuple(parameters), **{**own, **more})
 
-    def sentence_of(self, cells: Iterable[Cell]) -> str:
-        """Return its sentence about some cells."""
-        return (all(cell.slide for cell in cells) and self.slide_sentence) or self.sentence
+    def sentence_of(self, candidates: Iterable[Candidate]) -> str:
+        """Return its sentence about some candidates."""
+        return (
+            all(candidate.slide for candidate in candidates) and self.slide_sentence
+        ) or self.sentence
 
-    def remedy_of(self, cell: Cell) -> str:
-        """Return what to do about a cell and others like it."""
-        remedy = (cell.slide and self.slide_remedy) or self.remedy
-        return remedy.format(driver=cell.driver.replace('_', ' '))
+    def remedy_of(self, candidate: Candidate) -> str:
+        """Return what to do about a candidate and others like it."""
+        remedy = (candidate.slide and self.slide_remedy) or self.remedy
+        return remedy.format(driver=candidate.driver.replace('_', ' '))
 
     def at_joints(
         self,
@@ -248,12 +252,12 @@ class Effect:
         features: Callable[[Context, int], Sequence[FloatArray]],
         parameters: Sequence[str],
         **more: Any,
-    ) -> Iterator[Cell]:
-        """Give a cell for each of some joints (1-based), which adds to that joint's angle.
+    ) -> Iterator[Candidate]:
+        """Give a candidate for each of some joints (1-based), which adds to that joint's angle.
 
         ``joints``: which of the context's; ``features``: context and joint to m added angles, rad
         or m per unit, (n,) each; ``parameters``: names of the m parameters, with ``{joint}`` for
-        the joint; ``more``: further arguments of `Cell`.
+        the joint; ``more``: further arguments of `Candidate`.
         """
         for joint in joints:
             own: dict[str, Any] = {}
@@ -263,7 +267,7 @@ class Effect:
                 own |= {'slide': True}
                 if self.plausible:
                     own['largest'] = counts * self.plausible[1]
-            yield self.cell(
+            yield self.candidate(
                 partial(_added, joint=joint, features=features),
                 [name.format(joint=joint) for name in parameters],
                 joints=(joint,),

@@ -7,30 +7,32 @@ from functools import partial
 
 import numpy as np
 
-from remaster_ros.discovery.effects.base import Cell, Design, Effect, needs_gravity, turned
+from remaster_ros.discovery.effects.base import Candidate, Design, Effect, needs_gravity, turned
 from remaster_ros.discovery.effects.context import Context
 from remaster_ros.discovery.effects.moments import switched
 from remaster_ros.discovery.effects.sizes import angle, largest
 from remaster_ros.types import FloatArray
 
 
-def cells(context: Context) -> Iterator[Cell]:
+def candidates(context: Context) -> Iterator[Candidate]:
     """One compliance for all directions, or one about each horizontal axis."""
     x, y, z = np.eye(3)
     for variant, axes, parameters in (
         ('isotropic', [x + y + z], ['base_compliance']),
         ('by axis', [x, y], ['base_compliance_x', 'base_compliance_y']),
     ):
-        yield EFFECT.cell(partial(_tipped, axes=axes), parameters, drawn_from=2, variant=variant)
+        yield EFFECT.candidate(
+            partial(_tipped, axes=axes), parameters, drawn_from=2, variant=variant
+        )
 
 
 def _tipped(context: Context, axes: list[FloatArray]) -> Design:
     return turned(context, [context.base_moment * axis for axis in axes], np.zeros(3))
 
 
-def _tips(context: Context, cell: Cell, draws: FloatArray) -> str:
+def _tips(context: Context, candidate: Candidate, draws: FloatArray) -> str:
     moment = largest(np.linalg.norm(context.base_moment, axis=1))
-    about = cell.parameters if cell.size > 1 else ('',)
+    about = candidate.parameters if candidate.size > 1 else ('',)
     return ' and '.join(
         f'base and first links tip by {angle(draws[:, i] * moment)} under {moment:.0f} N m'
         + (f' about {name[-1]}' if name else '')
@@ -56,7 +58,7 @@ EFFECT = Effect(
     'tip, or another arm of the type on another stand gives way as much, it is the arm: its '
     'bearings and first links give way, no bolt changes that, and it can only be corrected.',
     size=_tips,
-    cells=cells,
+    candidates=candidates,
     changes=switched,
     needs=needs_gravity,
 )

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from remaster_ros.discovery.effects.base import Cell, Design, Effect, needs_gravity, turned
+from remaster_ros.discovery.effects.base import Candidate, Design, Effect, needs_gravity, turned
 from remaster_ros.discovery.effects.context import Context
 from remaster_ros.discovery.effects.sizes import angle
 from remaster_ros.types import FloatArray
@@ -21,16 +21,16 @@ SHARES = (0.15, 0.25, 0.35, 0.5, 0.65, 0.75, 0.85)
 FINER = np.arange(-4, 5) / 4.0
 
 
-def cells(context: Context) -> Iterator[Cell]:
+def candidates(context: Context) -> Iterator[Candidate]:
     """About each axis, where the moment of the arm's weight exceeds each of some values."""
     for degrees in np.arange(AXES) * (180.0 / AXES):
         for share in SHARES:
-            yield _cell(context, float(degrees), share)
+            yield _candidate(context, float(degrees), share)
 
 
-def _cell(context: Context, degrees: float, share: float) -> Cell:
+def _candidate(context: Context, degrees: float, share: float) -> Candidate:
     level = float(np.quantile(context.base_moment[context.to_fit] @ _axis(degrees), share))
-    return EFFECT.cell(
+    return EFFECT.candidate(
         Rocking(degrees, level),
         ['base_tipping'],
         variant=f'{degrees:.2f}° from x, at {level:.1f} N m'.replace('-', '−'),
@@ -38,15 +38,15 @@ def _cell(context: Context, degrees: float, share: float) -> Cell:
     )
 
 
-def finer(context: Context, cell: Cell) -> Iterator[Cell]:
-    """Give cells about axes and moments near those of another."""
-    best = cell.columns
+def finer(context: Context, candidate: Candidate) -> Iterator[Candidate]:
+    """Give candidates about axes and moments near those of another."""
+    best = candidate.columns
     assert isinstance(best, Rocking)
     share = float(np.mean(context.base_moment[context.to_fit] @ best.axis <= best.level))
     for turn in FINER * (180.0 / AXES):
         for shift in FINER * 0.1:
             if 0.05 < share + shift < 0.95:
-                yield _cell(context, best.degrees + float(turn), share + float(shift))
+                yield _candidate(context, best.degrees + float(turn), share + float(shift))
 
 
 def _axis(degrees: float) -> FloatArray:
@@ -71,8 +71,8 @@ class Rocking:
         return turned(context, [side[:, None] * self.axis], np.zeros(3))
 
 
-def _rocks(context: Context, cell: Cell, draws: FloatArray) -> str:
-    return f'the base rocks by {angle(draws[:, 0])} about an axis {cell.variant}'
+def _rocks(context: Context, candidate: Candidate, draws: FloatArray) -> str:
+    return f'the base rocks by {angle(draws[:, 0])} about an axis {candidate.variant}'
 
 
 EFFECT = Effect(
@@ -90,8 +90,8 @@ EFFECT = Effect(
     remedy='Hold a dial gauge between the ground and each foot of the stand while the arm reaches '
     'from one side to the other; level the feet, tighten the bolts, and measure again.',
     size=_rocks,
-    cells=cells,
+    candidates=candidates,
     needs=needs_gravity,
-    in_family=lambda cell: False,
+    in_family=lambda candidate: False,
     finer=finer,
 )

@@ -5,18 +5,18 @@ from __future__ import annotations
 from collections.abc import Iterator
 from functools import partial
 
-from remaster_ros.discovery.effects.base import Cell, Design, Effect, displaced, needs_motion
+from remaster_ros.discovery.effects.base import Candidate, Design, Effect, displaced, needs_motion
 from remaster_ros.discovery.effects.context import Context
 from remaster_ros.discovery.effects.sizes import number
 from remaster_ros.types import FloatArray
 
 
-def cells(context: Context) -> Iterator[Cell]:
+def candidates(context: Context) -> Iterator[Candidate]:
     """Each sensor: δp = J q̇ d (t - t̄)."""
     for index, name in enumerate(context.sensor_names):
         mine = context.seen_by(index) & context.to_fit
         middle = float(context.elapsed_s[mine].mean()) if mine.any() else 0.0
-        yield EFFECT.cell(
+        yield EFFECT.candidate(
             partial(_moved_on, sensor=index, middle=middle),
             [f'clock_drift_{name}'],
             drawn_from=len(context.sensor_names),
@@ -29,12 +29,12 @@ def _moved_on(context: Context, sensor: int, middle: float) -> Design:
     return displaced(context.marker_velocity * seconds[:, None])
 
 
-def _fast(context: Context, cell: Cell, draws: FloatArray) -> str:
+def _fast(context: Context, candidate: Candidate, draws: FloatArray) -> str:
     parts = 1e6 * draws[:, 0]
     mean = float(parts.mean())
     what = 'slow' if mean >= 0.0 else 'fast'
     shown = number(abs(mean), float(parts.std()), '')
-    return f"{cell.subject}'s clock is {shown} parts in a million {what}"
+    return f"{candidate.subject}'s clock is {shown} parts in a million {what}"
 
 
 EFFECT = Effect(
@@ -50,6 +50,6 @@ EFFECT = Effect(
     separate_by='a longer recording, which moves throughout',
     remedy='Synchronise the clocks of sensor and controller (PTP).',
     size=_fast,
-    cells=cells,
+    candidates=candidates,
     needs=needs_motion,
 )

@@ -5,16 +5,16 @@ from __future__ import annotations
 from collections.abc import Iterator
 from functools import partial
 
-from remaster_ros.discovery.effects.base import Cell, Design, Effect, displaced, needs_motion
+from remaster_ros.discovery.effects.base import Candidate, Design, Effect, displaced, needs_motion
 from remaster_ros.discovery.effects.context import Context
 from remaster_ros.discovery.effects.sizes import number
 from remaster_ros.types import FloatArray
 
 
-def cells(context: Context) -> Iterator[Cell]:
+def candidates(context: Context) -> Iterator[Candidate]:
     """Each sensor: δp = J q̇ c, c being what its stamps lack."""
     for index, name in enumerate(context.sensor_names):
-        yield EFFECT.cell(
+        yield EFFECT.candidate(
             partial(_moved_on, sensor=index),
             [f'clock_offset_{name}'],
             drawn_from=len(context.sensor_names),
@@ -26,12 +26,12 @@ def _moved_on(context: Context, sensor: int) -> Design:
     return displaced(context.marker_velocity * context.seen_by(sensor)[:, None])
 
 
-def _late(context: Context, cell: Cell, draws: FloatArray) -> str:
+def _late(context: Context, candidate: Candidate, draws: FloatArray) -> str:
     late = -1e3 * draws[:, 0]
     mean = float(late.mean())
     what = 'later' if mean >= 0.0 else 'earlier'
     shown = number(abs(mean), float(late.std()), ' ms')
-    return f"{cell.subject}'s stamps are {shown} {what} than import took them to be"
+    return f"{candidate.subject}'s stamps are {shown} {what} than import took them to be"
 
 
 EFFECT = Effect(
@@ -48,6 +48,6 @@ EFFECT = Effect(
     remedy='Synchronise the clocks of sensor and controller (PTP), or state the offset to what '
     'joins their data (import --clock-offset).',
     size=_late,
-    cells=cells,
+    candidates=candidates,
     needs=needs_motion,
 )

@@ -227,7 +227,7 @@ class Context:
         points = self.chain.positions(
             self.measurements.q, self.markers[self.marker], self.joint_offsets
         )
-        # No cell uses the centre of a sensor without rows.
+        # No candidate uses the centre of a sensor without rows.
         seen = [points[self.seen_by(sensor)] for sensor in range(len(self.sensor_names))]
         return np.array([rows.mean(axis=0) if len(rows) else np.zeros(3) for rows in seen])
 

@@ -16,7 +16,7 @@ from remaster_ros.types import BoolArray, FloatArray
 class Driver:
     """What may drive an error."""
 
-    # As the cells have them
+    # As the candidates have them
     name: str
     unit: str
     value: Callable[[Context], FloatArray]  # Its value in each row, (n,)
@@ -131,7 +131,7 @@ _OF_JOINTS: dict[str, Callable[[Context, int, str], Driver]] = {
 
 
 def driver_named(context: Context, name: str, joint: int) -> Driver | None:
-    """Return the driver of a cell by its name; None where it is no single number.
+    """Return the driver of a candidate by its name; None where it is no single number.
 
     ``joint`` (1-based) is that of a name which has none.
     """

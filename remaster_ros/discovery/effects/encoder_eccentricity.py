@@ -7,7 +7,7 @@ from functools import partial
 
 import numpy as np
 
-from remaster_ros.discovery.effects.base import Cell, Effect
+from remaster_ros.discovery.effects.base import Candidate, Effect
 from remaster_ros.discovery.effects.context import Context
 from remaster_ros.discovery.effects.sizes import up_to
 from remaster_ros.types import FloatArray
@@ -16,7 +16,7 @@ from remaster_ros.types import FloatArray
 ORDERS = ((1,), (2,), (1, 2))
 
 
-def cells(context: Context) -> Iterator[Cell]:
+def candidates(context: Context) -> Iterator[Candidate]:
     """Sine and cosine of the joint's own angle."""
     for orders in ORDERS:
         yield from EFFECT.at_joints(
@@ -48,6 +48,6 @@ EFFECT = Effect(
     remedy='Correct the angle by the wave that was found; where the wave is large, have the '
     'disc of the encoder centred.',
     size=up_to('joint {joint} errs'),
-    cells=cells,
-    in_family=lambda cell: cell.variant == '1+2',
+    candidates=candidates,
+    in_family=lambda candidate: candidate.variant == '1+2',
 )

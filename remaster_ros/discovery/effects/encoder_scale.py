@@ -6,14 +6,14 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from remaster_ros.discovery.effects.base import Cell, Effect
+from remaster_ros.discovery.effects.base import Candidate, Effect
 from remaster_ros.discovery.effects.context import Context
 from remaster_ros.discovery.effects.sizes import along_mean, number, of_joint, span_of
 from remaster_ros.types import FloatArray
 
 
-def cells(context: Context) -> Iterator[Cell]:
-    """One cell per joint: δq_j = s_j q_j."""
+def candidates(context: Context) -> Iterator[Candidate]:
+    """One candidate per joint: δq_j = s_j q_j."""
     return EFFECT.at_joints(
         context,
         context.moving,
@@ -23,15 +23,16 @@ def cells(context: Context) -> Iterator[Cell]:
     )
 
 
-def _scaled(context: Context, cell: Cell, draws: FloatArray) -> str:
-    joint, scale = cell.joints[0], draws[:, 0]
+def _scaled(context: Context, candidate: Candidate, draws: FloatArray) -> str:
+    joint, scale = candidate.joints[0], draws[:, 0]
     more = 'more' if scale.mean() >= 0.0 else 'less'
     span = np.ptp(context.measurements.q[:, joint - 1])
     # Of a slide in mm a metre, as screws and scales are specified.
-    times, unit = (1e3, ' mm a metre') if cell.slide else (100.0, ' %')
+    times, unit = (1e3, ' mm a metre') if candidate.slide else (100.0, ' %')
     share = number(times * np.abs(scale.mean()), times * scale.std(), unit)
     return (
-        f'joint {joint} {"slides" if cell.slide else "turns"} {share} {more} than it reports, '
+        f'joint {joint} {"slides" if candidate.slide else "turns"} {share} {more} '
+        'than it reports, '
         f'{of_joint(context, joint, along_mean(draws[:, :1]) * span)} over the '
         f'{span_of(context, joint, span)} that it took'
     )
@@ -54,5 +55,5 @@ EFFECT = Effect(
     slide_remedy='Check the lead, the gear ratio and the resolution of the scale that are set in '
     'the controller.',
     size=_scaled,
-    cells=cells,
+    candidates=candidates,
 )

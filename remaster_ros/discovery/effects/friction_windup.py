@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from remaster_ros.discovery.effects.base import Cell, Effect, needs_motion
+from remaster_ros.discovery.effects.base import Candidate, Effect, needs_motion
 from remaster_ros.discovery.effects.context import Context
 from remaster_ros.discovery.effects.sizes import of_joint
 from remaster_ros.types import FloatArray
 
 
-def cells(context: Context) -> Iterator[Cell]:
-    """One cell per joint: δq_j = w_j f_j, f_j with the sign of q̇_j, with memory."""
+def candidates(context: Context) -> Iterator[Candidate]:
+    """One candidate per joint: δq_j = w_j f_j, f_j with the sign of q̇_j, with memory."""
     return EFFECT.at_joints(
         context,
         context.turning,
@@ -21,8 +21,8 @@ def cells(context: Context) -> Iterator[Cell]:
     )
 
 
-def _wound(context: Context, cell: Cell, draws: FloatArray) -> str:
-    joint = cell.joints[0]
+def _wound(context: Context, candidate: Candidate, draws: FloatArray) -> str:
+    joint = candidate.joints[0]
     return f'joint {joint} is {of_joint(context, joint, 2.0 * draws[:, 0])} apart, way by way'
 
 
@@ -40,6 +40,6 @@ EFFECT = Effect(
     remedy='Have the friction of the gearbox checked (grease, preload); where it must be exact, '
     'come from the same side.',
     size=_wound,
-    cells=cells,
+    candidates=candidates,
     needs=needs_motion,
 )

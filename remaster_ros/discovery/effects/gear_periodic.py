@@ -7,7 +7,7 @@ from functools import partial
 
 import numpy as np
 
-from remaster_ros.discovery.effects.base import Cell, Effect
+from remaster_ros.discovery.effects.base import Candidate, Effect
 from remaster_ros.discovery.effects.context import Context
 from remaster_ros.discovery.effects.sizes import angle
 from remaster_ros.types import FloatArray
@@ -17,7 +17,7 @@ LOWEST_ORDER = 3
 HIGHEST_ORDER = 400
 
 
-def cells(context: Context) -> Iterator[Cell]:
+def candidates(context: Context) -> Iterator[Candidate]:
     """Sine and cosine at every whole order that the number of rows allows."""
     highest = int(min(HIGHEST_ORDER, 4 * len(context)))
     orders = range(LOWEST_ORDER, highest + 1)
@@ -37,9 +37,10 @@ def _waves(context: Context, joint: int, order: int) -> list[FloatArray]:
     return [np.sin(phase), np.cos(phase)]
 
 
-def _wave(context: Context, cell: Cell, draws: FloatArray) -> str:
+def _wave(context: Context, candidate: Candidate, draws: FloatArray) -> str:
     amplitude = np.hypot(draws[:, 0], draws[:, 1])
-    return f'joint {cell.joints[0]} errs by ±{angle(amplitude)}, {cell.variant} times a turn'
+    (joint,) = candidate.joints
+    return f'joint {joint} errs by ±{angle(amplitude)}, {candidate.variant} times a turn'
 
 
 EFFECT = Effect(
@@ -58,7 +59,7 @@ EFFECT = Effect(
     'which part runs unevenly, and where it grows from session to session that part wears. One '
     'that fits nothing in this joint is a wave to correct, whatever its cause.',
     size=_wave,
-    cells=cells,
+    candidates=candidates,
     cause_per='joints',
     costly=True,
     many=True,

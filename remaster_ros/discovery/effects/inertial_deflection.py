@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from remaster_ros.discovery.effects.base import Cell, Effect, needs_gravity, needs_motion
+from remaster_ros.discovery.effects.base import Candidate, Effect, needs_gravity, needs_motion
 from remaster_ros.discovery.effects.context import Context
 from remaster_ros.discovery.effects.sizes import largest, of_joint
 from remaster_ros.types import FloatArray
 
 
-def cells(context: Context) -> Iterator[Cell]:
-    """One cell per joint: δq_j = s_j τ_j."""
+def candidates(context: Context) -> Iterator[Candidate]:
+    """One candidate per joint: δq_j = s_j τ_j."""
     return EFFECT.at_joints(
         context,
         context.turning,
@@ -21,8 +21,8 @@ def cells(context: Context) -> Iterator[Cell]:
     )
 
 
-def _gave_way(context: Context, cell: Cell, draws: FloatArray) -> str:
-    joint = cell.joints[0]
+def _gave_way(context: Context, candidate: Candidate, draws: FloatArray) -> str:
+    joint = candidate.joints[0]
     torque = largest(context.motion.inertial_torque[:, joint - 1])
     moved = of_joint(context, joint, draws[:, 0] * torque)
     return f'joint {joint} gives way by {moved} under {torque:.0f} N m of inertia'
@@ -43,6 +43,6 @@ EFFECT = Effect(
     remedy='Accelerate less where it must be exact, and have gearbox and bearing checked for '
     'play; where the weight carried bends the joint too, correct that by its torque.',
     size=_gave_way,
-    cells=cells,
+    candidates=candidates,
     needs=lambda context: needs_motion(context) or needs_gravity(context),
 )

@@ -7,7 +7,7 @@ from functools import partial
 
 import numpy as np
 
-from remaster_ros.discovery.effects.base import Cell, Design, Effect, ModelChange, turned
+from remaster_ros.discovery.effects.base import Candidate, Design, Effect, ModelChange, turned
 from remaster_ros.discovery.effects.context import Context
 from remaster_ros.discovery.effects.sizes import along_mean, angle
 from remaster_ros.types import FloatArray
@@ -17,7 +17,7 @@ from remaster_ros.types import FloatArray
 RARITY = 3
 
 
-def cells(context: Context) -> Iterator[Cell]:
+def candidates(context: Context) -> Iterator[Candidate]:
     """Each joint after the first, about the axes of its frame that are not its own axis."""
     for joint in range(2, context.joints + 1):
         directions = tilt_directions(context, joint)
@@ -25,7 +25,7 @@ def cells(context: Context) -> Iterator[Cell]:
         for axes in (''.join(directions), *directions):
             rarity = 1 if len(axes) > 1 else RARITY * len(directions)
             turns = np.array([directions[axis] for axis in axes])
-            yield EFFECT.cell(
+            yield EFFECT.candidate(
                 partial(_tilted, joint=joint, axes=list(turns)),
                 [f'tilt_{axis}_{joint}' for axis in axes],
                 joints=(joint,),
@@ -50,10 +50,10 @@ def tilt_directions(context: Context, joint: int) -> dict[str, FloatArray]:
     }
 
 
-def _tilt(context: Context, cell: Cell, draws: FloatArray) -> str:
-    size = along_mean(draws) if cell.size > 1 else draws[:, 0]
-    axes = ' and '.join(cell.variant)
-    return f'the axis of joint {cell.joints[0]} is tilted by {angle(size)} about {axes}'
+def _tilt(context: Context, candidate: Candidate, draws: FloatArray) -> str:
+    size = along_mean(draws) if candidate.size > 1 else draws[:, 0]
+    axes = ' and '.join(candidate.variant)
+    return f'the axis of joint {candidate.joints[0]} is tilted by {angle(size)} about {axes}'
 
 
 EFFECT = Effect(
@@ -69,6 +69,6 @@ EFFECT = Effect(
     separate_by='all joint solutions of each pose: the tilt changes sign with the branch',
     remedy='Load apply/robot_model.urdf: tilts, with the zero-offsets that belong to them.',
     size=_tilt,
-    cells=cells,
-    in_family=lambda cell: cell.size == 1,
+    candidates=candidates,
+    in_family=lambda candidate: candidate.size == 1,
 )

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from remaster_ros.discovery.effects.base import Cell, Effect, needs_gravity
+from remaster_ros.discovery.effects.base import Candidate, Effect, needs_gravity
 from remaster_ros.discovery.effects.context import Context
 from remaster_ros.discovery.effects.moments import switched
 from remaster_ros.discovery.effects.sizes import largest, of_joint
 from remaster_ros.types import FloatArray
 
 
-def cells(context: Context) -> Iterator[Cell]:
-    """One cell per joint: δq_j = c_j τ_j."""
+def candidates(context: Context) -> Iterator[Candidate]:
+    """One candidate per joint: δq_j = c_j τ_j."""
     return EFFECT.at_joints(
         context,
         range(1, context.joints + 1),
@@ -22,11 +22,11 @@ def cells(context: Context) -> Iterator[Cell]:
     )
 
 
-def _turned(context: Context, cell: Cell, draws: FloatArray) -> str:
-    joint = cell.joints[0]
+def _turned(context: Context, candidate: Candidate, draws: FloatArray) -> str:
+    joint = candidate.joints[0]
     torque = largest(context.gravity_torque[:, joint - 1])
     moved = of_joint(context, joint, draws[:, 0] * torque)
-    verb, unit = ('slides', 'N') if cell.slide else ('turns', 'N m')
+    verb, unit = ('slides', 'N') if candidate.slide else ('turns', 'N m')
     return f'joint {joint} {verb} {moved} under {torque:.0f} {unit}'
 
 
@@ -48,7 +48,7 @@ EFFECT = Effect(
     slide_remedy='Have belt, rack or screw and its bearings checked for play and wear; correct '
     'what is left by the force, and state the payload.',
     size=_turned,
-    cells=cells,
+    candidates=candidates,
     changes=switched,
     needs=needs_gravity,
 )

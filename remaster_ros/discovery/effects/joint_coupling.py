@@ -7,7 +7,7 @@ from functools import partial
 
 import numpy as np
 
-from remaster_ros.discovery.effects.base import Cell, Design, Effect
+from remaster_ros.discovery.effects.base import Candidate, Design, Effect
 from remaster_ros.discovery.effects.context import Context
 from remaster_ros.discovery.effects.drivers import driver_at
 from remaster_ros.discovery.effects.sizes import up_to
@@ -17,7 +17,7 @@ from remaster_ros.types import FloatArray
 LARGEST = 1e-2
 
 
-def cells(context: Context) -> Iterator[Cell]:
+def candidates(context: Context) -> Iterator[Candidate]:
     """Joint j by every other joint l: linear, or sine and cosine of one that turns."""
     units, counts = context.chain.units, context.chain.per_radian
     count = 2 * context.joints * max(1, len(context.moving) - 1)
@@ -33,7 +33,7 @@ def cells(context: Context) -> Iterator[Cell]:
             ):
                 if form == 'sin/cos' and context.slides(other):
                     continue
-                yield EFFECT.cell(
+                yield EFFECT.candidate(
                     partial(_followed, joint=joint, other=other, form=form),
                     parameters,
                     joints=(joint, other),
@@ -52,9 +52,9 @@ def _followed(context: Context, joint: int, other: int, form: str) -> Design:
     return Design(joint - 1, np.stack(features, axis=-1))
 
 
-def _coupled(context: Context, cell: Cell, draws: FloatArray) -> str:
-    verb = 'slides' if context.slides(cell.joints[0]) else 'turns'
-    return up_to(f'joint {{joint}} {verb} with joint {{other}}')(context, cell, draws)
+def _coupled(context: Context, candidate: Candidate, draws: FloatArray) -> str:
+    verb = 'slides' if context.slides(candidate.joints[0]) else 'turns'
+    return up_to(f'joint {{joint}} {verb} with joint {{other}}')(context, candidate, draws)
 
 
 EFFECT = Effect(
@@ -74,7 +74,7 @@ EFFECT = Effect(
     slide_remedy='Check the coupling that is set in the controller for these joints; correct what '
     'is left by the position of the other joint.',
     size=_coupled,
-    cells=cells,
+    candidates=candidates,
     cause_per='joints',
     driven_by_joint=True,
 )

@@ -7,7 +7,7 @@ from functools import partial
 
 import numpy as np
 
-from remaster_ros.discovery.effects.base import Cell, Design, Effect
+from remaster_ros.discovery.effects.base import Candidate, Design, Effect
 from remaster_ros.discovery.effects.context import Context
 from remaster_ros.discovery.effects.drivers import angle_of
 from remaster_ros.discovery.effects.sizes import ARC_MINUTE, MM, number
@@ -26,7 +26,7 @@ RARITY = 10
 ROWS_PER_KNOT = 6.0
 
 
-def cells(context: Context) -> Iterator[Cell]:
+def candidates(context: Context) -> Iterator[Candidate]:
     """One curve per joint."""
     configurations = len(np.unique(context.measurements.configuration[context.to_fit]))
     for joint in context.moving:
@@ -34,7 +34,7 @@ def cells(context: Context) -> Iterator[Cell]:
         curve = driver.curve(context, ROWS_PER_KNOT / configurations, unit * FINEST_KNOTS)
         shown = context.chain.shown_units[joint - 1]
         places = context.chain.shown_scale[joint - 1] * curve.places
-        yield EFFECT.cell(
+        yield EFFECT.candidate(
             partial(_splines, joint=joint, curve=curve),
             [f'curve_{joint}_at_{place:+.1f}{shown}' for place in places],
             driver=driver.name,
@@ -52,10 +52,10 @@ def _splines(context: Context, joint: int, curve: Curve) -> Design:
     return Design(joint - 1, curve.columns(context.measurements.q[:, joint - 1]))
 
 
-def _range(context: Context, cell: Cell, draws: FloatArray) -> str:
-    joint = cell.joints[0]
-    values = cell.columns(context).values
-    one, unit, digits = (MM, ' mm', 3) if cell.slide else (ARC_MINUTE, '′', 1)
+def _range(context: Context, candidate: Candidate, draws: FloatArray) -> str:
+    joint = candidate.joints[0]
+    values = candidate.columns(context).values
+    one, unit, digits = (MM, ' mm', 3) if candidate.slide else (ARC_MINUTE, '′', 1)
     middle = values @ draws.mean(axis=0) / one
     rms = np.sqrt(np.mean((draws[:DRAWS] @ values.T / one) ** 2, axis=1))
     ends = ' to '.join(f'{end:+.{digits}f}{unit}' for end in (middle.min(), middle.max()))
@@ -83,5 +83,5 @@ EFFECT = Effect(
     slide_remedy='Correct the place by the curve that was found, within the places that were '
     'measured; where it grows from session to session, have screw or rack checked.',
     size=_range,
-    cells=cells,
+    candidates=candidates,
 )

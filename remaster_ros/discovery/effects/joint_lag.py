@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from remaster_ros.discovery.effects.base import Cell, Effect, needs_motion
+from remaster_ros.discovery.effects.base import Candidate, Effect, needs_motion
 from remaster_ros.discovery.effects.context import Context
 from remaster_ros.discovery.effects.sizes import number
 from remaster_ros.types import FloatArray
 
 
-def cells(context: Context) -> Iterator[Cell]:
-    """One cell per joint: δq_j = l_j q̇_j."""
+def candidates(context: Context) -> Iterator[Candidate]:
+    """One candidate per joint: δq_j = l_j q̇_j."""
     return EFFECT.at_joints(
         context,
         context.turning,
@@ -21,13 +21,12 @@ def cells(context: Context) -> Iterator[Cell]:
     )
 
 
-def _late(context: Context, cell: Cell, draws: FloatArray) -> str:
+def _late(context: Context, candidate: Candidate, draws: FloatArray) -> str:
     late = 1e3 * draws[:, 0]
     mean = float(late.mean())
     shown = number(abs(mean), float(late.std()), ' ms')
-    return (
-        f'the reports of joint {cell.joints[0]} are {shown} {"late" if mean >= 0.0 else "early"}'
-    )
+    (joint,) = candidate.joints
+    return f'the reports of joint {joint} are {shown} {"late" if mean >= 0.0 else "early"}'
 
 
 EFFECT = Effect(
@@ -44,6 +43,6 @@ EFFECT = Effect(
     remedy='Have the controller report measured positions of one moment; in use, allow for the '
     'lag in proportion to the speed, or stop before what must be exact.',
     size=_late,
-    cells=cells,
+    candidates=candidates,
     needs=needs_motion,
 )

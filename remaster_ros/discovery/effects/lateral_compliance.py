@@ -8,21 +8,21 @@ from functools import partial
 
 import numpy as np
 
-from remaster_ros.discovery.effects.base import Cell, Design, Effect, needs_gravity, turned
+from remaster_ros.discovery.effects.base import Candidate, Design, Effect, needs_gravity, turned
 from remaster_ros.discovery.effects.context import Context
 from remaster_ros.discovery.effects.moments import switched
 from remaster_ros.discovery.effects.sizes import angle, largest
 from remaster_ros.types import FloatArray
 
 
-def cells(context: Context) -> Iterator[Cell]:
+def candidates(context: Context) -> Iterator[Candidate]:
     """The bearing of each joint but the last, alike in both directions across its axis.
 
     That of joint 1 is a part of the base.
     """
     links = context.links()[1:]
     for joint in links:
-        yield EFFECT.cell(
+        yield EFFECT.candidate(
             partial(_tipped, joint=joint),
             [f'lateral_compliance_{joint}'],
             joints=(joint,),
@@ -42,8 +42,8 @@ def _tipped(context: Context, joint: int) -> Design:
     return turned(context, [_moment(context, joint)], context.joint_origin(joint))
 
 
-def _tips(context: Context, cell: Cell, draws: FloatArray) -> str:
-    (joint,) = cell.joints
+def _tips(context: Context, candidate: Candidate, draws: FloatArray) -> str:
+    (joint,) = candidate.joints
     moment = largest(np.linalg.norm(_moment(context, joint), axis=1))
     return f'joint {joint} tips by {angle(draws[:, 0] * moment)} under {moment:.0f} N m'
 
@@ -64,7 +64,7 @@ EFFECT = Effect(
     remedy='Have the main bearing of the joint checked for play with a dial gauge across the '
     'axis; correct what is left by the moment.',
     size=_tips,
-    cells=cells,
+    candidates=candidates,
     changes=switched,
     needs=needs_gravity,
 )

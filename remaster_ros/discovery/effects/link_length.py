@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 
 from remaster_ros.discovery.effects.base import (
-    Cell,
+    Candidate,
     Design,
     Effect,
     ModelChange,
@@ -19,12 +19,12 @@ from remaster_ros.discovery.effects.sizes import along_mean, length
 from remaster_ros.types import FloatArray
 
 
-def cells(context: Context) -> Iterator[Cell]:
+def candidates(context: Context) -> Iterator[Candidate]:
     """Each link from joint j to joint j + 1, along its length and across it."""
     for link in context.links():
         directions = link_directions(context, link)
         for axis, direction in directions.items():
-            yield EFFECT.cell(
+            yield EFFECT.candidate(
                 partial(_shifted, link=link, direction=direction),
                 [f'length_{link}' if axis == 'along' else f'offset_{axis}_{link}'],
                 joints=(link,),
@@ -53,13 +53,13 @@ def link_directions(context: Context, link: int) -> dict[str, FloatArray]:
     }
 
 
-def _longer(context: Context, cell: Cell, draws: FloatArray) -> str:
-    link, value, size = cell.joints[0], draws[:, 0], length(along_mean(draws[:, :1]))
-    if cell.variant == 'along':
+def _longer(context: Context, candidate: Candidate, draws: FloatArray) -> str:
+    link, value, size = candidate.joints[0], draws[:, 0], length(along_mean(draws[:, :1]))
+    if candidate.variant == 'along':
         longer = 'longer' if value.mean() >= 0.0 else 'shorter'
         return f'link {link} is {size} {longer} than the model'
     side = '+' if value.mean() >= 0.0 else '−'
-    return f'link {link} ends {size} off, along {side}{cell.variant} of its frame'
+    return f'link {link} ends {size} off, along {side}{candidate.variant} of its frame'
 
 
 EFFECT = Effect(
@@ -75,6 +75,6 @@ EFFECT = Effect(
     separate_by='poses that fold and stretch the arm, with the tool turned at each',
     remedy='Load apply/robot_model.urdf: lengths, with the zero-offsets that belong to them.',
     size=_longer,
-    cells=cells,
-    in_family=lambda cell: cell.size == 1,
+    candidates=candidates,
+    in_family=lambda candidate: candidate.size == 1,
 )

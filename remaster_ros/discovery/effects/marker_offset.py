@@ -5,19 +5,19 @@ from __future__ import annotations
 from collections.abc import Iterator
 from functools import partial
 
-from remaster_ros.discovery.effects.base import Cell, Design, Effect, displaced
+from remaster_ros.discovery.effects.base import Candidate, Design, Effect, displaced
 from remaster_ros.discovery.effects.context import Context
 from remaster_ros.discovery.effects.sizes import up_to
 
 
-def cells(context: Context) -> Iterator[Cell]:
+def candidates(context: Context) -> Iterator[Candidate]:
     """Each marker, along the axes of the tool frame.
 
-    The offsets model fits the markers already: this cell is judged by how far the fit moved them,
+    The offsets model fits the markers already: this one is judged by how far the fit moved them,
     against their stated accuracy.
     """
     for index, name in enumerate(context.marker_names):
-        yield EFFECT.cell(
+        yield EFFECT.candidate(
             partial(_moved, marker=index),
             [f'{axis}_{name}' for axis in 'xyz'],
             drawn_from=len(context.marker_names),
@@ -44,6 +44,6 @@ EFFECT = Effect(
     remedy='Correct the place of the marker in session.yaml, or measure it against the tool '
     'plate.',
     size=up_to('{subject} is off'),
-    cells=cells,
+    candidates=candidates,
     moves_the_fit=True,
 )

@@ -13,7 +13,7 @@ from functools import partial
 
 import numpy as np
 
-from remaster_ros.discovery.effects.base import Cell, Changes, Design
+from remaster_ros.discovery.effects.base import Candidate, Changes, Design
 from remaster_ros.discovery.effects.context import Context
 from remaster_ros.types import FloatArray
 
@@ -58,35 +58,37 @@ def after(context: Context, gap: FloatArray) -> FloatArray:
     return share[:, None]
 
 
-def switched(context: Context, cell: Cell, gap: FloatArray, ends: bool) -> Design:
-    """Return the columns of a cell from a moment on, or up to it, and nothing else."""
-    design = cell.columns(context)
+def switched(context: Context, candidate: Candidate, gap: FloatArray, ends: bool) -> Design:
+    """Return the columns of a candidate from a moment on, or up to it, and nothing else."""
+    design = candidate.columns(context)
     share = 1.0 - after(context, gap) if ends else after(context, gap)
     values = design.values * (share if design.values.ndim == 2 else share[:, None])
     return Design(design.at, values)
 
 
-def changed_at(cell: Cell, changes: Changes, gap: FloatArray) -> Iterator[Cell]:
-    """Give a cell that begins, or becomes more or less, in a gap (2,), and one that ends then."""
+def changed_at(candidate: Candidate, changes: Changes, gap: FloatArray) -> Iterator[Candidate]:
+    """Give a candidate that begins, or becomes more or less, in a gap (2,), and one that ends."""
     begins = replace(
-        cell,
-        parameters=tuple(f'{name}_change' for name in cell.parameters),
-        columns=partial(changes, cell=cell, gap=gap, ends=False),
-        drawn_from=cell.drawn_from * MOMENTS_OF_CHANGE * RARITY_OF_CHANGE,
+        candidate,
+        parameters=tuple(f'{name}_change' for name in candidate.parameters),
+        columns=partial(changes, candidate=candidate, gap=gap, ends=False),
+        drawn_from=candidate.drawn_from * MOMENTS_OF_CHANGE * RARITY_OF_CHANGE,
         sign=0,
         moment=float(gap.mean()),
-        changes=cell,
+        changes=candidate,
         model_change=None,
     )
     yield begins
-    columns = partial(changes, cell=cell, gap=gap, ends=True)
-    yield replace(begins, columns=columns, sign=cell.sign, ends=True)
+    columns = partial(changes, candidate=candidate, gap=gap, ends=True)
+    yield replace(begins, columns=columns, sign=candidate.sign, ends=True)
 
 
-def changed(context: Context, cells: Iterable[tuple[Cell, Changes | None]]) -> Iterator[Cell]:
-    """Give the changes of cells at moments spread over the session, each with how it changes."""
+def changed(
+    context: Context, candidates: Iterable[tuple[Candidate, Changes | None]]
+) -> Iterator[Candidate]:
+    """Give the changes of candidates, each with how it changes, at moments over the session."""
     moments = spread(gaps(context), MOMENTS_OF_CHANGE) if context.has_time else np.zeros((0, 2))
-    for cell, changes in cells:
-        if changes is not None and cell.penalty is None:
+    for candidate, changes in candidates:
+        if changes is not None and candidate.penalty is None:
             for gap in moments:
-                yield from changed_at(cell, changes, gap)
+                yield from changed_at(candidate, changes, gap)

@@ -7,13 +7,13 @@ from functools import partial
 
 import numpy as np
 
-from remaster_ros.discovery.effects.base import Cell, Design, Effect, displaced, needs_time
+from remaster_ros.discovery.effects.base import Candidate, Design, Effect, displaced, needs_time
 from remaster_ros.discovery.effects.context import Context
 from remaster_ros.discovery.effects.sizes import along_mean, length
 from remaster_ros.types import FloatArray
 
 
-def cells(context: Context) -> Iterator[Cell]:
+def candidates(context: Context) -> Iterator[Candidate]:
     """Each sensor's frame shifts steadily, or shifts and turns."""
     for index, name in context.sensors('controller'):
         mine = context.seen_by(index) & context.to_fit
@@ -22,7 +22,7 @@ def cells(context: Context) -> Iterator[Cell]:
         shifts = [f'drift_{axis}_{name}' for axis in 'xyz']
         turns = [f'drift_r{axis}_{name}' for axis in 'xyz']
         for variant, parameters in (('shift', shifts), ('shift and turn', shifts + turns)):
-            yield EFFECT.cell(
+            yield EFFECT.candidate(
                 partial(_crept, sensor=index, middle=middle, turning=parameters != shifts),
                 parameters,
                 drawn_from=2 * len(context.sensor_names),
@@ -46,18 +46,18 @@ def _columns(context: Context, sensor: int, passed_s: FloatArray, turning: bool)
     return displaced(*shifts)
 
 
-def _began(context: Context, cell: Cell, gap: FloatArray, ends: bool) -> Design:
+def _began(context: Context, candidate: Candidate, gap: FloatArray, ends: bool) -> Design:
     """Return a drift that begins, or becomes faster, at a moment, or ends then."""
     since_s = context.elapsed_s - gap.mean()
     since_s = np.minimum(since_s, 0.0) if ends else np.maximum(since_s, 0.0)
-    sensor = context.sensor_names.index(cell.subject)
-    return _columns(context, sensor, since_s, cell.size > 3)
+    sensor = context.sensor_names.index(candidate.subject)
+    return _columns(context, sensor, since_s, candidate.size > 3)
 
 
-def _moved_by(context: Context, cell: Cell, draws: FloatArray) -> str:
+def _moved_by(context: Context, candidate: Candidate, draws: FloatArray) -> str:
     hours = float(np.ptp(context.elapsed_s)) / 3600.0
     way = along_mean(draws[:, :3]) * hours * 3600.0
-    return f'{cell.subject} moves by {length(way)} in {hours:.1f} h'
+    return f'{candidate.subject} moves by {length(way)} in {hours:.1f} h'
 
 
 EFFECT = Effect(
@@ -74,7 +74,7 @@ EFFECT = Effect(
     remedy='Fix the mount of the sensor, let the sensor warm up, and watch references while '
     'measuring.',
     size=_moved_by,
-    cells=cells,
+    candidates=candidates,
     changes=_began,
     needs=needs_time,
 )

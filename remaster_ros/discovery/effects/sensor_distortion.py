@@ -7,7 +7,7 @@ from functools import partial
 
 import numpy as np
 
-from remaster_ros.discovery.effects.base import Cell, Design, Effect, displaced
+from remaster_ros.discovery.effects.base import Candidate, Design, Effect, displaced
 from remaster_ros.discovery.effects.context import Context
 from remaster_ros.discovery.effects.moments import switched
 from remaster_ros.discovery.effects.sizes import up_to
@@ -26,13 +26,13 @@ VARIANTS = (
 )
 
 
-def cells(context: Context) -> Iterator[Cell]:
+def candidates(context: Context) -> Iterator[Candidate]:
     """Each sensor that may have lenses: radial about its z axis, another one, or its origin."""
     for index, name in context.sensors('tracker', 'controller'):
         for variant, form, unit, axes in VARIANTS:
             kind = variant.replace(' ', '_')
             rarity = SPHERE_RARITY if variant == 'radial sphere' else 1
-            yield EFFECT.cell(
+            yield EFFECT.candidate(
                 partial(_bent, sensor=index, variant=variant),
                 [f'{kind}_{axis}_{name}' for axis in axes] or [f'{kind}_{name}'],
                 form=form,
@@ -86,6 +86,6 @@ EFFECT = Effect(
     'If it has none (a laser tracker, points that the controller computed), state its kind in '
     'session.yaml and search again.',
     size=up_to('{subject} errs'),
-    cells=cells,
+    candidates=candidates,
     changes=switched,
 )

@@ -16,7 +16,7 @@ import numpy as np
 import scipy
 from scipy.spatial.distance import cdist
 
-from remaster_ros.discovery.effects.base import Cell, Design, Effect, along_axes, displaced
+from remaster_ros.discovery.effects.base import Candidate, Design, Effect, along_axes, displaced
 from remaster_ros.discovery.effects.context import Context
 from remaster_ros.discovery.effects.sizes import up_to
 from remaster_ros.discovery.effects.splines import basis, knot_vector, roughness
@@ -33,7 +33,7 @@ RARITY = 20
 JITTER = 1e-6
 
 
-def cells(context: Context) -> Iterator[Cell]:
+def candidates(context: Context) -> Iterator[Candidate]:
     """Each sensor, with a long and with a short length, and along the line of sight."""
     for index, name in context.sensors('controller'):
         mine = context.seen_by(index)
@@ -49,7 +49,7 @@ def cells(context: Context) -> Iterator[Cell]:
         for variant, factor in LENGTHS.items():
             length = factor * spread
             kernel = _kernel(centers, centers, length) + JITTER * np.eye(len(centers))
-            yield EFFECT.cell(
+            yield EFFECT.candidate(
                 partial(_field, sensor=index, centers=centers, length=length),
                 [
                     f'field_{axis}_{variant}_{name}_{i}'
@@ -64,7 +64,7 @@ def cells(context: Context) -> Iterator[Cell]:
             )
         distance = context.range_m[mine]
         knots = knot_vector(distance.min(), distance.max(), np.ptp(distance) / RANGE_KNOTS)
-        yield EFFECT.cell(
+        yield EFFECT.candidate(
             partial(_along_sight, sensor=index, knots=knots),
             [f'field_range_{name}_{i}' for i in range(len(knots) - 4)],
             # Its mean is free: bound to zero, what it lacked was a scale of the sensor.
@@ -119,6 +119,6 @@ EFFECT = Effect(
     remedy='Measure with the sensor somewhere else, and calibrate its lenses; the errors '
     'follow its volume.',
     size=up_to('{subject} errs'),
-    cells=cells,
+    candidates=candidates,
     is_cause=False,
 )

@@ -7,14 +7,14 @@ from functools import partial
 
 import numpy as np
 
-from remaster_ros.discovery.effects.base import Cell, Design, Effect, displaced
+from remaster_ros.discovery.effects.base import Candidate, Design, Effect, displaced
 from remaster_ros.discovery.effects.context import Context
 from remaster_ros.discovery.effects.moments import switched
 from remaster_ros.discovery.effects.sizes import number
 from remaster_ros.types import FloatArray
 
 
-def cells(context: Context) -> Iterator[Cell]:
+def candidates(context: Context) -> Iterator[Candidate]:
     """Each sensor: one scale, one along its z axis (depth), or one per axis."""
     x, y, z = np.eye(3)
     with_lens = context.sensors('tracker', 'controller')
@@ -27,7 +27,7 @@ def cells(context: Context) -> Iterator[Cell]:
             # Each direction of a tracker has the same measure: the wavelength of its laser.
             if variant and (index, name) not in with_lens:
                 continue
-            yield EFFECT.cell(
+            yield EFFECT.candidate(
                 partial(_stretched, sensor=index, directions=directions),
                 parameters,
                 drawn_from=3 * len(context.sensor_names),
@@ -46,12 +46,14 @@ def _stretched(context: Context, sensor: int, directions: list[FloatArray]) -> D
     )
 
 
-def _long(context: Context, cell: Cell, draws: FloatArray) -> str:
-    axes = [f' along {name.split("_")[1]}' if 'scale_' in name else '' for name in cell.parameters]
-    if cell.size == 1 and not cell.variant:
+def _long(context: Context, candidate: Candidate, draws: FloatArray) -> str:
+    axes = [
+        f' along {name.split("_")[1]}' if 'scale_' in name else '' for name in candidate.parameters
+    ]
+    if candidate.size == 1 and not candidate.variant:
         axes = ['']
     return ' and '.join(
-        f'{cell.subject} measures 1 m{axis} '
+        f'{candidate.subject} measures 1 m{axis} '
         f'{number(1e3 * abs(float(s.mean())), 1e3 * float(s.std()), " mm")} too '
         f'{"long" if s.mean() >= 0.0 else "short"}'
         for axis, s in zip(axes, draws.T, strict=True)
@@ -71,6 +73,6 @@ EFFECT = Effect(
     separate_by='a calibrated length bar in several places of the volume',
     remedy='Calibrate the sensor again, with a length standard of certified length.',
     size=_long,
-    cells=cells,
+    candidates=candidates,
     changes=switched,
 )

@@ -15,7 +15,7 @@ import numpy as np
 import scipy
 
 from remaster_ros.discovery.effects.base import (
-    Cell,
+    Candidate,
     Design,
     Effect,
     along_axes,
@@ -33,7 +33,7 @@ FEWEST_READINGS = 20
 RARITY = 3
 
 
-def cells(context: Context) -> Iterator[Cell]:
+def candidates(context: Context) -> Iterator[Candidate]:
     """Each sensor, with a long, a middling and a short memory."""
     for index, name in context.sensors('controller'):
         mine = context.seen_by(index)
@@ -43,7 +43,7 @@ def cells(context: Context) -> Iterator[Cell]:
             knots = np.linspace(0.0, 1.0, 1 + int(np.ceil(KNOTS_PER_LENGTH / length)))
             correlation = np.exp(-np.abs(knots[:, None] - knots) / length)
             mean = _between(context, knots)[mine & context.to_fit].mean(axis=0)
-            yield EFFECT.cell(
+            yield EFFECT.candidate(
                 partial(_wandered, sensor=index, knots=knots, mean=mean),
                 [
                     f'wander_{axis}_{variant}_{name}_{i}'
@@ -85,7 +85,7 @@ EFFECT = Effect(
     separate_by='fixed reference markers measured again and again, and poses repeated in time',
     remedy='Fix the mount of the sensor, let it warm up, and watch references while measuring.',
     size=up_to('{subject} wanders'),
-    cells=cells,
+    candidates=candidates,
     needs=needs_time,
     is_cause=False,
 )

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from remaster_ros.discovery.effects.base import Cell, Effect, needs_approach
+from remaster_ros.discovery.effects.base import Candidate, Effect, needs_approach
 from remaster_ros.discovery.effects.context import Context
 from remaster_ros.discovery.effects.moments import switched
 from remaster_ros.discovery.effects.sizes import largest, of_joint, span_of
 from remaster_ros.types import FloatArray
 
 
-def cells(context: Context) -> Iterator[Cell]:
-    """One cell per joint: δq_j = -s_j (q_j - from_q_j)."""
+def candidates(context: Context) -> Iterator[Candidate]:
+    """One candidate per joint: δq_j = -s_j (q_j - from_q_j)."""
     return EFFECT.at_joints(
         context,
         context.moving,
@@ -22,8 +22,8 @@ def cells(context: Context) -> Iterator[Cell]:
     )
 
 
-def _short(context: Context, cell: Cell, draws: FloatArray) -> str:
-    joint = cell.joints[0]
+def _short(context: Context, candidate: Candidate, draws: FloatArray) -> str:
+    joint = candidate.joints[0]
     move = largest(context.last_move[:, joint - 1])
     short = of_joint(context, joint, draws[:, 0] * move)
     return f'joint {joint} is {short} short after {span_of(context, joint, move)}'
@@ -45,7 +45,7 @@ EFFECT = Effect(
     remedy='Wait longer before each measurement, and in use before each action that must be '
     'exact; check the integral gain of the servo.',
     size=_short,
-    cells=cells,
+    candidates=candidates,
     changes=switched,
     needs=needs_approach,
 )

@@ -1,7 +1,7 @@
 """Sizes in sentences: arc minutes and millimetres with their uncertainty.
 
-Each effect has a function of context, cell and draws of the cell's parameters (draws, m) that
-returns what the cell amounts to in this session, as part of a sentence.
+Each effect has a function of context, candidate and draws of its parameters (draws, m) that
+returns what the candidate amounts to in this session, as part of a sentence.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from remaster_ros.discovery.effects.base import Cell
+from remaster_ros.discovery.effects.base import Candidate
 from remaster_ros.discovery.effects.context import Context
 from remaster_ros.types import FloatArray
 
@@ -79,12 +79,12 @@ def largest(values: FloatArray) -> float:
     return float(np.abs(values).max(initial=0.0))
 
 
-def at_most(context: Context, cell: Cell, draws: FloatArray) -> str:
-    """Return the most that a cell adds to a joint, less its mean, or its largest displacement.
+def at_most(context: Context, candidate: Candidate, draws: FloatArray) -> str:
+    """Return the most that a candidate adds to a joint, less its mean; else its displacement.
 
     In the row where the mean of the draws has it: the largest of each draw would be larger.
     """
-    columns = cell.columns(context)
+    columns = candidate.columns(context)
     if columns.at is not None:
         turns = columns.values - columns.values.mean(axis=0)
         row = int(np.argmax(np.abs(turns @ draws.mean(axis=0))))
@@ -93,17 +93,19 @@ def at_most(context: Context, cell: Cell, draws: FloatArray) -> str:
     return length(along_mean(draws @ columns.values[row].T))
 
 
-def up_to(words: str) -> Callable[[Context, Cell, FloatArray], str]:
+def up_to(words: str) -> Callable[[Context, Candidate, FloatArray], str]:
     """Return a size of the form 'joint 2 errs by up to 5.1′ ± 0.3′'.
 
     ``{joint}``, ``{other}`` (the joint that drives) and ``{subject}`` of ``words`` are filled in.
     """
 
-    def size(context: Context, cell: Cell, draws: FloatArray) -> str:
-        joint = cell.joints[0] if cell.joints else ''
+    def size(context: Context, candidate: Candidate, draws: FloatArray) -> str:
+        joint = candidate.joints[0] if candidate.joints else ''
         start = words.format(
-            joint=joint, other=cell.joints[-1] if cell.joints else '', subject=cell.subject
+            joint=joint,
+            other=candidate.joints[-1] if candidate.joints else '',
+            subject=candidate.subject,
         )
-        return f'{start} by up to {at_most(context, cell, draws)}'
+        return f'{start} by up to {at_most(context, candidate, draws)}'
 
     return size

@@ -12,7 +12,7 @@ from functools import partial
 import numpy as np
 
 from remaster_ros.discovery.effects.base import (
-    Cell,
+    Candidate,
     Design,
     Effect,
     along_axes,
@@ -27,17 +27,17 @@ from remaster_ros.types import FloatArray
 MOMENTS = 40
 
 
-def cells(context: Context) -> Iterator[Cell]:
+def candidates(context: Context) -> Iterator[Candidate]:
     """Every place, at moments spread evenly over the configurations."""
     yield from _in(context, spread(gaps(context), MOMENTS))
 
 
-def between(context: Context, low: float, high: float) -> Iterator[Cell]:
+def between(context: Context, low: float, high: float) -> Iterator[Candidate]:
     """Every place, in every gap that reaches between two moments."""
     yield from _in(context, gaps(context, low, high))
 
 
-def _in(context: Context, chosen: FloatArray) -> Iterator[Cell]:
+def _in(context: Context, chosen: FloatArray) -> Iterator[Candidate]:
     """Zero-offsets; markers; sensors, which shift or also turn; the base where several see it."""
     sensors: list[tuple[int, ...]] = [(index,) for index, _ in context.sensors('controller')]
     if len(sensors) > 1:
@@ -45,7 +45,7 @@ def _in(context: Context, chosen: FloatArray) -> Iterator[Cell]:
     places = context.joints + len(context.marker_names) + 2 * len(sensors)
     for gap in chosen:
         moment = float(gap.mean())
-        at = partial(EFFECT.cell, moment=moment, drawn_from=MOMENTS * places)
+        at = partial(EFFECT.candidate, moment=moment, drawn_from=MOMENTS * places)
         for joint in range(1, context.joints + 1):
             yield at(
                 partial(_slipped, joint=joint, gap=gap),
@@ -109,16 +109,24 @@ def _sensor_moved(
 LARGEST_RAD = 2e-2
 
 
-def _jump(context: Context, cell: Cell, draws: FloatArray) -> str:
-    if cell.place == 'joint_angle':
-        return f'joint {cell.joints[0]} by {of_joint(context, cell.joints[0], draws[:, 0])}'
+def _jump(context: Context, candidate: Candidate, draws: FloatArray) -> str:
+    if candidate.place == 'joint_angle':
+        return (
+            f'joint {candidate.joints[0]} by {of_joint(context, candidate.joints[0], draws[:, 0])}'
+        )
     way = length(along_mean(draws[:, :3]))
-    turn = f' and {angle(along_mean(draws[:, 3:]))}' if cell.size > 3 else ''
+    turn = f' and {angle(along_mean(draws[:, 3:]))}' if candidate.size > 3 else ''
     mean = draws[:, :3].mean(axis=0)
     parts = ', '.join(f'{part:+.2f}' for part in mean / max(float(np.linalg.norm(mean)), 1e-12))
-    frame = 'the tool' if cell.place == 'marker' else 'its own frame' if cell.subject else 'R'
+    frame = (
+        'the tool'
+        if candidate.place == 'marker'
+        else 'its own frame'
+        if candidate.subject
+        else 'R'
+    )
     direction = f'along ({parts}) in {frame}'.replace('-', '−')
-    return f'{cell.subject or "the base"} by {way} {direction}{turn}'
+    return f'{candidate.subject or "the base"} by {way} {direction}{turn}'
 
 
 EFFECT = Effect(
@@ -135,7 +143,7 @@ EFFECT = Effect(
     separate_by='reference poses measured again and again during the session',
     remedy='Find what slipped or was bumped, fasten it, and measure again.',
     size=_jump,
-    cells=cells,
+    candidates=candidates,
     needs=needs_time,
     cause_per='variant',
     many=True,

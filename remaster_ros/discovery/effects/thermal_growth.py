@@ -8,7 +8,7 @@ from functools import partial
 
 import numpy as np
 
-from remaster_ros.discovery.effects.base import NO_TIMES, Cell, Design, Effect, displaced
+from remaster_ros.discovery.effects.base import NO_TIMES, Candidate, Design, Effect, displaced
 from remaster_ros.discovery.effects.context import Context
 from remaster_ros.discovery.effects.drivers import TEMPERATURE, Driver, driver_named, slow_drivers
 from remaster_ros.discovery.effects.sizes import along_mean, length
@@ -23,7 +23,7 @@ BESIDE_TEMPERATURE = 50
 LAGS_S = (600.0, 1800.0, 5400.0)
 
 
-def cells(context: Context) -> Iterator[Cell]:
+def candidates(context: Context) -> Iterator[Candidate]:
     """The whole arm, and each link, in proportion to warming and to time."""
     arm: tuple[int, ...] = ()
     parts = [arm, *((link,) for link in context.links() if _has_length(context, link))]
@@ -32,7 +32,7 @@ def cells(context: Context) -> Iterator[Cell]:
             # The whole arm first: that one link alone grows is rare. And where the temperature
             # is known, what time explains beyond it is hardly growth.
             beside = driver.name == 'time' and context.has_temperature
-            yield EFFECT.cell(
+            yield EFFECT.candidate(
                 partial(_grown, driver=driver, joints=joints),
                 [f'growth_{joints[0]}' if joints else 'growth'],
                 joints=joints,
@@ -46,7 +46,7 @@ def cells(context: Context) -> Iterator[Cell]:
 
     if context.has_temperature and context.has_time:
         for lag in LAGS_S:
-            yield EFFECT.cell(
+            yield EFFECT.candidate(
                 partial(_grown, driver=lagging(lag), joints=arm),
                 [f'growth_lag_{lag:.0f}'],
                 driver='temperature',
@@ -86,9 +86,9 @@ def needs_warming(context: Context) -> str:
     return 'neither temperature nor time varies' if context.timed else NO_TIMES
 
 
-def _grown_by(context: Context, cell: Cell, draws: FloatArray) -> str:
-    part = f'of link {cell.joints[0]}' if cell.joints else 'of the arm'
-    driver = driver_named(context, cell.driver, 0)
+def _grown_by(context: Context, candidate: Candidate, draws: FloatArray) -> str:
+    part = f'of link {candidate.joints[0]}' if candidate.joints else 'of the arm'
+    driver = driver_named(context, candidate.driver, 0)
     assert driver is not None
     span = float(np.ptp(driver.value(context)))
     grows = 'grows' if draws.mean() >= 0.0 else 'shrinks'
@@ -110,6 +110,6 @@ EFFECT = Effect(
     remedy='Let the arm warm up before it must be exact, or correct its lengths by the '
     'temperature.',
     size=_grown_by,
-    cells=cells,
+    candidates=candidates,
     needs=needs_warming,
 )

@@ -6,15 +6,15 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from remaster_ros.discovery.effects.base import Cell, Design, Effect, displaced, needs_motion
+from remaster_ros.discovery.effects.base import Candidate, Design, Effect, displaced, needs_motion
 from remaster_ros.discovery.effects.context import Context
 from remaster_ros.discovery.effects.sizes import number
 from remaster_ros.types import FloatArray
 
 
-def cells(context: Context) -> Iterator[Cell]:
+def candidates(context: Context) -> Iterator[Candidate]:
     """The tool as a whole: δp = -R diag(m) R' a, one m for each axis of the tool."""
-    yield EFFECT.cell(_swung, [f'tool_mode_{axis}' for axis in 'xyz'])
+    yield EFFECT.candidate(_swung, [f'tool_mode_{axis}' for axis in 'xyz'])
 
 
 def _swung(context: Context) -> Design:
@@ -22,7 +22,7 @@ def _swung(context: Context) -> Design:
     return displaced(*(swing[:, :, axis] for axis in range(3)))
 
 
-def _frequency(context: Context, cell: Cell, draws: FloatArray) -> str:
+def _frequency(context: Context, candidate: Candidate, draws: FloatArray) -> str:
     axis = int(np.argmax(draws.mean(axis=0)))
     softest = np.maximum(draws[:, axis], 1e-7)
     hertz = 1.0 / (2.0 * np.pi * np.sqrt(softest))
@@ -43,6 +43,6 @@ EFFECT = Effect(
     separate_by='the same path at two speeds, and markers on the flange beside those of the tool',
     remedy='Stiffen the tool or its mount, or accelerate less where it must be exact.',
     size=_frequency,
-    cells=cells,
+    candidates=candidates,
     needs=needs_motion,
 )

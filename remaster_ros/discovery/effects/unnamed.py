@@ -11,7 +11,7 @@ import numpy as np
 
 from remaster_ros.discovery.effects import joint_error_curve
 from remaster_ros.discovery.effects.base import (
-    Cell,
+    Candidate,
     Design,
     Effect,
     Place,
@@ -43,11 +43,11 @@ FREE_KNOTS = 10
 Feature = Callable[[Context], FloatArray]
 
 
-def cells(context: Context) -> Iterator[Cell]:
-    """All cells that no named effect has."""
+def candidates(context: Context) -> Iterator[Candidate]:
+    """All candidates that no named effect has."""
     found = [*_joint_angles(context), *_links(context), *_frames(context)]
-    for cell in found:
-        yield replace(cell, drawn_from=RARITY * len(found))
+    for candidate in found:
+        yield replace(candidate, drawn_from=RARITY * len(found))
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,7 +101,7 @@ def _spline(context: Context, value: Feature, curve: Curve) -> FloatArray:
     return curve.columns(value(context))
 
 
-def _cell(
+def _candidate(
     place: Place,
     form: _Form,
     stems: list[str],
@@ -110,8 +110,8 @@ def _cell(
     joints: tuple[int, ...] = (),
     subject: str = '',
     **more: Any,
-) -> Cell:
-    return EFFECT.cell(
+) -> Candidate:
+    return EFFECT.candidate(
         columns,
         [f'{stem}{suffix}' for suffix in form.suffixes for stem in stems],
         joints=joints,
@@ -163,14 +163,14 @@ def _joint_forms(context: Context, joint: int) -> Iterator[tuple[tuple[int, ...]
             yield from by(driver, 'linear')
 
 
-def _joint_angles(context: Context) -> Iterator[Cell]:
+def _joint_angles(context: Context) -> Iterator[Candidate]:
     """Angles: by own angle squared, by other joints, by torques, over time and temperature."""
     for joint in range(1, context.joints + 1):
         for joints, form in _joint_forms(context, joint):
             stem = f'joint_{joint}_by_{form.driver}'
             columns = partial(_at, joint=joint, form=form)
             unit = 1.0 if form.curve is not None else _rms(form.features(context))
-            yield _cell(
+            yield _candidate(
                 'joint_angle',
                 form,
                 [stem],
@@ -200,7 +200,7 @@ def _rotated(context: Context, turn: Feature, about: Feature, form: _Form) -> De
     return turned(context, along_axes(form.features(context), turn(context)), about(context))
 
 
-def _links(context: Context) -> Iterator[Cell]:
+def _links(context: Context) -> Iterator[Candidate]:
     """Links that shift or turn over time or by temperature."""
     slow = [form for driver in slow_drivers(context) for form in _forms(context, driver, 'linear')]
     for link in context.links():
@@ -209,9 +209,9 @@ def _links(context: Context) -> Iterator[Cell]:
         for form in slow:
             axes, turns = ([f'link_{link}_{kind}{axis}' for axis in 'xyz'] for kind in ('', 'r'))
             shift = partial(_shifted, turn=turn, form=form)
-            yield _cell('link_translation', form, axes, 'm', shift, (link,))
+            yield _candidate('link_translation', form, axes, 'm', shift, (link,))
             rotation = partial(_rotated, turn=turn, about=about, form=form)
-            yield _cell('link_rotation', form, turns, 'rad', rotation, (link,))
+            yield _candidate('link_rotation', form, turns, 'rad', rotation, (link,))
 
 
 def _base_turn(context: Context) -> FloatArray:
@@ -243,7 +243,7 @@ def _line_of_sight(context: Context, sensor: int, power: int) -> Design:
     return displaced((context.seen_by(sensor) * distance ** (power - 1.0))[:, None] * along)
 
 
-def _frames(context: Context) -> Iterator[Cell]:
+def _frames(context: Context) -> Iterator[Candidate]:
     """Base, markers and sensors: over time, by temperature, gravity, joint 1, range."""
     slow = [form for driver in slow_drivers(context) for form in _forms(context, driver, 'linear')]
     first = angle_of(context, 1, 'angle_of_joint_1')
@@ -251,13 +251,15 @@ def _frames(context: Context) -> Iterator[Cell]:
     names = ('linear', 'quadratic') if context.slides(1) else ('sin/cos',)
     for form in (*slow, *_forms(context, first, *names)):
         columns = partial(_rotated, turn=_base_turn, about=_base_origin, form=form)
-        yield _cell('base_rotation', form, [f'base_r{axis}' for axis in 'xyz'], 'rad', columns)
+        yield _candidate(
+            'base_rotation', form, [f'base_r{axis}' for axis in 'xyz'], 'rad', columns
+        )
     for index, marker in enumerate(context.marker_names):
         axes = [f'marker_{marker}_{axis}' for axis in 'xyz']
         for form in slow:
             columns = partial(_shifted, turn=partial(_tool_turn, marker=index), form=form)
-            yield _cell('marker', form, axes, 'm', columns, subject=marker)
-        yield EFFECT.cell(
+            yield _candidate('marker', form, axes, 'm', columns, subject=marker)
+        yield EFFECT.candidate(
             partial(_sagging, marker=index),
             [f'sag_{marker}'],
             place='marker',
@@ -271,11 +273,11 @@ def _frames(context: Context) -> Iterator[Cell]:
         axes = [f'{sensor}_{axis}' for axis in 'xyz']
         for form in _sensor_forms(context, index):
             columns = partial(_shifted, turn=partial(_sensor_turn, sensor=index), form=form)
-            yield _cell('sensor_frame', form, axes, 'm', columns, subject=sensor)
+            yield _candidate('sensor_frame', form, axes, 'm', columns, subject=sensor)
         for name, power, unit in (('constant', 0, 'm'), ('quadratic', 2, '1/m')):
             if power and (index, sensor) not in with_lens:
                 continue
-            yield EFFECT.cell(
+            yield EFFECT.candidate(
                 partial(_line_of_sight, sensor=index, power=power),
                 [f'range_{name}_{sensor}'],
                 place='sensor_frame',
@@ -300,9 +302,13 @@ def _sensor_forms(context: Context, sensor: int) -> Iterator[_Form]:
                 yield form
 
 
-def _size(context: Context, cell: Cell, draws: FloatArray) -> str:
-    what = f'joint {cell.joints[0]} errs' if cell.place == 'joint_angle' else 'the marker is moved'
-    return f'{what} by up to {at_most(context, cell, draws)}'
+def _size(context: Context, candidate: Candidate, draws: FloatArray) -> str:
+    what = (
+        f'joint {candidate.joints[0]} errs'
+        if candidate.place == 'joint_angle'
+        else 'the marker is moved'
+    )
+    return f'{what} by up to {at_most(context, candidate, draws)}'
 
 
 EFFECT = Effect(
@@ -319,7 +325,7 @@ EFFECT = Effect(
     remedy='Find the cause: measure poses in which {driver} changes and all else is held, and see '
     'what it comes with.',
     size=_size,
-    cells=cells,
+    candidates=candidates,
     cause_per='variant',
     many=True,
 )

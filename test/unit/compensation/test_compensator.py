@@ -63,36 +63,36 @@ def context():
     return residuals_of(session).context
 
 
-def the_cells(context):
+def the_candidates(context):
     """Give a cell of each effect for each place, driver, form and size that it has."""
     for effect in EFFECTS.values():
         if effect.needs(context):
             continue
         seen = set()
-        for cell in effect.cells(context):
-            driver = cell.driver.rstrip('0123456789')
-            key = cell.place, driver, cell.form, cell.size, bool(cell.curve)
-            if key not in seen and not cell.of_measurement:
+        for candidate in effect.candidates(context):
+            driver = candidate.driver.rstrip('0123456789')
+            key = candidate.place, driver, candidate.form, candidate.size, bool(candidate.curve)
+            if key not in seen and not candidate.of_measurement:
                 seen.add(key)
-                yield cell
+                yield candidate
 
 
-def test_each_cell_moves_the_arm_as_its_effect_defines(context):
+def test_each_candidate_moves_the_arm_as_its_effect_defines(context):
     """What the file says of an effect is what the fit meant, for all that the registry has."""
     chain, m = context.chain, context.measurements
     nothing = arm('iiwa7', chain=chain, joint_offsets=context.joint_offsets)
     first = m.temperature_c[np.argmin(m.stamp_s)]
     nothing = replace(nothing, reference_c=first, mean_c=first)
     corrected, left = set(), set()
-    for cell in the_cells(context):
-        slots = list(slots_of(cell, chain))
+    for candidate in the_candidates(context):
+        slots = list(slots_of(candidate, chain))
         if not slots:
-            left.add((cell.name, cell.place, cell.driver.partition('_of_')[0]))
+            left.add((candidate.name, candidate.place, candidate.driver.partition('_of_')[0]))
             continue
-        corrected.add(cell.name)
-        design = cell.columns(context)
+        corrected.add(candidate.name)
+        design = candidate.columns(context)
         expected = design.displacement(context)
-        for parameter in range(0, cell.size, max(1, cell.size // 4)):
+        for parameter in range(0, candidate.size, max(1, candidate.size // 4)):
             size = 1e-5 / max(1e-12, np.abs(expected[:, :, parameter]).max())
             model = nothing
             for slot, matrix in slots:
@@ -103,13 +103,15 @@ def test_each_cell_moves_the_arm_as_its_effect_defines(context):
                 for one in (model, nothing)
             ]
             moved = points[0] - points[1]
-            if cell.happened:
+            if candidate.happened:
                 # As it is since.
                 after = design.values[:, parameter] == 1.0
                 moved, wanted = moved[after], size * expected[after, :, parameter]
             else:
                 wanted = size * expected[:, :, parameter]
-            np.testing.assert_allclose(moved, wanted, rtol=0, atol=2e-9, err_msg=str(cell.key))
+            np.testing.assert_allclose(
+                moved, wanted, rtol=0, atol=2e-9, err_msg=str(candidate.key)
+            )
     assert {
         *('joint_compliance', 'encoder_eccentricity', 'encoder_scale', 'gear_periodic'),
         *('joint_error_curve', 'joint_coupling', 'link_length', 'joint_axis_tilt'),

@@ -200,8 +200,8 @@ def residuals():
     return residuals_of(session_with(26, poses=20, sensor_count=2))
 
 
-def cells_named(name: str):
-    return list(EFFECTS[name].cells(residuals().context))
+def candidates_named(name: str):
+    return list(EFFECTS[name].candidates(residuals().context))
 
 
 @pytest.mark.parametrize('split', [(), (0,)])
@@ -209,8 +209,8 @@ def cells_named(name: str):
 def test_restricted_likelihood_has_the_gradient_it_says(name, split):
     data = residuals()
     model = NoiseModel.of(data.rows, data.context.T_R_N, split)
-    cells = tuple(cells_named(name)[1:3])
-    columns = data.columns(cells)
+    candidates = tuple(candidates_named(name)[1:3])
+    columns = data.columns(candidates)
     scale = np.sqrt(np.sum(columns**2, axis=(0, 1)))
     scale[scale == 0.0] = scale.max()
     joined = np.concatenate((data.base, columns / scale, data.errors[:, :, None]), axis=2)
@@ -220,7 +220,7 @@ def test_restricted_likelihood_has_the_gradient_it_says(name, split):
     noise = model.of_sensors(*robust_noise(data.rows, data.errors, np.ones(len(data), bool)))
     ridge = np.where(np.arange(len(unit)) < p, 0.0, 0.5)
     grams = packed.of_rows(grams, 0)
-    system = System(model, grams, noise, cells, data.base_precision, unit, ridge)
+    system = System(model, grams, noise, candidates, data.base_precision, unit, ridge)
     eta, _, _ = system._start({}, system.guess)
     gradient, information = system.derivatives(eta)
     for i in range(len(eta)):
@@ -234,17 +234,17 @@ def test_restricted_likelihood_has_the_gradient_it_says(name, split):
 
 def test_a_curve_has_a_plausible_size_where_the_data_leave_it_open():
     data = residuals()
-    cell = cells_named('joint_error_curve')[1]
+    candidate = candidates_named('joint_error_curve')[1]
     # Displacements of nanometres: the rows do not show the curve.
     blind = replace(
-        cell,
-        columns=lambda context: Design(1, 1e-6 * cell.columns(context).values),
+        candidate,
+        columns=lambda context: Design(1, 1e-6 * candidate.columns(context).values),
     )
     fit = solve(data, (blind,))
     assert fit is not None
     std = np.sqrt(np.diag(fit.covariance))
-    assert std.max() <= 1.001 * cell.largest
-    assert np.abs(fit.parameters).max() < 3.0 * cell.largest
+    assert std.max() <= 1.001 * candidate.largest
+    assert np.abs(fit.parameters).max() < 3.0 * candidate.largest
 
 
 def test_a_joint_that_moves_only_in_gross_errors_suggests_nothing():
@@ -278,7 +278,7 @@ def test_five_poses_have_no_background(seed):
     ]
     # With all kinds 0.077, 0.114 and 0.159 mm.
     assert found.gain.held_out_rms_after_m < 0.07e-3
-    assert {cell.name for cell in found.solution.cells} == {'joint_compliance'}
+    assert {candidate.name for candidate in found.solution.candidates} == {'joint_compliance'}
 
 
 def test_columns_and_errors_of_a_part_are_those_of_the_whole():
@@ -287,10 +287,11 @@ def test_columns_and_errors_of_a_part_are_those_of_the_whole():
     data, solution = found.residuals, found.solution
     rows = data.rows.source
     wanted = [
-        cell.columns(data.context).displacement(data.context)[rows] for cell in solution.cells
+        candidate.columns(data.context).displacement(data.context)[rows]
+        for candidate in solution.candidates
     ]
     np.testing.assert_allclose(
-        data.columns(solution.cells), np.concatenate(wanted, axis=2), atol=1e-12
+        data.columns(solution.candidates), np.concatenate(wanted, axis=2), atol=1e-12
     )
     np.testing.assert_allclose(
         data.left(solution), data.unexplained(solution)[rows], rtol=0.0, atol=1e-12
@@ -312,12 +313,14 @@ def test_readings_that_remember_say_nothing_of_the_arm(seed):
     found = discover_session(session, rng=np.random.default_rng(0))
     assert not found.effects
     assert found.verdict == 'unexplained'
-    assert {cell.name for cell in found.solution.cells} == {'sensor_wander'}
+    assert {candidate.name for candidate in found.solution.candidates} == {'sensor_wander'}
     # The registration is that of the whole session, not of its first reading.
     shift = sum(
-        found.residuals.columns([cell]) @ found.solution.parameters[where]
-        for cell, where in zip(found.solution.cells, found.solution.slices(), strict=True)
-        if cell.name == 'sensor_wander'
+        found.residuals.columns([candidate]) @ found.solution.parameters[where]
+        for candidate, where in zip(
+            found.solution.candidates, found.solution.slices(), strict=True
+        )
+        if candidate.name == 'sensor_wander'
     )
     assert np.linalg.norm(shift.mean(axis=0)) < 0.02 * np.linalg.norm(shift, axis=1).mean()
 
@@ -494,29 +497,33 @@ def test_a_joint_a_turn_further_is_the_same_where_it_turns_over(turns):
     context = residuals_of(session_with(26, poses=20, validation=0)).context
     chain = replace(CHAIN, lower=np.full(7, -7.0), upper=np.full(7, 7.0))
     context = replace(context, chain=chain)
-    cell = next(c for c in EFFECTS['joint_error_curve'].cells(context) if c.joints == (2,))
+    candidate = next(
+        c for c in EFFECTS['joint_error_curve'].candidates(context) if c.joints == (2,)
+    )
     m = context.measurements
     q = m.q.copy()
     q[:, 1] += 2.0 * np.pi * turns
     other = replace(context, measurements=replace(m, q=q))
-    wide = widened(cell, context, other)
+    wide = widened(candidate, context, other)
     here, there = wide.columns(context).values, wide.columns(other).values
     np.testing.assert_allclose(there, here, atol=1e-9)
     # As many knots, and zero on the average where the cell was found.
-    assert abs(wide.size - cell.size) <= 1
+    assert abs(wide.size - candidate.size) <= 1
     np.testing.assert_allclose(here.mean(axis=0), 0.0, atol=1e-9)
 
 
 def test_a_curve_reaches_over_both_sessions():
     context = residuals_of(session_with(26, poses=20, validation=0)).context
-    cell = next(c for c in EFFECTS['joint_error_curve'].cells(context) if c.joints == (2,))
+    candidate = next(
+        c for c in EFFECTS['joint_error_curve'].candidates(context) if c.joints == (2,)
+    )
     m = context.measurements
     beyond = replace(context, measurements=replace(m, q=m.q + 1.0))
-    wide = widened(cell, context, beyond)
-    assert wide.size > cell.size
+    wide = widened(candidate, context, beyond)
+    assert wide.size > candidate.size
     np.testing.assert_allclose(wide.columns(context).values.mean(axis=0), 0.0, atol=1e-9)
     # What the first session shows of it is the same.
-    shape = cell.columns(context).values @ np.linspace(-1.0, 1.0, cell.size) ** 2
+    shape = candidate.columns(context).values @ np.linspace(-1.0, 1.0, candidate.size) ** 2
     values = wide.columns(context).values
     fitted = values @ np.linalg.lstsq(values, shape, rcond=None)[0]
     assert np.std(fitted - shape) < 0.05 * np.std(shape)

@@ -12,7 +12,7 @@ import pytest
 from worlds.calibration_scenes import CHAIN
 from worlds.discovery_scenes import residuals_of, session_with
 
-from remaster_ros.discovery.effects.base import PLACES, Cell
+from remaster_ros.discovery.effects.base import PLACES, Candidate
 from remaster_ros.discovery.effects.context import Context
 from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.discovery.effects.sizes import along_mean, number
@@ -35,8 +35,8 @@ def scene_of(gravity: bool = True) -> Context:
     return scene if gravity else replace(scene, chain=replace(CHAIN, has_inertials=False))
 
 
-def cells_of(name: str) -> list[Cell]:
-    return list(EFFECTS[name].cells(scene_of()))
+def candidates_of(name: str) -> list[Candidate]:
+    return list(EFFECTS[name].candidates(scene_of()))
 
 
 def moved(chain: SerialChain, scene: Context) -> np.ndarray:
@@ -45,23 +45,25 @@ def moved(chain: SerialChain, scene: Context) -> np.ndarray:
 
 
 @pytest.mark.parametrize('name', EFFECTS)
-def test_every_cell_has_columns_of_its_size_and_a_place_of_the_table(name):
+def test_every_candidate_has_columns_of_its_size_and_a_place_of_the_table(name):
     scene = scene_of()
     effect = EFFECTS[name]
     assert effect.needs(scene) == ''
-    cells = [c for c in effect.cells(scene) if c.name != 'gear_periodic'] or cells_of(name)[:20]
-    keys = [cell.key for cell in cells]
+    candidates = [
+        c for c in effect.candidates(scene) if c.name != 'gear_periodic'
+    ] or candidates_of(name)[:20]
+    keys = [candidate.key for candidate in candidates]
     assert len(set(keys)) == len(keys)
-    for cell in cells:
-        columns = cell.columns(scene)
-        assert columns.displacement(scene).shape == (len(scene), 3, cell.size)
+    for candidate in candidates:
+        columns = candidate.columns(scene)
+        assert columns.displacement(scene).shape == (len(scene), 3, candidate.size)
         assert np.all(np.isfinite(columns.values))
-        assert cell.place in PLACES
-        assert cell.drawn_from >= 1
-        assert len(set(cell.parameters)) == cell.size
-        assert all(1 <= joint <= scene.joints for joint in cell.joints)
-        if cell.penalty is not None:
-            assert np.all(np.linalg.eigvalsh(cell.penalty) > 0.0)
+        assert candidate.place in PLACES
+        assert candidate.drawn_from >= 1
+        assert len(set(candidate.parameters)) == candidate.size
+        assert all(1 <= joint <= scene.joints for joint in candidate.joints)
+        if candidate.penalty is not None:
+            assert np.all(np.linalg.eigvalsh(candidate.penalty) > 0.0)
 
 
 @pytest.mark.parametrize('name', EFFECTS)
@@ -70,10 +72,10 @@ def test_columns_of_some_rows_are_those_they_have_among_all(name):
     scene = scene_of()
     rows = np.random.default_rng(5).permutation(len(scene))[: len(scene) // 3]
     part = scene.at(rows)
-    for cell in cells_of(name):
-        if cell.name == 'gear_periodic' and cell.label != '7':
+    for candidate in candidates_of(name):
+        if candidate.name == 'gear_periodic' and candidate.label != '7':
             continue
-        whole, some = cell.columns(scene), cell.columns(part)
+        whole, some = candidate.columns(scene), candidate.columns(part)
         assert whole.at == some.at
         np.testing.assert_allclose(
             some.displacement(part), whole.displacement(scene)[rows], rtol=1e-9, atol=1e-12
@@ -107,44 +109,44 @@ def test_every_effect_says_what_a_technician_and_a_scientist_need(name):
 )
 def test_effects_of_an_angle_turn_the_joint_by_their_driver(name, feature):
     scene = scene_of()
-    for cell in cells_of(name):
-        joint = cell.joints[0] - 1
+    for candidate in candidates_of(name):
+        joint = candidate.joints[0] - 1
         added = np.zeros_like(scene.q)
         added[:, joint] = STEP * feature(scene, joint)
         points = scene.markers[scene.marker]
         shift = CHAIN.positions(scene.q + added, points) - CHAIN.positions(scene.q, points)
-        columns = cell.columns(scene).displacement(scene)[:, :, 0]
+        columns = candidate.columns(scene).displacement(scene)[:, :, 0]
         np.testing.assert_allclose(columns, shift / STEP, atol=3e-5 * np.abs(columns).max() + 1e-9)
 
 
 @pytest.mark.parametrize('name', ['link_length', 'joint_axis_tilt'])
 def test_geometry_columns_are_those_of_a_chain_built_that_way(name):
     scene = scene_of()
-    for cell in cells_of(name):
-        if cell.size > 1:
+    for candidate in candidates_of(name):
+        if candidate.size > 1:
             continue
         T_fixed = CHAIN.T_fixed.copy()
         if name == 'link_length':
-            link = cell.joints[0]
+            link = candidate.joints[0]
             own = CHAIN.T_fixed[link][:3, 3]
-            axis = own / np.linalg.norm(own) if cell.variant == 'along' else None
-            step = STEP * (np.eye(3)['xyz'.index(cell.variant)] if axis is None else axis)
+            axis = own / np.linalg.norm(own) if candidate.variant == 'along' else None
+            step = STEP * (np.eye(3)['xyz'.index(candidate.variant)] if axis is None else axis)
             T_fixed[link] = transform(np.eye(3), step) @ T_fixed[link]
         else:
-            fixed = cell.joints[0] - 1
-            turn = rotation_vector_to_matrix(STEP * np.eye(3)['xyz'.index(cell.variant)])
+            fixed = candidate.joints[0] - 1
+            turn = rotation_vector_to_matrix(STEP * np.eye(3)['xyz'.index(candidate.variant)])
             T_fixed[fixed] = T_fixed[fixed] @ transform(turn, np.zeros(3))
         shift = moved(replace(CHAIN, T_fixed=T_fixed), scene) - moved(CHAIN, scene)
-        columns = cell.columns(scene).displacement(scene)[:, :, 0]
+        columns = candidate.columns(scene).displacement(scene)[:, :, 0]
         np.testing.assert_allclose(columns, shift / STEP, atol=1e-5)
 
 
 def test_thermal_growth_is_that_of_every_link():
     scene = scene_of()
-    cell = next(
-        c for c in cells_of('thermal_growth') if c.driver == 'temperature' and not c.joints
+    candidate = next(
+        c for c in candidates_of('thermal_growth') if c.driver == 'temperature' and not c.joints
     )
-    columns = cell.columns(scene).displacement(scene)[:, :, 0]
+    columns = candidate.columns(scene).displacement(scene)[:, :, 0]
     row = len(scene) // 2
     grown = CHAIN.T_fixed.copy()
     grown[:, :3, 3] *= 1.0 + STEP * scene.warming[row]
@@ -155,13 +157,15 @@ def test_thermal_growth_is_that_of_every_link():
 def test_sensor_effects_act_in_the_frame_of_their_own_sensor():
     scene = scene_of()
     for name in ('sensor_scale', 'sensor_distortion', 'registration_drift'):
-        for cell in cells_of(name):
-            columns = cell.columns(scene).displacement(scene)
-            mine = scene.sensor == scene.sensor_names.index(cell.subject)
+        for candidate in candidates_of(name):
+            columns = candidate.columns(scene).displacement(scene)
+            mine = scene.sensor == scene.sensor_names.index(candidate.subject)
             assert np.all(columns[~mine] == 0.0)
-    cell = next(c for c in cells_of('sensor_scale') if c.variant == '' and c.subject == 'mocap')
+    candidate = next(
+        c for c in candidates_of('sensor_scale') if c.variant == '' and c.subject == 'mocap'
+    )
     mine = scene.sensor == scene.sensor_names.index('mocap')
-    shift = cell.columns(scene).displacement(scene)[mine, :, 0]
+    shift = candidate.columns(scene).displacement(scene)[mine, :, 0]
     in_sensor = np.einsum('nji,nj->ni', scene.sensor_turn[mine], shift)
     np.testing.assert_allclose(in_sensor, scene.in_sensor[mine], atol=1e-9)
 
@@ -195,22 +199,22 @@ def test_gravity_moment_about_the_axis_is_the_torque():
 
 
 @pytest.mark.parametrize('name', EFFECTS)
-def test_every_cell_has_a_size_in_words_and_its_effect_a_remedy(name):
+def test_every_candidate_has_a_size_in_words_and_its_effect_a_remedy(name):
     scene, effect = scene_of(), EFFECTS[name]
     assert effect.remedy.endswith('.')
     seed = 12
     print(f'seed {seed}')
     rng = np.random.default_rng(seed)
-    for cell in cells_of(name)[::7]:
-        draws = 1e-4 * (1.0 + 0.1 * rng.standard_normal((50, cell.size)))
-        text = effect.size(scene, cell, draws)
+    for candidate in candidates_of(name)[::7]:
+        draws = 1e-4 * (1.0 + 0.1 * rng.standard_normal((50, candidate.size)))
+        text = effect.size(scene, candidate, draws)
         assert re.search('[′ ]', text), text
         assert re.search('(′|mm)', text), text
         assert '±' in text
         assert 'nan' not in text
         assert '-' not in text
         # All signs: a negative length is a shorter link, not a negative longer one.
-        assert effect.size(scene, cell, -draws)
+        assert effect.size(scene, candidate, -draws)
 
 
 def draws_of(*values: float, share: float = 0.02) -> np.ndarray:
@@ -223,12 +227,12 @@ def test_sizes_are_the_ones_that_were_put_in():
     scene = scene_of()
 
     def size(name, draws, **chosen):
-        cell = next(
+        candidate = next(
             c
-            for c in cells_of(name)
+            for c in candidates_of(name)
             if all(getattr(c, key) == value for key, value in chosen.items())
         )
-        return EFFECTS[name].size(scene, cell, draws)
+        return EFFECTS[name].size(scene, candidate, draws)
 
     text = size('link_length', draws_of(0.75e-3), joints=(2,), variant='along')
     assert re.fullmatch(r'link 2 is 0\.7[45]\d? mm ± 0\.01\d mm longer than the model', text), text
@@ -318,7 +322,7 @@ def test_a_joint_that_moves_in_held_out_rows_alone_is_not_tested():
     q[~held_out, 2] = 0.3
     still = replace(scene, measurements=replace(m, q=q, is_validation=held_out))
     assert 3 not in still.moving
-    joints = {cell.joints for cell in EFFECTS['joint_error_curve'].cells(still)}
+    joints = {candidate.joints for candidate in EFFECTS['joint_error_curve'].candidates(still)}
     assert (3,) not in joints
     assert (2,) in joints
 

@@ -8,7 +8,7 @@ import pytest
 from worlds.discovery_scenes import residuals_of, session_with
 
 from remaster_ros.discovery import evidence, packed
-from remaster_ros.discovery.effects.base import Cell
+from remaster_ros.discovery.effects.base import Candidate
 from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.discovery.evidence import solve
 from remaster_ros.discovery.residuals import Residuals, units
@@ -16,18 +16,18 @@ from remaster_ros.discovery.solution import Solution
 
 
 @pytest.fixture(scope='module')
-def scene() -> tuple[Any, list[Cell]]:
+def scene() -> tuple[Any, list[Candidate]]:
     session = session_with(5)
     data = residuals_of(session)
-    cells = []
+    candidates = []
     for name in ('joint_compliance', 'joint_error_curve', 'link_length'):
         added = 0
-        for cell in EFFECTS[name].cells(data.context):
-            if added < 3 and solve(data, (*cells, cell)) is not None:
-                cells.append(cell)
+        for candidate in EFFECTS[name].candidates(data.context):
+            if added < 3 and solve(data, (*candidates, candidate)) is not None:
+                candidates.append(candidate)
                 added += 1
-    assert len(cells) == 9
-    return session, cells
+    assert len(candidates) == 9
+    return session, candidates
 
 
 def assert_near(grams, others, size):
@@ -43,10 +43,10 @@ def assert_near(grams, others, size):
     ids=['a part', 'with other cells'],
 )
 def test_gram_matrices_beside_known_ones_are_those_computed_for_them_alone(scene, known, wanted):
-    session, cells = scene
+    session, candidates = scene
     data = residuals_of(session)
-    data.gram_matrices([cells[i] for i in known])
-    part = [cells[i] for i in wanted]
+    data.gram_matrices([candidates[i] for i in known])
+    part = [candidates[i] for i in wanted]
     norms, grams = data.gram_matrices(part)
     fresh_norms, fresh_grams = residuals_of(session).gram_matrices(part)
     assert norms == pytest.approx(fresh_norms, rel=1e-12)
@@ -54,20 +54,20 @@ def test_gram_matrices_beside_known_ones_are_those_computed_for_them_alone(scene
 
 
 def test_gram_matrices_are_of_columns_in_their_units(scene):
-    data, cells = residuals_of(scene[0]), scene[1]
-    norms, grams = data.gram_matrices(cells)
-    joined = np.concatenate((data.base, data.columns(cells), data.errors[:, :, None]), axis=2)
+    data, candidates = residuals_of(scene[0]), scene[1]
+    norms, grams = data.gram_matrices(candidates)
+    joined = np.concatenate((data.base, data.columns(candidates), data.errors[:, :, None]), axis=2)
     assert norms == pytest.approx(np.sqrt(np.sum(joined**2, axis=(0, 1))))
     unit = np.ones(len(norms))
-    unit[data.base.shape[2] : -1] = units(cells, norms[data.base.shape[2] : -1])
+    unit[data.base.shape[2] : -1] = units(candidates, norms[data.base.shape[2] : -1])
     joined = joined / unit
     plain = data.noise_model.gram(lambda _, where: joined[where], len(norms))
     assert_near(grams, packed.of_rows(plain, 0), len(norms))
 
 
 def test_a_column_without_rows_has_the_unit_of_its_spline_or_one(scene):
-    curve = next(cell for cell in scene[1] if cell.penalty is not None)
-    plain = next(cell for cell in scene[1] if cell.penalty is None)
+    curve = next(candidate for candidate in scene[1] if candidate.penalty is not None)
+    plain = next(candidate for candidate in scene[1] if candidate.penalty is None)
     norms = np.zeros(plain.size + curve.size)
     assert np.array_equal(units((plain, curve), norms), np.ones(len(norms)))
     norms[-2] = 4.0
@@ -77,14 +77,14 @@ def test_a_column_without_rows_has_the_unit_of_its_spline_or_one(scene):
 @pytest.mark.parametrize('count', [0, 2, 8])
 def test_what_a_caller_does_to_norms_and_matrices_stays_with_the_caller(scene, count):
     data = residuals_of(scene[0])
-    cells = scene[1][:count]
-    given = data.gram_matrices(cells)
+    candidates = scene[1][:count]
+    given = data.gram_matrices(candidates)
     kept = [values.copy() for values in given]
     for values in given:
         # What is not a copy is kept, and cannot be written to.
         if values.flags.writeable:
             values[:] = 0.0
-    for values, before in zip(data.gram_matrices(cells), kept, strict=True):
+    for values, before in zip(data.gram_matrices(candidates), kept, strict=True):
         assert np.array_equal(values, before)
 
 

@@ -9,7 +9,7 @@ import pytest
 from worlds.discovery_scenes import at_joint, discovered, residuals_of, session_with
 
 from remaster_ros.discovery import discover
-from remaster_ros.discovery.effects.base import Cell
+from remaster_ros.discovery.effects.base import Candidate
 from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.discovery.explain import describe
 from remaster_ros.discovery.residuals import Residuals
@@ -32,30 +32,38 @@ def eccentric() -> Residuals:
     return residuals_of(wavy(41))
 
 
-def cells_of(data: Residuals, name: str, *joints: int) -> list[Cell]:
+def candidates_of(data: Residuals, name: str, *joints: int) -> list[Candidate]:
     return [
-        cell for cell in EFFECTS[name].cells(data.context) if cell.joints in [(j,) for j in joints]
+        candidate
+        for candidate in EFFECTS[name].candidates(data.context)
+        if candidate.joints in [(j,) for j in joints]
     ]
 
 
-def walked(data: Residuals, cells: list[Cell]) -> Walk:
-    return Walk(data, cells, np.random.default_rng(0))
+def walked(data: Residuals, candidates: list[Candidate]) -> Walk:
+    return Walk(data, candidates, np.random.default_rng(0))
 
 
 def test_the_shapes_that_a_curve_can_have_are_special_cases_of_it():
     data = eccentric()
-    named = [*cells_of(data, 'encoder_eccentricity', 2, 4), *cells_of(data, 'joint_compliance', 2)]
-    (curve,) = cells_of(data, 'joint_error_curve', 2)
-    assert [cell.is_shape_of(curve) for cell in named] == [
-        (cell.name, cell.joints) == ('encoder_eccentricity', (2,)) for cell in named
+    named = [
+        *candidates_of(data, 'encoder_eccentricity', 2, 4),
+        *candidates_of(data, 'joint_compliance', 2),
+    ]
+    (curve,) = candidates_of(data, 'joint_error_curve', 2)
+    assert [candidate.is_shape_of(curve) for candidate in named] == [
+        (candidate.name, candidate.joints) == ('encoder_eccentricity', (2,)) for candidate in named
     ]
     assert not curve.is_shape_of(named[0])
 
 
 def test_a_wave_is_named_by_its_shape_and_not_as_a_curve():
     data = eccentric()
-    cells = [*cells_of(data, 'encoder_eccentricity', 2), *cells_of(data, 'joint_error_curve', 2)]
-    _, (effect,) = describe(walked(data, cells), lambda share: None)
+    candidates = [
+        *candidates_of(data, 'encoder_eccentricity', 2),
+        *candidates_of(data, 'joint_error_curve', 2),
+    ]
+    _, (effect,) = describe(walked(data, candidates), lambda share: None)
     assert (effect.name, effect.joints) == ('encoder_eccentricity', (2,))
     # The free form has this shape, too, and leaves it in no doubt.
     assert not effect.tied
@@ -63,10 +71,10 @@ def test_a_wave_is_named_by_its_shape_and_not_as_a_curve():
 
 def test_two_names_of_one_displacement_share_the_probability_and_leave_no_doubt():
     data = eccentric()
-    cell = cells_of(data, 'encoder_eccentricity', 2)[0]
-    names = tuple(f'{name} of another name' for name in cell.parameters)
-    twin = replace(cell, name='encoder_scale', parameters=names)
-    _, (effect,) = describe(walked(data, [cell, twin]), lambda share: None)
+    candidate = candidates_of(data, 'encoder_eccentricity', 2)[0]
+    names = tuple(f'{name} of another name' for name in candidate.parameters)
+    twin = replace(candidate, name='encoder_scale', parameters=names)
+    _, (effect,) = describe(walked(data, [candidate, twin]), lambda share: None)
     (other,) = effect.confusable_with
     assert other.same
     assert other.probability == pytest.approx(0.5, abs=0.4)

@@ -49,8 +49,8 @@ def points(scene, q):
 
 
 def column(scene, name, which=0, parameter=0):
-    cell = list(EFFECTS[name].cells(scene))[which]
-    return cell.columns(scene).displacement(scene)[:, :, parameter]
+    candidate = list(EFFECTS[name].candidates(scene))[which]
+    return candidate.columns(scene).displacement(scene)[:, :, parameter]
 
 
 def test_clocks_move_the_arm_on_in_time(scene):
@@ -103,17 +103,17 @@ def test_each_has_words_and_columns_of_any_rows(name, scene):
     assert effect.remedy
     rows = np.random.default_rng(5).permutation(len(scene))[: len(scene) // 3]
     part = scene.at(rows)
-    for cell in effect.cells(scene):
-        columns = cell.columns(scene)
-        assert columns.displacement(scene).shape == (len(scene), 3, cell.size)
+    for candidate in effect.candidates(scene):
+        columns = candidate.columns(scene)
+        assert columns.displacement(scene).shape == (len(scene), 3, candidate.size)
         np.testing.assert_allclose(
-            cell.columns(part).displacement(part),
+            candidate.columns(part).displacement(part),
             columns.displacement(scene)[rows],
             rtol=1e-9,
             atol=1e-12,
         )
-        draws = np.random.default_rng(1).normal(1e-4, 1e-5, (50, cell.size))
-        assert '±' in effect.size(scene, cell, draws)
+        draws = np.random.default_rng(1).normal(1e-4, 1e-5, (50, candidate.size))
+        assert '±' in effect.size(scene, candidate, draws)
 
 
 def test_they_are_tried_on_no_arm_that_stood_still(scene):

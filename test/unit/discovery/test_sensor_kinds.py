@@ -18,21 +18,21 @@ def session_of(kind):
     return replace(session, sensor_kinds={name: kind for name in session.sensors if kind})
 
 
-def candidates(kind):
+def tried(kind):
     """Names of the causes that are tried, and of their variants, of the sensors alone."""
     session = session_of(kind)
     context = Residuals.of(estimate(Problem.of(session))).context
     return {
-        (cell.name, cell.variant, cell.driver)
+        (candidate.name, candidate.variant, candidate.driver)
         for effect in EFFECTS.values()
-        for cell in effect.cells(context)
-        if cell.subject in session.sensors
+        for candidate in effect.candidates(context)
+        if candidate.subject in session.sensors
     }
 
 
 def test_what_a_sensor_is_decides_what_may_be_wrong_with_it():
-    unknown, camera = candidates(''), candidates('camera')
-    tracker, controller = candidates('tracker'), candidates('controller')
+    unknown, camera = tried(''), tried('camera')
+    tracker, controller = tried('tracker'), tried('controller')
     assert unknown == camera
     assert {name for name, *_ in camera} >= {'sensor_distortion', 'sensor_scale', 'sensor_field'}
     # It has no lens, and one measure for all directions.

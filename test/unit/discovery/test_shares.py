@@ -8,7 +8,7 @@ import pytest
 from worlds.discovery_scenes import residuals_of, session_with
 
 from remaster_ros.discovery import evidence
-from remaster_ros.discovery.effects.base import Cell
+from remaster_ros.discovery.effects.base import Candidate
 from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.discovery.evidence import Solution, solve
 from remaster_ros.discovery.explain import shares
@@ -27,20 +27,20 @@ def waves(session: Session) -> FloatArray:
     return angles
 
 
-def scene(with_held_out: bool) -> tuple[Residuals, list[tuple[Cell, ...]], Solution]:
+def scene(with_held_out: bool) -> tuple[Residuals, list[tuple[Candidate, ...]], Solution]:
     session = session_with(17, angles=waves)
     if not with_held_out:
         session = session.select(~session.measurements.is_validation)
     data = residuals_of(session)
 
-    def cell(name: str, joint: int) -> Cell:
-        return next(c for c in EFFECTS[name].cells(data.context) if c.joints == (joint,))
+    def candidate(name: str, joint: int) -> Candidate:
+        return next(c for c in EFFECTS[name].candidates(data.context) if c.joints == (joint,))
 
     # A wave of joint 2 and a free curve of it: each can do what the other does.
     groups = [
-        (cell('joint_error_curve', 4),),
-        (cell('encoder_eccentricity', 2), cell('encoder_scale', 2)),
-        (cell('joint_error_curve', 2),),
+        (candidate('joint_error_curve', 4),),
+        (candidate('encoder_eccentricity', 2), candidate('encoder_scale', 2)),
+        (candidate('joint_error_curve', 2),),
     ]
     solution = solve(data, [one for group in groups for one in group])
     assert solution is not None
@@ -48,7 +48,9 @@ def scene(with_held_out: bool) -> tuple[Residuals, list[tuple[Cell, ...]], Solut
 
 
 @pytest.fixture(scope='module', params=[True, False], ids=['held out', 'fitted'])
-def found(request: pytest.FixtureRequest) -> tuple[Residuals, list[tuple[Cell, ...]], Solution]:
+def found(
+    request: pytest.FixtureRequest,
+) -> tuple[Residuals, list[tuple[Candidate, ...]], Solution]:
     return scene(request.param)
 
 

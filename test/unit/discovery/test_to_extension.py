@@ -86,7 +86,9 @@ def test_an_offset_that_the_data_determine_beside_the_causes_needs_no_more():
     session = session_with(7, lambda s: at_joint(4, 2e-2 * np.sin(3.0 * s.measurements.q[:, 3])))
     found = estimate(Problem.of(session))
     data = Residuals.of(found)
-    waves = [one for one in EFFECTS['gear_periodic'].cells(data.context) if one.joints == (4,)]
+    waves = [
+        one for one in EFFECTS['gear_periodic'].candidates(data.context) if one.joints == (4,)
+    ]
     (wave,) = (one for one in waves if one.parameters[0] == 'sin3_4')
     solution = solve(data, (wave,))
     assert solution is not None
@@ -110,7 +112,7 @@ def test_the_tolerance_of_a_drawing_widens_offsets_beside_what_is_named():
     found, data, nothing = searched(0.5e-3)
     equations = Unmodelled.of(found, data, nothing)
     drawn = equations.by_drawing(())
-    lengths = list(EFFECTS['link_length'].cells(data.context))
+    lengths = list(EFFECTS['link_length'].candidates(data.context))
     fewer = equations.by_drawing(lengths)
     known = ~np.isnan(offsets_of(found)[1])
     every, less = (equations.std_of_offsets([moves])[known] for moves in (drawn, fewer))

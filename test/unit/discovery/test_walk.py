@@ -11,7 +11,7 @@ from worlds.discovery_scenes import at_joint, residuals_of, session_with
 from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.discovery.evidence import System
 from remaster_ros.discovery.residuals import Residuals
-from remaster_ros.discovery.surface import LEVELS_M, Pool, State, Surface, Walker, candidates
+from remaster_ros.discovery.surface import LEVELS_M, Pool, State, Surface, Walker, blocks_of
 from remaster_ros.discovery.walk import Walk, evaluated, identity, p_value
 
 ARC_MINUTE = np.radians(1.0 / 60.0)
@@ -32,19 +32,19 @@ def scene(hidden: bool = True) -> Residuals:
 
 
 @cache
-def cells():
+def candidates():
     data = scene()
     return [
-        cell
+        candidate
         for name in NAMES
         if not EFFECTS[name].needs(data.context)
-        for cell in EFFECTS[name].cells(data.context)
+        for candidate in EFFECTS[name].candidates(data.context)
     ]
 
 
 @cache
 def pool() -> Pool:
-    return Pool(scene(), candidates(scene(), cells()))
+    return Pool(scene(), blocks_of(scene(), candidates()))
 
 
 @cache
@@ -124,41 +124,41 @@ def test_a_chain_visits_models_by_their_posterior():
 
 def test_two_causes_at_once_are_found_with_their_probability():
     data = scene()
-    walk = Walk(data, cells(), np.random.default_rng(1))
-    found = {(cell.name, cell.joints) for cell in walk.claimed}
+    walk = Walk(data, candidates(), np.random.default_rng(1))
+    found = {(candidate.name, candidate.joints) for candidate in walk.claimed}
     assert found == {('joint_compliance', (2,)), ('encoder_eccentricity', (4,))}
-    for cell in walk.claimed:
-        assert walk.probability[identity(cell)] > 0.95
-        assert walk.log_gain([cell]) > 5.0
+    for candidate in walk.claimed:
+        assert walk.probability[identity(candidate)] > 0.95
+        assert walk.log_gain([candidate]) > 5.0
     assert walk.share.sum() == pytest.approx(1.0)
     assert walk.best.log_evidence == walk.models[0].value == max(m.value for m in walk.models)
 
 
 def test_nothing_is_found_where_nothing_is_hidden():
-    walk = Walk(scene(False), cells(), np.random.default_rng(2))
+    walk = Walk(scene(False), candidates(), np.random.default_rng(2))
     assert not walk.claimed
     assert walk.models[0].value - walk.bare.value < 6.0
 
 
 def test_a_kind_that_the_data_do_not_show_leaves_the_background():
-    walk = Walk(scene(False), cells(), np.random.default_rng(3))
+    walk = Walk(scene(False), candidates(), np.random.default_rng(3))
     assert len(walk.models[0].families) < len(walk.families)
 
 
 def test_a_walk_goes_on_from_the_model_of_another():
     data = scene()
-    first = Walk(data, cells(), np.random.default_rng(4))
+    first = Walk(data, candidates(), np.random.default_rng(4))
     rows = data.rows.source[:-3]
-    again = Walk(data.only(rows), cells(), np.random.default_rng(5), start=first.models[0])
+    again = Walk(data.only(rows), candidates(), np.random.default_rng(5), start=first.models[0])
     assert {identity(c) for c in again.claimed} == {identity(c) for c in first.claimed}
 
 
 def test_a_solution_predicts_what_its_model_does():
     data = scene()
-    walk = Walk(data, cells(), np.random.default_rng(6))
+    walk = Walk(data, candidates(), np.random.default_rng(6))
     model = walk.models[0]
     mean, _ = model.estimate
-    columns = np.concatenate((data.base, data.columns(model.cells)), axis=2)
+    columns = np.concatenate((data.base, data.columns(model.candidates)), axis=2)
     np.testing.assert_allclose(data.left(walk.best), data.errors - columns @ mean, atol=1e-9)
     assert evaluated(walk.pool, model.families, model.model) is not None
 

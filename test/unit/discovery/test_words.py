@@ -32,25 +32,31 @@ def one_each(context):
     found = {}
     for effect in EFFECTS.values():
         if not effect.needs(context):
-            for cell in effect.cells(context):
-                found.setdefault((cell.name, cell.place, cell.driver, cell.form), cell)
+            for candidate in effect.candidates(context):
+                found.setdefault(
+                    (candidate.name, candidate.place, candidate.driver, candidate.form), candidate
+                )
     return list(found.values())
 
 
 def groups(context):
     """Return every cause that may be found: one cell, or those of two joints together."""
-    for cell in one_each(context):
-        yield (cell,)
-        if len(cell.joints) == 1 and EFFECTS[cell.name].cause_per == 'effect':
-            other = 1 + cell.joints[0] % context.joints
-            yield (cell, replace(cell, joints=(other,)))
+    for candidate in one_each(context):
+        yield (candidate,)
+        if len(candidate.joints) == 1 and EFFECTS[candidate.name].cause_per == 'effect':
+            other = 1 + candidate.joints[0] % context.joints
+            yield (candidate, replace(candidate, joints=(other,)))
 
 
 def test_no_sentence_names_a_thing_twice_or_has_a_plural_with_a_singular_verb(context):
-    cells = one_each(context)
-    assert {cell.place for cell in cells} >= {'sensor_frame', 'marker', 'joint_angle'}
+    candidates = one_each(context)
+    assert {candidate.place for candidate in candidates} >= {
+        'sensor_frame',
+        'marker',
+        'joint_angle',
+    }
     for group in groups(context):
-        joints = tuple(sorted({joint for cell in group for joint in cell.joints}))
+        joints = tuple(sorted({joint for candidate in group for joint in candidate.joints}))
         draws = np.full((2, group[0].size), 1e-4)
         told = [
             in_words(group, context),
@@ -71,7 +77,7 @@ def test_names_that_tell_the_kind_are_not_preceded_by_it():
 
 
 def test_headings_say_what_happened_and_where(context):
-    titles = {titled(cell, cell.joints) for cell in one_each(context)}
+    titles = {titled(candidate, candidate.joints) for candidate in one_each(context)}
     for title in (
         'Joint 1 slipped',
         'The sensor moved',
@@ -85,13 +91,13 @@ def test_headings_say_what_happened_and_where(context):
 
 def test_what_a_remedy_calls_for_is_named_in_it(context):
     """No remedy refers to measurements, or to a file, that nothing names."""
-    for cell in one_each(context):
-        remedy = EFFECTS[cell.name].remedy.format(driver=cell.driver.replace('_', ' '))
+    for candidate in one_each(context):
+        remedy = EFFECTS[candidate.name].remedy.format(driver=candidate.driver.replace('_', ' '))
         assert 'measurements named' not in remedy
         assert '{' not in remedy
-        if cell.name == 'unnamed':
-            assert f'poses in which {cell.driver.replace("_", " ")} changes' in remedy
-        if cell.name == 'base_compliance':
+        if candidate.name == 'unnamed':
+            assert f'poses in which {candidate.driver.replace("_", " ")} changes' in remedy
+        if candidate.name == 'base_compliance':
             # Two arms of one type are equally soft: then bolts are not the remedy.
             assert 'another arm of the type' in remedy
             assert 'dial gauge' in remedy

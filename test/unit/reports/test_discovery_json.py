@@ -147,11 +147,13 @@ def test_a_free_curve_is_drawn_where_it_was_measured_with_a_band_that_opens(save
     q = data.context.measurements.q[:, 1]
     # A curve of the same joint in place of the wave, with nothing measured in the middle of it.
     away = np.abs(q - np.median(q)) > 0.3
-    cell = next(c for c in EFFECTS['joint_error_curve'].cells(data.context) if c.joints == (2,))
+    candidate = next(
+        c for c in EFFECTS['joint_error_curve'].candidates(data.context) if c.joints == (2,)
+    )
     curve = Curve.of(q[away & data.context.to_fit], 0.05)
     names = tuple(f'height_{i}' for i in range(len(curve.places)))
-    cell = replace(
-        cell,
+    candidate = replace(
+        candidate,
         curve=curve,
         parameters=names,
         columns=lambda context: Design(1, curve.columns(context.measurements.q[:, 1])),
@@ -162,10 +164,10 @@ def test_a_free_curve_is_drawn_where_it_was_measured_with_a_band_that_opens(save
         curve.columns(q[away]).T @ curve.columns(q[away]) + 1e-3 * curve.penalty
     )
     draws = np.random.default_rng(seed).multivariate_normal(0.0 * curve.places, covariance, 400)
-    solution = replace(found.solution, cells=(cell,), parameters=draws[0])
+    solution = replace(found.solution, candidates=(candidate,), parameters=draws[0])
     drawn = replace(
         found,
-        groups=((cell,),),
+        groups=((candidate,),),
         solution=solution,
         fit=replace(found.fit, theta_names=names, theta_draws=draws[None]),
     )
@@ -251,7 +253,9 @@ def test_discovery_json_has_registration_markers_and_joint_covariance(saved):
     covariance = content['covariance']
     known = [row['joint'] for row in content['joint_offsets_after'] if row['identifiable']]
     # Errors of other kinds that are in the model without a name are not in it.
-    causes = {name for group in found.groups for cell in group for name in cell.parameters}
+    causes = {
+        name for group in found.groups for candidate in group for name in candidate.parameters
+    }
     of_causes = [name for name in found.fit.theta_names if name in causes]
     assert covariance['names'] == [*known, *of_causes]
     assert len(covariance['units']) == len(covariance['names'])
@@ -281,18 +285,18 @@ def test_lengths_and_tilts_are_in_the_robot_model(saved):
     """The corrected URDF moves the tool as the cells of the search do, to first order."""
     found, _ = saved
     context, chain = found.residuals.context, found.fit.chain
-    cells = [
-        cell
+    candidates = [
+        candidate
         for name in ('link_length', 'joint_axis_tilt')
-        for cell in EFFECTS[name].cells(context)
-        if cell.size == 1
+        for candidate in EFFECTS[name].candidates(context)
+        if candidate.size == 1
     ]
     seed = 4
     print(f'seed {seed}')
-    theta = 1e-5 * np.random.default_rng(seed).standard_normal(len(cells))
+    theta = 1e-5 * np.random.default_rng(seed).standard_normal(len(candidates))
     shifts, turns = np.zeros((2, len(chain), 3))
-    for cell, value in zip(cells, theta, strict=True):
-        change = cell.model_change
+    for candidate, value in zip(candidates, theta, strict=True):
+        change = candidate.model_change
         shifts[change.joint] += value * change.shifts[0]
         turns[change.joint] += value * change.turns[0]
     drawn = replace(found.geometry, shifts=shifts, turns=turns, joint_offsets=np.zeros(len(chain)))
@@ -300,7 +304,7 @@ def test_lengths_and_tilts_are_in_the_robot_model(saved):
     model = SerialChain.from_urdf(text, chain.base_link, chain.tip_link)
     markers = context.markers[context.marker]
     moved = model.positions(context.q, markers) - chain.positions(context.q, markers)
-    np.testing.assert_allclose(moved, found.residuals.displaced(cells, theta), atol=2e-9)
+    np.testing.assert_allclose(moved, found.residuals.displaced(candidates, theta), atol=2e-9)
     offsets = 1e-3 * np.random.default_rng(seed + 1).standard_normal(len(chain))
     text = model_text(found.alone, replace(drawn, joint_offsets=offsets))
     both = SerialChain.from_urdf(text, chain.base_link, chain.tip_link)
@@ -338,7 +342,7 @@ def test_what_is_no_better_in_the_figures_shown_is_not_to_be_loaded(monkeypatch)
         residuals=SimpleNamespace(context=SimpleNamespace(measurements=rows)),
         outliers=(),
         fit=None,
-        solution=SimpleNamespace(cells=(SimpleNamespace(of_measurement=True, size=1),)),
+        solution=SimpleNamespace(candidates=(SimpleNamespace(of_measurement=True, size=1),)),
         loads_geometry=True,
     )
     model = SimpleNamespace(largest_slope=lambda: 0.1)
@@ -562,8 +566,8 @@ def test_a_wave_has_no_band_where_nothing_was_measured(scenes, monkeypatch):
     # Drawn at the rows that were searched.
     monkeypatch.setattr(figures, 'MOST_DRAWN', 0)
     ax = Figure().subplots()
-    (cell,) = discovery.groups[0]
-    figures._cause(ax, shown, cell)
+    (candidate,) = discovery.groups[0]
+    figures._cause(ax, shown, candidate)
     (band,) = ax.collections
     sides = [path.vertices[:, 0] for path in band.get_paths()]
     assert len(sides) >= 2
