@@ -86,7 +86,10 @@ def _halves(draws: FloatArray) -> FloatArray:
 
 
 def _normal_scores(draws: FloatArray) -> FloatArray:
-    """Normal quantiles of the ranks (eq. 14); equal draws share their mean rank."""
+    """Normal quantiles of each parameter's ranks over all chains (eq. 14), shape as ``draws``.
+
+    ``draws``: (chains, draws, parameters); equal draws share their mean rank.
+    """
     columns = draws.reshape(-1, draws.shape[2]).T
     rank = np.empty_like(columns)
     for of_one, column in zip(rank, columns, strict=True):

@@ -317,9 +317,9 @@ def moving_words(found: Estimate) -> str:
 
 
 def clocks_of(found: Estimate) -> dict[str, tuple[float, float]]:
-    """Delay of each sensor's stamps to those of the joints, and its standard deviation, s.
+    """Delay of stamps to those of the joints, and its standard deviation, s, by sensor.
 
-    {} for a fit without parameters of motion.
+    Of sensors that measured in motion; {} for a fit without parameters of motion.
     """
     extension, model = found.model.extension, found.model
     if extension is None or not extension.of_motion:

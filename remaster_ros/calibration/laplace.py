@@ -314,7 +314,10 @@ def _noise_covariance(linearisation: Linearisation, peak: FloatArray) -> FloatAr
 def _noise_slope(
     linearisation: Linearisation, at: FloatArray
 ) -> tuple[float, FloatArray, FloatArray]:
-    """Log density of the noise, its gradient, and its approximate negative second derivative."""
+    """Log posterior density of the noise coordinates `at`, (e,), with gradient and curvature.
+
+    Returns the density, its gradient (e,), and its approximate negative second derivative (e, e).
+    """
     posterior = linearisation.posterior
     value, slope, information = linearisation.by_variances(at)
 

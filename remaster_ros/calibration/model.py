@@ -134,7 +134,7 @@ class Model:
         )
 
     def rows(self, measurements: Measurements, rows: IntArray) -> Rows:
-        """Given rows, sorted, with their orientations if these are fitted."""
+        """Given rows (indices), sorted by `Rows.of`, with orientations if these are fitted."""
         return Rows.with_turns(measurements, rows, self.reference, self.bodies, self.on_tool)
 
     def rows_of_path(self, measurements: Measurements, rows: IntArray) -> Rows:

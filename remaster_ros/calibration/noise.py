@@ -318,8 +318,9 @@ class NoiseModel:
     def parts(
         self, features: Callable[[Rows, slice], FloatArray]
     ) -> Iterator[tuple[int, FloatArray]]:
-        """Error groups with columns (r, width) whose products sum up to those of the features.
+        """Yield (error group, columns (r, width)) whose products sum up to those of the features.
 
+        The columns are decorrelated and turned into the noise's frames, not weighted by variances.
         A group comes several times; the products of the groups `contained` in it are to be
         subtracted. ``features``: of rows, and of their slice among all rows, to vectors (rows, 3,
         width) in the coordinates of `Rows.target`; called with some thousand rows at a time, so

@@ -324,7 +324,7 @@ class FitResult:
 
     @property
     def other_errors(self) -> bool:
-        """Whether errors remain that are neither offsets nor noise."""
+        """Whether noise checks or structure tests show errors beyond offsets and noise."""
         return errors_are_left(self.noise_checks, self.structure)
 
     @property
@@ -565,7 +565,10 @@ def _orientations(
     x: FloatArray,
     x_draws: FloatArray,
 ) -> Orientations | None:
-    """Result for the orientations, at natural x (size,) and of draws (n, size)."""
+    """Orientations at natural x, (size,), with standard deviations of x_draws, (n, size).
+
+    If none are fitted: only the reason why they were left out, or None without a reason.
+    """
     model = posterior.model
     if not model.bodies:
         why_not = '' if sampled.found is None else sampled.found.without_turns

@@ -258,7 +258,10 @@ def _results(job: Job) -> dict[str, Any]:
 
 
 def _of_fit(path: Path) -> dict[str, Any]:
-    """Return the columns of a fit.json."""
+    """Robot, judgement, held-out errors, mm, and offsets of a fit.json.
+
+    Raises OSError, ValueError, KeyError or TypeError if it is unreadable or of another form.
+    """
     content = json.loads(path.read_bytes())
     held_out = (content['accuracy']['validation'] or {}).get('post_registration') or {}
     return {
@@ -274,7 +277,10 @@ def _of_fit(path: Path) -> dict[str, Any]:
 
 
 def _offset(offset: Mapping[str, Any]) -> dict[str, Any]:
-    """Return an offset of fit.json, in degrees, or in mm for a prismatic joint."""
+    """Row of an offset of fit.json, in its unit there (deg, or mm for a prismatic joint).
+
+    Mean and standard deviation are None if the offset is not identifiable.
+    """
     known, unit = offset['identifiable'], offset.get('unit', 'deg')
     row = {'joint': offset['joint'], 'mean_deg': None, 'std_deg': None}
     row |= {} if unit == 'deg' else {'unit': unit}

@@ -77,7 +77,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Read, add to the history, judge, print."""
+    """Judge a session against the baseline, add it to the history, print the result; return 0.
+
+    A session that cannot be judged is not added; the newest check of the history is judged again
+    without being added. Raises InputError for a session that is an older check.
+    """
     session, baseline = read_session(args.session), read_compensation(args.baseline)
     refuse_moving(session, args.session, 'check')
     require_same_arm(session, baseline, args.session)
@@ -176,7 +180,10 @@ def _require_history(path: Path) -> None:
 def _before(
     history: Journal, path: Path, baseline: Compensation
 ) -> tuple[list[Measured], list[str]]:
-    """Return the checks of a history and their names, oldest first."""
+    """Return the checks of a history and their names, oldest first.
+
+    Raises InputError for a record of another arm or baseline, or a damaged record.
+    """
     checks, names = [], []
     for line, record in enumerate(history.records, 1):
         where = f'{path}, line {line}'

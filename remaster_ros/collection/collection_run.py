@@ -115,7 +115,7 @@ class CollectionRun:
         return ''
 
     def collect(self, new_token: str) -> None:
-        """Begin a run with this token, unless one is under way."""
+        """Begin a run with this token, or go on with that under way; clears `left` and `why`."""
         self.left = ''
         if self.state != 'running':
             self.token = new_token

@@ -376,6 +376,7 @@ def decode(text: str) -> EventRecord:
 
 
 def _plain(value: np.generic) -> object:
+    """NumPy scalar as a Python number, for the JSON encoder."""
     return value.item()
 
 

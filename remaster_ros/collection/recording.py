@@ -47,7 +47,10 @@ class SettledArm:
         return self.pose.ids[self.solution]
 
     def recorded_before(self, result: Outcome, *, registered: bool) -> ConfigurationEnded:
-        """Event of a configuration that needs no further reading."""
+        """Event that this configuration was recorded before and needs no further reading.
+
+        ``registered``: whether every sensor that the arm waits for is registered.
+        """
         return ConfigurationEnded(
             stamp=self.pose.stamp,
             solution=self.solution,

@@ -213,6 +213,7 @@ class ReferenceWatch:
         return not self._open or self._key(reading) in self._rounds[-1].rows
 
     def _key(self, reading: ReferenceReading) -> tuple[int, str]:
+        """Number of a reading's reference (a new one if none is near), and its sensor."""
         known = None
         if self._references:
             units = JointUnits.of(self._chain)

@@ -77,7 +77,10 @@ class Compensator:
         return np.repeat((1.0 / lever, TOOL_SIZE), 3)
 
     def angle_errors(self, q: FloatArray, warming: FloatArray | None = None) -> FloatArray:
-        """Change that removes the errors of the joint angles alone, rad, (n, k)."""
+        """Change to be added to q, (n, k), to remove errors of the joint angles alone, rad or m.
+
+        ``warming``: temperature above the reference, K, (n,); by default that of the model's mean.
+        """
         warming = self.model.warming(len(q), None) if warming is None else warming
         command = q
         for _ in range(FIXED_POINT_STEPS):

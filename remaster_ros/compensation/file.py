@@ -433,6 +433,7 @@ def _origins(geometry: Geometry, names: Sequence[str]) -> list[OriginPart]:
 
 
 def _triple(values: FloatArray) -> Triple:
+    """Three numbers as a tuple of floats."""
     x, y, z = (float(value) for value in values)
     return x, y, z
 

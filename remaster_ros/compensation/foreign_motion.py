@@ -137,7 +137,7 @@ class ArmReports:
 
     @property
     def q(self) -> FloatArray:
-        """Last reported position, rad, (k,)."""
+        """Last reported position, rad or m, (k,); there must be a report."""
         return self._reports[-1][1]
 
     @property

@@ -74,7 +74,7 @@ class MasteringStep:
 
     @property
     def to_set_zero(self) -> str:
-        """Number to drive to if the controller can only set 0."""
+        """Position to drive to, as the pad shows it (`unit`), if the controller can only set 0."""
         return self.shown(self.drive_to - self.set_to)
 
 

@@ -67,7 +67,7 @@ class Conductor(Node):
         self.summaries[node] = {'message': message, **values}
 
     def _on_record(self, record: EventRecord) -> None:
-        """Take an event of a node."""
+        """Keep the time of a node's event, and the description of a planned tour."""
         if isinstance(record.body, TourPlanned):
             self.planned = record.body.description
         self.times.add(record.body)

@@ -183,7 +183,10 @@ class Demo:
         return complete
 
     def _estimate(self) -> list[tuple[str, Path, str]]:
-        """Fit the session, and look for causes; return label, folder and file of each result."""
+        """Fit the session and, if there are `requests`, look for causes.
+
+        Returns label, folder and file of each result.
+        """
         self.console.print('fitting')
         self._trigger('remaster/fit', 'optimizer', timeout_s=WORK_WALL_S)
         results = [('report', self.fit, 'fit.json')]

@@ -123,6 +123,7 @@ def _belongs(candidate: Candidate, cause: Named) -> bool:
 
 
 def _without(found: Discovery, *causes: Named) -> float:
+    """Log evidence of the discovery's model without some causes; -inf if it has no solution."""
     rest = _rest(found, *causes)
     bare = solve(found.residuals, rest, found.solution)
     return -np.inf if bare is None else bare.log_evidence
@@ -146,7 +147,10 @@ def _evidence(found: Discovery, cause: Named, other: Named) -> float | None:
 
 
 def _variants(every: Sequence[Candidate], cause: Named) -> list[tuple[Candidate, ...]]:
-    """Return the sets of candidates that a cause can be: each of its joints; else one a joint."""
+    """Sets of candidates that a cause can be: each candidate of its joints, alone.
+
+    If there are none, one candidate for each of the joints together; [] if a joint has none.
+    """
     mine = [candidate for candidate in every if candidate.name == cause.name]
     one: list[tuple[Candidate, ...]] = [
         (candidate,) for candidate in mine if candidate.joints == cause.joints

@@ -156,7 +156,7 @@ class FoundEffect:
 
     @property
     def is_certain(self) -> bool:
-        """Whether its probability is that of a statement."""
+        """Whether the cause's probability is at least `CERTAIN`; True if it is unknown (None)."""
         return self.probability is None or self.probability >= CERTAIN
 
     @property
@@ -169,7 +169,7 @@ class FoundEffect:
 
 
 def clearest(parameters: Iterable[tuple[float, float]]) -> float:
-    """Return the largest of some (value, std) in standard deviations; infinite of known ones."""
+    """Largest |value| / std of (value, std) pairs with std > 0; infinite if there are none."""
     return max((abs(value) / std for value, std in parameters if std > 0.0), default=np.inf)
 
 

@@ -48,7 +48,10 @@ def gain_of(
     fit: FitResult,
     rng: np.random.Generator,
 ) -> Gain:
-    """Measure the gain of the sampled fit over the fit with offsets only."""
+    """RMS errors of held-out rows before and after the sampled fit, and the noise floor, m.
+
+    Before is the fit with offsets only. Without held-out rows both errors are None.
+    """
     measurements = found.problem.measurements
     held_out = measurements.is_validation
     noise = data.noise_model.sensor_noise(solution.noise)

@@ -420,7 +420,10 @@ class State:
         return [int(self.surface.pool.kind[block]) for block, _ in self.model]
 
     def _prior(self, block: int, there: bool) -> float:
-        """Return the log prior odds of a block whose kind is there, or not."""
+        """Return the log prior odds of a block; less likely if it is the first of its kind.
+
+        ``there``: whether the model has another block of this kind; else log(KIND_ODDS) is added.
+        """
         odds = float(self.surface.pool.log_prior[block])
         return odds if there else odds + float(np.log(KIND_ODDS))
 

@@ -30,9 +30,9 @@ NOTICEABLE = 0.1
 
 @dataclass(frozen=True, eq=False)
 class Unmodelled:
-    """The normal equations of all that is fitted, with a solution's noise and priors.
+    """Normal equations of a solution, for the effect of errors that are not in its model.
 
-    ``found``: the fit that is searched beside; ``data``: its residuals.
+    ``found``: fit whose residuals the discovery explains; ``data``: those residuals.
     """
 
     found: Estimate
@@ -44,7 +44,7 @@ class Unmodelled:
 
     @classmethod
     def of(cls, found: Estimate, data: Residuals, solution: Solution) -> Unmodelled:
-        """Assemble the equations of a solution."""
+        """Assemble the normal equations of a solution, with its noise and its priors."""
         free, size = found.posterior.free, found.model.size
         own = data.columns(solution.candidates)
         columns = np.concatenate((data.full_jacobian[data.rows.source][:, :, free], own), axis=2)
@@ -83,7 +83,9 @@ class Unmodelled:
         return moves
 
     def by_drawing(self, named: Sequence[Candidate]) -> FloatArray:
-        """Return the movement by lengths and tilts without a name, off their drawing.
+        """Return columns F, (size, c), by which lengths and tilts off their drawing move the fit.
+
+        They add FF' to the covariance. ``named``: causes that are named, which are left out.
 
         No session proves that an arm is its drawing. As random effects of its tolerance beside
         the model they add L U G⁻¹ U'L' to the covariance LL' of all that is fitted, with their

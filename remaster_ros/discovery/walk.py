@@ -616,7 +616,10 @@ class Walk:
             best = more
 
     def _swapped(self, found: Evaluated) -> Evaluated | None:
-        """Return a model with the members that stand out of the background as its blocks."""
+        """Return a model with background members that stand out added as blocks of its own.
+
+        None if none stands out, or if the model cannot be fitted.
+        """
         have = {
             name
             for block, _ in found.model
@@ -747,9 +750,9 @@ class Walk:
 
     @cached_property
     def claimed(self) -> list[Candidate]:
-        """Causes of the best model that are there, or of which one of several look-alikes is.
+        """Candidates of `best` whose probability, with their look-alikes', is at least 1/2.
 
-        As candidates of `best`.
+        Other forms of a claimed cause, and weaker copies of it by another axis, are left out.
         """
         found = []
         best = self.models[0]

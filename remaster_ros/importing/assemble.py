@@ -273,9 +273,10 @@ def with_controller_coupling(
 
 
 def without_whole_turns(session: Session, chain: SerialChain) -> tuple[Session, str]:
-    """Session with angles shifted by whole turns into the limits.
+    """Session with angles (q and from_q) shifted by whole turns into the limits.
 
-    Last result: a sentence on the shifts, '' if there are none.
+    Last result: a sentence on the shifts; '', with the session as it is, if there are none. A
+    shifted session has no `observations_sha256`, as its rows differ from its file.
     """
     m = session.measurements
     q = chain.within_turns(m.q)

@@ -378,7 +378,11 @@ def _joint_number(
 def _chosen_points(
     table: TextTable, headers: Sequence[_Header], names: Sequence[str], found: Columns
 ) -> dict[str, tuple[int, ...]]:
-    """Columns by marker that the user chose, by marker names or by three columns each."""
+    """Columns by marker of --points, by marker names or by three columns each.
+
+    Notes the origin of the columns in `found`; {} if this table does not have all of them.
+    Raises InputError if they do not come by threes.
+    """
     groups = {name: table.groups[name] for name in table.groups} or {
         _marker_label(table, columns): columns for columns in _xyz_groups(headers, set()).values()
     }
@@ -597,7 +601,11 @@ def _claim(found: Columns, columns: Sequence[int], taken: set[int]) -> None:
 
 
 def _columns_by_place(table: TextTable, found: Columns, joints: int) -> Columns:
-    """Assign columns without a header by their place: a name, then joints, then X, Y, Z."""
+    """Complete `found` (changed in place) by the place of columns without a header.
+
+    A name, joints, then X, Y, Z; or only the joints, or only X, Y, Z. Raises InputError if nothing
+    is found and the number of numeric columns fits none of these.
+    """
     if table.groups and not found.points:
         found.points, found.orientations = {**table.groups}, {**table.turns}
         for columns in (*found.points.values(), *found.orientations.values()):

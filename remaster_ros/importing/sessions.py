@@ -126,7 +126,11 @@ def corrected_session(session: Session, arrangement: Arrangement) -> Session:
 def _controller(
     session: Session, arrangement: Arrangement, joint_names: Sequence[str]
 ) -> Controller | None:
-    """How the controller counts the joints after their columns were rearranged."""
+    """How the controller counts the joints after their columns were rearranged.
+
+    The session's own (or None) if joints stay as they are. Raises InputError for --couple if the
+    joints concerned are coupled or moved already.
+    """
     plain = Arrangement.given(len(joint_names))
     of_joints = (arrangement.order, arrangement.signs, arrangement.quarters, arrangement.coupled)
     if of_joints == (plain.order, plain.signs, plain.quarters, plain.coupled):

@@ -363,6 +363,7 @@ def _bounded(table: TextTable) -> TextTable:
 
 
 def _too_wide(path: Path, line: int, width: int) -> InputError:
+    """InputError of a line with `width` columns, more than MOST_COLUMNS."""
     return InputError(
         f'{path}, line {line}: {width} columns, where {MOST_COLUMNS} at the most are read; give a '
         'line to each configuration, and leave out columns that are neither joints nor points'

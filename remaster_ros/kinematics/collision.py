@@ -279,7 +279,7 @@ class CollisionModel:
         return f'{outer} {1e3 * short.distance:.0f} mm from {inner}, {kept}'
 
     def _limit_trouble(self, q: FloatArray) -> str:
-        """Return in words which waypoint of (n, k) is outside the joint limits; '' if none."""
+        """Return in words the joint furthest outside its limits, over waypoints (n, k); or ''."""
         chain = self.chain
         over = np.maximum(chain.lower - q, q - chain.upper)
         if np.max(over) <= _LIMIT_TOLERANCE:

@@ -236,7 +236,10 @@ class InverseKinematics:
         return max(p.difference_m for p in found), max(p.difference_rad for p in found)
 
     def in_words(self) -> str:
-        """Return one sentence on how solutions are found, and how complete they are."""
+        """Return sentences on how solutions are found, and how complete they are.
+
+        Without a closed form near this arm they need a trial of many starts (`missed_solutions`).
+        """
         within = 'each is kept where forward kinematics reaches the pose to 1e-8 m and 1e-8 rad'
         if self.difference is not None:
             off_m, off_rad = self.difference

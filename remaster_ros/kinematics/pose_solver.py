@@ -51,7 +51,10 @@ def reach_from(
 def _newton(
     chain: SerialChain, free: list[int], q: FloatArray, T: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return final configurations and residuals of one chunk of starts; see `reach_from`."""
+    """Damped Newton steps of starts q, (n, k), changed in place, towards poses T, (n, 4, 4).
+
+    Returns q and the residuals, (n,), as in `reach_from`.
+    """
     residuals = np.full(len(q), np.inf)
     active = np.arange(len(q))
     diagonal, turning = np.arange(len(free)), ~chain.slides[free]

@@ -317,10 +317,11 @@ class ArmSupervisor:
         self._interlocks.interrupted(since_wall_s)
 
     def not_sent(self, command: Drive | Renew | Stop, wall_s: float) -> list[Action]:
-        """Process that a command was not published, as this process was paused since its decision.
+        """Actions for a command that was not published, as this process was paused meanwhile.
 
-        A move is decided again after all that arrived meanwhile is processed. An arm that was to
-        be stopped goes on, and where it is now is not known.
+        A move is decided again after all that arrived meanwhile is processed. A stop that was not
+        sent halts: the arm goes on, and its present place is unknown. A renewal needs no action:
+        the piece before it ends in a stop.
         """
         self._motion.take_back()
         if isinstance(command, Renew):

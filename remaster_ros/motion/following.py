@@ -291,14 +291,15 @@ class Following:
 
 
 def path_tolerance(speeds: FloatArray, rules: SupervisorRules) -> FloatArray:
-    """Return how far joints may be from where they should be at a time, rad or m, (k,).
+    """Return how far joints may be off their planned position at a time, rad or m, (k,).
 
-    The same as of `Following`, for a controller that follows too: beside the path and behind it.
+    ON_PATH_RAD beside the path, and allowed lag times speed behind it, as in `Following`; for a
+    controller that watches its path itself.
 
     Parameters
     ----------
     speeds
-        The largest of the move, rad/s or m/s, (k,).
+        Largest speed of each joint in the move, rad/s or m/s, (k,).
     rules
         How far the arm may lag.
     """

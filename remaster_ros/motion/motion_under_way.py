@@ -105,7 +105,11 @@ class Visit:
         return Settled(self.solution, seen.stamp, self.detector.mean, motion_s, settle_s)
 
     def judge_settled(self, seen: Seen, *, recorder_waits: bool) -> Outcome:
-        """Return the outcome for an arm that must stand until the recorder answers."""
+        """Outcome for an arm that must stand until the recorder answers.
+
+        'halted' if the arm was moved, 'failed' if the answer is late, else UNDER_WAY.
+        ``recorder_waits``: the recorder waits on purpose, so that the deadline begins anew.
+        """
         moved, units = np.abs(seen.q - self.trajectory.end), self.rules.units
         if units.largest(moved) > MOVED_RAD:
             joint = units.farthest(moved)
@@ -364,7 +368,10 @@ class MotionUnderWay:
         return Stop(admitted, reason, wall_s)
 
     def _brake(self, end: FloatArray, begins: float, over: float, rate: float) -> None:
-        """Begin to look at a stop that leads to `end`, (k,), between two robot times, s."""
+        """Begin to watch a stop at `end`, (k,), from `begins` to `over`, robot time, s.
+
+        ``rate``: robot time per wall time; above 1 it lengthens the patience.
+        """
         patience_s = ASTRAY_S * max(rate, 1.0)
         deadline = over + max(STOPPED_S, patience_s)
         units = self.rules.units

@@ -28,7 +28,10 @@ class PathSearch:
         self._model, self._speeds = model, speeds
 
     def find(self, request: CheckPath) -> PathAnswer:
-        """Answer a request."""
+        """Free path for a request: the planned one, or another.
+
+        Without one: what is in the way and, from a start that is not free, a way out if known.
+        """
         rng = np.random.default_rng(SEED)
         at_start = self._model.trouble(request.start)
         if at_start:

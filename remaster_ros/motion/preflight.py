@@ -51,6 +51,7 @@ def preflight(facts: Facts) -> tuple[str, ...]:
 
 
 def _trouble(sensor: SensorFacts) -> str:
+    """Why a sensor is not ready (no node, not ready, marker not read), and a remedy; or ''."""
     if not sensor.node_age_s <= FRESH_S:
         return f'{sensor.name}: no sign of its node: is it running in this ROS domain?'
     if not sensor.ready:

@@ -59,7 +59,7 @@ class SettleDetector:
         self._still: _Standstill | None = None
 
     def update(self, stamp: float, q: FloatArray) -> SettleState:
-        """Take one report and return the state.
+        """Process one report and return the state; 'moving' if a position is not finite.
 
         ``stamp``: time of the report, s; ``q``: reported joint positions in the order of the
         target, rad or m, (k,).

@@ -43,7 +43,7 @@ class Background:
         self._work.put((work, then))
 
     def close(self, timeout_s: float = 5.0) -> None:
-        """End the thread when all jobs are done, or after a timeout; drop later results."""
+        """End the thread after the queued jobs; wait for its end `timeout_s` at most."""
         self._work.put(None)
         self._thread.join(timeout_s)
 

@@ -95,7 +95,10 @@ class CellSensors:
         return {name: age_s if np.isfinite(age_s) else None for name, age_s in ages_s.items()}
 
     def trigger(self, pairing: Pairing) -> None:
-        """Request the measurements of single-shot sensors for a reading."""
+        """Send the requests to single-shot sensors that a pairing still needs, except absent ones.
+
+        Returns at once; to be called until the pairing is decided.
+        """
         self._shots.look(pairing, self._absent(), self._steady_s())
 
     def give_up(self, recording: Recording) -> None:

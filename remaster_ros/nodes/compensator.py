@@ -396,6 +396,10 @@ class CompensatorNode(RemasterNode):
         return self._temperature_c if self._correction.compensator.model.grows else None
 
     def _on_joint_state(self, message: JointState, info: Any) -> None:
+        """Publish the true joint angles, or the reported ones with the correction off.
+
+        Positions that are not finite are refused; those of other joints are passed on unchanged.
+        """
         if not self._order.concerns(message):
             # A gripper's: the planner wants to know of it too.
             self._states.note(message, info)
@@ -541,6 +545,7 @@ class CompensatorNode(RemasterNode):
         self._passed, self._end_s = None, self.now_s()
 
     def _keep(self, *samples: FloatArray) -> None:
+        """Note where the arm is led to; write the last position to the command file, if kept."""
         self._led.lead_to(*samples)
         if self._keeps_end:
             write = partial(self._command_file.write, samples[-1], time.time_ns())

@@ -239,6 +239,7 @@ class Optimizer(RemasterNode):
         return report, '; '.join(('fitted', *result.implausible))
 
     def _priors(self) -> Priors | None:
+        """Priors of the file in the parameter `prior`; None if the parameter is empty."""
         return read_priors(self.p.prior) if self.p.prior else None
 
     def _discover(self) -> tuple[Path, str]:
@@ -277,7 +278,10 @@ class Optimizer(RemasterNode):
         self._state = f'{stage} {100 * share:.0f} %'
 
     def _publish_last(self) -> None:
-        """Publish what was fitted before this optimizer was started (again)."""
+        """Publish the offsets of a fit from before this node was started.
+
+        Nothing without such a file; a warning if it is unreadable.
+        """
         path = Path(self.p.out) / FIT_FILE
         if not path.exists():
             return

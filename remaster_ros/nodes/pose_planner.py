@@ -441,7 +441,10 @@ class PosePlanner(RemasterNode):
         self.journal.record_state(state, token)
 
     def _is_written(self) -> bool:
-        """Retry a failed write once a second; return whether all is written."""
+        """Retry a failed write, at most once in RETRY_WALL_S; return whether all is written.
+
+        False between two tries.
+        """
         now = time.monotonic()
         if now - self._tried_wall < RETRY_WALL_S:
             return False

@@ -124,6 +124,7 @@ class MeasureService:
                 self._T_R_T = self._chain.forward(q)
 
     def _on_registration(self, message: TransformStamped) -> None:
+        """Keep the inverse of this sensor's registration, T_N_R; ignore those of other sensors."""
         if message.child_frame_id == self._node.sensor:
             self._T_N_R = transforms.inverse(transform_array(message))
 

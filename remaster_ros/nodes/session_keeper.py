@@ -59,7 +59,10 @@ class SessionKeeper:
             self.full = ''
 
     def look(self) -> bool:
-        """Repeat a waiting write, and repair files that others changed; return whether any was."""
+        """Retry a failed write and repair files that others changed; whether one was repaired.
+
+        Writes are repeated every `RETRY_S`, files checked every `CHECK_S`; False in between.
+        """
         now = time.monotonic()
         if self._waiting is not None and now - self._tried_wall > RETRY_S:
             self.write(self._waiting)

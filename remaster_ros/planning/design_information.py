@@ -251,7 +251,10 @@ class DesignInformation:
         return self.pose_variance / (1.0 + count[:, None] * self.pose_variance * self.weight)
 
     def _shared(self, sums: FloatArray, count: IntArray) -> FloatArray:
-        """Return the information lost to the common error of poses, (p, f, f), from `_sums`."""
+        """Return the information lost to the common error of each pose, (poses, f, f).
+
+        ``sums``, ``count``: as returned by `_sums`.
+        """
         rooted = np.sqrt(self._factor(count))[:, :, None, None] * sums
         return _squares(rooted.reshape(len(sums), 3 * len(self.weight), len(self.scale)))
 

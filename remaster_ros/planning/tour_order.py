@@ -438,8 +438,9 @@ def free_waypoints(
     velocity_limits: FloatArray,
     seed: int,
 ) -> FloatArray | None:
-    """Return waypoints of a free path from q to one configuration, rad, (n, k); None if none.
+    """Return waypoints between q and goal (both excluded) of a free path, rad or m, (n, k).
 
+    None if no path is found. ``model``: obstacles; with None the straight path is free, n = 0.
     Repeatable: the same ends and seed give the same path.
     """
     rng = np.random.default_rng([seed, *b'reference'])

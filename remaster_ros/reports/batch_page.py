@@ -106,7 +106,11 @@ def _shown(one: Mapping[str, Any], key: str) -> str:
 def _joint(
     robot: str, name: str, index: int, rows: Sequence[Mapping[str, Any]], level: float
 ) -> dict[str, Any]:
-    """Median, scatter and outliers of a joint's offset over the sessions of one kind of arm."""
+    """Row of a joint for the page: median, spread, sessions that differ, lasting change.
+
+    None for what is unknown; fewer than FEW sessions have median and spread alone. ``level``: of
+    `differing`.
+    """
     unit = rows[0]['fit']['joints'][index].get('unit', 'deg')
     known = [row for row in rows if row['fit']['joints'][index].get(f'mean_{unit}') is not None]
     mean = np.array([row['fit']['joints'][index][f'mean_{unit}'] for row in known])

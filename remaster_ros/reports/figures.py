@@ -818,7 +818,10 @@ def _sides(
     band: FloatArray,
     shown: tuple[FloatArray, FloatArray],
 ) -> None:
-    """Draw a step: the points of each side spread out, and the level of each side."""
+    """Draw a step at x = -1 and 1: points spread out, and the level of each side, ± ``band``.
+
+    ``shown``: places and values of the points.
+    """
     places, points = shown
     spread_out = places + 0.3 * np.linspace(-1.0, 1.0, len(places))
     ax.plot(spread_out, points, '.', color=BEFORE, markersize=2.5, alpha=0.6)

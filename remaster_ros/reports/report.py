@@ -103,7 +103,10 @@ class View3D(NamedTuple):
 
 
 def draw_view(result: FitResult) -> View3D:
-    """3-D view of a fit."""
+    """3-D view of a fit: arms, sensors, markers, and magnified errors before and after.
+
+    At most `ROWS_SHOWN` rows and `ARMS_SHOWN` arms, evenly spread, are drawn.
+    """
     m, chain = result.session.measurements, result.chain
     shown = evenly(len(m), ROWS_SHOWN)
     sensors = [result.session.sensor_names[i] for i in m.sensor[shown]]
@@ -236,7 +239,7 @@ def write_fit_report(result: FitResult, folder: Path) -> Path:
 
 
 def inputs_of(result: FitResult) -> Inputs:
-    """Inputs of the first screen for a fit without a discovery."""
+    """`Inputs` of the first screen for a fit alone; what needs a discovery is None."""
     before_mm, after_mm = map(lengths_mm, (result.residuals_before, result.residuals_after))
     return Inputs(result.session, fit_content(result), None, before_mm, after_mm, None)
 
@@ -717,7 +720,7 @@ def checked_svg(text: str, path: Path) -> str:
 
 
 def as_image(svg: str) -> Markup:
-    """A figure as an embedded image, in the colours of paper."""
+    """SVG figure as an embedded <img>: it keeps its colours, whatever the styles of the page."""
     data = base64.b64encode(svg.encode()).decode()
     return Markup('<img alt="" src="data:image/svg+xml;base64,{}">').format(data)
 

@@ -370,7 +370,10 @@ def checked(content: Mapping[str, Any], schema: type[Content]) -> Content:
 
 
 def _plain(values: Any) -> Any:
-    """Arrays and mappings as plain types."""
+    """Array as nested lists, mapping as a dict (not deeper), for a JSON encoder.
+
+    Raises TypeError for other types.
+    """
     if isinstance(values, np.ndarray | np.generic):
         return values.tolist()
     if isinstance(values, Mapping):

@@ -343,9 +343,10 @@ DETECTED = 4.5
 def judgement(
     discovery: Discovery, confirmation: Confirmation | None, content: Discovered
 ) -> Judgement:
-    """Judgement of a discovery: 'good' if all data agree with the verdict, else 'caution'.
+    """Judgement of a discovery: 'good' if its verdict is proven and no data disagree.
 
-    ``content``: the content of discovery.json.
+    Else 'caution'. Data disagree by errors above the noise, by differences between repeated
+    measurements, or by disagreements of the session. ``content``: the content of discovery.json.
     """
     more = more_than_noise(content)
     again = MeasuredAgain.of(discovery.fit.session.measurements)

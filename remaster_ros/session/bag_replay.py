@@ -247,6 +247,6 @@ def _rows(session: Path) -> dict[tuple[str, ...], dict[str, str]]:
 
 
 def _name(row: dict[str, str]) -> str:
-    """Return a row in words, for a message."""
+    """Row of observations.csv in words: number, pose, sensor, marker and stamp."""
     place = f'pose {row["pose"]}, {row["sensor"]}, {row["marker"]}, {row["stamp_s"]} s'
     return f'observation {row["observation"]} ({place})'

@@ -323,7 +323,10 @@ class RowFormat:
         return self._accept(self._convert(table), first_line, rules)
 
     def _accept(self, m: Measurements, first_line: int, rules: SequenceRules) -> list[RowKeys]:
-        """Check rows against the rules, and add them; raise InputError at the first violation."""
+        """Check rows against the rules, and add them; raise InputError at the first violation.
+
+        Rows before a violation stay in the rules.
+        """
         keys = list(row_keys(m, first_line))
         for row in keys:
             if problem := rules.problem(row):

@@ -62,7 +62,10 @@ def recover_session(folder: str | os.PathLike[str]) -> Recovery:
 
 
 def _finish_session(folder: Path, header: SessionHeader, recovery: Recovery) -> None:
-    """Complete the session files from the journal."""
+    """Complete the session files from the journal and close the session; note repairs.
+
+    Exit status 'aborted' if the header has none.
+    """
     urdf, chain = read_robot(folder, header)
     session = header.session(urdf, Measurements.empty(len(chain)))
     writer = SessionWriter(folder, session, resume=True, even_complete=True)

@@ -321,7 +321,11 @@ class SessionRecorder:
             self.trouble = 'settled at no joint solution of an announced pose'
 
     def take_marker(self, sensor: str, marker: str, message: Any) -> bool:
-        """Take a geometry_msgs/PointStamped or PoseStamped; return whether it is valid."""
+        """Process a reading (PointStamped or PoseStamped); return whether the marker is seen.
+
+        A position that is not finite is dropped and counted. Of a sensor with several markers, NaN
+        means a hidden marker, and is recorded. Both return False.
+        """
         body = getattr(message, 'pose', None)
         point = message.point if body is None else body.position
         position = np.array([point.x, point.y, point.z])
@@ -522,7 +526,10 @@ class SessionRecorder:
         self.keeper.write(partial(self._write_outcome, ended))
 
     def _write_outcome(self, ended: EndedReading) -> None:
-        """Write the outcome of a configuration; publish it afterwards."""
+        """Write the outcome of a configuration, publish it, and take the next configuration.
+
+        A rejected configuration of a pose that is no longer announced is published, not written.
+        """
         settled, pose = ended.settled, ended.settled.pose
         if ended.result == 'rejected' and pose not in (self.recording.pose, BY_HAND):
             # The pose was retracted, or announced again, and will be visited again.

@@ -219,7 +219,7 @@ def _counted_on(part: Measurements, added: Mapping[str, float], frames: int) -> 
 
 
 def _power_of_ten(largest: int) -> int:
-    """Return the smallest power of ten above a number."""
+    """Return 10 to the number of digits of a whole number >= 0: 9 -> 10, 10 -> 100, 0 -> 10."""
     return int(10 ** len(str(largest)))
 
 

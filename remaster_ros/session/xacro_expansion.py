@@ -45,7 +45,7 @@ _TOKENS = re.compile(
 
 
 class Expansion:
-    """Expansion of one file, without restrictions if it is trusted.
+    """Expansion of one file: by plain xacro if it is trusted, else confined and of limited length.
 
     ``package_path``: folders to search for ROS packages, besides those around the file; ``named``:
     files named by the user, which may be read as well.
@@ -113,7 +113,10 @@ class Expansion:
         return ''.join(joined)
 
     def _count(self, part: Any) -> None:
-        """Add a part to the length of the expansion; raise InputError above the limit."""
+        """Add a part (a text: its length, else 1) to the length of the expansion.
+
+        Raises InputError above `URDF_LIMIT`.
+        """
         self._written += len(part) if isinstance(part, str) else 1
         if self._written > URDF_LIMIT:
             raise InputError(f'{_here()}: it expands to more than {URDF_LIMIT} characters')
@@ -254,6 +257,7 @@ def _fatal(*given: Any) -> None:
 
 
 def _tokens(text: str, sep: str = ',; ', skip_empty: bool = True) -> list[str]:
+    """Split a text at each character of `sep`; empty parts are dropped if `skip_empty`."""
     items = re.split(f'[{re.escape(sep)}]', text)
     return [item for item in items if item or not skip_empty]
 

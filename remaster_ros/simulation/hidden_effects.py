@@ -536,7 +536,7 @@ def base_compliance(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
     Part('lateral_compliance_{j}'),
 )
 def lateral_compliance(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """Rotation of joint j per moment of weight across its axis, rad/(N m)."""
+    """Add to ``d.tilt`` a rotation of joint j per moment of weight across its axis, rad/(N m)."""
     j = e.joints[0] - 1
     across = np.eye(3) - np.outer(c.axes[j], c.axes[j])
     d.tilt[:, j] += e.values[0] * c.carried_moment[:, j] @ across

@@ -377,6 +377,7 @@ class TrackerInstrument:
         self._out.append(Reply(command, status, values))
 
     def _readiness_change(self) -> StatusChange:
+        """Status change that reports the present state of readiness."""
         # The three changes have the order of the three states.
         return StatusChange(Change.NOT_READY + self.readiness)
 
@@ -534,6 +535,7 @@ class TrackerInstrument:
             self._out.append(ErrorReport(Command.START_MEASUREMENT, problem))
 
     def _result(self, truth: FloatArray) -> Measurement:
+        """Measurement of a point, m, (3,), with noise, its std and the weather station's data."""
         cov = covariance(truth, self.behaviour)
         position = self._rng.multivariate_normal(truth, cov)
         temperature, pressure, humidity = map(float, self._settings[Command.GET_ENVIRONMENT])

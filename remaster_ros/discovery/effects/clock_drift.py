@@ -12,7 +12,7 @@ from remaster_ros.types import FloatArray
 
 
 def candidates(context: Context) -> Iterator[Candidate]:
-    """Each sensor: δp = J q̇ d (t - t̄)."""
+    """One candidate for each sensor, also without rows: δp = J q̇ d (t - t̄), d: drift, s/s."""
     for index, name in enumerate(context.sensor_names):
         mine = context.seen_by(index) & context.to_fit
         middle = float(context.elapsed_s[mine].mean()) if mine.any() else 0.0

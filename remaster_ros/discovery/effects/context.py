@@ -120,7 +120,7 @@ class Context:
 
     @cached_property
     def last_move(self) -> FloatArray:
-        """How far each joint moved to get here, rad or m, (n, k); 0 where unknown."""
+        """Signed move of each joint to get here, q - from_q, rad or m, (n, k); 0 if unknown."""
         return np.nan_to_num(self.measurements.q - self.measurements.from_q, nan=0.0)
 
     @cached_property
@@ -139,7 +139,7 @@ class Context:
 
     @cached_property
     def has_approach(self) -> bool:
-        """Whether it is recorded where the arm came from."""
+        """Whether `from_q` is known in at least `KNOWN_SHARE` of the rows; False without rows."""
         known = np.all(np.isfinite(self.measurements.from_q), axis=1)
         return bool(len(known) and np.mean(known) >= KNOWN_SHARE)
 
@@ -155,7 +155,7 @@ class Context:
 
     @cached_property
     def marker_velocity(self) -> FloatArray:
-        """Velocity of the marker in R, m/s, (n, 3)."""
+        """Velocity of the marker in R by the joints' velocities, m/s, (n, 3); 0 if unknown."""
         return np.einsum('nik,nk->ni', self.jacobian, self.motion.velocity)
 
     @cached_property

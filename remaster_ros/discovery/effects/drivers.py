@@ -107,7 +107,10 @@ def approach_of(context: Context, joint: int, name: str) -> Driver:
 
 
 def last_move_of(context: Context, joint: int, name: str) -> Driver:
-    """Return how far a joint moved to get here."""
+    """Driver `name`: signed move of a joint to get here, rad or m, 0 if unknown.
+
+    ``joint``: number of the joint, from 1.
+    """
     return Driver(
         name,
         context.chain.units[joint - 1],

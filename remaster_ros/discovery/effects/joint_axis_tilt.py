@@ -43,7 +43,10 @@ def _tilted(context: Context, joint: int, axes: list[FloatArray]) -> Design:
 
 
 def tilt_directions(context: Context, joint: int) -> dict[str, FloatArray]:
-    """Return the axes of a joint's frame (at angle zero) that are not along its own axis."""
+    """Unit vectors of the joint's frame by name ('x', 'y', 'z'), without those along its axis.
+
+    Along means within 26° of the line of the axis.
+    """
     own = context.chain.axes[joint - 1]
     return {
         name: axis for name, axis in zip('xyz', np.eye(3), strict=True) if abs(axis @ own) < 0.9

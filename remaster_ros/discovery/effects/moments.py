@@ -52,7 +52,10 @@ def spread(found: FloatArray, count: int) -> FloatArray:
 
 
 def after(context: Context, gap: FloatArray) -> FloatArray:
-    """Return how probably each row is after what happened at some moment in a gap, (n, 1)."""
+    """Probability that each row is after a moment uniform in a gap, (n, 1).
+
+    ``gap``: start and end, start < end, s since the first row.
+    """
     start, end = gap
     share: FloatArray = np.clip((context.elapsed_s - start) / (end - start), 0.0, 1.0)
     return share[:, None]

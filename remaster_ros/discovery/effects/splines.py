@@ -166,7 +166,10 @@ def in_turn(values: FloatArray, start: float) -> FloatArray:
 
 
 def knot_vector(low: float, high: float, spacing: float) -> FloatArray:
-    """Return uniform knots over [low, high], about ``spacing`` apart, with those beyond."""
+    """Uniform knots over [low, high], at most ``spacing`` apart, with DEGREE more beyond each end.
+
+    There are at least two intervals.
+    """
     count = max(2, int(np.ceil((high - low) / spacing)))
     step = (high - low) / count
     knots: FloatArray = low + step * np.arange(-DEGREE, count + DEGREE + 1.0)

@@ -68,7 +68,7 @@ def _grown(context: Context, driver: Driver, joints: tuple[int, ...]) -> Design:
 
 
 def link_vector(context: Context, link: int) -> FloatArray:
-    """Return a link's vector in R, from joint ``link`` to the next, m, (n, 3)."""
+    """Vector in R from joint ``link`` (0: the base) to the next joint, m, (n, 3)."""
     shift = context.chain.T_fixed[link][:3, 3]
     if link == 0:
         return np.broadcast_to(shift, (len(context), 3))

@@ -21,7 +21,10 @@ _FEWEST, _MOST = 3, 8
 
 
 def read(text: str) -> NamedColumns | None:
-    """Joint positions of a program of Denso's; None for other text."""
+    """Joint positions of a PacScript program (Denso); None for other text.
+
+    Raises InputError for a malformed or cut statement, or a program without joint positions.
+    """
     if not re.search(
         r'^[^\S\n]*(?:let\s+)?J\[\s*\w+\s*\]\s*=\s*J?\s*\(', text, re.MULTILINE | re.I
     ):

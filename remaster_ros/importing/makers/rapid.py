@@ -120,7 +120,11 @@ def _statements(text: str) -> list[tuple[int, str]]:
 
 
 def _axes(number: int, statement: str, value: re.Match[str]) -> dict[str, str]:
-    """Axes of a joint target; unused external axes are left out."""
+    """Axes of a joint target as text, J1… and E1…; unused external axes are left out.
+
+    Raises InputError with line and statement for text that is no number, and for an unused axis
+    of the arm.
+    """
     axes = {}
     for letter, group in (('J', value[1]), ('E', value[2])):
         for i, cell in enumerate((group or '').split(',') if group else (), 1):

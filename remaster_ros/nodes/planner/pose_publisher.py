@@ -52,7 +52,9 @@ class PosePublisher:
         self._solutions.publish(JointTrajectory(joint_names=list(self._chain.joint_names)))
 
     def announce(self, visit: PoseVisit, plan: str, status: NodeStatus, *, last: bool) -> str:
-        """Publish a visit with its solutions; return the stamp of the announcement.
+        """Publish a visit and its event; return the stamp of the announcement as its key.
+
+        A visit without solutions (`ids`) is published as an event alone.
 
         ``plan``: identifier of the plan that numbers pose and solutions; ``last``: whether the
         visit is to the last reference of a round.

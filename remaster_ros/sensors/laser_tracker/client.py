@@ -254,7 +254,7 @@ class TrackerLink:
             return self._reply(exchange, values)
 
     def measure(self, timeout_s: float) -> tuple[Measurement, float]:
-        """Measure once: result, and time in the middle of the integration, s.
+        """Measure once: result, and this computer's time midway between start and result, s.
 
         Raises LaserTrackerError as `ask`.
         """

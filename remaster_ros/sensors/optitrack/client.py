@@ -182,6 +182,7 @@ class NatNetClient(MarkerFollower):
             self._backlog.append((datagram, received_s, sender, source is self._data))
 
     def _digest_backlog(self) -> None:
+        """Digest waiting datagrams, oldest first, for `DIGEST_S` at most; the others stay."""
         until = time.monotonic() + DIGEST_S
         while self._backlog:
             datagram, received_s, sender, from_data_socket = self._backlog.popleft()
@@ -193,7 +194,7 @@ class NatNetClient(MarkerFollower):
     def _digest(
         self, datagram: bytes, received_s: float, sender: Source, *, from_data_socket: bool
     ) -> None:
-        """Decode one datagram and process it.
+        """Decode one datagram and process it; drop a foreign one, count a malformed one.
 
         Frames count from one source, answers from the command port only: another program on the
         server's computer could send another version or another marker.
@@ -267,7 +268,10 @@ class NatNetClient(MarkerFollower):
         self._status.version = None if self._settings.wanted_version else server.natnet_version
 
     def _negotiate(self, server: ServerInfo) -> None:
-        """Request the wanted bitstream; after several refusals the server's own is read."""
+        """Request the wanted bitstream once more, up to NEGOTIATION_TRIES times.
+
+        After that, or if none is wanted, the server's own version is read.
+        """
         wanted = self._settings.wanted_version
         if wanted is None or self._negotiation_tries >= NEGOTIATION_TRIES:
             self._status.version = server.natnet_version

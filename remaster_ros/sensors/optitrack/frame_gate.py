@@ -367,7 +367,11 @@ class MarkerGate:
         self._last_reading = None
 
     def _order(self, frame: Frame) -> Dropped | None:
-        """Reason to drop a frame by its number or its time, or None."""
+        """Reason to drop a frame (not live, duplicate, out of order, stale), or None.
+
+        Counts lost frames and restarts, and remembers the frame: called once per frame. A large
+        step of the number or back in time is a restart of the server.
+        """
         if frame.params & NOT_LIVE:
             return Dropped.NOT_LIVE
         if self._last_number is not None:

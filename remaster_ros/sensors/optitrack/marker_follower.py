@@ -194,6 +194,7 @@ def _no_frames(
 
 
 def _foreign(status: StreamStatus) -> str:
+    """Sentence that data come from the servers `status.foreign`, which must not be empty."""
     return (
         f'NatNet data come from {", ".join(status.foreign)}, not from {status.server_ip}: set '
         f'server to the one that is meant, or stop the other'
@@ -398,6 +399,7 @@ class MarkerFollower(ABC):
         )
 
     def _note_malformed(self, what: object) -> None:
+        """Count a malformed packet, and keep its fault as text in the status, without logging."""
         self._gate.drop(Dropped.MALFORMED)
         self._status.last_malformed = str(what)
 

@@ -288,7 +288,7 @@ class Columns(Codec):
         self._least_row = sum(kind.least for kind in kinds)
 
     def read(self, reader: Reader) -> tuple[Any, ...]:
-        """Read the columns."""
+        """Read the number of rows, then that many items of each kind; one tuple for each kind."""
         count = reader.count(self._least_row)
         return tuple([kind.read_many(reader, count) for kind in self._kinds])
 

@@ -89,6 +89,7 @@ class NatNetClientBackend(MarkerFollower):
         """Do nothing: `_run` closes its own sockets."""
 
     def _run(self) -> None:
+        """Greet and follow the server until stopped; after an error (in the status), again."""
         while not self._stopping.is_set():
             if self._greet():
                 client = self._kind.__new__(self._kind)
