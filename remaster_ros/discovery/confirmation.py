@@ -328,6 +328,7 @@ class _Both:
 
     @classmethod
     def of(cls, discovery: Discovery, fit: Estimate, rng: np.random.Generator) -> _Both:
+        """Assemble both sessions; `fit`: of the other session; its rows are thinned by `rng`."""
         mine, theirs = discovery.residuals, Residuals.of(fit)
         theirs = theirs.only(draw_rows(fit.problem.measurements, fit.kept, rng))
         named = [candidate for group in discovery.groups for candidate in group]
@@ -643,6 +644,7 @@ def _prior(discovery: Discovery, candidate: Candidate, wide: Candidate) -> Float
 
 
 def _driver(context: Context, candidate: Candidate) -> Driver:
+    """Driver that a candidate depends on, of its last joint if it has joints."""
     driver = driver_named(
         context, candidate.driver, candidate.joints[-1] if candidate.joints else 0
     )

@@ -80,6 +80,7 @@ def decisions(found: Discovery, pairs: Sequence[tuple[Named, Named]]) -> tuple[D
 
 
 def _decision(found: Discovery, cause: Named, look_alike: Named) -> Decision:
+    """Decision between a cause and a look-alike by log evidence; 'neither' if both are gone."""
     # Named are causes that the search has found now; part of a solution may be located structure.
     named = [Named(effect.name, effect.joints) for effect in found.effects]
     if cause not in named and look_alike not in named:
@@ -116,6 +117,7 @@ def _rest(found: Discovery, *causes: Named) -> tuple[Candidate, ...]:
 
 
 def _belongs(candidate: Candidate, cause: Named) -> bool:
+    """Whether a candidate is of a cause: of its name, and of all its joints or one of them."""
     parts = [(joint,) for joint in cause.joints]
     return candidate.name == cause.name and (
         candidate.joints == cause.joints or candidate.joints in parts
@@ -165,6 +167,7 @@ def _variants(every: Sequence[Candidate], cause: Named) -> list[tuple[Candidate,
 
 
 def _candidates(found: Discovery) -> list[Candidate]:
+    """Candidates of all effects that the session can show, except costly ones."""
     context = found.residuals.context
     return [
         candidate

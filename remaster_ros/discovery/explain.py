@@ -230,6 +230,10 @@ def grouped(candidates: Sequence[Candidate]) -> list[tuple[Candidate, ...]]:
 
 
 def _described(walk: Walk, group: tuple[Candidate, ...], share: float) -> FoundEffect:
+    """Effect of a group of candidates, which are one cause, for the report.
+
+    ``share``: as in `FoundEffect`.
+    """
     data, solution, first = walk.data, walk.best, group[0]
     wheres = dict(zip(solution.candidates, solution.slices(), strict=True))
     variance = np.diag(solution.covariance)
@@ -408,6 +412,7 @@ def size_of(data: Residuals, solution: Solution, group: Sequence[Candidate]) -> 
 
 
 def _size(data: Residuals, group: Sequence[Candidate], parameters: Sequence[FloatArray]) -> float:
+    """RMS displacement by candidates with these parameters, less what the base absorbs, m."""
     shift = np.zeros((len(data), 3))
     for candidate, values in zip(group, parameters, strict=True):
         shift += data.columns([candidate]) @ values

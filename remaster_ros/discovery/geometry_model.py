@@ -264,6 +264,7 @@ def _without_open_offsets(found: Estimate) -> Estimate:
 
 
 def _lengths(context: Context) -> list[Candidate]:
+    """Candidates of link lengths along x, y, z of each frame, or a link if it is among these."""
     # A link's own direction is one more where it is none of the axes of its frame.
     candidates = list(link_length.candidates(context))
     per_link = {

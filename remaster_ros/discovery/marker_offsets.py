@@ -130,6 +130,10 @@ def _effect(
     square: float,
     rank: int,
 ) -> FoundEffect:
+    """Effect of a marker that moved by `moved`, m, (3,), with its covariance, (3, 3).
+
+    ``blind``: axes of the tool along which the poses determine the move only in part.
+    """
     effect = MARKER_OFFSET
     cause = effect.sentence.format(subject=the('marker', name))
     cause = cause[:1].upper() + cause[1:]

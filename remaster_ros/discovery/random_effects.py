@@ -121,6 +121,7 @@ def _lever(data: Residuals, members: Sequence[Candidate]) -> float:
 
 
 def _columns(context: Context, members: Sequence[Candidate], maps: Sequence[FloatArray]) -> Design:
+    """Columns of a family's members side by side, each weighted by its map."""
     parts = [
         member.columns(context).displacement(context) @ one
         for member, one in zip(members, maps, strict=True)

@@ -467,6 +467,7 @@ class Walker:
                 self._add(more, heat)
 
     def _add(self, state: State, heat: float) -> None:
+        """Propose a drawn block, unless its gain by the diagonal is far too small."""
         drawn = self._draw(state, heat)
         # By the diagonal far worse: the exact gain is hardly ever that much more.
         if drawn is not None and state.value + state.gains[drawn] > self.state.value - FAR:

@@ -118,5 +118,5 @@ class SupervisorRules:
 
     @property
     def units(self) -> JointUnits:
-        """Those of the arm's joints."""
+        """Units of the arm's joints."""
         return self.settle.units

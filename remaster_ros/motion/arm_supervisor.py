@@ -182,7 +182,7 @@ class ArmSupervisor:
         return self.tick(wall_s)
 
     def observe(self, name: str, trouble: str, wall_s: float) -> list[Action]:
-        """Process what else must be right before the arm may move.
+        """Process a trouble of something observed beside the joints; return actions.
 
         ``name`` is one of `interlocks.OBSERVED`, ``trouble`` what is wrong with it; ''. Rivals
         (other publishers of what moves the arm) always halt a collection. The others halt it if
@@ -313,7 +313,7 @@ class ArmSupervisor:
         return [] if self.halted else self._halt_braking(why, wall_s)
 
     def interrupted(self, since_wall_s: float) -> None:
-        """Process since when a bridge before this one has been gone, s of wall time."""
+        """Process the time since which there was no bridge, wall time, s."""
         self._interlocks.interrupted(since_wall_s)
 
     def not_sent(self, command: Drive | Renew | Stop, wall_s: float) -> list[Action]:
@@ -360,7 +360,7 @@ class ArmSupervisor:
 
     @property
     def state(self) -> Arm:
-        """What the arm does by this program."""
+        """State of the arm in the table `states.ARM`."""
         return self._motion.state
 
     @property
@@ -385,7 +385,7 @@ class ArmSupervisor:
         return self._motion.next_end
 
     def use_stamps(self, *, kept: bool) -> None:
-        """Send moves from now on as of `SupervisorRules.keeps_stamps`."""
+        """Send moves from now on with stamps or without, as in `SupervisorRules.keeps_stamps`."""
         self._keeps_stamps = kept
 
     @property
@@ -395,7 +395,7 @@ class ArmSupervisor:
 
     @property
     def trouble(self) -> str:
-        """What is wrong with the reports of the joints; ''."""
+        """Trouble with the joint reports (refused, silent, of other joints), or ''."""
         limit = self.rules.heartbeat_s
         silent = self._interlocks.silence_s('robot', self._wall) > limit
         others = silent and self._wall - self._others_wall <= limit
@@ -499,6 +499,7 @@ class ArmSupervisor:
         return actions
 
     def _drive(self, solution: int, path: FreePath, seen: Seen, wall_s: float) -> list[Action]:
+        """Actions that begin a move; none if the arm has moved since its path was checked."""
         # A stamp that is not of the controller's clock would lead the arm to another time.
         self._motion.keeps_stamps = self._keeps_stamps and self.reports.is_on_time
         doubtful = None
@@ -516,7 +517,7 @@ class ArmSupervisor:
         return self._step(BEGINS.get(solution, Event.MOVE), drive)
 
     def _give_up(self, solution: int, reason: str, wall_s: float) -> list[Action]:
-        """Go on with the next solution where the gate or the path refuses one."""
+        """Actions after a refused move: the next solution, or a halt if it is no solution's."""
         if solution < 0:
             return self._halt(reason)
         actions = self._refuse(solution, reason)
@@ -566,7 +567,7 @@ class ArmSupervisor:
         return self._step(event, Halted(self.halted))
 
     def _halt_braking(self, reason: str, wall_s: float) -> list[Action]:
-        """Halt an arm; it is stopped first where it is known to follow its path."""
+        """Actions that halt an arm; it is stopped first if it is known to follow its path."""
         seen = self._seen
         if seen is not None and self.state in (Arm.LEAVES, Arm.MOVES):
             known = not self._motion.lost(seen, wall_s)

@@ -86,7 +86,7 @@ class Seen:
         return cls(q, stamp, wall, time, at, since, late_s, changed, resumed)
 
     def is_fresh(self, wall_s: float) -> bool:
-        """Whether it shows where the arm is now."""
+        """Whether this report is at most `FRESH_S` old."""
         return wall_s - self.wall <= FRESH_S
 
     def stands(self, wall_s: float) -> bool:
@@ -94,7 +94,7 @@ class Seen:
         return self.time - self.stands_since >= STANDING_S and self.is_fresh(wall_s)
 
     def frozen(self) -> BoolArray:
-        """Which joints are reported the same to the last bit again and again, (k,)."""
+        """Whether each joint's position has not changed by a bit for `VARIES_S`, (k,)."""
         return self.time - self.changed > VARIES_S
 
     def now(self, wall_s: float, rate: float) -> float:
@@ -125,7 +125,7 @@ class Following:
         self._astray_wall: float | None = None
 
     def elapsed_s(self, time: float) -> float:
-        """Return the time since it was sent at a robot time, s."""
+        """Return the time since the trajectory was sent, s; ``time``: robot time, s."""
         return time - self.sent
 
     def set_back(self, by_s: float) -> None:
@@ -134,7 +134,7 @@ class Following:
         self._trail = deque((t - by_s, q, lag - by_s) for t, q, lag in self._trail)
 
     def update(self, seen: Seen, rate: float) -> str:
-        """Process a report; return how the arm has been off its path for too long, ''."""
+        """Process a report; return in words how the arm is off its path for too long, or ''."""
         self._allowed_s = allowed_lag_s(self._rules, rate)
         # A clock that runs faster stands still, too, while a busy machine catches up: when a move
         # was sent is then reckoned too late.
@@ -152,7 +152,7 @@ class Following:
         return self._astray if lasts else ''
 
     def lost(self, seen: Seen, wall_s: float) -> str:
-        """Return why it is not known where on its path the arm is; ''."""
+        """Return why the arm's place on its path is unknown, or ''."""
         if not seen.is_fresh(wall_s):
             return f'the last report of the joints is {wall_s - seen.wall:.1f} s old'
         if self._lag_s > self._allowed_s and not self._astray:
@@ -160,7 +160,7 @@ class Following:
         return self._astray or (STOPPED_ON_ITS_WAY if self._is_slowed() else '')
 
     def unseen(self, seen: Seen, wall_s: float, rate: float) -> str:
-        """Return why no report of just now shows that the arm goes on along its path; ''.
+        """Return why the latest reports do not show the arm going on along its path, or ''.
 
         For a stop it is enough to know where the arm may be (`lost`). What leads it on is for one
         that moves: a controller may join it to an arm that has been stopped since by a jump.

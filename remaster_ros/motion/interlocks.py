@@ -45,7 +45,7 @@ class Interlocks:
         self._looked_wall: float | None = None
 
     def note_alive(self, name: str, reason: str, wall_s: float) -> None:
-        """Process a sign of life, and why the arm must not move; '' if it may."""
+        """Process a sign of life of an origin, with its reason not to move, or ''."""
         self._seen[name], self._reasons[name] = wall_s, reason
 
     def planner(self, state: str, run: str, wall_s: float) -> bool:
@@ -70,7 +70,7 @@ class Interlocks:
         return began_another
 
     def set(self, name: str, reason: str) -> None:
-        """Process why the arm must not move; '' if it may."""
+        """Process an origin's reason not to move, or ''."""
         self._reasons[name] = reason
 
     def reason(self, name: str) -> str:
@@ -116,7 +116,7 @@ class Interlocks:
         self.say(Word.HINDERED)
 
     def stopped_on_its_way(self, wall_s: float) -> None:
-        """Process that the arm comes to rest on its way by itself, and for no reason that is here.
+        """Process that the arm stops by itself, without a reason known to this program.
 
         As after any interruption: where nothing shows who stops the arm meanwhile, a person goes
         on.
@@ -127,16 +127,16 @@ class Interlocks:
 
     @property
     def _is_released(self) -> bool:
-        """Whether the robot itself reports that nobody stops it."""
+        """Whether the robot's safety circuit is known, and reports no stop."""
         return self.was_right('safety') and not self.reason('safety_link')
 
     def revoke(self, why: str) -> None:
-        """Process that a person has changed what consent was given for."""
+        """Withdraw a person's consent to move, as they changed its terms; ``why``: for people."""
         self._must_collect = why
         self.say(Word.REVOKED)
 
     def say(self, word: Word) -> None:
-        """Process what is said about the run."""
+        """Change the consent to move by the table `states.CONSENT`."""
         self.consent = after(CONSENT, self.consent, word)
 
     def look_at_interruption(self, wall_s: float) -> None:
@@ -176,6 +176,7 @@ class Interlocks:
         return f'{self._must_collect}: /remaster/collect goes on' if asked else ''
 
     def _hindrance(self, wall_s: float) -> str:
+        """First reason not to move (a silent node, a trouble), or ''."""
         limit = self._heartbeat_s
         silent = [name for name in NAMES if self.silence_s(name, wall_s) > limit]
         if silent:

@@ -136,7 +136,7 @@ class JointReports:
         self.forget()
 
     def forget(self) -> None:
-        """Learn again what is usual: a person has attended to the robot, or its clock was set."""
+        """Forget the last report and the usual delay, after a person's work or a clock change."""
         self._last: JointReport | None = None
         self._delays: list[tuple[float, float]] = []
         self._delay: float | None = None
@@ -151,7 +151,7 @@ class JointReports:
         return abs(self._delay) <= SAME_CLOCK_S * max(self.clock.rate, 1.0)
 
     def believes(self, report: JointReport) -> bool:
-        """Return whether a report is believed; `trouble` is the reason where it is not."""
+        """Return whether a report is believed; else `kind` and `trouble` are the reason."""
         self.clock.update(report.clock_s, report.wall_s)
         self.kind, self.trouble = self._doubt(report)
         if self.kind:
@@ -187,6 +187,7 @@ class JointReports:
         return self._doubt_time(report)
 
     def _doubt_time(self, report: JointReport) -> tuple[str, str]:
+        """Kind ('late', 'early') and text if a report's stamp is off its time; else '', ''."""
         if self._delay is None:
             return '', ''
         late = report.clock_s - report.stamp_s - self._delay

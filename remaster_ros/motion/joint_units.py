@@ -27,12 +27,12 @@ class JointUnits:
 
     @classmethod
     def of(cls, chain: SerialChain) -> JointUnits:
-        """Return those of an arm."""
+        """Return the joint units of an arm."""
         return cls(tuple(chain.slides.tolist()) if chain.slides.any() else ())
 
     @cached_property
     def per_radian(self) -> FloatArray:
-        """How much of each joint's own unit counts as a radian, (k,); (1,) where all turn."""
+        """Amount in each joint's unit that counts as a radian, (k,); (1,) if all joints turn."""
         return np.where(self.slides, LEVER_M, 1.0) if self.slides else np.ones(1)
 
     def slide(self, joint: int) -> bool:
@@ -55,7 +55,7 @@ class JointUnits:
         return f'{shown:{sign}.{digits}f} {unit}'
 
     def in_radians(self, way: FloatArray, digits: int) -> str:
-        """Return the largest of a way (k,) without its sign, in rad or in mm."""
+        """Return the largest joint motion of a way (k,), as text without sign, in rad or mm."""
         joint = self.farthest(way)
         value = abs(float(way[joint]))
         if self.slide(joint):

@@ -18,7 +18,7 @@ from remaster_ros.types import FloatArray
 
 
 class LedLast:
-    """The memory of it, of the bridge and of the compensator alike.
+    """Memory of where the last command led the arm, for bridge and compensator.
 
     ``names, units``: of the joints; ``tolerance_rad``: an arm that is no further off is there;
     ``end``: where it was led before this process was started, rad or m, (k,), or between which
@@ -49,7 +49,7 @@ class LedLast:
         return self._places[-1] if self._places else None
 
     def lead_to(self, *places: FloatArray) -> None:
-        """Process a command that leads to a place, rad or m, (k,), or to one between several."""
+        """Process a command that leads to a position, rad or m, (k,), or between several."""
         self._before, self._places = self._places, places
 
     def take_back(self) -> None:
@@ -57,7 +57,7 @@ class LedLast:
         self._places = self._before
 
     def differs(self, q: FloatArray, other: FloatArray) -> bool:
-        """Whether two places, (k,), are not the same."""
+        """Whether two joint positions, (k,), are further apart than the tolerance."""
         return self._units.largest(q - other) > self._tolerance_rad
 
     def elsewhere(self, q: FloatArray) -> str:
@@ -97,13 +97,13 @@ class LedLast:
         return min(found, key=lambda place: self._units.largest(q - place))
 
     def ask(self, q: FloatArray) -> None:
-        """Process that a person was told where the arm is reported, (k,)."""
+        """Note the reported position, (k,), that a person was asked to compare."""
         self._asked = q
 
     def confirm(self, q: FloatArray) -> str:
-        """Take a report, (k,), for true, if a person who was told it confirms it.
+        """Accept a reported position, (k,), if a person was asked about it before.
 
-        Returns what that person is to compare first, '' where it is taken.
+        Returns what that person is to compare first; '' if it is accepted.
         """
         asked, self._asked = self._asked, q
         if asked is None or self.differs(asked, q):
@@ -112,5 +112,5 @@ class LedLast:
         return ''
 
     def forget_question(self) -> None:
-        """Process that the question, if there was one, is settled."""
+        """Forget the position that a person was asked about, if any."""
         self._asked = None

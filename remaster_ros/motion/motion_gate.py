@@ -76,7 +76,7 @@ class StartMovedError(MotionRefusedError):
 
 @dataclass(frozen=True)
 class Admitted:
-    """What may be published."""
+    """Waypoints that may be published."""
 
     waypoints: tuple[Waypoint, ...]  # For the controller, which begins at once
     # The lines that the arm will be on; None for a stop, which stays on those of its move, and for
@@ -89,7 +89,7 @@ class Admitted:
 
 
 class MotionGate:
-    """Admit moves and make stops of them.
+    """Checks moves against the limits, and computes their stops.
 
     Parameters
     ----------
@@ -161,10 +161,10 @@ class MotionGate:
         return Admitted(waypoints, trajectory, piece=piece)
 
     def renew(self, sent_s: float, horizon_s: float) -> Admitted:
-        """Return the piece that replaces the one under way.
+        """Return the next piece of the move under way, in place of the present one.
 
-        ``sent_s``: the time since the start of the move, s; ``horizon_s``: as of `admit`.
-        Raises MotionRefusedError: as of `admit`; LookupError: no move is under way.
+        ``sent_s``: time since the start of the move, s; ``horizon_s``: as in `admit`.
+        Raises MotionRefusedError as `admit`, LookupError if no move is under way.
         """
         if self._under_way is None:
             raise LookupError('no move is under way')
@@ -203,7 +203,7 @@ class MotionGate:
         return Admitted(sent, trajectory, piece=piece)
 
     def admit_probe(self, path: FreePath, q: FloatArray, doubtful: BoolArray) -> Admitted:
-        """Return a move of next to nothing that is harmless where the arm is not as reported.
+        """Return a minimal move, harmless even if the arm is not where it is reported.
 
         A controller begins it where the arm really is. It has a single waypoint, so far ahead in
         time that from anywhere within the limits of the doubtful joints no speed and no
@@ -274,7 +274,10 @@ class MotionGate:
         path: FreePath,
         limits: MotionLimits,
     ) -> None:
-        """Look at each cubic from a state on; the last one must end at rest."""
+        """Check each cubic from a start state on, which must end at rest.
+
+        Raises MotionRefusedError.
+        """
         units, q = limits.units, start.q
         low = np.minimum(limits.lower + limits.margins, q)
         high = np.maximum(limits.upper - limits.margins, q)
@@ -307,6 +310,7 @@ class MotionGate:
             raise MotionRefusedError(_too_long())
 
     def _check_point_speed(self, piece: Cubic, limits: MotionLimits) -> None:
+        """Raise MotionRefusedError if a point of arm or tool is faster than `tool_speed`."""
         if self._speeds is None or not np.isfinite(limits.tool_speed):
             return
         way = piece.at(piece.duration_s) - piece.at(0.0)
@@ -414,7 +418,7 @@ class ForeignGate:
         return Admitted((Waypoint(time_s, end, np.zeros_like(end)),))
 
     def _check_start(self, first: Waypoint, q: FloatArray, velocity: FloatArray) -> None:
-        """Look whether the controller could begin there at once: it would jump there."""
+        """Raise StartMovedError if the trajectory does not begin at the arm, at rest."""
         off, units = np.abs(first.q - q), self.limits.units
         if not units.largest(off) <= START_RAD:
             joint = units.farthest(off)
@@ -429,6 +433,7 @@ def _too_long() -> str:
 
 
 def _way_out_limits(limits: MotionLimits) -> MotionLimits:
+    """Limits for a slow way out of a contact."""
     return replace(
         limits,
         velocity=WAY_OUT_SPEED * limits.velocity,
@@ -439,6 +444,7 @@ def _way_out_limits(limits: MotionLimits) -> MotionLimits:
 def _check_range(
     least: FloatArray, most: FloatArray, low: FloatArray, high: FloatArray, limits: MotionLimits
 ) -> None:
+    """Raise MotionRefusedError if joints, from `least` to `most`, leave `low` to `high`, (k,)."""
     # To rounding: an arm that stands outside may stay there, and go inwards.
     bad = (least < low - 1e-9) | (most > high + 1e-9)
     if np.any(bad):
@@ -453,6 +459,10 @@ def _check_range(
 def _check_rate(
     what: str, largest: FloatArray, allowed: FloatArray, per: str, limits: MotionLimits
 ) -> None:
+    """Raise MotionRefusedError if a joint's largest rate, (k,), is above the allowed rate.
+
+    ``what``: 'speed' or the like; ``per``: unit of time for the message.
+    """
     bad = ~(largest <= allowed * (1.0 + TOLERANCE))
     if np.any(bad):
         joint = int(np.argmax(largest / allowed))
@@ -465,7 +475,7 @@ def _check_rate(
 
 @dataclass(frozen=True)
 class Cubic:
-    """What a controller makes of two waypoints, or n cubics, each of two."""
+    """Cubic that a controller interpolates between two waypoints, or n such cubics."""
 
     duration_s: float | FloatArray  # s; of n cubics (n, 1)
     # Of the powers of time since its start, lowest first, (4, k); of n cubics (4, n, k)
@@ -486,7 +496,7 @@ class Cubic:
         end_q: FloatArray,
         end_velocity: FloatArray,
     ) -> Cubic:
-        """Return the same of arrays: durations (n, 1), the others (n, k)."""
+        """Return the cubics by Hermite data: durations, s, (n, 1), positions and speeds (n, k)."""
         gap = end_q - q
         with np.errstate(divide='ignore', invalid='ignore'):
             second = (3 * gap / duration_s - 2 * velocity - end_velocity) / duration_s

@@ -58,7 +58,7 @@ class Visit:
 
     @property
     def trajectory(self) -> Trajectory:
-        """Where it was sent."""
+        """Trajectory that was sent."""
         return self.following.trajectory
 
     def judge(self, seen: Seen, rate: float) -> Outcome:
@@ -93,7 +93,7 @@ class Visit:
         return UNDER_WAY
 
     def set_back(self, by_s: float) -> None:
-        """Process that the rest of the move begins later, s."""
+        """Process that the rest of the move begins later by `by_s`, s."""
         self.following.set_back(by_s)
         self.deadline += by_s
 
@@ -202,7 +202,7 @@ class MotionUnderWay:
         self._set_back_s = 0.0
 
     def enter(self, state: Arm) -> None:
-        """Be in this state from now on; what does not belong to it is over."""
+        """Enter a state; forget the visit and the stop that it does not have."""
         self.state = state
         self.visit = self.visit if state in HAS_VISIT else None
         self.braking = self.braking if state in HAS_STOP else None
@@ -312,7 +312,7 @@ class MotionUnderWay:
         self._piece, self._piece_sent_s = piece, sent_s
 
     def end_piece(self, seen: Seen, wall_s: float, rate: float) -> None:
-        """Let the piece under way end in its stop; it is under way in the state that follows."""
+        """Watch the present piece end in its stop, as no further one is sent."""
         assert self.visit is not None
         assert self._piece is not None
         begins = self.visit.following.sent + self._piece.cut_s

@@ -48,6 +48,7 @@ class Background:
         self._thread.join(timeout_s)
 
     def _run(self) -> None:
+        """Thread: run queued jobs in order, keeping result or exception; end at a None."""
         while (item := self._work.get()) is not None:
             work, then = item
             try:
@@ -77,7 +78,7 @@ class PlanningThread:
         self._result: tuple[Any] | None = None
 
     def ask(self, what: object, q: FloatArray, job: Callable[[], Result]) -> tuple[Result] | None:
-        """Return the result of a job in a tuple, or raise its exception; None while it works.
+        """Return a job's result in a tuple, or raise its exception; None while the job runs.
 
         ``what``: identifier of the job; ``q``: configuration of the arm, rad or m, (k,). A result
         of another job, or for an arm that has moved by more than `MOVED_RAD` since, is dropped.

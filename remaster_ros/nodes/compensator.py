@@ -120,7 +120,7 @@ class Parameters:
 
 @dataclass(eq=False)
 class _Goal:
-    """A goal of a client, and what became of it at the controller."""
+    """A client's goal, with the goal sent to the controller for it and whether it has ended."""
 
     handle: Any
     sent: Any = None
@@ -295,7 +295,10 @@ class CompensatorNode(RemasterNode):
         )
 
     def _misled(self) -> str:
-        """Return that the arm is not reported where what was passed on has led it; ''."""
+        """Return in words that the arm is not on the path it was sent along, or at its end.
+
+        '' if it is.
+        """
         q, since_s = self._present.q, self.now_s() - self._begun_s
         passed = self._passed
         if passed is not None and passed.admitted.waypoints and since_s < passed.end_s + STOPPED_S:
@@ -315,6 +318,7 @@ class CompensatorNode(RemasterNode):
         return f'a trajectory is under way for {left_s:.1f} s more' if left_s > 0.0 else ''
 
     def _look(self) -> None:
+        """Switch on once the arm stands without trouble; end goals whose controller has gone."""
         trouble = self._trouble()
         if self._on is None and not (trouble or self._moves()):
             self._turn(True)
@@ -325,6 +329,7 @@ class CompensatorNode(RemasterNode):
                 self._end(goal, GoalStatus.STATUS_ABORTED, self._refused(why))
 
     def _switch(self, on: bool, request: Trigger.Request, response: Trigger.Response) -> Any:
+        """Serve a request to switch the correction on (read anew) or off; refused while moving."""
         why = self._moves()
         if on and not why and self._led.elsewhere(self._present.q):
             why = self._led.confirm(self._present.q)
@@ -367,6 +372,7 @@ class CompensatorNode(RemasterNode):
         return text
 
     def _tell(self, trouble: str) -> None:
+        """Publish the state of the correction if it has changed, and log a trouble."""
         state = {
             'correction': 'on' if self._on else 'off',
             'sha256': self._correction.sha256,
@@ -380,6 +386,7 @@ class CompensatorNode(RemasterNode):
                 self._say(f'nothing is passed on: {state["why"]}')
 
     def _say(self, words: str) -> None:
+        """Log an error; the same words in succession once in `SAME_WORDS_S`."""
         now = time.monotonic()
         if now - self._said.get(words, -np.inf) >= SAME_WORDS_S:
             self._said = {words: now}
@@ -434,7 +441,7 @@ class CompensatorNode(RemasterNode):
         pass_on: Callable[[JointTrajectory], None],
         refuse: Callable[[str], None],
     ) -> None:
-        """Work out what is sent for a planner's trajectory, and pass it on.
+        """Correct a planner's trajectory in the background, and pass on the result or refuse it.
 
         Beside the callbacks, as that takes a second where there are ten thousand points. A
         trajectory that comes meanwhile takes its place; an empty one, which lets the controller
@@ -496,7 +503,7 @@ class CompensatorNode(RemasterNode):
         warm: float | None,
         told: FloatArray | None,
     ) -> tuple[Any, JointTrajectory]:
-        """Return what is passed on, and its message; reads nothing that callbacks change."""
+        """Return the corrected trajectory and its message; uses no state that callbacks change."""
         wanted = self._motion.Trajectory(*_points(message, self._names))
         passed = self._motion.corrected_for_controller(
             wanted, arm, gate, in_use, 1e-3 * self.p.tolerance_mm, warm, told
@@ -504,7 +511,10 @@ class CompensatorNode(RemasterNode):
         return passed, self._message(passed.admitted)
 
     def _outdated(self, number: int, arm: Any, found: Any) -> str:
-        """Return why what was worked out for an arm as it was is not passed on any more; ''."""
+        """Return why a corrected trajectory is not passed on after all (outdated, trouble).
+
+        '' if it is passed on. ``number``: of the trajectory; ``arm``: state it was corrected for.
+        """
         if number != self._wanted:
             return 'another trajectory has come since'
         if why := self._trouble():
@@ -527,7 +537,7 @@ class CompensatorNode(RemasterNode):
         return ''
 
     def _note_led(self, passed: Any) -> None:
-        """Keep where the arm is led from now on."""
+        """Keep the trajectory that was passed on, its times, and where it leads the arm."""
         self._true.lead(passed)
         if not passed.admitted.waypoints:
             self._note_held()
@@ -556,7 +566,7 @@ class CompensatorNode(RemasterNode):
             self._say(f'{self._command_file.path}: where the arm was led is not kept ({result})')
 
     def _message(self, admitted: Admitted) -> JointTrajectory:
-        """Return what the gate has admitted as a message; nothing else is ever sent."""
+        """Return an admitted trajectory as a message; nothing else is ever sent."""
         message = JointTrajectory(joint_names=list(self._names))
         message.points = [
             JointTrajectoryPoint(
@@ -569,6 +579,8 @@ class CompensatorNode(RemasterNode):
         return message
 
     def _on_trajectory(self, message: JointTrajectory) -> None:
+        """Correct a trajectory and publish it to the controller; refused without a subscriber."""
+
         def refuse(why: str) -> None:
             self._say(f'trajectory refused: {why}')
 
@@ -580,6 +592,7 @@ class CompensatorNode(RemasterNode):
     # The same by the action
 
     def _offer_action(self, controllers: str) -> None:
+        """Offer follow_joint_trajectory, as a client of the action named `controllers`."""
         self._action, _ = control_messages()
         self._controllers = self.resolve_topic_name(controllers)
         self._client = ActionClient(self, self._action, self._controllers)
@@ -594,6 +607,7 @@ class CompensatorNode(RemasterNode):
         )
 
     def _on_goal(self, handle: Any) -> None:
+        """Correct the trajectory of a goal and send it to the controller, or refuse the goal."""
         goal = _Goal(handle)
         request = handle.request
 
@@ -621,6 +635,7 @@ class CompensatorNode(RemasterNode):
         return self._action.Result(error_code=self._action.Result.INVALID_GOAL, error_string=why)
 
     def _on_answer(self, goal: _Goal, future: Future) -> None:
+        """Process whether the controller accepts a goal; a refused goal is aborted."""
         if future.cancelled() or future.result() is None:
             return
         if not future.result().accepted:
@@ -638,6 +653,7 @@ class CompensatorNode(RemasterNode):
             goal.sent.cancel_goal_async()
 
     def _on_feedback(self, goal: _Goal, message: Any) -> None:
+        """Pass on feedback of the controller, with true joint angles if correction is on."""
         feedback = message.feedback
         if goal.over or not goal.handle.is_active:
             return
@@ -652,6 +668,7 @@ class CompensatorNode(RemasterNode):
         goal.handle.publish_feedback(feedback)
 
     def _on_cancel(self, handle: Any) -> CancelResponse:
+        """Cancel a goal at the controller, or while it is worked out; REJECT an unknown goal."""
         for goal in self._goals:
             if goal.handle.goal_id == handle.goal_id:
                 goal.cancelled = True
@@ -664,6 +681,7 @@ class CompensatorNode(RemasterNode):
         return CancelResponse.REJECT
 
     def _on_result(self, goal: _Goal, future: Future) -> None:
+        """End a goal as the controller has ended it; note where the arm is held if it failed."""
         if not future.cancelled() and future.result() is not None:
             if goal is self._goals[-1]:
                 succeeded = future.result().status == GoalStatus.STATUS_SUCCEEDED

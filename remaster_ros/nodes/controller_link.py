@@ -71,7 +71,7 @@ def action_of(topic: str) -> str:
 
 
 class ForeignGoals:
-    """Whether another client than the bridge sends goals; the topic is no way round them."""
+    """Watch for goals of other clients of the controller's action than the bridge."""
 
     def __init__(self, node: Node) -> None:
         self.own: set[bytes] = set()
@@ -86,6 +86,7 @@ class ForeignGoals:
         )
 
     def _on_status(self, message: GoalStatusArray) -> None:
+        """Keep the identifiers of the goals that are under way at the controller."""
         self._active = {
             bytes(status.goal_info.goal_id.uuid)
             for status in message.status_list
@@ -119,7 +120,10 @@ class ControllerStates:
         self._node, self._topic = node, f'{place}/controller_state'
 
     def is_there(self) -> bool:
-        """Return whether it does now; its type is known without the package of its message."""
+        """Return whether the topic has a publisher of `STATE_TYPE` now.
+
+        Its type is known without the package of its message.
+        """
         if not self._node.count_publishers(self._topic):
             return False
         found = self._node.get_publishers_info_by_topic(self._topic)
@@ -151,7 +155,7 @@ class TopicLink:
         self.missing = f'no controller listens to {self._topic}'
 
     def matched(self) -> bool:
-        """Whether anybody listens."""
+        """Whether the command topic has a subscriber."""
         return bool(self._publisher.get_subscription_count())
 
     def listens(self) -> bool:
@@ -215,7 +219,7 @@ class ActionLink:
         self.missing = f'no controller has the action {self._action}'
 
     def matched(self) -> bool:
-        """Whether a server is there, with all that belongs to it."""
+        """Whether an action server is there, with all its services and topics."""
         return bool(self._client.server_is_ready())
 
     listens = matched
@@ -306,6 +310,7 @@ class ActionLink:
             done(goal, future.result())
 
     def _on_answer(self, goal: _Goal, handle: Any) -> None:
+        """Process whether the controller accepts a goal; give up the command if it refuses."""
         if not handle.accepted:
             if goal in self._goals:
                 self._goals.remove(goal)
@@ -318,6 +323,7 @@ class ActionLink:
             self.cancel()
 
     def _on_result(self, goal: _Goal, future: Future) -> None:
+        """Give up if the newest goal failed; replaced and cancelled goals are no failures."""
         goal.over = True
         # A goal that was replaced ends as cancelled: that is how it is meant.
         newest = bool(self._goals) and goal is self._goals[-1]
@@ -340,6 +346,7 @@ class ActionLink:
         self._failed(why)
 
     def _on_cancelled(self, goal: _Goal, response: CancelGoal.Response) -> None:
+        """Log an error if the controller refuses to cancel a goal that is not over."""
         if not response.goals_canceling and response.return_code not in OVER:
             self._node.get_logger().error(
                 f'{self._action}: the controller refuses to cancel a command; if the arm moves, '

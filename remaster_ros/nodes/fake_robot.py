@@ -101,7 +101,7 @@ class FakeRobotNode(RemasterNode):
         self._thread.start()
 
     def _run(self) -> None:
-        """Publish states and the clock, and let world time go on; what is late is left out."""
+        """Thread: publish states and the clock, and advance world time; skip what is late."""
         state_s, clock_s = 1.0 / self.p.joint_state_rate, self.world.rate / self.p.clock_rate
         state_due = clock_due = self.world.now()
         clock_wall, wait_s, moved = 0.0, 0.0, False
@@ -127,6 +127,7 @@ class FakeRobotNode(RemasterNode):
             self._pace.took(int(pid), seconds(message.stamp), leads=what == LEADS)
 
     def _publish_state(self) -> None:
+        """Publish a changed protective stop, and the joint states if the arm reports any."""
         if self.arm.reports_stop != self._reported_stop:
             self._reported_stop = self.arm.reports_stop
             self._safety.publish(Bool(data=self._reported_stop))
@@ -141,6 +142,7 @@ class FakeRobotNode(RemasterNode):
             self._states.publish(message)
 
     def _on_trajectory(self, message: JointTrajectory) -> None:
+        """Give a trajectory to the simulated arm; log an error if the arm drops it."""
         points = [
             ServoPoint(
                 seconds(point.time_from_start),
@@ -163,7 +165,7 @@ class FakeRobotNode(RemasterNode):
 
 
 def _next_due(due: float, period: float, now: float) -> float:
-    """Return when something of this period is due after `now`; what is late is left out."""
+    """Return the first time after `now` of a period that was due at `due`, s; none are made up."""
     return due + period * max(math.floor((now - due) / period) + 1, 0)
 
 

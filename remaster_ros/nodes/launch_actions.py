@@ -61,7 +61,7 @@ def _action(node: NodeToStart) -> Node:
 
 
 def _on_exit(event: Any, context: Any) -> list[EmitEvent]:
-    """End everything where a node is configured wrongly; to start it again does not help."""
+    """Shut down the launch if a node is configured wrongly; else [] (it may be started again)."""
     if exit_ends_launch(event.process_name, event.returncode):
         return [EmitEvent(event=Shutdown(reason=f'{event.process_name} ended with status 2'))]
     return []

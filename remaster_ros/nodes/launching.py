@@ -133,7 +133,10 @@ def real_nodes(
 
 
 def _beside(params: str, section: Mapping[str, Any], folders: Mapping[str, str]) -> dict[str, str]:
-    """Return paths of a section as absolute ones: relative to the file, wherever launch is."""
+    """Return the paths of a section as absolute paths, relative to the folder of the file.
+
+    ``folders``: keys of the paths with their defaults; an empty path is left out.
+    """
     home = Path(params).resolve().parent
     given = {key: str(section.get(key, default)) for key, default in folders.items()}
     return {key: str(home / path) for key, path in given.items() if path}
@@ -188,7 +191,7 @@ def read_sections(params: str, namespace: str = '') -> dict[str, Mapping[str, An
 
 
 def exit_ends_launch(process: str, returncode: int | None) -> bool:
-    """Return whether the end of a node ends them all: started again it would end the same way.
+    """Return whether a node's exit ends the launch: it is configured wrongly (status `WRONG`).
 
     ``process``: the executable's name, then a hyphen and a number. The live page, which the others
     do not need, ends nobody.

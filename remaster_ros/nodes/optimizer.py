@@ -123,6 +123,7 @@ class PrecisionWatch:
             node.create_timer(STATE_EVERY_S, self._step, callback_group=group, clock=steady)
 
     def _on_record(self, record: EventRecord) -> None:
+        """Keep the states of the recorder and the planner."""
         match record.body:
             case RecorderState() as recorder:
                 self._recorder = recorder
@@ -130,6 +131,7 @@ class PrecisionWatch:
                 self._planned = planned
 
     def _step(self) -> None:
+        """Look at the precision once there are new observations; errors end in the state."""
         recorder, planned = self._recorder, self._planned
         if recorder is None or not (planned and recorder.plan and recorder.observations):
             return
@@ -151,6 +153,7 @@ class PrecisionWatch:
             self._node.get_logger().error(str(fault_of_this_program(error)))
 
     def _look(self, rule: StoppingRule, plan: str) -> None:
+        """Fit at each count of configurations reached since the last look; publish the result."""
         session = read_session(self._folder)
         done = configurations(session)
         for count in rule.counts[len(self._looks) :]:
@@ -203,6 +206,7 @@ class Optimizer(RemasterNode):
         request: Trigger.Request,
         response: Trigger.Response,
     ) -> Any:
+        """Do a job for a service, one at a time; its error becomes the response's message."""
         if not self._busy.acquire(blocking=False):
             response.message = 'a fit is under way'
             return response
@@ -243,6 +247,7 @@ class Optimizer(RemasterNode):
         return read_priors(self.p.prior) if self.p.prior else None
 
     def _discover(self) -> tuple[Path, str]:
+        """Search the session for causes; return the report's path and a summary."""
         # Imported when it is needed, as it takes a second: the node is there at once.
         from remaster_ros.discovery.decision import decisions
         from remaster_ros.discovery.discover import discover_session
@@ -293,6 +298,7 @@ class Optimizer(RemasterNode):
         self._publish([row.joint for row in rows], *np.array([row.mean_and_std for row in rows]).T)
 
     def _publish(self, names: Sequence[str], offsets: FloatArray, std: FloatArray) -> None:
+        """Publish offsets and their standard deviations, rad or m, by joint name, one stamp."""
         stamp = self.get_clock().now().to_msg()
         for publisher, values in ((self._means, offsets), (self._stds, std)):
             message = JointState(name=list(names), position=values.tolist())

@@ -97,6 +97,7 @@ def _changed(
 
 
 def _descriptor(field: dataclasses.Field[Any]) -> ParameterDescriptor:
+    """ROS descriptor of a parameter, with its description, unit, choices and range."""
     meta = field.metadata
     unit = f' [{meta["unit"]}]' if meta['unit'] else ''
     descriptor = ParameterDescriptor(

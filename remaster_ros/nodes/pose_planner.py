@@ -258,6 +258,7 @@ class PosePlanner(RemasterNode):
             self.create_service(Trigger, path, partial(self._on_confirm, plan=plan))
 
     def _on_pause(self, request: Trigger.Request, response: Trigger.Response) -> Any:
+        """Serve a request to pause the run; refused if none is running."""
         with self._lock:
             response.success = self.run.pause()
             self._follow_run()

@@ -108,7 +108,7 @@ class Recorder(RemasterNode):
         bag.subscribe_rest()
 
     def _on_joint_state(self, message: JointState, info: Mapping[str, Any]) -> None:
-        """Record joint states unless there are two publishers of them."""
+        """Record joint states; with two publishers, report the rival instead."""
         self._taken.take(message.header.stamp)
         self._states.note(message, info)
         if rival := self._states.rival():

@@ -93,7 +93,7 @@ class Parameters:
 
 
 class Replay(RemasterNode):
-    """See the module's text; it ends when the last message is out."""
+    """Replay a bag, as in the module's docstring; the node ends after the last message."""
 
     def __init__(self) -> None:
         super().__init__('replay')
@@ -138,6 +138,7 @@ class Replay(RemasterNode):
         return self.create_publisher(message_class(type_name), topic.lstrip('/'), qos)
 
     def _play(self) -> None:
+        """Thread: replay the bag; `finished` at its end, else `failure` is the error."""
         try:
             self._wait_for_subscriber()
             self._refuse_live()
@@ -151,6 +152,7 @@ class Replay(RemasterNode):
             self.failure = error
 
     def _wait_for_subscriber(self) -> None:
+        """Wait for a subscriber of `wait_for`; InputError if none comes in `wait_s`."""
         topic = self.p.wait_for
         if not topic:
             self._ending.wait(DISCOVERY_S)
@@ -167,7 +169,7 @@ class Replay(RemasterNode):
         self._ending.wait(DISCOVERY_S)
 
     def _refuse_live(self) -> None:
-        """Refuse to publish where an arm may move by it.
+        """Check that no arm is in this graph, which the replay could move.
 
         Raises InputError: naming the node. One that was killed stays listed for some 20 s.
         """
@@ -188,7 +190,7 @@ class Replay(RemasterNode):
                 raise InputError(_live(info, f'listens to {name}'))
 
     def _look_who_listens(self, publisher: Publisher) -> None:
-        """Refuse a new subscriber of what moves an arm before the next message, if it obeys it."""
+        """Wait for a new subscriber to be known, and raise InputError if it moves an arm."""
         count = publisher.get_subscription_count()
         known = self._listeners.get(publisher.topic_name)
         if count != known:
@@ -199,6 +201,7 @@ class Replay(RemasterNode):
             self._listeners[publisher.topic_name] = count
 
     def _send_all(self) -> None:
+        """Publish the bag's messages at `rate` times their speed, until the node is to end."""
         start_wall = first = None
         looked = shown = time.monotonic()
         last = self._reader.whole.last_ns or 0
@@ -247,12 +250,12 @@ class Replay(RemasterNode):
         self.get_logger().info(f'{self.sent} messages published')
 
     def _await_recorder(self) -> None:
-        """Wait until the recorder, where there is one, has taken what was sent."""
+        """Wait until a recorder, if there is one, has taken the messages sent; count drops."""
         for topic, count in self._acknowledged.wait(self._ending).items():
             self._dropped[topic] += count
 
     def _await_taken(self, topic: str) -> None:
-        """Wait until the subscribers of a topic have all that was sent, or count it as dropped.
+        """Wait until all subscribers of a topic have its messages; after `TAKEN_S` count drops.
 
         Later messages would take the places of those that a slow subscriber has not taken yet.
         """
@@ -280,6 +283,7 @@ class Replay(RemasterNode):
             raise InsufficientDataError(f'replay: {"; ".join(lost)}; the rest was published')
 
     def _publish_clock(self, time_ns: float) -> None:
+        """Publish a time, ns, on /clock, if it is replayed; at most every 9 ms."""
         now = time.monotonic()
         if self._clock_publisher is not None and now - self._clock_sent >= 0.009:
             self._clock_sent = now
@@ -292,7 +296,7 @@ class Replay(RemasterNode):
 
 
 class Acknowledged:
-    """What of the messages sent a recorder has taken, as it answers; nothing where there is none.
+    """Messages that a recorder has taken of those sent, as it answers; {} without a recorder.
 
     ``node``: the replay, which is spun by another thread than the one that waits here.
     Attributes: ``sent``: messages sent by topic, and on remaster/events by `taken_key`.
@@ -323,7 +327,7 @@ class Acknowledged:
         self._before = self._ask(ending)
 
     def _ask(self, ending: threading.Event) -> dict[str, int] | None:
-        """Return how many messages the recorder has taken; None where it gives no answer."""
+        """Return how many messages a recorder has taken, by topic; None without an answer."""
         answered = threading.Event()
         future = self._client.call_async(Trigger.Request())
         future.add_done_callback(lambda _: answered.set())
@@ -336,9 +340,9 @@ class Acknowledged:
         return None if response is None else json.loads(response.message)
 
     def wait(self, ending: threading.Event) -> dict[str, int]:
-        """Wait until the recorder has taken what was sent since the last call.
+        """Wait until the recorder has taken all messages sent since the last call.
 
-        Returns how many messages it has not taken, where for `TAKEN_S` it took no more of them.
+        Returns the number not taken by topic, if none were taken for `TAKEN_S`; {} if all were.
         """
         if self._before is None or not self.sent:
             return {}
@@ -370,7 +374,7 @@ class Acknowledged:
 
 
 def _record(data: bytes) -> events.EventRecord | None:
-    """Return the record in a serialised message; None where a recorder takes none from it."""
+    """Return the record in a serialised message; None if it is not a valid record."""
     try:
         return events.decode(deserialize_message(data, String).data)
     except InputError:
@@ -378,6 +382,7 @@ def _record(data: bytes) -> events.EventRecord | None:
 
 
 def _live(info: TopicEndpointInfo, does: str) -> str:
+    """Error message that a node makes this graph live; ``does``: its doing as a phrase."""
     return (
         f'replay: this graph is live: {node_of(info)} {does}; end it, or replay in another ROS '
         'domain (ROS_DOMAIN_ID) or namespace'

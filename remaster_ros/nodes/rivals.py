@@ -44,7 +44,7 @@ class OnlyPublisher:
         self._alive = 0
 
     def trouble(self) -> str:
-        """Return who publishes there, if they are more than one; ''."""
+        """Return a sentence on the topic's publishers if they are too many, or ''."""
         if self._node.count_publishers(self._topic) <= self._allowed:
             self._several_wall = None
             return ''
@@ -65,7 +65,7 @@ class OnlyPublisher:
         return sum(publisher.topic_name == self._topic for publisher in self._node.publishers)
 
     def _count(self) -> None:
-        """Begin to count those that are alive.
+        """Subscribe to count living publishers by their leases.
 
         It is never ended: Fast DDS reports to a subscription that is made again no publishers
         whose lease it has seen before.
@@ -85,6 +85,7 @@ class OnlyPublisher:
         self._alive = change.alive_count
 
     def _words(self, listed: list[TopicEndpointInfo]) -> str:
+        """Sentence on publishers that are too many on the topic, with their nodes."""
         names = sorted(node_of(info) for info in listed)
         count = '1 publisher' if len(listed) == 1 else f'{len(listed)} publishers'
         may = 'one' if self._allowed else 'none'
@@ -131,7 +132,7 @@ class ArmStates:
         return self._order.positions(message) if self.note(message, info) else None
 
     def note(self, message: JointState, info: Mapping[str, Any]) -> bool:
-        """Look at who publishes a message; return whether it is the arm's."""
+        """Note a rival publisher of joint states; return whether they are of this arm."""
         if not self._order.concerns(message):
             found = ', '.join(message.name) or 'no joints'
             self.others = (

@@ -236,7 +236,7 @@ class Parameters(SimulationParameters):
     )
 
     def rules(self, units: JointUnits) -> SupervisorRules:
-        """Return what of them the supervisor keeps, of an arm with joints of these units."""
+        """Return the supervisor's rules by these parameters; ``units``: of the arm's joints."""
         return SupervisorRules(
             settle=SettleRules(
                 self.settle_s, self.arrive_tolerance, self.still_tolerance, units=units
@@ -258,14 +258,17 @@ class Parameters(SimulationParameters):
         return '' if self.emergency_stop_topic == NO_TOPIC else self.emergency_stop_topic
 
     def raised_from(self, before: Parameters) -> str:
-        """Return which limit is higher than it was before; ''. No limit is higher than any."""
+        """Return the name of a speed limit that is higher than before, or ''; 0 is no limit."""
         if self.speed_share > before.speed_share:
             return 'speed_share'
         now, then = (p.cartesian_speed_limit_m_s or np.inf for p in (self, before))
         return 'cartesian_speed_limit_m_s' if now > then else ''
 
     def correction(self, cell: Workcell, chain: SerialChain) -> CorrectionInUse | None:
-        """Return the correction in use; `InputError` where it is not of this arm, or too large."""
+        """Return the correction in use, None if there is none.
+
+        Raises InputError if it is not of this arm, too large, or the arm has a prismatic joint.
+        """
         if not self.compensation:
             return None
         if chain.slides.any():
@@ -330,7 +333,7 @@ class EmergencyLink:
             node.create_subscription(Bool, self.topic, self._on_message, qos)
 
     def trouble(self) -> str:
-        """Return why the state of the circuit is not known; '' where it is, or is not used."""
+        """Return why the state of the safety circuit is unknown (silent topic), or ''."""
         if not self.topic:
             return ''
         if not self._stamps:
@@ -468,7 +471,7 @@ class RobotBridge(RemasterNode):
             )
 
     def _on_parameters(self, p: Parameters) -> None:
-        """Go on with other speeds; higher ones are for an idle bridge."""
+        """Use other speed limits; raises InputError if one is raised while a collection runs."""
         raised = p.raised_from(self.p)
         if raised and self.supervisor.under_way:
             raise InputError(
@@ -504,6 +507,7 @@ class RobotBridge(RemasterNode):
     # What comes in
 
     def _on_record(self, record: events.EventRecord) -> None:
+        """Tell the supervisor of states of planner and recorder, and of recorded poses."""
         now = self.steady_s()
         self._models.take(record, now)
         match record.body:
@@ -520,6 +524,7 @@ class RobotBridge(RemasterNode):
                 self._do(self.supervisor.answered(solution, now))
 
     def _on_description(self, message: String) -> None:
+        """Compare a published robot description with the URDF of the cell."""
         why = difference(self.chain, message.data)
         self._described = why and (
             f'{self.resolve_topic_name(DESCRIPTION)} is not the URDF of the cell, '
@@ -533,6 +538,7 @@ class RobotBridge(RemasterNode):
         self._waypoints = message
 
     def _on_solutions(self, message: JointTrajectory) -> None:
+        """Process the joint solutions of a pose; a repeated announcement is ignored."""
         try:
             targets = solutions_of(message, self.chain.joint_names)
             belongs = self._waypoints.header.stamp == message.header.stamp
@@ -579,6 +585,7 @@ class RobotBridge(RemasterNode):
         self._taken.take(message.header.stamp)
 
     def _take_report(self, message: JointState, info: Mapping[str, Any]) -> None:
+        """Give joint states to the supervisor; doubt those that are invalid or of a rival."""
         now = self.steady_s()
         if self.clock_trouble:
             self._do(self.supervisor.observe('clock', self.clock_trouble, now))
@@ -603,6 +610,7 @@ class RobotBridge(RemasterNode):
         self._do(self.supervisor.emergency(stopped, self.steady_s()))
 
     def _on_clear_halt(self, request: Trigger.Request, response: Trigger.Response) -> Any:
+        """Serve a request to clear a halt, also in its file; or say why it is refused."""
         refusal = self.supervisor.clear_halt()
         response.success = not refusal
         response.message = refusal or 'cleared; /remaster/collect goes on'
@@ -614,6 +622,7 @@ class RobotBridge(RemasterNode):
         return response
 
     def _watch(self) -> None:
+        """Tell the supervisor of rivals, model, controller, clock and safety, each or ''."""
         now = self.steady_s()
         others = (only.trouble() for only in self._only)
         rivals = self._states.rival() or next(filter(None, others), '')
@@ -661,6 +670,7 @@ class RobotBridge(RemasterNode):
     # What goes out
 
     def _do(self, actions: list[Action]) -> None:
+        """Carry out the supervisor's actions in order; late commands are not published."""
         stops = any(isinstance(action, Stop) for action in actions)
         for action in actions:
             match action:
@@ -705,7 +715,7 @@ class RobotBridge(RemasterNode):
         self._keep_end()
 
     def _tell_missed(self) -> None:
-        """Say that the arm stops on its way, as the next piece of its move came too late."""
+        """Publish that the arm stops, once for each piece of a move that came too late."""
         if self.supervisor.missed == self._missed:
             return
         self._missed = self.supervisor.missed
@@ -724,13 +734,14 @@ class RobotBridge(RemasterNode):
         self._disk.submit(write, self._on_end_written)
 
     def _on_end_written(self, result: object) -> None:
+        """Log an error if the last commanded position could not be written."""
         if isinstance(result, Exception):
             self.get_logger().error(
                 f'{self._command_file.path}: where the arm was led last is not kept ({result})'
             )
 
     def _is_late(self, command: Drive | Renew | Stop) -> bool:
-        """Whether a command was decided so long ago that it is not published any more."""
+        """Whether a command was decided too long ago to be published (`LATE_WALL_S`)."""
         limit_s = LATE_WALL_S[type(command)]
         if isinstance(command, Drive) and command.begins_s:
             # It begins at a time, and not when it comes.
@@ -738,7 +749,7 @@ class RobotBridge(RemasterNode):
         return self.steady_s() - command.wall_s > limit_s
 
     def _send(self, command: Drive | Renew | Stop) -> None:
-        """Publish a command; the supervisor is told where that fails."""
+        """Publish a command; if that fails, tell the supervisor and raise the exception again."""
         try:
             kind = {Stop: 'stop', Renew: 'renewal', Drive: 'move'}[type(command)]
             begins_s = 0.0 if isinstance(command, Stop) else command.begins_s
@@ -768,6 +779,7 @@ class RobotBridge(RemasterNode):
         self._controller.send(message, kind)
 
     def _on_commanded(self, drive: Drive) -> None:
+        """Count and publish a move to a solution; log a long probe move."""
         solution, duration_s = drive.solution, drive.admitted.waypoints[-1].time_s
         if solution == PROBE and duration_s > PROBE_S:
             self.get_logger().info(
@@ -786,6 +798,7 @@ class RobotBridge(RemasterNode):
         )
 
     def _on_path(self, number: int, answer: PathAnswer | Exception) -> None:
+        """Give the answer of a path check to the supervisor; an exception as 'no path'."""
         if isinstance(answer, Exception):
             self.get_logger().error(f'the path could not be checked: {answer!r}')
             answer = PathAnswer(None, f'it could not be checked ({answer})')
@@ -796,6 +809,7 @@ class RobotBridge(RemasterNode):
             self.get_logger().error(f'{self._halt_file.path}: the halt is not kept ({result})')
 
     def _announce(self, settled: Settled) -> None:
+        """Publish where the arm has settled, with wanted positions if a correction is on."""
         self._settled_wall = self.steady_s()
         self.counts['settled'] += 1
         names, q = list(self.chain.joint_names), settled.q
@@ -815,6 +829,7 @@ class RobotBridge(RemasterNode):
         )
 
     def _summary(self) -> Summary:
+        """Summary for the status: counts, what blocks the arm, and the bridge's state."""
         supervisor, now = self.supervisor, self.steady_s()
         blocked = supervisor.blocked(now)
         text = 'moving or measuring' if supervisor.busy else 'waiting for a pose'

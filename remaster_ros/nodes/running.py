@@ -245,6 +245,7 @@ class _Takes(Executor):
         return self._taken(super()._take_service, srv, srv.srv_name)
 
     def _taken(self, take: Callable[[Any], Any], entity: Any, name: str) -> Any:
+        """Result of `take` for an entity; None if its message is unreadable, which is reported."""
         try:
             return take(entity)
         except Exception as error:

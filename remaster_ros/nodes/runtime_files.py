@@ -70,6 +70,7 @@ class NameLock:
         os.pwrite(self._file, f'{os.getpid()}\n'.encode(), 0)
 
     def _lock(self, domain: int, name: str, patience_s: float) -> None:
+        """Lock the file, waiting up to `patience_s`; InputError if another process holds it."""
         deadline = time.monotonic() + patience_s
         while True:
             try:

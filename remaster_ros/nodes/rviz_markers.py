@@ -48,6 +48,7 @@ class RvizMarkers:
             self._tf = message, node.create_publisher(message, TF_STATIC, LATCHED)
 
     def _surface(self, number: int, surface: Surface) -> Marker:
+        """Triangle marker of a surface of the arm, coarsened to `MOST_TRIANGLES`."""
         points, faces = coarser(surface.vertices, surface.faces, MOST_TRIANGLES)
         marker = self._marker('arm', number, Marker.TRIANGLE_LIST, COLORS[surface.role], 1.0)
         if surface.color is not None:
@@ -56,6 +57,7 @@ class RvizMarkers:
         return marker
 
     def _marker(self, space: str, number: int, kind: int, color: str, size: float) -> Marker:
+        """Marker in the base frame at the origin; `size`: scale along all axes, m."""
         marker = Marker(ns=space, id=number, type=kind, action=Marker.ADD)
         marker.header.frame_id = self._base
         marker.pose.orientation.w = 1.0
@@ -95,6 +97,7 @@ class RvizMarkers:
         self._publisher.publish(MarkerArray(markers=markers))
 
     def _axes(self, T: FloatArray) -> list[Marker]:
+        """Arrow markers of the axes of a pose T, (4, 4): x red, y green, z blue."""
         markers = []
         for axis, color in enumerate(('#d62728', '#2ca02c', '#1f77b4')):
             arrow = self._marker('target', axis, Marker.ARROW, color, 0.012)

@@ -117,6 +117,7 @@ class MeasureService:
         self._T_R_T = read_place(message.pose.position, message.pose.orientation)
 
     def _on_joints(self, message: JointState) -> None:
+        """Keep the tool's pose of a finite joint state; ignore an invalid joint state."""
         # What is wrong with joint states, the bridge reports.
         with contextlib.suppress(InputError):
             q = self._joint_order.positions(message)
@@ -408,6 +409,7 @@ class SensorNode(RemasterNode):
         self.published += reading.seen
 
     def _summary(self) -> Summary:
+        """Summary for the status: readiness, and the trouble of node, clock or driver."""
         state = self.driver.state()
         open_now = self.driver.phase == 'ready' and self.driver.connected
         trouble, level = state.trouble, state.level

@@ -22,7 +22,7 @@ CHECK_S = 1.0
 
 
 class SessionKeeper:
-    """Writes a session, one record at a time.
+    """Journal and bag of a session, whose writes wait if the disk is full.
 
     ``began``: first record of a bag; None for no bag.
     Attributes: ``journal, bag``; ``full``: why a write waits, '' if none does; ``restored``: last

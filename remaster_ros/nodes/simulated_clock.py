@@ -94,7 +94,7 @@ class SteadyTime:
 
 
 class ReportsTaken:
-    """Publishes, in a simulation, until when a node has taken what came.
+    """Publishes, in a simulation, up to which stamp a node has processed its messages.
 
     ``simulated``: `simulated_clock_rate`, or whether the clock is simulated; else nothing is
     published; ``leads``: whether the node leads the arm.

@@ -120,7 +120,7 @@ LEVELS = {
 
 
 class Summary(NamedTuple):
-    """What a node reports of itself now."""
+    """Present status of a node."""
 
     level: str  # ``ok``, ``warn`` or ``error``
     message: str  # For people
@@ -168,12 +168,12 @@ class NodeStatus:
 
     @property
     def started(self) -> str:
-        """What its records have of when the node was started."""
+        """Identifier of this start of the node, as in its records."""
         return self._started
 
     @property
     def alone_since(self) -> float | None:
-        """Since when no other of this name was found, `time.monotonic`; None where not yet."""
+        """Time since which no other node of this name was found, `time.monotonic`; or None."""
         return self._duplicates.alone_since_s
 
     def alone(self, now: float) -> bool:
@@ -184,6 +184,7 @@ class NodeStatus:
         self._qos_trouble = mismatches(self._node)
 
     def _on_record(self, record: EventRecord) -> None:
+        """Set the node's failure if another process with its name has run for longer."""
         own = self._node.get_fully_qualified_name()
         if record.node != own or not record.started or not isinstance(record.body, STATES):
             return
@@ -220,6 +221,7 @@ class NodeStatus:
         self._publish_record(event)
 
     def _publish_record(self, body: State | Event) -> None:
+        """Publish a state or an event as a record of this node, with stamp and uptime."""
         record = EventRecord(
             node=self._node.get_fully_qualified_name(),
             body=body,
@@ -235,6 +237,7 @@ class NodeStatus:
             self._publish_status(self._diagnostics, self._summary())
 
     def _publish_status(self, publisher: Any, summary: Summary) -> None:
+        """Publish a summary as diagnostics; 'ok' becomes 'warn' if there is QoS trouble."""
         level, message = summary.level, summary.message
         if self._qos_trouble and level == 'ok':
             level, message = 'warn', self._qos_trouble
@@ -280,7 +283,7 @@ def _text(value: Any) -> str:
 
 
 def taken_key(record: EventRecord) -> str:
-    """Return by what a recorder counts the records that it has taken."""
+    """Return the key by which a recorder counts the records of a node's start."""
     return f'{record.node} {record.started}'
 
 
@@ -310,7 +313,7 @@ def listen(
     on_record: Callable[[EventRecord], None] | None = None,
     on_summary: Callable[[str, str, dict[str, str]], None] | None = None,
 ) -> None:
-    """Subscribe to the records of all nodes, or to what they show to people.
+    """Subscribe to the records of all nodes, to their diagnostics, or to both.
 
     ``on_summary``: called with (node, message, values) of every status; for programs that show
     them.

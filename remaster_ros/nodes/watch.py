@@ -126,6 +126,7 @@ class Watch(RemasterNode):
         self.create_timer(EVERY_S, self._show, clock=self.status.steady)
 
     def _open_page(self, scene: bytes) -> LiveServer:
+        """Start the server of the live page, and print its address for this user alone."""
         names = tuple(name.strip() for name in self.p.names.split(',') if name.strip())
         place = Place(self.p.address, self.p.port, names, self.p.certificate, self.p.key)
         name = page_name(self.context.get_domain_id(), self.get_fully_qualified_name())
@@ -137,6 +138,8 @@ class Watch(RemasterNode):
         return page
 
     def _subscribe(self, sensors: Mapping[str, Mapping[str, str]]) -> None:
+        """Subscribe to all topics that the page shows, and the markers of `sensors`."""
+
         def take(kind: type, topic: str, callback: Callable[[Any], None], qos: QoSProfile) -> None:
             self.create_subscription(kind, topic, _tolerant(callback), qos)
 
@@ -165,6 +168,7 @@ class Watch(RemasterNode):
         self.view.take(record.body, time.monotonic())
 
     def _on_status(self, array: DiagnosticArray) -> None:
+        """Show each diagnostic status; then look for a new plan."""
         words = {level: word for word, level in LEVELS.items()}
         for status in array.status:
             values = {pair.key: pair.value for pair in status.values}
@@ -174,7 +178,7 @@ class Watch(RemasterNode):
         self._look_for_plan()
 
     def _look_for_plan(self) -> None:
-        """Have the page of the plan that is next served, and its service at hand."""
+        """Read the page of the next plan, and make a client of its confirmation service."""
         plan, page = self.view.plan_to_show()
         if plan == self._plan:
             return
@@ -187,6 +191,7 @@ class Watch(RemasterNode):
             self._background.submit(read, partial(self._on_plan_page, plan))
 
     def _on_plan_page(self, plan: str, found: bytes | Exception) -> None:
+        """Show the page of a plan, or the error with which it could not be had."""
         if isinstance(found, Exception):
             self.view.take_plan_page(PlanPage(plan, trouble=str(found)))
         else:
@@ -208,7 +213,7 @@ class Watch(RemasterNode):
         self._waypoints = message
 
     def _on_solutions(self, message: JointTrajectory) -> None:
-        """Take the way from where the arm is through all solutions of the pose."""
+        """Show the path from the arm's position through all solutions of the pose."""
         names, waypoints = self.chain.joint_names, self._waypoints
         targets = solutions_of(message, names)
         belongs = waypoints.header.stamp == message.header.stamp
@@ -274,6 +279,7 @@ class Watch(RemasterNode):
             done(False, OTHER_PLAN)
 
     def _show(self) -> None:
+        """Publish the view to page and RViz; less often if nobody looks."""
         now = time.monotonic()
         confirming = self._callers.get(f'{CONFIRM}/{self._plan}')
         self.view.plan_offered = confirming is not None and confirming.service_is_ready()
@@ -296,7 +302,7 @@ class Watch(RemasterNode):
 
 
 def _tolerant(callback: Callable[[Any], None]) -> Callable[[Any], None]:
-    """Return a callback that leaves out a message which makes no sense; the nodes report those."""
+    """Return a callback that drops invalid messages, which other nodes report."""
 
     def receive(message: Any) -> None:
         with contextlib.suppress(RemasterError, ValueError, msgspec.MsgspecError):
@@ -306,10 +312,10 @@ def _tolerant(callback: Callable[[Any], None]) -> Callable[[Any], None]:
 
 
 def fit_facts(folder: Path, offsets: Mapping[str, float]) -> FitFacts:
-    """Return what the page shows of a fit beside its offsets.
+    """Return figures of a fit.json for the page, besides offsets; empty if there is none.
 
-    ``folder``: the optimizer's, on this computer; where it is elsewhere there is nothing to show;
-    ``offsets``: as published, joint -> rad or m: the file has to be that of the same fit.
+    ``folder``: of the optimizer, if it is on this computer; ``offsets``: as published, joint ->
+    rad or m; a file of another fit counts as none.
     """
     try:
         fit = read_fit(folder / FIT_FILE)

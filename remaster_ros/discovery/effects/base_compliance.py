@@ -31,6 +31,7 @@ def _tipped(context: Context, axes: list[FloatArray]) -> Design:
 
 
 def _tips(context: Context, candidate: Candidate, draws: FloatArray) -> str:
+    """Phrase for the largest tip of the base under the arm's weight, by axis."""
     moment = largest(np.linalg.norm(context.base_moment, axis=1))
     about = candidate.parameters if candidate.size > 1 else ('',)
     return ' and '.join(

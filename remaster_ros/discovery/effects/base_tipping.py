@@ -29,6 +29,7 @@ def candidates(context: Context) -> Iterator[Candidate]:
 
 
 def _candidate(context: Context, degrees: float, share: float) -> Candidate:
+    """Candidate that rocks about an axis `degrees` from x, at the quantile `share` of moment."""
     level = float(np.quantile(context.base_moment[context.to_fit] @ _axis(degrees), share))
     return EFFECT.candidate(
         Rocking(degrees, level),

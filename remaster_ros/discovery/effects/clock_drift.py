@@ -30,6 +30,7 @@ def _moved_on(context: Context, sensor: int, middle: float) -> Design:
 
 
 def _fast(context: Context, candidate: Candidate, draws: FloatArray) -> str:
+    """Phrase for the rate of a sensor's clock, parts in a million."""
     parts = 1e6 * draws[:, 0]
     mean = float(parts.mean())
     what = 'slow' if mean >= 0.0 else 'fast'

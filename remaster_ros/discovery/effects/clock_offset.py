@@ -27,6 +27,7 @@ def _moved_on(context: Context, sensor: int) -> Design:
 
 
 def _late(context: Context, candidate: Candidate, draws: FloatArray) -> str:
+    """Phrase for the delay of a sensor's stamps, ms."""
     late = -1e3 * draws[:, 0]
     mean = float(late.mean())
     what = 'later' if mean >= 0.0 else 'earlier'

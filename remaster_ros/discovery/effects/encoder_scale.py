@@ -24,6 +24,7 @@ def candidates(context: Context) -> Iterator[Candidate]:
 
 
 def _scaled(context: Context, candidate: Candidate, draws: FloatArray) -> str:
+    """Phrase for how much more or less a joint moves than it reports, over its span."""
     joint, scale = candidate.joints[0], draws[:, 0]
     more = 'more' if scale.mean() >= 0.0 else 'less'
     span = np.ptp(context.measurements.q[:, joint - 1])

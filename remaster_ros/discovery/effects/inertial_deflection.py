@@ -22,6 +22,7 @@ def candidates(context: Context) -> Iterator[Candidate]:
 
 
 def _gave_way(context: Context, candidate: Candidate, draws: FloatArray) -> str:
+    """Phrase for a joint's deflection under its largest inertial torque."""
     joint = candidate.joints[0]
     torque = largest(context.motion.inertial_torque[:, joint - 1])
     moved = of_joint(context, joint, draws[:, 0] * torque)

@@ -23,6 +23,7 @@ def candidates(context: Context) -> Iterator[Candidate]:
 
 
 def _turned(context: Context, candidate: Candidate, draws: FloatArray) -> str:
+    """Phrase for a joint's deflection under its largest gravity torque (force of a slide)."""
     joint = candidate.joints[0]
     torque = largest(context.gravity_torque[:, joint - 1])
     moved = of_joint(context, joint, draws[:, 0] * torque)

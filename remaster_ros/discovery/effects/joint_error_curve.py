@@ -53,6 +53,7 @@ def _splines(context: Context, joint: int, curve: Curve) -> Design:
 
 
 def _range(context: Context, candidate: Candidate, draws: FloatArray) -> str:
+    """Phrase for the range and RMS of a joint's error curve, arc minutes (mm of a slide)."""
     joint = candidate.joints[0]
     values = candidate.columns(context).values
     one, unit, digits = (MM, ' mm', 3) if candidate.slide else (ARC_MINUTE, '′', 1)

@@ -22,6 +22,7 @@ def candidates(context: Context) -> Iterator[Candidate]:
 
 
 def _late(context: Context, candidate: Candidate, draws: FloatArray) -> str:
+    """Phrase for the delay of a joint's reports, ms."""
     late = 1e3 * draws[:, 0]
     mean = float(late.mean())
     shown = number(abs(mean), float(late.std()), ' ms')

@@ -54,6 +54,7 @@ def link_directions(context: Context, link: int) -> dict[str, FloatArray]:
 
 
 def _longer(context: Context, candidate: Candidate, draws: FloatArray) -> str:
+    """Phrase for a link that is longer than its model, or ends off it along an axis."""
     link, value, size = candidate.joints[0], draws[:, 0], length(along_mean(draws[:, :1]))
     if candidate.variant == 'along':
         longer = 'longer' if value.mean() >= 0.0 else 'shorter'

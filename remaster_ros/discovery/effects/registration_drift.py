@@ -36,6 +36,7 @@ def _crept(context: Context, sensor: int, middle: float, turning: bool) -> Desig
 
 
 def _columns(context: Context, sensor: int, passed_s: FloatArray, turning: bool) -> Design:
+    """Columns of a sensor's shift (and turn, if `turning`) in proportion to the time passed, s."""
     amount = (passed_s * context.seen_by(sensor))[:, None]
     axes = [context.sensor_turn[:, :, axis] for axis in range(3)]
     shifts = [amount * axis for axis in axes]

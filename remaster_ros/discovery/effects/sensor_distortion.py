@@ -44,6 +44,7 @@ def candidates(context: Context) -> Iterator[Candidate]:
 
 
 def _bent(context: Context, sensor: int, variant: str) -> Design:
+    """Columns of a sensor's distortion of the given variant, in the rows that it saw."""
     mine = context.seen_by(sensor)[:, None]
     return displaced(
         *(

@@ -91,6 +91,7 @@ def _kernel(places: FloatArray, centers: FloatArray, length: float) -> FloatArra
 
 
 def _along_sight(context: Context, sensor: int, knots: FloatArray) -> Design:
+    """Columns of an error along the line of sight: a spline of the range with these knots."""
     sight = context.in_sensor / np.maximum(context.range_m, 1e-3)[:, None]
     along = np.einsum('nij,nj->ni', context.sensor_turn, sight)
     along = along * context.seen_by(sensor)[:, None]

@@ -37,6 +37,7 @@ def candidates(context: Context) -> Iterator[Candidate]:
 
 
 def _stretched(context: Context, sensor: int, directions: list[FloatArray]) -> Design:
+    """Columns of a sensor's scale along each of `directions`, in the rows that it saw."""
     mine = context.seen_by(sensor)[:, None]
     return displaced(
         *(
@@ -47,6 +48,7 @@ def _stretched(context: Context, sensor: int, directions: list[FloatArray]) -> D
 
 
 def _long(context: Context, candidate: Candidate, draws: FloatArray) -> str:
+    """Phrase for a sensor's scale error, mm per metre, by axis."""
     axes = [
         f' along {name.split("_")[1]}' if 'scale_' in name else '' for name in candidate.parameters
     ]

@@ -23,6 +23,7 @@ def candidates(context: Context) -> Iterator[Candidate]:
 
 
 def _short(context: Context, candidate: Candidate, draws: FloatArray) -> str:
+    """Phrase for how far a joint stays short of its target after its largest move."""
     joint = candidate.joints[0]
     move = largest(context.last_move[:, joint - 1])
     short = of_joint(context, joint, draws[:, 0] * move)

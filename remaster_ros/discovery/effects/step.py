@@ -94,6 +94,7 @@ def _marker_moved(context: Context, marker: int, gap: FloatArray) -> Design:
 def _sensor_moved(
     context: Context, sensors: tuple[int, ...], gap: FloatArray, turning: bool
 ) -> Design:
+    """Columns of sensors shifted (and turned, if `turning`) together at a moment in a gap, s."""
     mine = after(context, gap) * np.isin(context.sensor, sensors)[:, None]
     # Along the axes of the sensor, or of the base where all of them are concerned.
     turn = context.sensor_turn if len(sensors) == 1 else np.eye(3)[None]
@@ -110,6 +111,7 @@ LARGEST_RAD = 2e-2
 
 
 def _jump(context: Context, candidate: Candidate, draws: FloatArray) -> str:
+    """Phrase for the size and direction of a step of a joint, sensor or marker."""
     if candidate.place == 'joint_angle':
         return (
             f'joint {candidate.joints[0]} by {of_joint(context, candidate.joints[0], draws[:, 0])}'

@@ -87,6 +87,7 @@ def needs_warming(context: Context) -> str:
 
 
 def _grown_by(context: Context, candidate: Candidate, draws: FloatArray) -> str:
+    """Phrase for the growth of 1 m of a link (or the arm) over the span of the driver."""
     part = f'of link {candidate.joints[0]}' if candidate.joints else 'of the arm'
     driver = driver_named(context, candidate.driver, 0)
     assert driver is not None

@@ -23,6 +23,7 @@ def _swung(context: Context) -> Design:
 
 
 def _frequency(context: Context, candidate: Candidate, draws: FloatArray) -> str:
+    """Phrase for the frequency, Hz, of the tool's softest axis."""
     axis = int(np.argmax(draws.mean(axis=0)))
     softest = np.maximum(draws[:, axis], 1e-7)
     hertz = 1.0 / (2.0 * np.pi * np.sqrt(softest))

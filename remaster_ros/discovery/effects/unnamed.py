@@ -111,6 +111,7 @@ def _candidate(
     subject: str = '',
     **more: Any,
 ) -> Candidate:
+    """Candidate of a form at a place; stems and the form's suffixes name its parameters."""
     return EFFECT.candidate(
         columns,
         [f'{stem}{suffix}' for suffix in form.suffixes for stem in stems],
@@ -303,6 +304,7 @@ def _sensor_forms(context: Context, sensor: int) -> Iterator[_Form]:
 
 
 def _size(context: Context, candidate: Candidate, draws: FloatArray) -> str:
+    """Phrase for the largest error of a free form, of a joint or the marker."""
     what = (
         f'joint {candidate.joints[0]} errs'
         if candidate.place == 'joint_angle'

@@ -109,7 +109,10 @@ class Parameters(InspectionParameters):
         return TourPlanner(scene, counts, self.seed, self.reference_every, design, travel, causes)
 
     def causes(self, joint_names: Sequence[str]) -> tuple[FoundCause, ...]:
-        """Return the causes that the plan has to separate; errors as of `read_causes`."""
+        """Return the causes that the plan has to separate, () if none are given.
+
+        Raises InputError as `read_causes`.
+        """
         if not self.separate:
             return ()
         # Imported when needed, since the import is slow.

@@ -100,7 +100,7 @@ class PlanPreview(PlanConfirmation):
         return self.refusal()
 
     def _next(self, required: RequiredSensors) -> tuple[str, Tour | None]:
-        """Return an identifier of the next plan, and its tour; None if that is not planned yet.
+        """Return identifier and tour of the next plan; the tour is None if it is not planned yet.
 
         The next plan is the one that `TourProgress.next` would visit.
         """
